@@ -18,10 +18,11 @@ from embomatrix.sim.placing.pose_cache import build_pose_cache
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
 from embomatrix.world.codec_task import poses_from_json, poses_to_json
-from embomatrix.world.field import SceneInvalidError
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import PoseCache
+from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.state import Relation
+from embomatrix.world.tables import Tables, TableWriter
 
 ON_COUNTER = Placing("apple_1", "countertop_1", Relation.ONTOP)
 INTO_BOWL = Placing("apple_1", "bowl_1", Relation.INSIDE)
@@ -134,7 +135,8 @@ def test_what_the_arm_gets_at_travels_in_the_bundle(known):
 
 @pytest.mark.parametrize("number", ["3", -1, 0.5, True, None])
 def test_a_number_of_a_pose_that_is_none_is_refused_by_name(number):
-    value = poses_to_json(PoseCache(reached={Relation.ONTOP: {"mug_1": {"sink_1": 1}}}))
+    writer = TableWriter()
+    value = poses_to_json(PoseCache(reached={Relation.ONTOP: {"mug_1": {"sink_1": 1}}}), writer)
     value["reached"]["ontop"]["mug_1"]["sink_1"] = number
     with pytest.raises(SceneInvalidError, match="sink_1"):
-        poses_from_json(value)
+        poses_from_json(value, Tables(writer.arrays()))
