@@ -16,7 +16,7 @@ from embomatrix.sim.state.relations import Relations
 from embomatrix.sim.state.symbols import Symbols
 from embomatrix.sim.state.thermal import Thermal
 from embomatrix.sim.state.water import Water
-from embomatrix.skills.appliance import cold_source, heat_source
+from embomatrix.skills.appliances import cold_source, heat_source
 from embomatrix.skills.view import ObjectReach
 from embomatrix.world.state import State
 from embomatrix.world.substances import MEANINGS, facts_of

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from embomatrix.sim.state.thermal import Change
-from embomatrix.skills.household import coverings, liquids_given, soaked_with, washed_away, washing
+from embomatrix.skills.appliances import coverings, liquids_given, soaked_with, washed_away, washing
 from embomatrix.world.state import State, SubstanceFact, SubstanceRelation
 from embomatrix.world.substances import flows_from, in_words, word_of
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.state.news import News
     from embomatrix.sim.state.relations import Relations
-    from embomatrix.skills.household import Washing
+    from embomatrix.skills.appliances import Washing
 
 
 class Water:
