@@ -147,7 +147,7 @@ class Simulator:
             refusal = self._actor.act(world, call, self._draws.generator)
         if refusal is not None:
             self._hash.update(world.state_bytes() + refusal.reason.encode())
-            return Step(call, refusal.reason, refusal.sentence)
+            return Step(call, refusal.reason, refusal.sentence, refusal.blocker)
         changes = world.let_sources_act() if call.skill in CHANGING else ()
         self._touched.update(filter(None, (target_of(world, call), source_of(world, call))))
         self._hash.update(world.state_bytes())

@@ -13,7 +13,7 @@ from embomatrix.sim.placing.placement import Placer
 from embomatrix.sim.state.facts import EngineFacts, Symbols
 from embomatrix.sim.state.relations import Relations
 from embomatrix.sim.state.sources import News, Thermal, Water
-from embomatrix.skills.appliance import cold_source, heat_source
+from embomatrix.skills.appliances import cold_source, heat_source
 from embomatrix.skills.view import ObjectReach
 from embomatrix.world.state import State
 from embomatrix.world.substances import MEANINGS, facts_of

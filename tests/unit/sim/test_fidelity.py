@@ -85,7 +85,7 @@ def test_the_first_step_that_differs_is_named_with_both_sentences(cached, bundle
     told = disagreement_to_json(comparison)
     assert (told["step"], told["skill"]) == (2, "toggle_on")
     assert "switched table_lamp_1 on" in told["cached"]
-    assert "bars it" in told["physical"]
+    assert "blocks it" in told["physical"]
 
 
 def test_atoms_that_hold_in_one_mode_alone_are_told(cached, bundle):

@@ -6,11 +6,11 @@ import pytest
 from tests.fakes import furniture as make
 from tests.fakes.plans import executed, with_objects
 from tests.fakes.scenes import kitchen_scene, placed, upright
+from tests.fakes.skill_reasons import MISHAPS, reasons_of
 
 from embomatrix.sim.physical.actor import MOTIONS, PhysicalActor, physical_simulator
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.library import MISHAPS, reasons_of
 from embomatrix.skills.syntax import Skill
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.geometry import Pose

@@ -111,7 +111,7 @@ def test_where_nothing_could_be_taken_from_nothing_is_placed():
     assert other.startswith(("side", "lid", "stand"))
     trace = execute(scene, poses, "move slice_1; pick_up slice_1; move stand_1; place stand_1 ontop")
     assert trace.failure is FailureReason.ARM_BLOCKED
-    assert trace.steps[-1].message == f"the arm finds no free way to a place for slice_1: {other} bars it"
+    assert trace.steps[-1].message == f"the arm finds no free path to a place for slice_1: {other} blocks it"
 
 
 def test_a_place_is_free_again_when_what_barred_it_is_taken_away():

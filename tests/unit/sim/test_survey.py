@@ -80,7 +80,7 @@ def test_what_is_walled_in_is_barred_and_cached_mode_says_who_bars_it():
     assert other.startswith(("board", "lid"))
     trace = executed_with(scene, poses, "move apple_1; pick_up apple_1")
     assert trace.failure is FailureReason.ARM_BLOCKED
-    assert trace.steps[-1].message == f"the arm finds no free way to apple_1: {other} bars it"
+    assert trace.steps[-1].message == f"the arm finds no free path to apple_1: {other} blocks it"
 
 
 def test_a_thing_is_free_again_when_what_barred_it_is_taken_away():

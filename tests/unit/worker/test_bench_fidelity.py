@@ -171,7 +171,7 @@ def test_a_disagreement_is_shown_again_step_by_step(suite, dataset):
     )
     lines = list(replay(dataset, read_disagreement(f"{path}:{number}"), Modes(load_simulator, clumsy)))
     assert any(line.startswith("≠") and "toggle_on" in line for line in lines)
-    assert any("bars it" in line for line in lines)
+    assert any("blocks it" in line for line in lines)
     assert any(line.strip().startswith("cached only:") for line in lines)
 
 

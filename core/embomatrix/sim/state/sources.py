@@ -9,8 +9,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.skills.appliance import cold_source, cooks, freezes, heat_source, heats
-from embomatrix.skills.household import coverings, liquids_given, soaked_with, washed_away, washing
+from embomatrix.skills.appliances import (
+    cold_source,
+    cooks,
+    coverings,
+    freezes,
+    heat_source,
+    heats,
+    liquids_given,
+    soaked_with,
+    washed_away,
+    washing,
+)
 from embomatrix.world.geometry import Aabb
 from embomatrix.world.state import Relation, State, SubstanceFact, SubstanceRelation
 from embomatrix.world.substances import flows_from, in_words, word_of
@@ -20,8 +30,7 @@ if TYPE_CHECKING:
 
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.state.relations import Relations
-    from embomatrix.skills.appliance import Source
-    from embomatrix.skills.household import Washing
+    from embomatrix.skills.appliances import ThermalSource, Washing
     from embomatrix.world.asset import Asset
 
 VESSEL_M: Final = 0.3
@@ -79,7 +88,7 @@ class Thermal:
         self._relations = relations
         self._scene = engine.scene
         self._states = states
-        self._sources: list[tuple[str, Source]] = []
+        self._sources: list[tuple[str, ThermalSource]] = []
         self._acted = False
         for item in self._scene.objects:
             asset = self._scene.assets[item.asset_id]
@@ -99,7 +108,7 @@ class Thermal:
                     changes += self._expose(item, source)
         return changes
 
-    def works(self, name: str, source: Source) -> bool:
+    def works(self, name: str, source: ThermalSource) -> bool:
         """Whether the source is on and closed, as far as it must be."""
         # The switch first: most sources of a scene are off, and all are asked after every change.
         if source.requires_on and State.TOGGLED_ON not in self._states.get(name, ()):
@@ -108,7 +117,7 @@ class Thermal:
             return False
         return not (source.requires_closed and self._relations.open(name))
 
-    def is_at(self, item: str, name: str, source: Source) -> bool:
+    def is_at(self, item: str, name: str, source: ThermalSource) -> bool:
         """Whether the source acts on the object where it lies: inside it, or on it, or in or on a vessel on it."""
         if source.requires_inside:
             return self._relations.inside(item, name)
@@ -121,7 +130,7 @@ class Thermal:
             if vessel != item
         )
 
-    def _acted_on(self, name: str, source: Source) -> Iterator[str]:
+    def _acted_on(self, name: str, source: ThermalSource) -> Iterator[str]:
         """Objects where the source acts, of those that it would change."""
         for item in self._above(name):
             if self._gained(item, source) and self.is_at(item, name, source):
@@ -141,12 +150,12 @@ class Thermal:
     def _bears(self, vessel: str, item: str) -> bool:
         return self._relations.holds(Relation.INSIDE, item, vessel) or self._relations.ontop(item, vessel)
 
-    def _gained(self, item: str, source: Source) -> list[State]:
+    def _gained(self, item: str, source: ThermalSource) -> list[State]:
         """States that the object would get from the source and does not have."""
         states = self._states.get(item, ())
         return [state for state in _states_at(self._scene.asset_of(item), source) if state not in states]
 
-    def _expose(self, item: str, source: Source) -> list[Change]:
+    def _expose(self, item: str, source: ThermalSource) -> list[Change]:
         """Give the object the states of the source's temperature that its asset can have."""
         gained, states = self._gained(item, source), self._states[item]
         if State.HOT in gained:
@@ -157,7 +166,7 @@ class Thermal:
         return [Change(item, state.value) for state in gained]
 
 
-def _states_at(asset: Asset, source: Source) -> list[State]:
+def _states_at(asset: Asset, source: ThermalSource) -> list[State]:
     found: list[State] = []
     if heats(source) and asset.can("heatable"):
         found.append(State.HOT)
