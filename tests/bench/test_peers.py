@@ -25,7 +25,7 @@ from embomatrix.bench.peers.contest import (
 from embomatrix.bench.peers.scene_process import executed_twice, write_bundles
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.bench.report.page import peer_lines
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import decode_bundle
 from embomatrix.world.dataset import Dataset
 
@@ -72,7 +72,7 @@ def traces(work):
     """Yield the trace digest of each plan."""
     for digest, data in work.bundles.items():
         bundle = decode_bundle(data)
-        with contextlib.closing(Simulator(bundle)) as simulator:
+        with contextlib.closing(load_simulator(bundle)) as simulator:
             for rollout in work.rollouts:
                 if rollout.bundle_digest == digest:
                     yield simulator.execute(bundle.tasks[rollout.task_id], rollout.plan, rollout.seed).digest

@@ -34,8 +34,8 @@ from embomatrix.bench.report.figures import (
 )
 from embomatrix.bench.report.output import console, errors, hand_in, refusals, write
 from embomatrix.bench.report.page import check_page, render_page
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.actor import physical_simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.dataset import Dataset
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ Parts = Annotated[
 Naive = Annotated[int, typer.Option(min=1, help="Rollouts of the ablation's first row; each takes seconds.")]
 PAGE = Path("docs/benchmarks.md")
 FULL_SUITE = Path("build/scenes")
-MODES = Modes(cached=Simulator, physical=physical_simulator)
+MODES = Modes(cached=load_simulator, physical=physical_simulator)
 QUICK = FidelitySettings(plans=24, calls=0, seed=0)
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from embomatrix.bench.engine.workload import PINNED, load_workload, nearest_size
 from embomatrix.reward.hierarchy import score
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import plan_from_json
 from embomatrix.world.bundle import decode_bundle
 from embomatrix.world.dataset import Dataset
@@ -36,7 +36,7 @@ def test_scene_executes_its_first_plan_and_an_oracle_plan_reaches_its_goal(scene
     bundle = decode_bundle(WORKLOAD.bundles[scene.bundle_digest], digest=scene.bundle_digest)
     assert len(bundle.scene.objects) == scene.bodies, REMEDY
     record = next(item for item in Dataset.load(PINNED).records if item.bundle_digest == scene.bundle_digest)
-    with contextlib.closing(Simulator(bundle)) as simulator:
+    with contextlib.closing(load_simulator(bundle)) as simulator:
         first = scene.executions[0]
         assert simulator.execute(bundle.tasks[first.task_id], first.plan, first.seed).failure is None, REMEDY
         plan = plan_from_json([*record.oracle], record.task.profile)

@@ -22,7 +22,7 @@ from embomatrix.bench.engine.workload import (
     workload_to_text,
 )
 from embomatrix.bench.report.figures import BenchError
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
 from embomatrix.world.dataset import write_dataset
 from embomatrix.world.whole_file import write_whole
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
+    from embomatrix.sim.executor import Simulator
     from embomatrix.skills.syntax import Plan
     from embomatrix.world.bundle import Bundle
     from embomatrix.world.dataset import Dataset
@@ -98,7 +99,7 @@ def _executions(bundle: Bundle, count: int, rng: np.random.Generator) -> Iterato
     """Yield up to ``count`` different plans, the tasks in turn; fewer if too many tries fail."""
     known: set[tuple[str, Plan]] = set()
     tasks = cycle([bundle.tasks[task_id] for task_id in sorted(bundle.tasks)])
-    with contextlib.closing(Simulator(bundle)) as simulator:
+    with contextlib.closing(load_simulator(bundle)) as simulator:
         for _ in range(count * TRIES_PER_PLAN):
             if len(known) == count:
                 return

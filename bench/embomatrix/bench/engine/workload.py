@@ -16,7 +16,7 @@ from embomatrix.bench.report.figures import BenchError
 from embomatrix.rpc.wire.values import Rollout
 from embomatrix.skills.parse import PlanError, parse_plan, plan_to_lines
 from embomatrix.world.dataset import Dataset, DatasetError
-from embomatrix.world.field import Field, SceneInvalidError
+from embomatrix.world.records import Name, Record, SceneInvalidError, decode
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -29,6 +29,20 @@ PINNED: Final = Path(__file__).parents[1] / "data"
 WORKLOAD_FILE: Final = "workload.json"
 SIZES: Final = (60, 150, 300, 600)
 """Scene sizes, in bodies, that costs are reported for. A scene counts for the nearest size, as a ratio."""
+
+
+class SceneWorkJson(Record):
+    scene_id: Name
+    bundle: Name
+    bodies: int
+    executions: list[str]
+
+
+class WorkloadJson(Record):
+    format: int
+    seed: int
+    bodies: int
+    scenes: list[SceneWorkJson]
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,13 +170,10 @@ def workload_to_text(workload: Workload) -> str:
 def read_workload(path: Path) -> Workload:
     """Read a workload's file, without bundles. Raises BenchError that names the file and the remedy."""
     try:
-        fields = Field(json.loads(path.read_text(encoding="utf-8")), "workload").record(
-            "format", "seed", "bodies", "scenes"
-        )
-        if fields["format"].integer() != FORMAT:
-            fields["format"].fail(f"found {fields['format'].value}: this version reads {FORMAT}")
-        scenes = tuple(_scene_from_field(item) for item in fields["scenes"].items())
-        return Workload(fields["seed"].integer(), fields["bodies"].integer(), scenes)
+        record = decode(path.read_bytes(), WorkloadJson, "workload")
+        if record.format != FORMAT:
+            raise SceneInvalidError("workload.format", f"found {record.format}: this version reads {FORMAT}")
+        return Workload(record.seed, record.bodies, tuple(map(_scene_work, record.scenes)))
     except (OSError, ValueError, RecursionError) as error:
         raise BenchError(f"no workload can be read from {path} ({error}): {_remedy(path.parent)}") from error
 
@@ -174,22 +185,20 @@ def _remedy(folder: Path) -> str:
     )
 
 
-def _scene_from_field(field: Field) -> SceneWork:
-    fields = field.record("scene_id", "bundle", "bodies", "executions")
-    return SceneWork(
-        fields["scene_id"].name(),
-        fields["bundle"].name(),
-        fields["bodies"].integer(),
-        tuple(_execution(item) for item in fields["executions"].items()),
-    )
+def _scene_work(record: SceneWorkJson) -> SceneWork:
+    executions = tuple(_execution(text, record.scene_id) for text in record.executions)
+    return SceneWork(record.scene_id, record.bundle, record.bodies, executions)
 
 
-def _execution(field: Field) -> Execution:
-    head, _, text = field.text().partition(": ")
+def _execution(line: str, scene_id: str) -> Execution:
+    path = f"workload, scene {scene_id}"
+    head, _, text = line.partition(": ")
     task_id, _, seed = head.rpartition(" ")
     if not (task_id and seed.isdecimal()):
-        field.fail(f"begins with {head[:60]!r}: expected a task's id and a seed")
+        raise SceneInvalidError(
+            path, f"an execution begins with {head[:60]!r}: expected a task's id and a seed"
+        )
     try:
         return Execution(task_id, int(seed), parse_plan(text))
     except PlanError as error:
-        raise SceneInvalidError(field.path, str(error)) from error
+        raise SceneInvalidError(path, str(error)) from error

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.manager.control.audit.auditor import Auditor, AuditRules, Opinion, Ruling, judge, opinion_of
 from embomatrix.manager.control.commands import CancelLease, QuarantineWorker
 from embomatrix.manager.control.dispatch.ledger import DispatchPhase, RolloutKey, RolloutRecord
-from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure
 
 if TYPE_CHECKING:
@@ -266,7 +265,6 @@ class Audits:
             name not in check.barred
             and not (worker.quarantined or worker.draining)
             and (worker.render_slots > 0 or not check.rollout.render)
-            and (worker.scores or check.reward == PAPER)
             for name, worker in self._desk.fleet.workers.items()
         )
 

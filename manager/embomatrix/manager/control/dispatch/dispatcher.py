@@ -50,7 +50,6 @@ from embomatrix.manager.control.events import (
     WorkersExpected,
     WorkerSuspected,
 )
-from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure
 
 if TYPE_CHECKING:
@@ -150,7 +149,6 @@ class Dispatcher:
             lags=dict(desk.fleet.lags),
             runs={heads[0].scene: heads[0].key.run_id for heads in lanes},
             rendering=frozenset(h.scene for heads in lanes for h in heads if h.rollout.render),
-            scored=frozenset(heads[0].scene for heads in lanes if all(h.reward != PAPER for h in heads)),
         )
 
     @property
@@ -219,7 +217,8 @@ class Dispatcher:
             flat_s = now_s - lease.moved_s
             if flat_s >= self._stall_after_s(lease):
                 text = f"{event.worker_id} did no step for {flat_s:.0f} s, after {lease.steps}"
-                self._take_away(lease, InfraFailure(InfraCode.STALLED, text, event.worker_id))
+                failure = InfraFailure(InfraCode.STALLED, text, event.worker_id)
+                self._take_away(lease, failure, started=lease.started_s is not None)
 
     def _stall_after_s(self, lease: LeaseRecord) -> float:
         usual_s = self._desk.runs.of(lease.record.key.run_id).times.quantile_s(0.99)
@@ -229,8 +228,10 @@ class Dispatcher:
 
     def _on_tick(self) -> None:
         self._recovery.tick()
-        for lease in self._desk.leases.due(self._desk.now_s):
-            self._expire(lease)
+        # Ending a lease starts the next one behind its slot: a lease that expires now counts only if it ran before.
+        expired = [(lease, lease.started_s is not None) for lease in self._desk.leases.due(self._desk.now_s)]
+        for lease, started in expired:
+            self._expire(lease, started=started)
         for record, had_s in self._desk.batches.overdue(self._desk.now_s):
             message = f"no outcome within {had_s:g} s of its submission"
             self._desk.finish(record, InfraFailure(InfraCode.DEADLINE, message))
@@ -251,17 +252,18 @@ class Dispatcher:
             return  # nobody waits, neither for a lease nor behind a busy slot
         self._desk.fill([*forgiven, *fleet.seekers(), *fleet.lags])
 
-    def _expire(self, lease: LeaseRecord) -> None:
+    def _expire(self, lease: LeaseRecord, *, started: bool) -> None:
         if lease.expires_s <= self._desk.now_s:
             message = f"{lease.worker_id} did not renew the lease for {self._limits.lease_ttl_s:g} s"
         else:
             message = f"{lease.worker_id} gave no result within {self._limits.lease_limit_s:g} s"
-        self._take_away(lease, InfraFailure(InfraCode.LEASE_EXPIRED, message, lease.worker_id))
+        failure = InfraFailure(InfraCode.LEASE_EXPIRED, message, lease.worker_id)
+        self._take_away(lease, failure, started=started)
 
-    def _take_away(self, lease: LeaseRecord, failure: InfraFailure) -> None:
+    def _take_away(self, lease: LeaseRecord, failure: InfraFailure, *, started: bool) -> None:
         """The worker had its chance: another one gets the rollout."""
         if lease not in lease.record.leases:
             return  # it ended with its group a moment ago
         self._desk.commands.append(CancelLease(lease.worker_id, lease.ref))
-        self._desk.give_back(lease, failure, counted=lease.started_s is not None)
+        self._desk.give_back(lease, failure, counted=started)
         self._desk.offer(lease.record.scene)

@@ -43,6 +43,14 @@ class RolloutKey(NamedTuple):
     rollout_id: str
 
 
+class Lane(NamedTuple):
+    """Rollouts of one run that need the same kind of slot and worker."""
+
+    run_id: str
+    render: bool
+    barred: frozenset[str]
+
+
 class DispatchPhase(Enum):
     """Where a rollout stands: in the queue, taken out of it, or at its one outcome, which is final."""
 
@@ -82,6 +90,10 @@ class RolloutRecord:
     """Workers that executed it before, and whose results it is to be compared with."""
     reward: RewardSettings = PAPER
     """How its run wants it scored."""
+    lane: Lane = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.lane = Lane(self.key.run_id, self.rollout.render, self.barred)
 
     @property
     def scene(self) -> str:
@@ -144,8 +156,6 @@ class WorkerRecord:
     """It was found to give wrong results."""
     versions: Mapping[str, str] = field(default_factory=dict)
     """Of what its results depend on."""
-    scores: bool = True
-    """It scores with the coefficients that a lease asks for; workers of protocol 1 know only the paper's."""
     log_lag: float = 0.0
     reluctance_s: float = 0.0
     """It takes only rollouts that have waited for so long: the time that it needs longer than others."""
@@ -210,13 +220,15 @@ class WorkerRecord:
         in_s = began_s + self.pace_s * math.ceil(len(self.held) / self.slots - 1) - now_s
         return self.completed > 0 and -LATE_S < in_s < BEGINS_S
 
+    def avoids(self, record: RolloutRecord, now_s: float) -> bool:
+        """True while the rollout's last failure on this worker is too recent."""
+        return record.failed_on == self.worker_id and now_s < record.avoid_until_s
+
     def takes(self, record: RolloutRecord, now_s: float) -> bool:
-        """Whether this rollout may go here, as far as it is not a question of credits or of the scene."""
-        if record.failed_on == self.worker_id and now_s < record.avoid_until_s:
+        """True if this rollout may run here, apart from credits and the scene."""
+        if self.avoids(record, now_s):
             return False
         if now_s - record.submitted_s < self.reluctance_s:
-            return False
-        if not self.scores and record.reward != PAPER:
             return False
         if record.rollout.render and self.rendering >= self.render_slots:
             return False

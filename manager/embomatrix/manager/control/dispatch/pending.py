@@ -4,28 +4,17 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING
 
 from embomatrix.manager.control.dispatch.ledger import DispatchPhase, RolloutRecord
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from embomatrix.manager.control.dispatch.ledger import WorkerRecord
-
-PASSED_OVER: Final = 8
-"""So many rollouts at the head of a lane that a worker may not take are looked past, and no more."""
+    from embomatrix.manager.control.dispatch.ledger import Lane, WorkerRecord
 
 Turn = tuple[float, float, int]
 """Orders waiting rollouts: whose is least goes first."""
-
-
-class Lane(NamedTuple):
-    """Rollouts of one run that go to the same kind of slots, and are barred from the same workers."""
-
-    run_id: str
-    render: bool
-    barred: frozenset[str]
 
 
 _Heap = list[tuple[int, RolloutRecord]]
@@ -66,7 +55,7 @@ class PendingQueues:
     def push(self, record: RolloutRecord) -> None:
         """Queue a rollout that no one holds."""
         record.phase = DispatchPhase.PENDING
-        heap = self._heaps.setdefault(record.scene, {}).setdefault(_lane(record), [])
+        heap = self._heaps.setdefault(record.scene, {}).setdefault(record.lane, [])
         heapq.heappush(heap, (record.sequence, record))
         self._counts[record.scene] += 1
         self._by_run[record.key.run_id] += 1
@@ -96,7 +85,7 @@ class PendingQueues:
 
     def take(self, record: RolloutRecord) -> None:
         """The record gets a lease."""
-        heap = self._heaps[record.scene][_lane(record)]
+        heap = self._heaps[record.scene][record.lane]
         if heap[0][1] is record:
             heapq.heappop(heap)
         else:
@@ -163,10 +152,6 @@ class Choice:
         return None
 
 
-def _lane(record: RolloutRecord) -> Lane:
-    return Lane(record.key.run_id, record.rollout.render, record.barred)
-
-
 def _head(heap: _Heap) -> RolloutRecord | None:
     while heap and heap[0][1].phase is not DispatchPhase.PENDING:
         heapq.heappop(heap)
@@ -174,12 +159,23 @@ def _head(heap: _Heap) -> RolloutRecord | None:
 
 
 def _first_taken(heap: _Heap, worker: WorkerRecord, now_s: float) -> RolloutRecord | None:
-    """The first in the lane that the worker may take."""
-    head = _head(heap)
-    if head is None or worker.takes(head, now_s):
-        return head
-    if head.rollout.render and not worker.free_render_slots:
-        return None  # no more than this one would it take another of the lane
-    few = heapq.nsmallest(PASSED_OVER, heap)
-    takers = (r for _, r in few if r.phase is DispatchPhase.PENDING and worker.takes(r, now_s))
-    return next(takers, None)
+    """Return the first rollout of the queue that the worker may take, however many it may not take come before it.
+
+    Only rollouts that failed on this worker a moment ago are skipped; any other refusal holds for the whole queue. The
+    heap is walked best first, so skipping k rollouts costs O(k log k).
+    """
+    if _head(heap) is None:
+        return None
+    frontier = [(heap[0][0], 0)]
+    while frontier:
+        _, index = heapq.heappop(frontier)
+        record = heap[index][1]
+        if record.phase is DispatchPhase.PENDING:
+            if worker.takes(record, now_s):
+                return record
+            if not worker.avoids(record, now_s):
+                return None
+        for child in (2 * index + 1, 2 * index + 2):
+            if child < len(heap):
+                heapq.heappush(frontier, (heap[child][0], child))
+    return None

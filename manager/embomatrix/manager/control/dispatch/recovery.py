@@ -84,7 +84,7 @@ class Recovery:
         for other in others:
             self._desk.void(other)
         if record.phase is DispatchPhase.PENDING:
-            self._desk.pending.remove(record)
+            self._desk.pending.take(record)
         self._forget(record)
         record.attempts = max(record.attempts, origin.attempt - 1)
         self._desk.leases.note(ref, record, worker, self._desk.now_s)
