@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.bench.report.figures import BenchError
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import PlanError, parse_plan, plan_to_lines
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
 from embomatrix.world.records import Name, Record, SceneInvalidError, decode
@@ -25,6 +25,7 @@ from embomatrix.world.records import Name, Record, SceneInvalidError, decode
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+    from embomatrix.sim.executor import Simulator
     from embomatrix.skills.syntax import Plan
     from embomatrix.world.bundle import Bundle
     from embomatrix.world.dataset import Dataset
@@ -204,7 +205,7 @@ def _executions(bundle: Bundle, count: int, rng: np.random.Generator) -> Iterato
     """Up to ``count`` plans that differ, the tasks in turns; fewer when too many tries fail."""
     known: set[tuple[str, Plan]] = set()
     tasks = cycle([bundle.tasks[task_id] for task_id in sorted(bundle.tasks)])
-    with contextlib.closing(Simulator(bundle)) as stage:
+    with contextlib.closing(load_simulator(bundle)) as stage:
         for _ in range(count * TRIES_PER_PLAN):
             if len(known) == count:
                 return

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from embomatrix.sim.live_world import LiveWorld
-    from embomatrix.sim.state.footing import Host
+    from embomatrix.sim.state.supports import Host
     from embomatrix.skills.syntax import SkillCall
     from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.geometry import Aabb
