@@ -63,8 +63,8 @@ class Cluster:
     def change_standing(self, event):
         """Apply what the dispatcher would."""
         match event:
-            case WorkerJoined(worker_id, resources, protocol):
-                self.pool.join(worker_id, resources, protocol=protocol)
+            case WorkerJoined(worker_id, resources):
+                self.pool.join(worker_id, resources)
             case WorkerLost(worker_id):
                 self.pool.leave(worker_id)
             case WorkerReported() | WorkerDrained() | WorkerSuspected():

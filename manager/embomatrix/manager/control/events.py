@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from embomatrix.rpc.versions import PROTOCOL_VERSION
-
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -29,8 +27,6 @@ class WorkerJoined:
 
     worker_id: str
     resources: Resources
-    protocol: int = PROTOCOL_VERSION
-    """Protocol version of the worker."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,8 +190,6 @@ class DemandObserved:
     """Run whose turn is next, by scene."""
     rendering: frozenset[str] = frozenset()
     """Scenes that need slots that render."""
-    scored: frozenset[str] = frozenset()
-    """Scenes that only runs with reward coefficients of their own wait for."""
     lags: Mapping[str, float] = field(default_factory=dict)
     """Slowdown of each slow worker against the others."""
 

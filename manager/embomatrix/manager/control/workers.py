@@ -14,7 +14,6 @@ from embomatrix.manager.control.events import (
     WorkerResumed,
     WorkerSuspected,
 )
-from embomatrix.rpc.versions import PROTOCOL_VERSION, SCORES_SINCE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -56,7 +55,6 @@ class WorkerRecord:
 
     worker_id: str
     resources: Resources
-    protocol: int = PROTOCOL_VERSION
 
     reported: bool = False
     suspect: bool = False
@@ -106,11 +104,6 @@ class WorkerRecord:
             case WorkerSuspected() | WorkerRecovered():
                 self.suspect = isinstance(event, WorkerSuspected)
         self.refresh()
-
-    @property
-    def scores(self) -> bool:
-        """True if it computes rewards with the coefficients of a lease; otherwise it knows only the paper's."""
-        return self.protocol >= SCORES_SINCE
 
     @property
     def draining(self) -> bool:
@@ -173,8 +166,6 @@ class WorkerRecord:
         if now_s - record.submitted_s < self.penalty_s:
             return False
         queue = record.queue
-        if queue.custom_reward and not self.scores:
-            return False
         if queue.render and self.rendering >= self.render_slots:
             return False
         if self.worker_id in queue.excluded_workers:
@@ -198,9 +189,9 @@ class WorkerPool:
         self._live: set[str] = set()
         #: Workers that could take work now or once they have reported.
 
-    def join(self, worker_id: str, resources: Resources, *, protocol: int = PROTOCOL_VERSION) -> WorkerRecord:
+    def join(self, worker_id: str, resources: Resources) -> WorkerRecord:
         """Add a worker. It can take nothing until it has reported."""
-        record = self.workers[worker_id] = WorkerRecord(worker_id, resources, protocol)
+        record = self.workers[worker_id] = WorkerRecord(worker_id, resources)
         self._live.add(worker_id)
         return record
 

@@ -229,7 +229,6 @@ def _can_execute(state: DispatchState, check: RolloutRecord) -> bool:
         name not in queue.excluded_workers
         and not (worker.quarantined or worker.draining)
         and (worker.render_slots > 0 or not queue.render)
-        and (worker.scores or not queue.custom_reward)
         for name, worker in state.pool.workers.items()
     )
 

@@ -153,7 +153,6 @@ class Dispatcher:
             lags=dict(state.pool.lags),
             runs={heads[0].scene: heads[0].key.run_id for heads in scenes},
             rendering=frozenset(h.scene for heads in scenes for h in heads if h.queue.render),
-            scored=frozenset(heads[0].scene for heads in scenes if all(h.queue.custom_reward for h in heads)),
         )
 
     @property

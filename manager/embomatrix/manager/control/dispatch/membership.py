@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 def worker_joined(state: DispatchState, event: WorkerJoined) -> None:
     """Add a worker; leases of an older session of it end."""
     worker_lost(state, WorkerLost(event.worker_id, "a newer session of the same worker took over"))
-    worker = state.pool.join(event.worker_id, event.resources, protocol=event.protocol)
+    worker = state.pool.join(event.worker_id, event.resources)
     restore_quarantine(state, worker)
 
 

@@ -35,8 +35,6 @@ class QueueKey(NamedTuple):
     run_id: str
     render: bool
     excluded_workers: frozenset[str]
-    custom_reward: bool
-    """The run has reward coefficients other than the paper's."""
 
 
 class DispatchPhase(Enum):
@@ -81,10 +79,7 @@ class RolloutRecord:
     queue: QueueKey = field(init=False)
 
     def __post_init__(self) -> None:
-        # Computed once: comparing reward settings on every lease is slow.
-        self.queue = QueueKey(
-            self.key.run_id, self.rollout.render, self.excluded_workers, self.reward != PAPER
-        )
+        self.queue = QueueKey(self.key.run_id, self.rollout.render, self.excluded_workers)
 
     @property
     def scene(self) -> str:

@@ -102,9 +102,7 @@ class ReadinessForecast:
         return load_s * (1 + ahead // residency.worker.slots)
 
 
-def refusal_reason(
-    residencies: Residencies, scene: str, size_mb: float, *, renders: bool, scored: bool
-) -> str:
+def refusal_reason(residencies: Residencies, scene: str, size_mb: float, *, renders: bool) -> str:
     """Return in words why no worker takes the scene."""
     failing = (residencies.by_id[name].failure_messages for name in sorted(residencies.failing))
     errors = [messages[scene] for messages in failing if scene in messages]
@@ -112,11 +110,6 @@ def refusal_reason(
         return f"scene {scene} fails to load: {next(filter(None, errors), 'no reason given')}"
     if renders and not any(residency.renders for residency in residencies.by_id.values()):
         return f"scene {scene} needs slots that render on a GPU, and no worker has any"
-    if scored and not any(residency.worker.scores for residency in residencies.by_id.values()):
-        return (
-            "the run has reward coefficients of its own, which workers of protocol 1 do not know, and no other is there: "
-            "upgrade one with `pip install --upgrade 'embomatrix[worker]'`"
-        )
     return (
         f"scene {scene} needs {size_mb:.0f} MB and the largest worker gives {residencies.most_memory_mb} MB: "
         f"raise a worker's memory limit"

@@ -240,14 +240,11 @@ class ResidencySites:
         *,
         needs: Iterable[Need],
         measured_mb: Mapping[str, float],
-        scored: frozenset[str],
     ) -> None:
         self._residencies = residencies
         self._now_s = now_s
         self._in_use = in_use
         self._retry_s = retry_s
-        self._scored = scored
-        """Scenes of runs with reward coefficients of their own."""
         self._rendering = frozenset(need.bundle_digest for need in needs if need.render)
         sizes = ((need.bundle_digest, measured_mb.get(need.bundle_digest, 0.0)) for need in needs)
         self._large = [(scene, size) for scene, size in sizes if size > residencies.least_memory_mb]
@@ -275,14 +272,12 @@ class ResidencySites:
         )
 
     def refused(self, residency: WorkerResidency) -> frozenset[str]:
-        """Return the scenes that recently failed there, that do not fit, or that need a GPU or a newer version."""
+        """Return the scenes that recently failed there, that do not fit, or that need a GPU."""
         refused = {scene for scene, at_s in residency.failed_s.items() if self._now_s - at_s < self._retry_s}
         memory_mb = residency.worker.resources.memory_mb
         refused.update(scene for scene, size in self._large if size > memory_mb)
         if self._rendering and not residency.renders:
             refused.update(self._rendering)
-        if not residency.worker.scores:
-            refused.update(self._scored)
         return frozenset(refused)
 
     def having(self, scene: str) -> Iterable[str]:

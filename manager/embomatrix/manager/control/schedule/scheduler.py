@@ -34,7 +34,6 @@ from embomatrix.manager.control.schedule.lookahead import LookaheadWindow, Prewa
 from embomatrix.manager.control.schedule.placement import Need, RunShare, needs_of, place
 from embomatrix.manager.control.schedule.readiness import ReadinessForecast, SceneCosts, refusal_reason
 from embomatrix.manager.control.schedule.residency import Residencies, ResidencySites
-from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.wire.values import Batch, Completed, Resident, RunTerms
 
 if TYPE_CHECKING:
@@ -143,7 +142,6 @@ class Scheduler:
             self._limits.retry_load_s,
             needs=needs,
             measured_mb=self._costs.measured_mb,
-            scored=self._scored(),
         )
         placement = place(sites, needs, self._costs.size_mb)
         self._residencies.fresh.clear()
@@ -286,20 +284,7 @@ class Scheduler:
         announced = {e.bundle_digest for w in self.windows.values() for e in w.entries if e.render}
         renders = scene in announced or scene in self._demand.rendering
         size_mb = self._costs.size_mb(scene)
-        return refusal_reason(
-            self._residencies, scene, size_mb, renders=renders, scored=scene in self._scored()
-        )
-
-    def _scored(self) -> frozenset[str]:
-        """Return the scenes that only runs with reward coefficients of their own wait for or announced."""
-        own = {run_id for run_id, terms in self._terms.items() if terms.reward != PAPER}
-        if not own:
-            return frozenset()
-        plain = self._demand.pending.keys() - self._demand.scored
-        wanted = set(self._demand.scored)
-        for run_id, window in self.windows.items():
-            (wanted if run_id in own else plain).update(entry.bundle_digest for entry in window.entries)
-        return frozenset(wanted - plain)
+        return refusal_reason(self._residencies, scene, size_mb, renders=renders)
 
     def _order(self, name: str, scenes: tuple[str, ...]) -> SetDesired | None:
         """Return the order for a worker; None if neither the set nor the order of its loads changes."""
