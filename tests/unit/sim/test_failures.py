@@ -9,7 +9,7 @@ from tests.fakes.plans import awkward_scene, executed, executed_alone, with_obje
 from tests.fakes.scenes import kitchen_scene, placed, scene_of, upright
 from tests.fakes.skill_reasons import MISHAPS, reasons_of
 
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.scene import RobotStart
@@ -17,21 +17,21 @@ from embomatrix.world.scene import RobotStart
 
 @pytest.fixture(scope="module")
 def flat():
-    simulator = Simulator(Bundle(kitchen_scene(), {}))
+    simulator = load_simulator(Bundle(kitchen_scene(), {}))
     yield simulator
     simulator.close()
 
 
 @pytest.fixture(scope="module")
 def home():
-    simulator = Simulator(Bundle(household_scene(), {}))
+    simulator = load_simulator(Bundle(household_scene(), {}))
     yield simulator
     simulator.close()
 
 
 @pytest.fixture(scope="module")
 def awkward():
-    simulator = Simulator(Bundle(awkward_scene(), {}))
+    simulator = load_simulator(Bundle(awkward_scene(), {}))
     yield simulator
     simulator.close()
 
@@ -231,7 +231,7 @@ def test_a_mug_in_front_of_the_microwave_keeps_its_door_shut():
 
 
 def test_a_door_that_is_blocked_stays_as_it_was():
-    simulator = Simulator(Bundle(in_front_of_the_microwave(), {}))
+    simulator = load_simulator(Bundle(in_front_of_the_microwave(), {}))
     executed(simulator, "move microwave_1; open microwave_1")
     assert not simulator.facts.holds("open", ("microwave_1",))
     simulator.close()

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from tests.fakes.household import household_scene
 from tests.fakes.plans import executed, plan_of, task_over
 
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import PROFILES, Skill
 from embomatrix.world.bundle import Bundle
@@ -15,7 +15,7 @@ from embomatrix.world.task import Profile
 
 @pytest.fixture(scope="module")
 def home():
-    simulator = Simulator(Bundle(household_scene(), {}))
+    simulator = load_simulator(Bundle(household_scene(), {}))
     yield simulator
     simulator.close()
 

@@ -10,11 +10,11 @@ from tests.fakes.plans import executed, with_objects
 from tests.fakes.scenes import kitchen_scene, placed, upright
 
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical.prospects import Placing
 from embomatrix.sim.physical.survey import prospects
 from embomatrix.sim.placing.pose_cache import build_pose_cache
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
 from embomatrix.world.codec_task import poses_from_json, poses_to_json
@@ -123,7 +123,7 @@ def test_a_place_is_free_again_when_what_barred_it_is_taken_away():
 
 
 def execute(scene, poses, text):
-    with contextlib.closing(Simulator(Bundle(scene, {}, poses))) as simulator:
+    with contextlib.closing(load_simulator(Bundle(scene, {}, poses))) as simulator:
         return executed(simulator, text)
 
 

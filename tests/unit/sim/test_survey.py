@@ -9,10 +9,10 @@ from tests.fakes.plans import executed, with_objects
 from tests.fakes.scenes import kitchen_scene, placed, upright
 
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.placing.pose_cache import standing_poses
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
 from embomatrix.world.geometry import Pose
@@ -57,7 +57,7 @@ def surveyed(scene, names, foresight=None):
 
 
 def executed_with(scene, poses, text):
-    simulator = Simulator(Bundle(scene, {}, poses))
+    simulator = load_simulator(Bundle(scene, {}, poses))
     try:
         return executed(simulator, text)
     finally:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from embomatrix.sim.geometry import surfaces as spots
-from embomatrix.sim.state import relations, thermal
+from embomatrix.sim.state import relations, sources
 from embomatrix.skills.check import RULES
 from embomatrix.skills.failure import SENTENCES
 from embomatrix.skills.library import LIBRARY, Precondition
@@ -107,7 +107,7 @@ def test_table_lists_every_relation_tolerance_with_its_value():
 
 
 def test_table_lists_every_state_threshold_with_its_value():
-    known = {**vars(state), **vars(thermal)}
+    known = {**vars(state), **vars(sources)}
     written = {name: float(value) for name, (value, _) in rows("constant").items()}
     assert written == {name: known[name] for name in written}
     assert {"HOT_C", "COOK_C", "FREEZE_C", "OPEN_FRACTION"} <= set(written)
