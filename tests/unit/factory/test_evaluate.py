@@ -27,7 +27,7 @@ from embomatrix.factory.metrics.figures import (
     read_evaluation,
 )
 from embomatrix.factory.pipeline.corpus import HELDOUT_SCENES, training_scenes
-from embomatrix.factory.social.milieus import NAMES
+from embomatrix.factory.social.casting import NAMES
 from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.catalog import Catalog

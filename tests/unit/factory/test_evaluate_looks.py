@@ -16,7 +16,7 @@ from embomatrix.factory.evaluate.page import with_factory
 from embomatrix.factory.evaluate.scenes import LIST, LayoutMethod, SceneTask
 from embomatrix.factory.evaluate.side_by_side import LEAST_PX, draw_side_by_side, named
 from embomatrix.factory.layout.generator import lay
-from embomatrix.factory.layout.jobs import RequestedObject
+from embomatrix.factory.layout.request import RequestedObject
 from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.factory.pictures.sights import alone
 from embomatrix.factory.scenes.editor import SceneEditor

@@ -19,7 +19,7 @@ from embomatrix.factory.evaluate.scenes import (
     fixed_tasks,
 )
 from embomatrix.factory.layout.generator import lay
-from embomatrix.factory.layout.jobs import RequestedObject
+from embomatrix.factory.layout.request import RequestedObject
 from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.factory.scenes.editor import SceneEditor
 from embomatrix.factory.task_import.sources import SourceText

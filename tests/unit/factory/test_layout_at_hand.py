@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from embomatrix.factory.layout.generator import lay
-from embomatrix.factory.layout.jobs import RequestedObject
-from embomatrix.factory.layout.seating import MOVES, Seat, Seating
+from embomatrix.factory.layout.pending import MOVES, Seat, Seating
+from embomatrix.factory.layout.request import RequestedObject
 from embomatrix.factory.layout.values import Failure, LayoutRelation
 from embomatrix.factory.scenes.editor import LayoutReason, SceneEditor
 from embomatrix.factory.scenes.rehearsal import Rehearsal

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from embomatrix.factory.layout.arrangement import (
+from embomatrix.factory.layout.constraints import (
     WEIGHTS,
     SpotCandidates,
     half_extents,

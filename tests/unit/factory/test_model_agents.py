@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from tests.fakes.chat_server import ChatServer, completion
 
+from embomatrix.factory.admission import RefusalReason, TaskRefusal
 from embomatrix.factory.pictures.sights import sight_of_room
 from embomatrix.factory.pipeline.settings import BuildSettings
 from embomatrix.factory.pipeline.variants import VariantMaker, VariantOrder
-from embomatrix.factory.refusal import RefusalReason, TaskRefusal
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.facts import MOST_IN_ROOM, facts_of

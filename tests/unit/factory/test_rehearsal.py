@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from embomatrix.factory.pipeline.poses import SceneSurvey
+from embomatrix.factory.pipeline.task_poses import SceneSurvey
 from embomatrix.factory.scenes.rehearsal import Rehearsal
-from embomatrix.factory.scenes.robot import AnyRobot
-from embomatrix.factory.scenes.view import SceneView
+from embomatrix.factory.scenes.view import AnyRobot, SceneView
 from embomatrix.factory.social.requests import RequestedAtom, TaskRequest, Wanted, check_request
 from embomatrix.factory.writer.tasks import PlainWriter
 from embomatrix.factory.writer.variant import Variant

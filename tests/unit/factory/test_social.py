@@ -13,9 +13,8 @@ from pydantic import ValidationError
 
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
-from embomatrix.factory.social.casting import GrammarRolePlayer
+from embomatrix.factory.social.casting import HOBBIES, NAMES, GrammarRolePlayer
 from embomatrix.factory.social.fitting import is_plausible, themes_of, why_of
-from embomatrix.factory.social.milieus import HOBBIES, NAMES
 from embomatrix.factory.social.occasions import Theme, occasion_of, occasions, occasions_in
 from embomatrix.factory.social.phrases import (
     CLAUSES,

@@ -13,14 +13,14 @@ import typer
 from embomatrix.factory.commands.asked_model import Key, Tape, chat_model
 from embomatrix.factory.commands.layout import Llm, Model, mended_layout, modelled_agents
 from embomatrix.factory.commands.terminal import fail
-from embomatrix.factory.layout.agent_io import DOORS, MODELLED, AgentName
-from embomatrix.factory.social.agent_io import SOCIAL_DOORS, SocialAgent, asked
+from embomatrix.factory.layout.agent_interfaces import DOORS, MODELLED, AgentName
+from embomatrix.factory.social.agent_interfaces import SOCIAL_DOORS, SocialAgent, asked
 from embomatrix.factory.social.model_agents import ModelAgents
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from embomatrix.factory.layout.agent_io import AgentInterface
+    from embomatrix.factory.layout.agent_interfaces import AgentInterface
 
 EVERY: Final[Mapping[str, AgentInterface]] = {
     **{name.value: door for name, door in SOCIAL_DOORS.items()},

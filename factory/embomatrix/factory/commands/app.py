@@ -40,8 +40,8 @@ from embomatrix.world.task import TaskCategory
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from embomatrix.factory.layout.agent_io import AgentName
-    from embomatrix.factory.layout.jobs import LayoutAgents
+    from embomatrix.factory.layout.agent_interfaces import AgentName
+    from embomatrix.factory.layout.request import LayoutAgents
     from embomatrix.factory.writer.tasks import TaskWriter
     from embomatrix.llm.ledger import Ledger
 

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 from rich.console import Console
 
+from embomatrix.factory.admission import TaskRefusal
 from embomatrix.factory.commands.asked_model import Key, Tape, model_asked
-from embomatrix.factory.layout.agent_io import DOORS, MODELLED, AgentName, BriefError
+from embomatrix.factory.layout.agent_interfaces import DOORS, MODELLED, AgentName, BriefError
 from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.distribution import DistributionError
 from embomatrix.factory.layout.generator import lay as lay_by_tree
-from embomatrix.factory.layout.jobs import LayoutAgents
 from embomatrix.factory.layout.model_agents import ModelLayoutAgents
+from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pictures.scene import draw_plan
-from embomatrix.factory.refusal import TaskRefusal
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.sources import ProblemSourceError, read_activity, read_file
 from embomatrix.factory.task_import.task import Manner, import_problem
@@ -28,7 +28,7 @@ from embomatrix.world.catalog import CatalogError
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from embomatrix.factory.layout.jobs import Layout, Record, RequestedObject
+    from embomatrix.factory.layout.request import Layout, Record, RequestedObject
     from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.llm.patience import FailureLimit
 

@@ -11,15 +11,15 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from embomatrix.factory.admission import TaskRefusal
 from embomatrix.factory.commands.terminal import fail, mended, progress
 from embomatrix.factory.metrics.figures import EvaluationError, evaluation_to_json
-from embomatrix.factory.outcome_log import LineLog
 from embomatrix.factory.pipeline.options import Jobs, processes
 from embomatrix.factory.pipeline.settings import scene_ids
-from embomatrix.factory.refusal import TaskRefusal
+from embomatrix.factory.pipeline.store import LineLog
 from embomatrix.factory.task_import.batch import Verified
 from embomatrix.factory.task_import.dialects import read_problem
-from embomatrix.factory.task_import.judges import Depth, Docket, judging
+from embomatrix.factory.task_import.importer import Depth, Docket, judging
 from embomatrix.factory.task_import.reach import unreachable_atoms
 from embomatrix.factory.task_import.report import (
     ProblemOutcome,

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from embomatrix.factory.evaluate.scenes import METHODS
-from embomatrix.factory.layout.tree import tree_in
+from embomatrix.factory.layout.organization import tree_in
 from embomatrix.factory.metrics.figures import EvaluationFigures
 from embomatrix.factory.pictures.sights import sight_of_room
 from embomatrix.factory.scenes.build import build_base_scene
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from embomatrix.factory.evaluate.scenes import LayoutMethod, SceneTask
-    from embomatrix.factory.layout.jobs import Layout, RequestedObject
+    from embomatrix.factory.layout.request import Layout, RequestedObject
     from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.factory.task_import.task import Lay
     from embomatrix.llm.values import ChatModel

@@ -14,7 +14,7 @@ from embomatrix.factory.evaluate.spoiling import SPOILERS
 from embomatrix.factory.evaluate.tasks import panel
 from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.social.milieus import NAMES
+from embomatrix.factory.social.casting import NAMES
 from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.factory.writer.tasks import PlainWriter
 from embomatrix.pages.figures import Better, Figure

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from embomatrix.factory.furnish.hosts import NO_HOSTS, hosts_of, kept_behind_doors
 from embomatrix.factory.furnish.pieces import REST_GAP_M, Placed
 from embomatrix.factory.furnish.roles import FurnitureRole
-from embomatrix.factory.furnish.small_objects import NO_HOSTS, hosts_of, kept_behind_doors
 from embomatrix.factory.furnish.space import BoxStack
 from embomatrix.world.state import Relation
 

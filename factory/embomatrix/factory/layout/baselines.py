@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.layout.jobs import Layout, Record, thing_of
 from embomatrix.factory.layout.organization import in_order
+from embomatrix.factory.layout.request import Layout, Record, thing_of
 from embomatrix.factory.layout.sampling import LIFT_M, ObjectSampler
 from embomatrix.factory.scenes.editor import LayoutReason, PlacementError
 from embomatrix.world.geometry import Pose
@@ -21,7 +21,7 @@ from embomatrix.world.state import Relation
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from embomatrix.factory.layout.jobs import RequestedObject
+    from embomatrix.factory.layout.request import RequestedObject
     from embomatrix.factory.layout.values import Failure
     from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.world.asset import Asset

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.furnish.small_objects import belongs
-from embomatrix.factory.layout.customs import likes, may_hold
+from embomatrix.factory.furnish.small_objects import belongs, likes, may_hold
 from embomatrix.factory.layout.values import Distribution, Kind
 
 if TYPE_CHECKING:

@@ -18,12 +18,12 @@ import numpy as np
 from embomatrix.factory.layout.distribution import DistributionError
 from embomatrix.factory.layout.facts import hosts_in, rooms_of
 from embomatrix.factory.layout.hanging import Hanger
-from embomatrix.factory.layout.jobs import Layout, LayoutAgents, Record, kind_of, thing_of
+from embomatrix.factory.layout.organization import tree_in
+from embomatrix.factory.layout.pending import Seat, Seating
 from embomatrix.factory.layout.planes import brief_for, company_on, planes_of, pose_at
-from embomatrix.factory.layout.rest import settle
+from embomatrix.factory.layout.request import Layout, LayoutAgents, Record, kind_of, thing_of
 from embomatrix.factory.layout.sampling import ObjectSampler
-from embomatrix.factory.layout.seating import Seat, Seating
-from embomatrix.factory.layout.tree import tree_in
+from embomatrix.factory.layout.stability import settle
 from embomatrix.factory.layout.values import (
     Arrangement,
     DistributionBrief,
@@ -39,9 +39,9 @@ from embomatrix.world.state import Relation
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from embomatrix.factory.layout.jobs import RequestedObject
+    from embomatrix.factory.layout.organization import LayoutTree
     from embomatrix.factory.layout.planes import Plane
-    from embomatrix.factory.layout.tree import LayoutTree
+    from embomatrix.factory.layout.request import RequestedObject
     from embomatrix.factory.layout.values import ObjectBrief, PlacementConstraint, PlaneSpot
     from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.world.asset import Asset

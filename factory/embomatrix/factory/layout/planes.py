@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.layout.arrangement import half_extents
+from embomatrix.factory.layout.constraints import half_extents
 from embomatrix.factory.layout.sampling import LIFT_M
 from embomatrix.factory.layout.values import PlacementConstraint, PlaneBrief, PlaneFootprint, PlaneThing
 from embomatrix.sim.geometry.bounds import bounds_of

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 from embomatrix.factory.assets.solids import Solids
 from embomatrix.factory.furnish.roles import FurnitureRole, role_of
 from embomatrix.factory.furnish.small_objects import NEVER_SWITCHED
 from embomatrix.factory.scenes.joints import bumped_into
-from embomatrix.factory.scenes.robot import AnyRobot
 from embomatrix.sim.joints.swings import SWING
-from embomatrix.skills.appliance import cold_source, cooks, freezes, heat_source, heats
+from embomatrix.skills.appliances import cold_source, cooks, freezes, heat_source, heats
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.asset import FLOOR_CATEGORY
 from embomatrix.world.state import OPEN_FRACTION, Relation, State
@@ -19,9 +18,10 @@ from embomatrix.world.state import OPEN_FRACTION, Relation, State
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from embomatrix.factory.scenes.robot import Robot
     from embomatrix.world.asset import Asset
     from embomatrix.world.scene import Scene, SceneObject
+    from embomatrix.world.state import Relation
+
 
 MIN_SURFACE_M: Final = 0.18
 """Both extents of a surface that a task may ask to put things on."""
@@ -211,3 +211,46 @@ class SceneView:
 def is_liftable(size_m: tuple[float, float, float], mass_kg: float) -> bool:
     """Whether the arm lifts it and the gripper takes it."""
     return mass_kg <= ROBOT.mass_kg and min(size_m) <= ROBOT.grip_m and max(size_m) <= ROBOT.extent_m
+
+
+class Robot(Protocol):
+    """Answers about one thing at a time, from the start of the scene. Names are those of scene objects."""
+
+    def fetches(self, thing: str) -> bool:
+        """Whether it gets the thing into its hand."""
+        ...
+
+    def puts(self, thing: str, relation: Relation, host: str) -> bool:
+        """Whether it brings the thing on or into another."""
+        ...
+
+    def swings(self, name: str, *, shut: bool) -> bool:
+        """Whether it opens, or shuts, all doors and drawers of an object."""
+        ...
+
+    def switches(self, name: str, *, on: bool) -> bool:
+        """Whether it switches an object on, or off."""
+        ...
+
+    def exposes(self, thing: str, source: str, state: State) -> bool:
+        """Whether the thing becomes hot, cooked or frozen at a source, and was not so before."""
+        ...
+
+
+class AnyRobot:
+    """One that can do all: nobody was asked."""
+
+    def fetches(self, thing: str) -> bool:
+        return True
+
+    def puts(self, thing: str, relation: Relation, host: str) -> bool:
+        return True
+
+    def swings(self, name: str, *, shut: bool) -> bool:
+        return True
+
+    def switches(self, name: str, *, on: bool) -> bool:
+        return True
+
+    def exposes(self, thing: str, source: str, state: State) -> bool:
+        return True

@@ -6,11 +6,11 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.refusal import RefusalReason, TaskRefusal
+from embomatrix.factory.admission import RefusalReason, TaskRefusal
 from embomatrix.factory.social.conversing import starting_slots
 from embomatrix.factory.social.facts import facts_of, with_sights
 from embomatrix.factory.social.requests import piece_of
-from embomatrix.factory.social.transcript import transcript_of
+from embomatrix.factory.social.summary import transcript_of
 from embomatrix.factory.writer.goals import Workshop
 from embomatrix.factory.writer.tasks import Draft, DraftOrder, draft_of
 from embomatrix.llm.loop import OnOneLoop

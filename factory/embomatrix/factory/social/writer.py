@@ -14,8 +14,7 @@ from embomatrix.factory.social.casting import GrammarRolePlayer
 from embomatrix.factory.social.conversing import ConversationScenario, GrammarConversation
 from embomatrix.factory.social.fitting import best_slot, why_of
 from embomatrix.factory.social.phrases import CLAUSES, MANNERS, NOUNS, WHENCE, WHERE, room_called
-from embomatrix.factory.social.summary import instruction_of
-from embomatrix.factory.social.transcript import transcript_of
+from embomatrix.factory.social.summary import instruction_of, transcript_of
 from embomatrix.factory.writer.goals import Workshop
 from embomatrix.factory.writer.tasks import Draft, draft_of, pieces_of
 from embomatrix.factory.writer.words import FreshVoice

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.refusal import RefusalReason, RefusedError
+from embomatrix.factory.admission import RefusalReason, RefusedError
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.expressible import AGENT, FLOORS, check_evaluable, check_expressible
 from embomatrix.factory.task_import.reach import pieces_of
