@@ -37,7 +37,7 @@ class GoalError(ValueError):
 
 
 def evaluate(formula: Formula, facts: Facts, types: Types) -> bool:
-    """Return True if the closed formula holds; only the facts that decide it are queried. Raises GoalError for unknown types."""
+    """Return True if the closed formula holds; queries only deciding facts. Raises GoalError for unknown types."""
     return _holds(formula, facts, types, {})
 
 

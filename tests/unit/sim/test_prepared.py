@@ -50,7 +50,7 @@ def test_boxes_obstacles_and_floor_are_those_that_loading_would_derive(bundle):
     assert boxes == found.object_boxes
     assert np.array_equal(grid.covered, other.covered)
     assert np.array_equal(grid.free, other.free)
-    for column in ("boxes", "owners", "leaves"):
+    for column in ("boxes", "owners", "is_panel"):
         assert np.array_equal(getattr(obstacles, column), getattr(others, column))
 
 
@@ -81,7 +81,7 @@ def _without(arrays, name):
         lambda arrays: arrays | {"1.owners": arrays["1.owners"] + 99},
         lambda arrays: arrays | {"1.covered": arrays["1.covered"][:, 1:]},
         lambda arrays: arrays | {"1.free": arrays["1.free"][1:]},
-        lambda arrays: arrays | {"1.leaves": arrays["1.leaves"].astype(np.float64)},
+        lambda arrays: arrays | {"1.is_panel": arrays["1.is_panel"].astype(np.float64)},
         lambda arrays: arrays | {"1.obstacles": arrays["1.obstacles"].ravel()},
     ],
 )

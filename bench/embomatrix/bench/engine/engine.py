@@ -119,7 +119,7 @@ def _measure_rollouts(scene: SceneWork, data: bytes, samples: EngineSamples) -> 
             # What is made when it is first needed, a worker makes before it forks slots.
             simulator.execute(task, (), 0)
             score(task, frozenset(), simulator.facts)
-            for _ in (*engine.complete(), *simulator.complete()):
+            for _ in (*engine.warm_up(), *simulator.warm_up()):
                 pass
             for execution in scene.executions:
                 task = bundle.tasks[execution.task_id]

@@ -98,7 +98,7 @@ class SceneProcess:
         self._scenes: dict[str, PhysicsScene] = {}
         self._executed = 0
         for digest in digests:
-            for _ in self._load(digest).complete():
+            for _ in self._load(digest).warm_up():
                 pass
         gc.collect()
         gc.freeze()

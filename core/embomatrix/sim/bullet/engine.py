@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.bullet.bodies import PART_LIMIT
 from embomatrix.sim.bullet.client import ClientPool, pybullet
-from embomatrix.sim.bullet.mini_world import MiniWorld, Still
+from embomatrix.sim.bullet.mini_world import MiniWorld, StaticObject
 from embomatrix.sim.bullet.scene_bodies import SceneBodies
 from embomatrix.sim.engine import (
     FLOOR,
@@ -25,7 +25,7 @@ from embomatrix.sim.engine import (
     Settled,
 )
 from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of, forget
-from embomatrix.sim.geometry.spatial_hash import Neighbourhood
+from embomatrix.sim.geometry.spatial_hash import SpatialHash
 from embomatrix.sim.validation import check_fractions, check_pose, check_scene
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ class BulletEngine:
         boxes = prepared.object_boxes if prepared else map(self._box, range(len(self._names)))
         self._boxes = list(boxes)
         self._boxes_at_start = tuple(self._boxes)
-        self._around = Neighbourhood()
+        self._around = SpatialHash()
         for number, box in enumerate(self._boxes):
             if self._present[number]:
                 self._around.put(number, box)
@@ -223,7 +223,7 @@ class BulletEngine:
         number = self._number(name)
         box = self._boxes[number]
         stills = [
-            Still(self._assets[other], self._poses[other], self._fractions[other])
+            StaticObject(self._assets[other], self._poses[other], self._fractions[other])
             for other in self._around.near(box, SETTLE_RADIUS_M)
             if other != number and self._names[other] not in ignore
         ]
@@ -251,7 +251,7 @@ class BulletEngine:
         values = (*pose.position_m, *pose.quat_xyzw, *fractions)
         return struct.pack(f"<i?{len(values)}d", number, present, *values)
 
-    def complete(self) -> Iterator[None]:
+    def warm_up(self) -> Iterator[None]:
         """Make the bodies of objects and walls that nobody asked for yet, one at a step, changing no answer.
 
         Work for a process that waits.
@@ -326,8 +326,8 @@ class BulletEngine:
         return min([contact[8] for contact in contacts]) if contacts else math.inf
 
 
-def _neighbourhood(boxes: Iterable[Aabb]) -> Neighbourhood:
-    around = Neighbourhood()
+def _neighbourhood(boxes: Iterable[Aabb]) -> SpatialHash:
+    around = SpatialHash()
     for number, box in enumerate(boxes):
         around.put(number, box)
     return around

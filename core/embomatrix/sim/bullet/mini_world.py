@@ -45,7 +45,7 @@ EVERYWHERE: Final = Aabb((-math.inf,) * 3, (math.inf,) * 3)
 
 
 @dataclass(frozen=True, slots=True)
-class Still:
+class StaticObject:
     """An object that stands still in the mini world."""
 
     asset: Asset
@@ -78,7 +78,7 @@ class MiniWorld:
         asset: Asset,
         pose: Pose,
         fractions: Sequence[float],
-        stills: Sequence[Still],
+        stills: Sequence[StaticObject],
         walls: Sequence[ConvexPart] = (),
         region: Aabb | None = None,
     ) -> None:

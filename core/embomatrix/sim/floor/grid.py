@@ -11,7 +11,7 @@ import numpy as np
 from scipy import ndimage
 
 from embomatrix.sim.floor.components import FloorParts, overlap
-from embomatrix.sim.floor.paths import RecentDistances, cheapest_way
+from embomatrix.sim.floor.paths import RecentDistances, cheapest_path
 from embomatrix.skills.limits import ROBOT
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ class FloorGrid:
         window = self._window(low.tolist(), high.tolist())
         free = self.parts.within(window) > 0
         changes = (*self._changes, (gone, -1), (come, 1))
-        for a, b, c, d in _lots(boxes, reach):
+        for a, b, c, d in _clusters(boxes, reach):
             here = self._window((a - reach, b - reach), (c + reach, d + reach))
             around = self._window((a - 2 * reach, b - 2 * reach), (c + 2 * reach, d + 2 * reach))
             _, inner = overlap(here, around)
@@ -122,10 +122,10 @@ class FloorGrid:
         return self._with_parts(self.parts.changed(free, window))
 
     def _blocked_by(self, boxes: FloatArray) -> list[tuple[Window, BoolArray]]:
-        """For each lot of cells that boxes cover, the window in which the robot may touch them, and where in it it does."""
+        """For each cluster of cells that boxes cover, the window in which the robot may touch them, and where in it it does."""
         windows = (self._window(box[:2], box[2:4]) for box in boxes.tolist())
-        lots = sorted({(rows.start, rows.stop, cols.start, cols.stop) for rows, cols in windows})
-        return [_blocked(slice(*lot[:2]), slice(*lot[2:]), self._shape) for lot in lots]
+        clusters = sorted({(rows.start, rows.stop, cols.start, cols.stop) for rows, cols in windows})
+        return [_blocked(slice(*cluster[:2]), slice(*cluster[2:]), self._shape) for cluster in clusters]
 
     def _with_parts(self, parts: FloorParts) -> FloorGrid:
         """This grid with other free cells. It shares all it can: there are dozens of such grids in memory."""
@@ -248,7 +248,7 @@ class FloorGrid:
         The way leads over ``floor`` only, of the grid's shape. Empty when there is none.
         """
         free, goal = self.free, self._window(low_m, high_m)
-        way = cheapest_way(free, floor, start, goal)
+        way = cheapest_path(free, floor, start, goal)
         return np.array([self.center(cell) for cell in way if not free[cell]]).reshape(-1, 2)
 
     def drives_straight(self, start: Vec2, end: Vec2) -> bool:
@@ -297,18 +297,18 @@ def _floor_of(
     return floor
 
 
-def _lots(boxes: FloatArray, apart_m: float) -> list[list[float]]:
+def _clusters(boxes: FloatArray, apart_m: float) -> list[list[float]]:
     """Rectangles that hold all boxes, shape (n, 6), those that are near to one another together: parts of one thing are."""
-    lots: list[list[float]] = []
+    clusters: list[list[float]] = []
     for a, b, c, d in boxes[:, :4].tolist():
-        for lot in lots:
-            e, f, g, h = lot
+        for cluster in clusters:
+            e, f, g, h = cluster
             if a <= g + apart_m and e <= c + apart_m and b <= h + apart_m and f <= d + apart_m:
-                lot[:] = min(a, e), min(b, f), max(c, g), max(d, h)
+                cluster[:] = min(a, e), min(b, f), max(c, g), max(d, h)
                 break
         else:
-            lots.append([a, b, c, d])
-    return lots
+            clusters.append([a, b, c, d])
+    return clusters
 
 
 def _cells_between(low_m: float, high_m: float, origin_m: float, count: int) -> tuple[int, int]:

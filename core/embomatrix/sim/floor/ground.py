@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.floor.grid import FloorGrid
 from embomatrix.sim.floor.obstacles import WALLS, Obstacles
-from embomatrix.sim.floor.open_panels import OpenLeaves
+from embomatrix.sim.floor.open_panels import OpenPanels
 from embomatrix.sim.geometry.bounds import AssetParts
 from embomatrix.world.geometry import Pose
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.floor.open_panels import Ajar
+    from embomatrix.sim.floor.open_panels import OpenJoints
     from embomatrix.sim.floor.prepared import PreparedScene
 
 ON_FLOOR_M: Final = 0.05
@@ -31,12 +31,12 @@ Floor = tuple[tuple[int, Pose | None], ...]
 
 
 @dataclass(slots=True)
-class Laid:
-    """A floor with its leaves shut: what bars the way, where the robot fits, and where it does with leaves open."""
+class FloorLayout:
+    """A floor with its leaves shut: what blocking the way, where the robot fits, and where it does with leaves open."""
 
     obstacles: Obstacles
     grid: FloorGrid
-    narrowed: OrderedDict[Ajar, FloorGrid]
+    narrowed: OrderedDict[OpenJoints, FloorGrid]
 
 
 class Ground:
@@ -49,25 +49,25 @@ class Ground:
         self.numbers = {item.name: number for number, item in enumerate(self._scene.objects)}
         """Of the scene's objects, by their names."""
         self._parts: dict[str, AssetParts] = {}
-        bars = [item for item in self._scene.objects if item.fixed or self._on_floor(item.name)]
-        self._on_floor_at_start = {self.numbers[item.name] for item in bars if not item.fixed}
+        blocking = [item for item in self._scene.objects if item.fixed or self._on_floor(item.name)]
+        self._on_floor_at_start = {self.numbers[item.name] for item in blocking if not item.fixed}
         if prepared is not None:
             obstacles = prepared.obstacles
             grid = FloorGrid.restored(self._scene, prepared.covered, prepared.free)
         else:
             obstacles = Obstacles.joined(
-                [self._walls(), *(self._parts_of(item.name, engine.pose(item.name)) for item in bars)]
+                [self._walls(), *(self._parts_of(item.name, engine.pose(item.name)) for item in blocking)]
             )
-            grid = FloorGrid(self._scene, obstacles.barring)
-        self._at_start = Laid(obstacles, grid, OrderedDict())
-        self._kept: OrderedDict[Floor, Laid] = OrderedDict()
+            grid = FloorGrid(self._scene, obstacles.blocking)
+        self._at_start = FloorLayout(obstacles, grid, OrderedDict())
+        self._kept: OrderedDict[Floor, FloorLayout] = OrderedDict()
         self._moved: dict[int, Pose | None] = {}
         """As ``floor`` has them, in any order."""
-        self._leaves = OpenLeaves(engine)
-        self._one_open: dict[Ajar, FloorGrid] = {}
+        self._open_panels = OpenPanels(engine)
+        self._with_one_open: dict[OpenJoints, FloorGrid] = {}
         """Where the robot fits on the floor of the start with the leaves of one more object wide open."""
         self._round, self._read = -1, 0
-        self._current: Laid | None = None
+        self._current: FloorLayout | None = None
         self._now: FloorGrid | None = None
         self.refresh()
 
@@ -76,72 +76,72 @@ class Ground:
         journal = self._engine.journal
         if journal.rounds != self._round:
             self._moved.clear()
-            self._leaves.forget()
+            self._open_panels.forget()
             self._round, self._read = journal.rounds, 0
         for name in dict.fromkeys([name for name, _ in journal.entries[self._read :]]):
             number = self.numbers[name]
             if self._scene.objects[number].fixed:
-                self._leaves.note(number)
+                self._open_panels.note(number)
             else:
                 self._compare(number)
         self._read = len(journal.entries)
         self.floor: Floor = tuple(sorted(self._moved.items())) if self._moved else ()
         """What stands on the floor otherwise than at the start."""
-        self.ajar: Ajar = self._leaves.ajar()
+        self.open_joints: OpenJoints = self._open_panels.open_now()
         """Whose leaves stand open."""
         self._current = self._now = None
 
     @property
-    def _laid(self) -> Laid:
+    def _layout(self) -> FloorLayout:
         """The floor as it is, made when it is asked for: after what is put down last, nobody drives."""
         if self._current is None:
-            self._current = self._lay_or_recall(self.floor) if self.floor else self._at_start
+            self._current = self._layout_of(self.floor) if self.floor else self._at_start
         return self._current
 
     @property
     def obstacles(self) -> Obstacles:
         """What stands in the way, all leaves shut. For reading only."""
-        return self._laid.obstacles
+        return self._layout.obstacles
 
     @property
-    def leaves(self) -> Obstacles:
+    def open_panels(self) -> Obstacles:
         """Doors and drawers that stand open."""
-        return self._leaves.obstacles(self.ajar)
+        return self._open_panels.obstacles(self.open_joints)
 
     @property
     def shut(self) -> FloorGrid:
         """Where the robot would fit if all leaves were shut."""
-        return self._laid.grid
+        return self._layout.grid
 
     @property
     def grid(self) -> FloorGrid:
         """Where the robot fits, made when it is asked for: many doors are shut again before it drives."""
-        if self._now is None and not self.ajar:
-            self._now = self._laid.grid
+        if self._now is None and not self.open_joints:
+            self._now = self._layout.grid
         if self._now is None:
-            foreseen = self._one_open.get(self.ajar) if self._laid is self._at_start else None
-            self._now = foreseen or self._narrowed()
+            known = self._with_one_open.get(self.open_joints) if self._layout is self._at_start else None
+            self._now = known or self._narrowed()
         return self._now
 
-    def complete(self) -> Iterator[None]:
+    def warm_up(self) -> Iterator[None]:
         """Find out where the robot fits with the leaves of each object wide open, one object at a step.
 
         Work for a process that waits. Changes no answer: most plans open one thing, and most of these are opened again.
         """
-        for ajar in self._leaves.each_open():
-            leaves = self._leaves.obstacles(ajar)
-            self._one_open[ajar] = self._at_start.grid.narrowed(leaves.barring)
+        for joints in self._open_panels.each_open():
+            panels = self._open_panels.obstacles(joints)
+            self._with_one_open[joints] = self._at_start.grid.narrowed(panels.blocking)
             yield
 
     def _narrowed(self) -> FloorGrid:
         """The floor with the leaves that stand open now."""
-        kept = self._laid.narrowed
-        if self.ajar not in kept:
-            kept[self.ajar] = self.shut.narrowed(self.leaves.barring)
+        kept = self._layout.narrowed
+        if self.open_joints not in kept:
+            kept[self.open_joints] = self.shut.narrowed(self.open_panels.blocking)
             if len(kept) > LEAVES_KEPT:
                 kept.popitem(last=False)
-        kept.move_to_end(self.ajar)
-        return kept[self.ajar]
+        kept.move_to_end(self.open_joints)
+        return kept[self.open_joints]
 
     @property
     def at_start(self) -> tuple[Obstacles, FloorGrid]:
@@ -150,7 +150,7 @@ class Ground:
 
     def with_shut(self, number: int) -> FloorGrid:
         """Where the robot would fit if the leaves of one object were shut."""
-        return self.shut.narrowed(self.leaves.without([number]).barring)
+        return self.shut.narrowed(self.open_panels.without([number]).blocking)
 
     def _compare(self, number: int) -> None:
         """Note whether a movable object stands on the floor otherwise than at the start."""
@@ -162,15 +162,15 @@ class Ground:
         else:
             self._moved[number] = pose
 
-    def _lay_or_recall(self, floor: Floor) -> Laid:
+    def _layout_of(self, floor: Floor) -> FloorLayout:
         if floor not in self._kept:
-            self._kept[floor] = self._lay(floor)
+            self._kept[floor] = self._make_layout(floor)
             if len(self._kept) > GRIDS_KEPT:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(floor)
         return self._kept[floor]
 
-    def _lay(self, floor: Floor) -> Laid:
+    def _make_layout(self, floor: Floor) -> FloorLayout:
         moved = [number for number, _ in floor]
         parts = [
             self._parts_of(self._scene.objects[number].name, pose)
@@ -180,7 +180,7 @@ class Ground:
         come = Obstacles.joined([Obstacles.of([], WALLS, []), *parts])
         obstacles, grid = self.at_start
         now = Obstacles.joined([obstacles.without(moved), come])
-        return Laid(now, grid.changed(obstacles.only(moved).barring, come.barring), OrderedDict())
+        return FloorLayout(now, grid.changed(obstacles.only(moved).blocking, come.blocking), OrderedDict())
 
     def _on_floor(self, name: str) -> bool:
         return not self._engine.is_parked(name) and self._engine.aabb(name).low_m[2] < ON_FLOOR_M
@@ -197,5 +197,5 @@ class Ground:
             self._parts[asset.asset_id] = AssetParts(asset)
         shut = (0.0,) * len(asset.joints)
         boxes = self._parts[asset.asset_id].boxes(pose, shut)
-        leaves = [link.joint is not None for link in asset.links for _ in link.parts]
-        return Obstacles.of(boxes, self.numbers[name], leaves)
+        panels = [link.joint is not None for link in asset.links for _ in link.parts]
+        return Obstacles.of(boxes, self.numbers[name], panels)

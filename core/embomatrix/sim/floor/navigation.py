@@ -15,7 +15,7 @@ import numpy as np
 from embomatrix.sim.floor.grid import CELL_M, FloorGrid
 from embomatrix.sim.floor.ground import Ground
 from embomatrix.sim.floor.obstacles import WALLS, crosses
-from embomatrix.sim.floor.standing import Service
+from embomatrix.sim.floor.standing import StandingArea
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.poses import StandPose
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
     from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.floor.open_panels import Ajar
+    from embomatrix.sim.floor.open_panels import OpenJoints
     from embomatrix.sim.floor.paths import Cell
     from embomatrix.sim.floor.prepared import PreparedScene
     from embomatrix.sim.state.relations import Relations
@@ -36,7 +36,7 @@ ROOFED_M: Final = 1.5
 ANSWERS_KEPT: Final = 4096
 """Standing poses and rectangles in memory, a few KB each."""
 ENTRY_M: Final = 0.4
-ASIDE_M: Final = (0.45, 0.9, 1.6)
+STEP_ASIDE_M: Final = (0.45, 0.9, 1.6)
 """When a leaf takes the place where the robot stands, one this near does, or else one that near."""
 STEP_M: Final = CELL_M / 2
 
@@ -71,7 +71,7 @@ class Navigator:
         start = self._cell(origin)
         if start is None:
             return np.zeros((0, 2))
-        floor = FloorGrid(self._scene, self.ground.obstacles.only([WALLS]).barring).free
+        floor = FloorGrid(self._scene, self.ground.obstacles.only([WALLS]).blocking).free
         return self.ground.grid.crossing(start, low_m, high_m, floor)
 
     @property
@@ -167,7 +167,7 @@ class Navigator:
                 found = True
                 yield stand
         if not found:
-            yield from self._stands_on(grid, (self._key(name), self.ground.ajar, label), name)
+            yield from self._stands_on(grid, (self._key(name), self.ground.open_joints, label), name)
 
     def stands_past_shut(self, name: str, origin: StandPose) -> tuple[StandPose, ...]:
         """As ``stands``, as if all doors and drawers of furniture were shut: few leaves stand in any of these places."""
@@ -189,50 +189,50 @@ class Navigator:
         if self.ground.floor == ():
             return True
         before, grid = self.ground.at_start
-        service = self.service(name)
-        if not self.ground.shut.is_like(grid, *service.window):
+        area = self.standing_area(name)
+        if not self.ground.shut.is_like(grid, *area.window):
             return False
         own = [self.ground.numbers[item] for item in (name, *self._relations.hosts_of(name))]
-        return np.array_equal(_within_reach(before.blockers(service.box, own), service.box), service.blockers)
+        return np.array_equal(_within_reach(before.blockers(area.box, own), area.box), area.blockers)
 
     def _stands_on(
-        self, grid: FloorGrid, key: tuple[tuple[object, ...], Ajar, int], name: str
+        self, grid: FloorGrid, key: tuple[tuple[object, ...], OpenJoints, int], name: str
     ) -> tuple[StandPose, ...]:
         """Standing poses on the component of a grid that the key ends with. Found once for each key."""
         if key not in self._stands:
             if len(self._stands) == ANSWERS_KEPT:
                 self._stands.clear()
-            service = self.service(name)
-            self._stands[key] = service.stands(grid.free_centers(*service.window, key[2]))
+            area = self.standing_area(name)
+            self._stands[key] = area.stands(grid.free_centers(*area.window, key[2]))
         return self._stands[key]
 
-    def aside(self, name: str, origin: StandPose) -> StandPose:
+    def step_aside(self, name: str, origin: StandPose) -> StandPose:
         """Where the robot serves an object, as near to ``origin`` as there is room: there, unless a leaf takes the place.
 
         Nor does it stay in a corner that a leaf cuts off from most of the floor. ``origin`` where there is no such place.
         """
         if not self.ground.grid.may_differ_at(self.ground.shut, origin.x_m, origin.y_m):
             return origin
-        key = self.ground.floor, name, self._engine.pose(name), self.ground.ajar, origin
+        key = self.ground.floor, name, self._engine.pose(name), self.ground.open_joints, origin
         if key not in self._asides:
             if len(self._asides) == ANSWERS_KEPT:
                 self._asides.clear()
-            self._asides[key] = self._find_aside(self.service(name), origin)
+            self._asides[key] = self._find_aside(self.standing_area(name), origin)
         return self._asides[key]
 
-    def _find_aside(self, service: Service, origin: StandPose) -> StandPose:
+    def _find_aside(self, area: StandingArea, origin: StandPose) -> StandPose:
         grid = self.ground.grid
         main = grid.main_part_of(self.ground.shut, origin.x_m, origin.y_m)
         if grid.label_at(origin.x_m, origin.y_m) == main:
             return origin
-        for away in ASIDE_M:
+        for away in STEP_ASIDE_M:
             low, high = (origin.x_m - away, origin.y_m - away), (origin.x_m + away, origin.y_m + away)
-            found = service.nearest(grid.free_centers(low, high, main), origin)
+            found = area.nearest(grid.free_centers(low, high, main), origin)
             if found is not None and math.hypot(found.x_m - origin.x_m, found.y_m - origin.y_m) <= away:
                 return found
         return origin
 
-    def complete(self) -> Iterator[None]:
+    def warm_up(self) -> Iterator[None]:
         """Find out what bars the arm's way to each object, and the robot's where a door stands open, one object at a step.
 
         Work for a process that waits. Changes no answer.
@@ -240,15 +240,15 @@ class Navigator:
         for item in self._scene.objects:
             self._blockers_of(item.name)
             yield
-        yield from self.ground.complete()
+        yield from self.ground.warm_up()
 
-    def service(self, name: str) -> Service:
+    def standing_area(self, name: str) -> StandingArea:
         """What a place must offer from which the robot works on the object."""
         # The front is that of the fixed furniture which the object stands in or on, or its own.
         fixed = [host for host in self._relations.hosts_of(name) if self._scene.by_name[host].fixed]
         yaw = self._engine.pose(fixed[0] if fixed else name).yaw
         from_front = has_front(self._scene.asset_of(name))
-        return Service(self._relations.body(name), yaw, from_front, self._blockers_of(name))
+        return StandingArea(self._relations.body(name), yaw, from_front, self._blockers_of(name))
 
     def line_is_clear(self, origin: StandPose, name: str) -> bool:
         """Whether no wall nor anything much taller than the object stands between the robot and the object's box."""

@@ -34,19 +34,19 @@ class Obstacles:
     ``leaves`` marks doors and drawers.
     """
 
-    def __init__(self, boxes: FloatArray, owners: IntArray, leaves: BoolArray) -> None:
+    def __init__(self, boxes: FloatArray, owners: IntArray, is_panel: BoolArray) -> None:
         self.boxes = boxes
         self.owners = owners
-        self.leaves = leaves
+        self.is_panel = is_panel
 
     @staticmethod
-    def of(boxes: Sequence[Aabb], owner: int, leaves: Sequence[bool]) -> Obstacles:
+    def of(boxes: Sequence[Aabb], owner: int, is_panel: Sequence[bool]) -> Obstacles:
         """Boxes of one owner."""
         rows = [(*box.low_m[:2], *box.high_m[:2], box.low_m[2], box.high_m[2]) for box in boxes]
         return Obstacles(
             np.array(rows, dtype=np.float64).reshape(-1, 6),
             np.full(len(rows), owner, dtype=np.int32),
-            np.array(leaves, dtype=np.bool_),
+            np.array(is_panel, dtype=np.bool_),
         )
 
     @staticmethod
@@ -55,7 +55,7 @@ class Obstacles:
         return Obstacles(
             np.concatenate([item.boxes for item in parts]),
             np.concatenate([item.owners for item in parts]),
-            np.concatenate([item.leaves for item in parts]),
+            np.concatenate([item.is_panel for item in parts]),
         )
 
     def only(self, owners: Sequence[int]) -> Obstacles:
@@ -67,13 +67,13 @@ class Obstacles:
         return self._chosen(~np.isin(self.owners, owners))
 
     @property
-    def barring(self) -> FloatArray:
+    def blocking(self) -> FloatArray:
         """Those that the robot's base can't drive through, shape (m, 6)."""
-        return self.boxes[self._bars_base()]
+        return self.boxes[self._blocks_base()]
 
     def owners_near(self, points: FloatArray) -> dict[int, int]:
         """For how many of some points of the plane, shape (n, 2), each owner keeps the robot from standing there."""
-        bars = self._bars_base()
+        bars = self._blocks_base()
         boxes, owners = self.boxes[bars], self.owners[bars]
         counts: dict[int, int] = {}
         for owner in dict.fromkeys(owners.tolist()):
@@ -92,25 +92,25 @@ class Obstacles:
         rows, owners = self.boxes, self.owners
         low, top = box.low_m[2], box.high_m[2]
         x, y, _ = box.center_m
-        barring = (rows[:, 5] > top + OVER_M) & (rows[:, 4] < max(top, ROBOT.shoulder_m))
+        blocking = (rows[:, 5] > top + OVER_M) & (rows[:, 4] < max(top, ROBOT.shoulder_m))
         for place, number in enumerate(own):
             mine = np.flatnonzero(owners == number)
-            barring[mine] = False
+            blocking[mine] = False
             if place == 0:
                 continue
             parts = rows[mine]
             over = (parts[:, 0] <= x) & (x <= parts[:, 2]) & (parts[:, 1] <= y) & (y <= parts[:, 3])
             # Under a lid the arm reaches from above; shut, it is in the way otherwise.
-            stiff = ~self.leaves[mine]
+            stiff = ~self.is_panel[mine]
             if (over & stiff & (parts[:, 4] >= top)).any():
                 beside = (parts[:, 4] < top - SLACK_M) & (parts[:, 5] > low + SLACK_M)
-                barring[mine] = beside & stiff
-        return np.ascontiguousarray(rows[barring, :4].T)
+                blocking[mine] = beside & stiff
+        return np.ascontiguousarray(rows[blocking, :4].T)
 
     def _chosen(self, rows: BoolArray) -> Obstacles:
-        return Obstacles(self.boxes[rows], self.owners[rows], self.leaves[rows])
+        return Obstacles(self.boxes[rows], self.owners[rows], self.is_panel[rows])
 
-    def _bars_base(self) -> BoolArray:
+    def _blocks_base(self) -> BoolArray:
         return np.asarray((self.boxes[:, 4] < ROBOT.height_m) & (self.boxes[:, 5] > FLAT_M))
 
 

@@ -1,6 +1,6 @@
 """Doors, drawers and lids of furniture that stand open: which of them do, and the room that they take.
 
-One that is ajar by no more than what counts as shut takes none.
+One that is joints by no more than what counts as shut takes none.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
     from embomatrix.sim.engine import PhysicsEngine
 
-Ajar = tuple[tuple[int, tuple[float, ...]], ...]
+OpenJoints = tuple[tuple[int, tuple[float, ...]], ...]
 """Fixed objects of which a leaf stands open, by their numbers in the scene, and their joint positions."""
 
 
-class OpenLeaves:
+class OpenPanels:
     """The leaves of one engine's fixed objects. Which objects were moved, it must be told."""
 
     def __init__(self, engine: PhysicsEngine) -> None:
@@ -29,25 +29,25 @@ class OpenLeaves:
         jointed = [number for number, item in enumerate(self._objects) if item.fixed and item.joints]
         self._jointed = frozenset(jointed)
         self._at_start = frozenset(number for number in jointed if any(self._objects[number].joints))
-        self._swung = set(self._at_start)
+        self._moved = set(self._at_start)
 
     def forget(self) -> None:
         """The engine was reset."""
-        self._swung = set(self._at_start)
+        self._moved = set(self._at_start)
 
     def note(self, number: int) -> None:
         """Something about the object of this number has changed."""
         if number in self._jointed:
-            self._swung.add(number)
+            self._moved.add(number)
 
-    def ajar(self) -> Ajar:
+    def open_now(self) -> OpenJoints:
         """What stands open now, in scene order."""
-        if not self._swung:
+        if not self._moved:
             return ()
-        joints = [(number, self._engine.joints(self._objects[number].name)) for number in sorted(self._swung)]
+        joints = [(number, self._engine.joints(self._objects[number].name)) for number in sorted(self._moved)]
         return tuple((number, fractions) for number, fractions in joints if max(fractions) > OPEN_FRACTION)
 
-    def each_open(self) -> Iterator[Ajar]:
+    def each_open(self) -> Iterator[OpenJoints]:
         """What stands open at the start, and one object more with all its joints wide open: for each object in turn."""
         at_start = {number: tuple(self._objects[number].joints) for number in self._at_start}
         for number in sorted(self._jointed):
@@ -58,10 +58,10 @@ class OpenLeaves:
                 if max(fractions) > OPEN_FRACTION
             )
 
-    def obstacles(self, ajar: Ajar) -> Obstacles:
+    def obstacles(self, joints: OpenJoints) -> Obstacles:
         """Boxes of the parts of leaves that stand open so."""
         found = [Obstacles.of([], WALLS, [])]
-        for number, fractions in ajar:
+        for number, fractions in joints:
             item = self._objects[number]
             asset = self._engine.scene.asset_of(item.name)
             boxes = parts_of(asset).boxes(self._engine.pose(item.name), fractions)

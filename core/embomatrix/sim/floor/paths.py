@@ -108,7 +108,7 @@ class RecentDistances:
         return self._kept[floor]
 
 
-def cheapest_way(free: BoolArray, floor: BoolArray, start: Cell, goal: Window) -> list[Cell]:
+def cheapest_path(free: BoolArray, floor: BoolArray, start: Cell, goal: Window) -> list[Cell]:
     """The cells back from a free one in the goal to the start, by a way over ``floor`` that has few that are not free.
 
     Empty when there is none.

@@ -59,8 +59,8 @@ class PreparedScene:
     @property
     def obstacles(self) -> Obstacles:
         """What stands in the robot's way."""
-        leaves = self._arrays["leaves"].astype(np.bool_)
-        return Obstacles(self._arrays["obstacles"], self._arrays["owners"], leaves)
+        is_panel = self._arrays["leaves"].astype(np.bool_)
+        return Obstacles(self._arrays["obstacles"], self._arrays["owners"], is_panel)
 
     @property
     def covered(self) -> NDArray[np.int16]:
@@ -100,7 +100,7 @@ def prepared_arrays(engine: PhysicsEngine, obstacles: Obstacles, grid: FloorGrid
         "walls": _rows([wall.aabb(IDENTITY) for wall in scene.walls]),
         "obstacles": obstacles.boxes,
         "owners": obstacles.owners,
-        "leaves": obstacles.leaves.astype(np.uint8),
+        "leaves": obstacles.is_panel.astype(np.uint8),
         "covered": covered.astype(np.uint8),
         "free": np.packbits(grid.free),
     }

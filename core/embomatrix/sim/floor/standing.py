@@ -28,7 +28,7 @@ SIDE_WEIGHT_M: Final = 0.4
 
 
 @dataclass(frozen=True, slots=True)
-class Service:
+class StandingArea:
     """What a place must offer that serves a thing: ``blockers``, shape (4, n), are rectangles that the arm can't pass.
 
     ``front_yaw`` is where the thing, or the furniture that it is in, looks; ``from_front`` when it can't be served otherwise.

@@ -53,7 +53,7 @@ class Neighbours:
 
 
 @dataclass(frozen=True, slots=True)
-class Lineup:
+class PoseBoxes:
     """Boxes in the world that one thing has at n poses, shape (n, 3) each corner. A pose that is none is at infinity."""
 
     lows_m: FloatArray
@@ -70,15 +70,15 @@ class Lineup:
             box = Aabb((a, b, c), (d, e, f)).grown(margin_m)
             yield any(box.overlaps(other) for other in others)
 
-    def at(self, rows: Sequence[int]) -> Lineup:
+    def at(self, rows: Sequence[int]) -> PoseBoxes:
         """Some of the poses, in the order of ``rows``."""
-        return Lineup(self.lows_m[rows], self.highs_m[rows])
+        return PoseBoxes(self.lows_m[rows], self.highs_m[rows])
 
-    def raised_over(self, height_m: float) -> Lineup:
+    def raised_over(self, height_m: float) -> PoseBoxes:
         """The boxes as high up as they must come on their way, those that begin lower over a height."""
         rise = np.zeros_like(self.lows_m)
         rise[:, 2] = np.maximum(height_m - self.lows_m[:, 2], 0.0)
-        return Lineup(self.lows_m + rise, self.highs_m + rise)
+        return PoseBoxes(self.lows_m + rise, self.highs_m + rise)
 
     def reached_from(self, stand: StandPose) -> BoolArray:
         """Whether the arm reaches the nearest point of each box in the plane, and its middle's height; shape (n,)."""
@@ -142,7 +142,7 @@ class LinkBoxes:
         """The boxes of these rows, shape (m,), each moved on its link by its own way, shape (m, 3)."""
         return LinkBoxes(self.corners_m[rows] + np.tile(by_m, 2), self.links, self.link_of[rows])
 
-    def lineup(self, frames: Mapping[str, Pose]) -> Lineup | None:
+    def world_boxes(self, frames: Mapping[str, Pose]) -> PoseBoxes | None:
         """The boxes in the world; at infinity on links without a frame, None when a frame is not square to the world."""
         turns = {link: quarter_turns(frames[link]) for link in self.links if link in frames}
         if -1 in turns.values():
@@ -166,8 +166,8 @@ def _turned(corners_m: FloatArray, turns: int, frame: Pose) -> FloatArray:
     return placed
 
 
-def _split(corners_m: FloatArray) -> Lineup:
-    return Lineup(corners_m[:, :3], corners_m[:, 3:])
+def _split(corners_m: FloatArray) -> PoseBoxes:
+    return PoseBoxes(corners_m[:, :3], corners_m[:, 3:])
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,21 +210,23 @@ class PoseSet:
 
     def boxes(self, bounds: AssetBounds) -> LinkBoxes:
         """Boxes of a thing with these bounds, its joints shut, in the frames of the links."""
-        found = self.lineup(bounds, (), dict.fromkeys(self.links, IDENTITY))
+        found = self.world_boxes(bounds, (), dict.fromkeys(self.links, IDENTITY))
         return LinkBoxes(np.concatenate([found.lows_m, found.highs_m], axis=1), self.links, self.link_of)
 
-    def lineup(self, bounds: AssetBounds, fractions: Sequence[float], frames: Mapping[str, Pose]) -> Lineup:
+    def world_boxes(
+        self, bounds: AssetBounds, fractions: Sequence[float], frames: Mapping[str, Pose]
+    ) -> PoseBoxes:
         """Boxes of a thing with these bounds and joint positions, where the links are; at infinity on links without frame."""
         if not self.links:
-            return Lineup(np.zeros((0, 3)), np.zeros((0, 3)))
+            return PoseBoxes(np.zeros((0, 3)), np.zeros((0, 3)))
         if len(self.links) == 1 and self.links[0] in frames:
-            return Lineup(*self._extents(bounds, fractions, frames[self.links[0]], np.s_[:]))
+            return PoseBoxes(*self._extents(bounds, fractions, frames[self.links[0]], np.s_[:]))
         lows, highs = np.full_like(self.positions_m, np.inf), np.full_like(self.positions_m, np.inf)
         for number, link in enumerate(self.links):
             if link in frames:
                 rows = self.link_of == number
                 lows[rows], highs[rows] = self._extents(bounds, fractions, frames[link], rows)
-        return Lineup(lows, highs)
+        return PoseBoxes(lows, highs)
 
     def _extents(
         self, bounds: AssetBounds, fractions: Sequence[float], frame: Pose, rows: slice | BoolArray

@@ -149,7 +149,7 @@ class AssetParts:
         self._links = [(link.joint, link.parts) for link in asset.links if link.parts]
         self._of_base = len(asset.links[0].parts)
         self._extents: dict[tuple[Quat, tuple[float, ...]], list[tuple[Vec3, Vec3]]] = {}
-        self._leaves: dict[tuple[Quat, tuple[float, ...]], list[tuple[Vec3, Vec3]]] = {}
+        self._panels: dict[tuple[Quat, tuple[float, ...]], list[tuple[Vec3, Vec3]]] = {}
 
     def boxes(self, pose: Pose, fractions: Sequence[float]) -> list[Aabb]:
         """Box of every part in the world, in the order of the links, as ``ConvexPart.aabb`` has it."""
@@ -163,15 +163,15 @@ class AssetParts:
         """Box of every part of the base in the world."""
         return self.boxes(pose, ())[: self._of_base]
 
-    def leaves(self, pose: Pose, fractions: Sequence[float]) -> list[Aabb]:
+    def panels(self, pose: Pose, fractions: Sequence[float]) -> list[Aabb]:
         """Box of every link that moves, in the world."""
         x, y, z = pose.position_m
         key = (pose.quat_xyzw, tuple(fractions))
-        known = self._leaves.get(key)
+        known = self._panels.get(key)
         if known is None:
-            if len(self._leaves) >= EXTENTS_KEPT:
-                self._leaves.clear()
-            known = self._leaves[key] = self._reckon_leaves(*key)
+            if len(self._panels) >= EXTENTS_KEPT:
+                self._panels.clear()
+            known = self._panels[key] = self._reckon_panels(*key)
         return [Aabb((x + a, y + b, z + c), (x + d, y + e, z + f)) for (a, b, c), (d, e, f) in known]
 
     def within(self, pose: Pose, fractions: Sequence[float], box: Aabb) -> list[ConvexPart]:
@@ -203,7 +203,7 @@ class AssetParts:
             known = self._extents[key] = self._reckon(Pose((0.0, 0.0, 0.0), quat_xyzw), fractions)
         return known
 
-    def _reckon_leaves(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> list[tuple[Vec3, Vec3]]:
+    def _reckon_panels(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> list[tuple[Vec3, Vec3]]:
         extents = iter(self._extents_at(quat_xyzw, fractions))
         found: list[tuple[Vec3, Vec3]] = []
         for joint, parts in self._links:

@@ -22,7 +22,7 @@ Span = tuple[int, int, int, int]
 Extent = tuple[float, float, float, float, float, float]
 
 
-class Neighbourhood:
+class SpatialHash:
     """Numbered boxes that can be moved, taken out and asked for by place."""
 
     def __init__(self) -> None:

@@ -117,7 +117,7 @@ def _within(box: Aabb, interior: Interior) -> bool:
     return True
 
 
-def links_with_spots(asset: Asset) -> set[str]:
+def links_with_surfaces(asset: Asset) -> set[str]:
     """Links on which surfaces or cavities ride; "" for the base."""
     return {surface.link for surface in asset.supports} | {interior.link for interior in asset.interiors}
 

@@ -14,7 +14,7 @@ from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of
 from embomatrix.sim.geometry.candidates import patches, proposed_places
 from embomatrix.sim.geometry.footprints import LEVEL_FLOOR, footprint_of, pose_box_asset
 from embomatrix.sim.geometry.statics import base_of
-from embomatrix.sim.geometry.surfaces import link_under, links_with_spots
+from embomatrix.sim.geometry.surfaces import link_under, links_with_surfaces
 from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.placements import pose_rows, rows_of
 from embomatrix.world.poses import PlacementKey
@@ -23,7 +23,7 @@ from embomatrix.world.state import Relation
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-    from embomatrix.sim.geometry.batch_poses import Lineup
+    from embomatrix.sim.geometry.batch_poses import PoseBoxes
     from embomatrix.sim.geometry.bounds import AssetBounds
     from embomatrix.sim.geometry.candidates import Patch
     from embomatrix.sim.geometry.statics import Base
@@ -36,7 +36,7 @@ PLACED: Final = (Relation.ONTOP, Relation.INSIDE, Relation.UNDER)
 """The relations that placing brings about."""
 
 
-class Spots:
+class CandidatePoses:
     """Poses of one asset in the frames of a support's links. ``local`` gives a pose by its number."""
 
     def __init__(
@@ -59,21 +59,23 @@ class Spots:
         """A pose in the world. Raises KeyError when its link has no frame."""
         return frames[self._links[number]] @ self._local(number)
 
-    def ride(self, number: int) -> tuple[str, Pose]:
+    def link_pose(self, number: int) -> tuple[str, Pose]:
         """The link that a pose rides on, and the pose in that link's frame."""
         return self._links[number], self._local(number)
 
-    def lineup(self, bounds: AssetBounds, fractions: Sequence[float], frames: Mapping[str, Pose]) -> Lineup:
+    def world_boxes(
+        self, bounds: AssetBounds, fractions: Sequence[float], frames: Mapping[str, Pose]
+    ) -> PoseBoxes:
         """Boxes at all the poses in the world, of the asset with these bounds; at infinity on links without a frame.
 
         Furniture stands square to the world: there the boxes in its frame are those in the world, but for a quarter turn.
         """
-        square = None if any(fractions) else self._boxes.lineup(frames)
-        return square if square is not None else self._places().lineup(bounds, fractions, frames)
+        square = None if any(fractions) else self._boxes.world_boxes(frames)
+        return square if square is not None else self._places().world_boxes(bounds, fractions, frames)
 
 
 @dataclass(frozen=True, slots=True)
-class Pattern:
+class SurfacePattern:
     """Where one asset fits on another by geometry alone; ``middles`` and ``boxes`` are of one pose for each patch."""
 
     patches: tuple[Patch, ...]
@@ -81,19 +83,19 @@ class Pattern:
     boxes: LinkBoxes
 
 
-class Repertoire:
+class PlacementOptions:
     """The poses that a cache and the surfaces of a scene's assets offer. Depends on no state of the world."""
 
     def __init__(self, scene: Scene, cache: PoseCache) -> None:
         self._scene = scene
         self._cache = cache
-        self._exact: dict[PlacementKey, Spots] = {}
-        self._by_class: dict[PlacementKey, Spots] = {}
+        self._exact: dict[PlacementKey, CandidatePoses] = {}
+        self._by_class: dict[PlacementKey, CandidatePoses] = {}
         self._footprints: dict[str, tuple[str, Pose]] = {}
         self._bases: dict[str, Base | None] = {}
-        self._patterns: dict[PlacementKey, Pattern] = {}
+        self._patterns: dict[PlacementKey, SurfacePattern] = {}
 
-    def complete(self, tables: Iterable[Sequence[str]]) -> Iterator[None]:
+    def warm_up(self, tables: Iterable[Sequence[str]]) -> Iterator[None]:
         """Look up what was verified for the things and supports of each table, one pair of assets at a step.
 
         Work for a process that waits. Changes no answer.
@@ -101,14 +103,14 @@ class Repertoire:
         scene = self._scene
         for table in tables:
             movable = [name for name in table if not scene.by_name[name].fixed]
-            hosts = [name for name in table if links_with_spots(scene.asset_of(name))]
+            hosts = [name for name in table if links_with_surfaces(scene.asset_of(name))]
             for held, target in itertools.product(movable, hosts):
                 for relation in PLACED:
                     for _ in self.verified(held, target, relation):
                         pass
                 yield
 
-    def verified(self, held: str, target: str, relation: Relation) -> Iterator[Spots]:
+    def verified(self, held: str, target: str, relation: Relation) -> Iterator[CandidatePoses]:
         """Spots verified for this pair of assets, then those verified for the footprint of what is held."""
         one, other = self._scene.asset_of(held), self._scene.asset_of(target)
         key = PlacementKey(one.asset_id, other.asset_id, relation)
@@ -121,7 +123,7 @@ class Repertoire:
             self._by_class[key] = _spots(boxes, pose_box_held, one, other, relation)
         yield self._by_class[key]
 
-    def fresh(self, held: str, target: str, relation: Relation, shift: Vec2, tries: int) -> Spots:
+    def fresh(self, held: str, target: str, relation: Relation, shift: Vec2, tries: int) -> CandidatePoses:
         """At most so many poses by geometry alone, spread over the surfaces; ``shift`` moves the whole pattern."""
         one, other = self._scene.asset_of(held), self._scene.asset_of(target)
         key = PlacementKey(one.asset_id, other.asset_id, relation)
@@ -130,7 +132,7 @@ class Repertoire:
             found = patches(bounds_of(one), other, relation)
             middles = [Pose.from_xyz_yaw(*patch.center_m, patch.yaw) for patch in found]
             places = PoseSet.of(pose_rows(middles), [patch.link for patch in found])
-            pattern = self._patterns[key] = Pattern(found, places, places.boxes(bounds_of(one)))
+            pattern = self._patterns[key] = SurfacePattern(found, places, places.boxes(bounds_of(one)))
         return _spread(pattern, shift, tries)
 
     def base(self, asset: Asset) -> Base | None:
@@ -154,22 +156,22 @@ class Repertoire:
 
 
 _NO_PLACES: Final = PoseSet.of(pose_rows(()), ())
-NO_SPOTS: Final = Spots(
+NO_CANDIDATES: Final = CandidatePoses(
     lambda number: IDENTITY, (), LinkBoxes(np.zeros((0, 6)), (), _NO_PLACES.link_of), lambda: _NO_PLACES
 )
 
 
-def _spots(rows: FloatArray, then: Pose, held: Asset, support: Asset, relation: Relation) -> Spots:
+def _spots(rows: FloatArray, then: Pose, held: Asset, support: Asset, relation: Relation) -> CandidatePoses:
     """Spots at poses in the frame of a support with its joints shut; ``then`` is the thing's pose in each of their frames.
 
     ``rows``, shape (n, 7), are positions and quaternions.
     """
     if not len(rows):
-        return NO_SPOTS
+        return NO_CANDIDATES
     links = [""] * len(rows)
     places = PoseSet.of(rows, links, then)
     boxes = places.boxes(bounds_of(held))
-    if not links_with_spots(support) <= {""}:
+    if not links_with_surfaces(support) <= {""}:
         links = [
             link_under(Aabb((a, b, c), (d, e, f)), support, relation)
             for a, b, c, d, e, f in boxes.corners_m.tolist()
@@ -182,10 +184,10 @@ def _spots(rows: FloatArray, then: Pose, held: Asset, support: Asset, relation: 
         return Pose((x, y, z), (a, b, c, d)) @ then
 
     # Kept are the boxes only: what makes the arrays anew is asked where something stands askew, or is placed half open.
-    return Spots(local, links, boxes, lambda: PoseSet.of(rows, links, then))
+    return CandidatePoses(local, links, boxes, lambda: PoseSet.of(rows, links, then))
 
 
-def _spread(pattern: Pattern, shift: Vec2, tries: int) -> Spots:
+def _spread(pattern: SurfacePattern, shift: Vec2, tries: int) -> CandidatePoses:
     """Spots at so many poses, the patches taken in turn."""
     found, middles = pattern.patches, pattern.middles
     points = proposed_places(found, shift, tries)
@@ -197,4 +199,4 @@ def _spread(pattern: Pattern, shift: Vec2, tries: int) -> Spots:
         x, y, z = points[number].tolist()
         return Pose.from_xyz_yaw(x, y, z, found[number % len(found)].yaw)
 
-    return Spots(local, links, boxes, lambda: middles.repeated_at(points))
+    return CandidatePoses(local, links, boxes, lambda: middles.repeated_at(points))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.bullet.mini_world import MiniWorld, Still
+from embomatrix.sim.bullet.mini_world import MiniWorld, StaticObject
 from embomatrix.sim.engine import TOLERANCE_M
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of
@@ -137,7 +137,7 @@ class PlacementLibrary:
             return
         pose_world_support = _on_floor(support)
         shut = (0.0,) * len(held.joints)
-        still = Still(support, pose_world_support, (0.0,) * len(support.joints))
+        still = StaticObject(support, pose_world_support, (0.0,) * len(support.joints))
         self._mini.stage(held, pose_world_support @ first, shut, [still])
         back = pose_world_support.inverse()
         found = 0

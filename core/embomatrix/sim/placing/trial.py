@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.placing.options import Repertoire, Spots
+    from embomatrix.sim.placing.options import CandidatePoses, PlacementOptions
     from embomatrix.sim.state.relations import Relations
     from embomatrix.world.geometry import Aabb
     from embomatrix.world.poses import StandPose
@@ -30,31 +30,31 @@ NEAR_M: Final = UNDISTURBED_M + TOLERANCE_M
 
 
 @dataclass(frozen=True, slots=True)
-class Errand:
+class PlacementRequest:
     """What is to be placed where, and from which standing pose it must be in reach."""
 
     held: str
     target: str
     relation: Relation
     robot: StandPose
-    passed_over: tuple[StandPose, ...] = ()
+    excluded_stands: tuple[StandPose, ...] = ()
 
 
 class PoseTrial:
     """Tries poses of a held object in an engine: it is left where it was tried last.
 
-    A pose that is given back has the errand's relation, penetrates nothing, is within the robot's reach and stable.
+    A pose that is given back has the request's relation, penetrates nothing, is within the robot's reach and stable.
     """
 
-    def __init__(self, engine: PhysicsEngine, relations: Relations, repertoire: Repertoire) -> None:
+    def __init__(self, engine: PhysicsEngine, relations: Relations, options: PlacementOptions) -> None:
         self._engine = engine
         self._relations = relations
         self._scene = engine.scene
-        self._repertoire = repertoire
+        self._options = options
 
-    def verified(self, errand: Errand, pose: Pose, nearest: str) -> Pose | None:
+    def verified(self, request: PlacementRequest, pose: Pose, nearest: str) -> Pose | None:
         """A pose that was verified with nothing but its support around; it is settled where anything else is near."""
-        engine, held, target = self._engine, errand.held, errand.target
+        engine, held, target = self._engine, request.held, request.target
         engine.set_pose(held, pose)
         if nearest and self._is_deep(held, nearest):
             return None
@@ -62,18 +62,20 @@ class PoseTrial:
         if other in self._scene.by_name and self._is_deep(held, other):
             return None
         if other:
-            return None if engine.penetrates(held) else self.settled(errand)
+            return None if engine.penetrates(held) else self.settled(request)
         # It was verified with both their joints shut: while they are, it is as free of the support as it was then.
         if any((*engine.joints(target), *engine.joints(held))) and self._is_deep(held, target):
             return None
-        return pose if self.holds(errand) else self.settled(errand)
+        return pose if self.holds(request) else self.settled(request)
 
-    def proved(self, errand: Errand, spots: Spots, number: int, frames: Mapping[str, Pose]) -> Pose | None:
+    def proved(
+        self, request: PlacementRequest, options: CandidatePoses, number: int, frames: Mapping[str, Pose]
+    ) -> Pose | None:
         """Where the thing rests for certain, with nothing but its support within 5 mm; None when it takes a settle to tell."""
-        engine, held, target = self._engine, errand.held, errand.target
+        engine, held, target = self._engine, request.held, request.target
         one, other = self._scene.asset_of(held), self._scene.asset_of(target)
-        base = self._repertoire.base(one)
-        link, local = spots.ride(number)
+        base = self._options.base(one)
+        link, local = options.link_pose(number)
         if base is None or not is_level(frames[link]):
             return None
         fractions = engine.joints(target)
@@ -87,38 +89,38 @@ class PoseTrial:
         if engine.penetrates(held, NEAR_M, frozenset((target, FLOOR))):
             return None
         engine.set_pose(held, pose)
-        return pose if self.holds(errand) and self.reaches(errand) else None
+        return pose if self.holds(request) and self.reaches(request) else None
 
     def _is_deep(self, held: str, other: str) -> bool:
         gap_m = self._engine.gap(held, other, 0.0)
         return gap_m is not None and gap_m < -TOLERANCE_M
 
-    def settled(self, errand: Errand) -> Pose | None:
+    def settled(self, request: PlacementRequest) -> Pose | None:
         """Let the object go where it is and take the pose where it comes to rest, if all still holds there."""
-        settled = self._engine.settle(errand.held)
-        if not settled.stable or not self.is_free(errand, settled.pose, "") or not self.reaches(errand):
+        settled = self._engine.settle(request.held)
+        if not settled.stable or not self.is_free(request, settled.pose, "") or not self.reaches(request):
             return None
-        return settled.pose if self.holds(errand) else None
+        return settled.pose if self.holds(request) else None
 
-    def holds(self, errand: Errand) -> bool:
+    def holds(self, request: PlacementRequest) -> bool:
         """Whether the relation holds where the object is being tried."""
-        match errand.relation:
+        match request.relation:
             case Relation.ONTOP:
-                return self._relations.footings.would_be_on(errand.held, errand.target)
+                return self._relations.supports.would_be_on(request.held, request.target)
             case Relation.INSIDE:
-                return self._relations.footings.would_be_in(errand.held, errand.target)
+                return self._relations.supports.would_be_in(request.held, request.target)
             case _:
-                return self._relations.holds(errand.relation, errand.held, errand.target)
+                return self._relations.holds(request.relation, request.held, request.target)
 
-    def is_free(self, errand: Errand, pose: Pose, nearest: str) -> bool:
+    def is_free(self, request: PlacementRequest, pose: Pose, nearest: str) -> bool:
         """Put the object at the pose and tell whether it penetrates nothing there, ``nearest`` the least."""
-        self._engine.set_pose(errand.held, pose)
-        if nearest and self._is_deep(errand.held, nearest):
+        self._engine.set_pose(request.held, pose)
+        if nearest and self._is_deep(request.held, nearest):
             return False
-        return not self._engine.penetrates(errand.held)
+        return not self._engine.penetrates(request.held)
 
-    def reaches(self, errand: Errand) -> bool:
-        return in_reach(self._engine.aabb(errand.held), errand.robot)
+    def reaches(self, request: PlacementRequest) -> bool:
+        return in_reach(self._engine.aabb(request.held), request.robot)
 
 
 def in_reach(box: Aabb, robot: StandPose) -> bool:
