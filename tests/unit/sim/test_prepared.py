@@ -81,7 +81,7 @@ def _without(arrays, name):
         lambda arrays: arrays | {"1.owners": arrays["1.owners"] + 99},
         lambda arrays: arrays | {"1.covered": arrays["1.covered"][:, 1:]},
         lambda arrays: arrays | {"1.free": arrays["1.free"][1:]},
-        lambda arrays: arrays | {"1.is_panel": arrays["1.is_panel"].astype(np.float64)},
+        lambda arrays: arrays | {"1.leaves": arrays["1.leaves"].astype(np.float64)},
         lambda arrays: arrays | {"1.obstacles": arrays["1.obstacles"].ravel()},
     ],
 )

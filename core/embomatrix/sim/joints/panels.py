@@ -94,7 +94,7 @@ class DoorPanels:
         self._put([one + low * (other - one) for one, other in zip(free, barred, strict=True)])
 
     def restore(self) -> None:
-        """Undo the swing, bit by bit exact."""
+        """Undo the swing exactly, to the bit."""
         self._put(self._before)
         for item in self._carried_objects:
             self._engine.set_pose(item.name, item.before)
