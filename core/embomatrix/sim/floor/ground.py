@@ -1,4 +1,4 @@
-"""What stands on the floor, and where the robot fits between it: as the scene was loaded, and as it is now."""
+"""Obstacles on the floor and the free space between them, in the scene as loaded and now."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
     from embomatrix.sim.floor.prepared import PreparedScene
 
 ON_FLOOR_M: Final = 0.05
-"""A movable object whose underside is lower than this stands on the floor."""
+"""A movable object with a lower underside stands on the floor."""
 GRIDS_KEPT: Final = 2
-"""Floors in memory besides that of the start: a plan comes back to few, and each takes a megabyte in a house with a garden."""
+"""Floor layouts in memory besides the first: a plan returns to few; each takes 1 MB in a house with a garden."""
 LEAVES_KEPT: Final = 12
-"""Floors with doors and drawers open in memory, for each of these: they share most with one another."""
+"""Grids with open doors and drawers in memory per layout; most of their data is shared."""
 
 Floor = tuple[tuple[int, Pose | None], ...]
-"""Movable objects that stand on the floor otherwise than at the start: number and pose, None for what stands there no more."""
+"""Movable objects whose place on the floor differs from the start: number and pose, None if no longer there."""
 
 
 @dataclass(slots=True)
 class FloorLayout:
-    """A floor with its leaves shut: what blocking the way, where the robot fits, and where it does with leaves open."""
+    """Floor with all panels shut: obstacles, grid, and the grids with open panels."""
 
     obstacles: Obstacles
     grid: FloorGrid
@@ -40,14 +40,14 @@ class FloorLayout:
 
 
 class Ground:
-    """The floor in an engine's present state. Call ``refresh`` after anything on it has moved, or a leaf."""
+    """Floor in an engine's present state. Call ``refresh`` after objects or panels on it have moved."""
 
     def __init__(self, engine: PhysicsEngine, prepared: PreparedScene | None = None) -> None:
-        """``prepared`` was found before, in this scene as it was loaded."""
+        """``prepared`` was derived from this scene as loaded."""
         self._engine = engine
         self._scene = engine.scene
         self.numbers = {item.name: number for number, item in enumerate(self._scene.objects)}
-        """Of the scene's objects, by their names."""
+        """Numbers of the scene's objects by name."""
         self._parts: dict[str, AssetParts] = {}
         blocking = [item for item in self._scene.objects if item.fixed or self._on_floor(item.name)]
         self._on_floor_at_start = {self.numbers[item.name] for item in blocking if not item.fixed}
@@ -62,17 +62,17 @@ class Ground:
         self._at_start = FloorLayout(obstacles, grid, OrderedDict())
         self._kept: OrderedDict[Floor, FloorLayout] = OrderedDict()
         self._moved: dict[int, Pose | None] = {}
-        """As ``floor`` has them, in any order."""
+        """Unsorted entries of ``floor``."""
         self._open_panels = OpenPanels(engine)
         self._with_one_open: dict[OpenJoints, FloorGrid] = {}
-        """Where the robot fits on the floor of the start with the leaves of one more object wide open."""
+        """Grids of the initial floor with the panels of one more object wide open."""
         self._round, self._read = -1, 0
         self._current: FloorLayout | None = None
         self._now: FloorGrid | None = None
         self.refresh()
 
     def refresh(self) -> None:
-        """Bring the floor up to date. States seen before cost a look-up."""
+        """Update the floor. States seen before cost a look-up."""
         journal = self._engine.journal
         if journal.rounds != self._round:
             self._moved.clear()
@@ -86,36 +86,36 @@ class Ground:
                 self._compare(number)
         self._read = len(journal.entries)
         self.floor: Floor = tuple(sorted(self._moved.items())) if self._moved else ()
-        """What stands on the floor otherwise than at the start."""
+        """Movable objects whose place on the floor differs from the start."""
         self.open_joints: OpenJoints = self._open_panels.open_now()
-        """Whose leaves stand open."""
+        """Fixed objects with open panels, and their joint positions."""
         self._current = self._now = None
 
     @property
     def _layout(self) -> FloorLayout:
-        """The floor as it is, made when it is asked for: after what is put down last, nobody drives."""
+        """Current layout, built on demand: after the last placement of a plan nobody drives."""
         if self._current is None:
             self._current = self._layout_of(self.floor) if self.floor else self._at_start
         return self._current
 
     @property
     def obstacles(self) -> Obstacles:
-        """What stands in the way, all leaves shut. For reading only."""
+        """Obstacles with all panels shut. Read-only."""
         return self._layout.obstacles
 
     @property
     def open_panels(self) -> Obstacles:
-        """Doors and drawers that stand open."""
+        """Doors and drawers that are open."""
         return self._open_panels.obstacles(self.open_joints)
 
     @property
     def shut(self) -> FloorGrid:
-        """Where the robot would fit if all leaves were shut."""
+        """Grid with all panels shut."""
         return self._layout.grid
 
     @property
     def grid(self) -> FloorGrid:
-        """Where the robot fits, made when it is asked for: many doors are shut again before it drives."""
+        """Grid now, built on demand: many doors are shut again before the robot drives."""
         if self._now is None and not self.open_joints:
             self._now = self._layout.grid
         if self._now is None:
@@ -124,9 +124,9 @@ class Ground:
         return self._now
 
     def warm_up(self) -> Iterator[None]:
-        """Find out where the robot fits with the leaves of each object wide open, one object at a step.
+        """Build the grid with each object's panels wide open, one object per step. Changes no answer.
 
-        Work for a process that waits. Changes no answer: most plans open one thing, and most of these are opened again.
+        Most plans open one object, and mostly the same ones.
         """
         for joints in self._open_panels.each_open():
             panels = self._open_panels.obstacles(joints)
@@ -134,7 +134,7 @@ class Ground:
             yield
 
     def _narrowed(self) -> FloorGrid:
-        """The floor with the leaves that stand open now."""
+        """Grid with the panels that are open now."""
         kept = self._layout.narrowed
         if self.open_joints not in kept:
             kept[self.open_joints] = self.shut.narrowed(self.open_panels.blocking)
@@ -145,15 +145,15 @@ class Ground:
 
     @property
     def at_start(self) -> tuple[Obstacles, FloorGrid]:
-        """``obstacles`` and ``shut`` in the scene as it was loaded. For reading only."""
+        """``obstacles`` and ``shut`` in the scene as loaded. Read-only."""
         return self._at_start.obstacles, self._at_start.grid
 
     def with_shut(self, number: int) -> FloorGrid:
-        """Where the robot would fit if the leaves of one object were shut."""
+        """Grid if one object's panels were shut."""
         return self.shut.narrowed(self.open_panels.without([number]).blocking)
 
     def _compare(self, number: int) -> None:
-        """Note whether a movable object stands on the floor otherwise than at the start."""
+        """Record a movable object whose place on the floor differs from the start."""
         item = self._scene.objects[number]
         pose = self._engine.pose(item.name) if self._on_floor(item.name) else None
         before = item.pose_world_asset if number in self._on_floor_at_start else None

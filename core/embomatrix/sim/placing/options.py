@@ -1,4 +1,4 @@
-"""Where one thing may stand on, in or under another, before anything else is looked at: verified poses and fresh ones."""
+"""Candidate poses of one object on, in or under another: verified poses and fresh ones, independent of the world's state."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 PLACED: Final = (Relation.ONTOP, Relation.INSIDE, Relation.UNDER)
-"""The relations that placing brings about."""
+"""Relations that placing creates."""
 
 
 class CandidatePoses:
-    """Poses of one asset in the frames of a support's links. ``local`` gives a pose by its number."""
+    """Poses of one asset in the frames of a support's links. ``local`` returns a pose by its number."""
 
     def __init__(
         self,
@@ -46,7 +46,7 @@ class CandidatePoses:
         boxes: LinkBoxes,
         places: Callable[[], PoseSet],
     ) -> None:
-        """``boxes`` are those of the asset with its joints shut. ``places`` makes the poses as arrays, for other joints."""
+        """``boxes`` are those of the asset with its joints shut. ``places`` builds the poses as arrays, for other joints."""
         self._local = local
         self._links = links
         self._boxes = boxes
@@ -56,19 +56,19 @@ class CandidatePoses:
         return len(self._links)
 
     def pose(self, number: int, frames: Mapping[str, Pose]) -> Pose:
-        """A pose in the world. Raises KeyError when its link has no frame."""
+        """Pose in the world. Raises KeyError if its link has no frame."""
         return frames[self._links[number]] @ self._local(number)
 
     def link_pose(self, number: int) -> tuple[str, Pose]:
-        """The link that a pose rides on, and the pose in that link's frame."""
+        """Link that carries a pose, and the pose in that link's frame."""
         return self._links[number], self._local(number)
 
     def world_boxes(
         self, bounds: AssetBounds, fractions: Sequence[float], frames: Mapping[str, Pose]
     ) -> PoseBoxes:
-        """Boxes at all the poses in the world, of the asset with these bounds; at infinity on links without a frame.
+        """World boxes at all the poses, of the asset with these bounds; at infinity on links without a frame.
 
-        Furniture stands square to the world: there the boxes in its frame are those in the world, but for a quarter turn.
+        Furniture stands square to the world: there a box in its frame is a world box after quarter turns.
         """
         square = None if any(fractions) else self._boxes.world_boxes(frames)
         return square if square is not None else self._places().world_boxes(bounds, fractions, frames)
@@ -76,7 +76,7 @@ class CandidatePoses:
 
 @dataclass(frozen=True, slots=True)
 class SurfacePattern:
-    """Where one asset fits on another by geometry alone; ``middles`` and ``boxes`` are of one pose for each patch."""
+    """Fit of one asset on another by geometry alone; ``middles`` and ``boxes`` hold one pose per patch."""
 
     patches: tuple[Patch, ...]
     middles: PoseSet
@@ -84,7 +84,7 @@ class SurfacePattern:
 
 
 class PlacementOptions:
-    """The poses that a cache and the surfaces of a scene's assets offer. Depends on no state of the world."""
+    """Candidate poses from a pose cache and from the surfaces of a scene's assets."""
 
     def __init__(self, scene: Scene, cache: PoseCache) -> None:
         self._scene = scene
@@ -96,10 +96,7 @@ class PlacementOptions:
         self._patterns: dict[PlacementKey, SurfacePattern] = {}
 
     def warm_up(self, tables: Iterable[Sequence[str]]) -> Iterator[None]:
-        """Look up what was verified for the things and supports of each table, one pair of assets at a step.
-
-        Work for a process that waits. Changes no answer.
-        """
+        """Look up the verified poses for the objects and supports of each table, one pair per step. Changes no answer."""
         scene = self._scene
         for table in tables:
             movable = [name for name in table if not scene.by_name[name].fixed]
@@ -111,7 +108,7 @@ class PlacementOptions:
                 yield
 
     def verified(self, held: str, target: str, relation: Relation) -> Iterator[CandidatePoses]:
-        """Spots verified for this pair of assets, then those verified for the footprint of what is held."""
+        """Poses verified for this pair of assets, then those verified for the footprint of the held object."""
         one, other = self._scene.asset_of(held), self._scene.asset_of(target)
         key = PlacementKey(one.asset_id, other.asset_id, relation)
         if key not in self._exact:
@@ -124,7 +121,7 @@ class PlacementOptions:
         yield self._by_class[key]
 
     def fresh(self, held: str, target: str, relation: Relation, shift: Vec2, tries: int) -> CandidatePoses:
-        """At most so many poses by geometry alone, spread over the surfaces; ``shift`` moves the whole pattern."""
+        """Return up to ``tries`` poses by geometry alone, spread over the surfaces; ``shift`` moves the whole pattern."""
         one, other = self._scene.asset_of(held), self._scene.asset_of(target)
         key = PlacementKey(one.asset_id, other.asset_id, relation)
         pattern = self._patterns.get(key)
@@ -136,13 +133,13 @@ class PlacementOptions:
         return _spread(pattern, shift, tries)
 
     def base(self, asset: Asset) -> Base | None:
-        """What the asset stands on when it stands upright, as ``statics`` has it."""
+        """Contact polygon of the upright asset; see ``statics``."""
         if asset.asset_id not in self._bases:
             self._bases[asset.asset_id] = base_of(asset)
         return self._bases[asset.asset_id]
 
     def footprint(self, asset: Asset) -> tuple[str, Pose]:
-        """Name of the footprint class of an asset, "" without one, and the asset's pose in the frame of the class's box."""
+        """Footprint class of an asset ("" for none), and the asset's pose in the frame of the class's box."""
         known = self._footprints.get(asset.asset_id)
         if known is None:
             key = PlacementKey(asset.asset_id, LEVEL_FLOOR.asset_id, Relation.ONTOP)
@@ -162,9 +159,9 @@ NO_CANDIDATES: Final = CandidatePoses(
 
 
 def _spots(rows: FloatArray, then: Pose, held: Asset, support: Asset, relation: Relation) -> CandidatePoses:
-    """Spots at poses in the frame of a support with its joints shut; ``then`` is the thing's pose in each of their frames.
+    """Candidates at poses in the frame of a support with its joints shut.
 
-    ``rows``, shape (n, 7), are positions and quaternions.
+    ``rows``, shape (n, 7), are positions and quaternions; ``then`` is the object's pose in each of their frames.
     """
     if not len(rows):
         return NO_CANDIDATES
@@ -183,12 +180,12 @@ def _spots(rows: FloatArray, then: Pose, held: Asset, support: Asset, relation: 
         x, y, z, a, b, c, d = rows[number].tolist()
         return Pose((x, y, z), (a, b, c, d)) @ then
 
-    # Kept are the boxes only: what makes the arrays anew is asked where something stands askew, or is placed half open.
+    # Only the boxes are kept. The arrays are rebuilt for the rare support that is tilted or object that is placed half open.
     return CandidatePoses(local, links, boxes, lambda: PoseSet.of(rows, links, then))
 
 
 def _spread(pattern: SurfacePattern, shift: Vec2, tries: int) -> CandidatePoses:
-    """Spots at so many poses, the patches taken in turn."""
+    """Candidates at ``tries`` poses, the patches taken in turn."""
     found, middles = pattern.patches, pattern.middles
     points = proposed_places(found, shift, tries)
     links = [patch.link for patch in islice(cycle(found), len(points))]

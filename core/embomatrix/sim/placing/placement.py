@@ -1,4 +1,4 @@
-"""Where a held object goes when it is placed: the first verified pose that is still free and in reach."""
+"""Placement of a held object: the first verified pose that is still free and in reach."""
 
 from __future__ import annotations
 
@@ -31,21 +31,20 @@ if TYPE_CHECKING:
     from embomatrix.world.poses import PoseCache, StandPose
 
 LIVE_TRIES: Final = 64
-"""Candidates looked at beyond the cached ones."""
+"""Candidates tried beyond the cached ones."""
 LIVE_SETTLES: Final = 8
-"""How many of them are simulated at most."""
+"""Most of these candidates that are simulated."""
 LINES_LOOKED_AT: Final = 8
-"""How many poses without a line of approach are put off until others were looked at."""
+"""Poses without a line of approach that are deferred behind others."""
 HIGH_RIM_M: Final = ROBOT.reach_high_m - ROBOT.extent_m / 2
-"""Over a rim that is no higher than this the arm lifts whatever it can hold."""
+"""Highest rim over which the arm lifts any object it can hold."""
 
 
 class Placer:
     """Finds terminal poses in an engine's present state.
 
-    A pose that is returned has the relation asked for, penetrates nothing, is within the robot's reach and stable: verified
-    offline or proved by statics, with nothing but its support within 5 mm, or settled now. Doors in the way are the caller's
-    to check.
+    A returned pose has the requested relation, penetrates nothing, is within the robot's reach and is stable: verified offline
+    or proved by statics with nothing but its support within 5 mm, or settled now. The caller checks for doors in the way.
     """
 
     def __init__(
@@ -55,7 +54,7 @@ class Placer:
         cache: PoseCache,
         navigator: Navigator | None = None,
     ) -> None:
-        """With a ``navigator`` poses from which the robot could take the object back come before those that are cut off."""
+        """``navigator`` puts poses first from which the robot could take the object back."""
         self._engine = engine
         self._relations = relations
         self._navigator = navigator
@@ -65,10 +64,7 @@ class Placer:
         self._reached = cache.reached
 
     def warm_up(self) -> Iterator[None]:
-        """Find out what everything stands on, and where the parts of what it may be put on are, one asset at a step.
-
-        Work for a process that waits. Changes no answer.
-        """
+        """Compute footprints, contact polygons and part boxes, one asset per step. Changes no answer."""
         movable = {item.asset_id for item in self._scene.objects if not item.fixed}
         for asset_id, asset in self._scene.assets.items():
             if asset_id in movable:
@@ -79,10 +75,7 @@ class Placer:
             yield
 
     def look_up(self, tables: Iterable[Sequence[str]]) -> Iterator[None]:
-        """Look up where the things of each table may be put on its supports, one pair of assets at a step.
-
-        Work for a process that waits. Changes no answer.
-        """
+        """Look up placements of the objects of each table on its supports, one pair per step. Changes no answer."""
         return self._options.warm_up(tables)
 
     def find(
@@ -94,11 +87,10 @@ class Placer:
         rng: np.random.Generator | None = None,
         excluded_stands: tuple[StandPose, ...] = (),
     ) -> Pose | FailureReason:
-        """Pose for a parked object on, in or under another, or why there is none.
+        """Return a pose for a parked object on, in or under another, or the reason for none.
 
-        The order of the poses follows from ``rng``; without one it is the cache's. Poses within reach of the standing poses
-        ``passed_over`` are not looked at. The world is left as it was. Raises EngineError for names that the engine does not
-        know.
+        ``rng`` orders the poses; without one the cache's order holds. Poses within reach of ``excluded_stands`` are skipped.
+        The world is left unchanged. Raises EngineError for unknown names.
         """
         found = self.choices(held, target, relation, robot, rng, most=1, excluded_stands=excluded_stands)
         return found if isinstance(found, FailureReason) else found[0]
@@ -114,7 +106,7 @@ class Placer:
         most: int,
         excluded_stands: tuple[StandPose, ...] = (),
     ) -> tuple[Pose, ...] | FailureReason:
-        """The first poses, at least one and at most ``most``, that ``find`` would choose from, in its order."""
+        """First poses in the order of ``find``, at least one and at most ``most``."""
         if held == target or self._engine.is_parked(target):
             return FailureReason.PLACE_ON_ITSELF
         fails = FailureReason.NO_CAVITY if relation is Relation.INSIDE else FailureReason.NO_SURFACE
@@ -132,13 +124,13 @@ class Placer:
         return FailureReason.NO_FREE_POSE if self._fits(held, target, relation) else fails
 
     def has_verified(self, held: str, target: str, relation: Relation) -> bool:
-        """Whether any pose was verified for the one on, in or under the other."""
+        """Return True if any pose was verified for this pair and relation."""
         return held != target and any(map(len, self._options.verified(held, target, relation)))
 
     def verified(
         self, held: str, target: str, relation: Relation, robot: StandPose, most: int
     ) -> tuple[tuple[int, Pose], ...]:
-        """As ``choices``, but only of the first set of verified poses that is not empty, with their numbers in that set."""
+        """Apply ``choices`` to the first non-empty set of verified poses; each pose comes with its number in the set."""
         request = PlacementRequest(held, target, relation, robot)
         sets = (options for options in self._options.verified(held, target, relation) if len(options))
         options = next(sets, None)
@@ -153,16 +145,16 @@ class Placer:
             self._engine.park(held)
 
     def _fits(self, held: str, target: str, relation: Relation) -> bool:
-        """Whether there is any pose for the one on, in or under the other when nothing else is there."""
+        """Return True if a pose exists when nothing else is there."""
         if self.has_verified(held, target, relation):
             return True
         one, other = self._scene.asset_of(held), self._scene.asset_of(target)
         return any(True for _ in candidates(one, other, relation, (0.5, 0.5), LIVE_TRIES))
 
     def _search(self, request: PlacementRequest, rng: np.random.Generator | None) -> Iterator[Pose]:
-        """Good poses: of those verified for the pair, then for the footprint's class, then of fresh ones.
+        """Accepted poses: verified for the pair, then for the footprint class, then fresh ones.
 
-        Of the first set that comes first which the arm was seen to get at, while the target is where the scene has it.
+        In the first set, the pose that the arm reached in the analysis comes first while the target is where the scene has it.
         """
         frames = self._frames(request)
         reached = self._reached_in_set(request)
@@ -179,7 +171,7 @@ class Placer:
         yield from self._fresh(request, frames, rng)
 
     def _takeable_first(self, request: PlacementRequest, poses: Iterator[Pose]) -> Iterator[Pose]:
-        """Good poses: those that the robot has a line of approach to before some others, unless the arm was asked already."""
+        """Poses with a line of approach before a few others, unless the arm was checked already."""
         if self._navigator is None or self._reached_in_set(request) is not None:
             yield from poses
             return
@@ -199,7 +191,7 @@ class Placer:
         yield from poses
 
     def _reached_in_set(self, request: PlacementRequest) -> int | None:
-        """Number of the pose that the arm was seen to get at, in the first set that is not empty."""
+        """Number of the pose that the arm reached in the analysis, in the first non-empty set."""
         if not self._reached:
             return None
         before = self._scene.by_name[request.target].pose_world_asset
@@ -214,7 +206,7 @@ class Placer:
         frames: dict[str, Pose],
         order: Sequence[int],
     ) -> Iterator[tuple[int, Pose]]:
-        """Good ones of a set's poses, each with its number."""
+        """Accepted poses of a set, each with its number."""
         for number, nearest in self._roomy_first(request, options, frames, order):
             found = self._trial.verified(request, options.pose(number, frames), nearest)
             if found is not None:
@@ -223,7 +215,7 @@ class Placer:
     def _fresh(
         self, request: PlacementRequest, frames: dict[str, Pose], rng: np.random.Generator | None
     ) -> Iterator[Pose]:
-        """Poses for pairs that the analysis did not foresee, and on surfaces that have filled up."""
+        """Poses for pairs that the analysis did not cover, and on surfaces that have filled up."""
         shift = (0.5, 0.5) if rng is None else (float(rng.random()), float(rng.random()))
         options = self._options.fresh(request.held, request.target, request.relation, shift, LIVE_TRIES)
         settles = 0
@@ -250,10 +242,10 @@ class Placer:
         frames: dict[str, Pose],
         order: Sequence[int],
     ) -> Iterator[tuple[int, str]]:
-        """Those in reach: first those around which there is nothing but the target, then the others, the handy ones before.
+        """Candidates in reach: first those with nothing but the target around, then the others; handy ones lead each group.
 
-        With each of the others comes the object that it is most likely to meet. Boxes decide that, so it is cheap; what is
-        really free is looked at later. Where something stands for sure is left out.
+        Each of the others comes with the object it most likely meets. This coarse test uses boxes only; candidates that
+        certainly collide are left out.
         """
         if not order:
             return
@@ -286,7 +278,7 @@ class Placer:
                 yield number, near[nearest]
 
     def _served(self, request: PlacementRequest, boxes: PoseBoxes, stand: StandPose) -> BoolArray:
-        """Which boxes, shape (n,), the arm reaches from a standing pose, over the target's rim and past its open doors."""
+        """Tell for each box, shape (n,), if the arm reaches it over the target's rim and past its open doors."""
         target = request.target
         asset, fractions = self._scene.asset_of(target), self._engine.joints(target)
         reached = boxes.reached_from(stand)
@@ -298,7 +290,7 @@ class Placer:
         return reached
 
     def _frames(self, request: PlacementRequest) -> dict[str, Pose]:
-        """Frame of each link of the target on which something can be placed; not of a drawer that is shut."""
+        """Frame of each link of the target that can carry objects; shut drawers are left out."""
         asset = self._scene.asset_of(request.target)
         pose, fractions = self._engine.pose(request.target), self._engine.joints(request.target)
         shut = {

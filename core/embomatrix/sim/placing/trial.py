@@ -1,4 +1,4 @@
-"""Whether a pose will do for an object that is placed: looked at where it is tried, in the engine's present state."""
+"""Trial of a pose for an object that is placed, in the engine's present state."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from embomatrix.world.poses import StandPose
 
 UNDISTURBED_M: Final = 0.005
-"""A pose that was verified offline is settled again when anything but its support is this near."""
+"""A pose verified offline is settled again if anything but its support is this near."""
 NEAR_M: Final = UNDISTURBED_M + TOLERANCE_M
-"""The margin of a question after what is that near: one about penetration forgives the tolerance."""
+"""Margin for penetration queries at this distance, which subtract the tolerance."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlacementRequest:
-    """What is to be placed where, and from which standing pose it must be in reach."""
+    """Request to place an object: relation, target and the standing pose that must reach it."""
 
     held: str
     target: str
@@ -41,9 +41,9 @@ class PlacementRequest:
 
 
 class PoseTrial:
-    """Tries poses of a held object in an engine: it is left where it was tried last.
+    """Tries poses of a held object in an engine and leaves the object where it was tried last.
 
-    A pose that is given back has the request's relation, penetrates nothing, is within the robot's reach and stable.
+    A returned pose has the requested relation, penetrates nothing, is within the robot's reach and is stable.
     """
 
     def __init__(self, engine: PhysicsEngine, relations: Relations, options: PlacementOptions) -> None:
@@ -53,7 +53,7 @@ class PoseTrial:
         self._options = options
 
     def verified(self, request: PlacementRequest, pose: Pose, nearest: str) -> Pose | None:
-        """A pose that was verified with nothing but its support around; it is settled where anything else is near."""
+        """Accept a pose that was verified with nothing but its support around; settle it if anything else is near."""
         engine, held, target = self._engine, request.held, request.target
         engine.set_pose(held, pose)
         if nearest and self._is_deep(held, nearest):
@@ -63,7 +63,7 @@ class PoseTrial:
             return None
         if other:
             return None if engine.penetrates(held) else self.settled(request)
-        # It was verified with both their joints shut: while they are, it is as free of the support as it was then.
+        # The pose was verified with all joints shut: while they are, the object is free of its support.
         if any((*engine.joints(target), *engine.joints(held))) and self._is_deep(held, target):
             return None
         return pose if self.holds(request) else self.settled(request)
@@ -71,7 +71,7 @@ class PoseTrial:
     def proved(
         self, request: PlacementRequest, options: CandidatePoses, number: int, frames: Mapping[str, Pose]
     ) -> Pose | None:
-        """Where the thing rests for certain, with nothing but its support within 5 mm; None when it takes a settle to tell."""
+        """Rest pose by statics with nothing but the support within 5 mm; None if only a settle can tell."""
         engine, held, target = self._engine, request.held, request.target
         one, other = self._scene.asset_of(held), self._scene.asset_of(target)
         base = self._options.base(one)
@@ -84,7 +84,7 @@ class PoseTrial:
             return None
         pose = engine.pose(target) @ rest
         x, y, z = pose.position_m
-        # Looked at a margin higher up, where what lies below its underside, as the table under a sheet, is far enough away.
+        # Checked slightly higher, out of range of objects below the support, such as the table under a sheet.
         engine.set_pose(held, Pose((x, y, z + NEAR_M), pose.quat_xyzw))
         if engine.penetrates(held, NEAR_M, frozenset((target, FLOOR))):
             return None
@@ -96,14 +96,14 @@ class PoseTrial:
         return gap_m is not None and gap_m < -TOLERANCE_M
 
     def settled(self, request: PlacementRequest) -> Pose | None:
-        """Let the object go where it is and take the pose where it comes to rest, if all still holds there."""
+        """Let the object settle and accept the pose if all conditions still hold."""
         settled = self._engine.settle(request.held)
         if not settled.stable or not self.is_free(request, settled.pose, "") or not self.reaches(request):
             return None
         return settled.pose if self.holds(request) else None
 
     def holds(self, request: PlacementRequest) -> bool:
-        """Whether the relation holds where the object is being tried."""
+        """Return True if the relation holds at the pose under trial."""
         match request.relation:
             case Relation.ONTOP:
                 return self._relations.supports.would_be_on(request.held, request.target)
@@ -113,7 +113,7 @@ class PoseTrial:
                 return self._relations.holds(request.relation, request.held, request.target)
 
     def is_free(self, request: PlacementRequest, pose: Pose, nearest: str) -> bool:
-        """Put the object at the pose and tell whether it penetrates nothing there, ``nearest`` the least."""
+        """Put the object at the pose. Return True if it penetrates nothing; ``nearest`` is checked first."""
         self._engine.set_pose(request.held, pose)
         if nearest and self._is_deep(request.held, nearest):
             return False
@@ -124,7 +124,7 @@ class PoseTrial:
 
 
 def in_reach(box: Aabb, robot: StandPose) -> bool:
-    """Whether the arm reaches the nearest point of a box in the plane, and its middle's height."""
+    """Return True if the arm reaches the nearest point of a box in the plane, and the height of its middle."""
     dx = max(box.low_m[0] - robot.x_m, robot.x_m - box.high_m[0], 0.0)
     dy = max(box.low_m[1] - robot.y_m, robot.y_m - box.high_m[1], 0.0)
     height = box.center_m[2]
