@@ -23,9 +23,12 @@ from embomatrix.cli.examinee import Chosen, Questions, asked_of
 from embomatrix.cli.failure import INTERRUPTED, fail
 from embomatrix.host.cores import usable_cores
 from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.cluster.executor import ClusterExecutor
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.eai.exam import CODEC as EAI_CODEC
 from embomatrix.trainer.eai.exam import NAME as NATIVE
 from embomatrix.trainer.eai.exam import NativeExam
+from embomatrix.trainer.evaluation.answer_sources import questions_digest
 from embomatrix.trainer.evaluation.answers import (
     FILE,
     MOST_SAMPLES,
@@ -35,14 +38,11 @@ from embomatrix.trainer.evaluation.answers import (
     ordered,
     read_answers,
 )
-from embomatrix.trainer.evaluation.asking import questions_digest
 from embomatrix.trainer.evaluation.baselines import BaselineName
 from embomatrix.trainer.evaluation.benchmark import find_benchmark
-from embomatrix.trainer.evaluation.cluster import ClusterExecutor
 from embomatrix.trainer.evaluation.exam import WorldExam
 from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
-from embomatrix.trainer.run.errors import TrainerError
 from embomatrix.world.task import Profile
 from embomatrix.world.whole_file import write_whole
 

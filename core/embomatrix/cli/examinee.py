@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.eai.exam import NAME as NATIVE
 from embomatrix.trainer.eai.exam import NativeExam
-from embomatrix.trainer.evaluation.asking import EndpointAsker, PolicyAsker, WriterAsker
+from embomatrix.trainer.evaluation.answer_sources import EndpointAsker, PolicyAsker, WriterAsker
 from embomatrix.trainer.evaluation.baselines import BaselineName, baseline_for
 from embomatrix.trainer.evaluation.exam import WorldExam
-from embomatrix.trainer.run.errors import TrainerError
 from embomatrix.world.task import MAX_TABLE
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.trainer.evaluation.asking import Asker
+    from embomatrix.trainer.evaluation.answer_sources import Asker
     from embomatrix.trainer.evaluation.exam import Exam
     from embomatrix.world.task import Profile
 

@@ -13,9 +13,9 @@ from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.adapters import openrlhf, rows, verl
 from embomatrix.trainer.adapters.scorer import PlanScorer, scorer_for
 from embomatrix.trainer.adapters.trl import AnnouncedSampler, ClusterLookahead, ClusterReward, text_of
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.data.tasks import load_tasks
 from embomatrix.trainer.policy.prompts import plan_text
-from embomatrix.trainer.run.data import load_tasks
-from embomatrix.trainer.run.errors import TrainerError
 from embomatrix.world.task import Profile
 
 TASKS = make_tasks(6, 1)

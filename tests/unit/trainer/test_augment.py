@@ -5,8 +5,8 @@ import pytest
 from tests.fakes.symbolic_household import make_tasks, run_plan
 
 from embomatrix.skills.prompt import Codec, plan_in_names, prompt_for
-from embomatrix.trainer.grpo.rollout import parsed
-from embomatrix.trainer.imitation.augment import Variation, used_rows, varied, with_fewer_bystanders
+from embomatrix.trainer.cluster.gateway import parsed
+from embomatrix.trainer.data.variation import Variation, used_rows, varied, with_fewer_bystanders
 
 TASKS = make_tasks(40, 0)
 VARIATION = Variation(TASKS.kinds, rename=1.0)

@@ -13,7 +13,7 @@ from embomatrix.bench.report.figures import BenchError
 from embomatrix.bench.trainer.load import load_of, read_load, write_load
 from embomatrix.bench.trainer.measure import Shares, bench_trainer, seconds_told
 from embomatrix.bench.trainer.own_steps import measure, policy_of
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
 
 TASKS = make_tasks(3, 0, objects=6).train
 SMALL = {"tasks": 2, "group": 3, "new": 4, "steps": 2, "layers": 1, "width": 32, "heads": 2, "inner": 32}

@@ -10,15 +10,15 @@ from rich.console import Console
 from tests.fakes.symbolic_household import SymbolicCluster
 from tests.unit.trainer.test_loop import TASKS, run, weights
 
-from embomatrix.trainer.logging.progress import LineDisplay
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import read_settings
+from embomatrix.trainer.grpo.data_parallel import Crew
+from embomatrix.trainer.grpo.learner import Learner
+from embomatrix.trainer.grpo.shared_memory import SharedTensors
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore
+from embomatrix.trainer.logging.display import LineDisplay
 from embomatrix.trainer.logging.recorder import read_metrics
-from embomatrix.trainer.parallel.data_parallel import Crew
-from embomatrix.trainer.parallel.learner import Learner
-from embomatrix.trainer.parallel.shared_memory import SharedTensors
-from embomatrix.trainer.policy.choice import new_policy
-from embomatrix.trainer.run.checkpoint import CHECKPOINTS, CheckpointStore
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.settings import read_settings
+from embomatrix.trainer.policy.loading import new_policy
 
 FAST = {"imitation__steps": 20, "grpo__steps": 4, "checkpoint_every": 2}
 

@@ -12,8 +12,9 @@ from tests.fakes.executors import HereExecutor
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.evaluation.answer_sources import EndpointAsker, WriterAsker, questions_digest
 from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, EvaluationSetup, read_answers
-from embomatrix.trainer.evaluation.asking import EndpointAsker, WriterAsker, questions_digest
 from embomatrix.trainer.evaluation.baselines import BaselineName, baseline_for
 from embomatrix.trainer.evaluation.benchmark import find_benchmark
 from embomatrix.trainer.evaluation.exam import WorldExam
@@ -21,7 +22,6 @@ from embomatrix.trainer.evaluation.judging import AnswerJudge
 from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
 from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
-from embomatrix.trainer.run.errors import TrainerError
 from embomatrix.worker.slots.rollout_pool import RolloutPool
 from embomatrix.world.task import Profile
 

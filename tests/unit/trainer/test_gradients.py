@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 
-from embomatrix.trainer.parallel.gradients import GradientSum
+from embomatrix.trainer.grpo.gradients import GradientSum
 
 PARTS = [torch.tensor([scale, 1 / scale, 0.1]) for scale in (1e7, 3.0, 1e-7, 0.3, 1e3)]
 

@@ -14,21 +14,21 @@ from tests.fakes.small_llama import random_llama, word_tokenizer
 from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 
 from embomatrix.skills.prompt import Codec, prompt_for
+from embomatrix.trainer.cluster.gateway import Gateway
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, read_settings
+from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.evaluation.models import load_model
-from embomatrix.trainer.grpo.rollout import Gateway
-from embomatrix.trainer.imitation.augment import Variation
-from embomatrix.trainer.logging.progress import LineDisplay
+from embomatrix.trainer.lifecycle.checkpoint import CheckpointStore, TrainingProgress
+from embomatrix.trainer.logging.display import LineDisplay
 from embomatrix.trainer.logging.recorder import read_metrics
-from embomatrix.trainer.policy.choice import saved_policy
+from embomatrix.trainer.policy.compute_dtype import multiply_in
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.import_gguf import import_gguf
+from embomatrix.trainer.policy.loading import saved_policy
 from embomatrix.trainer.policy.lora import LoraShape
-from embomatrix.trainer.policy.products import multiply_in
 from embomatrix.trainer.policy.prompts import Teller
-from embomatrix.trainer.run.checkpoint import CheckpointStore, TrainingProgress
-from embomatrix.trainer.run.errors import TrainerError
 from embomatrix.trainer.run.loop import Parts, TrainingRun
-from embomatrix.trainer.run.settings import LANGUAGE_MODEL_DEFAULTS, read_settings
 from embomatrix.trainer.run.starting import usual_threads
 
 TASKS = make_tasks(6, 2, objects=8)

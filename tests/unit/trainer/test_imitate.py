@@ -9,18 +9,18 @@ import torch
 from rich.console import Console
 from tests.fakes.symbolic_household import make_tasks
 
-from embomatrix.trainer.imitation.augment import Variation
-from embomatrix.trainer.imitation.imitate import Imitation
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import read_settings
+from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.imitation.optimisers import ImitationOptimiser
-from embomatrix.trainer.imitation.phase import warm_up
-from embomatrix.trainer.logging.progress import LineDisplay, LiveDisplay
+from embomatrix.trainer.imitation.teacher_forcing import Imitation
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
+from embomatrix.trainer.logging.display import LineDisplay, LiveDisplay
 from embomatrix.trainer.logging.recorder import IMITATION, Recorder
-from embomatrix.trainer.policy.choice import new_policy, saved_policy
+from embomatrix.trainer.policy.loading import new_policy, saved_policy
 from embomatrix.trainer.policy.prompts import Teller
 from embomatrix.trainer.policy.tiny import TinyPolicy
-from embomatrix.trainer.run.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.settings import read_settings
+from embomatrix.trainer.run.imitation import warm_up
 
 TINY = {"tiny.layers": 1, "tiny.width": 32, "tiny.heads": 2, "tiny.inner": 64}
 SHORT = {"imitation.steps": 12, "imitation.batch": 4, "imitation.learning_rate": 8e-3}

@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from embomatrix.trainer.run.interrupts import Interrupts
+from embomatrix.trainer.lifecycle.interrupts import Interrupts
 
 
 def interrupt():

@@ -10,20 +10,20 @@ import torch
 from rich.console import Console
 from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 
-from embomatrix.trainer.grpo.rollout import Gateway
+from embomatrix.trainer.cluster.gateway import Gateway
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import OnLost, read_settings
+from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.grpo.update import Updater
-from embomatrix.trainer.imitation.augment import Variation
-from embomatrix.trainer.logging.progress import LineDisplay, LiveDisplay
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, read_state
+from embomatrix.trainer.lifecycle.stopwatch import Activity
+from embomatrix.trainer.logging.display import LineDisplay, LiveDisplay
+from embomatrix.trainer.logging.outcome import read_outcome
 from embomatrix.trainer.logging.recorder import read_metrics
 from embomatrix.trainer.logging.report import success_rows, time_rows
-from embomatrix.trainer.policy.choice import new_policy, saved_policy
+from embomatrix.trainer.policy.loading import new_policy, saved_policy
 from embomatrix.trainer.policy.prompts import Teller
-from embomatrix.trainer.run.checkpoint import CHECKPOINTS, CheckpointStore, read_state
-from embomatrix.trainer.run.errors import TrainerError
 from embomatrix.trainer.run.loop import REFERENCE, Parts, TrainingRun
-from embomatrix.trainer.run.outcome import read_outcome
-from embomatrix.trainer.run.settings import OnLost, read_settings
-from embomatrix.trainer.run.stopwatch import Activity
 
 TINY = {"tiny.layers": 2, "tiny.width": 32, "tiny.heads": 2, "tiny.inner": 64}
 SHORT = {

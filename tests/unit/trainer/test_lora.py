@@ -9,18 +9,18 @@ from tests.fakes.small_llama import random_llama, word_tokenizer
 from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 
 from embomatrix.skills.prompt import Codec, prompt_for
+from embomatrix.trainer.cluster.gateway import Gateway
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, Products, read_settings
+from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.evaluation.models import load_model
-from embomatrix.trainer.grpo.rollout import Gateway
-from embomatrix.trainer.imitation.augment import Variation
-from embomatrix.trainer.logging.progress import LineDisplay
-from embomatrix.trainer.policy.choice import new_policy, saved_policy
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, read_state
+from embomatrix.trainer.logging.display import LineDisplay
 from embomatrix.trainer.policy.hf import HfPolicy
+from embomatrix.trainer.policy.loading import new_policy, saved_policy
 from embomatrix.trainer.policy.lora import LoraShape, adapters
 from embomatrix.trainer.policy.prompts import Teller
-from embomatrix.trainer.run.checkpoint import CHECKPOINTS, CheckpointStore, read_state
-from embomatrix.trainer.run.errors import TrainerError
 from embomatrix.trainer.run.loop import REFERENCE, Parts, TrainingRun
-from embomatrix.trainer.run.settings import LANGUAGE_MODEL_DEFAULTS, Products, read_settings
 
 TASKS = make_tasks(6, 2, objects=8)
 SHAPE = LoraShape(rank=4, alpha=8.0)

@@ -10,11 +10,11 @@ from tests.fakes.symbolic_household import make_tasks
 
 from embomatrix.skills.prompt import Codec, PromptRow, plan_in_names, prompt_for
 from embomatrix.skills.syntax import PROFILES
-from embomatrix.trainer.grpo.rollout import parsed
+from embomatrix.trainer.cluster.gateway import parsed
 from embomatrix.trainer.policy.decoder import DecoderShape
 from embomatrix.trainer.policy.grammar import PlanGrammar
 from embomatrix.trainer.policy.tiny import TinyPolicy
-from embomatrix.trainer.policy.words import END, build_vocabulary
+from embomatrix.trainer.policy.vocabulary import END, build_vocabulary
 from embomatrix.world.task import Profile
 
 TASKS = make_tasks(12, 3)

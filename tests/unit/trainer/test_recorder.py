@@ -4,9 +4,9 @@ import json
 
 import pytest
 
+from embomatrix.trainer.config.errors import TrainerError, reason_of
+from embomatrix.trainer.lifecycle.checkpoint import whole_folder
 from embomatrix.trainer.logging.recorder import METRICS, SAMPLES, Recorder, read_metrics
-from embomatrix.trainer.run.checkpoint import whole_folder
-from embomatrix.trainer.run.errors import TrainerError, reason_of
 
 
 def test_steps_after_the_checkpoint_and_half_lines_are_forgotten(tmp_path):

@@ -8,9 +8,9 @@ from tests.unit.trainer.test_rollout import outcomes
 
 from embomatrix.rpc.status import PreconditionError, UnavailableError
 from embomatrix.rpc.training import TrainingReport
+from embomatrix.trainer.cluster.gateway import REPORTS_KEPT, Gateway
 from embomatrix.trainer.grpo.records import GroupLog
-from embomatrix.trainer.grpo.rollout import REPORTS_KEPT, Gateway
-from embomatrix.trainer.logging.reporting import SHOWN, Reporter
+from embomatrix.trainer.logging.dashboard import SHOWN, Reporter
 
 ORACLE_TASK = TASKS.train[0]
 

@@ -10,9 +10,9 @@ from embomatrix.reward.settings import RewardSettings
 from embomatrix.rpc.status import DeadlineError, ManagerUnreachableError, UnavailableError
 from embomatrix.rpc.wire.values import RunTerms
 from embomatrix.skills.prompt import Codec, plan_in_names
-from embomatrix.trainer.grpo.rollout import Gateway, waited
-from embomatrix.trainer.run.data import Schedule, group_seed
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.cluster.gateway import Gateway, waited
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.data.tasks import Schedule, group_seed
 
 TASKS = make_tasks(6, 2)
 TASK = TASKS.train[0]

@@ -2,8 +2,8 @@
 
 import pytest
 
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.settings import read_settings
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import read_settings
 
 
 def test_file_stands_above_defaults_and_below_options(tmp_path):

@@ -8,11 +8,11 @@ from tests.fakes.datasets import write_kitchen_dataset
 from tests.fakes.small_llama import random_llama, word_tokenizer
 
 from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.data.tasks import load_tasks
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, read_state
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.run import starting
-from embomatrix.trainer.run.checkpoint import CHECKPOINTS, CheckpointStore, read_state
-from embomatrix.trainer.run.data import load_tasks
-from embomatrix.trainer.run.errors import TrainerError
 from embomatrix.trainer.run.starting import resumed, started
 
 SMALL = {"tiny.layers": 1, "tiny.width": 16, "tiny.heads": 2, "tiny.inner": 16, "threads": 1}

@@ -7,10 +7,10 @@ import torch
 from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 from tests.unit.trainer.test_loop import run, weights
 
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import Overlap
 from embomatrix.trainer.grpo.objective import LossKind
 from embomatrix.trainer.logging.recorder import read_metrics
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.settings import Overlap
 
 TASKS = make_tasks(10, 0, objects=10)
 

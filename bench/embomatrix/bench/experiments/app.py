@@ -32,9 +32,9 @@ from embomatrix.cli.failure import fail
 from embomatrix.cli.foreground import no_problem, run_command
 from embomatrix.host.cores import usable_cores
 from embomatrix.pages.figures import figure_to_json, shown
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.logging.outcome import OUTCOME, read_outcome
 from embomatrix.trainer.logging.recorder import read_metrics
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.outcome import OUTCOME, read_outcome
 from embomatrix.trainer.run.starting import usual_threads
 from embomatrix.world.whole_file import write_whole
 
@@ -305,7 +305,7 @@ def _check_settings(design: Design) -> None:
     """A setting that is none is refused before anything is computed. Raises TrainerError."""
     import tomllib
 
-    from embomatrix.trainer.run.settings import checked_settings
+    from embomatrix.trainer.config.settings import checked_settings
 
     for arm in design.arms:
         checked_settings(tomllib.loads(toml_of({**design.shared, **arm.settings})))

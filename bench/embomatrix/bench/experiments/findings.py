@@ -15,7 +15,7 @@ from embomatrix.trainer.evaluation.intervals import Interval, bootstrap
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from embomatrix.trainer.run.outcome import RunOutcome, TaskRate
+    from embomatrix.trainer.logging.outcome import RunOutcome, TaskRate
 
 BINS: Final = 10
 """A curve is told by the means over so many stretches of a run, each of as many steps."""

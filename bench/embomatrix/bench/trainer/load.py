@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.skills.prompt import Codec, limited, prompt_for
 from embomatrix.skills.syntax import PROFILES, PlaceRelation
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.world.task import Profile
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from embomatrix.trainer.run.data import TrainingTask
+    from embomatrix.trainer.data.tasks import TrainingTask
 
 END: Final = "<end>"
 UNKNOWN: Final = "<unknown>"

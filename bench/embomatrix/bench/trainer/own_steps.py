@@ -18,22 +18,22 @@ import torch
 from embomatrix.bench.trainer.load import END, ROWS, UNKNOWN, Load, read_load
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.skills.prompt import Codec
-from embomatrix.trainer.grpo.rollout import PlanOutcome
+from embomatrix.trainer.cluster.gateway import PlanOutcome
+from embomatrix.trainer.config.settings import GrpoSettings
+from embomatrix.trainer.data.tasks import load_tasks
+from embomatrix.trainer.data.variation import Variation
+from embomatrix.trainer.grpo.data_parallel import Crew
+from embomatrix.trainer.grpo.learner import Learner
 from embomatrix.trainer.grpo.update import StepPlan, Updater
-from embomatrix.trainer.imitation.augment import Variation
-from embomatrix.trainer.parallel.data_parallel import Crew
-from embomatrix.trainer.parallel.learner import Learner
+from embomatrix.trainer.lifecycle.stopwatch import Stopwatch
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.prompts import Teller
-from embomatrix.trainer.run.data import load_tasks
-from embomatrix.trainer.run.settings import GrpoSettings
-from embomatrix.trainer.run.stopwatch import Stopwatch
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from embomatrix.skills.prompt import Situation
-    from embomatrix.trainer.run.data import TrainingTask
+    from embomatrix.trainer.data.tasks import TrainingTask
 
 
 class LengthScore:

@@ -18,8 +18,8 @@ from embomatrix.rpc.reward_label import RewardLabel, answer_in
 from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.trainer.adapters.rows import messages, tasks_of
 from embomatrix.trainer.adapters.scorer import ATTEMPTS, given_up, scorer_for
-from embomatrix.trainer.run.data import group_seed, load_tasks
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.data.tasks import group_seed, load_tasks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from embomatrix.skills.prompt import Codec, prompt_for
-from embomatrix.trainer.run.data import load_tasks
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.data.tasks import load_tasks
 
 if TYPE_CHECKING:
     from embomatrix.skills.prompt import Situation
-    from embomatrix.trainer.run.data import TrainingTask
+    from embomatrix.trainer.data.tasks import TrainingTask
 
 SOURCE = "embomatrix"
 

@@ -23,9 +23,9 @@ from embomatrix.rpc.status import ClusterError
 from embomatrix.rpc.trust import read_ca, read_token
 from embomatrix.rpc.wire.values import GroupPolicy, RunTerms
 from embomatrix.skills.prompt import Codec
-from embomatrix.trainer.grpo.rollout import Gateway
-from embomatrix.trainer.run.data import TaskSet, load_tasks
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.cluster.gateway import Gateway
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.data.tasks import TaskSet, load_tasks
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from contextlib import AbstractAsyncContextManager
 
     from embomatrix.reward.settings import RewardSettings
-    from embomatrix.trainer.grpo.rollout import Cluster, PlanOutcome
-    from embomatrix.trainer.run.data import TrainingTask
+    from embomatrix.trainer.cluster.gateway import Cluster, PlanOutcome
+    from embomatrix.trainer.data.tasks import TrainingTask
 
 RUN_NAME: Final = "adapter"
 GATHER_S: Final = 0.005

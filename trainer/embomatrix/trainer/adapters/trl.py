@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from embomatrix.trainer.adapters.scorer import scorer_for
-from embomatrix.trainer.grpo.lookahead import Lookahead
+from embomatrix.trainer.data.lookahead import Lookahead
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from typing import Self
 
     from embomatrix.trainer.adapters.scorer import PlanScorer
-    from embomatrix.trainer.grpo.rollout import PlanOutcome
+    from embomatrix.trainer.cluster.gateway import PlanOutcome
 
 
 class ClusterReward:

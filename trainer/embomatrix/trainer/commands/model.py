@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
 

@@ -14,17 +14,17 @@ from rich.table import Table
 
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.logs import LogFormat, log_to_stderr
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from embomatrix.rpc.client import ClusterClient
-    from embomatrix.trainer.grpo.rollout import Gateway
-    from embomatrix.trainer.imitation.imitate import ImitationState
+    from embomatrix.trainer.cluster.gateway import Gateway
+    from embomatrix.trainer.config.settings import OnLost, TrainSettings
+    from embomatrix.trainer.data.tasks import TaskSet
+    from embomatrix.trainer.imitation.teacher_forcing import ImitationState
     from embomatrix.trainer.logging.report import TrainingSummary
-    from embomatrix.trainer.run.data import TaskSet
-    from embomatrix.trainer.run.settings import OnLost, TrainSettings
     from embomatrix.trainer.run.starting import Start
 
     Connect = Callable[[], ClusterClient]
@@ -209,8 +209,8 @@ def _gateway(
     tasks: TaskSet, connect: Connect, name: str, settings: TrainSettings, on_lost: OnLost
 ) -> Gateway:
     from embomatrix.rpc.wire.values import GroupPolicy, RunTerms
-    from embomatrix.trainer.grpo.rollout import Gateway
-    from embomatrix.trainer.run.settings import OnLost
+    from embomatrix.trainer.cluster.gateway import Gateway
+    from embomatrix.trainer.config.settings import OnLost
 
     whole = on_lost is OnLost.GROUP
     policy = GroupPolicy.RETRY_THEN_FAIL_GROUP if whole else GroupPolicy.PARTIAL
@@ -219,9 +219,9 @@ def _gateway(
 
 
 def _run(start: Start, connect: Connect, out: Path) -> TrainingSummary:
-    from embomatrix.trainer.logging.progress import display_for
+    from embomatrix.trainer.logging.display import display_for
     from embomatrix.trainer.logging.trackers import trackers_of
-    from embomatrix.trainer.policy.choice import saved_policy
+    from embomatrix.trainer.policy.loading import saved_policy
     from embomatrix.trainer.run.loop import REFERENCE, Parts, TrainingRun
 
     settings, tasks, policy = start.settings, start.tasks, start.policy
@@ -237,11 +237,11 @@ def _run(start: Start, connect: Connect, out: Path) -> TrainingSummary:
 
 
 def _imitated(start: Start, out: Path) -> ImitationState:
-    from embomatrix.trainer.imitation.phase import warm_up
-    from embomatrix.trainer.logging.progress import display_for
+    from embomatrix.trainer.lifecycle.checkpoint import whole_folder
+    from embomatrix.trainer.logging.display import display_for
     from embomatrix.trainer.logging.recorder import Recorder
     from embomatrix.trainer.logging.trackers import trackers_of
-    from embomatrix.trainer.run.checkpoint import whole_folder
+    from embomatrix.trainer.run.imitation import warm_up
     from embomatrix.trainer.run.loop import REFERENCE
 
     progress = start.progress

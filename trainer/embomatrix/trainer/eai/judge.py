@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.eai.sanitise import sanitised
-from embomatrix.trainer.run.errors import TrainerError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from embomatrix.skills.prompt import Codec
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

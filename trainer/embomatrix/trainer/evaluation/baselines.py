@@ -13,7 +13,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.skills.syntax import MAX_STEPS, PlaceRelation, Skill, SkillCall
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.world.evaluate import substitute
 from embomatrix.world.goal import And, Atom, Exists, Forall, ForN, ForNPairs, ForPairs, Imply, Not, Or
 from embomatrix.world.state import Relation, State
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from embomatrix.skills.prompt import PromptRow
     from embomatrix.skills.syntax import Plan
-    from embomatrix.trainer.run.data import TrainingTask
+    from embomatrix.trainer.data.tasks import TrainingTask
     from embomatrix.world.goal import Formula
 
     Baseline = Callable[[TrainingTask, np.random.Generator], Plan]

@@ -9,15 +9,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.trainer.run.data import training_task
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.data.tasks import training_task
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, record_to_json
 from embomatrix.world.task import Profile
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from embomatrix.trainer.run.data import TrainingTask
+    from embomatrix.trainer.data.tasks import TrainingTask
     from embomatrix.world.dataset import TaskRecord
     from embomatrix.world.scene import Scene
 

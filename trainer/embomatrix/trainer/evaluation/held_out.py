@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from embomatrix.trainer.cluster.gateway import waited
 from embomatrix.trainer.evaluation.intervals import bootstrap
-from embomatrix.trainer.grpo.rollout import waited
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from concurrent.futures import Future
 
+    from embomatrix.trainer.cluster.gateway import Gateway, PlanOutcome
+    from embomatrix.trainer.config.settings import EvaluationSettings
+    from embomatrix.trainer.data.tasks import TrainingTask
     from embomatrix.trainer.evaluation.intervals import Interval
-    from embomatrix.trainer.grpo.rollout import Gateway, PlanOutcome
     from embomatrix.trainer.policy.prompts import Teller
     from embomatrix.trainer.policy.protocol import Policy
-    from embomatrix.trainer.run.data import TrainingTask
-    from embomatrix.trainer.run.settings import EvaluationSettings
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Protocol
 from embomatrix.rpc.wire.values import Rollout
 from embomatrix.skills.parse import PlanError, parse_plan
 from embomatrix.skills.prompt import Codec, limited, with_indices
+from embomatrix.trainer.data.tasks import group_seed
 from embomatrix.trainer.evaluation.verdicts import of_plan, of_text
-from embomatrix.trainer.run.data import group_seed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import torch
 
 from embomatrix.skills.prompt import Codec
-from embomatrix.trainer.policy.choice import saved_policy
+from embomatrix.trainer.config.errors import TrainerError, reason_of
+from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, LoraSettings, read_settings
+from embomatrix.trainer.lifecycle.checkpoint import read_state
 from embomatrix.trainer.policy.hf import HfPolicy
+from embomatrix.trainer.policy.loading import saved_policy
 from embomatrix.trainer.policy.tiny import TinyPolicy
-from embomatrix.trainer.run.checkpoint import read_state
-from embomatrix.trainer.run.errors import TrainerError, reason_of
-from embomatrix.trainer.run.settings import LANGUAGE_MODEL_DEFAULTS, LoraSettings, read_settings
 
 if TYPE_CHECKING:
     from embomatrix.trainer.policy.protocol import Policy

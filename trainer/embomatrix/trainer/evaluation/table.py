@@ -6,9 +6,9 @@ import json
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.evaluation.scoreboard import estimate_to_json
 from embomatrix.trainer.evaluation.taxonomy import MEANINGS, Cause
-from embomatrix.trainer.run.errors import TrainerError
 from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ from embomatrix.rpc.wire.values import Completed
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from embomatrix.trainer.cluster.gateway import PlanOutcome
+    from embomatrix.trainer.data.tasks import TrainingTask
     from embomatrix.trainer.grpo.objective import LossMetrics
-    from embomatrix.trainer.grpo.rollout import PlanOutcome
-    from embomatrix.trainer.run.data import TrainingTask
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import torch
 
-from embomatrix.trainer.grpo.rollout import waited
+from embomatrix.trainer.cluster.gateway import waited
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from embomatrix.skills.prompt import Codec
-    from embomatrix.trainer.grpo.rollout import PlanOutcome, Submitting
-    from embomatrix.trainer.parallel.data_parallel import Crew
-    from embomatrix.trainer.parallel.learner import Sampling
+    from embomatrix.trainer.cluster.gateway import PlanOutcome, Submitting
+    from embomatrix.trainer.config.settings import GrpoSettings
+    from embomatrix.trainer.data.tasks import TrainingTask
+    from embomatrix.trainer.grpo.data_parallel import Crew
+    from embomatrix.trainer.grpo.learner import Sampling
     from embomatrix.trainer.policy.prompts import Teller, Told
     from embomatrix.trainer.policy.protocol import Samples
-    from embomatrix.trainer.run.data import TrainingTask
-    from embomatrix.trainer.run.settings import GrpoSettings
 
 _SEEDS: Final = 2**62
 

@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import OnLost, Overlap
+from embomatrix.trainer.grpo.gradients import GradientSum
+from embomatrix.trainer.grpo.learner import Lesson
 from embomatrix.trainer.grpo.objective import LossKind, LossMetrics, Scale, divisor, group_advantages
 from embomatrix.trainer.grpo.records import GroupLog, StepRecord, record_of
 from embomatrix.trainer.grpo.sampling import Sampler, next_back
-from embomatrix.trainer.parallel.gradients import GradientSum
-from embomatrix.trainer.parallel.learner import Lesson
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.settings import OnLost, Overlap
-from embomatrix.trainer.run.stopwatch import Activity
+from embomatrix.trainer.lifecycle.stopwatch import Activity
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -33,15 +33,15 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.trainer.grpo.rollout import PlanOutcome, Submitting
+    from embomatrix.trainer.cluster.gateway import PlanOutcome, Submitting
+    from embomatrix.trainer.config.settings import GrpoSettings
+    from embomatrix.trainer.data.tasks import TrainingTask
+    from embomatrix.trainer.grpo.data_parallel import Crew, RemoteLearner
     from embomatrix.trainer.grpo.sampling import SampledChunk
-    from embomatrix.trainer.parallel.data_parallel import Crew, RemoteLearner
+    from embomatrix.trainer.lifecycle.interrupts import Interrupts
+    from embomatrix.trainer.lifecycle.stopwatch import Stopwatch
     from embomatrix.trainer.policy.prompts import Teller
     from embomatrix.trainer.policy.protocol import Policy
-    from embomatrix.trainer.run.data import TrainingTask
-    from embomatrix.trainer.run.interrupts import Interrupts
-    from embomatrix.trainer.run.settings import GrpoSettings
-    from embomatrix.trainer.run.stopwatch import Stopwatch
 
 GRADIENTS_ASIDE = 2
 """Chunks back-propagated before their turn, at most: each keeps a gradient of the policy's size."""

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
-from embomatrix.trainer.run.settings import OptimiserKind
+from embomatrix.trainer.config.settings import OptimiserKind
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from torch.optim import Optimizer
 
-    from embomatrix.trainer.run.settings import ImitationSettings
+    from embomatrix.trainer.config.settings import ImitationSettings
 
 _BETAS = (0.9, 0.95)
 

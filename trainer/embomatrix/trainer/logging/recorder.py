@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
+    from embomatrix.trainer.cluster.gateway import PlanOutcome
     from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation
     from embomatrix.trainer.grpo.records import GroupLog, StepRecord
-    from embomatrix.trainer.grpo.rollout import PlanOutcome
-    from embomatrix.trainer.imitation.imitate import ImitationProgress
+    from embomatrix.trainer.imitation.teacher_forcing import ImitationProgress
     from embomatrix.trainer.logging.trackers import Tracker
 
 METRICS = "metrics.jsonl"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from embomatrix.trainer.evaluation.held_out import improvement
-from embomatrix.trainer.run.outcome import RunOutcome, TaskRate
+from embomatrix.trainer.logging.outcome import RunOutcome, TaskRate
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -6,14 +6,14 @@ import contextlib
 import secrets
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from embomatrix.trainer.run.errors import TrainerError, reason_of
-from embomatrix.trainer.run.settings import TrackerKind
+from embomatrix.trainer.config.errors import TrainerError, reason_of
+from embomatrix.trainer.config.settings import TrackerKind
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from embomatrix.trainer.run.settings import TrainSettings
+    from embomatrix.trainer.config.settings import TrainSettings
 
 PROJECT: Final = "embomatrix"
 IMITATION_PHASE: Final = "imitation"

@@ -18,7 +18,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from embomatrix.trainer.policy.products import Product
+from embomatrix.trainer.policy.compute_dtype import Product
 
 if TYPE_CHECKING:
     from torch import Tensor

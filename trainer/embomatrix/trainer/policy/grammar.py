@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Final
 import torch
 
 from embomatrix.skills.syntax import SIGNATURES, Arg, PlaceRelation
-from embomatrix.trainer.policy.words import BREAK, END, PAD
+from embomatrix.trainer.policy.vocabulary import BREAK, END, PAD
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from torch import Tensor
 
-    from embomatrix.trainer.policy.words import Vocabulary
+    from embomatrix.trainer.policy.vocabulary import Vocabulary
 
 
 class _Place(IntEnum):

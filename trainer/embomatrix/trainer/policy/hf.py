@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any, Final
 import torch
 
 from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.config.errors import TrainerError, reason_of
+from embomatrix.trainer.config.settings import Products
+from embomatrix.trainer.policy.compute_dtype import multiply_in, type_of, unchanged
 from embomatrix.trainer.policy.drawing import draw
 from embomatrix.trainer.policy.lora import adapt, load_adapters, merged, save_adapters
-from embomatrix.trainer.policy.products import multiply_in, type_of, unchanged
 from embomatrix.trainer.policy.protocol import Samples, Scored
 from embomatrix.trainer.policy.recompute import recomputing
-from embomatrix.trainer.run.errors import TrainerError, reason_of
-from embomatrix.trainer.run.settings import Products
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

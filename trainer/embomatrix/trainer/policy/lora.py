@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import torch
 from torch import nn
 
-from embomatrix.trainer.run.errors import DAMAGE, TrainerError, reason_of
+from embomatrix.trainer.config.errors import DAMAGE, TrainerError, reason_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

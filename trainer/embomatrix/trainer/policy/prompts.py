@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 
 from embomatrix.skills.parse import plan_to_json, plan_to_lines
 from embomatrix.skills.prompt import Codec, limited, plan_in_names, prompt_for, subset
-from embomatrix.trainer.imitation.augment import Variation, used_rows, varied, with_fewer_bystanders
+from embomatrix.trainer.data.variation import Variation, used_rows, varied, with_fewer_bystanders
 
 if TYPE_CHECKING:
     import numpy as np
 
     from embomatrix.skills.prompt import Situation
     from embomatrix.skills.syntax import Plan
+    from embomatrix.trainer.data.tasks import TrainingTask
     from embomatrix.trainer.policy.protocol import Policy, Tokens
-    from embomatrix.trainer.run.data import TrainingTask
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,13 +11,13 @@ import torch
 from torch.nn import functional
 
 from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.policy.compute_dtype import unchanged
 from embomatrix.trainer.policy.decoder import Decoder, DecoderShape
 from embomatrix.trainer.policy.drawing import draw
 from embomatrix.trainer.policy.grammar import PlanGrammar
-from embomatrix.trainer.policy.products import unchanged
 from embomatrix.trainer.policy.protocol import Samples, Scored
-from embomatrix.trainer.policy.words import END, GO, PAD, Vocabulary
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.policy.vocabulary import END, GO, PAD, Vocabulary
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -15,39 +15,39 @@ import numpy as np
 import torch
 
 from embomatrix.host.cores import usable_cores
+from embomatrix.trainer.data.tasks import Curriculum, Schedule
 from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation, evaluate_policy
+from embomatrix.trainer.grpo.data_parallel import Crew
+from embomatrix.trainer.grpo.learner import Learner
 from embomatrix.trainer.grpo.update import StepPlan, Updater
-from embomatrix.trainer.imitation.phase import warm_up
-from embomatrix.trainer.logging.recorder import METRICS, SAMPLES, Recorder, read_metrics
-from embomatrix.trainer.logging.report import REPORT, TrainingSummary, outcome_of, write_report
-from embomatrix.trainer.logging.reporting import Reporter
-from embomatrix.trainer.parallel.data_parallel import Crew
-from embomatrix.trainer.parallel.learner import Learner
-from embomatrix.trainer.run.checkpoint import (
+from embomatrix.trainer.lifecycle.checkpoint import (
     CHECKPOINTS,
     CheckpointStore,
     TrainingProgress,
     restore,
     whole_folder,
 )
-from embomatrix.trainer.run.data import Curriculum, Schedule
-from embomatrix.trainer.run.interrupts import Interrupts
-from embomatrix.trainer.run.outcome import write_outcome
-from embomatrix.trainer.run.stopwatch import Activity, Stopwatch
+from embomatrix.trainer.lifecycle.interrupts import Interrupts
+from embomatrix.trainer.lifecycle.stopwatch import Activity, Stopwatch
+from embomatrix.trainer.logging.dashboard import Reporter
+from embomatrix.trainer.logging.outcome import write_outcome
+from embomatrix.trainer.logging.recorder import METRICS, SAMPLES, Recorder, read_metrics
+from embomatrix.trainer.logging.report import REPORT, TrainingSummary, outcome_of, write_report
+from embomatrix.trainer.run.imitation import warm_up
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
     from typing import Any
 
+    from embomatrix.trainer.cluster.gateway import Gateway
+    from embomatrix.trainer.config.settings import TrainSettings
+    from embomatrix.trainer.data.tasks import TaskSet
     from embomatrix.trainer.grpo.records import GroupLog, StepRecord
-    from embomatrix.trainer.grpo.rollout import Gateway
-    from embomatrix.trainer.logging.progress import Display
+    from embomatrix.trainer.logging.display import Display
     from embomatrix.trainer.logging.trackers import Tracker
     from embomatrix.trainer.policy.prompts import Teller
     from embomatrix.trainer.policy.protocol import Policy
-    from embomatrix.trainer.run.data import TaskSet
-    from embomatrix.trainer.run.settings import TrainSettings
 
 logger = logging.getLogger(__name__)
 REFERENCE = "reference"

@@ -10,21 +10,21 @@ from typing import TYPE_CHECKING, Any, Final
 import torch
 
 from embomatrix.host.cores import usable_cores
-from embomatrix.trainer.imitation.augment import Variation
-from embomatrix.trainer.policy.choice import TINY, is_tiny, new_policy, saved_policy
+from embomatrix.trainer.config.errors import TrainerError, reason_of
+from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, read_settings, with_changes
+from embomatrix.trainer.data.tasks import load_tasks
+from embomatrix.trainer.data.variation import Variation
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
 from embomatrix.trainer.policy.hf import HfPolicy
+from embomatrix.trainer.policy.loading import TINY, is_tiny, new_policy, saved_policy
 from embomatrix.trainer.policy.prompts import Teller
-from embomatrix.trainer.run.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
-from embomatrix.trainer.run.data import load_tasks
-from embomatrix.trainer.run.errors import TrainerError, reason_of
-from embomatrix.trainer.run.settings import LANGUAGE_MODEL_DEFAULTS, read_settings, with_changes
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from embomatrix.trainer.config.settings import TrainSettings
+    from embomatrix.trainer.data.tasks import TaskSet
     from embomatrix.trainer.policy.protocol import Policy
-    from embomatrix.trainer.run.data import TaskSet
-    from embomatrix.trainer.run.settings import TrainSettings
 
 
 MAY_CHANGE: Final = frozenset(

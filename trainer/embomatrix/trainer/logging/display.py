@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation
     from embomatrix.trainer.grpo.records import StepRecord
-    from embomatrix.trainer.imitation.imitate import ImitationProgress
+    from embomatrix.trainer.imitation.teacher_forcing import ImitationProgress
 
 _SMOOTHING = 0.9
 _LINE_EVERY_S = 10.0

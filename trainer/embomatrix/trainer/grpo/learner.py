@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
+    from embomatrix.trainer.config.settings import GrpoSettings
     from embomatrix.trainer.policy.protocol import Policy, Samples, Tokens
-    from embomatrix.trainer.run.settings import GrpoSettings
 
 
 @dataclass(frozen=True, slots=True)

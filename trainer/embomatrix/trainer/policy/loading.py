@@ -5,18 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.trainer.config.errors import DAMAGE, TrainerError, reason_of
+from embomatrix.trainer.policy.compute_dtype import type_of
 from embomatrix.trainer.policy.decoder import DecoderShape
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.lora import LoraShape, has_adapters
-from embomatrix.trainer.policy.products import type_of
 from embomatrix.trainer.policy.tiny import TinyPolicy
-from embomatrix.trainer.policy.words import build_vocabulary
-from embomatrix.trainer.run.errors import DAMAGE, TrainerError, reason_of
+from embomatrix.trainer.policy.vocabulary import build_vocabulary
 
 if TYPE_CHECKING:
+    from embomatrix.trainer.config.settings import TrainSettings
+    from embomatrix.trainer.data.tasks import TaskSet
     from embomatrix.trainer.policy.protocol import Policy
-    from embomatrix.trainer.run.data import TaskSet
-    from embomatrix.trainer.run.settings import TrainSettings
 
 TINY: Final = "tiny"
 

@@ -9,9 +9,9 @@ from typing import Annotated, Any, NoReturn
 import typer
 from rich.console import Console
 
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.eai.environment import JudgeEnvironment, default_folder, install
 from embomatrix.trainer.eai.judge import NativeJudge
-from embomatrix.trainer.run.errors import TrainerError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
 console = Console(highlight=False, markup=False, soft_wrap=True)

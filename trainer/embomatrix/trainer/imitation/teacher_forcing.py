@@ -14,19 +14,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.imitation.optimisers import ImitationOptimiser
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.interrupts import Interrupts
+from embomatrix.trainer.lifecycle.interrupts import Interrupts
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from torch import Tensor
 
+    from embomatrix.trainer.config.settings import ImitationSettings
+    from embomatrix.trainer.data.tasks import TrainingTask
     from embomatrix.trainer.policy.prompts import Teller
     from embomatrix.trainer.policy.protocol import Policy, Tokens
-    from embomatrix.trainer.run.data import TrainingTask
-    from embomatrix.trainer.run.settings import ImitationSettings
 
     Lesson = tuple[Tokens, Tokens]  # prompt and plan
 

@@ -5,21 +5,21 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.trainer.imitation.imitate import Imitation
+from embomatrix.trainer.imitation.teacher_forcing import Imitation
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, restore
 from embomatrix.trainer.logging.recorder import IMITATION
-from embomatrix.trainer.run.checkpoint import CHECKPOINTS, CheckpointStore, restore
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from embomatrix.trainer.imitation.imitate import ImitationProgress
+    from embomatrix.trainer.config.settings import TrainSettings
+    from embomatrix.trainer.data.tasks import TrainingTask
+    from embomatrix.trainer.imitation.teacher_forcing import ImitationProgress
+    from embomatrix.trainer.lifecycle.checkpoint import TrainingProgress
     from embomatrix.trainer.logging.recorder import Recorder
     from embomatrix.trainer.policy.prompts import Teller
     from embomatrix.trainer.policy.protocol import Policy
-    from embomatrix.trainer.run.checkpoint import TrainingProgress
-    from embomatrix.trainer.run.data import TrainingTask
-    from embomatrix.trainer.run.settings import TrainSettings
 
 LOG_EVERY: Final = 10
 """Steps between two lines of the log, besides those with a measurement."""

@@ -20,8 +20,8 @@ from embomatrix.rpc.status import ClusterError, DeadlineError, PreconditionError
 from embomatrix.rpc.wire.values import Batch, Completed, LookaheadEntry, Rollout, RunStats, RunTerms
 from embomatrix.skills.parse import PlanError, parse_plan
 from embomatrix.skills.prompt import Codec, with_indices
-from embomatrix.trainer.run.data import group_seed
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.data.tasks import group_seed
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Mapping, Sequence
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from embomatrix.rpc.wire.values import Outcome, RolloutResult, Warmth
     from embomatrix.skills.prompt import Situation
     from embomatrix.skills.syntax import Plan
-    from embomatrix.trainer.run.data import TrainingTask
+    from embomatrix.trainer.data.tasks import TrainingTask
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")

@@ -10,7 +10,7 @@ import numpy as np
 
 from embomatrix.skills.parse import PlanError, plan_from_json
 from embomatrix.skills.prompt import Situation, situation_of
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.world.dataset import Dataset, DatasetError
 
 if TYPE_CHECKING:

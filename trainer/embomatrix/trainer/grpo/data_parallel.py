@@ -8,9 +8,9 @@ from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.reduction import DupFd
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
-from embomatrix.trainer.parallel.helper import Workplace, serve
-from embomatrix.trainer.parallel.shared_memory import SharedTensors
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.grpo.remote import Workplace, serve
+from embomatrix.trainer.grpo.shared_memory import SharedTensors
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
+    from embomatrix.trainer.config.settings import TrainSettings
+    from embomatrix.trainer.grpo.learner import Learner, Lesson, Sampling
     from embomatrix.trainer.grpo.objective import LossMetrics
-    from embomatrix.trainer.parallel.learner import Learner, Lesson, Sampling
     from embomatrix.trainer.policy.protocol import Policy, Samples, Tokens
-    from embomatrix.trainer.run.settings import TrainSettings
 
 T = TypeVar("T")
 

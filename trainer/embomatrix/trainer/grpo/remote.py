@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 
-from embomatrix.trainer.parallel.learner import Learner
-from embomatrix.trainer.parallel.shared_memory import SharedTensors
-from embomatrix.trainer.policy.choice import saved_policy
-from embomatrix.trainer.run.errors import DAMAGE, TrainerError
-from embomatrix.trainer.run.settings import TrainSettings
+from embomatrix.trainer.config.errors import DAMAGE, TrainerError
+from embomatrix.trainer.config.settings import TrainSettings
+from embomatrix.trainer.grpo.learner import Learner
+from embomatrix.trainer.grpo.shared_memory import SharedTensors
+from embomatrix.trainer.policy.loading import saved_policy
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
     from torch import nn
 
+    from embomatrix.trainer.grpo.learner import Lesson
     from embomatrix.trainer.grpo.objective import LossMetrics
-    from embomatrix.trainer.parallel.learner import Lesson
 
 
 class Descriptor(Protocol):

@@ -6,8 +6,8 @@ import json
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.trainer.run.errors import TrainerError, reason_of
-from embomatrix.trainer.run.stopwatch import TimeShares
+from embomatrix.trainer.config.errors import TrainerError, reason_of
+from embomatrix.trainer.lifecycle.stopwatch import TimeShares
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:

@@ -19,8 +19,8 @@ from embomatrix.trainer.logging.trackers import GRPO_PHASE
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from embomatrix.trainer.cluster.gateway import PlanOutcome
     from embomatrix.trainer.grpo.records import GroupLog
-    from embomatrix.trainer.grpo.rollout import PlanOutcome
 
 SHOWN: Final = 4
 """Plans of a step: of the group whose rewards differ most, from the best to the worst."""

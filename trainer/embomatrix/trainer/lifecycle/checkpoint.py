@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from embomatrix.trainer.imitation.imitate import ImitationState
-from embomatrix.trainer.run.errors import DAMAGE, TrainerError, reason_of
-from embomatrix.trainer.run.settings import TrainSettings
+from embomatrix.trainer.config.errors import DAMAGE, TrainerError, reason_of
+from embomatrix.trainer.config.settings import TrainSettings
+from embomatrix.trainer.imitation.teacher_forcing import ImitationState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping

@@ -10,8 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.grpo.objective import LossKind, Objective, RatioLevel
-from embomatrix.trainer.run.errors import TrainerError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

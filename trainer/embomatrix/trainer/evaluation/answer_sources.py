@@ -10,8 +10,8 @@ import numpy as np
 
 from embomatrix.llm.ledger import Ledger
 from embomatrix.llm.values import ChatRequest, LlmError, Message, Speaker
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.evaluation.answers import Answer
-from embomatrix.trainer.run.errors import TrainerError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

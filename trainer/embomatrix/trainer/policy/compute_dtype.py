@@ -12,7 +12,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from embomatrix.trainer.run.settings import Products
+from embomatrix.trainer.config.settings import Products
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
