@@ -34,7 +34,7 @@ from embomatrix.trainer.evaluation.answers import (
     MOST_SAMPLES,
     AnswerSheet,
     EvaluationSetup,
-    check_asked_for,
+    check_expected,
     ordered,
     read_answers,
 )
@@ -50,10 +50,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from embomatrix.cli.examinee import EvaluationSubject
+    from embomatrix.trainer.cluster.executor import Executor
     from embomatrix.trainer.evaluation.answers import Answer
     from embomatrix.trainer.evaluation.benchmark import Benchmark
     from embomatrix.trainer.evaluation.exam import Exam
-    from embomatrix.trainer.evaluation.judging import Executor
     from embomatrix.trainer.evaluation.table import ScoreRow
 
 DEFAULT_BENCH: Final = "build/dataset"
@@ -276,7 +276,7 @@ def _judge_stored(
                 f"{path} answers other tasks than {bench or setup.bench} holds now (digest {setup.bench_digest[:19]}…, now "
                 f"{exam.digest[:19]}…): pass the benchmark that was asked with --bench"
             )
-        check_asked_for(stored, exam.task_ids, setup, path)
+        check_expected(stored, exam.task_ids, setup, path)
         given = ordered(stored, exam.task_ids, setup.samples)
         asked_for = len(exam.task_ids) * setup.samples
         if len(given) < asked_for:

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 from embomatrix.factory.cli import app
 from embomatrix.factory.export import FIELDS, card, encoded, export_rows
 from embomatrix.factory.inspection.page import task_page, transcript_html
-from embomatrix.factory.inspection.plan_view import PlanView
 from embomatrix.factory.inspection.playing import play_oracle
+from embomatrix.pages.plan_view import PlanView
 from embomatrix.world.dataset import Dataset, DatasetError
 
 EVIL = '</script><script>alert(1)</script><b onclick="x">'

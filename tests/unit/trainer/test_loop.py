@@ -22,8 +22,8 @@ from embomatrix.trainer.logging.outcome import read_outcome
 from embomatrix.trainer.logging.recorder import read_metrics
 from embomatrix.trainer.logging.report import success_rows, time_rows
 from embomatrix.trainer.policy.loading import new_policy, saved_policy
-from embomatrix.trainer.policy.prompts import Teller
-from embomatrix.trainer.run.loop import REFERENCE, Parts, TrainingRun
+from embomatrix.trainer.policy.prompts import PromptBuilder
+from embomatrix.trainer.run.loop import REFERENCE, RunComponents, TrainingRun
 
 TINY = {"tiny.layers": 2, "tiny.width": 32, "tiny.heads": 2, "tiny.inner": 64}
 SHORT = {
@@ -53,13 +53,13 @@ def run(out, cluster=None, tasks=TASKS, resume=False, display=None, **changes):
         progress, settings = read_state(newest)
         policy = saved_policy(newest / "policy", settings)
         reference = saved_policy(out / REFERENCE, settings).frozen_copy()
-    teller = Teller(policy, settings.prompt.rows, Variation(tasks.kinds, 0.5, 0.5))
+    prompt_builder = PromptBuilder(policy, settings.prompt.rows, Variation(tasks.kinds, 0.5, 0.5))
     display = display or LineDisplay(Console(quiet=True))
     with (
         Gateway(lambda: cluster, tasks.bundle_bytes, run_name="test", run_seed=0) as gateway,
         display,
     ):
-        parts = Parts(policy, teller, tasks, gateway, display, reference)
+        parts = RunComponents(policy, prompt_builder, tasks, gateway, display, reference)
         return TrainingRun(parts, settings, out, progress).run(), policy
 
 

@@ -35,7 +35,7 @@ from embomatrix.pages.figures import figure_to_json, shown
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.logging.outcome import OUTCOME, read_outcome
 from embomatrix.trainer.logging.recorder import read_metrics
-from embomatrix.trainer.run.starting import usual_threads
+from embomatrix.trainer.run.starting import default_threads
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -248,7 +248,7 @@ def _design(
         imitation=imitation,
         patience=patience,
         grpo=grpo,
-        threads=threads or usual_threads(),
+        threads=threads or default_threads(),
         shared=parse_settings(settings or ()),
         arms=arms,
     )

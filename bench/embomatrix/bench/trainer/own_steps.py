@@ -22,12 +22,12 @@ from embomatrix.trainer.cluster.gateway import PlanOutcome
 from embomatrix.trainer.config.settings import GrpoSettings
 from embomatrix.trainer.data.tasks import load_tasks
 from embomatrix.trainer.data.variation import Variation
-from embomatrix.trainer.grpo.data_parallel import Crew
+from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers
 from embomatrix.trainer.grpo.learner import Learner
 from embomatrix.trainer.grpo.update import StepPlan, Updater
 from embomatrix.trainer.lifecycle.stopwatch import Stopwatch
 from embomatrix.trainer.policy.hf import HfPolicy
-from embomatrix.trainer.policy.prompts import Teller
+from embomatrix.trainer.policy.prompts import PromptBuilder
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -63,9 +63,9 @@ def measure(load: Load, tasks: Sequence[TrainingTask]) -> list[float]:
     settings = GrpoSettings(
         tasks_per_step=load.tasks, group=load.group, chunk=load.tasks, max_new=load.new, kl_coef=0.0
     )
-    teller = Teller(policy, ROWS, Variation({}, rename=0.0, drop=0.0))
-    crew = Crew(Learner(policy, policy, settings))
-    updater = Updater(policy, crew, teller, LengthScore(), settings, Stopwatch())
+    prompt_builder = PromptBuilder(policy, ROWS, Variation({}, rename=0.0, drop=0.0))
+    crew = DataParallelWorkers(Learner(policy, policy, settings))
+    updater = Updater(policy, crew, prompt_builder, LengthScore(), settings, Stopwatch())
     generator = torch.Generator().manual_seed(load.seed)
     spent_s = []
     for step in range(load.unmeasured + load.steps):

@@ -1,7 +1,7 @@
-"""From plan texts to rewards: a gateway that keeps the cluster busy while the trainer computes.
+"""Gateway of a trainer to the cluster: plan texts in, rewards out, while the trainer computes.
 
-The client runs on an event loop in its own thread. A group is submitted as soon as its plans are sampled, and waited for
-only when its rewards are needed.
+The gRPC client runs on an event loop in its own thread. A group is submitted as soon as its plans are sampled, and the
+trainer waits only when it needs the rewards.
 """
 
 from __future__ import annotations
@@ -24,15 +24,16 @@ from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.data.tasks import group_seed
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Coroutine, Mapping, Sequence
     from concurrent.futures import Future
     from contextlib import AbstractAsyncContextManager
     from typing import Any
 
     from embomatrix.reward.breakdown import RewardBreakdown
     from embomatrix.reward.settings import RewardSettings
+    from embomatrix.rpc.client import ClusterClient
     from embomatrix.rpc.training import TrainingReport
-    from embomatrix.rpc.wire.values import Outcome, RolloutResult, Warmth
+    from embomatrix.rpc.wire.values import Outcome
     from embomatrix.skills.prompt import Situation
     from embomatrix.skills.syntax import Plan
     from embomatrix.trainer.data.tasks import TrainingTask
@@ -40,39 +41,21 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
 DEFAULT_TERMS: Final = RunTerms()
-REPORTS_KEPT: Final = 64
-"""That wait for a manager which is away: those of the last steps."""
-AWAY_S: Final = 600.0
-"""For which a scene waits for a manager that is away: as long as a batch waits for its results."""
-AWAY_FIRST_S: Final = 0.1
-AWAY_LONGEST_S: Final = 5.0
-"""Wait before a scene is sent again: doubled from the first to the longest."""
-
-
-class Cluster(Protocol):
-    """What the gateway needs of ``rpc.client.ClusterClient``."""
-
-    async def open_run(self, name: str, run_id: str = "", terms: RunTerms = DEFAULT_TERMS) -> str: ...
-
-    async def announce_lookahead(
-        self, run_id: str, version: int, entries: Iterable[LookaheadEntry]
-    ) -> dict[str, Warmth]: ...
-
-    async def put_bundles(self, bundles: Mapping[str, bytes]) -> tuple[str, ...]: ...
-
-    def execute(self, batch: Batch) -> AsyncIterator[RolloutResult]: ...
-
-    async def report_training(self, run_id: str, report: TrainingReport) -> None: ...
-
-    async def close_run(self, run_id: str) -> RunStats: ...
+MAX_QUEUED_REPORTS: Final = 64
+"""Reports kept while the manager is unreachable. Older ones are dropped."""
+RETRY_BUNDLE_S: Final = 600.0
+"""Seconds to retry a bundle upload while the manager is unreachable: equal to the batch timeout."""
+FIRST_RETRY_S: Final = 0.1
+MAX_RETRY_S: Final = 5.0
+"""The wait between two attempts doubles from ``FIRST_RETRY_S`` up to this value."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanOutcome:
-    """One sampled plan and what became of it.
+    """One sampled plan and its result.
 
-    ``reward`` is None where the infrastructure lost the rollout: that says nothing about the plan. ``outcome`` is None for
-    text that is no plan, which is scored here and never executed; ``problem`` then says why.
+    ``reward`` is None if the infrastructure lost the rollout, which says nothing about the plan. ``outcome`` is None for text
+    that can't be parsed: it is scored here and never executed, and ``problem`` gives the reason.
     """
 
     text: str
@@ -82,11 +65,11 @@ class PlanOutcome:
 
     @property
     def value(self) -> float:
-        """The reward's total; NaN where there is none."""
+        """Total reward, NaN if there is none."""
         return math.nan if self.reward is None else self.reward.total
 
-    def valued(self, relevance: float) -> float:
-        """The reward with its second tier weighted; NaN where there is none."""
+    def weighted_reward(self, relevance: float) -> float:
+        """Reward with a weight on its relevance tier, NaN if there is none."""
         reward = self.reward
         return math.nan if reward is None else reward.format + relevance * reward.relevance + reward.goal
 
@@ -95,8 +78,8 @@ class PlanOutcome:
         return self.reward is not None and self.reward.success
 
 
-class Submitting(Protocol):
-    """What a step of GRPO needs of a gateway."""
+class PlanSubmitter(Protocol):
+    """Part of the gateway that a GRPO step uses."""
 
     def submit(
         self,
@@ -107,25 +90,24 @@ class Submitting(Protocol):
         texts: Sequence[str],
         codec: Codec,
     ) -> Future[tuple[PlanOutcome, ...]]:
-        """Have the plans of one task executed; outcomes come in the order of ``texts``."""
+        """Execute one task's plans. Outcomes keep the order of ``texts``."""
         ...
 
 
-def parsed(text: str, situation: Situation, codec: Codec) -> Plan:
-    """The plan that a policy's text means. Raises PlanError when it means none."""
+def parse_policy_text(text: str, situation: Situation, codec: Codec) -> Plan:
+    """Parse a policy's text. Raises PlanError if it holds no plan."""
     return parse_plan(with_indices(text, situation) if codec is Codec.NAMES else text, situation.profile)
 
 
 class Gateway:
-    """Context manager over one run of the cluster. Methods are called from the trainer's thread, ``submit`` from any.
+    """Context manager over one run of the cluster. Call ``submit`` from any thread, all other methods from the trainer's.
 
-    ``terms`` say what becomes of the rest of a group that lost a rollout, for nobody executes what is left out anyway, and
-    how plans are scored: by the worker, and here where a text is none.
+    ``terms`` set the policy for groups that lost a rollout, and the reward's coefficients.
     """
 
     def __init__(
         self,
-        open_cluster: Callable[[], AbstractAsyncContextManager[Cluster]],
+        open_cluster: Callable[[], AbstractAsyncContextManager[ClusterClient]],
         bundle_bytes: Callable[[str], bytes],
         *,
         run_name: str,
@@ -138,8 +120,8 @@ class Gateway:
         self._run_seed = run_seed
         self._terms = terms
         self._announced = 0
-        self._sent: dict[str, asyncio.Task[None]] = {}
-        self._reports: deque[TrainingReport] = deque(maxlen=REPORTS_KEPT)
+        self._uploads: dict[str, asyncio.Task[None]] = {}
+        self._reports: deque[TrainingReport] = deque(maxlen=MAX_QUEUED_REPORTS)
         self._reporting = asyncio.Lock()
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="gateway", daemon=True)
@@ -148,7 +130,7 @@ class Gateway:
     def __enter__(self) -> Self:
         self._thread.start()
         try:
-            self._wait(self._open())
+            self._run_on_loop(self._open())
         except BaseException:
             self._stop_thread()
             raise
@@ -168,18 +150,18 @@ class Gateway:
         try:
             self.close_run()
         except TrainerError as error:
-            logger.warning("the run could not be closed: %s", error)
+            logger.warning("run not closed at the manager: %s", error)
         finally:
-            self._wait(self._leave())
+            self._run_on_loop(self._disconnect())
             self._stop_thread()
 
     def close_run(self) -> RunStats:
-        """End the run at the manager, once, whatever is still under way; returns its counters."""
+        """Cancel pending work, end the run at the manager, and return its counters. Later calls return the same counters."""
         if self._stats is None:
-            self._stats = self._wait(self._close())
+            self._stats = self._run_on_loop(self._close())
         return self._stats
 
-    async def _leave(self) -> None:
+    async def _disconnect(self) -> None:
         await self._context.__aexit__(None, None, None)
 
     async def _close(self) -> RunStats:
@@ -196,11 +178,11 @@ class Gateway:
         self._thread.join()
         self._loop.close()
 
-    def _wait(self, work: Coroutine[Any, Any, T]) -> T:
-        return waited(asyncio.run_coroutine_threadsafe(work, self._loop))
+    def _run_on_loop(self, work: Coroutine[Any, Any, T]) -> T:
+        return result_of(asyncio.run_coroutine_threadsafe(work, self._loop))
 
     def announce(self, steps: Mapping[int, Sequence[TrainingTask]], group: int) -> None:
-        """Replace the look-ahead: which tasks coming steps need. Advice only, so a refusal is logged."""
+        """Replace the look-ahead: the tasks of the coming steps. A rejection is only logged, because look-ahead is advice."""
         entries = [
             LookaheadEntry(step, task.bundle_digest, group) for step, tasks in steps.items() for task in tasks
         ]
@@ -211,37 +193,37 @@ class Gateway:
         try:
             for entry in entries:
                 if version != self._announced:
-                    return  # a newer window has overtaken this one
-                await self._bundle_sent(entry.bundle_digest)
+                    return  # superseded by a newer window
+                await self._upload_once(entry.bundle_digest)
             if version == self._announced:
                 await self._cluster.announce_lookahead(self.run_id, version, entries)
         except ClusterError as error:
-            logger.warning("the look-ahead was not taken: %s", error)
+            logger.warning("look-ahead rejected: %s", error)
 
-    async def _bundle_sent(self, digest: str) -> None:
-        """Give the manager a bundle once in a run; a failed attempt may be repeated by the next caller."""
-        task = self._sent.get(digest)
+    async def _upload_once(self, digest: str) -> None:
+        """Upload a bundle once per run. After a failure, the next caller retries."""
+        task = self._uploads.get(digest)
         if task is None or (task.done() and (task.cancelled() or task.exception() is not None)):
-            task = self._sent[digest] = asyncio.create_task(self._send_bundle(digest))
+            task = self._uploads[digest] = asyncio.create_task(self._upload(digest))
         await asyncio.shield(task)
 
-    async def _send_bundle(self, digest: str) -> None:
+    async def _upload(self, digest: str) -> None:
         bundle = {digest: self._bundle_bytes(digest)}
-        until_s, wait_s = self._loop.time() + AWAY_S, AWAY_FIRST_S
+        deadline_s, wait_s = self._loop.time() + RETRY_BUNDLE_S, FIRST_RETRY_S
         while True:
             try:
                 await self._cluster.put_bundles(bundle)
             except (UnavailableError, DeadlineError) as error:
-                if self._loop.time() + wait_s > until_s:
+                if self._loop.time() + wait_s > deadline_s:
                     raise
-                logger.warning("scene %s: sending it again after: %s", digest, error)
+                logger.warning("bundle upload failed, retrying digest=%s: %s", digest, error)
             else:
                 return
             await asyncio.sleep(wait_s)
-            wait_s = min(2 * wait_s, AWAY_LONGEST_S)
+            wait_s = min(2 * wait_s, MAX_RETRY_S)
 
     def report(self, report: TrainingReport) -> None:
-        """Tell people who watch how training goes. Waits for nobody: what can't be told is dropped, and logged."""
+        """Queue a report for the dashboard without waiting. Rejected reports are logged and dropped."""
         self._reports.append(report)
         asyncio.run_coroutine_threadsafe(self._send_reports(), self._loop)
 
@@ -252,13 +234,13 @@ class Gateway:
                 try:
                     await self._cluster.report_training(self.run_id, report)
                 except (UnavailableError, DeadlineError):
-                    return  # the next report tries again, with those that wait
+                    return  # the next report retries the queue
                 except PreconditionError as error:
-                    logger.warning("the dashboard does not show this training: %s", error)
+                    logger.warning("training reports disabled, the manager rejects them: %s", error)
                     self._reports = deque(maxlen=0)
                 except ClusterError as error:
-                    logger.warning("a report of training was not taken: %s", error)
-                # A newer one may have pushed it out meanwhile.
+                    logger.warning("training report rejected: %s", error)
+                # A newer report may have evicted this one from the full queue.
                 if self._reports and self._reports[0] is report:
                     self._reports.popleft()
 
@@ -271,12 +253,12 @@ class Gateway:
         texts: Sequence[str],
         codec: Codec,
     ) -> Future[tuple[PlanOutcome, ...]]:
-        """Start the rollouts of one task's plans; outcomes come in the order of ``texts``.
+        """Start the rollouts of one task's plans. Outcomes keep the order of ``texts``.
 
-        ``situation`` is the telling that the texts answer: it knows what their names mean.
+        ``situation`` is the varied situation of the prompt, which resolves the object names in the texts.
         """
         plans: list[Plan | PlanOutcome] = [
-            _plan_or_verdict(text, situation, codec, self._terms.reward) for text in texts
+            _plan_or_failure(text, situation, codec, self._terms.reward) for text in texts
         ]
         rollouts = tuple(
             Rollout(
@@ -299,7 +281,7 @@ class Gateway:
     ) -> tuple[PlanOutcome, ...]:
         outcomes: dict[str, Outcome] = {}
         if batch.rollouts:
-            await self._bundle_sent(batch.rollouts[0].bundle_digest)
+            await self._upload_once(batch.rollouts[0].bundle_digest)
             async for result in self._cluster.execute(batch):
                 outcomes[result.rollout_id] = result.outcome
         return tuple(
@@ -310,11 +292,11 @@ class Gateway:
         )
 
 
-def _plan_or_verdict(
+def _plan_or_failure(
     text: str, situation: Situation, codec: Codec, reward: RewardSettings
 ) -> Plan | PlanOutcome:
     try:
-        return parsed(text, situation, codec)
+        return parse_policy_text(text, situation, codec)
     except PlanError as error:
         return PlanOutcome(text, unparsable(reward), problem=str(error))
 
@@ -325,8 +307,8 @@ def _plan_outcome(text: str, outcome: Outcome | None) -> PlanOutcome:
     return PlanOutcome(text, None, outcome)
 
 
-def waited(future: Future[T]) -> T:
-    """The future's value; what went wrong with the cluster becomes a TrainerError."""
+def result_of(future: Future[T]) -> T:
+    """Wait for the future's value. A ClusterError becomes a TrainerError."""
     try:
         return future.result()
     except ClusterError as error:

@@ -1,4 +1,4 @@
-"""`embomatrix eai`: install EAI's judge, and judge answers that others collected."""
+"""`embomatrix eai`: install EAI's judge, and judge files of answers."""
 
 from __future__ import annotations
 
@@ -19,34 +19,35 @@ console = Console(highlight=False, markup=False, soft_wrap=True)
 
 @app.callback()
 def eai() -> None:
-    """Install EAI's judge, and judge answers that others collected."""
+    """Install EAI's judge, and judge files of answers."""
 
 
 @app.command("install")
 def install_command(
     folder: Annotated[
-        Path | None, typer.Option(help="Where; else $EMBOMATRIX_EAI, else a folder in your cache.")
+        Path | None,
+        typer.Option(help="Installation folder. Default: $EMBOMATRIX_EAI, or a folder in your cache."),
     ] = None,
 ) -> None:
-    """Fetch EAI's published judge (27 MB) into a virtual environment of its own (150 MB). `eval --bench eai-native` uses it."""
+    """Download EAI's published judge (27 MB) into its own virtual environment (150 MB), for `eval --bench eai-native`."""
     try:
         found = install(folder, console.print)
     except TrainerError as error:
-        _leave("install", error)
-    console.print(f"EAI's judge is in {found.folder}")
-    console.print(f"its tasks for our world: embomatrix factory import --eai {found.package_root}")
+        _exit("install", error)
+    console.print(f"EAI's judge is installed in {found.folder}")
+    console.print(f"import its tasks: embomatrix factory import --eai {found.package_root}")
     if folder is not None and folder != default_folder():
-        console.print(f"let EMBOMATRIX_EAI={folder} name it")
+        console.print(f"set EMBOMATRIX_EAI={folder} to use it")
 
 
 @app.command("judge")
 def judge_command(
     answers: Annotated[
-        Path, typer.Argument(help='JSON as EAI\'s own tools take it: [{"identifier": …, "llm_output": …}].')
+        Path, typer.Argument(help='JSON in EAI\'s own format: [{"identifier": …, "llm_output": …}].')
     ],
-    out: Annotated[Path, typer.Argument(help="Where the results go, as JSON.")],
+    out: Annotated[Path, typer.Argument(help="JSON file for the results.")],
 ) -> None:
-    """Judge a file of answers in EAI's own format, each by itself. `embomatrix eval` makes tables of what it asked."""
+    """Judge a file of answers in EAI's own format. For tables of results, use `embomatrix eval`."""
     try:
         given = _read(answers)
         with NativeJudge(JudgeEnvironment.find()) as judge:
@@ -54,15 +55,15 @@ def judge_command(
             results = [_result(judge, known, entry) for entry in given]
         out.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
-        _leave("judge", TrainerError(f"{out} can't be written ({error.strerror}): name another file"))
+        _exit("judge", TrainerError(f"{out} can't be written ({error.strerror}): pass another file"))
     except TrainerError as error:
-        _leave("judge", error)
-    told = {
+        _exit("judge", error)
+    counts = {
         name: sum(bool(entry[name]) for entry in results)
         for name in ("official", "exact", "executed", "lost")
     }
     console.print(
-        f"{len(results)} answers: {', '.join(f'{count} {name}' for name, count in told.items())}: {out}"
+        f"{len(results)} answers: {', '.join(f'{count} {name}' for name, count in counts.items())}: {out}"
     )
 
 
@@ -74,7 +75,7 @@ def _read(path: Path) -> list[dict[str, str]]:
         raise TrainerError(f"{path} can't be read ({error.strerror}): expected a JSON file") from error
     except (ValueError, KeyError, TypeError) as error:
         raise TrainerError(
-            f'{path} holds no answers of EAI ({error!r}): expected [{{"identifier": …, "llm_output": …}}, …]'
+            f'{path} is not an answer file of EAI ({error!r}): expected [{{"identifier": …, "llm_output": …}}, …]'
         ) from error
 
 
@@ -82,7 +83,7 @@ def _result(judge: NativeJudge, known: set[str], entry: dict[str, str]) -> dict[
     name = entry["identifier"]
     if name not in known:
         raise TrainerError(
-            f"there is no task {name!r} in EAI's BEHAVIOR split: expected one of its {len(known)}"
+            f"EAI's BEHAVIOR split has no task {name!r}: expected one of its {len(known)} identifiers"
         )
     found = judge.judge(name, entry["llm_output"])
     if found is None:
@@ -98,7 +99,7 @@ def _result(judge: NativeJudge, known: set[str], entry: dict[str, str]) -> dict[
     }
 
 
-def _leave(command: str, error: TrainerError) -> NoReturn:
+def _exit(command: str, error: TrainerError) -> NoReturn:
     Console(stderr=True, soft_wrap=True).print(
         f"embomatrix eai {command}: {error}", highlight=False, markup=False
     )

@@ -1,4 +1,4 @@
-"""What a person can mend: each message names the thing and the remedy."""
+"""Errors that a user can fix. Each message names the object, the finding, the expectation and the remedy."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import pickle
 from typing import Final
 
 DAMAGE: Final = (OSError, ValueError, LookupError, TypeError, RuntimeError, EOFError, pickle.UnpicklingError)
-"""What reading a damaged file may raise: torch's reader lets its own slips through."""
+"""Exceptions that reading a damaged file may raise. ``torch.load`` passes on the errors of its own readers."""
 
 
 class TrainerError(Exception):
-    """One sentence for a person; commands show it and end with status 2."""
+    """Error with a one-sentence message for the user. Commands print it and exit with status 2."""
 
 
 def reason_of(error: BaseException) -> str:
-    """What another library says, in short, for a message: torch writes essays with its traces in them."""
+    """Return the first sentence of another library's error: torch puts stack traces into its messages."""
     text = (error.strerror or "") if isinstance(error, OSError) else ""
     lines = (text or str(error)).strip().splitlines() or [type(error).__name__]
     return lines[0].split(". ")[0].rstrip(".")

@@ -1,4 +1,4 @@
-"""Every constant of a training run, parsed once: from the command line, from a TOML file, or from a checkpoint."""
+"""Settings of a training run, parsed once from the command line, a TOML file or a checkpoint."""
 
 from __future__ import annotations
 
@@ -11,23 +11,41 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.grpo.objective import LossKind, Objective, RatioLevel
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
 
-class Overlap(StrEnum):
-    """What is computed while the cluster simulates."""
+class LossKind(StrEnum):
+    """Denominator of the loss."""
 
-    NONE = "none"  # nothing: every reward of a step is waited for, then the policy learns
-    STREAM = "stream"  # groups are sampled and learnt while others are simulated
-    AHEAD = "ahead"  # so is the next step's batch sampled, with weights that are one step old
+    PAPER = "paper"  # sum over a plan's tokens, mean over plans: the formula of the paper
+    GRPO = "grpo"  # mean over a plan's tokens, then over plans: DeepSeekMath
+    BNPO = "bnpo"  # mean over the tokens of each microbatch, then over microbatches
+    DAPO = "dapo"  # mean over all tokens of the step: a plan's weight grows with its length
+    DR_GRPO = "dr_grpo"  # sum over tokens / (plans * longest allowed plan): length has no influence
+    GSPO = "gspo"  # like GRPO, with the geometric mean of a plan's token ratios in place of each ratio
+
+
+class RatioLevel(StrEnum):
+    """Level of the importance ratio (new probability / old probability)."""
+
+    TOKEN = "token"
+    SEQUENCE = "sequence"  # product over a plan's tokens: the formula of the paper
+    MEAN = "mean"  # geometric mean over a plan's tokens: GSPO
+
+
+class Overlap(StrEnum):
+    """Work of the trainer while the cluster simulates."""
+
+    NONE = "none"  # none: wait for all rewards of a step, then update
+    STREAM = "stream"  # sample and back-propagate groups while others are simulated
+    AHEAD = "ahead"  # also sample the next step's batch, from weights that are one step old
 
 
 class TrackerKind(StrEnum):
-    """Programs that draw metrics."""
+    """Experiment trackers."""
 
     TENSORBOARD = "tensorboard"
     WANDB = "wandb"
@@ -35,25 +53,25 @@ class TrackerKind(StrEnum):
 
 
 class OptimiserKind(StrEnum):
-    """What imitation moves weights by."""
+    """Optimiser of imitation."""
 
     ADAMW = "adamw"
-    MUON = "muon"  # for the matrices of linear layers, and AdamW for everything else
+    MUON = "muon"  # for the matrices of linear layers; AdamW for all other parameters
 
 
-class Products(StrEnum):
-    """The type in which a policy's layers multiply on a processor; weights, sums and attention are of 32 bits always."""
+class ComputeDtype(StrEnum):
+    """Data type of the matrix products in linear layers on a CPU. Weights, sums and attention stay in float32."""
 
-    AUTO = "auto"  # bfloat16 where the processor has instructions for it
+    AUTO = "auto"  # bfloat16 if the CPU has instructions for it, else float32
     BFLOAT16 = "bfloat16"
     FLOAT32 = "float32"
 
 
 class OnLost(StrEnum):
-    """What becomes of a group of which the infrastructure lost a rollout."""
+    """Treatment of a group that lost a rollout to the infrastructure."""
 
-    GROUP = "group"  # the whole group is left out of the update
-    PARTIAL = "partial"  # only the lost rollout is
+    GROUP = "group"  # leave out the whole group
+    PARTIAL = "partial"  # leave out the lost rollout only
 
 
 class _Frozen(BaseModel):
@@ -61,7 +79,7 @@ class _Frozen(BaseModel):
 
 
 class TinySettings(_Frozen):
-    """The from-scratch policy's shape."""
+    """Shape of the word-level policy that is trained from scratch."""
 
     layers: int = Field(default=4, ge=1)
     width: int = Field(default=128, ge=16)
@@ -70,112 +88,119 @@ class TinySettings(_Frozen):
 
 
 class LoraSettings(_Frozen):
-    """Low-rank adapters for a Hugging Face model, in place of learning all of its weights."""
+    """Low-rank adapters for a Hugging Face model. The model's own weights stay frozen."""
 
     rank: int = Field(default=0, ge=0)
-    """0: none, the whole model learns."""
+    """0: no adapters, all weights learn."""
     alpha: float = Field(default=32.0, gt=0)
-    """What the adapters add is scaled by alpha / rank."""
+    """The adapters' output is scaled by alpha / rank."""
     targets: tuple[str, ...] = ()
-    """Last parts of the names of the linear layers that get one; none: all but the output layer."""
+    """Last parts of the names of the linear layers to adapt. Empty: all except the output layer."""
 
 
 class PromptSettings(_Frozen):
-    """What of a task's table is told, and how the telling varies during training."""
+    """Contents of prompts, and their variation during training."""
 
     rows: int = Field(default=16, ge=1)
-    """Rows told at most: those that the instruction names come first."""
+    """Maximum rows of the object table. Rows that the instruction names come first."""
     rename_share: float = Field(default=0.8, ge=0, le=1)
-    """Share of imitation's examples in which categories are called by the names of others (tiny policy only)."""
+    """Share of imitation examples with renamed object categories (word-level policy only)."""
     practice_rename_share: float = Field(default=0.0, ge=0, le=1)
-    """The same for GRPO's: by default it practises in the words of its tasks."""
+    """The same share in GRPO. The default keeps the tasks' own words."""
     drop_share: float = Field(default=0.7, ge=0, le=1)
-    """During imitation: up to this share of the rows that the oracle does not use is left untold."""
+    """Imitation leaves out up to this share of the rows that the oracle plan does not use."""
 
 
 class ImitationSettings(_Frozen):
-    """Teacher forcing on the oracle's plans, before GRPO."""
+    """Teacher forcing on the oracle plans, before GRPO."""
 
     seconds: float = Field(default=150.0, ge=0)
     steps: int | None = Field(default=None, ge=0)
-    """A number of steps in place of the seconds."""
+    """Number of steps. Overrides ``seconds``."""
     batch: int = Field(default=32, ge=1)
-    """Plans of a step."""
+    """Plans per step."""
     chunk: int | None = Field(default=None, ge=1)
-    """Plans that are learnt from at once: a step's gradient is accumulated over chunks, and memory is a chunk's. None: all."""
+    """Plans per forward pass. Gradients accumulate over chunks, which bounds memory. None: the whole batch."""
     optimiser: OptimiserKind = OptimiserKind.MUON
     learning_rate: float = Field(default=2e-3, gt=0)
-    """AdamW's."""
+    """Learning rate of AdamW."""
     matrix_learning_rate: float = Field(default=0.02, gt=0)
-    """Muon's."""
+    """Learning rate of Muon."""
     warmup_steps: int = Field(default=20, ge=0)
     weight_decay: float = Field(default=0.01, ge=0)
     patience: int = Field(default=0, ge=0)
-    """Early stopping: so many measurements in a row without a lower loss on tasks set aside end imitation, once their mean is
-    not below that of as many before them. The policy is put back to where that loss was lowest. 0: every task is taught, for
-    the whole budget."""
+    """Early stopping: evaluations without a lower validation loss before imitation ends and the best weights are restored.
+
+    The mean loss over the last ``patience`` evaluations must also not be below the mean over the ``patience`` before
+    them. 0: no early stopping, and no task is held back.
+    """
     validation_share: float = Field(default=0.05, gt=0, lt=1)
-    """Share of the training tasks that are set aside for it."""
+    """Share of the training tasks that is held back for validation."""
     validate_every: int = Field(default=100, ge=1)
-    """Steps between two measurements."""
+    """Steps between two evaluations."""
     checkpoint_seconds: float = Field(default=60.0, gt=0)
-    """Seconds of imitation between two checkpoints."""
+    """Seconds between two checkpoints."""
 
 
 class GrpoSettings(_Frozen):
-    """Group relative policy optimisation. The paper gives no values for these constants."""
+    """Group relative policy optimisation. The paper publishes no values for these constants."""
 
     minutes: float = Field(default=5.0, ge=0)
     steps: int | None = Field(default=None, ge=0)
-    """A number of steps in place of the minutes."""
+    """Number of steps. Overrides ``minutes``."""
     tasks_per_step: int = Field(default=16, ge=1)
     group: int = Field(default=8, ge=2)
     """Plans per task: G."""
     chunk: int = Field(default=8, ge=1)
-    """Tasks sampled together: their plans go to the cluster while the next chunk is sampled."""
+    """Tasks per microbatch. Its plans go to the cluster while the next microbatch is sampled."""
     learning_rate: float = Field(default=4e-4, gt=0)
     warmup_steps: int = Field(default=20, ge=0)
-    """Adam's first steps have the full length of the rate whatever the gradient: unless it rises slowly, the first few small
-    batches undo what imitation taught."""
+    """Steps of linear warm-up. Adam's first steps have full length for any gradient: without warm-up, the first small batches
+    undo imitation.
+    """
     final_learning_rate_share: float = Field(default=0.2, gt=0, le=1)
-    """The rate falls linearly to this share of itself."""
+    """The learning rate decays linearly to this share of itself."""
     temperature: float = Field(default=1.0, gt=0)
     max_new: int = Field(default=72, ge=1)
-    """Tokens of a plan at most."""
+    """Maximum tokens of a plan."""
     loss: LossKind = LossKind.DAPO
     ratio: RatioLevel = RatioLevel.TOKEN
     clip_low: float = Field(default=0.2, gt=0, lt=1)
     clip_high: float = Field(default=0.28, gt=0)
+    """Upper clip. Above ``clip_low`` it lets the probability of rare tokens grow (DAPO)."""
     kl_coef: float = Field(default=0.02, ge=0)
-    """Weight of the KL to the policy as imitation left it: the paper's beta."""
+    """Weight of the KL divergence to the policy after imitation: the paper's beta."""
     entropy_coef: float = Field(default=0.0, ge=0)
     spread_floor: float = Field(default=1.0, gt=0)
-    """Added to the spread of a group's rewards, in units of reward, before they are divided by it. At 1, a group whose plans
-    differ by a touched object only weighs a tenth of one in which some reach the goal; near 0, as in the paper, as much."""
+    """Reward units added to a group's standard deviation before the division by it.
+
+    At 1, a group that differs only by a touched object weighs a tenth of a group in which some plans reach the goal.
+    Near 0, as in the paper, both weigh the same.
+    """
     max_grad_norm: float = Field(default=1.0, gt=0)
     lookahead: int = Field(default=3, ge=0)
-    """Steps announced ahead."""
+    """Steps that are announced to the cluster ahead of time."""
     on_lost: OnLost = OnLost.GROUP
     overlap: Overlap = Overlap.STREAM
     reserve: int = Field(default=0, ge=0)
-    """Dynamic sampling: tasks of a step, at most, that take the place of groups without signal."""
+    """Dynamic sampling: maximum tasks per step that replace zero-variance groups."""
     curriculum_tasks: int = Field(default=0, ge=0)
-    """While so many tasks are drawn, they come from a pool that grows from the shortest plans to all; 0: from all at once."""
+    """Number of draws over which the task pool grows from the shortest plans to all tasks. 0: no curriculum."""
     curriculum_start: float = Field(default=0.25, gt=0, le=1)
-    """The pool's share of all tasks at the start."""
+    """Initial share of the tasks in the pool."""
     relevance: float = Field(default=1.0, ge=0)
-    """Weight of the reward's second tier in what is learnt; 0 leaves it out."""
+    """Weight of the reward's relevance tier in the advantage. 0 leaves the tier out."""
     relevance_final: float | None = Field(default=None, ge=0)
-    """Its weight at the end of the budget, reached linearly; None: it stays."""
+    """Weight at the end of the budget, reached linearly. None: constant."""
 
-    def objective(self) -> Objective:
-        return Objective(
-            self.loss, self.ratio, self.clip_low, self.clip_high, self.kl_coef, self.entropy_coef
-        )
+    @property
+    def ratio_level(self) -> RatioLevel:
+        """Level of the importance ratio. GSPO is defined with the geometric mean."""
+        return RatioLevel.MEAN if self.loss is LossKind.GSPO else self.ratio
 
 
 class RewardTable(_Frozen):
-    """Coefficients of the reward's tiers: what the cluster scores this run's plans with. 0 leaves a tier out."""
+    """Coefficients of the reward's tiers, which the cluster applies to this run's plans. 0 leaves a tier out."""
 
     unparsable: float = PAPER.unparsable
     format: float = PAPER.format
@@ -184,7 +209,7 @@ class RewardTable(_Frozen):
     goal: float = PAPER.goal
 
     @model_validator(mode="after")
-    def _pays(self) -> Self:
+    def _check(self) -> Self:
         self.settings()
         return self
 
@@ -193,7 +218,7 @@ class RewardTable(_Frozen):
 
 
 class EvaluationSettings(_Frozen):
-    """Success on held-out tasks."""
+    """Evaluation on held-out tasks."""
 
     samples: int = Field(default=10, ge=1)
     temperature: float = Field(default=1.0, ge=0)
@@ -201,28 +226,30 @@ class EvaluationSettings(_Frozen):
 
 
 class TrainSettings(_Frozen):
-    """One training run."""
+    """Settings of one training run."""
 
     model: str = "tiny"
     """``tiny``, or a Hugging Face model by name or folder."""
     codec: Codec = Codec.LINES
-    """Plan form of a Hugging Face model: ``lines`` or ``json``. The tiny policy calls objects by name."""
+    """Plan format of a Hugging Face model: ``lines`` or ``json``. The word-level policy always uses ``names``."""
     seed: int = 0
     threads: int = Field(default=1, ge=1)
-    """Threads of torch, in each process."""
+    """Torch threads per process."""
     processes: int = Field(default=1, ge=1)
-    """Processes that sample and back-propagate GRPO's chunks side by side, on a processor. What is learnt is the same to the
-    bit with any number; more than a step has chunks have nothing to do."""
+    """Data-parallel processes for GRPO, on a CPU. The result is bit-identical for any number.
+
+    Processes beyond the number of microbatches of a step stay idle.
+    """
     device: str = "cpu"
     checkpoint_every: int = Field(default=50, ge=1)
     keep_checkpoints: int = Field(default=2, ge=1)
     track: tuple[TrackerKind, ...] = ()
-    """Where metrics go besides the run's own files."""
+    """Experiment trackers that also receive the metrics."""
     samples_every: int = Field(default=10, ge=1)
-    """Steps between two groups that are written to the sample log."""
+    """Steps between two groups in the sample log."""
     gradient_checkpointing: bool = False
-    """Hugging Face models: keep only the inputs of layers for the way back, and compute the rest again."""
-    products: Products = Products.AUTO
+    """Hugging Face models: keep only the layers' inputs for the backward pass and recompute the rest."""
+    compute_dtype: ComputeDtype = ComputeDtype.AUTO
     tiny: TinySettings = TinySettings()
     lora: LoraSettings = LoraSettings()
     prompt: PromptSettings = PromptSettings()
@@ -244,13 +271,13 @@ LANGUAGE_MODEL_DEFAULTS: Final[Mapping[str, Any]] = {
     "grpo.learning_rate": 1e-5,
     "grpo.max_new": 96,
 }
-"""What differs by default for a pretrained model: it knows words and needs memory."""
+"""Defaults that differ for a pretrained model: it already knows words, and it needs more memory."""
 
 
 def read_settings(
     path: Path | None, changes: Mapping[str, Any], defaults: Mapping[str, Any] | None = None
 ) -> TrainSettings:
-    """``defaults``, then a TOML file, then ``changes`` (dotted keys; None: not given). Raises TrainerError."""
+    """Merge ``defaults``, then a TOML file, then ``changes`` (dotted keys; None: not given). Raises TrainerError."""
     values: dict[str, Any] = {}
     _set_all(values, defaults or {})
     if path is not None:
@@ -261,25 +288,27 @@ def read_settings(
                 f"the settings file {path} can't be read ({error.strerror}): expected a TOML file"
             ) from error
         except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise TrainerError(f"the settings file {path} is no TOML: {error}") from error
+            raise TrainerError(
+                f"the settings file {path} is not valid TOML ({error}): fix the file"
+            ) from error
     return with_changes(values, changes)
 
 
 def with_changes(values: dict[str, Any], changes: Mapping[str, Any]) -> TrainSettings:
-    """Settings of nested ``values`` with ``changes`` on top. Raises TrainerError that names the field."""
+    """Apply ``changes`` to nested ``values``. Raises TrainerError that names the field."""
     _set_all(values, changes)
     return checked_settings(values)
 
 
 def checked_settings(values: Mapping[str, Any]) -> TrainSettings:
-    """Settings of nested ``values``. Raises TrainerError that names the field."""
+    """Validate nested ``values``. Raises TrainerError that names the field."""
     try:
         return TrainSettings.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         if first["type"] == "extra_forbidden":
-            raise TrainerError(f"there is no setting {where!r}: mend its name or leave it out") from error
+            raise TrainerError(f"unknown setting {where!r}: correct its name or remove it") from error
         expected = first["msg"].removeprefix("Value error, ")
         expected = expected[:1].lower() + expected[1:]
         raise TrainerError(f"setting {where!r}: {expected} (found {first.get('input')!r})") from error

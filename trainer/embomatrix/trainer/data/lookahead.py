@@ -1,13 +1,13 @@
-"""Looking ahead in any data loader: the batches to come are known without being consumed, and can be announced.
+"""Look-ahead for any data loader: the coming batches are known before they are consumed, so they can be announced.
 
-A trainer of your own wraps its ``DataLoader``, or its sampler, and tells the cluster what the window holds:
+Wrap your ``DataLoader`` or sampler, and announce the window to the cluster:
 
     ahead = Lookahead(loader, steps=3)
     for batch in ahead:
-        announce(ahead.window())     # this batch and the three after it
+        announce(ahead.window())     # this batch and the next three
         ...
 
-Nothing is drawn twice and nothing is skipped: batches come in the loader's order, each ``steps`` earlier than it is needed.
+Batches keep the loader's order, and each is drawn exactly once, ``steps`` earlier than needed.
 """
 
 from __future__ import annotations
@@ -22,11 +22,10 @@ T = TypeVar("T")
 
 
 class Lookahead(Generic[T]):
-    """Iterates like ``batches``, and knows ``steps`` of them ahead. Each iteration over it begins a new epoch.
+    """Iterable over ``batches`` that knows ``steps`` of them ahead. Each iteration starts a new epoch.
 
-    ``batches`` is whatever can be iterated again and again: a ``torch.utils.data.DataLoader``, a (batch) sampler, a list.
-    Wrapped around a sampler it costs indices only; around a loader it holds ``steps`` batches in memory. With worker
-    processes of a loader, its own prefetching goes on below.
+    ``batches`` is any re-iterable: a ``torch.utils.data.DataLoader``, a (batch) sampler, a list. Around a sampler, the window
+    holds indices only; around a loader, it holds ``steps`` batches in memory. A loader's own prefetching still works.
     """
 
     def __init__(self, batches: Iterable[T], *, steps: int) -> None:
@@ -50,16 +49,16 @@ class Lookahead(Generic[T]):
             self._fill(source)
 
     def __len__(self) -> int:
-        """Batches of an epoch. Raises TypeError where ``batches`` has no length."""
+        """Batches of an epoch. Raises TypeError if ``batches`` has no length."""
         return len(self._batches)  # type: ignore[arg-type]  # a sampler without length raises as len() does
 
     @property
     def step(self) -> int:
-        """Number of the batch that is worked on, from 0, within the epoch."""
+        """Index of the current batch within the epoch, from 0."""
         return self._consumed
 
     def window(self) -> tuple[T, ...]:
-        """The batch that is worked on and those after it, ``steps`` at most; fewer at the end of the epoch."""
+        """The current batch and up to ``steps`` after it; fewer at the end of the epoch."""
         return tuple(self._window)
 
     def _fill(self, source: Iterator[T]) -> None:

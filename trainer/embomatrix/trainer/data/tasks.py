@@ -1,4 +1,4 @@
-"""Tasks to train on, and the order in which they come: a seeded permutation per epoch, known arbitrarily far ahead."""
+"""Training tasks and their order: a seeded permutation per epoch, known arbitrarily far ahead."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class TrainingTask:
-    """A task as the trainer needs it: what the prompt tells, where its bundle is, and the oracle's plan."""
+    """Task with the content of its prompt, the digest of its bundle, and the oracle plan."""
 
     task: Task
     situation: Situation
@@ -37,9 +37,9 @@ class TrainingTask:
 
 @dataclass(frozen=True)
 class TaskSet:
-    """Training and held-out tasks; ``bundle_bytes`` gives a bundle by its digest.
+    """Training and held-out tasks. ``bundle_bytes`` returns a bundle by its digest.
 
-    ``kinds`` maps a category to all categories of its kind: those with the same abilities.
+    ``kinds`` maps a category to all categories of the same kind, which have the same abilities.
     """
 
     train: tuple[TrainingTask, ...]
@@ -49,7 +49,7 @@ class TaskSet:
 
 
 def load_tasks(folder: Path) -> TaskSet:
-    """Read a dataset folder. Raises TrainerError with a remedy where it is missing or broken."""
+    """Load a dataset folder. Raises TrainerError if it is missing or damaged."""
     if not folder.is_dir():
         raise TrainerError(
             f"no dataset at {folder}: build one with `embomatrix factory build --out={folder}`, or pass --dataset"
@@ -62,7 +62,7 @@ def load_tasks(folder: Path) -> TaskSet:
         for record in dataset.records:
             by_bundle.setdefault(record.bundle_digest, []).append(record)
         for digest, records in by_bundle.items():
-            # One scene at a time: all of them decoded would fill the memory that simulators need.
+            # One scene at a time: decoding all of them would use the memory that simulators need.
             bundle = dataset.read_bundle(digest)
             kinds.add(bundle.scene)
             tasks |= {record.task.task_id: training_task(bundle, record) for record in records}
@@ -75,12 +75,12 @@ def load_tasks(folder: Path) -> TaskSet:
     return TaskSet(train, heldout, dataset.bundle_bytes, kinds.table())
 
 
-_TELLING: Final = ("toggleable", "heatSource", "coldSource", "cookable", "freezable")
-"""Abilities that decide what a plan may do with a thing."""
+_KIND_ABILITIES: Final = ("toggleable", "heatSource", "coldSource", "cookable", "freezable")
+"""Abilities that decide which skills apply to an object."""
 
 
 class KindTable:
-    """Which categories a plan treats alike: same abilities, doors, cavities and surfaces, and fixed or not."""
+    """Groups categories that a plan treats alike: same abilities, doors, cavities and surfaces, and all fixed or all loose."""
 
     def __init__(self) -> None:
         self._kinds: dict[str, set[tuple[object, ...]]] = {}
@@ -91,7 +91,7 @@ class KindTable:
             self._kinds.setdefault(asset.category, set()).add(_kind(asset, fixed=item.fixed))
 
     def table(self) -> dict[str, tuple[str, ...]]:
-        """Category to all of its kind. A category seen in two kinds (a fixed and a loose chair) belongs to neither."""
+        """Map each category to all of its kind. Categories that occur as two kinds (a fixed and a loose chair) are left out."""
         members: dict[tuple[object, ...], list[str]] = {}
         for category, kinds in self._kinds.items():
             if len(kinds) == 1:
@@ -100,12 +100,12 @@ class KindTable:
 
 
 def _kind(asset: Asset, *, fixed: bool) -> tuple[object, ...]:
-    abilities = tuple(asset.can(ability) for ability in _TELLING)
+    abilities = tuple(asset.can(ability) for ability in _KIND_ABILITIES)
     return (fixed, bool(asset.joints), bool(asset.interiors), bool(asset.supports), abilities)
 
 
 def training_task(bundle: Bundle, record: TaskRecord) -> TrainingTask:
-    """The task of a record with what a prompt tells of it. Raises TrainerError where record and bundle disagree."""
+    """Build the training task of a record. Raises TrainerError if record and bundle disagree."""
     task = record.task
     if bundle.tasks.get(task.task_id) != task:
         raise TrainerError(
@@ -122,33 +122,33 @@ def training_task(bundle: Bundle, record: TaskRecord) -> TrainingTask:
 
 
 def group_seed(run_seed: int, task_id: str) -> int:
-    """Seed that all rollouts of a task share in a run, in [0, 2^31): equal plans get equal rewards."""
+    """Seed in [0, 2^31) that all rollouts of a task share in a run, so equal plans get equal rewards."""
     digest = hashlib.sha256(f"{run_seed}:{task_id}".encode()).digest()
     return int.from_bytes(digest[:4], "big") >> 1
 
 
-LONGEST_PLAN: Final = 10_000
-"""Stands for the length of a plan that nobody knows: such tasks come last."""
+UNKNOWN_LENGTH: Final = 10_000
+"""Sort key for tasks without an oracle plan: they come last."""
 
 
 @dataclass(frozen=True, slots=True)
 class Curriculum:
-    """A pool that grows linearly from its ``start`` share of the tasks to all of them over the first ``tasks`` draws."""
+    """Pool of tasks that grows linearly from the ``start`` share to all tasks over the first ``tasks`` draws."""
 
     tasks: int = 0
     start: float = 1.0
 
     def pool(self, position: int, count: int) -> int:
-        """How many of ``count`` tasks are in the pool at this draw."""
+        """Size of the pool out of ``count`` tasks at this draw."""
         share = self.start + (1.0 - self.start) * min(1.0, position / self.tasks)
         return max(1, min(count, round(share * count)))
 
 
 class Schedule:
-    """Endless order of tasks. ``cursor`` is the whole state: the same seed and cursor give the same future.
+    """Endless order of tasks. ``cursor`` is its whole state: equal seeds and cursors give equal futures.
 
-    Each epoch is a permutation of all tasks. With a ``curriculum``, the first positions draw from a pool that begins with the
-    tasks of the shortest oracle plans. ``stream`` tells schedules of one seed apart.
+    Each epoch is a permutation of all tasks. With a ``curriculum``, the first draws come from a pool that starts with the
+    shortest oracle plans. ``stream`` separates schedules with the same seed.
     """
 
     def __init__(
@@ -164,18 +164,18 @@ class Schedule:
         self._seed = (seed, stream)
         self._curriculum = curriculum or Curriculum()
         self._by_length = sorted(
-            self._tasks, key=lambda task: (len(task.oracle) or LONGEST_PLAN, task.task.task_id)
+            self._tasks, key=lambda task: (len(task.oracle) or UNKNOWN_LENGTH, task.task.task_id)
         )
         self.cursor = cursor
 
     def take(self, count: int) -> tuple[TrainingTask, ...]:
-        """The next tasks; moves the cursor."""
+        """Return the next tasks and advance the cursor."""
         taken = self.peek(count)
         self.cursor += count
         return taken
 
     def peek(self, count: int, *, skip: int = 0) -> tuple[TrainingTask, ...]:
-        """The tasks that ``take`` will give after ``skip`` others."""
+        """Return the tasks that ``take`` would return after skipping ``skip`` others."""
         begin = self.cursor + skip
         return tuple(self._at(position) for position in range(begin, begin + count))
 

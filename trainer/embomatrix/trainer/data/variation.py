@@ -1,10 +1,10 @@
-"""One task, told in many ways: what must not matter to a policy is varied, in the prompt and in the plan alike.
+"""Random variation of prompts and plans: properties that must not matter to a policy change in both alike.
 
-Row order, instance numbers, the choice of bystanders, and the names of categories. What the instruction names may get the
-name of anything at all: its words say what to do with it, and the table tells its doors and switches, so that a policy
-learns to go by them and not by what it mostly does with a thing of that name. What the instruction doesn't name may be meant
-all the same ("cook the steak"): it is renamed only to one *of its kind* (same abilities, fixed or not), so that what the plan
-does stays right for what the prompt says. Held-out tasks lend their category words, never their instructions, goals or plans.
+Varied are the row order, instance numbers, the choice of bystanders, and category names. A category that the instruction
+names may get any other name: the instruction says what to do, and the table lists doors and switches, so the policy
+learns to read them instead of memorising typical uses. A category that the instruction does not name may still be meant
+("cook the steak"), so it is only renamed to one *of its kind* (same abilities, fixed or not), which keeps the plan valid.
+Held-out tasks contribute category names only, never their instructions, goals or plans.
 """
 
 from __future__ import annotations
@@ -24,32 +24,32 @@ if TYPE_CHECKING:
     from embomatrix.skills.syntax import Plan
 
 _WORD: Final = re.compile(r"[a-z0-9_]+", re.IGNORECASE)
-_LONGEST: Final = 6
-"""Words of a category's name at most."""
-_KEPT: Final = 0.2
-"""Share of categories that keep their word in a telling with other words."""
+_MAX_PHRASE_WORDS: Final = 6
+"""Maximum words of a category name."""
+_KEEP_SHARE: Final = 0.2
+"""Share of categories that keep their name in a renamed prompt."""
 
 
 @dataclass(frozen=True, slots=True)
 class Variation:
-    """How much is varied: ``rename`` is a probability per telling, ``drop`` the largest share of bystanders left out."""
+    """Strength of the variation. ``rename``: probability per prompt; ``drop``: maximum share of bystanders left out."""
 
     kinds: Mapping[str, tuple[str, ...]]
-    """Category to all categories of its kind, itself included."""
+    """Category to all categories of its kind, including itself."""
     rename: float = 0.5
     drop: float = 0.5
 
 
 def used_rows(plan: Plan) -> frozenset[int]:
-    """Rows that a plan calls."""
+    """Return the table rows that a plan uses."""
     calls = [(call.object_index, call.source_index) for call in plan]
     return frozenset(index for pair in calls for index in pair if index is not None)
 
 
-def with_fewer_bystanders(
+def drop_bystanders(
     situation: Situation, needed: frozenset[int], drop: float, rng: np.random.Generator
 ) -> Situation:
-    """Leave out a random share, at most ``drop``, of the rows that are neither needed nor host a needed one."""
+    """Leave out a random share, at most ``drop``, of the rows that are neither needed nor hold a needed one."""
     hosts = {row.host for row in situation.rows if row.index in needed and row.host}
     share = rng.uniform(0.0, drop)
     kept = [
@@ -60,8 +60,8 @@ def with_fewer_bystanders(
     return subset(situation, kept)
 
 
-def varied(situation: Situation, variation: Variation, rng: np.random.Generator) -> Situation:
-    """The same situation in other words: rows in another order, other instance numbers, perhaps other categories."""
+def vary(situation: Situation, variation: Variation, rng: np.random.Generator) -> Situation:
+    """Shuffle rows and instance numbers, and perhaps rename categories."""
     order = rng.permutation(len(situation.rows))
     situation = replace(situation, rows=tuple(situation.rows[int(at)] for at in order))
     if rng.random() < variation.rename:
@@ -70,7 +70,7 @@ def varied(situation: Situation, variation: Variation, rng: np.random.Generator)
 
 
 def _renumbered(situation: Situation, rng: np.random.Generator) -> Situation:
-    """Shuffle the names among the rows of each category; the instruction's full names follow."""
+    """Shuffle the names within each category, in the table and in the instruction."""
     names: dict[str, str] = {}
     by_category: dict[str, list[str]] = {}
     for row in situation.rows:
@@ -84,14 +84,14 @@ def _renumbered(situation: Situation, rng: np.random.Generator) -> Situation:
 def _renamed(
     situation: Situation, kinds: Mapping[str, tuple[str, ...]], rng: np.random.Generator
 ) -> Situation:
-    """Give categories the words of others, each word to one category at most; no word that the instruction holds."""
+    """Swap category names, each at most once. Names that the instruction contains are never given."""
     taken = {row.category for row in situation.rows}
-    spoken = _phrases(situation.instruction)
+    phrases = _phrases(situation.instruction)
     new: dict[str, str] = {}
     for category in dict.fromkeys(row.category for row in situation.rows):
-        choices = kinds if _spoken(category) in spoken else kinds.get(category, ())
-        free = [word for word in choices if word not in taken and _spoken(word) not in spoken]
-        if not free or rng.random() < _KEPT:
+        choices = kinds if _as_words(category) in phrases else kinds.get(category, ())
+        free = [word for word in choices if word not in taken and _as_words(word) not in phrases]
+        if not free or rng.random() < _KEEP_SHARE:
             continue
         new[category] = free[int(rng.integers(len(free)))]
         taken.add(new[category])
@@ -122,39 +122,39 @@ def _with_names(situation: Situation, names: Mapping[str, str], categories: Mapp
 
 
 def _replaced(text: str, words: Mapping[str, str]) -> str:
-    """All replacements at once, longest first: a word that was put in is not replaced again.
+    """Apply all replacements at once, longest first, so no replacement is replaced again.
 
-    Spoken words stay spoken ("pen" becomes "chicken leg") and names stay names ("pen_1" becomes "chicken_leg_1").
+    Words stay words ("pen" becomes "chicken leg") and names stay names ("pen_1" becomes "chicken_leg_1").
     """
-    changes = {**words, **{_spoken(old): _spoken(new) for old, new in words.items()}}
+    changes = {**words, **{_as_words(old): _as_words(new) for old, new in words.items()}}
     longest = max((phrase.count(" ") + 1 for phrase in changes), default=0)
     spans = [match.span() for match in _WORD.finditer(text)]
     parts: list[str] = []
-    at = told = 0
+    at = copied = 0
     while at < len(spans):
         for size in range(min(longest, len(spans) - at), 0, -1):
             begin, end = spans[at][0], spans[at + size - 1][1]
             new = changes.get(text[begin:end].lower())
             if new is not None:
-                parts += [text[told:begin], new]
-                told = end
+                parts += [text[copied:begin], new]
+                copied = end
                 break
         else:
             size = 1
         at += size
-    return "".join([*parts, text[told:]])
+    return "".join([*parts, text[copied:]])
 
 
-def _spoken(word: str) -> str:
+def _as_words(word: str) -> str:
     return word.replace("_", " ")
 
 
 def _phrases(text: str) -> frozenset[str]:
-    """Every run of up to ``_LONGEST`` words of a text, as it stands there in small letters."""
+    """All runs of up to ``_MAX_PHRASE_WORDS`` words of a text, in lower case."""
     text = text.lower()
     spans = [match.span() for match in _WORD.finditer(text)]
     return frozenset(
         text[spans[begin][0] : spans[end][1]]
         for begin in range(len(spans))
-        for end in range(begin, min(begin + _LONGEST, len(spans)))
+        for end in range(begin, min(begin + _MAX_PHRASE_WORDS, len(spans)))
     )

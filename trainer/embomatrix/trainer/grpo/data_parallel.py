@@ -1,85 +1,125 @@
-"""The processes of a trainer. Part ``n`` of a step belongs to process ``n`` modulo their number; the first is this one."""
+"""Data-parallel workers: processes that sample and back-propagate GRPO's microbatches side by side.
+
+Microbatch ``n`` of a step belongs to process ``n`` modulo the number of processes. Process 0 is the trainer itself.
+All processes see the same weights in shared memory.
+"""
 
 from __future__ import annotations
 
+import mmap
 import multiprocessing
+import os
 import pickle
+import signal
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.reduction import DupFd
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
-from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.grpo.remote import Workplace, serve
-from embomatrix.trainer.grpo.shared_memory import SharedTensors
+import torch
+
+from embomatrix.rpc.nameless import nameless_file
+from embomatrix.trainer.config.errors import DAMAGE, TrainerError
+from embomatrix.trainer.config.settings import TrainSettings
+from embomatrix.trainer.grpo.learner import Learner
+from embomatrix.trainer.policy.loading import saved_policy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from concurrent.futures import Future
+    from multiprocessing.connection import Connection
     from pathlib import Path
-    from types import TracebackType
 
     from torch import Tensor
 
-    from embomatrix.trainer.config.settings import TrainSettings
-    from embomatrix.trainer.grpo.learner import Learner, Lesson, Sampling
+    from embomatrix.trainer.grpo.learner import Microbatch, SamplingLearner
     from embomatrix.trainer.grpo.objective import LossMetrics
     from embomatrix.trainer.policy.protocol import Policy, Samples, Tokens
 
 T = TypeVar("T")
+_ALIGNMENT_BYTES: Final = 64
+"""Alignment of each tensor: the width of the widest vector instructions."""
+
+
+class SharedTensors:
+    """Tensors with the shapes and dtypes of ``like`` in one anonymous shared-memory file.
+
+    Without ``fd`` the memory is new and zero. torch's own sharing is not used: it needs /dev/shm, 64 MB in a container.
+    """
+
+    def __init__(self, like: Sequence[Tensor], fd: int | None = None) -> None:
+        sizes = [each.numel() * each.element_size() for each in like]
+        offsets = [0]
+        for size in sizes:
+            offsets.append(offsets[-1] + -(-size // _ALIGNMENT_BYTES) * _ALIGNMENT_BYTES)
+        self.fd = nameless_file("embomatrix-trainer", offsets[-1]) if fd is None else fd
+        memory = mmap.mmap(self.fd, offsets[-1])
+        self.tensors = tuple(
+            torch.frombuffer(memory, dtype=each.dtype, count=each.numel(), offset=offset).view(each.shape)
+            for each, offset in zip(like, offsets, strict=False)
+        )
+
+    def close(self) -> None:
+        """Close the descriptor. The memory lives as long as one of its tensors."""
+        os.close(self.fd)
 
 
 class RemoteLearner:
-    """A helper, and the thread that speaks with it: what is asked of it is done one after the other."""
+    """Learner in another process. Its requests are executed one after the other."""
 
     def __init__(self, number: int, settings: TrainSettings, reference: Path, weights: SharedTensors) -> None:
         spawn = multiprocessing.get_context("spawn")
         self._gradient = SharedTensors(weights.tensors)
-        self._connection, theirs = spawn.Pipe()
-        place = Workplace(
-            settings.model_dump(mode="json"), reference, DupFd(weights.fd), DupFd(self._gradient.fd)
-        )
+        self._connection, remote_end = spawn.Pipe()
         self._name = f"trainer-{number}"
-        self._process = spawn.Process(target=serve, args=(theirs, place), name=self._name, daemon=True)
+        memory = (DupFd(weights.fd), DupFd(self._gradient.fd))
+        self._process = spawn.Process(
+            target=_serve,
+            args=(remote_end, settings.model_dump(mode="json"), reference, *memory),
+            name=self._name,
+            daemon=True,
+        )
         self._process.start()
-        theirs.close()
+        remote_end.close()
         self._gradient.close()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix=self._name)
         self.closed = False
 
     def run(self, job: Callable[[RemoteLearner], T]) -> Future[T]:
-        """Have ``job`` work with this helper when its turn comes. It waits for nobody else: an interrupt would wait for it."""
+        """Queue ``job`` on this learner's thread. The job must not wait for other jobs, or Ctrl-C would wait too."""
         return self._thread.submit(job, self)
 
     def sample(self, prompts: Sequence[Tokens], seed: int) -> Samples:
-        samples: Samples = self._asked("sample", tuple(prompts), seed)
+        samples: Samples = self._request("sample", tuple(prompts), seed)
         return samples
 
-    def of_reference(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:
-        scored: Tensor = self._asked("of_reference", tuple(prompts), tokens, mask)
-        return scored
+    def reference_logprobs(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:
+        logprobs: Tensor = self._request("reference_logprobs", tuple(prompts), tokens, mask)
+        return logprobs
 
-    def learn(self, lesson: Lesson) -> tuple[LossMetrics, list[Tensor | None]]:
-        """A part's metrics, and its gradient by parameter."""
-        metrics, has = self._asked("learn", lesson)
+    def learn(self, microbatch: Microbatch) -> tuple[LossMetrics, list[Tensor | None]]:
+        """Return the metrics of a microbatch, and its gradient by parameter."""
+        metrics, has_gradient = self._request("learn", microbatch)
         shared = self._gradient.tensors
-        return metrics, [each.clone() if there else None for each, there in zip(shared, has, strict=True)]
+        return metrics, [
+            each.clone() if present else None for each, present in zip(shared, has_gradient, strict=True)
+        ]
 
-    def _asked(self, name: str, *arguments: object) -> Any:
+    def _request(self, name: str, *arguments: object) -> Any:
         try:
             self._connection.send_bytes(pickle.dumps((name, arguments)))
-            done, reply = pickle.loads(self._connection.recv_bytes())
+            succeeded, reply = pickle.loads(self._connection.recv_bytes())
         except (EOFError, OSError) as error:
             self._process.join(timeout=5)
             raise TrainerError(
-                f"the process {self._name} ended in mid-step (exit code {self._process.exitcode}, which is -9 where the "
-                "system had no memory left): go on with --resume, with fewer `processes` where memory is short"
+                f"the process {self._name} ended during a step (exit code {self._process.exitcode}; -9 usually means out of "
+                "memory): continue with --resume, and lower `processes` if memory is short"
             ) from error
-        if not done:
-            raise TrainerError(f"the process {self._name} can't go on ({reply}): go on with --resume")
+        if not succeeded:
+            raise TrainerError(f"the process {self._name} failed ({reply}): continue with --resume")
         return reply
 
     def close(self) -> None:
-        """End the process, whatever it does."""
+        """Kill the process, even in the middle of a request."""
         self.closed = True
         self._process.kill()
         self._process.join()
@@ -87,60 +127,110 @@ class RemoteLearner:
         self._connection.close()
 
 
-class Crew:
-    """This process and its helpers, which see each change of the policy's weights at once: they lie in shared memory."""
+class _Requests:
+    """Methods that ``RemoteLearner`` calls by name in the other process."""
 
-    def __init__(self, own: Learner, helpers: Sequence[RemoteLearner] = ()) -> None:
-        self.own = own
-        self._helpers = tuple(helpers)
+    def __init__(self, settings: TrainSettings, reference: Path, weights_fd: int, gradient_fd: int) -> None:
+        torch.set_num_threads(settings.threads)
+        policy = saved_policy(reference, settings)
+        self._weights = list(policy.parameters())
+        shared = SharedTensors(self._weights, weights_fd)
+        for parameter, tensor in zip(self._weights, shared.tensors, strict=True):
+            parameter.data = tensor
+        shared.close()
+        self._gradient = SharedTensors(self._weights, gradient_fd)
+        self._gradient.close()
+        self._learner = Learner(policy, saved_policy(reference, settings).frozen_copy(), settings.grpo)
+        self.sample = self._learner.sample
+        self.reference_logprobs = self._learner.reference_logprobs
+
+    def learn(self, microbatch: Microbatch) -> tuple[LossMetrics, list[bool]]:
+        """Write the microbatch's gradient to shared memory. The list tells which parameters have a gradient."""
+        for parameter in self._weights:
+            parameter.grad = None
+        metrics = self._learner.learn(microbatch)
+        for parameter, shared in zip(self._weights, self._gradient.tensors, strict=True):
+            if parameter.grad is not None:
+                shared.copy_(parameter.grad)
+        return metrics, [parameter.grad is not None for parameter in self._weights]
+
+
+def _serve(
+    connection: Connection, settings: dict[str, Any], reference: Path, weights: Any, gradient: Any
+) -> None:
+    """Answer requests until the trainer closes the connection. The trainer handles Ctrl-C for all processes.
+
+    ``reference`` is the folder of the policy after imitation; ``weights`` and ``gradient`` are descriptors from DupFd.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    requests: _Requests | None = None
+    while True:
+        try:
+            name, arguments = pickle.loads(connection.recv_bytes())
+        except EOFError:
+            return
+        try:
+            if requests is None:
+                parsed = TrainSettings.model_validate(settings)
+                requests = _Requests(parsed, reference, weights.detach(), gradient.detach())
+            reply = (True, getattr(requests, name)(*arguments))
+        except (TrainerError, MemoryError, *DAMAGE) as error:
+            reply = (False, f"{type(error).__name__}: {error}")
+        try:
+            connection.send_bytes(pickle.dumps(reply))
+        except BrokenPipeError:
+            return
+
+
+class DataParallelWorkers:
+    """The trainer's own learner and its remote learners. Weight updates are visible to all of them at once."""
+
+    def __init__(self, local: Learner, remotes: Sequence[RemoteLearner] = ()) -> None:
+        self.local = local
+        self._remotes = tuple(remotes)
 
     @classmethod
-    def of(cls, own: Learner, policy: Policy, settings: TrainSettings, reference: Path) -> Self:
-        """With as many helpers as the settings want beside this process; ``reference`` is the reference policy's folder.
+    def start(cls, local: Learner, policy: Policy, settings: TrainSettings, reference: Path) -> Self:
+        """Start ``settings.processes - 1`` remote learners. ``reference`` is the reference policy's folder.
 
-        Raises TrainerError where the policy is not on a processor.
+        Raises TrainerError if several processes are asked for and the policy is not on the CPU.
         """
         if settings.processes == 1:
-            return cls(own)
+            return cls(local)
         if settings.device != "cpu":
             raise TrainerError(
-                f"processes = {settings.processes} share a policy in a processor's memory, and the device is "
-                f"{settings.device}: pass --processes=1"
+                f"processes = {settings.processes} needs a policy on the CPU, but the device is {settings.device}: pass "
+                "--processes=1"
             )
         learning = list(policy.parameters())
         weights = SharedTensors([parameter.data for parameter in learning])
         for parameter, shared in zip(learning, weights.tensors, strict=True):
             shared.copy_(parameter.data)
             parameter.data = shared
-        helpers = [
+        remotes = [
             RemoteLearner(number, settings, reference, weights) for number in range(1, settings.processes)
         ]
         weights.close()
-        return cls(own, helpers)
+        return cls(local, remotes)
 
-    def helper(self, part: int) -> RemoteLearner | None:
-        """Whose part it is; None: this process's."""
-        turn = part % (len(self._helpers) + 1)
-        return self._helpers[turn - 1] if turn else None
+    def remote(self, index: int) -> RemoteLearner | None:
+        """Return the owner of the microbatch with this index. None: this process."""
+        owner = index % (len(self._remotes) + 1)
+        return self._remotes[owner - 1] if owner else None
 
-    def spread(self, jobs: Sequence[tuple[int, Callable[[Sampling], T]]]) -> list[T]:
-        """Do jobs, each with the number of its part, in the processes that they belong to; results are in their order."""
-        elsewhere = {
-            at: helper.run(job)
-            for at, (part, job) in enumerate(jobs)
-            if (helper := self.helper(part)) is not None
+    def map(self, jobs: Sequence[tuple[int, Callable[[SamplingLearner], T]]]) -> list[T]:
+        """Run (microbatch index, job) pairs on the learners that own them. Results keep the order of the jobs."""
+        futures = {
+            at: remote.run(job)
+            for at, (index, job) in enumerate(jobs)
+            if (remote := self.remote(index)) is not None
         }
-        here = {at: job(self.own) for at, (_, job) in enumerate(jobs) if at not in elsewhere}
-        return [here[at] if at in here else elsewhere[at].result() for at in range(len(jobs))]
+        local = {at: job(self.local) for at, (_, job) in enumerate(jobs) if at not in futures}
+        return [local[at] if at in local else futures[at].result() for at in range(len(jobs))]
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        for helper in self._helpers:
-            helper.close()
+    def __exit__(self, *_: object) -> None:
+        for remote in self._remotes:
+            remote.close()

@@ -1,4 +1,4 @@
-"""What of a step any process can do that holds the policy: sample, score by the reference, back-propagate."""
+"""Work on one microbatch that any process with a copy of the policy can do: sample, score, back-propagate."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import torch
 
-from embomatrix.trainer.grpo.objective import LossMetrics, Scale, Terms, surrogate_loss
+from embomatrix.trainer.grpo.objective import LossInputs, LossMetrics, LossTotals, surrogate_loss
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Lesson:
-    """A part of a step to learn from: ``prompts`` of its tasks, and their plans as rows, a group after the other.
+class Microbatch:
+    """Part of a step that is back-propagated at once: ``prompts``, and one group of plans per prompt as rows.
 
-    ``tokens``, ``mask``, ``old_logprobs`` and ``reference`` have shape (plans, tokens), ``advantages`` (plans,). ``scale``
-    holds the totals that the part's loss is divided by.
+    ``tokens``, ``mask``, ``old_logprobs`` and ``reference`` have shape (plans, tokens); ``advantages`` has (plans,).
+    ``totals`` holds the denominators of the loss.
     """
 
     prompts: Sequence[Tokens]
@@ -32,23 +32,23 @@ class Lesson:
     old_logprobs: Tensor
     reference: Tensor | None
     advantages: Tensor
-    scale: Scale
+    totals: LossTotals
 
 
-class Sampling(Protocol):
-    """Who samples, here or in another process."""
+class SamplingLearner(Protocol):
+    """Sampling half of a learner, in this process or a remote one."""
 
     def sample(self, prompts: Sequence[Tokens], seed: int) -> Samples:
-        """A group of plans for each prompt, drawn by a generator of this seed."""
+        """Draw a group of plans per prompt with a generator of this seed."""
         ...
 
-    def of_reference(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:
-        """Log-probabilities (plans, tokens) of groups of plans under the reference policy."""
+    def reference_logprobs(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:
+        """Return log-probabilities (plans, tokens) under the reference policy."""
         ...
 
 
 class Learner:
-    """A policy with its reference, in this process."""
+    """A policy and its reference policy in this process."""
 
     def __init__(self, policy: Policy, reference: Policy, settings: GrpoSettings) -> None:
         self._policy = policy
@@ -62,24 +62,24 @@ class Learner:
         return self._policy.sample(prompts, settings.group, settings.temperature, settings.max_new, generator)
 
     @torch.no_grad()
-    def of_reference(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:
+    def reference_logprobs(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:
         settings = self._settings
         return self._reference.logprobs(prompts, tokens, mask, settings.group, settings.temperature).logprobs
 
-    def learn(self, lesson: Lesson) -> LossMetrics:
-        """Back-propagate a part: its gradient is added to that of the policy's parameters."""
+    def learn(self, microbatch: Microbatch) -> LossMetrics:
+        """Add the microbatch's gradient to the gradients of the policy's parameters."""
         settings = self._settings
-        scored = self._policy.logprobs(
-            lesson.prompts, lesson.tokens, lesson.mask, settings.group, settings.temperature
+        scores = self._policy.logprobs(
+            microbatch.prompts, microbatch.tokens, microbatch.mask, settings.group, settings.temperature
         )
-        terms = Terms(
-            logprobs=scored.logprobs,
-            old_logprobs=lesson.old_logprobs,
-            mask=lesson.mask,
-            advantages=lesson.advantages,
-            reference=lesson.reference,
-            entropy=scored.entropy,
+        inputs = LossInputs(
+            logprobs=scores.logprobs,
+            old_logprobs=microbatch.old_logprobs,
+            mask=microbatch.mask,
+            advantages=microbatch.advantages,
+            reference=microbatch.reference,
+            entropy=scores.entropy,
         )
-        loss, metrics = surrogate_loss(terms, settings.objective(), lesson.scale)
+        loss, metrics = surrogate_loss(inputs, settings, microbatch.totals)
         torch.autograd.backward(loss)
         return metrics

@@ -1,4 +1,4 @@
-"""Checkpoints: everything that decides how training goes on, written whole or not at all."""
+"""Atomic checkpoints with the complete state of a run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import torch
 
 from embomatrix.trainer.config.errors import DAMAGE, TrainerError, reason_of
 from embomatrix.trainer.config.settings import TrainSettings
-from embomatrix.trainer.imitation.teacher_forcing import ImitationState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -23,21 +22,37 @@ if TYPE_CHECKING:
 
 SCHEMA = 3
 CHECKPOINTS = "checkpoints"
-"""Their folder in a run's."""
+"""Name of the checkpoints folder in a run's folder."""
 _STATE = "state.json"
 _TENSORS = "training.pt"
 _PREFIXES = ("imitation-", "step-")
-"""Of the two phases of a run, in their order, which is also that of their names."""
-FULL_BYTES = 8 * 1024 * 1024
-"""With less than this left, a disk counts as full: torch does not tell why a file can't be written."""
+"""Folder prefixes of the two phases. Their alphabetical order is the order of the phases."""
+DISK_FULL_BYTES = 8 * 1024 * 1024
+"""A disk with less free space counts as full, because torch does not report why a write failed."""
+
+
+@dataclass
+class ImitationState:
+    """State of imitation. ``best_loss`` is the lowest of the validation ``losses``, found at ``best_step``.
+
+    ``stale_evaluations`` counts the evaluations since then.
+    """
+
+    step: int = 0
+    seconds: float = 0.0
+    best_loss: float | None = None
+    best_step: int = 0
+    stale_evaluations: int = 0
+    losses: list[float] = field(default_factory=list)
+    done: bool = False
 
 
 @dataclass
 class TrainingProgress:
-    """Where a run stands. ``cursor`` is the schedule's, ``reserve_cursor`` that of the reserve.
+    """Position of a run. ``cursor`` and ``reserve_cursor`` are positions in the two task schedules.
 
-    ``prepared``: imitation and the evaluation after it are done, and the reference is kept. Seconds are of GRPO and, by
-    activity, of the whole run. ``dataset`` is a digest of the tasks that the run began with; "": nobody kept it.
+    ``grpo_ready``: imitation and the evaluation after it are done, and the reference policy is saved. ``grpo_s`` are seconds of
+    GRPO, ``spent_s`` seconds of the whole run by activity. ``dataset`` is a digest of the run's tasks.
     """
 
     step: int = 0
@@ -46,7 +61,7 @@ class TrainingProgress:
     rollouts: int = 0
     lost: int = 0
     imitation: ImitationState = field(default_factory=ImitationState)
-    prepared: bool = False
+    grpo_ready: bool = False
     grpo_s: float = 0.0
     spent_s: dict[str, float] = field(default_factory=dict)
     before: list[dict[str, Any]] = field(default_factory=list)
@@ -54,7 +69,7 @@ class TrainingProgress:
 
 
 class CheckpointStore:
-    """Checkpoints of one run, a folder each: ``imitation-000800``, ``step-000050``. The newest ``keep`` stay."""
+    """Checkpoints of one run, one folder each: ``imitation-000800``, ``step-000050``. The newest ``keep`` are kept."""
 
     def __init__(self, folder: Path, *, keep: int) -> None:
         self._folder = folder
@@ -63,10 +78,10 @@ class CheckpointStore:
     def save(
         self, policy: Policy, tensors: Mapping[str, Any], progress: TrainingProgress, settings: TrainSettings
     ) -> Path:
-        """Write beside, sync, then rename: a crash leaves the last checkpoint as it was. Raises TrainerError."""
-        number = progress.step if progress.prepared else progress.imitation.step
-        final = self._folder / f"{_PREFIXES[progress.prepared]}{number:06d}"
-        with whole_folder(final) as partial:
+        """Write a checkpoint atomically: a crash leaves the previous one intact. Raises TrainerError."""
+        number = progress.step if progress.grpo_ready else progress.imitation.step
+        final = self._folder / f"{_PREFIXES[progress.grpo_ready]}{number:06d}"
+        with atomic_folder(final) as partial:
             policy.save(partial / "policy")
             torch.save(dict(tensors), partial / _TENSORS)
             state = {
@@ -81,7 +96,7 @@ class CheckpointStore:
         return final
 
     def latest(self) -> Path | None:
-        """Folder of the newest whole checkpoint."""
+        """Return the folder of the newest complete checkpoint."""
         found = self._all()
         return found[-1] if found else None
 
@@ -97,8 +112,8 @@ class CheckpointStore:
 
 
 @contextlib.contextmanager
-def whole_folder(final: Path) -> Iterator[Path]:
-    """An empty folder to fill, which becomes ``final`` at the end. Raises TrainerError, and leaves nothing, if that fails."""
+def atomic_folder(final: Path) -> Iterator[Path]:
+    """Yield an empty folder that is renamed to ``final`` at the end. On an error, nothing is left. Raises TrainerError."""
     partial = final.with_name(f".{final.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     try:
@@ -107,10 +122,11 @@ def whole_folder(final: Path) -> Iterator[Path]:
         shutil.rmtree(final, ignore_errors=True)
         os.replace(partial, final)
     except (OSError, RuntimeError) as error:  # torch's writer raises RuntimeError where a disk is full
-        full = shutil.disk_usage(final.parent if final.parent.is_dir() else ".").free < FULL_BYTES
+        full = shutil.disk_usage(final.parent if final.parent.is_dir() else ".").free < DISK_FULL_BYTES
         raise TrainerError(
-            f"{final} can't be written ({'the disk is full' if full else reason_of(error)}): make room there, or give rights; "
-            "checkpoints before it are whole, and --resume goes on from the newest"
+            f"{final} can't be written ({'the disk is full' if full else reason_of(error)}): free space or fix the "
+            "permissions; "
+            "earlier checkpoints are intact, and --resume continues from the newest"
         ) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -124,7 +140,7 @@ def _sync(folder: Path) -> None:
 
 
 def read_state(folder: Path) -> tuple[TrainingProgress, TrainSettings]:
-    """What a checkpoint says of the run. Raises TrainerError where it is none, or of another version."""
+    """Read a checkpoint's progress and settings. Raises TrainerError if it is damaged or of another version."""
     try:
         state = json.loads((folder / _STATE).read_text(encoding="utf-8"))
         if state["schema"] != SCHEMA:
@@ -133,27 +149,20 @@ def read_state(folder: Path) -> tuple[TrainingProgress, TrainSettings]:
             )
         progress = TrainingProgress(**state["progress"])
         progress.imitation = ImitationState(**state["progress"]["imitation"])
-        return progress, TrainSettings.model_validate(_of_today(state["settings"]))
+        return progress, TrainSettings.model_validate(state["settings"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrainerError(
-            f"{folder} is no readable checkpoint ({_STATE}: {reason_of(error)}): pass a folder such as "
+            f"{folder} is not a readable checkpoint ({_STATE}: {reason_of(error)}): pass a folder such as "
             "runs/NAME/checkpoints/step-000050"
         ) from error
 
 
-def _of_today(settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings of a checkpoint; once `products` was the small policy's alone."""
-    tiny = dict(settings["tiny"])
-    moved = {"products": tiny.pop("products")} if "products" in tiny else {}
-    return {**settings, "tiny": tiny, **moved}
-
-
-def restore(folder: Path, put_back: Callable[[dict[str, Any]], object]) -> None:
-    """Give ``put_back`` what was saved besides the policy. Raises TrainerError where that is damaged."""
+def restore(folder: Path, load: Callable[[dict[str, Any]], object]) -> None:
+    """Pass the saved tensors (without the policy) to ``load``. Raises TrainerError if they are damaged."""
     try:
-        put_back(torch.load(folder / _TENSORS, map_location="cpu", weights_only=True))
+        load(torch.load(folder / _TENSORS, map_location="cpu", weights_only=True))
     except DAMAGE as error:
         raise TrainerError(
-            f"{folder / _TENSORS} is damaged ({reason_of(error)}): remove {folder}, and --resume goes on from the "
+            f"{folder / _TENSORS} is damaged ({reason_of(error)}): remove {folder}, and --resume continues from the "
             "checkpoint before it"
         ) from error

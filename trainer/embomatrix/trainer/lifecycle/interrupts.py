@@ -1,4 +1,4 @@
-"""Interrupts that wait until what was begun is whole: a policy that was moved by half can't be gone on from."""
+"""Deferred Ctrl-C: a policy that was updated by half can't be resumed."""
 
 from __future__ import annotations
 
@@ -10,35 +10,35 @@ if TYPE_CHECKING:
     from types import FrameType, TracebackType
 
 
-class Interrupts:
-    """A context in which an interrupt is put off from ``put_off`` to the end, where it comes. A second one is not put off.
+class DeferredInterrupts:
+    """Context manager that holds back SIGINT from ``defer`` until its end. A second SIGINT takes effect at once.
 
-    Threads other than the main one know no interrupts.
+    Has no effect outside the main thread, which alone receives signals.
     """
 
     def __init__(self) -> None:
-        self._before: Any = None
-        self._came = False
+        self._previous_handler: Any = None
+        self._received = False
 
     def __enter__(self) -> Self:
         return self
 
-    def put_off(self) -> None:
-        """What follows, to the end of the context, is done as a whole."""
-        if self._before is None and threading.current_thread() is threading.main_thread():
-            self._before = signal.getsignal(signal.SIGINT)
-            if self._before is not None:  # else a handler that is not Python's, and can't be put back
-                signal.signal(signal.SIGINT, self._note)
+    def defer(self) -> None:
+        """Hold back SIGINT from now until the context ends."""
+        if self._previous_handler is None and threading.current_thread() is threading.main_thread():
+            self._previous_handler = signal.getsignal(signal.SIGINT)
+            if self._previous_handler is not None:  # None: not a Python handler, so it could not be restored
+                signal.signal(signal.SIGINT, self._on_interrupt)
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        self._came = True
-        signal.signal(signal.SIGINT, self._before)
+    def _on_interrupt(self, number: int, frame: FrameType | None) -> None:
+        self._received = True
+        signal.signal(signal.SIGINT, self._previous_handler)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._before is not None:
-            signal.signal(signal.SIGINT, self._before)
-            self._before = None
-        if self._came and error is None:
+        if self._previous_handler is not None:
+            signal.signal(signal.SIGINT, self._previous_handler)
+            self._previous_handler = None
+        if self._received and error is None:
             signal.raise_signal(signal.SIGINT)

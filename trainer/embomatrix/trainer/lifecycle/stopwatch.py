@@ -1,4 +1,4 @@
-"""Where the time goes: seconds of wall clock by activity."""
+"""Wall-clock seconds of a run by activity."""
 
 from __future__ import annotations
 
@@ -24,35 +24,35 @@ class Activity(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class TimeShares:
-    """Where the time of GRPO's steps went: ``seconds`` in all, of which ``spent_s`` tells parts by activity. NaN of no time."""
+    """Shares of GRPO's ``seconds``, from the seconds by activity. NaN if ``seconds`` is 0."""
 
     seconds: float
     spent_s: Mapping[str, float]
 
     @property
     def waiting(self) -> float:
-        """Share in which the trainer stood still for simulation."""
-        return self._of(Activity.WAITING)
+        """Share in which the trainer was idle because it waited for simulation."""
+        return self._share_of(Activity.WAITING)
 
     @property
     def overhead(self) -> float:
-        """Share in which the model neither sampled nor learnt: waiting and all that is around it."""
-        return 1.0 - self._of(Activity.SAMPLING) - self._of(Activity.UPDATE)
+        """Share outside of sampling and updates."""
+        return 1.0 - self._share_of(Activity.SAMPLING) - self._share_of(Activity.UPDATE)
 
-    def _of(self, activity: Activity) -> float:
+    def _share_of(self, activity: Activity) -> float:
         return self.spent_s.get(activity.value, 0.0) / self.seconds if self.seconds else math.nan
 
 
 class Stopwatch:
-    """Adds up what is spent in ``spending`` blocks, which do not nest."""
+    """Sum of the seconds in ``track`` blocks, by activity. The blocks must not nest."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self.spent_s: dict[str, float] = {}
 
     @contextlib.contextmanager
-    def whole(self) -> Iterator[None]:
-        """Work that counts when it is done: what is spent in it is forgotten where it is broken off."""
+    def discard_on_error(self) -> Iterator[None]:
+        """Count the block's seconds only if the block finishes."""
         before = dict(self.spent_s)
         try:
             yield
@@ -61,7 +61,7 @@ class Stopwatch:
             raise
 
     @contextlib.contextmanager
-    def spending(self, activity: Activity) -> Iterator[None]:
+    def track(self, activity: Activity) -> Iterator[None]:
         began_s = self._clock()
         try:
             yield

@@ -1,4 +1,4 @@
-"""Tells the manager how training goes, for people who look at its dashboard."""
+"""Training reports to the manager, for its dashboard."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ if TYPE_CHECKING:
     from embomatrix.trainer.cluster.gateway import PlanOutcome
     from embomatrix.trainer.grpo.records import GroupLog
 
-SHOWN: Final = 4
-"""Plans of a step: of the group whose rewards differ most, from the best to the worst."""
+PLANS_SHOWN: Final = 4
+"""Plans per step: from the group with the widest spread of rewards, from the best to the worst."""
 
 
-class Reporter:
-    """A tracker whose program is the manager. ``send`` takes a report and never waits for anything."""
+class DashboardReporter:
+    """Tracker that reports to the manager. ``send`` queues a report and never blocks."""
 
     def __init__(self, send: Callable[[TrainingReport], None]) -> None:
         self._send = send
 
     def log(self, phase: str, step: int, values: Mapping[str, float]) -> None:
-        """Numbers of a step; those that are not finite have nothing to show."""
+        """Report a step's finite numbers."""
         finite = [(name[:NAME_CHARS], value) for name, value in values.items() if math.isfinite(value)]
         self._send(TrainingReport(phase, step, dict(finite[:FIGURES])))
 
     def close(self) -> None:
-        """Nothing stays open: the gateway sends what is left."""
+        """No-op: the gateway sends the remaining reports."""
 
     def sampled(self, step: int, logs: Sequence[GroupLog]) -> None:
-        """Some plans of a step of GRPO."""
+        """Report some plans of a GRPO step."""
         widest = max(logs, key=_spread, default=None)
         self._send(TrainingReport(GRPO_PHASE, step, {}, () if widest is None else _plans(widest)))
 
@@ -52,13 +52,13 @@ def _spread(log: GroupLog) -> float:
 
 
 def _plans(log: GroupLog) -> tuple[SampledPlan, ...]:
-    """Evenly from the ranks of the group, so that both ends are among them; what was lost comes last."""
+    """Pick plans evenly by reward rank, including the best and the worst. Lost ones rank last."""
     ranked = sorted(
         zip(log.outcomes, log.advantages, strict=True),
         key=lambda pair: -math.inf if pair[0].reward is None else pair[0].value,
         reverse=True,
     )
-    last = min(SHOWN, len(ranked)) - 1
+    last = min(PLANS_SHOWN, len(ranked)) - 1
     chosen = [round(rank * (len(ranked) - 1) / max(last, 1)) for rank in range(last + 1)]
     return tuple(_plan(log, *ranked[rank]) for rank in chosen)
 

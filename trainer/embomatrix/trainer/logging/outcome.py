@@ -1,4 +1,4 @@
-"""What a finished run leaves for programs: one JSON file, written last, so that a folder which holds one is done."""
+"""Machine-readable result of a finished run: one JSON file, written last, so its presence marks a finished run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SCHEMA: Final = 1
 
 @dataclass(frozen=True, slots=True)
 class TaskRate:
-    """Success of one held-out task, in [0, 1]; None where every rollout of it was lost."""
+    """Success rate of one held-out task, None if all of its rollouts were lost."""
 
     task_id: str
     category: str
@@ -29,10 +29,10 @@ class TaskRate:
 
 @dataclass(frozen=True, slots=True)
 class RunOutcome:
-    """Numbers of one run. ``before`` and ``after`` GRPO are empty where nothing was held out.
+    """Numbers of one run. ``before`` and ``after`` GRPO are empty without held-out tasks.
 
-    ``spent_s`` are seconds by activity of the whole run, ``grpo_s`` those of GRPO's steps alone. ``peak_mb`` is the most memory
-    that the trainer's process held at once, since it was last resumed; 0 where nobody looked.
+    ``spent_s`` are seconds of the whole run by activity, ``grpo_s`` seconds of the GRPO steps. ``peak_mb`` is the peak memory
+    of the trainer process since the last resume in MB, 0 if unknown.
     """
 
     model: str
@@ -49,17 +49,17 @@ class RunOutcome:
 
     @property
     def wait_share(self) -> float:
-        """Share of GRPO's steps in which the trainer stood still for simulation; NaN without a step."""
+        """Share of the GRPO steps in which the trainer waited for simulation; NaN without steps."""
         return TimeShares(self.grpo_s, self.spent_s).waiting
 
     @property
     def overhead(self) -> float:
-        """Share of GRPO's steps in which the model neither sampled nor learnt: waiting and all that is around it."""
+        """Share of the GRPO steps outside of sampling and updates; NaN without steps."""
         return TimeShares(self.grpo_s, self.spent_s).overhead
 
 
 def write_outcome(folder: Path, outcome: RunOutcome) -> Path:
-    """Write it into a run's folder. Raises OSError."""
+    """Write the outcome into a run's folder. Raises OSError."""
     path = folder / OUTCOME
     value = {"schema": SCHEMA, **asdict(outcome)}
     write_whole(path, (json.dumps(value, indent=1) + "\n").encode("utf-8"))
@@ -67,16 +67,16 @@ def write_outcome(folder: Path, outcome: RunOutcome) -> Path:
 
 
 def read_outcome(folder: Path) -> RunOutcome:
-    """What ``write_outcome`` wrote. Raises TrainerError where there is none, or it is damaged."""
+    """Read an outcome. Raises TrainerError if it is missing or damaged."""
     path = folder / OUTCOME
     try:
         value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         if value.pop("schema") != SCHEMA:
-            raise TrainerError(f"{path} is of another version: train again with another --out")
+            raise TrainerError(f"{path} has another version than {SCHEMA}: train again with another --out")
         for name in ("before", "after"):
             value[name] = tuple(TaskRate(**item) for item in value[name])
         return RunOutcome(**value)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise TrainerError(
-            f"{path} is no outcome of a finished run ({reason_of(error)}): finish it with `embomatrix train --resume`"
+            f"{path} is not the outcome of a finished run ({reason_of(error)}): finish the run with `embomatrix train --resume`"
         ) from error

@@ -1,6 +1,7 @@
-"""Matrix products in fewer bits than the weights have: a processor with instructions for it takes a quarter of the time.
+"""Linear layers that multiply in a shorter data type than their weights, such as bfloat16 on a CPU with AVX-512 BF16.
 
-Weights, their gradients and their optimiser stay whole, unlike in a model that is kept in 16 bits.
+Such products take a quarter of the time. Weights, gradients and optimiser state stay in float32, unlike in a model that
+is stored in 16 bits.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from embomatrix.trainer.config.settings import Products
+from embomatrix.trainer.config.settings import ComputeDtype
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -20,67 +21,67 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-class Product(nn.Linear):
-    """``y = W x + b``, multiplied in a type of its own. The result is of that type; gradients are of the weight's."""
+class MixedLinear(nn.Linear):
+    """Linear layer ``y = W x + b`` that multiplies in ``compute_dtype``. The output has this dtype, gradients the weight's."""
 
-    def __init__(self, inside: int, outside: int, products: torch.dtype, *, bias: bool = False) -> None:
-        super().__init__(inside, outside, bias=bias)
-        self.products = products
-        self.converted: Tensor | None = None
-        """The weight as it is multiplied, while it is known not to change."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(…, inside) to (…, outside)."""
-        weight = self.weight.to(self.products) if self.converted is None else self.converted
-        bias = None if self.bias is None else self.bias.to(self.products)
-        return functional.linear(x.to(self.products), weight, bias)
-
-
-class ProductBetween(Product):
-    """A product between layers that know nothing of its type: the result is of its input's."""
+    def __init__(
+        self, in_features: int, out_features: int, compute_dtype: torch.dtype, *, bias: bool = False
+    ) -> None:
+        super().__init__(in_features, out_features, bias=bias)
+        self.compute_dtype = compute_dtype
+        self.cast_weight: Tensor | None = None
+        """Cached weight in ``compute_dtype``, valid inside ``frozen_weights``."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """(…, inside) to (…, outside)."""
+        """(…, in_features) to (…, out_features)."""
+        weight = self.weight.to(self.compute_dtype) if self.cast_weight is None else self.cast_weight
+        bias = None if self.bias is None else self.bias.to(self.compute_dtype)
+        return functional.linear(x.to(self.compute_dtype), weight, bias)
+
+
+class CastingLinear(MixedLinear):
+    """Mixed linear layer whose output has the dtype of its input, for models that know nothing of ``compute_dtype``."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(…, in_features) to (…, out_features)."""
         return super().forward(x).to(x.dtype)
 
     @classmethod
-    def of(cls, layer: nn.Linear, products: torch.dtype) -> ProductBetween:
-        """In place of ``layer``, with its parameters."""
+    def replacing(cls, layer: nn.Linear, compute_dtype: torch.dtype) -> CastingLinear:
+        """Return a layer that shares the parameters of ``layer``."""
         with torch.device("meta"):
-            made = cls(layer.in_features, layer.out_features, products, bias=layer.bias is not None)
+            made = cls(layer.in_features, layer.out_features, compute_dtype, bias=layer.bias is not None)
         made.weight, made.bias = layer.weight, layer.bias
         return made
 
 
-def multiply_in(model: nn.Module, products: torch.dtype, head: nn.Module | None) -> None:
-    """Let the linear layers of ``model`` multiply in ``products``.
-
-    Not so ``head``, whose results are the scores of words: they want all their digits.
-    """
+def use_compute_dtype(model: nn.Module, compute_dtype: torch.dtype, head: nn.Module | None) -> None:
+    """Replace the model's linear layers by casting ones. ``head`` stays in float32: token scores need all digits."""
     for parent in list(model.modules()):
         for name, layer in list(parent.named_children()):
             if type(layer) is nn.Linear and layer is not head:
-                setattr(parent, name, ProductBetween.of(layer, products))
+                setattr(parent, name, CastingLinear.replacing(layer, compute_dtype))
 
 
 @contextlib.contextmanager
-def unchanged(model: nn.Module) -> Iterator[None]:
-    """For many words in a row: no weight changes or learns meanwhile, so that each is converted once."""
-    layers = [layer for layer in model.modules() if isinstance(layer, Product)]
+def frozen_weights(model: nn.Module) -> Iterator[None]:
+    """Cast each weight once for many forward passes. The weights must not change inside the block."""
+    layers = [layer for layer in model.modules() if isinstance(layer, MixedLinear)]
     try:
         for layer in layers:
-            layer.converted = layer.weight.detach().to(layer.products)
+            layer.cast_weight = layer.weight.detach().to(layer.compute_dtype)
         yield
     finally:
         for layer in layers:
-            layer.converted = None
+            layer.cast_weight = None
 
 
-def type_of(products: Products, device: str) -> torch.dtype:
-    """What ``products`` means on a device: half the bits where its processor multiplies them in one instruction."""
-    if products is Products.AUTO:
-        tell: Callable[[], Mapping[str, Any]] = getattr(torch.cpu, "get_capabilities", dict)
-        told = tell()  # nothing, in torches before it could be asked
-        able = device == "cpu" and told.get("avx512_bf16", False)
-        products = Products.BFLOAT16 if able else Products.FLOAT32
-    return torch.bfloat16 if products is Products.BFLOAT16 else torch.float32
+def torch_dtype(compute_dtype: ComputeDtype, device: str) -> torch.dtype:
+    """Return the torch dtype. AUTO is bfloat16 on a CPU with AVX-512 BF16 instructions, else float32."""
+    if compute_dtype is ComputeDtype.AUTO:
+        query: Callable[[], Mapping[str, Any]] = getattr(
+            torch.cpu, "get_capabilities", dict
+        )  # newer torch only
+        supported = device == "cpu" and query().get("avx512_bf16", False)
+        compute_dtype = ComputeDtype.BFLOAT16 if supported else ComputeDtype.FLOAT32
+    return torch.bfloat16 if compute_dtype is ComputeDtype.BFLOAT16 else torch.float32

@@ -1,4 +1,4 @@
-"""From a model's name to a policy, new or saved."""
+"""Creation and loading of policies by model name or folder."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.trainer.config.errors import DAMAGE, TrainerError, reason_of
-from embomatrix.trainer.policy.compute_dtype import type_of
+from embomatrix.trainer.policy.compute_dtype import torch_dtype
 from embomatrix.trainer.policy.decoder import DecoderShape
 from embomatrix.trainer.policy.hf import HfPolicy
-from embomatrix.trainer.policy.lora import LoraShape, has_adapters
+from embomatrix.trainer.policy.lora import has_adapters
 from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.policy.vocabulary import build_vocabulary
 
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
 TINY: Final = "tiny"
 
 
-def is_tiny(model: str) -> bool:
-    """Whether a model by name or folder is the from-scratch policy, new or saved."""
+def is_word_level(model: str) -> bool:
+    """True for the word-level policy, new (``tiny``) or saved in a folder."""
     return model == TINY or TinyPolicy.is_saved_in(Path(model))
 
 
 def new_policy(settings: TrainSettings, tasks: TaskSet) -> Policy:
-    """The policy that a run starts from. Raises TrainerError where the model is unknown or can't be loaded."""
-    if not is_tiny(settings.model):
+    """Create the initial policy of a run. Raises TrainerError if the model is unknown or can't be loaded."""
+    if not is_word_level(settings.model):
         return _language_model(settings.model, settings)
     if settings.lora.rank or settings.gradient_checkpointing:
         raise TrainerError(
-            "lora and gradient_checkpointing are for Hugging Face models: the word-level policy needs neither, leave them out"
+            "lora and gradient_checkpointing are for Hugging Face models, not for the word-level policy: leave them out"
         )
     if settings.model != TINY:
         return saved_policy(Path(settings.model), settings)
@@ -44,16 +44,16 @@ def new_policy(settings: TrainSettings, tasks: TaskSet) -> Policy:
         shape,
         seed=settings.seed,
         device=settings.device,
-        products=type_of(settings.products, settings.device),
+        compute_dtype=torch_dtype(settings.compute_dtype, settings.device),
     )
 
 
 def saved_policy(folder: Path, settings: TrainSettings) -> Policy:
-    """A policy that was saved in a folder. Raises TrainerError where there is none."""
+    """Load a policy from a folder. Raises TrainerError if there is none, or it is damaged."""
     try:
         if TinyPolicy.is_saved_in(folder):
-            products = type_of(settings.products, settings.device)
-            return TinyPolicy.load(folder, device=settings.device, products=products)
+            compute_dtype = torch_dtype(settings.compute_dtype, settings.device)
+            return TinyPolicy.load(folder, device=settings.device, compute_dtype=compute_dtype)
     except DAMAGE as error:
         raise TrainerError(
             f"the policy in {folder} is damaged ({reason_of(error)}): use another checkpoint"
@@ -65,25 +65,24 @@ def saved_policy(folder: Path, settings: TrainSettings) -> Policy:
             folder,
             settings.codec,
             device=settings.device,
-            products=settings.products,
+            compute_dtype=settings.compute_dtype,
             label=settings.model,
-            recompute=settings.gradient_checkpointing,
+            gradient_checkpointing=settings.gradient_checkpointing,
         )
     raise TrainerError(
-        f"there is no policy in {folder}: pass a checkpoint folder, runs/NAME/checkpoints/step-000050"
+        f"no policy found in {folder}: pass a checkpoint folder such as runs/NAME/checkpoints/step-000050"
     )
 
 
 def _language_model(named: str, settings: TrainSettings, adapters: Path | None = None) -> HfPolicy:
-    """A Hugging Face model, with adapters where the settings want them: new ones, or those of a folder."""
+    """Load a Hugging Face model, with new or saved adapters if the settings ask for them."""
     policy = HfPolicy.load(
         named,
         settings.codec,
         device=settings.device,
-        products=settings.products,
-        recompute=settings.gradient_checkpointing,
+        compute_dtype=settings.compute_dtype,
+        gradient_checkpointing=settings.gradient_checkpointing,
     )
     if settings.lora.rank:
-        shape = LoraShape(settings.lora.rank, settings.lora.alpha, settings.lora.targets)
-        policy.adapt(shape, seed=settings.seed, saved=adapters)
+        policy.adapt(settings.lora, seed=settings.seed, saved=adapters)
     return policy

@@ -1,7 +1,7 @@
-"""A word-level vocabulary: small policies learn to copy words in minutes, sub-word pieces in hours.
+"""Word-level vocabulary. Small policies learn to copy words in minutes, subword tokens in hours.
 
-Built from the tasks at hand: skills, relations, states, the category words of the object tables, room types, small
-numbers, and the frequent words of the *training* instructions. ``apple_12`` is two tokens, ``apple`` and ``_12``.
+It holds skills, relations, states, the category words of the object tables, room types, small numbers, and the frequent
+words of the *training* instructions. ``apple_12`` is two tokens, ``apple`` and ``_12``.
 """
 
 from __future__ import annotations
@@ -44,28 +44,31 @@ _FIXED_WORDS: Final = (
 def build_vocabulary(
     situations: Iterable[Situation], instructions: Iterable[str], *, min_count: int = 2
 ) -> Vocabulary:
-    """Vocabulary for tasks whose tables are told by ``situations``; ``instructions`` are those of training."""
+    """Build the vocabulary of tasks from the object tables in ``situations`` and the training ``instructions``."""
     words: dict[str, None] = dict.fromkeys(_FIXED_WORDS)
-    things: dict[str, None] = {}
-    rooms: dict[str, None] = {}
+    object_stems: dict[str, None] = {}
+    room_stems: dict[str, None] = {}
     numbers = {0}
     for situation in situations:
         words |= dict.fromkeys(skill.value for skill in PROFILES[situation.profile])
         words |= dict.fromkeys(state for row in situation.rows for state in row.states)
-        things |= dict.fromkeys(row.category for row in situation.rows)
-        for stems, names in ((things, [row.name for row in situation.rows]), (rooms, situation.rooms)):
+        object_stems |= dict.fromkeys(row.category for row in situation.rows)
+        for stems, names in (
+            (object_stems, [row.name for row in situation.rows]),
+            (room_stems, situation.rooms),
+        ):
             for name in names:
                 stem, number = _split_number(name)
                 stems.setdefault(stem)
                 numbers |= {int(number[1:])} if number else set()
     counts = Counter(word for text in instructions for word in _WORD.findall(text.lower()))
     frequent = sorted(word for word, count in counts.items() if count >= min_count)
-    named = things | rooms
-    # An instruction that says living_room_0 is to be read as the table's names are: as a stem and a number.
+    named = object_stems | room_stems
+    # living_room_0 in an instruction must get the same tokens as in the table: a stem and a number.
     words |= dict.fromkeys(word for word in frequent if _split_number(word)[0] not in named)
     words |= named
     words |= dict.fromkeys(f"_{number}" for number in range(max(numbers) + 1))
-    return Vocabulary((*SPECIAL, *words), tuple(things), tuple(rooms))
+    return Vocabulary((*SPECIAL, *words), tuple(object_stems), tuple(room_stems))
 
 
 def _split_number(name: str) -> tuple[str, str]:
@@ -75,13 +78,13 @@ def _split_number(name: str) -> tuple[str, str]:
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """Words by token id. Text that it can't spell becomes ``<unknown>``; decoding never fails.
+    """Words by token id. Unknown words become ``<unknown>``; decoding never fails.
 
-    ``thing_words`` and ``room_words`` are those that a name of the object table or of a room begins with.
+    ``object_words`` and ``room_words`` are the first words of names in the object table and of rooms.
     """
 
     words: tuple[str, ...]
-    thing_words: tuple[str, ...]
+    object_words: tuple[str, ...]
     room_words: tuple[str, ...]
     index: Mapping[str, int] = field(init=False)
 
@@ -89,35 +92,35 @@ class Vocabulary:
         object.__setattr__(self, "index", {word: token for token, word in enumerate(self.words)})
 
     @property
-    def things(self) -> tuple[int, ...]:
-        return tuple(self.index[word] for word in self.thing_words)
+    def object_tokens(self) -> tuple[int, ...]:
+        return tuple(self.index[word] for word in self.object_words)
 
     @property
-    def rooms(self) -> tuple[int, ...]:
+    def room_tokens(self) -> tuple[int, ...]:
         return tuple(self.index[word] for word in self.room_words)
 
     @property
-    def numbers(self) -> tuple[int, ...]:
+    def number_tokens(self) -> tuple[int, ...]:
         """Words that end a name: ``_0``, ``_1`` and so on."""
         return tuple(token for token, word in enumerate(self.words) if _NUMBER.fullmatch(word))
 
     @property
-    def quantities(self) -> tuple[int, ...]:
-        """Words that are angles and distances."""
+    def quantity_tokens(self) -> tuple[int, ...]:
+        """Words for angles and distances."""
         return tuple(token for token, word in enumerate(self.words) if _QUANTITY.fullmatch(word))
 
     def __len__(self) -> int:
         return len(self.words)
 
     def encode(self, text: str) -> list[int]:
-        """Tokens of a text: the longest known phrase of up to four words first, so "chicken leg" is one token."""
+        """Encode a text. The longest known phrase of up to four words wins, so "chicken leg" is one token."""
         words = _WORD.findall(text.lower())
         tokens: list[int] = []
         at = 0
         while at < len(words):
-            taken, found = self._longest(words[at : at + _LONGEST_PHRASE])
+            length, found = self._longest(words[at : at + _LONGEST_PHRASE])
             tokens += found
-            at += taken
+            at += length
         return tokens
 
     def _longest(self, words: Sequence[str]) -> tuple[int, list[int]]:
@@ -137,12 +140,12 @@ class Vocabulary:
         return [self.index.get(singular, UNKNOWN)]
 
     def decode(self, tokens: Iterable[int]) -> str:
-        """Text up to the end token. Numbers that belong to a name join it: ``apple`` ``_2`` is ``apple_2``."""
+        """Decode up to the end token. Numbers join the word before: ``apple`` ``_2`` becomes ``apple_2``."""
         parts: list[str] = []
         for token in tokens:
             if token == END:
                 break
             word = self.words[token]
-            joined = word == BREAK or word.startswith("_") or not parts or parts[-1] == BREAK
-            parts += [word] if joined else [" ", word]
+            no_space = word == BREAK or word.startswith("_") or not parts or parts[-1] == BREAK
+            parts += [word] if no_space else [" ", word]
         return "".join(parts)

@@ -1,4 +1,4 @@
-"""Imitation in a run's folder: with a log, checkpoints to go on from, and the policy that it ends with."""
+"""Imitation phase of a run: log, checkpoints, resume."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
     from embomatrix.trainer.imitation.teacher_forcing import ImitationProgress
     from embomatrix.trainer.lifecycle.checkpoint import TrainingProgress
     from embomatrix.trainer.logging.recorder import Recorder
-    from embomatrix.trainer.policy.prompts import Teller
+    from embomatrix.trainer.policy.prompts import PromptBuilder
     from embomatrix.trainer.policy.protocol import Policy
 
 LOG_EVERY: Final = 10
-"""Steps between two lines of the log, besides those with a measurement."""
+"""Steps between two lines of the log. Steps with a validation loss are always logged."""
 
 
-def warm_up(
+def run_imitation(
     policy: Policy,
-    teller: Teller,
+    prompt_builder: PromptBuilder,
     tasks: Sequence[TrainingTask],
     settings: TrainSettings,
     out: Path,
@@ -35,14 +35,13 @@ def warm_up(
     recorder: Recorder,
     report: Callable[[ImitationProgress], None],
 ) -> None:
-    """Imitate for the budget, or what is left of it, and keep ``progress.imitation`` true.
+    """Use up the imitation budget and keep ``progress.imitation`` current. A checkpoint is always left. Raises TrainerError.
 
-    The policy is that of the newest checkpoint in ``out``, where ``progress`` comes from one. However it ends, a checkpoint
-    is left to go on from. Raises TrainerError.
+    If ``progress`` comes from a checkpoint, the policy must be that checkpoint's.
     """
     store = CheckpointStore(out / CHECKPOINTS, keep=settings.keep_checkpoints)
     state = progress.imitation
-    imitation = Imitation(policy, teller, tasks, settings.imitation, seed=settings.seed, state=state)
+    imitation = Imitation(policy, prompt_builder, tasks, settings.imitation, seed=settings.seed, state=state)
     if state.done:
         return
     newest = store.latest() if state.step else None
@@ -51,7 +50,7 @@ def warm_up(
     recorder.forget_after(state.step, IMITATION)
     saved_s = time.monotonic()
 
-    def told(step: ImitationProgress) -> None:
+    def on_step(step: ImitationProgress) -> None:
         nonlocal saved_s
         if step.validation is not None or step.step % LOG_EVERY == 1:
             recorder.imitation(step)
@@ -61,7 +60,7 @@ def warm_up(
             saved_s = time.monotonic()
 
     try:
-        imitation.run(told)
+        imitation.run(on_step)
     finally:
         if state.step:
             store.save(policy, imitation.tensors(), progress, settings)

@@ -12,15 +12,15 @@ from tests.fakes.symbolic_household import make_tasks
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import read_settings
 from embomatrix.trainer.data.variation import Variation
-from embomatrix.trainer.imitation.optimisers import ImitationOptimiser
+from embomatrix.trainer.imitation.optimiser import ImitationOptimiser
 from embomatrix.trainer.imitation.teacher_forcing import Imitation
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
 from embomatrix.trainer.logging.display import LineDisplay, LiveDisplay
 from embomatrix.trainer.logging.recorder import IMITATION, Recorder
 from embomatrix.trainer.policy.loading import new_policy, saved_policy
-from embomatrix.trainer.policy.prompts import Teller
+from embomatrix.trainer.policy.prompts import PromptBuilder
 from embomatrix.trainer.policy.tiny import TinyPolicy
-from embomatrix.trainer.run.imitation import warm_up
+from embomatrix.trainer.run.imitation import run_imitation
 
 TINY = {"tiny.layers": 1, "tiny.width": 32, "tiny.heads": 2, "tiny.inner": 64}
 SHORT = {"imitation.steps": 12, "imitation.batch": 4, "imitation.learning_rate": 8e-3}
@@ -41,7 +41,7 @@ def imitate(out, settings, cut_after=None, tasks=TASKS, display=None):
     newest = store.latest()
     progress = read_state(newest)[0] if newest else TrainingProgress()
     policy = saved_policy(newest / "policy", settings) if newest else new_policy(settings, tasks)
-    teller = Teller(policy, 16, Variation(tasks.kinds, 0.5, 0.5))
+    prompt_builder = PromptBuilder(policy, 16, Variation(tasks.kinds, 0.5, 0.5))
     steps = []
 
     def report(step):
@@ -51,7 +51,7 @@ def imitate(out, settings, cut_after=None, tasks=TASKS, display=None):
         if cut_after == step.step:
             raise CutError
 
-    warm_up(policy, teller, tasks.train, settings, out, progress, Recorder(out), report)
+    run_imitation(policy, prompt_builder, tasks.train, settings, out, progress, Recorder(out), report)
     return policy, progress.imitation, steps
 
 
@@ -94,7 +94,7 @@ def test_a_step_in_chunks_has_the_gradient_of_the_whole_and_the_memory_of_a_chun
     tmp_path, monkeypatch, chunk, at_once
 ):
     def gradient(name, **changes):
-        one = settings_of(imitation__steps=1, products="float32", **changes)
+        one = settings_of(imitation__steps=1, compute_dtype="float32", **changes)
         policy, _, (step,) = imitate(tmp_path / name, one)
         return torch.cat([each.grad.flatten() for each in policy.parameters()]), step.loss
 
@@ -148,7 +148,7 @@ def test_policy_is_put_back_to_where_it_was_best_on_tasks_set_aside(tmp_path):
 )
 def test_one_lucky_measurement_does_not_stop_what_goes_on_falling(tmp_path, monkeypatch, losses, taken):
     told = iter(losses)
-    monkeypatch.setattr(Imitation, "_loss_aside", lambda _: next(told))
+    monkeypatch.setattr(Imitation, "_validation_loss", lambda _: next(told))
     settings = settings_of(imitation__steps=len(losses), imitation__patience=3, imitation__validate_every=1)
     _, state, steps = imitate(tmp_path, settings)
     assert (len(steps), state.best_loss) == (taken, min(losses[:taken]))
@@ -169,7 +169,7 @@ def test_checkpoints_come_by_the_clock(tmp_path):
 
 
 def test_too_few_tasks_to_set_aside_are_told(tmp_path):
-    with pytest.raises(TrainerError, match="which leaves none to learn from"):
+    with pytest.raises(TrainerError, match="which leaves none to train on"):
         imitate(tmp_path, settings_of(imitation__patience=1), tasks=make_tasks(1, 0, objects=7))
 
 
@@ -186,4 +186,4 @@ def test_displays_tell_the_loss_on_tasks_set_aside(tmp_path, live):
     display = LiveDisplay(console) if live else LineDisplay(console)
     with display:
         imitate(tmp_path, settings_of(imitation__patience=20, imitation__validate_every=1), display=display)
-    assert "on tasks set aside" in console.export_text()
+    assert "validation loss" in console.export_text()

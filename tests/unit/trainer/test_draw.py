@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from embomatrix.trainer.policy.drawing import draw
+from embomatrix.trainer.policy.protocol import draw
 
 BARRED = -1e9
 

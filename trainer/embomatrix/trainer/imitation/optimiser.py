@@ -1,7 +1,7 @@
-"""What imitation moves weights by: AdamW, or Muon for the matrices of linear layers with AdamW for the rest.
+"""Optimiser of imitation: AdamW, or Muon for the matrices of linear layers with AdamW for all other parameters.
 
 Muon (Jordan et al. 2024, "Muon: an optimizer for hidden layers in neural networks") replaces a matrix's momentum by the
-nearest matrix whose singular values are all 1, so that rare directions learn as fast as frequent ones.
+nearest matrix whose singular values are all 1, so rare directions learn as fast as frequent ones.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _BETAS = (0.9, 0.95)
 
 
 class ImitationOptimiser:
-    """One optimiser or two, as one; each with a learning rate of its own, scaled together."""
+    """One or two torch optimisers behind one interface, each with its own learning rate."""
 
     def __init__(self, module: nn.Module, settings: ImitationSettings) -> None:
         matrices = _matrices(module) if settings.optimiser is OptimiserKind.MUON else []
-        taken = {id(matrix) for matrix in matrices}
-        rest = [parameter for parameter in module.parameters() if id(parameter) not in taken]
+        matrix_ids = {id(matrix) for matrix in matrices}
+        rest = [parameter for parameter in module.parameters() if id(parameter) not in matrix_ids]
         decay = settings.weight_decay
         self._parts: dict[str, tuple[Optimizer, float]] = {
             "adamw": (
@@ -46,7 +46,7 @@ class ImitationOptimiser:
             optimiser.zero_grad(set_to_none=True)
 
     def step(self, factor: float) -> None:
-        """Move the weights; ``factor`` scales every learning rate."""
+        """Update the weights. ``factor`` scales all learning rates."""
         for optimiser, rate in self._parts.values():
             for group in optimiser.param_groups:
                 group["lr"] = rate * factor
@@ -56,13 +56,13 @@ class ImitationOptimiser:
         return {name: optimiser.state_dict() for name, (optimiser, _) in self._parts.items()}
 
     def load_state_dict(self, states: Mapping[str, Any]) -> None:
-        """Go on from what ``state_dict`` gave. Raises LookupError, TypeError or ValueError where it is not such."""
+        """Restore the state from ``state_dict``. Raises LookupError, TypeError or ValueError if it does not fit."""
         for name, (optimiser, _) in self._parts.items():
             optimiser.load_state_dict(states[name])
 
 
 def _matrices(module: nn.Module) -> list[nn.Parameter]:
-    """Weights of linear layers with more than one output that learn."""
+    """Trainable weights of linear layers with more than one output."""
     layers = (layer for layer in module.modules() if isinstance(layer, nn.Linear) and layer.out_features > 1)
     weights = (layer.weight for layer in layers)
     return [weight for weight in weights if isinstance(weight, nn.Parameter) and weight.requires_grad]

@@ -5,8 +5,8 @@ import pytest
 from tests.fakes.symbolic_household import make_tasks, run_plan
 
 from embomatrix.skills.prompt import Codec, plan_in_names, prompt_for
-from embomatrix.trainer.cluster.gateway import parsed
-from embomatrix.trainer.data.variation import Variation, used_rows, varied, with_fewer_bystanders
+from embomatrix.trainer.cluster.gateway import parse_policy_text
+from embomatrix.trainer.data.variation import Variation, drop_bystanders, used_rows, vary
 
 TASKS = make_tasks(40, 0)
 VARIATION = Variation(TASKS.kinds, rename=1.0)
@@ -23,16 +23,16 @@ def rng(seed=0):
 @pytest.mark.parametrize("task", TASKS.train, ids=lambda task: task.task.task_id)
 def test_the_oracle_succeeds_in_every_telling(task):
     for seed in range(5):
-        situation = with_fewer_bystanders(task.situation, used_rows(task.oracle), 0.5, rng(seed))
-        told = varied(situation, VARIATION, rng(seed))
-        plan = parsed(plan_in_names(task.oracle, told), told, Codec.NAMES)
+        situation = drop_bystanders(task.situation, used_rows(task.oracle), 0.5, rng(seed))
+        told = vary(situation, VARIATION, rng(seed))
+        plan = parse_policy_text(plan_in_names(task.oracle, told), told, Codec.NAMES)
         assert plan == task.oracle
         assert run_plan(task, plan)[0].success
 
 
 @pytest.mark.parametrize("task", TASKS.train, ids=lambda task: task.task.task_id)
 def test_what_the_instruction_does_not_name_is_renamed_to_its_kind_only(task):
-    told = varied(task.situation, VARIATION, rng())
+    told = vary(task.situation, VARIATION, rng())
     before = {row.index: row for row in task.situation.rows}
     names = {row.name for row in told.rows}
     assert len(names) == len(told.rows)
@@ -56,18 +56,18 @@ def test_what_the_instruction_names_may_be_called_anything():
 
 
 def told_in_order(task):
-    return sorted(varied(task.situation, VARIATION, rng()).rows, key=lambda row: row.index)
+    return sorted(vary(task.situation, VARIATION, rng()).rows, key=lambda row: row.index)
 
 
 def test_tellings_differ_and_repeat_with_the_seed():
     situation = TASKS.train[0].situation
-    texts = [prompt_for(varied(situation, VARIATION, rng(seed)), Codec.NAMES).user for seed in (1, 1, 2)]
+    texts = [prompt_for(vary(situation, VARIATION, rng(seed)), Codec.NAMES).user for seed in (1, 1, 2)]
     assert texts[0] == texts[1] != texts[2]
 
 
 def test_without_renaming_only_order_changes_where_names_are_unique():
     situation = TASKS.train[0].situation
-    told = varied(situation, Variation(TASKS.kinds, rename=0.0), rng(3))
+    told = vary(situation, Variation(TASKS.kinds, rename=0.0), rng(3))
     assert sorted(told.rows, key=lambda row: row.index) == list(situation.rows)
     assert told.instruction == situation.instruction
 
@@ -76,7 +76,7 @@ def test_needed_rows_and_their_hosts_are_never_left_out():
     task = TASKS.train[0]
     needed = used_rows(task.oracle)
     for seed in range(20):
-        told = with_fewer_bystanders(task.situation, needed, 1.0, rng(seed))
+        told = drop_bystanders(task.situation, needed, 1.0, rng(seed))
         kept = {row.index for row in told.rows}
         hosts = {row.host for row in task.situation.rows if row.index in needed and row.host}
         assert needed <= kept

@@ -12,9 +12,8 @@ from tests.unit.trainer.test_loop import TASKS, run, weights
 
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import read_settings
-from embomatrix.trainer.grpo.data_parallel import Crew
+from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers, SharedTensors
 from embomatrix.trainer.grpo.learner import Learner
-from embomatrix.trainer.grpo.shared_memory import SharedTensors
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore
 from embomatrix.trainer.logging.display import LineDisplay
 from embomatrix.trainer.logging.recorder import read_metrics
@@ -24,16 +23,16 @@ FAST = {"imitation__steps": 20, "grpo__steps": 4, "checkpoint_every": 2}
 
 
 @pytest.fixture
-def helpers(monkeypatch):
-    """The processes of every crew that is made."""
+def remotes(monkeypatch):
+    """The processes of every workers that is made."""
     made = []
-    real = Crew.__init__
+    real = DataParallelWorkers.__init__
 
-    def noted(self, own, helpers=()):
-        made.extend(helper._process for helper in helpers)
-        real(self, own, helpers)
+    def noted(self, local, remotes=()):
+        made.extend(remote._process for remote in remotes)
+        real(self, local, remotes)
 
-    monkeypatch.setattr(Crew, "__init__", noted)
+    monkeypatch.setattr(DataParallelWorkers, "__init__", noted)
     return made
 
 
@@ -44,10 +43,10 @@ def learnt(folder, **changes):
 @pytest.mark.parametrize(
     "changes", [{}, {"grpo__reserve": 4, "grpo__overlap": "ahead"}], ids=["plain", "all"]
 )
-def test_two_processes_learn_what_one_learns_to_the_bit(tmp_path, helpers, changes):
+def test_two_processes_learn_what_one_learns_to_the_bit(tmp_path, remotes, changes):
     one = learnt(tmp_path / "one", **changes)
     two = learnt(tmp_path / "two", processes=2, **changes)
-    assert len(helpers) == 1
+    assert len(remotes) == 1
     assert torch.equal(one, two)
     told = [
         [{**row, "seconds": 0, "spent_s": {}} for row in read_metrics(tmp_path / name)]
@@ -56,21 +55,21 @@ def test_two_processes_learn_what_one_learns_to_the_bit(tmp_path, helpers, chang
     assert told[0] == told[1]
 
 
-def test_more_processes_than_a_step_has_chunks_change_nothing(tmp_path, helpers):
+def test_more_processes_than_a_step_has_chunks_change_nothing(tmp_path, remotes):
     assert torch.equal(learnt(tmp_path / "one"), learnt(tmp_path / "three", processes=3))
-    assert len(helpers) == 2
-    assert not any(process.is_alive() for process in helpers)
+    assert len(remotes) == 2
+    assert not any(process.is_alive() for process in remotes)
 
 
-def test_a_process_that_is_killed_ends_the_run_and_one_alone_goes_on_to_the_same_end(tmp_path, helpers):
+def test_a_process_that_is_killed_ends_the_run_and_one_alone_goes_on_to_the_same_end(tmp_path, remotes):
     whole, _ = run(tmp_path / "whole", **FAST)
 
     class Killer(LineDisplay):
         def stepped(self, record, share, rollouts_per_s):
             if record.step == 3:
-                os.kill(helpers[0].pid, signal.SIGKILL)
+                os.kill(remotes[0].pid, signal.SIGKILL)
 
-    with pytest.raises(TrainerError, match=r"the process trainer-1 ended in mid-step \(exit code -9"):
+    with pytest.raises(TrainerError, match=r"the process trainer-1 ended during a step \(exit code -9"):
         run(tmp_path / "cut", display=Killer(Console(quiet=True)), processes=2, **FAST)
     newest = CheckpointStore(tmp_path / "cut" / CHECKPOINTS, keep=9).latest()
     assert newest.name == "step-000003"
@@ -86,7 +85,7 @@ def interruptible():
     signal.signal(signal.SIGINT, before)
 
 
-def test_an_interrupt_waits_neither_for_rewards_nor_for_processes(tmp_path, helpers, interruptible):
+def test_an_interrupt_waits_neither_for_rewards_nor_for_processes(tmp_path, remotes, interruptible):
     class Silent(SymbolicCluster):
         """Gives no reward in the third step of GRPO, and has the trainer interrupted."""
 
@@ -100,7 +99,7 @@ def test_an_interrupt_waits_neither_for_rewards_nor_for_processes(tmp_path, help
 
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, Silent(TASKS), processes=2, **FAST)
-    assert not helpers[0].is_alive()
+    assert not remotes[0].is_alive()
     assert CheckpointStore(tmp_path / CHECKPOINTS, keep=9).latest().name == "step-000002"
 
 
@@ -108,18 +107,20 @@ def test_a_gradient_that_no_process_can_make_is_told(tmp_path, monkeypatch):
     settings = read_settings(None, {"processes": 2})
     policy = new_policy(settings, TASKS)
     policy.save(tmp_path)
-    with Crew.of(Learner(policy, policy, settings.grpo), policy, settings, tmp_path) as crew:
-        asked = crew.helper(1).run(lambda helper: helper.sample([(1, 2, 10**9)], 0))
-        with pytest.raises(TrainerError, match=r"trainer-1 can't go on \(IndexError.*go on with --resume"):
+    with DataParallelWorkers.start(
+        Learner(policy, policy, settings.grpo), policy, settings, tmp_path
+    ) as workers:
+        asked = workers.remote(1).run(lambda remote: remote.sample([(1, 2, 10**9)], 0))
+        with pytest.raises(TrainerError, match=r"trainer-1 failed \(IndexError.*continue with --resume"):
             asked.result(timeout=60)
 
 
-def test_a_policy_on_another_device_has_no_helpers(tmp_path):
+def test_a_policy_on_another_device_has_no_remotes(tmp_path):
     settings = read_settings(None, {"processes": 2})
     policy = new_policy(settings, TASKS)
     elsewhere = settings.model_copy(update={"device": "cuda"})
     with pytest.raises(TrainerError, match=r"processes = 2 .* the device is cuda: pass --processes=1"):
-        Crew.of(Learner(policy, policy, settings.grpo), policy, elsewhere, tmp_path)
+        DataParallelWorkers.start(Learner(policy, policy, settings.grpo), policy, elsewhere, tmp_path)
 
 
 def test_what_one_side_writes_the_other_reads():
