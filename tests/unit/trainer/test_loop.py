@@ -210,7 +210,7 @@ def test_damaged_checkpoints_are_named(tmp_path):
     run(tmp_path)
     newest = CheckpointStore(tmp_path / CHECKPOINTS, keep=9).latest()
     (newest / "state.json").write_text("{}")
-    with pytest.raises(TrainerError, match="no readable checkpoint"):
+    with pytest.raises(TrainerError, match="not a readable checkpoint"):
         read_state(newest)
     (newest / "policy" / "weights.pt").write_bytes(b"rubbish")
     with pytest.raises(TrainerError, match=r"damaged|no policy"):
