@@ -232,7 +232,10 @@ def test_unknown_setting_of_a_training_is_named(kitchen, tmp_path):
         (("scene", "build", "Rs_int", "--out=OUT"), "can't be written (Not a directory)"),
         (("manager", "serve", "--port=0", "--data-dir=OUT"), "pass another --data-dir"),
         (("worker", "run", "--cache-dir=OUT"), "name another folder with --cache-dir"),
-        (("train", "--dataset=DATASET", "--out=OUT"), "can't be created (Not a directory): pass another --out"),
+        (
+            ("train", "--dataset=DATASET", "--out=OUT"),
+            "can't be created (Not a directory): pass another --out",
+        ),
         (("demo", "--dataset=DATASET", "--out=OUT"), "can't be made (Not a directory): pass another --out"),
     ],
 )

@@ -11,10 +11,10 @@ from pathlib import Path
 
 from tests.fakes.scenes import kitchen_scene
 
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.facts import facts_of
 from embomatrix.factory.social.model_agents import ModelAgents
 from embomatrix.factory.social.values import ROBOT, Act, Cast, Conversation, DaySlot, DialogueTurn, Person
-from embomatrix.factory.writer.view import SceneView
 from embomatrix.llm.cassette import Cassette, CassetteMode
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
 from embomatrix.llm.values import UnusableReplyError

@@ -36,7 +36,10 @@ def told(*arguments):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--model=OUT", "--bench=DATASET"), "OUT is not a model: expected runs/NAME/checkpoints/step-000050"),
+        (
+            ("--model=OUT", "--bench=DATASET"),
+            "OUT is not a model: expected runs/NAME/checkpoints/step-000050",
+        ),
         (("--bench=DATASET",), "expected one of --model, --endpoint, --baseline and --answers"),
         (
             ("--baseline=oracle", "--model=tiny"),

@@ -2,8 +2,7 @@
 
 import pytest
 
-from embomatrix.factory.admission import Admitted, admit
-from embomatrix.factory.refusal import RefusalReason, TaskRefusal
+from embomatrix.factory.admission import Admitted, RefusalReason, TaskRefusal, admit
 from embomatrix.sim.planner.oracle import PlanNotFound
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Plan, Skill, SkillCall

@@ -12,7 +12,7 @@ from embomatrix.factory.assets.contact_sheet import TILE_PX, draw_sheet
 from embomatrix.factory.assets.families import Family
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.assets.naming import family_of
-from embomatrix.factory.assets_cli import app
+from embomatrix.factory.commands.assets import app
 from embomatrix.world.asset import Asset, Interior, Joint, JointKind, Link
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import ConvexPart, Pose, Shape

@@ -7,7 +7,7 @@ import pytest
 from tests.fakes.datasets import write_kitchen_dataset
 from typer.testing import CliRunner
 
-from embomatrix.factory.cli import app
+from embomatrix.factory.commands.app import app
 from embomatrix.factory.pipeline.corpus import (
     FROZEN_FILE,
     HELDOUT_SCENES,

@@ -7,9 +7,10 @@ from pathlib import Path
 import typer
 from tests.fakes.scenes import kitchen_scene
 
-from embomatrix.factory import cli, play_cli
-from embomatrix.factory.refusal import RefusalReason
-from embomatrix.factory.scenes import cli as scene_cli
+from embomatrix.factory.admission import RefusalReason
+from embomatrix.factory.commands import app as cli
+from embomatrix.factory.commands import play as play_cli
+from embomatrix.factory.commands import scenes as scene_cli
 from embomatrix.factory.task_import.reach import HELD
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.factory.task_import.task import ImportedTask, import_problem

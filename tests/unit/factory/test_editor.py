@@ -5,10 +5,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from embomatrix.factory.editor import PlacementError, SceneEditor
 from embomatrix.factory.layout.sampling import ObjectSampler
-from embomatrix.factory.layout.values import LayoutReason
 from embomatrix.factory.scenes.check import check_scene
+from embomatrix.factory.scenes.editor import LayoutReason, PlacementError, SceneEditor
 from embomatrix.factory.scenes.floor import ReachableFloor, box_of
 from embomatrix.world.state import Relation, State
 

@@ -11,23 +11,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from embomatrix.factory.cli import app
+from embomatrix.factory.commands.app import app
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
 from embomatrix.factory.evaluate.aesthetics import Calibration, auc, features_of, fit, score_room
 from embomatrix.factory.evaluate.drafts import DraftFeatures, asked_in
-from embomatrix.factory.evaluate.figures import (
-    EvaluationError,
-    EvaluationFigures,
-    evaluation_to_json,
-    read_evaluation,
-)
 from embomatrix.factory.evaluate.judge import DiversityScores
 from embomatrix.factory.evaluate.page import BEGIN, END, with_factory
 from embomatrix.factory.evaluate.rooms import FLOOR, RoomBox, RoomPlan, plan_of, read_rooms
 from embomatrix.factory.evaluate.spoiling import SPOILERS
 from embomatrix.factory.evaluate.tasks import evenness, panel, people_of
+from embomatrix.factory.metrics.figures import (
+    EvaluationError,
+    EvaluationFigures,
+    evaluation_to_json,
+    read_evaluation,
+)
 from embomatrix.factory.pipeline.corpus import HELDOUT_SCENES, training_scenes
-from embomatrix.factory.social.milieus import NAMES
+from embomatrix.factory.social.casting import NAMES
 from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.catalog import Catalog

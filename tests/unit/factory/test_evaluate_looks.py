@@ -10,16 +10,16 @@ from PIL import Image
 from tests.fakes.chat_server import ChatServer
 from typer.testing import CliRunner
 
-from embomatrix.factory.cli import app
-from embomatrix.factory.editor import SceneEditor
-from embomatrix.factory.evaluate.figures import EvaluationError
+from embomatrix.factory.commands.app import app
 from embomatrix.factory.evaluate.looks import Impression, evaluate_looks, impression_of
 from embomatrix.factory.evaluate.page import with_factory
 from embomatrix.factory.evaluate.scenes import LIST, LayoutMethod, SceneTask
 from embomatrix.factory.evaluate.side_by_side import LEAST_PX, draw_side_by_side, named
 from embomatrix.factory.layout.generator import lay
-from embomatrix.factory.layout.jobs import RequestedObject
+from embomatrix.factory.layout.request import RequestedObject
+from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.factory.pictures.sights import alone
+from embomatrix.factory.scenes.editor import SceneEditor
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.llm.endpoint import Endpoint
 from embomatrix.llm.values import UnusableReplyError

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from embomatrix.factory.assets.library import build_asset
-from embomatrix.factory.editor import SceneEditor
-from embomatrix.factory.evaluate.figures import EvaluationError
 from embomatrix.factory.evaluate.scene_geometry import Flaw, flaws_of
 from embomatrix.factory.evaluate.scene_runs import OutcomeLog, evaluate_scenes
 from embomatrix.factory.evaluate.scenes import (
@@ -21,7 +19,9 @@ from embomatrix.factory.evaluate.scenes import (
     fixed_tasks,
 )
 from embomatrix.factory.layout.generator import lay
-from embomatrix.factory.layout.jobs import RequestedObject
+from embomatrix.factory.layout.request import RequestedObject
+from embomatrix.factory.metrics.figures import EvaluationError
+from embomatrix.factory.scenes.editor import SceneEditor
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import Pose

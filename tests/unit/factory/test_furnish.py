@@ -12,7 +12,6 @@ from embomatrix.factory.floorplan.layout import plan_floor
 from embomatrix.factory.floorplan.spec import RoomSpec
 from embomatrix.factory.furnish.groups import room_groups
 from embomatrix.factory.furnish.hosts import hosts_of, kept_behind_doors
-from embomatrix.factory.furnish.panel import panel_of
 from embomatrix.factory.furnish.pieces import (
     REST_GAP_M,
     FurnitureGroup,
@@ -22,13 +21,13 @@ from embomatrix.factory.furnish.pieces import (
 )
 from embomatrix.factory.furnish.roles import HUNG_BOTTOM_M, FurnitureRole, role_of
 from embomatrix.factory.furnish.rooms import MAX_EQUAL, furnish
-from embomatrix.factory.furnish.space import RoomSpace, Target
+from embomatrix.factory.furnish.space import LOW_M, RoomSpace, Target
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.floor import box_of
 from embomatrix.world.asset import Asset, Joint, JointKind, Link, SupportSurface
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import ConvexPart, Pose, Shape, Vec3
-from embomatrix.world.scene import Doorway, Room, Scene, Window
+from embomatrix.world.scene import Doorway, Room, Scene, SceneObject, Window
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
@@ -313,9 +312,46 @@ def test_crockery_goes_behind_doors_and_milk_into_the_fridge() -> None:
     assert hosts_of("pillow")[0] == "bed"
 
 
-def test_the_panel_of_a_flat_shows_backs_at_walls_and_free_doorways(flat: Scene) -> None:
-    panel = panel_of(flat, Catalog.load().inventory("Rs_int"))
-    assert panel.placed_share > 0.9
-    assert panel.at_wall > 0.9
-    assert panel.in_doorways == 0
-    assert 0.1 < panel.free_floor < 1.0
+WALL_TYPES = (
+    *("bed", "bottom_cabinet", "bottom_cabinet_no_top", "fridge", "stove", "oven", "dishwasher", "washer"),
+    *("clothes_dryer", "furniture_sink", "pedestal_sink", "toilet", "urinal", "bookcase", "wardrobe"),
+    *("console_table", "nightstand", "locker", "hospital_bed", "bathtub", "shower_stall"),
+)
+
+
+def wall_gap_m(scene: Scene, item: SceneObject) -> float:
+    """Gap between the back of an object and the edge of its room."""
+    room = next(room for room in scene.rooms if room.name == item.room)
+    box, yaw = box_of(scene, item), item.pose_world_asset.yaw
+    for axis, direction in enumerate((round(math.cos(yaw)), round(math.sin(yaw)))):
+        if direction:
+            low, high = box.low_m[axis] - room.low_m[axis], room.high_m[axis] - box.high_m[axis]
+            return low if direction > 0 else high
+    raise AssertionError(f"{item.name} is at an odd angle: {yaw}")
+
+
+def part_rows(scene: Scene, item: SceneObject) -> np.ndarray:
+    parts = scene.asset_of(item.name).links[0].parts
+    boxes = [part.aabb(item.pose_world_asset) for part in parts]
+    return np.array([(*box.low_m, *box.high_m) for box in boxes])
+
+
+def test_furnished_flat_has_backs_at_walls_and_free_doorways(flat: Scene) -> None:
+    listed = sum(count for room in Catalog.load().inventory("Rs_int").rooms for _, _, count in room.items)
+    assert len(flat.objects) / listed > 0.9
+    standing = [item for item in flat.objects if item.room and not item.host]
+    gaps = [wall_gap_m(flat, item) for item in standing if flat.asset_of(item.name).category in WALL_TYPES]
+    assert sum(gap <= 0.15 for gap in gaps) / len(gaps) > 0.9
+    free, total = 0, 0
+    for room in flat.rooms:
+        space = RoomSpace(room, flat.doorways)
+        total += len(space.free_cells())
+        for item in standing:
+            rows = part_rows(flat, item)
+            rows = rows[rows[:, 5] > LOW_M]
+            assert item.room != room.name or not len(rows) or not space.blocks_zone(rows).any(), item.name
+        space.occupy(
+            [tuple(row) for item in flat.objects if item.room == room.name for row in part_rows(flat, item)]
+        )
+        free += len(space.free_cells())
+    assert 0.1 < free / total < 1.0

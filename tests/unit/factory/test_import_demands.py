@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from tests.fakes.problems import PROBLEM, source
 
+from embomatrix.factory.admission import RefusalReason, TaskRefusal
 from embomatrix.factory.assets.library import build_asset
-from embomatrix.factory.refusal import RefusalReason, TaskRefusal
+from embomatrix.factory.scenes.view import is_liftable
 from embomatrix.factory.task_import import batch
 from embomatrix.factory.task_import.binding import Addition
-from embomatrix.factory.task_import.demands import (
+from embomatrix.factory.task_import.models import models_for
+from embomatrix.factory.task_import.size_requirements import (
     CavityFit,
     Demand,
     demand_on,
@@ -16,10 +18,8 @@ from embomatrix.factory.task_import.demands import (
     room_for,
     smallest_m,
 )
-from embomatrix.factory.task_import.models import models_for
 from embomatrix.factory.task_import.sources import NAMESAKES, activity_names
 from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
-from embomatrix.factory.writer.view import is_liftable
 from embomatrix.world.bddl import parse_problem
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.scene import Scene

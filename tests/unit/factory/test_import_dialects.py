@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from tests.fakes.problems import PROBLEM, source
 
-from embomatrix.factory.refusal import RefusalReason, TaskRefusal
+from embomatrix.factory.admission import RefusalReason, TaskRefusal
 from embomatrix.factory.task_import.batch import bind_first
 from embomatrix.factory.task_import.dialects import (
     GROUPS,

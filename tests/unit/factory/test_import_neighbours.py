@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 from tests.fakes.problems import source
 
-from embomatrix.factory.pipeline.pairs import Beside
+from embomatrix.factory.pipeline.task_poses import Beside
 from embomatrix.factory.task_import.batch import Verified, verify_first
 from embomatrix.factory.task_import.neighbours import neighbours_of
 from embomatrix.sim.placing.pose_cache import PlacementLibrary

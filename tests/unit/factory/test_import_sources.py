@@ -10,8 +10,8 @@ from click.testing import Result
 from tests.fakes.problems import PROBLEM
 from typer.testing import CliRunner
 
-from embomatrix.factory.cli import app
-from embomatrix.factory.refusal import RefusedError, TaskRefusal
+from embomatrix.factory.admission import RefusedError, TaskRefusal
+from embomatrix.factory.commands.app import app
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.batch import bind_first
 from embomatrix.factory.task_import.expressible import check_expressible

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from tests.fakes.problems import PROBLEM, source
 
-from embomatrix.factory.refusal import RefusalReason, RefusedError, TaskRefusal
+from embomatrix.factory.admission import RefusalReason, RefusedError, TaskRefusal
 from embomatrix.factory.task_import.batch import Verified, verify
 from embomatrix.factory.task_import.binding import bind
-from embomatrix.factory.task_import.kinds import category_of, instruction_of
-from embomatrix.factory.task_import.scene import with_states
+from embomatrix.factory.task_import.start_state import with_states
 from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
+from embomatrix.factory.task_import.task_fields import category_of, instruction_of
 from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.world.bddl import BddlError, InitLiteral, parse_formula, parse_problem

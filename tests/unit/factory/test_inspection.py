@@ -10,10 +10,10 @@ import pytest
 from tests.fakes.datasets import write_kitchen_dataset
 from typer.testing import CliRunner
 
-from embomatrix.factory.cli import app
-from embomatrix.factory.export import FIELDS, card, encoded, export_rows
+from embomatrix.factory.commands.app import app
 from embomatrix.factory.inspection.page import task_page, transcript_html
 from embomatrix.factory.inspection.playing import play_oracle
+from embomatrix.factory.pipeline.export import FIELDS, card, encoded, export_rows
 from embomatrix.pages.plan_view import PlanView
 from embomatrix.world.dataset import Dataset, DatasetError
 

@@ -8,17 +8,15 @@ import pytest
 from tests.fakes.chat_server import ChatServer
 
 from embomatrix.factory.assets.library import build_asset
-from embomatrix.factory.editor import SceneEditor
 from embomatrix.factory.furnish.roles import wall_height_m
-from embomatrix.factory.layout.agent_io import DOORS, AgentName, BriefError
+from embomatrix.factory.layout.agent_interfaces import DOORS, AgentName, BriefError
 from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.distribution import DistributionError, distribute
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.hanging import Hanger
-from embomatrix.factory.layout.jobs import RequestedObject
 from embomatrix.factory.layout.model_agents import ModelLayoutAgents
-from embomatrix.factory.layout.organization import organize
-from embomatrix.factory.layout.tree import LayoutTree, TreeError
+from embomatrix.factory.layout.organization import LayoutTree, TreeError, organize
+from embomatrix.factory.layout.request import RequestedObject
 from embomatrix.factory.layout.values import (
     MEANS,
     Branch,
@@ -26,13 +24,13 @@ from embomatrix.factory.layout.values import (
     Failure,
     HostFacts,
     HostOffer,
-    LayoutReason,
     LayoutRelation,
     LayoutRoomFacts,
     ObjectBrief,
     RoomBrief,
 )
 from embomatrix.factory.scenes.check import check_scene
+from embomatrix.factory.scenes.editor import LayoutReason, SceneEditor
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
 from embomatrix.llm.patience import FailureLimit
 from embomatrix.llm.values import EndpointError

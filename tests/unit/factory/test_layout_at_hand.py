@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import pytest
 
-from embomatrix.factory.editor import SceneEditor
 from embomatrix.factory.layout.generator import lay
-from embomatrix.factory.layout.jobs import RequestedObject
-from embomatrix.factory.layout.seating import MOVES, Seat, Seating
-from embomatrix.factory.layout.values import Failure, LayoutReason, LayoutRelation
+from embomatrix.factory.layout.pending import MOVES, Seat, Seating
+from embomatrix.factory.layout.request import RequestedObject
+from embomatrix.factory.layout.values import Failure, LayoutRelation
+from embomatrix.factory.scenes.editor import LayoutReason, SceneEditor
+from embomatrix.factory.scenes.rehearsal import Rehearsal
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.factory.task_import.task import REDRAWN, ImportedTask, Manner, import_problem
-from embomatrix.factory.writer.rehearsal import Rehearsal
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import Pose
 from embomatrix.world.scene import Scene

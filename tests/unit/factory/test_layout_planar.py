@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from embomatrix.factory.layout.arrangement import (
+from embomatrix.factory.layout.constraints import (
     WEIGHTS,
     SpotCandidates,
     half_extents,
@@ -17,12 +17,12 @@ from embomatrix.factory.layout.arrangement import (
 from embomatrix.factory.layout.planar import arrange
 from embomatrix.factory.layout.values import (
     Arrangement,
-    LayoutReason,
     PlacementConstraint,
     PlaneBrief,
     PlaneFootprint,
     PlaneThing,
 )
+from embomatrix.factory.scenes.editor import LayoutReason
 from embomatrix.skills.limits import ROBOT
 
 PLANE = (2.0, 1.2)

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from tests.fakes.chat_server import ChatServer, completion
 
+from embomatrix.factory.admission import RefusalReason, TaskRefusal
 from embomatrix.factory.pictures.sights import sight_of_room
 from embomatrix.factory.pipeline.settings import BuildSettings
 from embomatrix.factory.pipeline.variants import VariantMaker, VariantOrder
-from embomatrix.factory.refusal import RefusalReason, TaskRefusal
 from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.facts import MOST_IN_ROOM, facts_of
 from embomatrix.factory.social.model_agents import ModelAgents
 from embomatrix.factory.social.model_writer import ModelWriter
@@ -20,7 +21,6 @@ from embomatrix.factory.social.requests import RequestedAtom, TaskRequest, Wante
 from embomatrix.factory.social.values import DaySlot
 from embomatrix.factory.writer.tasks import Draft, DraftOrder, PlainWriter
 from embomatrix.factory.writer.variant import build_variant
-from embomatrix.factory.writer.view import SceneView
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
 from embomatrix.llm.values import EndpointError, UnusableReplyError
 from embomatrix.world.goal import Atom, Not

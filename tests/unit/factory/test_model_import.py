@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from embomatrix.factory.assets.check import check_asset
-from embomatrix.factory.assets_cli import app
+from embomatrix.factory.commands.assets import app
+from embomatrix.factory.commands.scenes import app as scene_app
 from embomatrix.factory.importers.assemble import ImportedAsset, convex_part, import_model, read_model
 from embomatrix.factory.importers.convex import MAX_HULLS, MAX_VERTICES, Coacd, by_components
 from embomatrix.factory.importers.model import Mesh, ModelFileError
 from embomatrix.factory.importers.shelf import read_assets, save_asset
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.scenes.cli import app as scene_app
 from embomatrix.world.asset import Credit, JointKind
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import Aabb, Pose, Shape

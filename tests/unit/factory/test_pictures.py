@@ -7,9 +7,9 @@ import numpy as np
 from PIL import ImageColor
 from typer.testing import CliRunner
 
+from embomatrix.factory.commands.scenes import app
 from embomatrix.factory.pictures.scene import FILL, draw_plan
 from embomatrix.factory.pictures.sheet import draw_sheet, draw_views
-from embomatrix.factory.scenes.cli import app
 from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.world.asset import Asset, Link
 from embomatrix.world.geometry import ConvexPart, Pose, Shape

@@ -13,27 +13,25 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from embomatrix.factory.admission import objection
-from embomatrix.factory.cli import app
+from embomatrix.factory.admission import RefusalReason, objection
+from embomatrix.factory.commands.app import app
 from embomatrix.factory.evaluate.admissions import evaluate_admissions
-from embomatrix.factory.layout.jobs import LayoutAgents
-from embomatrix.factory.layout.organization import organize
-from embomatrix.factory.layout.tree import LayoutTree
+from embomatrix.factory.layout.organization import LayoutTree, organize
+from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.layout.values import RoomBrief
 from embomatrix.factory.pipeline.build import BuildSummary, build_dataset, split_rooms
 from embomatrix.factory.pipeline.cluster import admitted_by
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
 from embomatrix.factory.pipeline.store import BuildStore, VariantResult
 from embomatrix.factory.pipeline.variants import VariantYield
-from embomatrix.factory.refusal import RefusalReason
 from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.writer.tasks import is_heldout_signature
-from embomatrix.factory.writer.view import SceneView
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import score
 from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, Outcome, RolloutResult, Timings
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.actor import physical_simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import plan_from_json
 from embomatrix.world.dataset import Dataset, DatasetError
 from embomatrix.world.scene import Room, Scene
@@ -90,7 +88,7 @@ def test_every_oracle_plan_earns_full_success_from_the_bundle_on_disk(dataset: D
     for record in dataset.records:
         bundle = dataset.bundle(record.bundle_digest)
         assert bundle.tasks[record.task.task_id] == record.task
-        simulator = Simulator(bundle)
+        simulator = load_simulator(bundle)
         simulator.execute(record.task, (), 0)
         assert not score(record.task, frozenset(), simulator.facts).success
         trace = simulator.execute(record.task, plan_from_json(list(record.oracle)), 0)

@@ -8,7 +8,7 @@ from PIL import Image
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 from typer.testing import CliRunner
 
-from embomatrix.factory.play_cli import play
+from embomatrix.factory.commands.play import play
 from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import TaskRecord, write_dataset
 from embomatrix.world.inflation import bundle_digest

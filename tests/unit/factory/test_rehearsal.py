@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from embomatrix.factory.pipeline.poses import SceneSurvey
+from embomatrix.factory.pipeline.task_poses import SceneSurvey
+from embomatrix.factory.scenes.rehearsal import Rehearsal
+from embomatrix.factory.scenes.view import AnyRobot, SceneView
 from embomatrix.factory.social.requests import RequestedAtom, TaskRequest, Wanted, check_request
-from embomatrix.factory.writer.rehearsal import Rehearsal
-from embomatrix.factory.writer.robot import AnyRobot
 from embomatrix.factory.writer.tasks import PlainWriter
 from embomatrix.factory.writer.variant import Variant
-from embomatrix.factory.writer.view import SceneView
 from embomatrix.sim.physical.survey import Foresight
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import Handling

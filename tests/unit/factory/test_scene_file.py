@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 from typer.testing import CliRunner
 
-from embomatrix.factory.scenes.cli import app
+from embomatrix.factory.commands.scenes import app
 from embomatrix.factory.scenes.scene_file import MAX_BYTES, SceneFileError, read_scene, write_scene
 from embomatrix.world.codec import scene_to_json
 from embomatrix.world.geometry import Pose

@@ -11,9 +11,9 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
+from embomatrix.factory.commands.scenes import app
 from embomatrix.factory.scenes.batch import SceneBuildJob, run_batch
 from embomatrix.factory.scenes.check import STABLE_SHARE, ProblemKind, check_scene, check_settled
-from embomatrix.factory.scenes.cli import app
 from embomatrix.factory.scenes.floor import ReachableFloor
 from embomatrix.factory.scenes.report import report_of, report_on, unaccounted
 from embomatrix.factory.scenes.tables import TABLE_COLUMNS, report_table

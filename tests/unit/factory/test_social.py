@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.social.casting import GrammarRolePlayer
+from embomatrix.factory.scenes.view import SceneView
+from embomatrix.factory.social.casting import HOBBIES, NAMES, GrammarRolePlayer
 from embomatrix.factory.social.fitting import is_plausible, themes_of, why_of
-from embomatrix.factory.social.milieus import HOBBIES, NAMES
 from embomatrix.factory.social.occasions import Theme, occasion_of, occasions, occasions_in
 from embomatrix.factory.social.phrases import (
     CLAUSES,
@@ -30,7 +30,6 @@ from embomatrix.factory.social.values import ROBOT, Act, Cast, DaySlot, Person
 from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.factory.writer.goals import GoalConjunct
 from embomatrix.factory.writer.variant import build_variant
-from embomatrix.factory.writer.view import SceneView
 from embomatrix.factory.writer.words import PHRASES
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.goal import And, Atom

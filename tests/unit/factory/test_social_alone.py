@@ -7,10 +7,10 @@ import pytest
 from tests.fakes.chat_server import ChatServer
 from typer.testing import CliRunner
 
-from embomatrix.factory.agents_cli import EVERY
-from embomatrix.factory.cli import app
-from embomatrix.factory.layout.agent_io import AgentName
-from embomatrix.factory.social.agent_io import SOCIAL_DOORS, SocialAgent
+from embomatrix.factory.commands.agents import EVERY
+from embomatrix.factory.commands.app import app
+from embomatrix.factory.layout.agent_interfaces import AgentName
+from embomatrix.factory.social.agent_interfaces import SOCIAL_DOORS, SocialAgent
 from embomatrix.factory.social.values import SummaryBrief, TalkBrief
 
 BRIEF = '{"scene": "Rs_int", "seed": 1}'

@@ -8,7 +8,7 @@ import pytest
 from tests.fakes.datasets import write_kitchen_dataset
 from typer.testing import CliRunner
 
-from embomatrix.factory.cli import app
+from embomatrix.factory.commands.app import app
 from embomatrix.factory.verification.again import Look, sampled, verdict_of
 from embomatrix.factory.verification.figures import evaluation_of, objections
 from embomatrix.world.dataset import Dataset, write_dataset

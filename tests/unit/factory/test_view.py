@@ -1,7 +1,7 @@
 """A scene as the writers of tasks see it."""
 
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.writer.view import SceneView
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.world.scene import Scene
 
 

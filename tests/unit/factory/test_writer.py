@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.fakes.scenes import kitchen_scene
 
-from embomatrix.factory.writer.tables import (
+from embomatrix.factory.furnish.small_objects import (
     HOST_GROUPS,
     MEMBERS,
     NEVER_SWITCHED,
@@ -15,9 +15,9 @@ from embomatrix.factory.writer.tables import (
     groups_for,
     suits,
 )
+from embomatrix.factory.scenes.view import SceneView, is_liftable
 from embomatrix.factory.writer.tasks import Draft, PlainWriter, is_heldout_signature, object_table
 from embomatrix.factory.writer.variant import Variant
-from embomatrix.factory.writer.view import SceneView, is_liftable
 from embomatrix.factory.writer.words import Voice, refer, room_words, sentence
 from embomatrix.world.bddl import ROOM_TYPES, parse_formula
 from embomatrix.world.catalog import Catalog

@@ -162,6 +162,36 @@ def test_a_lease_that_is_renewed_for_ever_expires_too(table):
     assert CancelLease("w1", lease.ref) in commands
 
 
+def test_leases_that_expire_behind_a_busy_slot_cost_no_attempt_and_are_leased_again():
+    """Counterexample of the lease machine: expiring the running lease "started" the one behind it, and so on.
+
+    All of them then counted as failures of their worker, which kept its slots free although rollouts waited.
+    """
+    table = Table()
+    table.worker("w1")
+    (running, queued) = leases(table.submit(2))
+    table.worker("w2", warm=())
+    commands = table.tell(Tick(), after_s=31)
+    assert [command.ref for command in commands if isinstance(command, CancelLease)] == [
+        running.ref,
+        queued.ref,
+    ]
+    (again,) = leases(commands)
+    assert (again.worker_id, again.rollout.rollout_id, again.origin.attempt) == ("w1", "b1-1", 1)
+
+
+def test_worker_skips_any_number_of_rollouts_that_failed_on_it():
+    table = Table()
+    table.worker("w1", slots=12)
+    table.worker("w2", warm=())
+    failed = [f"b1-{index}" for index in range(12)]
+    for lease in leases(table.submit(40)):
+        if lease.rollout.rollout_id in failed:
+            table.finish(lease, crash())
+    held = {lease.record.key.rollout_id for lease in table.dispatcher.live_leases.values()}
+    assert held == {f"b1-{index}" for index in range(12, 36)}
+
+
 def test_leases_that_a_reconnected_worker_never_got_are_given_again(table):
     table.worker(slots=2)
     first, second = leases(table.submit(2))

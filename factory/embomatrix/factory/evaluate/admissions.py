@@ -6,7 +6,7 @@ import json
 from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.factory.evaluate.figures import EvaluationError, EvaluationFigures
+from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures
 from embomatrix.factory.pipeline.settings import WriterKind
 from embomatrix.factory.pipeline.store import ATTEMPTS_FILE, BUILD_FILE, TIMES_FILE, settings_of
 from embomatrix.pages.figures import Better, Figure

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.writer.tasks import Draft
 from embomatrix.factory.writer.variant import build_variant
-from embomatrix.factory.writer.view import SceneView
 from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:

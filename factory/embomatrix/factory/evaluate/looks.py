@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from embomatrix.factory.evaluate.figures import EvaluationFigures
 from embomatrix.factory.evaluate.scenes import METHODS
-from embomatrix.factory.layout.tree import tree_in
+from embomatrix.factory.layout.organization import tree_in
+from embomatrix.factory.metrics.figures import EvaluationFigures
 from embomatrix.factory.pictures.sights import sight_of_room
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
@@ -25,9 +25,9 @@ from embomatrix.pages.figures import Better, Figure
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from embomatrix.factory.editor import SceneEditor
     from embomatrix.factory.evaluate.scenes import LayoutMethod, SceneTask
-    from embomatrix.factory.layout.jobs import Layout, RequestedObject
+    from embomatrix.factory.layout.request import Layout, RequestedObject
+    from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.factory.task_import.task import Lay
     from embomatrix.llm.values import ChatModel
     from embomatrix.world.scene import Scene

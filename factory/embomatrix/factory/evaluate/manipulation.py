@@ -16,7 +16,7 @@ from embomatrix.world.state import Relation
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from embomatrix.factory.writer.view import SceneView
+    from embomatrix.factory.scenes.view import SceneView
     from embomatrix.sim.executor import Simulator
     from embomatrix.skills.syntax import Plan
     from embomatrix.world.task import Task

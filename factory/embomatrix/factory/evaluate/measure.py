@@ -9,12 +9,12 @@ import numpy as np
 
 from embomatrix.factory.evaluate.aesthetics import Calibration, auc, fit, score_room
 from embomatrix.factory.evaluate.drafts import asked_in
-from embomatrix.factory.evaluate.figures import EvaluationError, EvaluationFigures
 from embomatrix.factory.evaluate.rooms import read_rooms
 from embomatrix.factory.evaluate.spoiling import SPOILERS
 from embomatrix.factory.evaluate.tasks import panel
+from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.social.milieus import NAMES
+from embomatrix.factory.social.casting import NAMES
 from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.factory.writer.tasks import PlainWriter
 from embomatrix.pages.figures import Better, Figure

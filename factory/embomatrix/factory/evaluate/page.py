@@ -9,13 +9,13 @@ import textwrap
 from collections import Counter
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.evaluate.figures import EvaluationError
+from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.pages.figures import shown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from embomatrix.factory.evaluate.figures import EvaluationFigures
+    from embomatrix.factory.metrics.figures import EvaluationFigures
     from embomatrix.pages.figures import Figure
 
 WIDTH: Final = 128

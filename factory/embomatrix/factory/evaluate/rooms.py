@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from embomatrix.factory.evaluate.figures import EvaluationError
+from embomatrix.factory.metrics.figures import EvaluationError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -7,7 +7,7 @@ from collections import defaultdict
 from typing import TYPE_CHECKING, Any
 
 from embomatrix.factory.evaluate.scenes import LayoutMethod, LayoutOutcome, SceneTask, evaluation_of, judge
-from embomatrix.factory.outcome_log import LineLog
+from embomatrix.factory.pipeline.store import LineLog
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.process_pool import process_pool
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
-    from embomatrix.factory.evaluate.figures import EvaluationFigures
+    from embomatrix.factory.metrics.figures import EvaluationFigures
 
     Trial = tuple[SceneTask, LayoutMethod]
 

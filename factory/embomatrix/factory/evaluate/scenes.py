@@ -20,30 +20,29 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from embomatrix.factory.admission import Admitted, admit
+from embomatrix.factory.admission import Admitted, RefusalReason, TaskRefusal, admit
 from embomatrix.factory.evaluate.aesthetics import Calibration, score_room
-from embomatrix.factory.evaluate.figures import EvaluationError, EvaluationFigures
 from embomatrix.factory.evaluate.manipulation import out_of_hand
 from embomatrix.factory.evaluate.rooms import plan_of
 from embomatrix.factory.evaluate.scene_geometry import flaws_of
 from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.generator import lay
-from embomatrix.factory.refusal import RefusalReason, TaskRefusal
+from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.batch import poses_for
 from embomatrix.factory.task_import.sources import SourceText, read_activity
 from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
-from embomatrix.factory.writer.view import SceneView
 from embomatrix.pages.figures import Better, Figure
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.planner.oracle import find_plan
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from embomatrix.factory.editor import SceneEditor
-    from embomatrix.factory.layout.jobs import Layout, RequestedObject
+    from embomatrix.factory.layout.request import Layout, RequestedObject
+    from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.factory.task_import.task import Lay
     from embomatrix.sim.placing.pose_cache import PlacementLibrary
     from embomatrix.world.scene import Scene
@@ -175,7 +174,7 @@ def _executed(
     """What speaks against a task when its oracle's plan is executed, None: nothing; and what the robot can't get at."""
     view = SceneView(imported.scene)
     poses = poses_for(imported, view, library, None, seed)
-    with contextlib.closing(Simulator(Bundle(imported.scene, {}, poses))) as stage:
+    with contextlib.closing(load_simulator(Bundle(imported.scene, {}, poses))) as stage:
         verdict = admit(stage, imported.task, find_plan, imported.init)
         lost = out_of_hand(stage, imported.task, view, imported.about)
     return (None if isinstance(verdict, Admitted) else verdict), lost

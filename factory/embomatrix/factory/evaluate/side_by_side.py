@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Final
 
 from PIL import Image, ImageDraw, ImageFont
 
-from embomatrix.factory.evaluate.figures import EvaluationError
+from embomatrix.factory.admission import TaskRefusal
 from embomatrix.factory.evaluate.scenes import METHODS
+from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.factory.pictures.scene import draw_plan
 from embomatrix.factory.pictures.sights import alone
-from embomatrix.factory.refusal import TaskRefusal
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.task import Manner, import_problem
 

@@ -19,7 +19,7 @@ import numpy as np
 from PIL import Image
 
 from embomatrix.factory.inspection.plan_view import inspection_view
-from embomatrix.factory.writer.view import SceneView
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.pages.head import page_head
 from embomatrix.pages.plan_view import PlanView
 from embomatrix.sim.bullet.camera import render_oblique

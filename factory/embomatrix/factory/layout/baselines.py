@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.editor import PlacementError
-from embomatrix.factory.layout.jobs import Layout, Record, thing_of
 from embomatrix.factory.layout.organization import in_order
+from embomatrix.factory.layout.request import Layout, Record, thing_of
 from embomatrix.factory.layout.sampling import LIFT_M, ObjectSampler
-from embomatrix.factory.layout.values import Failure, LayoutReason
+from embomatrix.factory.scenes.editor import LayoutReason, PlacementError
 from embomatrix.world.geometry import Pose
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from embomatrix.factory.editor import SceneEditor
-    from embomatrix.factory.layout.jobs import RequestedObject
+    from embomatrix.factory.layout.request import RequestedObject
+    from embomatrix.factory.layout.values import Failure
+    from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.world.asset import Asset
 
 TRIES: Final = 10

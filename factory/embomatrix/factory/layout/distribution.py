@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.layout.customs import likes, may_hold
+from embomatrix.factory.furnish.small_objects import belongs, likes, may_hold
 from embomatrix.factory.layout.values import Distribution, Kind
-from embomatrix.factory.writer.tables import belongs
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.factory.furnish.small_objects import HOST_GROUPS
 from embomatrix.factory.layout.organization import HIGHEST_M, LOWEST_M
 from embomatrix.factory.layout.values import HostFacts, HostOffer, LayoutRelation, LayoutRoomFacts
-from embomatrix.factory.writer.tables import HOST_GROUPS
 from embomatrix.sim.geometry.candidates import EDGE_M, surfaces_for
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.state import Relation
@@ -15,7 +15,7 @@ from embomatrix.world.state import Relation
 if TYPE_CHECKING:
     from collections.abc import Container, Iterator
 
-    from embomatrix.factory.editor import SceneEditor
+    from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.world.asset import Asset
 
 OFFERED: Final = (LayoutRelation.ONTOP, LayoutRelation.INSIDE, LayoutRelation.UNDER)

@@ -15,36 +15,35 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.editor import PlacementError
 from embomatrix.factory.layout.distribution import DistributionError
 from embomatrix.factory.layout.facts import hosts_in, rooms_of
 from embomatrix.factory.layout.hanging import Hanger
-from embomatrix.factory.layout.jobs import Layout, LayoutAgents, Record, kind_of, thing_of
+from embomatrix.factory.layout.organization import tree_in
+from embomatrix.factory.layout.pending import Seat, Seating
 from embomatrix.factory.layout.planes import brief_for, company_on, planes_of, pose_at
-from embomatrix.factory.layout.rest import settle
+from embomatrix.factory.layout.request import Layout, LayoutAgents, Record, kind_of, thing_of
 from embomatrix.factory.layout.sampling import ObjectSampler
-from embomatrix.factory.layout.seating import Seat, Seating
-from embomatrix.factory.layout.tree import tree_in
+from embomatrix.factory.layout.stability import settle
 from embomatrix.factory.layout.values import (
     Arrangement,
     DistributionBrief,
     Failure,
     Kind,
-    LayoutReason,
     LayoutRelation,
     PlaneCompany,
     RoomBrief,
 )
+from embomatrix.factory.scenes.editor import LayoutReason, PlacementError
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from embomatrix.factory.editor import SceneEditor
-    from embomatrix.factory.layout.jobs import RequestedObject
+    from embomatrix.factory.layout.organization import LayoutTree
     from embomatrix.factory.layout.planes import Plane
-    from embomatrix.factory.layout.tree import LayoutTree
+    from embomatrix.factory.layout.request import RequestedObject
     from embomatrix.factory.layout.values import ObjectBrief, PlacementConstraint, PlaneSpot
+    from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Pose
     from embomatrix.world.scene import Room

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.editor import PlacementError, box_at
 from embomatrix.factory.floorplan.walls import WALL_HEIGHT_M
 from embomatrix.factory.furnish.roles import HUNG_BOTTOM_M, FurnitureRole, role_of, wall_height_m
-from embomatrix.factory.layout.values import LayoutReason
+from embomatrix.factory.scenes.editor import LayoutReason, PlacementError, box_at
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Pose
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.factory.editor import SceneEditor
+    from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.world.asset import Asset
     from embomatrix.world.scene import Room, Window
 

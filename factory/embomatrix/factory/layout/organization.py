@@ -6,22 +6,23 @@ things, by how much stands there already, and by what has failed before.
 
 from __future__ import annotations
 
-from collections import Counter
-from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from collections import Counter, defaultdict
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from embomatrix.factory.furnish.hosts import NO_HOSTS, kept_behind_doors
-from embomatrix.factory.layout.customs import likes, on_appliance
-from embomatrix.factory.layout.tree import LayoutTree
-from embomatrix.factory.layout.values import MEANS, Branch, Kind, LayoutReason, LayoutRelation, RelationMethod
-from embomatrix.factory.writer.tables import suits
+from embomatrix.factory.furnish.small_objects import likes, on_appliance, suits
+from embomatrix.factory.layout.values import MEANS, Branch, Kind, LayoutRelation, RelationMethod
+from embomatrix.factory.scenes.editor import LayoutReason
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from embomatrix.factory.layout.values import Failure, HostFacts, HostOffer, ObjectBrief, RoomBrief, Size3
+    from embomatrix.world.scene import SceneObject
+
 
 CHANCES: Final = 3
 AFTERWARDS: Final = frozenset({LayoutReason.UNSTABLE, LayoutReason.NOT_AT_HAND})
@@ -171,3 +172,129 @@ def described(failures: Sequence[Failure]) -> str:
         f"- {item.thing} {item.relation.value} {item.host}: {item.reason.value}, {item.detail}"
         for item in failures
     )
+
+
+class TreeError(ValueError):
+    """Branches that make no tree; the sentence says which and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class RelationNode:
+    """All that is in one relation to an object."""
+
+    relation: LayoutRelation
+    children: tuple[ObjectNode, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectNode:
+    """An object, or the floor of a room at the root, and what stands in relations to it."""
+
+    name: str
+    relations: tuple[RelationNode, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class LayoutTree:
+    """How the objects of a room hang together. Every object has one parent, the root none."""
+
+    root: ObjectNode
+
+    @staticmethod
+    def of(root: str, branches: Iterable[Branch]) -> LayoutTree:
+        """The tree of these branches, in their order. Raises TreeError for a second parent, a cycle or a loose end."""
+        children: defaultdict[str, dict[LayoutRelation, list[str]]] = defaultdict(dict)
+        parents: dict[str, str] = {}
+        for branch in branches:
+            if branch.child == root or branch.child in parents:
+                first = parents.get(branch.child, "nothing, being the root")
+                raise TreeError(
+                    f"{branch.child!r} hangs on {branch.parent!r} and on {first}: give every object one parent"
+                )
+            parents[branch.child] = branch.parent
+            children[branch.parent].setdefault(branch.relation, []).append(branch.child)
+        reached: set[str] = set()
+
+        def node(name: str) -> ObjectNode:
+            reached.add(name)
+            return ObjectNode(
+                name,
+                tuple(
+                    RelationNode(relation, tuple(node(child) for child in names))
+                    for relation, names in children[name].items()
+                ),
+            )
+
+        made = node(root)
+        if loose := [name for name in parents if name not in reached]:
+            raise TreeError(
+                f"{loose[0]!r} hangs on {parents[loose[0]]!r}, which does not lead to the root {root!r}: name an object of "
+                "the room as its parent"
+            )
+        return LayoutTree(made)
+
+    def branches(self) -> Iterator[Branch]:
+        """All edges, parents before their children."""
+        waiting = [self.root]
+        while waiting:
+            parent = waiting.pop(0)
+            for node in parent.relations:
+                for child in node.children:
+                    yield Branch(parent.name, node.relation, child.name)
+                    waiting.append(child)
+
+    def parent_of(self, name: str) -> Branch | None:
+        """The edge that ends at an object; None for the root and for what is not in the tree."""
+        return next((branch for branch in self.branches() if branch.child == name), None)
+
+    def nested(self) -> dict[str, Any]:
+        """Object and relation names in turn, leaves empty: the form in which the paper's factory writes its trees."""
+        return {self.root.name: _nested(self.root)}
+
+    def pruned(self, names: Iterable[str]) -> LayoutTree:
+        """The part of the tree that leads to these objects."""
+        above = {branch.child: branch for branch in self.branches()}
+        kept: set[str] = set()
+        for name in names:
+            while name in above and name not in kept:
+                kept.add(name)
+                name = above[name].parent
+        return LayoutTree.of(self.root.name, [branch for branch in self.branches() if branch.child in kept])
+
+    def drawn(self, labels: Mapping[str, str] | None = None) -> str:
+        """The tree as indented lines for people; ``labels`` are added to the names that they know."""
+        lines = [self.root.name]
+
+        def add(node: ObjectNode, indent: str) -> None:
+            for group in node.relations:
+                for child in group.children:
+                    label = (labels or {}).get(child.name, "")
+                    lines.append(
+                        f"{indent}{group.relation.value}: {child.name}{f'  ({label})' if label else ''}"
+                    )
+                    add(child, indent + "  ")
+
+        add(self.root, "  ")
+        return "\n".join(lines)
+
+
+def tree_in(objects: Iterable[SceneObject], room: str, names: Iterable[str]) -> LayoutTree:
+    """How some objects of a scene's room hang together with what they are on, in or under."""
+    branches = [
+        Branch(
+            item.host or room,
+            LayoutRelation(item.relation.value) if item.relation else LayoutRelation.ONTOP,
+            item.name,
+        )
+        for item in objects
+        if item.room == room and not item.absent
+    ]
+    known = {branch.child for branch in branches} | {room}
+    return LayoutTree.of(room, [branch for branch in branches if branch.parent in known]).pruned(names)
+
+
+def _nested(node: ObjectNode) -> dict[str, Any]:
+    return {
+        group.relation.value: {child.name: _nested(child) for child in group.children}
+        for group in node.relations
+    }

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.layout.arrangement import (
+from embomatrix.factory.layout.constraints import (
     SHADE,
     WEIGHTS,
     SpotCandidates,
@@ -26,12 +26,12 @@ from embomatrix.factory.layout.arrangement import (
 from embomatrix.factory.layout.values import (
     Arranged,
     Arrangement,
-    LayoutReason,
     PlaneBrief,
     PlaneFootprint,
     PlaneSpot,
     PlaneThing,
 )
+from embomatrix.factory.scenes.editor import LayoutReason
 from embomatrix.skills.limits import ROBOT
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from embomatrix.factory.layout.arrangement import BoolArray, FloatArray
+    from embomatrix.factory.layout.constraints import BoolArray, FloatArray
     from embomatrix.factory.layout.values import Size2
 
 BEAMS: Final = 3

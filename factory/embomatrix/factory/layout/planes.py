@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.layout.arrangement import half_extents
+from embomatrix.factory.layout.constraints import half_extents
 from embomatrix.factory.layout.sampling import LIFT_M
 from embomatrix.factory.layout.values import PlacementConstraint, PlaneBrief, PlaneFootprint, PlaneThing
 from embomatrix.sim.geometry.bounds import bounds_of
@@ -20,8 +20,8 @@ from embomatrix.world.state import Relation
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from embomatrix.factory.editor import SceneEditor
     from embomatrix.factory.layout.values import ObjectBrief, PlaneSpot, Size2
+    from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Aabb
 

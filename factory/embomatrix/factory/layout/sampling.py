@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.library import build_asset
-from embomatrix.factory.editor import PlacementError
-from embomatrix.factory.layout.values import LayoutReason
+from embomatrix.factory.scenes.editor import LayoutReason, PlacementError
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.candidates import candidates, patches, stands_in
 from embomatrix.world.catalog import Catalog, CatalogError
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.factory.editor import SceneEditor
+    from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.world.asset import Asset
     from embomatrix.world.scene import Room, SceneObject
 

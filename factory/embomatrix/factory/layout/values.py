@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import ClassVar, Final
 
+from embomatrix.factory.scenes.editor import LayoutReason  # noqa: TC001  pydantic reads the annotation
+
 _STRICT: Final = {"extra": "forbid"}
 
 Size2 = tuple[float, float]
@@ -57,22 +59,6 @@ class Kind(StrEnum):
     FURNITURE = "furniture"  # on the floor
     HUNG = "hung"  # on a wall
     OVERHEAD = "overhead"  # under the ceiling
-
-
-class LayoutReason(StrEnum):
-    """Why a thing found no place."""
-
-    UNKNOWN_HOST = "unknown_host"
-    UNKNOWN_MODEL = "unknown_model"
-    NO_HOST = "no_host"
-    NO_SURFACE = "no_surface"
-    TOO_LARGE = "too_large"
-    NO_FREE_SPOT = "no_free_spot"
-    OUT_OF_REACH = "out_of_reach"
-    BARS_THE_WAY = "bars_the_way"
-    UNSTABLE = "unstable"
-    NOT_AT_HAND = "not_at_hand"
-    RELATION_NOT_HELD = "relation_not_held"
 
 
 @dataclass(frozen=True, slots=True)

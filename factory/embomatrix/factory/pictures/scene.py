@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 
 from embomatrix.factory.pictures.labels import GAP, Labels, boxes
 from embomatrix.factory.pictures.legend import counted, draw_legend, in_order
-from embomatrix.factory.writer.view import SceneView
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Aabb, Pose
 

@@ -14,25 +14,30 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.pipeline.makers import makers
 from embomatrix.factory.pipeline.store import BuildStore, Rejection
-from embomatrix.factory.pipeline.variants import TASKS_EACH, VariantOrder, VariantYield, key_of
+from embomatrix.factory.pipeline.variants import TASKS_EACH, VariantMaker, VariantOrder, VariantYield, key_of
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.writer.view import SceneView
+from embomatrix.factory.scenes.view import SceneView
+from embomatrix.sim.process_pool import shared_work
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import DatasetError, write_dataset
 from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from embomatrix.factory.layout.request import LayoutAgents
+    from embomatrix.factory.pipeline.settings import BuildSettings
+    from embomatrix.factory.writer.tasks import TaskWriter
+
+    Make = Callable[[Sequence[VariantOrder]], Iterator[VariantYield]]
+    """Makes variants; what comes of them comes in the order of the orders."""
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from embomatrix.factory.layout.jobs import LayoutAgents
-    from embomatrix.factory.pipeline.makers import Make
-    from embomatrix.factory.pipeline.settings import BuildSettings
-    from embomatrix.factory.writer.tasks import TaskWriter
     from embomatrix.world.dataset import TaskRecord
     from embomatrix.world.scene import Scene
+
 
 Check = Callable[[VariantYield], VariantYield]
 """A second judge: leaves of a variant what is to be kept, and adds its refusals."""
@@ -288,3 +293,20 @@ def _summary(store: BuildStore, rooms: Mapping[str, Mapping[str, tuple[str, ...]
         variants=len(store.results),
         rooms=rooms,
     )
+
+
+@contextlib.contextmanager
+def makers(
+    settings: BuildSettings, writer: TaskWriter | None, layout: LayoutAgents | None, jobs: int
+) -> Iterator[Make]:
+    """For as long as this is held. ``writer`` and ``layout`` work in this process alone: they may hold a connection."""
+    if writer is not None or layout is not None:
+        with contextlib.closing(VariantMaker(settings, writer, layout)) as maker:
+            yield lambda orders: map(maker.make, orders)
+        return
+    died = DatasetError(
+        "a process that makes scene variants died, perhaps for want of memory: what was built is kept; call the same "
+        "command again, with fewer --jobs"
+    )
+    with shared_work(jobs, VariantMaker, VariantMaker.make, settings, died=died) as make:
+        yield make

@@ -6,9 +6,8 @@ import asyncio
 import dataclasses
 from typing import TYPE_CHECKING, Final, Self
 
-from embomatrix.factory.admission import SEED
+from embomatrix.factory.admission import SEED, RefusalReason
 from embomatrix.factory.pipeline.store import Rejection
-from embomatrix.factory.refusal import RefusalReason
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.wire.values import Batch, Completed, Rollout, RolloutResult
 from embomatrix.skills.parse import plan_from_json

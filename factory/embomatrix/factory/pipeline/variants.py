@@ -11,23 +11,22 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from embomatrix.factory.admission import Admitted, admit
-from embomatrix.factory.pipeline.poses import Needs, SceneSurvey, cache_poses
+from embomatrix.factory.admission import Admitted, TaskRefusal, admit
 from embomatrix.factory.pipeline.settings import WriterKind
 from embomatrix.factory.pipeline.store import Rejection, VariantResult
-from embomatrix.factory.refusal import TaskRefusal
+from embomatrix.factory.pipeline.task_poses import Needs, SceneSurvey, cache_poses
 from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.rehearsal import Rehearsal
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.writer import SocialWriter
-from embomatrix.factory.writer.rehearsal import Rehearsal
 from embomatrix.factory.writer.tasks import DraftOrder, ManyAtOnce, PlainWriter, is_heldout_signature
 from embomatrix.factory.writer.variant import Variant, build_variant
-from embomatrix.factory.writer.view import SceneView
-from embomatrix.sim.executor import Simulator
-from embomatrix.sim.floor.prepared import prepare
+from embomatrix.sim.live_world import prepare
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.planner.oracle import find_plan
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import TaskRecord
@@ -37,9 +36,10 @@ from embomatrix.world.task import TaskCategory
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from embomatrix.factory.layout.jobs import LayoutAgents
+    from embomatrix.factory.layout.request import LayoutAgents
     from embomatrix.factory.pipeline.settings import BuildSettings
     from embomatrix.factory.writer.tasks import Draft, TaskWriter
+    from embomatrix.sim.executor import Simulator
     from embomatrix.skills.syntax import Plan
     from embomatrix.world.scene import Scene
 
@@ -173,7 +173,7 @@ class _VariantJob:
         left = dict(missing)
         bundle = Bundle(scene, {}, poses)
         with contextlib.ExitStack() as stack:
-            stage = stack.enter_context(contextlib.closing(Simulator(bundle)))
+            stage = stack.enter_context(contextlib.closing(load_simulator(bundle)))
             robot = (
                 stack.enter_context(contextlib.closing(physical_simulator(bundle)))
                 if self._physical

@@ -10,7 +10,7 @@ from embomatrix.factory.writer.words import spoken
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from embomatrix.factory.writer.view import SceneView
+    from embomatrix.factory.scenes.view import SceneView
 
 MOST_IN_ROOM: Final = 40
 """Things that are told of a room; those that a task can be about come first."""

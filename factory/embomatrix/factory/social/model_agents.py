@@ -28,9 +28,9 @@ from embomatrix.llm.structured import ask
 from embomatrix.llm.values import ChatRequest, Message, Speaker
 
 if TYPE_CHECKING:
+    from embomatrix.factory.scenes.view import SceneView
     from embomatrix.factory.social.facts import SceneFacts
     from embomatrix.factory.social.values import DaySlot
-    from embomatrix.factory.writer.view import SceneView
     from embomatrix.llm.values import ChatModel
     from embomatrix.world.task import TaskCategory
 

@@ -6,11 +6,11 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.refusal import RefusalReason, TaskRefusal
+from embomatrix.factory.admission import RefusalReason, TaskRefusal
 from embomatrix.factory.social.conversing import starting_slots
 from embomatrix.factory.social.facts import facts_of, with_sights
 from embomatrix.factory.social.requests import piece_of
-from embomatrix.factory.social.transcript import transcript_of
+from embomatrix.factory.social.summary import transcript_of
 from embomatrix.factory.writer.goals import Workshop
 from embomatrix.factory.writer.tasks import Draft, DraftOrder, draft_of
 from embomatrix.llm.loop import OnOneLoop
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
     import numpy as np
 
+    from embomatrix.factory.scenes.view import SceneView
     from embomatrix.factory.social.facts import SceneFacts
     from embomatrix.factory.social.model_agents import ModelAgents
     from embomatrix.factory.social.values import Cast
     from embomatrix.factory.writer.variant import Variant
-    from embomatrix.factory.writer.view import SceneView
     from embomatrix.world.scene import Scene
     from embomatrix.world.task import TaskCategory
 

@@ -11,7 +11,7 @@ from embomatrix.factory.writer.words import room_words, spoken
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from embomatrix.factory.writer.view import SceneView
+    from embomatrix.factory.scenes.view import SceneView
 
 
 CLAUSES: Final[Mapping[str, tuple[str, ...]]] = {

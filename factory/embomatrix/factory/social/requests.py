@@ -12,7 +12,7 @@ from embomatrix.world.goal import Atom, Formula, Not
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from embomatrix.factory.writer.view import SceneView
+    from embomatrix.factory.scenes.view import SceneView
 
 
 class Wanted(StrEnum):

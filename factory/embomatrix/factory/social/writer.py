@@ -14,8 +14,7 @@ from embomatrix.factory.social.casting import GrammarRolePlayer
 from embomatrix.factory.social.conversing import ConversationScenario, GrammarConversation
 from embomatrix.factory.social.fitting import best_slot, why_of
 from embomatrix.factory.social.phrases import CLAUSES, MANNERS, NOUNS, WHENCE, WHERE, room_called
-from embomatrix.factory.social.summary import instruction_of
-from embomatrix.factory.social.transcript import transcript_of
+from embomatrix.factory.social.summary import instruction_of, transcript_of
 from embomatrix.factory.writer.goals import Workshop
 from embomatrix.factory.writer.tasks import Draft, draft_of, pieces_of
 from embomatrix.factory.writer.words import FreshVoice
@@ -23,11 +22,11 @@ from embomatrix.factory.writer.words import FreshVoice
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from embomatrix.factory.scenes.view import SceneView
     from embomatrix.factory.social.casting import RolePlayingAgent
     from embomatrix.factory.social.values import Cast, Conversation, DaySlot
     from embomatrix.factory.writer.goals import GoalConjunct
     from embomatrix.factory.writer.variant import Variant
-    from embomatrix.factory.writer.view import SceneView
     from embomatrix.world.scene import Scene
     from embomatrix.world.task import TaskCategory
 

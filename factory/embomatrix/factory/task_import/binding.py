@@ -10,11 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.refusal import RefusalReason, RefusedError
+from embomatrix.factory.admission import RefusalReason, RefusedError
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.expressible import AGENT, FLOORS, check_evaluable, check_expressible
 from embomatrix.factory.task_import.reach import pieces_of
 from embomatrix.factory.task_import.search import needs_of, search
-from embomatrix.factory.writer.view import SceneView
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.state import Relation
 from embomatrix.world.substances import is_substance

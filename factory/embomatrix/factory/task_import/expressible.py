@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.refusal import RefusalReason, RefusedError
+from embomatrix.factory.admission import RefusalReason, RefusedError
 from embomatrix.factory.task_import.reach import FUTURE, HELD, INSOURCE, Horizon, pieces_of
 from embomatrix.world.bddl import is_room_instance
 from embomatrix.world.catalog import Catalog

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from typing import TYPE_CHECKING
 
-from embomatrix.factory.pipeline.pairs import Beside
+from embomatrix.factory.pipeline.task_poses import Beside
 from embomatrix.factory.task_import.reach import literals
 from embomatrix.world.state import Relation
 

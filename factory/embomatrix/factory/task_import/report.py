@@ -7,8 +7,8 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.factory.evaluate.figures import EvaluationFigures
-from embomatrix.factory.refusal import TaskRefusal
+from embomatrix.factory.admission import TaskRefusal
+from embomatrix.factory.metrics.figures import EvaluationFigures
 from embomatrix.factory.task_import.batch import Verified
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.reach import unreachable_atoms

@@ -7,9 +7,9 @@ import math
 from collections import defaultdict
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.refusal import RefusalReason, RefusedError
-from embomatrix.factory.task_import.demands import demand_on, demands_of, room_for
-from embomatrix.factory.writer.view import is_liftable
+from embomatrix.factory.admission import RefusalReason, RefusedError
+from embomatrix.factory.scenes.view import is_liftable
+from embomatrix.factory.task_import.size_requirements import demand_on, demands_of, room_for
 from embomatrix.world.bddl import is_room_instance
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.evaluate import atoms_of
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.factory.writer.view import SceneView
+    from embomatrix.factory.scenes.view import SceneView
     from embomatrix.world.asset import Asset
     from embomatrix.world.bddl import BddlProblem
     from embomatrix.world.scene import Scene

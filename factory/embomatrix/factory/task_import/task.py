@@ -11,26 +11,31 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
+from embomatrix.factory.admission import RefusalReason, RefusedError, TaskRefusal
 from embomatrix.factory.assets.library import build_asset
-from embomatrix.factory.editor import SceneEditor, add_floor
 from embomatrix.factory.furnish.roles import is_portable
 from embomatrix.factory.layout.generator import lay
-from embomatrix.factory.layout.jobs import RequestedObject
+from embomatrix.factory.layout.request import RequestedObject
 from embomatrix.factory.layout.values import LayoutRelation
-from embomatrix.factory.refusal import RefusalReason, RefusedError, TaskRefusal
+from embomatrix.factory.scenes.editor import SceneEditor, add_floor
+from embomatrix.factory.scenes.view import SceneView, is_liftable
 from embomatrix.factory.task_import.binding import bind
-from embomatrix.factory.task_import.demands import demand_on, demands_of
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.expressible import AGENT, FLOORS
-from embomatrix.factory.task_import.kinds import SWITCHED, category_of, instruction_of, signature_of
-from embomatrix.factory.task_import.models import models_for
+from embomatrix.factory.task_import.models import models_for, sized
 from embomatrix.factory.task_import.neighbours import neighbours_of
 from embomatrix.factory.task_import.reach import FUTURE, INSOURCE, REAL, pieces_of, profile_for
-from embomatrix.factory.task_import.scene import with_robot_in, with_states
-from embomatrix.factory.task_import.sizes import sized
-from embomatrix.factory.task_import.thermal import sources_for, taps_for
+from embomatrix.factory.task_import.size_requirements import demand_on, demands_of
+from embomatrix.factory.task_import.start_state import with_robot_in, with_states
+from embomatrix.factory.task_import.task_fields import (
+    SWITCHED,
+    category_of,
+    instruction_of,
+    signature_of,
+    sources_for,
+    taps_for,
+)
 from embomatrix.factory.writer.tasks import object_table
-from embomatrix.factory.writer.view import SceneView, is_liftable
 from embomatrix.world.bddl import InitLiteral, is_room_instance
 from embomatrix.world.catalog import Catalog, share_of
 from embomatrix.world.evaluate import atoms_of, objects_of, render, substitute, types_of
@@ -42,7 +47,7 @@ from embomatrix.world.task import MAX_TABLE, Task
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from embomatrix.factory.layout.jobs import Layout
+    from embomatrix.factory.layout.request import Layout
     from embomatrix.factory.layout.values import Failure
     from embomatrix.factory.task_import.binding import Addition, Binding
     from embomatrix.factory.task_import.sources import SourceText

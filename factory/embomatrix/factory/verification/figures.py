@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.factory.evaluate.figures import EvaluationFigures
+from embomatrix.factory.metrics.figures import EvaluationFigures
 from embomatrix.pages.figures import Better, Figure
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.writer.tables import FOR_DRINKS, suits
+from embomatrix.factory.furnish.small_objects import FOR_DRINKS, suits
 from embomatrix.factory.writer.words import PHRASES, Voice, phrase, refer, room_words, spoken
 from embomatrix.world.asset import JointKind
 from embomatrix.world.goal import And, Atom, Exists, Formula, Not
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
     import numpy as np
 
+    from embomatrix.factory.scenes.view import SceneView
     from embomatrix.factory.writer.variant import Variant
-    from embomatrix.factory.writer.view import SceneView
 
 TAP: Final = "tap"
 DRAWERS: Final = "drawers"

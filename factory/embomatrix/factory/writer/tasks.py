@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.factory.refusal import TaskRefusal
+    from embomatrix.factory.admission import TaskRefusal
+    from embomatrix.factory.scenes.view import SceneView
     from embomatrix.factory.writer.variant import Variant
-    from embomatrix.factory.writer.view import SceneView
 
     Maker = Callable[[Workshop], GoalConjunct | None]
 

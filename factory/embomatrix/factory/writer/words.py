@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.factory.writer.view import SceneView
+    from embomatrix.factory.scenes.view import SceneView
 
 PHRASES: Final[Mapping[str, tuple[str, ...]]] = {
     "ontop": (

@@ -1,0 +1,210 @@
+"""``embomatrix factory assets``: test the generated assets, look at them, and import models from files."""
+
+from __future__ import annotations
+
+from collections import Counter
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final, NoReturn
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from embomatrix.factory.assets.check import Rule, check_asset
+from embomatrix.factory.assets.contact_sheet import draw_sheet
+from embomatrix.factory.assets.library import build_asset
+from embomatrix.factory.assets.naming import family_of
+from embomatrix.factory.assets.standing import GLANCE_STEPS, STEPS, check_standing
+from embomatrix.factory.importers.assemble import import_model, read_model
+from embomatrix.factory.importers.convex import Coacd, by_components
+from embomatrix.factory.importers.model import AxisConvention, ModelFileError
+from embomatrix.factory.importers.shelf import save_asset
+from embomatrix.sim.engine import EngineError
+from embomatrix.world.asset import Credit
+from embomatrix.world.catalog import Catalog, CatalogError
+from embomatrix.world.records import SceneInvalidError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.factory.importers.assemble import ImportedAsset
+    from embomatrix.world.asset import Asset
+
+app = typer.Typer(
+    help="Test, draw and import the models that scenes are built from.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+WORTH_TELLING: Final = 1.25
+"""A model that is stretched more than this along one side against another no longer looks like itself."""
+
+
+class Cut(StrEnum):
+    """Ways to cut a mesh into convex parts."""
+
+    COACD = "coacd"
+    COMPONENTS = "components"
+
+
+Categories = Annotated[
+    list[str] | None, typer.Option("--category", help="Only this category; give it again for more.")
+]
+
+
+@app.command()
+def check(
+    category: Categories = None,
+    every_model: Annotated[
+        bool, typer.Option("--every-model", help="All models of a category, not its first alone.")
+    ] = False,
+    glance: Annotated[
+        bool, typer.Option("--glance", help="Watch things only until they are slow, not for two seconds.")
+    ] = False,
+) -> None:
+    """Test size, cavities, doors and standing of all that scenes or activities use; exit status 1 when something is wrong."""
+    catalog = Catalog.load()
+    assets = _assets(catalog, category, every_model=every_model)
+    try:
+        findings = [finding for asset in assets for finding in check_asset(catalog, asset)]
+        findings += check_standing(catalog, assets, GLANCE_STEPS if glance else STEPS)
+    except EngineError as error:
+        _fail(str(error))
+    console = Console()
+    for finding in findings:
+        if not finding.excused:
+            console.print(f"{finding.asset_id}: {finding.rule}: {finding.detail}", highlight=False)
+    table = Table("rule", "wrong", "excused", title=f"{len(assets)} models")
+    counts = Counter((finding.rule, finding.excused) for finding in findings)
+    for rule in Rule:
+        table.add_row(rule, str(counts[rule, False]), str(counts[rule, True]))
+    console.print(table)
+    reasons = Counter(f"{finding.rule}: {finding.detail}" for finding in findings if finding.excused)
+    for reason, number in sorted(reasons.items()):
+        console.print(f"excused {number} x {reason}", highlight=False)
+    if any(not finding.excused for finding in findings):
+        raise typer.Exit(1)
+
+
+@app.command()
+def families() -> None:
+    """Count the categories of each family, of those that scenes or activities use."""
+    catalog = Catalog.load()
+    counts = Counter(family_of(catalog, name) for name in catalog.used_categories)
+    table = Table("family", "categories", title=f"{len(catalog.used_categories)} categories")
+    for family, number in counts.most_common():
+        table.add_row(family, str(number))
+    Console().print(table)
+
+
+@app.command()
+def draw(
+    out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("assets.png"),
+    category: Categories = None,
+    every_model: Annotated[bool, typer.Option("--every-model", help="All models of a category.")] = False,
+) -> None:
+    """Draw assets side by side, those with doors or drawers also open. Without a category: all that open, heat or cool."""
+    catalog = Catalog.load()
+    chosen = category or [name for name in catalog.used_categories if _is_worth_a_look(catalog, name)]
+    picture = draw_sheet(_assets(catalog, chosen, every_model=every_model))
+    try:
+        picture.save(out)
+    except (OSError, ValueError) as error:
+        _fail(f"can't write {out}: {error}")
+    Console().print(str(out), highlight=False)
+
+
+@app.command("import")
+def import_(
+    file: Annotated[Path, typer.Argument(help="OBJ, STL, GLB or URDF.")],
+    category: Annotated[str, typer.Option(help="Category of the catalog that the model is one of.")],
+    creator: Annotated[str, typer.Option(help="Whose work it is.")],
+    licence: Annotated[str, typer.Option(help="On which terms it may be used, e.g. CC0-1.0.")],
+    out: Annotated[Path, typer.Option(help="Folder of imported assets.")],
+    model: Annotated[
+        str,
+        typer.Option(help="The catalog's model to replace; by default the one of the likest proportions."),
+    ] = "",
+    source: Annotated[str, typer.Option(help="Where it comes from; by default the file's name.")] = "",
+    up: Annotated[
+        AxisConvention | None, typer.Option(help="Axis that points up: y (OBJ, GLB) or z (STL, URDF).")
+    ] = None,
+    cut: Annotated[Cut, typer.Option(help="How meshes are cut into convex parts.")] = Cut.COACD,
+) -> None:
+    """Make an asset of a model file, in the place of one of the catalog's models: `scene build --assets` then uses it."""
+    credit = Credit(creator, licence, source or file.name)
+    try:
+        raw = read_model(file, up)
+        decompose = Coacd() if cut is Cut.COACD else by_components
+        imported = import_model(Catalog.load(), raw, category, model, credit, decompose)
+        path = save_asset(out, imported.asset)
+    except (ModelFileError, CatalogError, SceneInvalidError) as error:
+        _fail(str(error))
+    except OSError as error:
+        _fail(f"{error.filename or out} can't be written ({error.strerror}): name another folder with --out")
+    _tell(imported, path)
+    Console(soft_wrap=True).print(_stands_in(imported.asset.asset_id), highlight=False)
+
+
+def _tell(imported: ImportedAsset, path: Path) -> None:
+    """What the asset has, what it lacks of what its category's things do, and which rule of `assets check` it breaks."""
+    asset, console = imported.asset, Console(soft_wrap=True)
+    parts = sum(len(link.parts) for link in asset.links)
+    console.print(
+        f"{asset.asset_id}: {parts} convex parts in {len(asset.links)} links, {len(asset.supports)} surfaces, "
+        f"{len(asset.interiors)} cavities: {path}",
+        highlight=False,
+    )
+    for lack in imported.lacks:
+        console.print(lack, highlight=False)
+    for finding in check_asset(Catalog.load(), asset):
+        # What is not there at all was told above.
+        if not finding.excused and not imported.lacks:
+            console.print(f"{finding.rule.value}: {finding.detail}", highlight=False)
+    if imported.stretch > WORTH_TELLING:
+        console.print(
+            f"its proportions are changed by a factor of {imported.stretch:.2f} to fit {asset.size_m} m: "
+            "another --model may be more like it",
+            highlight=False,
+        )
+
+
+def _stands_in(asset_id: str) -> str:
+    """In which base scenes `scene build --assets` makes a difference."""
+    catalog = Catalog.load()
+    listing = [
+        scene_id
+        for scene_id in catalog.scene_ids
+        if any(
+            f"{category}-{model}" == asset_id
+            for room in catalog.inventory(scene_id).rooms
+            for category, model, _ in room.items
+        )
+    ]
+    return (
+        f"it stands in {', '.join(listing)}"
+        if listing
+        else "it stands in no base scene: give a --model that one lists"
+    )
+
+
+def _is_worth_a_look(catalog: Catalog, name: str) -> bool:
+    return not {"openable", "heatSource", "coldSource"}.isdisjoint(catalog.category(name).abilities)
+
+
+def _assets(catalog: Catalog, categories: Sequence[str] | None, *, every_model: bool) -> list[Asset]:
+    try:
+        return [
+            build_asset(catalog, name, model.model_id)
+            for name in categories or catalog.used_categories
+            for model in catalog.models_of(name)[: None if every_model else 1]
+        ]
+    except CatalogError as error:
+        _fail(str(error))
+
+
+def _fail(sentence: str) -> NoReturn:
+    console = Console(stderr=True)
+    console.print(f"embomatrix factory assets: {sentence}", highlight=False, markup=False, soft_wrap=True)
+    raise typer.Exit(2) from None

@@ -1,0 +1,250 @@
+"""`embomatrix play`: execute a plan in a task and explain every step and the reward."""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress
+from rich.table import Table
+
+from embomatrix.factory.pictures.film import Caption, FilmError, check_suffix, draw_film, write_film
+from embomatrix.reward.hierarchy import score, unparsable
+from embomatrix.sim.engine import EngineError
+from embomatrix.sim.film import film_cached
+from embomatrix.sim.physical.actor import PhysicalActor
+from embomatrix.sim.physical.film import film_physical
+from embomatrix.sim.planner.oracle import PlanNotFound, find_plan
+from embomatrix.sim.simulation import load_simulator
+from embomatrix.sim.state.facts import FactError
+from embomatrix.skills.describe import call_in_words
+from embomatrix.skills.parse import PlanError, parse_plan
+from embomatrix.skills.syntax import MAX_PLAN_BYTES
+from embomatrix.world.dataset import Dataset, DatasetError
+from embomatrix.world.evaluate import GoalError
+from embomatrix.world.whole_file import check_writable
+
+if TYPE_CHECKING:
+    from embomatrix.reward.breakdown import RewardBreakdown
+    from embomatrix.sim.film import Film
+    from embomatrix.skills.syntax import Plan
+    from embomatrix.skills.trace import Trace
+    from embomatrix.world.bundle import Bundle
+    from embomatrix.world.task import Task
+
+DEFAULT_DATASET: Final = "build/dataset"
+BAD_INPUT: Final = 2
+NO_PLAN: Final = 1
+
+console = Console(highlight=False)
+
+
+class PlayMode(StrEnum):
+    """How a plan is carried out."""
+
+    CACHED = "cached"
+    PHYSICAL = "physical"
+
+
+@dataclass(frozen=True, slots=True)
+class Take:
+    """How a plan is to be executed, and where a film of it goes."""
+
+    mode: PlayMode
+    seed: int
+    film: Path | None
+
+
+class PlayError(Exception):
+    """Something that the person can mend. The message is one sentence."""
+
+
+def play(
+    task: Annotated[str, typer.Argument(help="Id of a task of the dataset.")],
+    plan: Annotated[
+        str, typer.Option("--plan", help="File with a plan, JSON or one call a line; - reads standard input.")
+    ] = "",
+    oracle: Annotated[bool, typer.Option("--oracle", help="Find a plan with the oracle and run it.")] = False,
+    dataset: Annotated[
+        Path | None,
+        typer.Option(help=f"Folder of the dataset; else $EMBOMATRIX_DATASET, else {DEFAULT_DATASET}."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Decides between outcomes that are equally good.")] = 0,
+    mode: Annotated[
+        PlayMode,
+        typer.Option(help="cached: verified outcomes; physical: a robot does it in stepped physics."),
+    ] = PlayMode.CACHED,
+    film: Annotated[
+        Path | None, typer.Option(help="Draw the plan as an animation: a .gif, .webp or .png file.")
+    ] = None,
+) -> None:
+    """Execute a plan in a task: every step with its reason, the final state and the reward.
+
+    Exit status: 0 for a plan that was executed, 1 for a text that is no plan, 2 for other bad input.
+    """
+    try:
+        if film is not None:
+            _check_film(film)
+        status = _play(task, plan, oracle, dataset, Take(mode, seed, film))
+    except (PlayError, DatasetError, EngineError, FactError, FilmError, GoalError) as error:
+        Console(stderr=True, highlight=False).print(f"embomatrix play: {error}", markup=False, soft_wrap=True)
+        raise SystemExit(BAD_INPUT) from None
+    if status:
+        raise SystemExit(status)
+
+
+def _play(task_id: str, plan: str, oracle: bool, folder: Path | None, take: Take) -> int:
+    if oracle == bool(plan):
+        raise PlayError("expected either --plan FILE or --oracle: give one of them")
+    root = folder if folder is not None else Path(os.environ.get("EMBOMATRIX_DATASET", DEFAULT_DATASET))
+    data = Dataset.load(root)
+    record = data.find(task_id)
+    bundle = data.bundle(record.bundle_digest)
+    text = "" if oracle else _text_of(plan)
+    _show_task(record.task)
+    if oracle:
+        found = find_plan(load_simulator(bundle), record.task)
+        if isinstance(found, PlanNotFound):
+            raise PlayError(f"the oracle finds no plan for {task_id!r}: {found.reason}")
+        _run(bundle, record.task, found, take)
+        return 0
+    try:
+        parsed = parse_plan(text, record.task.profile)
+    except PlanError as error:
+        _show_unparsable(error)
+        return NO_PLAN
+    _run(bundle, record.task, parsed, take)
+    return 0
+
+
+def _text_of(plan: str) -> str:
+    """The plan's text. One byte more than a plan may have is read at most."""
+    try:
+        if plan == "-":
+            if sys.stdin is None:
+                raise PlayError("there is no standard input to read a plan from: expected --plan FILE")
+            raw = sys.stdin.buffer.read(MAX_PLAN_BYTES + 1)
+        else:
+            with Path(plan).open("rb") as file:
+                raw = file.read(MAX_PLAN_BYTES + 1)
+    except OSError as error:
+        raise PlayError(f"the plan {plan!r} can't be read ({error.strerror}): expected a text file") from None
+    # No byte is refused here: what the text means, or that it means nothing, is the parser's to say.
+    return raw.decode("utf-8", errors="replace")
+
+
+def _run(bundle: Bundle, task: Task, plan: Plan, take: Take) -> None:
+    actor = PhysicalActor(bundle) if take.mode is PlayMode.PHYSICAL else None
+    simulator = load_simulator(bundle, actor=actor)
+    trace = simulator.execute(task, plan, take.seed)
+    _show_steps(task, trace)
+    console.print("\n[bold]Final state[/bold]")
+    for line in trace.final:
+        console.print(f"  {escape(line)}")
+    _show_reward(score(task, trace.touched, simulator.facts))
+    if take.film is None:
+        return
+    if actor is None:
+        _draw(film_cached(simulator, task, plan, take.seed), take.film)
+    else:
+        _draw(film_physical(simulator, actor, task, plan, take.seed), take.film)
+
+
+def _draw(film: Film, path: Path) -> None:
+    """Draw the film, with a bar that tells how far it is, and write it."""
+    done = [step.ok for step in film.steps]
+    captions = [
+        Caption(call_in_words(call, film.task.table), done[number] if number < len(done) else None)
+        for number, call in enumerate(film.plan)
+    ]
+    with Progress(console=console, transient=True) as progress:
+        bar = progress.add_task("drawing", total=len(film.frames))
+        pictures = draw_film(
+            film, captions, on_frame=lambda done, count: progress.update(bar, completed=done, total=count)
+        )
+    try:
+        write_film(path, pictures)
+    except OSError as error:
+        raise _unwritable(path, error) from None
+    console.print(f"\nfilm of {len(pictures)} frames: {path}", markup=False)
+
+
+def _check_film(path: Path) -> None:
+    """Before anything is executed: drawing takes minutes, and shall not end at a file that can't be written."""
+    check_suffix(path)
+    try:
+        check_writable(path)
+    except OSError as error:
+        raise _unwritable(path, error) from None
+
+
+def _unwritable(path: Path, error: OSError) -> PlayError:
+    return PlayError(
+        f"{path} can't be written ({error.strerror}): make room, or name another file with --film"
+    )
+
+
+def _show_task(task: Task) -> None:
+    console.print(f"[bold]{escape(task.task_id)}[/bold]  {task.category.value} in {escape(task.scene_id)}")
+    console.print(f"  {escape(task.instruction)}")
+    console.print(f"  [dim]{escape(task.goal_bddl)}[/dim]\n")
+
+
+def _show_steps(task: Task, trace: Trace) -> None:
+    table = Table(box=None, show_header=False, padding=(0, 1))
+    table.add_column(justify="right", style="dim")
+    table.add_column()
+    table.add_column()
+    table.add_column(overflow="fold")
+    for number, call in enumerate(trace.plan, start=1):
+        words = escape(call_in_words(call, task.table))
+        if number > len(trace.steps):
+            table.add_row(str(number), "[dim]·[/dim]", f"[dim]{words}[/dim]", "[dim]not executed[/dim]")
+            continue
+        step = trace.steps[number - 1]
+        if step.failure is None:
+            table.add_row(str(number), "[green]✓[/green]", words, escape(step.message))
+        else:
+            reason = f"[red]{step.failure.value}[/red]: {escape(step.message)}"
+            table.add_row(str(number), "[red]✗[/red]", words, reason)
+    console.print(table)
+
+
+def _show_unparsable(error: PlanError) -> None:
+    console.print(f"[red]✗[/red] the text can't be parsed ({error.reason.value}): {escape(str(error))}")
+    _show_reward(unparsable())
+
+
+def _show_reward(reward: RewardBreakdown) -> None:
+    table = Table(title="Reward", title_justify="left", title_style="bold", show_footer=True)
+    table.add_column("tier", footer="total")
+    table.add_column("made of", overflow="fold", footer=_verdict(reward))
+    table.add_column("points", justify="right", footer=f"{reward.total:.2f}")
+    if reward.format < 0:
+        table.add_row("format", "the text is no plan: it was not executed", f"{reward.format:.2f}")
+    else:
+        _add_tiers(table, reward)
+    console.print()
+    console.print(table)
+
+
+def _add_tiers(table: Table, reward: RewardBreakdown) -> None:
+    holding = sum(atom.holds for atom in reward.atoms)
+    table.add_row("format", "the text is a plan", f"{reward.format:.2f}")
+    table.add_row("relevance", "goal objects on which a call succeeded", f"{reward.relevance:.2f}")
+    table.add_row("goal", f"{holding} of {len(reward.atoms)} atoms hold", f"{reward.goal:.2f}")
+    for atom in reward.atoms:
+        mark = "[green]✓[/green]" if atom.holds else "[red]✗[/red]"
+        points = reward.goal / holding if atom.holds else 0.0
+        table.add_row("", f"{mark} {escape(atom.text)}", f"[dim]{points:.2f}[/dim]")
+
+
+def _verdict(reward: RewardBreakdown) -> str:
+    return "[green]success[/green]" if reward.success else "[red]the goal is not reached[/red]"

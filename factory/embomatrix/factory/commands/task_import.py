@@ -1,0 +1,277 @@
+"""``embomatrix factory import``: bind others' problems to base scenes, verify them, and report what can't be bound and why."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from embomatrix.factory.admission import TaskRefusal
+from embomatrix.factory.commands.terminal import fail, mended, progress
+from embomatrix.factory.metrics.figures import EvaluationError, evaluation_to_json
+from embomatrix.factory.pipeline.options import Jobs, processes
+from embomatrix.factory.pipeline.settings import scene_ids
+from embomatrix.factory.pipeline.store import LineLog
+from embomatrix.factory.task_import.batch import Verified
+from embomatrix.factory.task_import.dialects import read_problem
+from embomatrix.factory.task_import.importer import Depth, Docket, judging
+from embomatrix.factory.task_import.reach import unreachable_atoms
+from embomatrix.factory.task_import.report import (
+    ProblemOutcome,
+    evaluation_of,
+    outcome_from_json,
+    report_to_json,
+    report_to_markdown,
+    solved_of,
+)
+from embomatrix.factory.task_import.sources import (
+    ProblemSourceError,
+    SourceText,
+    activity_names,
+    read_activity,
+    read_eai,
+    read_file,
+    read_jsonl,
+)
+from embomatrix.world.bddl import BddlError
+from embomatrix.world.dataset import TASKS_FILE, write_dataset
+from embomatrix.world.substances import is_substance
+from embomatrix.world.task import Profile
+from embomatrix.world.whole_file import check_writable, write_whole
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from embomatrix.factory.metrics.figures import EvaluationFigures
+    from embomatrix.factory.task_import.task import ImportedTask
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+EVERY_ACTIVITY = "all"
+
+
+Report = Annotated[
+    Path | None, typer.Option(help="File for what became of each problem, in JSON; beside it in Markdown.")
+]
+Eai = Annotated[Path | None, typer.Option(help="Folder of the unpacked wheel of eai-eval: its 100 tasks.")]
+Instantiate = Annotated[
+    bool, typer.Option("--instantiate", help="Bind goals as well that no skill reaches; no verification.")
+]
+LookAhead = Annotated[bool, typer.Option(help="Find out what the robot's arm can do in each scene.")]
+Rates = Annotated[Path | None, typer.Option("--json", help="File for the import rates.")]
+Kept = Annotated[
+    Path | None,
+    typer.Option(
+        "--outcomes",
+        help="File for what became of each problem, JSON lines, as it comes: with it an import that was stopped goes on.",
+    ),
+]
+ReachedBy = Annotated[
+    Profile | None, typer.Option(help="Leave out problems with goals that no skill of this profile reaches.")
+]
+Solids = Annotated[bool, typer.Option("--solids", help="Leave out problems that name a liquid or a powder.")]
+Scenes = Annotated[
+    list[str] | None,
+    typer.Option("--scenes", "--scene", help="Base scene, or 'all'; give it again for more."),
+]
+
+
+@app.command("import")
+def import_(
+    bddl: Annotated[Path | None, typer.Option(help="A BDDL problem file.")] = None,
+    activity: Annotated[str, typer.Option(help="An activity of the bddl package, or 'all'.")] = "",
+    jsonl: Annotated[Path | None, typer.Option(help="Records with 'name' and 'bddl'.")] = None,
+    eai: Eai = None,
+    scenes: Scenes = None,
+    seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal datasets.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="Folder for the admitted tasks.")] = None,
+    bind_only: Annotated[bool, typer.Option("--bind-only", help="Leave out the verification.")] = False,
+    instantiate: Instantiate = False,
+    reached_by: ReachedBy = None,
+    solids: Solids = False,
+    look_ahead: LookAhead = True,
+    report: Report = None,
+    json_file: Rates = None,
+    outcomes: Kept = None,
+    jobs: Jobs = None,
+) -> None:
+    """Bind BDDL problems to base scenes and verify them, or say why not."""
+    console = Console()
+    depth = Depth.INSTANTIATE if instantiate else Depth.BIND if bind_only else Depth.VERIFY
+    kept = "; what was found is kept, and the same command goes on from there" if outcomes is not None else ""
+    with mended(out or outcomes, kept):
+        for file in filter(None, (report, json_file)):
+            check_writable(file)
+        if out is not None:
+            _check_free(out, depth, outcomes)
+        sources = _wanted(_sources(bddl, activity, jsonl, eai), reached_by, solids=solids)
+        docket = Docket(scene_ids(scenes), seed, depth, look_ahead)
+        log = _taken_up(outcomes, sources, docket)
+        made = _judged(console, sources[len(log.outcomes) :], docket, processes(jobs), log)
+        admitted = out is None or _written(out, made)
+        told = log.outcomes
+        verified = depth is Depth.VERIFY
+        evaluation = solved_of(told, seed, solids=solids) if verified else evaluation_of(told, seed)
+        _write(told, evaluation, report, json_file)
+    if len(sources) == len(made) == 1:
+        _print_one(console, sources[0], made[0])
+        return
+    _print_outcomes(console, told, depth)
+    if not admitted:
+        fail(f"no problem was admitted, so {out} was not written: `--bind-only` shows which could be bound")
+
+
+def _written(out: Path, made: Sequence[ImportedTask | Verified | TaskRefusal]) -> bool:
+    """Whether there was any task to put into the dataset."""
+    verified = [item for item in made if isinstance(item, Verified)]
+    if verified:
+        bundles = {item.record.bundle_digest: item.bundle for item in verified}
+        write_dataset(out, [item.record for item in verified], bundles)
+    return bool(verified)
+
+
+def _taken_up(
+    path: Path | None,
+    sources: Sequence[SourceText],
+    docket: Docket,
+) -> LineLog[ProblemOutcome]:
+    """What is known already of the first of the problems. Raises EvaluationError where a file tells of others."""
+    log = LineLog[ProblemOutcome](path)
+    told = {
+        "seed": docket.seed,
+        "depth": docket.depth,
+        "scenes": [*docket.scenes],
+        "look_ahead": docket.look_ahead,
+    }
+    log.take_up(told, outcome_from_json)
+    known = [outcome.name for outcome in log.outcomes]
+    if known != [source.name for source in sources[: len(known)]]:
+        raise EvaluationError(f"{path} tells of other problems than are to be imported: name another file")
+    return log
+
+
+def _wanted(sources: Sequence[SourceText], profile: Profile | None, *, solids: bool) -> Sequence[SourceText]:
+    """Those with goals that a profile's skills reach, and without substances. Raises SourceError where there is none."""
+    found = [(source, read_problem(source)[0]) for source in sources] if profile or solids else []
+    if profile is not None:
+        found = [(source, problem) for source, problem in found if not unreachable_atoms(problem, profile)]
+        if not found:
+            raise ProblemSourceError(
+                f"no goal of {len(sources)} problems is reached by the profile {profile.value!r}: leave out --reached-by"
+            )
+    if solids:
+        found = [
+            (source, problem)
+            for source, problem in found
+            if not any(map(is_substance, problem.objects.values()))
+        ]
+        if not found:
+            raise ProblemSourceError("each of the problems names a liquid or a powder: leave out --solids")
+    return [source for source, _ in found] if profile or solids else sources
+
+
+def _write(
+    outcomes: Sequence[ProblemOutcome],
+    evaluation: EvaluationFigures,
+    report: Path | None,
+    json_file: Path | None,
+) -> None:
+    if report is not None:
+        write_whole(report, (json.dumps(report_to_json(outcomes), indent=1) + "\n").encode("ascii"))
+        write_whole(report.with_suffix(".md"), report_to_markdown(outcomes).encode("utf-8"))
+    if json_file is not None:
+        write_whole(json_file, (json.dumps(evaluation_to_json(evaluation), indent=1) + "\n").encode("ascii"))
+
+
+def _check_free(out: Path, depth: Depth, outcomes: Path | None) -> None:
+    """Nothing that is already there is overwritten, and nothing that could not be written is begun."""
+    if depth is not Depth.VERIFY:
+        raise ProblemSourceError(
+            f"to {depth.value} admits no task that could be written: leave out --out, or --bind-only and --instantiate"
+        )
+    if outcomes is not None:
+        raise ProblemSourceError(
+            "an import into a dataset is not taken up again: leave out --out, or --outcomes"
+        )
+    if (out / TASKS_FILE).exists():
+        raise ProblemSourceError(f"{out} holds a dataset already: name another folder with --out")
+    out.mkdir(parents=True, exist_ok=True)
+
+
+def _parsed(source: SourceText) -> SourceText:
+    """The source, whose text is BDDL: what is not shall be told before scenes are built."""
+    try:
+        read_problem(source)
+    except BddlError as error:
+        raise ProblemSourceError(f"{source.name}: {error}") from error
+    return source
+
+
+def _sources(bddl: Path | None, activity: str, jsonl: Path | None, eai: Path | None) -> list[SourceText]:
+    """The problems that are given, all of which are BDDL. Raises SourceError."""
+    return [_parsed(source) for source in _given(bddl, activity, jsonl, eai)]
+
+
+def _given(bddl: Path | None, activity: str, jsonl: Path | None, eai: Path | None) -> Iterator[SourceText]:
+    given = sum(map(bool, (bddl, activity, jsonl, eai)))
+    if given != 1:
+        raise ProblemSourceError(
+            f"found {given} sources: expected exactly one of --bddl FILE, --activity NAME, --jsonl FILE and --eai FOLDER"
+        )
+    if bddl is not None:
+        yield read_file(bddl)
+    elif jsonl is not None:
+        yield from read_jsonl(jsonl)
+    elif eai is not None:
+        yield from read_eai(eai)
+    elif activity == EVERY_ACTIVITY:
+        yield from map(read_activity, activity_names())
+    else:
+        yield read_activity(activity)
+
+
+def _judged(
+    console: Console,
+    sources: Sequence[SourceText],
+    docket: Docket,
+    jobs: int,
+    log: LineLog[ProblemOutcome],
+) -> list[ImportedTask | Verified | TaskRefusal]:
+    """What becomes of these problems, but for those that another process has bound; each is added to the log."""
+    made: list[ImportedTask | Verified | TaskRefusal] = []
+    done = len(log.outcomes)
+    with progress(console) as bars, judging(docket, min(jobs, len(sources) or 1)) as judge:
+        bar = bars.add_task("problems", total=done + len(sources), completed=done)
+        for judged in judge(sources):
+            log.add(judged.outcome)
+            if judged.item is not None:
+                made.append(judged.item)
+            bars.advance(bar)
+    return made
+
+
+def _print_one(console: Console, source: SourceText, outcome: ImportedTask | Verified | TaskRefusal) -> None:
+    if isinstance(outcome, TaskRefusal):
+        fail(f"{source.name} is refused ({outcome.reason}): {outcome.sentence}")
+    for note in outcome.notes:
+        console.print(note, highlight=False, markup=False)
+    task = outcome.record.task if isinstance(outcome, Verified) else outcome.task
+    console.print(
+        f"{task.task_id}: {task.instruction}\n  goal: {task.goal_bddl}", highlight=False, markup=False
+    )
+    if isinstance(outcome, Verified):
+        for call in outcome.record.oracle:
+            console.print("  " + " ".join(map(str, call.values())), highlight=False, markup=False)
+
+
+def _print_outcomes(console: Console, outcomes: Sequence[ProblemOutcome], depth: Depth) -> None:
+    done = "verified" if depth is Depth.VERIFY else "imported"
+    counts = Counter(f"refused: {each.reason}" if each.reason else done for each in outcomes)
+    table = Table("outcome", "problems")
+    for outcome, count in counts.most_common():
+        table.add_row(outcome, str(count))
+    console.print(table)

@@ -1,0 +1,63 @@
+"""``embomatrix factory verify``: judge the tasks of a dataset again, in other processes, and in stepped physics."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from embomatrix.factory.commands.terminal import fail, mended, progress, report_evaluation
+from embomatrix.factory.pipeline.options import Jobs, processes
+from embomatrix.factory.verification.again import sampled, verify_again
+from embomatrix.factory.verification.figures import evaluation_of, objections
+from embomatrix.world.dataset import Dataset
+from embomatrix.world.whole_file import check_writable
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+"""Each process holds a scene."""
+
+Physical = Annotated[
+    bool,
+    typer.Option("--physical", help="Let a robot carry the oracle's plans out in stepped physics as well."),
+]
+Sample = Annotated[int | None, typer.Option(min=1, help="So many tasks, drawn by the seed. Default: all.")]
+Figures = Annotated[Path | None, typer.Option("--json", help="File for the figures, for `evaluate page`.")]
+
+
+@app.command()
+def verify(
+    folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")] = Path("build/dataset"),
+    physical: Physical = False,
+    sample: Sample = None,
+    seed: Annotated[int, typer.Option(min=0, help="Equal seeds draw equal tasks.")] = 0,
+    jobs: Jobs = None,
+    json_file: Figures = None,
+) -> None:
+    """Judge admitted tasks again, each in two other processes, which must agree to the bit.
+
+    Exit status: 1 when a task is not admitted again, or two processes disagree.
+    """
+    with mended(json_file):
+        if json_file is not None:
+            check_writable(json_file)
+        records = sampled(Dataset.load(folder).records, sample, seed)
+        if not records:
+            fail(f"{folder} holds no task: there is nothing to verify")
+        with progress(Console(stderr=True)) as bars:
+            bar = bars.add_task("looks", total=2 * len(records))
+            verdicts = verify_again(
+                folder,
+                records,
+                physical=physical,
+                jobs=processes(jobs),
+                progress=lambda done: bars.update(bar, completed=done),
+            )
+    conditions = {"dataset": folder.name, "tasks": len(verdicts), "seed": seed}
+    console = Console()
+    for line in objections(verdicts):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    report_evaluation(evaluation_of(verdicts, conditions), json_file)
+    if any(verdict.cached or not verdict.equal for verdict in verdicts):
+        raise typer.Exit(1)

@@ -1,0 +1,130 @@
+"""The agents' doors: briefs and answers as JSON, checked by pydantic; inside they are plain frozen values.
+
+Four agents by the paper's names. Three of them can be a language model; poses are always sampled by code.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, Final
+
+from pydantic import TypeAdapter, ValidationError
+
+from embomatrix.factory.layout.constraints import wish
+from embomatrix.factory.layout.distribution import distribute
+from embomatrix.factory.layout.organization import organize
+from embomatrix.factory.layout.planar import arrange
+from embomatrix.factory.layout.sampling import ObjectSampler
+from embomatrix.factory.layout.values import (
+    Arranged,
+    Branch,
+    Distribution,
+    DistributionBrief,
+    PlacementConstraints,
+    PlaneBrief,
+    PlaneCompany,
+    RoomBrief,
+    SampleBrief,
+    Sampled,
+)
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.editor import PlacementError, SceneEditor
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+import numpy as np
+
+
+class AgentName(StrEnum):
+    """Agents that can be run alone."""
+
+    DISTRIBUTOR = "scene-distributor"
+    ORGANIZER = "room-organizer"
+    PLANNER = "planar-constraints"
+    SOLVER = "planar-generator"
+    SAMPLER = "object-sampler"
+
+
+class BriefError(ValueError):
+    """A brief that an agent can't read; one sentence for a person."""
+
+
+@dataclass(frozen=True, slots=True)
+class AgentInterface:
+    """What an agent takes and gives, and its rules."""
+
+    about: str
+    brief: TypeAdapter[Any]
+    answer: TypeAdapter[Any]
+    rules: Callable[[Any], Any]
+
+    def read(self, text: str) -> Any:
+        """A brief from JSON. Raises BriefError naming the field."""
+        try:
+            return self.brief.validate_json(text)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            where = ".".join(map(str, first["loc"])) or "the brief"
+            raise BriefError(
+                f"{where}: {first['msg'].lower()}; `--schema` prints what is expected"
+            ) from error
+
+    def written(self, answer: Any) -> str:
+        """An answer as JSON."""
+        return self.answer.dump_json(answer, indent=1).decode()
+
+
+def _branches(brief: RoomBrief) -> tuple[Branch, ...]:
+    return tuple(organize(brief).branches())
+
+
+def sample(brief: SampleBrief) -> Sampled:
+    """Sample one pose in a base scene, as the object-level agent does."""
+    editor = SceneEditor(build_base_scene(brief.scene, seed=brief.seed))
+    sampler = ObjectSampler(editor, np.random.default_rng((brief.seed, 3)))
+    relation = Relation(brief.relation.value) if brief.relation else None
+    try:
+        name = sampler.add(brief.category, brief.model or None, relation, brief.host)
+    except PlacementError as error:
+        return Sampled(reason=error.reason, detail=str(error))
+    pose = editor.objects[name].pose_world_asset
+    return Sampled(name, pose.position_m, pose.quat_xyzw, editor.objects[name].room)
+
+
+DOORS: Final[Mapping[AgentName, AgentInterface]] = {
+    AgentName.DISTRIBUTOR: AgentInterface(
+        "Scene-level Distribution Agent: a room for each thing",
+        TypeAdapter(DistributionBrief),
+        TypeAdapter(Distribution),
+        distribute,
+    ),
+    AgentName.ORGANIZER: AgentInterface(
+        "Room-level Organization Agent: a layout tree, as branches",
+        TypeAdapter(RoomBrief),
+        TypeAdapter(tuple[Branch, ...]),
+        _branches,
+    ),
+    AgentName.PLANNER: AgentInterface(
+        "Planar-Level Placement Generator, first half: constraints",
+        TypeAdapter(PlaneCompany),
+        TypeAdapter(PlacementConstraints),
+        wish,
+    ),
+    AgentName.SOLVER: AgentInterface(
+        "Planar-Level Placement Generator, second half: spots on a plane",
+        TypeAdapter(PlaneBrief),
+        TypeAdapter(tuple[Arranged, ...]),
+        arrange,
+    ),
+    AgentName.SAMPLER: AgentInterface(
+        "Object-level Sampling Agent: a pose in a base scene",
+        TypeAdapter(SampleBrief),
+        TypeAdapter(Sampled),
+        sample,
+    ),
+}
+MODELLED: Final = frozenset({AgentName.DISTRIBUTOR, AgentName.ORGANIZER, AgentName.PLANNER})
+"""Agents that can be a language model."""

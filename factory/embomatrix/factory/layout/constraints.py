@@ -1,0 +1,295 @@
+"""What each constraint on a plane means, over whole arrays of candidate spots.
+
+All is in the plane's frame: origin in its middle, x and y along its sides. A thing's front looks along its own +x.
+Weights are those of the paper's released planar level, which gets three of the meanings wrong. Here a thing faces another
+when its front looks at it, near and far are told by gaps that suit the plane, and the middle counts.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.factory.furnish.roles import FurnitureRole, role_of
+from embomatrix.factory.layout.values import Arrangement, Kind, PlacementConstraint, PlacementConstraints
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from numpy.typing import NDArray
+
+    from embomatrix.factory.layout.values import (
+        ObjectBrief,
+        PlaneCompany,
+        PlaneFootprint,
+        Size2,
+        Size3,
+    )
+
+    FloatArray = NDArray[np.float64]
+    BoolArray = NDArray[np.bool_]
+
+
+WEIGHTS: Final[Mapping[Arrangement, float]] = {
+    Arrangement.EDGE: 2.0,
+    Arrangement.MIDDLE: 1.0,
+    Arrangement.NEAR: 0.5,
+    Arrangement.FAR: 0.5,
+    Arrangement.IN_FRONT_OF: 0.5,
+    Arrangement.SIDE_OF: 0.5,
+    Arrangement.CENTER_ALIGNED: 1.5,
+    Arrangement.FACE_TO: 1.5,
+    Arrangement.NEXT_TO: 1.5,
+}
+EDGE_M: Final = 0.10
+EDGE_SHARE: Final = 0.15
+"""At the edge is within 10 cm of a side, on small planes within this share of the shorter side."""
+MIDDLE_SHARE: Final = 0.15
+"""In the middle is within this share of each side from the plane's middle."""
+NEAR_M: Final = 1.0
+NEAR_SHARE: Final = 0.25
+"""Near is a gap of a metre at most, on small planes of this share of the diagonal; far is anything more."""
+FACE_RAD: Final = math.radians(5.0)
+ALIGNED_RAD: Final = math.radians(5.0)
+FRONT_RAD: Final = math.radians(45.0)
+NEXT_SHARE: Final = 1 / 6
+NEXT_M: Final = (0.05, 0.5)
+"""The engine's rule for ``nextto``: a sixth of the mean of the six extents, within these bounds."""
+NEXT_SLACK: Final = 0.8
+"""Round things are farther apart than their boxes: only this much of what the engine allows is used."""
+SHADE: Final = 0.3
+"""How much of a weight is given by degrees, so that what is nearly so counts for more than what is not at all."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpotCandidates:
+    """n spots of one thing: middles (n, 2), yaws (n,), and half extents (n, 2) of the box around the turned footprint."""
+
+    center: FloatArray
+    yaw: FloatArray
+    half: FloatArray
+
+    @staticmethod
+    def of(center: FloatArray, yaw: FloatArray, size_m: Size3) -> SpotCandidates:
+        """Spots of a thing of this size."""
+        return SpotCandidates(center, yaw, half_extents(yaw, (size_m[0], size_m[1])))
+
+    def at(self, rows: FloatArray | BoolArray | NDArray[np.int64]) -> SpotCandidates:
+        return SpotCandidates(self.center[rows], self.yaw[rows], self.half[rows])
+
+    def __len__(self) -> int:
+        return len(self.yaw)
+
+
+def half_extents(yaw: FloatArray, size_m: Size2) -> FloatArray:
+    """Half extents, shape (n, 2), of the upright boxes around a rectangle turned by each of n yaws."""
+    cosine, sine = np.abs(np.cos(yaw)), np.abs(np.sin(yaw))
+    x, y = size_m[0] / 2, size_m[1] / 2
+    return np.stack([cosine * x + sine * y, sine * x + cosine * y], axis=-1)
+
+
+def margins(spots: SpotCandidates, plane_m: Size2) -> FloatArray:
+    """Free strip between each spot and the nearest side of the plane, shape (n,); negative where it juts out."""
+    return np.asarray((np.asarray(plane_m) / 2 - np.abs(spots.center) - spots.half).min(axis=1))
+
+
+def gaps(spots: SpotCandidates, other: PlaneFootprint) -> FloatArray:
+    """Distance between the boxes around each spot and around another footprint, shape (n,); 0 where they overlap."""
+    apart = np.abs(spots.center - np.asarray(other.center_m)) - spots.half - _half(other)
+    return np.asarray(np.hypot(*np.maximum(apart, 0.0).T))
+
+
+def near_m(plane_m: Size2) -> float:
+    """How far apart two things on a plane of these sides may be and still be near one another, in metres."""
+    return min(NEAR_M, NEAR_SHARE * math.hypot(*plane_m))
+
+
+def holds(
+    wish: PlacementConstraint,
+    spots: SpotCandidates,
+    plane_m: Size2,
+    size_m: Size3,
+    other: PlaneFootprint | None,
+) -> BoolArray:
+    """At which spots a wish holds, shape (n,). A wish about an object that is not on the plane holds nowhere."""
+    if wish.kind is Arrangement.EDGE:
+        return margins(spots, plane_m) <= min(EDGE_M, EDGE_SHARE * min(plane_m))
+    if wish.kind is Arrangement.MIDDLE:
+        return np.asarray((np.abs(spots.center) <= MIDDLE_SHARE * np.asarray(plane_m)).all(axis=1))
+    if other is None:
+        return np.zeros(len(spots), dtype=bool)
+    match wish.kind:
+        case Arrangement.NEAR:
+            return np.asarray(gaps(spots, other) <= near_m(plane_m))
+        case Arrangement.FAR:
+            return np.asarray(gaps(spots, other) > near_m(plane_m))
+        case Arrangement.NEXT_TO:
+            return _beside(spots, size_m, other)
+        case Arrangement.IN_FRONT_OF:
+            return np.asarray(_off_front(spots, other) <= FRONT_RAD)
+        case Arrangement.SIDE_OF:
+            angle = _off_front(spots, other)
+            return np.asarray((angle > FRONT_RAD) & (angle < math.pi - FRONT_RAD))
+        case Arrangement.FACE_TO:
+            return np.asarray(_off_gaze(spots, other) <= FACE_RAD)
+        case _:
+            return np.asarray(_off_axis(spots, other) <= ALIGNED_RAD)
+
+
+def degrees(
+    wish: PlacementConstraint,
+    spots: SpotCandidates,
+    plane_m: Size2,
+    size_m: Size3,
+    other: PlaneFootprint | None,
+) -> FloatArray:
+    """How far a wish is met, from 0 to 1, shape (n,): falls off gently where it does not hold."""
+    if wish.kind is Arrangement.EDGE:
+        return np.asarray(np.exp(-np.maximum(margins(spots, plane_m), 0.0) / (0.25 * max(plane_m))))
+    if wish.kind is Arrangement.MIDDLE:
+        return np.asarray(1.0 - np.hypot(*(spots.center / np.asarray(plane_m)).T) * math.sqrt(2))
+    if other is None:
+        return np.zeros(len(spots))
+    match wish.kind:
+        case Arrangement.NEAR | Arrangement.NEXT_TO:
+            return np.asarray(np.exp(-gaps(spots, other) / near_m(plane_m)))
+        case Arrangement.FAR:
+            return np.asarray(1.0 - np.exp(-gaps(spots, other) / near_m(plane_m)))
+        case Arrangement.IN_FRONT_OF:
+            return np.asarray((1.0 + np.cos(_off_front(spots, other))) / 2)
+        case Arrangement.SIDE_OF:
+            return np.asarray(np.abs(np.sin(_off_front(spots, other))))
+        case Arrangement.FACE_TO:
+            return np.asarray((1.0 + np.cos(_off_gaze(spots, other))) / 2)
+        case _:
+            return np.asarray(np.cos(_off_axis(spots, other)) ** 8)
+
+
+def next_to_m(size_m: Size3, other: PlaneFootprint) -> float:
+    """The largest gap at which the engine calls two boxes next to each other."""
+    mean = (sum(size_m) + sum(other.size_m) + other.high_m - other.low_m) / 6
+    return min(max(NEXT_SHARE * mean, NEXT_M[0]), NEXT_M[1])
+
+
+def _beside(spots: SpotCandidates, size_m: Size3, other: PlaneFootprint) -> BoolArray:
+    """Side by side: their heights overlap, they face each other along one axis, and the gap is small."""
+    if other.low_m >= size_m[2] or other.high_m <= 0.0:
+        return np.zeros(len(spots), dtype=bool)
+    apart = np.abs(spots.center - np.asarray(other.center_m)) - spots.half - _half(other)  # (n, 2)
+    across = np.abs(spots.center - np.asarray(other.center_m)) <= np.maximum(spots.half, _half(other))
+    faces = (across[:, 0] & (apart[:, 1] >= 0)) | (across[:, 1] & (apart[:, 0] >= 0))
+    return np.asarray(faces & (gaps(spots, other) <= NEXT_SLACK * next_to_m(size_m, other)))
+
+
+def _off_front(spots: SpotCandidates, other: PlaneFootprint) -> FloatArray:
+    """Angle, 0 to pi, between where another's front looks and the way from it to each spot."""
+    way = spots.center - np.asarray(other.center_m)
+    return _turn(np.arctan2(way[:, 1], way[:, 0]) - other.yaw)
+
+
+def _off_gaze(spots: SpotCandidates, other: PlaneFootprint) -> FloatArray:
+    """Angle, 0 to pi, between where the thing's own front looks and the way to another's middle."""
+    way = np.asarray(other.center_m) - spots.center
+    return _turn(np.arctan2(way[:, 1], way[:, 0]) - spots.yaw)
+
+
+def _off_axis(spots: SpotCandidates, other: PlaneFootprint) -> FloatArray:
+    """Angle, 0 to pi/4, between the way from another to each spot and the nearest of the other's four axes."""
+    way = spots.center - np.asarray(other.center_m)
+    angle = np.arctan2(way[:, 1], way[:, 0]) - other.yaw
+    quarter = math.pi / 2
+    return np.asarray(np.abs((angle + quarter / 2) % quarter - quarter / 2))
+
+
+def _turn(angle: FloatArray) -> FloatArray:
+    return np.asarray(np.abs((angle + math.pi) % (2 * math.pi) - math.pi))
+
+
+def _half(other: PlaneFootprint) -> FloatArray:
+    return half_extents(np.asarray(other.yaw), other.size_m)
+
+
+_COMPANIONS: Final[Mapping[str, str]] = {
+    "tablefork table_knife tablespoon teaspoon chopstick dinner_napkin": "plate bowl place_mat",
+    "water_glass wineglass mug teacup beer_glass": "plate bowl teapot coaster",
+    "teapot jar_of_sugar carton_of_milk": "teacup mug",
+    "salt_shaker": "pepper_shaker",
+    "tube_of_toothpaste": "toothbrush",
+    "bottle_of_shampoo bar_soap": "hand_towel sponge",
+    "mouse": "keyboard laptop mousepad",
+    "headset calculator notepad pencil_case stapler": "laptop keyboard notebook",
+    "gaming_controller": "standing_tv",
+    "bagel croissant steak pizza hamburger hotdog salmon chicken_leg": "plate chopping_board frying_pan",
+    "apple pear orange peach lemon avocado banana": "bowl plate",
+    "table_knife carving_knife parer": "chopping_board",
+}
+COMPANIONS: Final = {
+    category: frozenset(others.split()) for names, others in _COMPANIONS.items() for category in names.split()
+}
+"""What a thing is put beside where both are on one table."""
+_CENTREPIECES: Final = "vase pillar_candle snow_globe fruit_bowl candelabrum bouquet wicker_basket"
+CENTREPIECES: Final = frozenset(_CENTREPIECES.split())
+_BOARDS: Final = "breakfast_table dining_table coffee_table conference_table pedestal_table garden_coffee_table garden_table"
+BOARDS: Final = frozenset(_BOARDS.split())
+"""Tables that people stand or sit around: their middle is for show."""
+TABLES: Final = BOARDS | {"desk", "booth", "lab_table"}
+"""What seats are drawn up to."""
+SEATED: Final = frozenset(["plate", "bowl", "place_mat", "laptop", "notebook"])
+"""What is laid where somebody sits: at the edge of such a table."""
+_BACKED: Final = (
+    "alarm_clock picture_frame radio table_lamp microwave toaster coffee_maker box_of_tissues hardback "
+    "paperback_book folder magazine newspaper comic_book board_game jigsaw_puzzle clipboard envelope box_of_cereal "
+    "box_of_crackers"
+)
+BACKED: Final = frozenset(_BACKED.split())
+"""What stands or lies at an edge, out of the way."""
+
+
+def wish(company: PlaneCompany) -> PlacementConstraints:
+    """Constraints for each thing of a plane, the most important first; none for what may stand anywhere."""
+    return PlacementConstraints(
+        {thing.name: tuple(dict.fromkeys(_wishes(thing, company))) for thing in company.things}
+    )
+
+
+def _wishes(thing: ObjectBrief, company: PlaneCompany) -> Iterator[PlacementConstraint]:
+    others = dict(company.others)
+    rank = company.things.index(thing)
+    before = {**others, **{each.name: each.category for each in company.things[:rank]}}
+    for other in thing.beside:
+        yield PlacementConstraint(Arrangement.NEXT_TO, other, required=True)
+    if company.on_floor:
+        yield from _on_floor(thing, before)
+        return
+    alike = next((name for name, category in before.items() if category == thing.category), "")
+    if alike:
+        yield PlacementConstraint(Arrangement.NEXT_TO, alike)
+        yield PlacementConstraint(Arrangement.CENTER_ALIGNED, alike)
+        return
+    everyone = {**before, **{each.name: each.category for each in company.things[rank + 1 :]}}
+    likes = COMPANIONS.get(thing.category, frozenset())
+    friend = next((name for name, category in everyone.items() if category in likes), "")
+    if friend:
+        yield PlacementConstraint(Arrangement.NEXT_TO, friend)
+        yield PlacementConstraint(Arrangement.SIDE_OF, friend)
+        return
+    if company.host in BOARDS and thing.category in CENTREPIECES:
+        yield PlacementConstraint(Arrangement.MIDDLE)
+    elif thing.category in BACKED or (company.host in BOARDS and thing.category in SEATED):
+        yield PlacementConstraint(Arrangement.EDGE)
+
+
+def _on_floor(thing: ObjectBrief, before: Mapping[str, str]) -> Iterator[PlacementConstraint]:
+    """Seats go to a table, tables stand in the open, the rest at a wall."""
+    role = role_of(thing.category, thing.size_m, 0.0) if thing.kind is Kind.FURNITURE else None
+    table = next((name for name, category in before.items() if category in TABLES), "")
+    if role is FurnitureRole.SEAT and table:
+        yield PlacementConstraint(Arrangement.FACE_TO, table)
+        yield PlacementConstraint(Arrangement.NEXT_TO, table)
+    elif role in (FurnitureRole.LOW_TABLE, FurnitureRole.OPEN) or thing.category in BOARDS:
+        yield PlacementConstraint(Arrangement.MIDDLE)
+    else:
+        yield PlacementConstraint(Arrangement.EDGE)

@@ -1,0 +1,292 @@
+"""A base scene that is being changed: what stands in it, what is still free, what the robot would still reach.
+
+The editor decides nothing about where things go; ``layout`` does. It keeps the objects, and tells whether one more may be where
+somebody wants it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.furnish.roles import is_portable
+from embomatrix.factory.scenes.check import reach_problems
+from embomatrix.factory.scenes.clearance import Clearance
+from embomatrix.factory.scenes.floor import ReachableFloor
+from embomatrix.factory.scenes.joints import with_joints
+from embomatrix.factory.scenes.solids import Solids, placed_parts
+from embomatrix.factory.scenes.view import SceneView
+from embomatrix.skills.limits import ROBOT
+from embomatrix.world.asset import FLOOR_CATEGORY, Asset, Link, SupportSurface
+from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
+from embomatrix.world.scene import SceneObject
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from embomatrix.world.scene import Room, Scene
+    from embomatrix.world.state import Relation, State
+
+_ON_FLOOR_M: Final = 0.05
+_FLAT_M: Final = 0.03
+_SUNK_M: Final = 0.008
+"""How deep the plate of a floor lies: near enough for things to be on it, too deep for them to touch it (5 mm)."""
+_PLATE_M: Final = 0.01
+
+
+class LayoutReason(StrEnum):
+    """Why a thing found no place."""
+
+    UNKNOWN_HOST = "unknown_host"
+    UNKNOWN_MODEL = "unknown_model"
+    NO_HOST = "no_host"
+    NO_SURFACE = "no_surface"
+    TOO_LARGE = "too_large"
+    NO_FREE_SPOT = "no_free_spot"
+    OUT_OF_REACH = "out_of_reach"
+    BARS_THE_WAY = "bars_the_way"
+    UNSTABLE = "unstable"
+    NOT_AT_HAND = "not_at_hand"
+    RELATION_NOT_HELD = "relation_not_held"
+
+
+class PlacementError(ValueError):
+    """An object can't be placed; ``reason`` says which rule stood against it."""
+
+    def __init__(self, reason: LayoutReason, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+class SceneEditor:
+    """Collects changes to a base scene; ``freeze`` makes the new scene. The base scene itself is never changed."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.base = scene
+        self.rooms: Mapping[str, Room] = {room.name: room for room in scene.rooms}
+        self.clearance = Clearance(scene)
+        self.view = SceneView(scene)
+        """The base scene."""
+        self._objects: dict[str, SceneObject] = {item.name: item for item in scene.objects}
+        self._assets: dict[str, Asset] = dict(scene.assets)
+        self._boxes: dict[str, Aabb] = {}
+        self._solids = Solids.of_scene(scene)
+        self._kept: set[str] = set()
+        self._floor = ReachableFloor(scene)
+        self._unreached = {problem.names for problem in reach_problems(scene)}
+        self.unserved = frozenset(name for names in self._unreached for name in names)
+        """Objects of the base scene that the robot could not get at to begin with."""
+        self.given_up: set[str] = set()
+        """Objects of the base scene that what is to come may bar the robot from."""
+        self._counts = Counter(self._assets[item.asset_id].category for item in scene.objects)
+
+    @property
+    def objects(self) -> Mapping[str, SceneObject]:
+        """The objects so far, by name, in the order of the scene."""
+        return self._objects
+
+    @property
+    def floor(self) -> ReachableFloor:
+        """Where the robot gets to, as things stand."""
+        return self._floor
+
+    def known(self, name: str) -> SceneObject:
+        """An object. Raises PlacementError for an unknown name."""
+        if name not in self._objects:
+            raise PlacementError(
+                LayoutReason.UNKNOWN_HOST,
+                f"no object {name!r} in {self.base.scene_id}: expected one of its {len(self._objects)} objects",
+            )
+        return self._objects[name]
+
+    def asset_of(self, name: str) -> Asset:
+        """An object's asset. Raises PlacementError for an unknown name."""
+        return self._assets[self.known(name).asset_id]
+
+    def box_of(self, name: str) -> Aabb:
+        """An object's box in the world, joints shut. Raises PlacementError for an unknown name."""
+        box = self._boxes.get(name)
+        if box is None:
+            item = self.known(name)
+            box = self._boxes[name] = box_at(self._assets[item.asset_id], item.pose_world_asset)
+        return box
+
+    def keep(self, names: Iterable[str]) -> None:
+        """Tell which objects of the base scene must stay: the task is about them."""
+        self._kept.update(names)
+
+    def is_spare(self, name: str) -> bool:
+        """Whether an object of the base scene may be taken away, with all that rests on it."""
+        guests = {item.name for item in self._objects.values() if item.host == name}
+        return name in self.base.by_name and not self._kept & {name, *guests}
+
+    def is_free(self, asset: Asset, pose: Pose) -> bool:
+        """Whether an asset would overlap nothing at a pose."""
+        return not self._solids.overlaps(placed_parts(asset, pose))
+
+    def objection(self, asset: Asset, pose: Pose, target: str = "") -> LayoutReason | None:
+        """What stands against an asset at a pose: it meets something, is out of reach, or bars the robot's way. None: nothing.
+
+        ``target`` is what it would be on or in: furniture with doors is served from its front.
+        """
+        if not self.is_free(asset, pose):
+            return LayoutReason.NO_FREE_SPOT
+        box = box_at(asset, pose)
+        room = self.base.room_at(box.center_m)
+        if not room:
+            return LayoutReason.NO_FREE_SPOT
+        if not self._in_reach(box, target):
+            return LayoutReason.OUT_OF_REACH
+        return None if self._leaves_ways(asset, pose, box, room) else LayoutReason.BARS_THE_WAY
+
+    def insert(self, asset: Asset, pose: Pose, relation: Relation | None, host: str, room: str = "") -> str:
+        """Add an object at a pose, looked at or not, and return its name, ``category_N``.
+
+        ``host`` is what it rests on or in by ``relation``; empty: the floor. Without a room it is where its middle is.
+        """
+        self._counts[asset.category] += 1
+        name = f"{asset.category}_{self._counts[asset.category]}"
+        box = box_at(asset, pose)
+        self._objects[name] = SceneObject(
+            name=name,
+            asset_id=asset.asset_id,
+            room=room or self.base.room_at(box.center_m),
+            pose_world_asset=pose,
+            fixed=not is_portable(asset),
+            joints=(0.0,) * len(asset.joints),
+            host=host,
+            relation=relation if host else None,
+        )
+        self._assets[asset.asset_id] = asset
+        self._solids.add(name, placed_parts(asset, pose))
+        if box.low_m[2] < _ON_FLOOR_M:
+            self._floor = ReachableFloor(self._as_scene())
+        return name
+
+    def fasten(self, name: str) -> None:
+        """Make an object one that never moves, as what hangs on a wall. Raises PlacementError for an unknown name."""
+        self._objects[name] = replace(self.known(name), fixed=True)
+
+    def loosen(self, name: str) -> None:
+        """Make an object one that can be carried, if the arm lifts it. Raises PlacementError for an unknown name."""
+        self._objects[name] = replace(self.known(name), fixed=False)
+
+    def remove(self, name: str) -> tuple[str, ...]:
+        """Take an object out again, with all that rests on or in it; their names. Raises PlacementError for an unknown name."""
+        self.known(name)
+        gone = {name: None}
+        for item in self._objects.values():  # hosts stand before their guests
+            if item.host in gone:
+                gone[item.name] = None
+        for each in gone:
+            del self._objects[each]
+        self._look_again(gone)
+        return tuple(gone)
+
+    def move(self, poses: Mapping[str, Pose]) -> None:
+        """Give objects other poses, such as those at which they came to rest. Raises PlacementError for an unknown name."""
+        for name, pose in poses.items():
+            self._objects[name] = replace(self.known(name), pose_world_asset=pose)
+        if poses:
+            self._look_again(poses)
+
+    def add_pieces(self, whole: str, asset: Asset, count: int) -> tuple[str, ...]:
+        """Add absent objects that come in when ``whole`` is sliced, and return their names. Raises PlacementError."""
+        origin = self.known(whole)
+        names: list[str] = []
+        for _ in range(count):
+            self._counts[asset.category] += 1
+            names.append(f"{asset.category}_{self._counts[asset.category]}")
+            self._objects[names[-1]] = SceneObject(
+                name=names[-1],
+                asset_id=asset.asset_id,
+                room=origin.room,
+                pose_world_asset=origin.pose_world_asset,
+                fixed=False,
+                joints=(0.0,) * len(asset.joints),
+                absent=True,
+            )
+        self._assets[asset.asset_id] = asset
+        self._objects[whole] = replace(origin, pieces=(*origin.pieces, *names))
+        return tuple(names)
+
+    def set_states(self, name: str, states: frozenset[State]) -> None:
+        """Give an object these symbolic states. Raises PlacementError for an unknown name."""
+        self._objects[name] = replace(self.known(name), states=frozenset(states))
+
+    def set_joints(self, name: str, fractions: Sequence[float]) -> None:
+        """Open or shut an object's joints, one share of the travel for each, with all that lies in its drawers.
+
+        Raises PlacementError, ValueError.
+        """
+        item = self.known(name)
+        joints = self._assets[item.asset_id].joints
+        if len(fractions) != len(joints) or not all(0.0 <= f <= 1.0 for f in fractions):
+            raise ValueError(
+                f"{name!r} was given joints {tuple(fractions)}: expected {len(joints)} numbers between 0 and 1"
+            )
+        self._objects.update(with_joints(self._objects, self._assets, name, fractions))
+
+    def freeze(self, scene_id: str) -> Scene:
+        """The scene as it is now, with the assets that it uses."""
+        objects = tuple(self._objects.values())
+        used = {item.asset_id: self._assets[item.asset_id] for item in objects}
+        return replace(self.base, scene_id=scene_id, objects=objects, assets=used)
+
+    def _as_scene(self) -> Scene:
+        return replace(self.base, objects=tuple(self._objects.values()), assets=self._assets)
+
+    def _look_again(self, changed: Mapping[str, object]) -> None:
+        for name in changed:
+            self._boxes.pop(name, None)
+        scene = self._as_scene()
+        self._solids = Solids.of_scene(scene)
+        self._floor = ReachableFloor(scene)
+
+    def _in_reach(self, box: Aabb, target: str) -> bool:
+        if not ROBOT.reach_low_m <= box.center_m[2] <= ROBOT.reach_high_m:
+            return False
+        front = self.known(target).pose_world_asset if target and self.asset_of(target).joints else None
+        return len(self._floor.spots(box, front_of=front)) > 0
+
+    def _leaves_ways(self, asset: Asset, pose: Pose, box: Aabb, room: str) -> bool:
+        """Whether, with the object on the floor, doorways stay clear and the robot gets to all that it got to before."""
+        if box.low_m[2] > _ON_FLOOR_M or box.high_m[2] < _FLAT_M:
+            return True
+        if self.clearance.bars_a_doorway(box):
+            return False
+        item = SceneObject("candidate", asset.asset_id, room, pose, fixed=False)
+        assets = {**self._assets, asset.asset_id: asset}
+        trial = replace(self.base, objects=(*self._objects.values(), item), assets=assets)
+        known = self._unreached | {(name,) for name in self.given_up}
+        return {problem.names for problem in reach_problems(trial)} <= known
+
+
+def box_at(asset: Asset, pose: Pose) -> Aabb:
+    """Box in the world of an asset at a pose, joints shut."""
+    return Aabb.around(part.aabb(pose) for link in asset.links for part in link.parts)
+
+
+def add_floor(editor: SceneEditor, room: str) -> str:
+    """Make the floor of a room an object that plans and goals can name, and return its name."""
+    area = editor.rooms[room]
+    x, y = area.center_m
+    name = editor.insert(floor_asset(area), Pose((x, y, -_SUNK_M - _PLATE_M / 2)), None, "", room)
+    editor.fasten(name)
+    return name
+
+
+def floor_asset(room: Room) -> Asset:
+    """The floor of a room as a fixed thing: a plate just below the ground, and a surface that is the ground itself."""
+    size = (*room.size_m, _PLATE_M)
+    return Asset(
+        asset_id=f"floors-{room.name}",
+        category=FLOOR_CATEGORY,
+        synset="floor.n.01",
+        size_m=size,
+        mass_kg=100.0,
+        links=(Link("base", (ConvexPart(Shape.BOX, Pose((0.0, 0.0, 0.0)), size),)),),
+        supports=(SupportSurface("floor", (0.0, 0.0, _PLATE_M / 2 + _SUNK_M), room.size_m, 2.0),),
+    )

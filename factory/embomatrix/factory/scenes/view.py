@@ -1,0 +1,256 @@
+"""What a task writer sees of a scene: which things can be carried, stood on, filled, opened or switched, and where they are."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Final, Protocol
+
+from embomatrix.factory.furnish.roles import FurnitureRole, role_of
+from embomatrix.factory.furnish.small_objects import NEVER_SWITCHED
+from embomatrix.factory.scenes.joints import bumped_into
+from embomatrix.factory.scenes.solids import Solids
+from embomatrix.sim.joints.swings import SWING
+from embomatrix.skills.appliances import cold_source, cooks, freezes, heat_source, heats
+from embomatrix.skills.limits import ROBOT
+from embomatrix.world.asset import FLOOR_CATEGORY
+from embomatrix.world.state import OPEN_FRACTION, Relation, State
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.scene import Scene, SceneObject
+    from embomatrix.world.state import Relation
+
+
+MIN_SURFACE_M: Final = 0.18
+"""Both extents of a surface that a task may ask to put things on."""
+MIN_CAVITY_M: Final = 0.12
+LOW_SURFACE_M: Final = 0.15
+HIGH_SURFACE_M: Final = 1.5
+"""Heights above the floor between which tasks ask to put things down."""
+HUNG_M: Final = 0.05
+"""What begins higher above the floor hangs, where nothing bears it."""
+
+
+class SceneView:
+    """A scene indexed for writing tasks. Names are those of scene objects."""
+
+    def __init__(self, scene: Scene, robot: Robot | None = None) -> None:
+        self.scene = scene
+        self.robot: Robot = robot if robot is not None else AnyRobot()
+        """Who is to do what is asked for. Without one nobody asks whether it can."""
+        self._opens: dict[str, bool] = {}
+
+    @cached_property
+    def in_room(self) -> Mapping[str, tuple[str, ...]]:
+        """Object names by room, in scene order."""
+        rooms: dict[str, list[str]] = {room.name: [] for room in self.scene.rooms}
+        for item in self.scene.objects:
+            rooms.setdefault(item.room, []).append(item.name)
+        return {room: tuple(names) for room, names in rooms.items()}
+
+    @cached_property
+    def _of_kind(self) -> Mapping[tuple[str, str], tuple[str, ...]]:
+        """Object names by category and room, in scene order."""
+        kinds: dict[tuple[str, str], list[str]] = {}
+        for item in self.scene.objects:
+            kinds.setdefault((self.category(item.name), item.room), []).append(item.name)
+        return {kind: tuple(names) for kind, names in kinds.items()}
+
+    def item(self, name: str) -> SceneObject:
+        return self.scene.by_name[name]
+
+    def asset(self, name: str) -> Asset:
+        return self.scene.asset_of(name)
+
+    def category(self, name: str) -> str:
+        return self.asset(name).category
+
+    def room(self, name: str) -> str:
+        return self.item(name).room
+
+    def alike(self, name: str) -> tuple[str, ...]:
+        """Objects of the same category in the same room, with this one."""
+        return self._of_kind[self.category(name), self.room(name)]
+
+    def floor_of(self, room: str) -> str:
+        """The floor of a room where it is an object; "" elsewhere."""
+        return next(
+            (name for name in self.in_room.get(room, ()) if self.category(name) == FLOOR_CATEGORY), ""
+        )
+
+    def rooms_with(self, category: str) -> tuple[str, ...]:
+        return tuple(room.name for room in self.scene.rooms if (category, room.name) in self._of_kind)
+
+    def whereabouts(self, name: str) -> str:
+        """What it is on or in, as ``ontop stove_1``, ``on the floor``, ``on the wall`` or ``under the ceiling``."""
+        item = self.item(name)
+        if item.host and item.relation is not None:
+            return f"{item.relation.value} {item.host}"
+        asset = self.asset(name)
+        if role_of(asset.category, asset.size_m, asset.mass_kg) is FurnitureRole.CEILING:
+            return "under the ceiling"
+        return "on the wall" if self.scene.box_of(name).low_m[2] > HUNG_M else "on the floor"
+
+    def is_portable(self, name: str) -> bool:
+        """Whether the robot can carry it."""
+        asset = self.asset(name)
+        return not self.item(name).fixed and is_liftable(asset.size_m, asset.mass_kg)
+
+    def is_surface(self, name: str) -> bool:
+        """Whether it is furniture with an open surface at a height to work at."""
+        item, asset = self.item(name), self.asset(name)
+        shut_off = {interior.name for interior in asset.interiors if interior.closed_by}
+        base = item.pose_world_asset.position_m[2]
+        return item.fixed and any(
+            min(surface.size_m) >= MIN_SURFACE_M
+            and surface.interior not in shut_off
+            and LOW_SURFACE_M <= base + surface.center_m[2] <= HIGH_SURFACE_M
+            for surface in asset.supports
+        )
+
+    def is_container(self, name: str) -> bool:
+        """Whether it is furniture or an appliance with a cavity."""
+        item, asset = self.item(name), self.asset(name)
+        base = item.pose_world_asset.position_m[2]
+        return item.fixed and any(
+            min(interior.size_m) >= MIN_CAVITY_M
+            and base + interior.center_m[2] - interior.size_m[2] / 2 <= HIGH_SURFACE_M
+            for interior in asset.interiors
+        )
+
+    def is_basket(self, name: str) -> bool:
+        """Whether it is a portable thing with a cavity that is always open."""
+        asset = self.asset(name)
+        return not self.item(name).fixed and any(
+            not interior.closed_by and min(interior.size_m[:2]) >= MIN_CAVITY_M
+            for interior in asset.interiors
+        )
+
+    def takes(self, host: str, thing: str, *, inside: bool) -> bool:
+        """Whether a cavity, or an open surface, of the host is larger than the thing on every side."""
+        size, asset = sorted(self.asset(thing).size_m), self.asset(host)
+        if inside:
+            return any(
+                all(a < b for a, b in zip(size, sorted(interior.size_m), strict=True))
+                for interior in asset.interiors
+            )
+        return any(
+            min(surface.size_m) > size[0] and max(surface.size_m) > size[1] for surface in asset.supports
+        )
+
+    def is_openable(self, name: str) -> bool:
+        return bool(self.asset(name).joints) and self.asset(name).can("openable")
+
+    def is_switchable(self, name: str) -> bool:
+        """Whether a task may ask to open it or to switch it on: in reach, and telling by its words."""
+        low = self.item(name).pose_world_asset.position_m[2] - self.asset(name).size_m[2] / 2
+        return (
+            self.category(name) not in NEVER_SWITCHED
+            and low <= HIGH_SURFACE_M
+            and (self.is_openable(name) or self.is_toggleable(name))
+        )
+
+    def is_open(self, name: str) -> bool:
+        return any(share > OPEN_FRACTION for share in self.item(name).joints)
+
+    def opens(self, name: str) -> bool:
+        """Whether its doors and drawers meet nothing on their way, where it has any."""
+        if name not in self._opens:
+            joints = len(self.asset(name).joints)
+            self._opens[name] = not joints or not any(
+                bumped_into(self.scene, self._solids, name, (share,) * joints) for share in SWING
+            )
+        return self._opens[name]
+
+    @cached_property
+    def _solids(self) -> Solids:
+        return Solids.of_scene(self.scene)
+
+    def is_toggleable(self, name: str) -> bool:
+        return self.asset(name).can("toggleable")
+
+    def is_on(self, name: str) -> bool:
+        return State.TOGGLED_ON in self.item(name).states
+
+    def thermal_effects(self, food: str, source: str) -> tuple[State, ...]:
+        """States that the source can give the food."""
+        asset, place = self.asset(food), self.asset(source)
+        heat, cold = heat_source(place), cold_source(place)
+        effects: list[State] = []
+        if cold is not None and freezes(cold) and asset.can("freezable"):
+            effects.append(State.FROZEN)
+        if heat is not None and heats(heat) and asset.can("heatable"):
+            effects.append(State.HOT)
+        if heat is not None and cooks(heat, asset):
+            effects.append(State.COOKED)
+        return tuple(effects)
+
+    def is_source(self, name: str) -> bool:
+        """Whether food can be heated or frozen in or on it."""
+        heat, cold = heat_source(self.asset(name)), cold_source(self.asset(name))
+        inside = any(source.requires_inside for source in (heat, cold) if source is not None)
+        works = (heat is not None and heats(heat)) or (cold is not None and freezes(cold))
+        return works and (self.is_container(name) if inside else self.is_surface(name))
+
+    def hosts(self, name: str) -> tuple[str, ...]:
+        """What the object rests on or in, from the nearest to the furniture on the floor."""
+        chain: list[str] = []
+        host = self.item(name).host
+        while host and host not in chain:
+            chain.append(host)
+            host = self.item(host).host
+        return tuple(chain)
+
+    def rests(self, name: str, relation: Relation, host: str) -> bool:
+        item = self.item(name)
+        return item.host == host and item.relation is relation
+
+
+def is_liftable(size_m: tuple[float, float, float], mass_kg: float) -> bool:
+    """Whether the arm lifts it and the gripper takes it."""
+    return mass_kg <= ROBOT.mass_kg and min(size_m) <= ROBOT.grip_m and max(size_m) <= ROBOT.extent_m
+
+
+class Robot(Protocol):
+    """Answers about one thing at a time, from the start of the scene. Names are those of scene objects."""
+
+    def fetches(self, thing: str) -> bool:
+        """Whether it gets the thing into its hand."""
+        ...
+
+    def puts(self, thing: str, relation: Relation, host: str) -> bool:
+        """Whether it brings the thing on or into another."""
+        ...
+
+    def swings(self, name: str, *, shut: bool) -> bool:
+        """Whether it opens, or shuts, all doors and drawers of an object."""
+        ...
+
+    def switches(self, name: str, *, on: bool) -> bool:
+        """Whether it switches an object on, or off."""
+        ...
+
+    def exposes(self, thing: str, source: str, state: State) -> bool:
+        """Whether the thing becomes hot, cooked or frozen at a source, and was not so before."""
+        ...
+
+
+class AnyRobot:
+    """One that can do all: nobody was asked."""
+
+    def fetches(self, thing: str) -> bool:
+        return True
+
+    def puts(self, thing: str, relation: Relation, host: str) -> bool:
+        return True
+
+    def swings(self, name: str, *, shut: bool) -> bool:
+        return True
+
+    def switches(self, name: str, *, on: bool) -> bool:
+        return True
+
+    def exposes(self, thing: str, source: str, state: State) -> bool:
+        return True

@@ -1,0 +1,162 @@
+"""Each agent of the social simulation alone: briefs and answers as JSON, by rules or by a language model.
+
+The answer of one is the brief of the next: from a scene to its people, to a conversation, to one instruction.
+"""
+
+from __future__ import annotations
+
+import zlib
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from pydantic import TypeAdapter
+
+from embomatrix.factory.layout.agent_interfaces import AgentInterface, BriefError
+from embomatrix.factory.pictures.sights import sights_of
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.view import SceneView
+from embomatrix.factory.social.conversing import starting_slots
+from embomatrix.factory.social.facts import SceneFacts, facts_of, with_sights
+from embomatrix.factory.social.fitting import why_of
+from embomatrix.factory.social.summary import instruction_of
+from embomatrix.factory.social.values import RequestSummary, SceneBrief, SummaryBrief, TalkBrief
+from embomatrix.factory.social.writer import SocialWriter
+from embomatrix.factory.writer.variant import build_variant
+from embomatrix.factory.writer.words import Voice
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.factory.social.model_agents import ModelAgents
+    from embomatrix.factory.social.values import Cast
+    from embomatrix.factory.writer.variant import Variant
+    from embomatrix.world.scene import Scene
+
+ROOMS: Final = 3
+"""Rooms of a scene that a conversation is about."""
+TALKS: Final = 40
+"""Conversations that are tried: not every goal of a scene has somebody who would wish for it."""
+NO_REASON: Final = "there is much to do today"
+
+
+class SocialAgent(StrEnum):
+    """Agents of the social simulation."""
+
+    EXTRACTOR = "scene-extractor"
+    PLAYER = "role-player"
+    SIMULATOR = "social-simulator"
+    SUMMARIZER = "summarizer"
+
+
+class _SameCast:
+    """Role-Playing Agent that has played already."""
+
+    def __init__(self, cast: Cast) -> None:
+        self._cast = cast
+
+    def cast(self, scene: Scene, rng: np.random.Generator) -> Cast:
+        return self._cast
+
+
+def extract(brief: SceneBrief) -> SceneFacts:
+    """Scene information extraction from the inventory. Raises CatalogError."""
+    return _facts(build_base_scene(brief.scene, seed=brief.seed))
+
+
+def play(brief: SceneBrief) -> TalkBrief:
+    """Role-Playing Agent. Raises CatalogError."""
+    cast = SocialWriter(brief.seed).cast_of(build_base_scene(brief.scene, seed=brief.seed))
+    return TalkBrief(scene=brief.scene, cast=cast, seed=brief.seed)
+
+
+def simulate(brief: TalkBrief) -> SummaryBrief:
+    """Social Simulation Agent. Raises CatalogError, BriefError where nobody comes to such a wish."""
+    rng = _rng(brief.scene, brief.seed)
+    variant = _variant(brief.scene, brief.seed, rng)
+    writer, view = SocialWriter(brief.seed, _SameCast(brief.cast)), SceneView(variant.scene)
+    for _ in range(TALKS):
+        talked = writer.talk(variant, view, brief.category, rng)
+        if talked is not None:
+            return SummaryBrief(
+                scene=brief.scene, cast=brief.cast, conversation=talked.conversation, seed=brief.seed
+            )
+    raise BriefError(
+        f"nobody in {brief.scene} comes to a wish of the kind {brief.category.value!r} in {TALKS} tries: another seed plays in "
+        "other rooms"
+    )
+
+
+def summarise(brief: SummaryBrief) -> RequestSummary:
+    """Summarization Agent. Raises CatalogError."""
+    rng = _rng(brief.scene, brief.seed)
+    view = SceneView(build_base_scene(brief.scene, seed=brief.seed))
+    voice = Voice(rng)
+    why = voice.choose(why_of(brief.conversation.slot.activity) or (NO_REASON,))
+    instruction = instruction_of(brief.conversation, brief.cast, view, voice, why)
+    return RequestSummary(instruction=instruction, wishes=brief.conversation.last_wishes)
+
+
+async def asked(agents: ModelAgents, name: SocialAgent, brief: Any) -> Any:
+    """The same of a language model. Raises LlmError, CatalogError."""
+    if name in (SocialAgent.EXTRACTOR, SocialAgent.PLAYER):
+        scene = build_base_scene(brief.scene, seed=brief.seed)
+        facts = _facts(scene)
+        if name is SocialAgent.PLAYER:
+            cast = await agents.cast(facts, brief.seed)
+            return TalkBrief(scene=brief.scene, cast=cast, seed=brief.seed)
+        return with_sights(facts, (await agents.describe(facts, sights_of(scene), brief.seed)).rooms)
+    rng = _rng(brief.scene, brief.seed)
+    variant = _variant(brief.scene, brief.seed, rng)
+    view = SceneView(variant.scene)
+    facts = facts_of(view, variant.rooms)
+    if name is SocialAgent.SIMULATOR:
+        slot = starting_slots(brief.cast, variant.rooms, rng)[0]
+        conversation = await agents.converse(facts, brief.cast, slot, brief.category, brief.seed)
+        return SummaryBrief(scene=brief.scene, cast=brief.cast, conversation=conversation, seed=brief.seed)
+    request = await agents.summarise(facts, view, brief.conversation, brief.seed)
+    wishes = tuple(wish.model_dump_json() for wish in request.wishes)
+    return RequestSummary(instruction=request.instruction, wishes=wishes)
+
+
+def _facts(scene: Scene) -> SceneFacts:
+    return facts_of(SceneView(scene), [room.name for room in scene.rooms])
+
+
+def _rng(scene: str, seed: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence((seed, zlib.crc32(scene.encode()))))
+
+
+def _variant(name: str, seed: int, rng: np.random.Generator) -> Variant:
+    """Some rooms of a base scene with small things about, the same for one seed."""
+    base = build_base_scene(name, seed=seed)
+    rooms = [str(room) for room in rng.permutation([room.name for room in base.rooms])[:ROOMS]]
+    return build_variant(base, rooms, f"{base.base}-alone", rng)
+
+
+SOCIAL_DOORS: Final[Mapping[SocialAgent, AgentInterface]] = {
+    SocialAgent.EXTRACTOR: AgentInterface(
+        "scene information extraction: rooms, things and what can be done with them",
+        TypeAdapter(SceneBrief),
+        TypeAdapter(SceneFacts),
+        extract,
+    ),
+    SocialAgent.PLAYER: AgentInterface(
+        "Role-Playing Agent: the people of a scene and their day",
+        TypeAdapter(SceneBrief),
+        TypeAdapter(TalkBrief),
+        play,
+    ),
+    SocialAgent.SIMULATOR: AgentInterface(
+        "Social Simulation Agent: a conversation that comes to a request",
+        TypeAdapter(TalkBrief),
+        TypeAdapter(SummaryBrief),
+        simulate,
+    ),
+    SocialAgent.SUMMARIZER: AgentInterface(
+        "Summarization Agent: one instruction",
+        TypeAdapter(SummaryBrief),
+        TypeAdapter(RequestSummary),
+        summarise,
+    ),
+}

@@ -1,0 +1,167 @@
+"""What a problem asks of the size of its things: what must go into them, and whether they are to be carried themselves."""
+
+from __future__ import annotations
+
+import functools
+import math
+import operator
+from collections import defaultdict
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.scenes.view import is_liftable
+from embomatrix.factory.task_import.reach import literals
+from embomatrix.sim.geometry.candidates import surfaces_for
+from embomatrix.world.catalog import Catalog, CatalogError
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.world.asset import Asset, SupportSurface
+    from embomatrix.world.bddl import BddlProblem
+    from embomatrix.world.geometry import Vec3
+    from embomatrix.world.goal import Atom
+
+SLACK: Final = 2.2
+"""Floor of a cavity over the footprints of all that goes in: things are put where they fall, not packed."""
+PLACED: Final = frozenset(set(Relation) - {Relation.INROOM})
+"""Relations between two things."""
+
+
+@dataclass(frozen=True, slots=True)
+class Demand:
+    """What is asked of one thing, or of all of a type.
+
+    ``contents`` are the types of what goes into it, one for each thing: those of the start, or those of the goal.
+    """
+
+    bears: bool = False
+    """Something is, or is to be, on or in it."""
+    contents: tuple[str, ...] = ()
+    carried: bool = False
+    """The goal wants it where it is not yet."""
+    places: tuple[tuple[Relation, str], ...] = ()
+    """What it is on or in, at the start or in the end, by name."""
+    burden: tuple[str, ...] = ()
+    """Types of what goes on top of it, one for each thing, as ``contents``."""
+
+
+def demands_of(problem: BddlProblem) -> Mapping[str, Demand]:
+    """Demands on objects, and on types that the goal's variables range over, by name."""
+    fixtures = {item.atom.args[0] for item in problem.init if item.atom.predicate == Relation.INROOM}
+    bears: set[str] = set()
+    carried: set[str] = set()
+    started: defaultdict[tuple[str, str], list[str]] = defaultdict(list)
+    ended: defaultdict[tuple[str, str], list[str]] = defaultdict(list)
+    places: defaultdict[str, dict[tuple[Relation, str], None]] = defaultdict(dict)
+    goal = list(literals(problem.goal, True, {}))
+    for atom, positive, _ in goal:
+        if not positive and atom.predicate in PLACED and _is_so(problem, atom):
+            carried.add(atom.args[0].lstrip("?"))
+    moments = (
+        (started, [item.atom for item in problem.init if item.positive]),
+        (ended, list(dict.fromkeys(atom for atom, positive, _ in goal if positive))),
+    )
+    for borne, atoms in moments:
+        for atom in atoms:
+            if atom.predicate not in PLACED:
+                continue
+            thing, host = (name.lstrip("?") for name in atom.args)
+            if borne is ended and not _is_so(problem, atom):
+                # of two that are to be neighbours, what the rooms don't have already
+                carried.add(host if atom.predicate == Relation.NEXTTO and thing in fixtures else thing)
+            if atom.predicate in (Relation.INSIDE, Relation.ONTOP):
+                bears.add(host)
+                places[thing][Relation(atom.predicate), problem.types.get(host, (host,))[0]] = None
+                borne[atom.predicate, host] += _share(problem, thing, host)
+    found = {}
+    for name in (*problem.objects, *problem.types):
+        contents, burden = (
+            tuple(started[relation, name])
+            if len(started[relation, name]) > len(ended[relation, name])
+            else tuple(ended[relation, name])
+            for relation in (Relation.INSIDE, Relation.ONTOP)
+        )
+        found[name] = Demand(name in bears, contents, name in carried, tuple(places[name]), burden)
+    return found
+
+
+def demand_on(demands: Mapping[str, Demand], name: str, type_name: str) -> Demand:
+    """What is asked of an object by its own name and by its type's."""
+    own, all_alike = demands.get(name, Demand()), demands.get(type_name, Demand())
+    return Demand(
+        own.bears or all_alike.bears,
+        max(own.contents, all_alike.contents, key=len),
+        own.carried or all_alike.carried,
+        tuple(dict.fromkeys((*own.places, *all_alike.places))),
+        max(own.burden, all_alike.burden, key=len),
+    )
+
+
+class CavityFit(IntEnum):
+    """What an asset has for things that are to go in, the best first."""
+
+    FOR_ALL = 0  # floor for all of them, side by side
+    FOR_EACH = 1  # floor for each, if not for all
+    FOR_SOME = 2  # not even that
+
+
+def room_for(asset: Asset, contents: tuple[str, ...], relation: Relation = Relation.INSIDE) -> CavityFit:
+    """What the cavities of an asset, or its surfaces, have for some types' smallest models."""
+    floors = surfaces_for(asset, relation)
+    sizes_m = [size_m for size_m in map(smallest_m, contents) if size_m is not None]
+    if not all(any(_fits(size_m, floor) for floor in floors) for size_m in sizes_m):
+        return CavityFit.FOR_SOME
+    return (
+        CavityFit.FOR_ALL
+        if floor_needed_m2(contents) <= sum(math.prod(floor.size_m) for floor in floors)
+        else CavityFit.FOR_EACH
+    )
+
+
+def floor_needed_m2(contents: tuple[str, ...]) -> float:
+    """Floor for things of some types side by side, as they fall, by their smallest models."""
+    sizes_m = [size_m for size_m in map(smallest_m, contents) if size_m is not None]
+    return SLACK * sum(size_m[0] * size_m[1] for size_m in sizes_m)
+
+
+def _fits(size_m: Vec3, floor: SupportSurface) -> bool:
+    """Whether a thing has its whole footprint on a floor, along either side, and its height below what is above."""
+    footprint = sorted(size_m[:2])
+    return all(map(operator.le, footprint, sorted(floor.size_m))) and size_m[2] <= floor.clearance_m
+
+
+@functools.cache
+def smallest_m(type_name: str) -> Vec3 | None:
+    """Size of the type's model with the smallest footprint, of those that the arm lifts where there are any."""
+    catalog = Catalog.load()
+    try:
+        models = [
+            (not is_liftable(model.size_m, catalog.category(category).mass_kg), model.size_m)
+            for category in catalog.categories_of(type_name)
+            for model in catalog.models_of(category)
+        ]
+    except CatalogError:
+        return None
+    if not models:
+        return None
+    return min(models, key=lambda pair: (pair[0], math.prod(pair[1][:2])))[1]
+
+
+def _is_so(problem: BddlProblem, atom: Atom) -> bool:
+    """Whether the start says so of everything that an atom of the goal is about."""
+    first, second = (problem.types.get(name.lstrip("?"), (name.lstrip("?"),)) for name in atom.args)
+    told = {
+        item.atom.args for item in problem.init if item.positive and item.atom.predicate == atom.predicate
+    }
+    return all(any((one, other) in told for other in second) for one in first)
+
+
+def _share(problem: BddlProblem, thing: str, host: str) -> list[str]:
+    """Types of what one host gets of things that may be many, as hosts may be: as many for each."""
+    things = problem.types.get(thing, (thing,))
+    hosts = problem.types.get(host, (host,))
+    type_name = problem.objects.get(thing, thing)
+    return [type_name] * math.ceil(len(things) / max(1, len(hosts)))

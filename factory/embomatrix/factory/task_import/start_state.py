@@ -1,0 +1,66 @@
+"""How a scene starts: where the robot stands, what is open, on, hot or frozen, and what is covered or filled with what."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from embomatrix.factory.admission import RefusalReason, RefusedError
+from embomatrix.factory.scenes.floor import ReachableFloor
+from embomatrix.factory.scenes.joints import with_joints
+from embomatrix.world.scene import RobotStart
+from embomatrix.world.state import State, SubstanceFact, SubstanceRelation
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from embomatrix.world.bddl import InitLiteral
+    from embomatrix.world.scene import Scene, SceneObject
+
+
+def with_robot_in(scene: Scene, room_name: str) -> Scene:
+    """The scene with the robot on the free floor nearest to the middle of a room. Raises RefusedError without one."""
+    if scene.robot.room == room_name:
+        return scene
+    room = next(room for room in scene.rooms if room.name == room_name)
+    cells = ReachableFloor(scene).cells(room.low_m, room.high_m)  # (n, 2)
+    if not len(cells):
+        raise RefusedError(
+            RefusalReason.DOES_NOT_FIT, f"no free floor of {room_name} can be reached by the robot"
+        )
+    x, y = cells[np.argmin(np.hypot(*(cells - np.asarray(room.center_m)).T))]
+    return dataclasses.replace(scene, robot=RobotStart(float(x), float(y), 0.0, room_name))
+
+
+def with_states(scene: Scene, literals: Iterable[InitLiteral]) -> Scene:
+    """The scene with doors, symbolic states and substances as the literals say. Relations are passed over."""
+    shares: dict[str, float] = {}
+    facts: dict[str, set[SubstanceFact]] = {}
+    denied: dict[str, set[SubstanceFact]] = {}
+    gained: dict[str, set[State]] = {}
+    lost: dict[str, set[State]] = {}
+    for literal in literals:
+        if literal.atom.predicate in set(SubstanceRelation):
+            name, substance = literal.atom.args
+            fact = SubstanceFact(SubstanceRelation(literal.atom.predicate), substance)
+            (facts if literal.positive else denied).setdefault(name, set()).add(fact)
+        if literal.atom.predicate not in set(State):
+            continue
+        name, state = literal.atom.args[0], State(literal.atom.predicate)
+        if state is State.OPEN:
+            shares[name] = float(literal.positive)
+        else:
+            (gained if literal.positive else lost).setdefault(name, set()).add(state)
+
+    def changed(item: SceneObject) -> SceneObject:
+        states = (item.states | gained.get(item.name, set())) - lost.get(item.name, set())
+        substances = (item.substances | facts.get(item.name, set())) - denied.get(item.name, set())
+        return dataclasses.replace(item, states=states, substances=substances)
+
+    objects = {item.name: item for item in scene.objects}
+    for name, share in shares.items():
+        joints = (share,) * len(scene.asset_of(name).joints)
+        objects |= with_joints(objects, scene.assets, name, joints)
+    return dataclasses.replace(scene, objects=tuple(changed(item) for item in objects.values()))

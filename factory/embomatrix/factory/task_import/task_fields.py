@@ -1,0 +1,118 @@
+"""What kind of task a problem is, and how a person asks for it."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.task_import.reach import REAL
+from embomatrix.skills.appliances import liquids_given
+from embomatrix.world.bddl import ROOM_TYPES, is_room_instance
+from embomatrix.world.evaluate import atoms_of
+from embomatrix.world.state import Relation, State, SubstanceRelation
+from embomatrix.world.substances import MEANINGS, WATER
+from embomatrix.world.task import TaskCategory
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+    from embomatrix.factory.scenes.view import SceneView
+    from embomatrix.factory.task_import.sources import SourceText
+    from embomatrix.world.bddl import BddlProblem
+    from embomatrix.world.goal import Formula
+
+
+KITCHEN: Final = frozenset({State.COOKED, State.FROZEN, State.HOT, State.SLICED, REAL})
+SWITCHED: Final = frozenset({State.OPEN, State.TOGGLED_ON})
+CLEANED: Final = frozenset((*MEANINGS, *SubstanceRelation))
+_ROOM_OR_TEXT: Final = re.compile(
+    rf"(?:{'|'.join(sorted(ROOM_TYPES, key=len, reverse=True))})_\d+|.+?(?=(?:{'|'.join(sorted(ROOM_TYPES))})_\d|$)",
+    re.IGNORECASE,
+)
+
+
+def instruction_of(source: SourceText, problem: BddlProblem) -> str:
+    """What a person asks for. The paper's tasks carry it as the problem's name, with underscores for spaces."""
+    words = source.request or problem.name
+    words = re.sub(r"-\d+$", "", words)
+    words = re.sub(r"\.n\.\d+(_\d+)?", "", words)
+    spaced = " ".join(
+        word if is_room_instance(word.lower()) else word.replace("_", " ")
+        for word in _ROOM_OR_TEXT.findall(words)
+    )
+    words = re.sub(r"\s+([.,]|$)", r"\1", re.sub(r"\s+", " ", spaced)).strip(" .")
+    return f"{words[:1].upper()}{words[1:]}."
+
+
+def category_of(goal: Formula) -> TaskCategory:
+    """Which of the paper's four kinds a goal is."""
+    predicates = {atom.predicate for atom in atoms_of(goal)}
+    moves = bool(predicates & set(Relation))
+    switches = bool(predicates & (SWITCHED | CLEANED))
+    if predicates & KITCHEN:
+        outside = {Relation.ONTOP, Relation.UNDER, Relation.NEXTTO, State.OPEN} & predicates
+        return TaskCategory.COMPOUND if outside else TaskCategory.KITCHEN_OPERATION
+    if moves and switches:
+        return TaskCategory.COMPOUND
+    return TaskCategory.APPLIANCE_USE if switches else TaskCategory.PICK_AND_PLACE
+
+
+def signature_of(goal: Formula, view: SceneView) -> str:
+    """Kind of a goal: its predicates over categories, sorted. Variables stand for their type."""
+    signs = []
+    for atom in atoms_of(goal):
+        args = (view.category(arg) if arg in view.scene.by_name else arg.lstrip("?") for arg in atom.args)
+        signs.append(f"{atom.predicate}({','.join(args)})")
+    return " ".join(sorted(signs))
+
+
+_THERMAL: Final = frozenset({State.COOKED, State.FROZEN, State.HOT})
+
+
+def sources_for(
+    view: SceneView, goal: Formula, types: Mapping[str, tuple[str, ...]], known: Iterable[str]
+) -> Iterator[str]:
+    """Objects of the scene that heat, cook or freeze what the goal asks for, where no object of the problem does.
+
+    The paper's own tasks freeze things in coolers, which keep drinks cool and no more.
+    """
+    for atom in atoms_of(goal):
+        if atom.predicate not in _THERMAL:
+            continue
+        effect = State(atom.predicate)
+        things = types.get(atom.args[0].lstrip("?"), (atom.args[0],))
+        for thing in things:
+            if thing not in view.scene.by_name:
+                continue
+            if any(effect in view.thermal_effects(thing, name) for name in known):
+                continue
+            able = (
+                item.name
+                for item in view.scene.objects
+                if item.fixed
+                and view.is_source(item.name)
+                and effect in view.thermal_effects(thing, item.name)
+                and view.opens(item.name)
+            )
+            yield from itertools.islice(able, 1)
+
+
+def taps_for(view: SceneView, goal: Formula, known: Iterable[str]) -> Iterator[str]:
+    """A tap of the scene where the goal asks for something wet, or clean, and no object of the problem gives water.
+
+    EAI's tasks soak things in a teapot, which is empty in our world.
+    """
+    asked = {atom.predicate for atom in atoms_of(goal)}
+    if not asked & {State.SOAKED, State.STAINED}:
+        return
+    rooms = {view.room(name) for name in known}
+    if any(_gives_water(view, name) for name in known):
+        return
+    taps = [item.name for item in view.scene.objects if item.fixed and _gives_water(view, item.name)]
+    taps.sort(key=lambda name: view.room(name) not in rooms)
+    yield from itertools.islice(taps, 1)
+
+
+def _gives_water(view: SceneView, name: str) -> bool:
+    return WATER in liquids_given(view.asset(name), view.item(name).substances, on=True)
