@@ -24,7 +24,7 @@ ADAPTERS: Final = "adapter"
 _BASE_DIGEST: Final = "base_model.sha256"
 
 
-def add_adapters(model: nn.Module, settings: LoraSettings, *, seed: int) -> Any:
+def add_adapters(model: Any, settings: LoraSettings, *, seed: int) -> Any:
     """Freeze ``model`` and put adapters on its linear layers. New adapters leave its output unchanged.
 
     Raises TrainerError if peft is missing or no layer matches ``settings.targets``.
@@ -35,12 +35,13 @@ def add_adapters(model: nn.Module, settings: LoraSettings, *, seed: int) -> Any:
         raise TrainerError(
             "lora.rank needs peft: `pip install 'embomatrix[hf]'`, or leave lora out"
         ) from error
-    targets = list(settings.targets) or "all-linear"
-    config = LoraConfig(r=settings.rank, lora_alpha=settings.alpha, target_modules=targets)  # type: ignore[arg-type]
+    targets: Any = list(settings.targets) or "all-linear"
+    options: dict[str, Any] = {"r": settings.rank, "lora_alpha": settings.alpha, "target_modules": targets}
+    config: Any = LoraConfig(**options)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         try:
-            return get_peft_model(model, config)  # type: ignore[arg-type]
+            return get_peft_model(model, config)
         except ValueError as error:
             raise TrainerError(
                 f"lora.targets: the model has no linear layer named {' or '.join(settings.targets)}: expected last parts of "
