@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 SEED: Final = 0
 """Seed of the verifying executions."""
-MOST_HELD: Final = 0.5
+MAX_HELD_SHARE: Final = 0.5
 """Share of a goal's atoms that may hold at the start: "leave it closed" is asked beside other things, not in their place."""
 
 
@@ -58,7 +58,7 @@ def admit(
     find_plan: Callable[[S, Task], Plan | PlanNotFound],
     init: Sequence[InitLiteral] = (),
     *,
-    most_held: float = MOST_HELD,
+    most_held: float = MAX_HELD_SHARE,
     physics: PlanExecutor | None = None,
 ) -> Admitted | TaskRefusal:
     """Judge a task by execution. ``init`` are atoms that must hold at the start, as the task's source says.
@@ -90,7 +90,7 @@ def admit(
     if trace.failure is not None or not reward.success:
         last = trace.steps[-1].message if trace.steps else "it is empty"
         return TaskRefusal(RefusalReason.ORACLE_FAILED, f"the oracle's plan earns {reward.total:.1f}: {last}")
-    against = objection(physics, task, plan) if physics is not None else ""
+    against = plan_failure(physics, task, plan) if physics is not None else ""
     if against:
         return TaskRefusal(
             RefusalReason.PHYSICS_FAILED, f"the oracle's plan fails in stepped physics: {against}"
@@ -98,7 +98,7 @@ def admit(
     return Admitted(plan, held)
 
 
-def objection(stage: PlanExecutor, task: Task, plan: Plan) -> str:
+def plan_failure(stage: PlanExecutor, task: Task, plan: Plan) -> str:
     """What speaks against a plan when it is executed on a stage; empty where it reaches the goal."""
     trace = stage.execute(task, plan, SEED)
     if trace.failure is None:

@@ -12,14 +12,14 @@ from embomatrix.factory.task_import.binding import Addition
 from embomatrix.factory.task_import.models import models_for
 from embomatrix.factory.task_import.size_requirements import (
     CavityFit,
-    Demand,
-    demand_on,
-    demands_of,
+    Requirement,
+    requirement_on,
+    requirements_of,
     room_for,
     smallest_m,
 )
-from embomatrix.factory.task_import.sources import NAMESAKES, activity_names
-from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
+from embomatrix.factory.task_import.sources import EAI_NAMESAKES, activity_names
+from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
 from embomatrix.world.bddl import parse_problem
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.scene import Scene
@@ -35,7 +35,7 @@ BOXES = """(define (problem p) (:domain igibson)
 CARTON = Addition("carton", "carton.n.02", None, "", "kitchen_0")
 
 
-def model_of(demand: Demand, addition: Addition = CARTON):
+def model_of(demand: Requirement, addition: Addition = CARTON):
     return models_for(addition, np.random.default_rng(0), demand)[0]
 
 
@@ -44,15 +44,17 @@ def asset_of(model):
 
 
 def test_what_goes_in_is_shared_by_all_containers_and_what_stays_is_not_carried() -> None:
-    demands = demands_of(parse_problem(BOXES))
+    demands = requirements_of(parse_problem(BOXES))
     on_floor = (Relation.ONTOP, "floor.n.01_1")
-    assert demand_on(demands, "carton.n.02_1", "carton.n.02") == Demand(
+    assert requirement_on(demands, "carton.n.02_1", "carton.n.02") == Requirement(
         bears=True, contents=("book.n.02",) * 2, places=(on_floor,)
     )
-    assert demand_on(demands, "book.n.02_1", "book.n.02") == Demand(
+    assert requirement_on(demands, "book.n.02_1", "book.n.02") == Requirement(
         carried=True, places=((Relation.ONTOP, "table.n.02_1"), (Relation.INSIDE, "carton.n.02_1"))
     )
-    assert demand_on(demands, "table.n.02_1", "table.n.02") == Demand(bears=True, burden=("book.n.02",) * 3)
+    assert requirement_on(demands, "table.n.02_1", "table.n.02") == Requirement(
+        bears=True, burden=("book.n.02",) * 3
+    )
 
 
 def test_what_must_not_stay_is_carried_and_what_must_not_go_in_needs_no_room() -> None:
@@ -60,21 +62,21 @@ def test_what_must_not_stay_is_carried_and_what_must_not_go_in_needs_no_room() -
         (:objects book.n.02_1 - book.n.02 carton.n.02_1 - carton.n.02 table.n.02_1 - table.n.02)
         (:init (ontop book.n.02_1 table.n.02_1) (inroom table.n.02_1 kitchen))
         (:goal (and (not (ontop book.n.02_1 table.n.02_1)) (not (inside book.n.02_1 carton.n.02_1)))))"""
-    demands = demands_of(parse_problem(text))
-    assert demands["book.n.02_1"] == Demand(carried=True, places=((Relation.ONTOP, "table.n.02_1"),))
-    assert demands["carton.n.02_1"] == Demand()
+    demands = requirements_of(parse_problem(text))
+    assert demands["book.n.02_1"] == Requirement(carried=True, places=((Relation.ONTOP, "table.n.02_1"),))
+    assert demands["carton.n.02_1"] == Requirement()
 
 
 def test_a_container_has_floor_for_all_that_goes_in() -> None:
     plates = ("plate.n.04",) * 4
-    model = model_of(Demand(bears=True, contents=plates))
+    model = model_of(Requirement(bears=True, contents=plates))
     assert room_for(asset_of(model), plates) is CavityFit.FOR_ALL
-    small = asset_of(model_of(Demand(bears=True)))
+    small = asset_of(model_of(Requirement(bears=True)))
     assert room_for(small, plates) > CavityFit.FOR_ALL
 
 
 def test_a_container_that_is_carried_can_be_lifted_whatever_goes_in() -> None:
-    model = model_of(Demand(bears=True, contents=("plate.n.04",) * 9, carried=True))
+    model = model_of(Requirement(bears=True, contents=("plate.n.04",) * 9, carried=True))
     assert is_liftable(model.size_m, Catalog.load().category(model.category).mass_kg)
 
 
@@ -100,7 +102,7 @@ def test_of_a_type_without_models_nothing_is_known() -> None:
 def test_the_scene_of_a_problem_comes_first_with_other_draws(home: Scene, flat: Scene) -> None:
     item = source(PROBLEM)
     at_home = type(item)(item.name, item.text, item.source, item.request, scene=home.base)
-    asked = list(batch.imports(at_home, [flat, home], seed=0, manner=Manner(), draws=2))
+    asked = list(batch.imports(at_home, [flat, home], seed=0, manner=ImportOptions(), draws=2))
     first = [found.scene.base for found in asked[:2] if isinstance(found, ImportedTask)]
     assert first == [home.base] * 2
     one, other = (found.scene for found in asked[:2])
@@ -113,7 +115,7 @@ def test_what_no_skill_reaches_is_tried_in_no_further_scene(home: Scene, flat: S
     )
     item = source(text)
     at_home = type(item)(item.name, item.text, item.source, item.request, scene=home.base)
-    (only,) = batch.imports(at_home, [flat, home], seed=0, manner=Manner(), draws=3)
+    (only,) = batch.imports(at_home, [flat, home], seed=0, manner=ImportOptions(), draws=3)
     assert isinstance(only, TaskRefusal)
     assert only.reason is RefusalReason.INEXPRESSIBLE
 
@@ -145,5 +147,5 @@ def test_what_examines_is_not_trained_on(home: Scene, name: str, origin: str, ex
 
 
 def test_the_namesakes_are_activities_of_the_package() -> None:
-    assert len(NAMESAKES) == 67
-    assert {name.replace("-", "_") for name in activity_names()} >= NAMESAKES
+    assert len(EAI_NAMESAKES) == 67
+    assert {name.replace("-", "_") for name in activity_names()} >= EAI_NAMESAKES

@@ -13,9 +13,9 @@ from embomatrix.factory.task_import.dialects import (
     GROUPS,
     LAMPS,
     RENAMED,
-    in_catalog_words,
     read_problem,
-    said_whole,
+    translate_types,
+    with_implied_rooms,
 )
 from embomatrix.factory.task_import.reach import unreachable_atoms
 from embomatrix.factory.task_import.report import (
@@ -32,18 +32,18 @@ from embomatrix.factory.task_import.sources import (
     ProblemSourceError,
     read_eai,
 )
-from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
+from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
 from embomatrix.world.bddl import InitLiteral, parse_formula, parse_problem
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.goal import Atom
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import Profile
 
-EVALUABLE = Manner(reachable=False)
+EVALUABLE = ImportOptions(reachable=False)
 
 
 def test_renamed_types_are_read_as_what_the_catalog_calls_them() -> None:
-    text, notes = in_catalog_words(PROBLEM.replace("breakfast_table.n.01", "cupboard.n.01"), RENAMED)
+    text, notes = translate_types(PROBLEM.replace("breakfast_table.n.01", "cupboard.n.01"), RENAMED)
     assert "cupboard.n.01_1 - cabinet.n.01" in text
     assert notes == ("cupboard.n.01 is read as cabinet.n.01",)
 
@@ -51,7 +51,7 @@ def test_renamed_types_are_read_as_what_the_catalog_calls_them() -> None:
 def test_a_group_stands_for_a_type_that_the_problem_does_not_name_already() -> None:
     text = "hardback.n.01_1 - hardback.n.01 book.n.02_1 - book.n.02"
     assert (
-        in_catalog_words(text, GROUPS)[0]
+        translate_types(text, GROUPS)[0]
         == "hardback.n.01_1 - hardback.n.01 book.n.02_1 - paperback_book.n.01"
     )
 
@@ -88,17 +88,17 @@ def test_every_word_is_read_as_types_that_have_models() -> None:
 
 def test_what_a_problem_leaves_unsaid_is_said() -> None:
     text = PROBLEM.replace("(ontop apple.n.01_2 breakfast_table.n.01_1)", "(inside apple.n.01_2 closet_1)")
-    problem, notes = said_whole(parse_problem(text))
+    problem, notes = with_implied_rooms(parse_problem(text))
     assert InitLiteral(Atom("inroom", ("apple.n.01_2", "closet_1"))) in problem.init
     assert notes == ("(inside apple.n.01_2 closet_1) is read as being in the room",)
-    assert said_whole(problem) == (problem, ())
+    assert with_implied_rooms(problem) == (problem, ())
 
 
 def test_a_floor_without_a_room_is_that_of_what_stands_on_it() -> None:
     text = PROBLEM.replace(
         "(inroom floor.n.01_1 kitchen)", "(inroom apple.n.01_1 kitchen) (ontop apple.n.01_1 floor.n.01_1)"
     )
-    problem, notes = said_whole(parse_problem(text))
+    problem, notes = with_implied_rooms(parse_problem(text))
     assert InitLiteral(Atom("inroom", ("floor.n.01_1", "kitchen"))) in problem.init
     assert len(notes) == 1
 

@@ -7,7 +7,7 @@ from tests.fakes.plans import plan_of
 from tests.fakes.problems import PROBLEM, source
 
 from embomatrix.factory.task_import.batch import Verified, verify
-from embomatrix.factory.task_import.reach import Horizon
+from embomatrix.factory.task_import.reach import Reachability
 from embomatrix.factory.task_import.task import ImportedTask, import_problem
 from embomatrix.sim.engine import FLOOR
 from embomatrix.sim.executor import Simulator
@@ -178,4 +178,4 @@ REACHABLE: dict[str, bool] = {
 def test_what_the_skills_can_bring_about_is_told_from_the_problem_alone(goal: str) -> None:
     problem = parse_problem(HOUSEHOLD)
     formula = parse_formula(goal, problem.objects)
-    assert (Horizon(problem).obstacle(formula) is None) is REACHABLE[goal]
+    assert (Reachability(problem).obstacle(formula) is None) is REACHABLE[goal]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 from tests.fakes.problems import source
 
-from embomatrix.factory.pipeline.task_poses import Beside
+from embomatrix.factory.pipeline.task_poses import NeighbourPair
 from embomatrix.factory.task_import.batch import Verified, verify_first
 from embomatrix.factory.task_import.neighbours import neighbours_of
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
@@ -32,26 +32,29 @@ PROBLEM = """(define (problem lay_the_money_down) (:domain omnigibson)
 @pytest.mark.parametrize(
     ("goal", "pairs"),
     [
-        ("(nextto cup_1 lamp_1)", (Beside("cup_1", "lamp_1"),)),
-        ("(nextto stove_1 cup_1)", (Beside("cup_1", "stove_1"),)),
+        ("(nextto cup_1 lamp_1)", (NeighbourPair("cup_1", "lamp_1"),)),
+        ("(nextto stove_1 cup_1)", (NeighbourPair("cup_1", "stove_1"),)),
         ("(not (nextto cup_1 lamp_1))", ()),
         (
             "(forall (?cup - cup) (nextto ?cup stove_1))",
-            (Beside("cup_1", "stove_1"), Beside("cup_2", "stove_1")),
+            (NeighbourPair("cup_1", "stove_1"), NeighbourPair("cup_2", "stove_1")),
         ),
         (
             "(and (nextto cup_1 lamp_1) (ontop cup_1 stove_1) (ontop lamp_1 stove_1))",
-            (Beside("cup_1", "lamp_1", "stove_1"),),
+            (NeighbourPair("cup_1", "lamp_1", "stove_1"),),
         ),
         ("(and (nextto cup_1 lamp_1) (ontop cup_1 stove_1) (ontop lamp_1 cup_2))", ()),
-        ("(and (nextto cup_1 lamp_1) (ontop lamp_1 stove_1))", (Beside("cup_1", "lamp_1", "stove_1"),)),
-        ("(and (nextto cup_1 lamp_1) (ontop cup_1 stove_1))", (Beside("lamp_1", "cup_1", "stove_1"),)),
-        ("(and (nextto cup_1 stove_1) (ontop cup_1 lamp_1))", (Beside("cup_1", "stove_1"),)),
+        (
+            "(and (nextto cup_1 lamp_1) (ontop lamp_1 stove_1))",
+            (NeighbourPair("cup_1", "lamp_1", "stove_1"),),
+        ),
+        ("(and (nextto cup_1 lamp_1) (ontop cup_1 stove_1))", (NeighbourPair("lamp_1", "cup_1", "stove_1"),)),
+        ("(and (nextto cup_1 stove_1) (ontop cup_1 lamp_1))", (NeighbourPair("cup_1", "stove_1"),)),
         ("(nextto stove_1 stove_1)", ()),
     ],
 )
 def test_what_is_carried_goes_beside_what_stays_or_goes_there_too(
-    goal: str, pairs: tuple[Beside, ...]
+    goal: str, pairs: tuple[NeighbourPair, ...]
 ) -> None:
     formula = parse_formula(goal, NAMES)
     assert neighbours_of(formula, TYPES, lambda name: not name.startswith("stove")) == pairs

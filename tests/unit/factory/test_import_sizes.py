@@ -10,8 +10,8 @@ import pytest
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.furnish.roles import is_portable
 from embomatrix.factory.task_import.binding import Addition
-from embomatrix.factory.task_import.models import sized
-from embomatrix.factory.task_import.size_requirements import Demand
+from embomatrix.factory.task_import.models import with_sizes
+from embomatrix.factory.task_import.size_requirements import Requirement
 from embomatrix.sim.geometry.candidates import candidates, surfaces_for
 from embomatrix.sim.planner.ways import CANDIDATES, MIDDLE
 from embomatrix.world.catalog import Catalog
@@ -25,13 +25,13 @@ CATALOG = Catalog.load()
 
 
 def chosen(
-    categories: dict[str, str], demands: dict[str, Demand], *, snug: bool = False
+    categories: dict[str, str], demands: dict[str, Requirement], *, snug: bool = False
 ) -> dict[str, list[Model]]:
     """Models for things of some categories, all of which are additions."""
     orders = {name: CATALOG.models_of(category) for name, category in categories.items()}
     additions = [Addition(name, "", None, "", "") for name in categories]
-    wanted = {name: demands.get(name, Demand()) for name in categories}
-    return sized(orders, additions, wanted, {}, snug=snug)
+    wanted = {name: demands.get(name, Requirement()) for name in categories}
+    return with_sizes(orders, additions, wanted, {}, snug=snug)
 
 
 def asset_of(model: Model) -> Asset:
@@ -41,7 +41,7 @@ def asset_of(model: Model) -> Asset:
 def test_what_the_gripper_takes_keeps_its_size_and_what_it_does_not_is_made_smaller() -> None:
     found = chosen(
         {"mug": "mug", "backpack": "backpack"},
-        {"mug": Demand(carried=True), "backpack": Demand(carried=True)},
+        {"mug": Requirement(carried=True), "backpack": Requirement(carried=True)},
     )
     assert found["mug"] == [model for model in CATALOG.models_of("mug") if is_portable(asset_of(model))] + [
         model for model in CATALOG.models_of("mug") if not is_portable(asset_of(model))
@@ -56,7 +56,7 @@ def test_what_the_gripper_takes_keeps_its_size_and_what_it_does_not_is_made_smal
 
 
 def test_what_must_be_carried_can_be_even_where_it_has_not_room_for_all() -> None:
-    demand = Demand(bears=True, carried=True, contents=("hardback.n.01",) * 40)
+    demand = Requirement(bears=True, carried=True, contents=("hardback.n.01",) * 40)
     assert is_portable(asset_of(chosen({"backpack": "backpack"}, {"backpack": demand})["backpack"][0]))
 
 
@@ -68,8 +68,8 @@ def test_a_sausage_goes_into_the_box_that_a_problem_puts_it_in() -> None:
     found = chosen(
         {"sausage": "chorizo", "box": "tupperware"},
         {
-            "sausage": Demand(carried=True, places=((Relation.INSIDE, "box"),)),
-            "box": Demand(bears=True),
+            "sausage": Requirement(carried=True, places=((Relation.INSIDE, "box"),)),
+            "box": Requirement(bears=True),
         },
     )
     box, sausage = asset_of(found["box"][0]), asset_of(found["sausage"][0])
@@ -80,10 +80,10 @@ def test_a_sausage_goes_into_the_box_that_a_problem_puts_it_in() -> None:
 
 
 def test_a_bag_grows_for_what_is_to_go_in() -> None:
-    demand = Demand(bears=True, contents=("bag__of__brown_rice.n.01",))
-    found = chosen({"bag": "paper_bag"}, {"bag": Demand(bears=True)})
+    demand = Requirement(bears=True, contents=("bag__of__brown_rice.n.01",))
+    found = chosen({"bag": "paper_bag"}, {"bag": Requirement(bears=True)})
     assert found["bag"][0].share == 1
-    grown = chosen({"bag": "shopping_basket"}, {"bag": Demand(bears=True, contents=("belt.n.02",))})
+    grown = chosen({"bag": "shopping_basket"}, {"bag": Requirement(bears=True, contents=("belt.n.02",))})
     assert grown["bag"][0].share > 1
     assert chosen({"bag": "paper_bag"}, {"bag": demand})["bag"][0] in CATALOG.models_of("paper_bag"), (
         "what no share brings about changes nothing"
@@ -94,11 +94,11 @@ def test_a_bag_grows_for_what_is_to_go_in() -> None:
 def test_things_that_share_a_host_have_more_room_when_it_is_to_be_snug(relation: Relation) -> None:
     names = [f"book_{number}" for number in range(24)]
     types = ("hardback.n.01",) * len(names)
-    demands = {name: Demand(carried=True, places=((relation, "host"),)) for name in names}
+    demands = {name: Requirement(carried=True, places=((relation, "host"),)) for name in names}
     demands["host"] = (
-        Demand(bears=True, contents=types)
+        Requirement(bears=True, contents=types)
         if relation is Relation.INSIDE
-        else Demand(bears=True, burden=types)
+        else Requirement(bears=True, burden=types)
     )
     category = {Relation.INSIDE: "shopping_basket", Relation.ONTOP: "coffee_table"}[relation]
     categories = {**dict.fromkeys(names, "hardback"), "host": category}

@@ -8,7 +8,7 @@ from embomatrix.factory.admission import RefusalReason, RefusedError, TaskRefusa
 from embomatrix.factory.task_import.batch import Verified, verify
 from embomatrix.factory.task_import.binding import bind
 from embomatrix.factory.task_import.start_state import with_states
-from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
+from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
 from embomatrix.factory.task_import.task_fields import category_of, instruction_of
 from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
@@ -20,7 +20,7 @@ from embomatrix.world.task import TaskCategory
 
 
 def refusal(text: str, scene: Scene) -> TaskRefusal:
-    outcome = import_problem(source(text), scene, manner=Manner(furnishing=False))
+    outcome = import_problem(source(text), scene, manner=ImportOptions(furnishing=False))
     assert isinstance(outcome, TaskRefusal)
     return outcome
 
@@ -147,7 +147,7 @@ def test_furniture_that_the_room_lacks_is_brought_in_where_that_is_allowed(home:
     chair = imported.scene.by_name["armchair_1"]
     assert (chair.room, chair.fixed) == ("kitchen_0", True)
     assert imported.scene.by_name["apple_3"].host == "armchair_1"
-    assert isinstance(import_problem(source(text), home, manner=Manner(furnishing=False)), TaskRefusal)
+    assert isinstance(import_problem(source(text), home, manner=ImportOptions(furnishing=False)), TaskRefusal)
 
 
 def test_states_of_the_start_are_set_and_taken_away(home: Scene) -> None:

@@ -1,4 +1,4 @@
-"""Rooms, trees and poses of a task's things: each level alone, and all of them in one flat."""
+"""Rooms, trees and poses of a task's objects: each level alone, and all of them in one flat."""
 
 import json
 from typing import TYPE_CHECKING
@@ -9,7 +9,7 @@ from tests.fakes.chat_server import ChatServer
 
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.furnish.roles import wall_height_m
-from embomatrix.factory.layout.agent_interfaces import DOORS, AgentName, BriefError
+from embomatrix.factory.layout.agent_interfaces import LAYOUT_AGENTS, AgentName, BriefError
 from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.distribution import DistributionError, distribute
 from embomatrix.factory.layout.generator import lay
@@ -18,12 +18,12 @@ from embomatrix.factory.layout.model_agents import ModelLayoutAgents
 from embomatrix.factory.layout.organization import LayoutTree, TreeError, organize
 from embomatrix.factory.layout.request import RequestedObject
 from embomatrix.factory.layout.values import (
-    MEANS,
+    RELATION_METHODS,
     Branch,
     DistributionBrief,
-    Failure,
     HostFacts,
     HostOffer,
+    LayoutFailure,
     LayoutRelation,
     LayoutRoomFacts,
     ObjectBrief,
@@ -49,7 +49,7 @@ PLATE = ObjectBrief("plate_1", "plate", (0.24, 0.24, 0.02))
 
 
 def test_every_relation_of_a_tree_has_its_means():
-    assert set(MEANS) == set(LayoutRelation)
+    assert set(RELATION_METHODS) == set(LayoutRelation)
     assert len(LayoutRelation) == 9
 
 
@@ -81,33 +81,33 @@ def test_branches_that_make_no_tree_are_told(branches, problem):
 
 
 def test_things_go_where_people_keep_them_and_with_what_they_belong_to():
-    things = (
+    objects = (
         PLATE,
         ObjectBrief("alarm_clock_1", "alarm_clock", (0.05, 0.1, 0.1)),
         ObjectBrief("apple_1", "apple", (0.07, 0.07, 0.07), relation=ON, host="plate_1"),
     )
-    found = distribute(DistributionBrief((KITCHEN, BEDROOM), things)).rooms
+    found = distribute(DistributionBrief((KITCHEN, BEDROOM), objects)).rooms
     assert found == {"plate_1": "kitchen_0", "alarm_clock_1": "bedroom_0", "apple_1": "kitchen_0"}
 
 
 def test_what_belongs_together_and_is_wanted_apart_is_told():
-    things = (
+    objects = (
         ObjectBrief("plate_1", "plate", (0.24, 0.24, 0.02), rooms=("kitchen_0",)),
         ObjectBrief(
             "apple_1", "apple", (0.07, 0.07, 0.07), rooms=("bedroom_0",), relation=ON, host="plate_1"
         ),
     )
     with pytest.raises(DistributionError, match="belong together"):
-        distribute(DistributionBrief((KITCHEN, BEDROOM), things))
+        distribute(DistributionBrief((KITCHEN, BEDROOM), objects))
 
 
 def test_a_host_that_failed_is_not_asked_again_and_what_fits_nowhere_is_left_out():
     brief = RoomBrief(KITCHEN, (TABLE,), (PLATE,))
     assert organize(brief).parent_of("plate_1") == Branch("breakfast_table_1", ON, "plate_1")
-    failed = Failure("plate_1", ON, "breakfast_table_1", LayoutReason.NO_FREE_SPOT, "full")
+    failed = LayoutFailure("plate_1", ON, "breakfast_table_1", LayoutReason.NO_FREE_SPOT, "full")
     floor = RoomBrief(KITCHEN, (TABLE,), (PLATE,), (failed,))
     assert organize(floor).parent_of("plate_1") == Branch("kitchen_0", ON, "plate_1")
-    nowhere = Failure("plate_1", ON, "kitchen_0", LayoutReason.BARS_THE_WAY, "")
+    nowhere = LayoutFailure("plate_1", ON, "kitchen_0", LayoutReason.BARS_THE_WAY, "")
     assert organize(RoomBrief(KITCHEN, (TABLE,), (PLATE,), (failed, nowhere))).parent_of("plate_1") is None
 
 
@@ -156,7 +156,7 @@ def test_what_fits_nowhere_is_left_out_with_its_reason_and_the_rest_is_laid(flat
         0,
     )
     (failure,) = layout.failures
-    assert (failure.thing, failure.reason) == ("bed", LayoutReason.TOO_LARGE)
+    assert (failure.object_name, failure.reason) == ("bed", LayoutReason.TOO_LARGE)
     assert "mug" in layout.names
 
 
@@ -164,7 +164,7 @@ def test_what_fits_nowhere_is_left_out_with_its_reason_and_the_rest_is_laid(flat
 def test_the_ways_that_layouts_are_compared_with_take_the_same_items(flat: "Scene", method) -> None:
     editor = SceneEditor(flat)
     layout = method(editor, items(flat), 0)
-    assert layout.names.keys() | {failure.thing for failure in layout.failures} == {
+    assert layout.names.keys() | {failure.object_name for failure in layout.failures} == {
         each.name for each in items(flat)
     }
 
@@ -172,8 +172,8 @@ def test_the_ways_that_layouts_are_compared_with_take_the_same_items(flat: "Scen
 @pytest.mark.parametrize("name", AgentName)
 def test_every_agent_has_a_door_that_names_what_is_wrong_with_a_brief(name):
     with pytest.raises(BriefError, match="--schema"):
-        DOORS[name].read('{"nonsense": 1}')
-    assert DOORS[name].about
+        LAYOUT_AGENTS[name].read('{"nonsense": 1}')
+    assert LAYOUT_AGENTS[name].about
 
 
 def test_what_hangs_high_elsewhere_hangs_where_the_robot_gets_at_it(home):
@@ -185,7 +185,7 @@ def test_what_hangs_high_elsewhere_hangs_where_the_robot_gets_at_it(home):
 
 
 def test_a_brief_goes_through_its_door_unchanged():
-    door = DOORS[AgentName.ORGANIZER]
+    door = LAYOUT_AGENTS[AgentName.ORGANIZER]
     brief = RoomBrief(KITCHEN, (TABLE, FRIDGE), (PLATE,))
     assert door.read(door.brief.dump_json(brief).decode()) == brief
     assert json.loads(door.written(door.rules(brief)))[-1]["child"] == "plate_1"

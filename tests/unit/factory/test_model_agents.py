@@ -15,9 +15,15 @@ from embomatrix.factory.pipeline.variants import VariantMaker, VariantOrder
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.facts import MOST_IN_ROOM, facts_of
-from embomatrix.factory.social.model_agents import ModelAgents
+from embomatrix.factory.social.model_agents import SocialModelAgents
 from embomatrix.factory.social.model_writer import ModelWriter
-from embomatrix.factory.social.requests import RequestedAtom, TaskRequest, Wanted, check_request, piece_of
+from embomatrix.factory.social.requests import (
+    RequestedAtom,
+    RequestPredicate,
+    TaskRequest,
+    check_request,
+    conjunct_of,
+)
 from embomatrix.factory.social.values import DaySlot
 from embomatrix.factory.writer.tasks import Draft, DraftOrder, PlainWriter
 from embomatrix.factory.writer.variant import build_variant
@@ -38,7 +44,7 @@ HOST = next(
     for name in VIEW.in_room[room]
     if VIEW.is_surface(name) and VIEW.takes(name, THING, inside=False) and VIEW.item(THING).host != name
 )
-KNOWN = frozenset(FACTS.things)
+KNOWN = frozenset(FACTS.objects)
 
 CAST = json.dumps(
     {
@@ -65,7 +71,7 @@ TALK = json.dumps(
 GOOD = json.dumps(
     {
         "instruction": "Ann wants it out of the way: put it over there.",
-        "wishes": [{"predicate": "ontop", "thing": THING, "place": HOST}],
+        "constraints": [{"predicate": "ontop", "thing": THING, "place": HOST}],
     }
 )
 
@@ -78,7 +84,7 @@ def written(*script, category=TaskCategory.PICK_AND_PLACE, look=None):
     limits = EndpointLimits(attempts=2, first_wait_s=0.01, timeout_s=5.0)
     with server.serving() as url:
         endpoint = Endpoint(url, "small-1", limits=limits)
-        with ModelWriter(ModelAgents(endpoint), look=look) as writer:
+        with ModelWriter(SocialModelAgents(endpoint), look=look) as writer:
             draft = writer.write(VARIANT, VIEW, category, "t", np.random.default_rng(0))
     return draft, server
 
@@ -153,7 +159,7 @@ def test_drafts_are_asked_for_at_once_each_by_its_own_draw():
         for number in range(4)
     ]
     server = ChatServer(CAST, *[slowly(TALK)] * 4, *[slowly(GOOD)] * 4)
-    with server.serving() as url, ModelWriter(ModelAgents(Endpoint(url, "small-1"))) as writer:
+    with server.serving() as url, ModelWriter(SocialModelAgents(Endpoint(url, "small-1"))) as writer:
         drafts = writer.write_all(VARIANT, VIEW, orders)
     assert [draft.task.task_id for draft in drafts] == ["t0", "t1", "t2", "t3"]
     assert server.most_at_once == 4
@@ -166,7 +172,7 @@ def test_of_drafts_that_are_asked_for_at_once_one_that_fails_costs_the_others_no
         for number in range(2)
     ]
     server = ChatServer(CAST, slowly(TALK), slowly(TALK), slowly("no"), slowly(GOOD), "no")
-    with server.serving() as url, ModelWriter(ModelAgents(Endpoint(url, "small-1"))) as writer:
+    with server.serving() as url, ModelWriter(SocialModelAgents(Endpoint(url, "small-1"))) as writer:
         found = writer.write_all(VARIANT, VIEW, orders)
     assert sorted(isinstance(draft, Draft) for draft in found) == [False, True]
     assert (
@@ -198,7 +204,10 @@ def in_a_row(*script, drafts):
     """What comes of so many drafts that are asked of one model, until it raises."""
     server, found = ChatServer(*script), []
     limits = EndpointLimits(attempts=2, first_wait_s=0.01, timeout_s=5.0)
-    with server.serving() as url, ModelWriter(ModelAgents(Endpoint(url, "small-1", limits=limits))) as writer:
+    with (
+        server.serving() as url,
+        ModelWriter(SocialModelAgents(Endpoint(url, "small-1", limits=limits))) as writer,
+    ):
         for number in range(drafts):
             rng = np.random.default_rng(number)
             found.append(writer.write(VARIANT, VIEW, TaskCategory.PICK_AND_PLACE, "t", rng))
@@ -229,14 +238,14 @@ async def test_a_cast_that_leaves_a_room_empty_is_sent_back():
     with server.serving() as url:
         async with Endpoint(url, "small-1") as endpoint:
             with pytest.raises(UnusableReplyError, match="nobody is ever in"):
-                await ModelAgents(endpoint).cast(everywhere, 0)
+                await SocialModelAgents(endpoint).cast(everywhere, 0)
 
 
 def test_what_a_model_is_told_names_every_thing_that_it_may_use():
     text = FACTS.described()
     assert all(f"- {name} (" in text for name in KNOWN)
     assert all(f"[{room}]" in text for room in VARIANT.rooms)
-    assert all(len(room.things) <= MOST_IN_ROOM for room in FACTS.rooms)
+    assert all(len(room.objects) <= MOST_IN_ROOM for room in FACTS.rooms)
 
 
 def a_door():
@@ -246,32 +255,41 @@ def a_door():
 @pytest.mark.parametrize(
     ("wish", "sentence"),
     [
-        (lambda: RequestedAtom(predicate=Wanted.ONTOP, thing=THING), "it takes a place"),
-        (lambda: RequestedAtom(predicate=Wanted.ONTOP, thing=HOST, place=HOST), "can't be carried"),
+        (lambda: RequestedAtom(predicate=RequestPredicate.ONTOP, thing=THING), "it takes a place"),
+        (lambda: RequestedAtom(predicate=RequestPredicate.ONTOP, thing=HOST, place=HOST), "can't be carried"),
         (
-            lambda: RequestedAtom(predicate=Wanted.ONTOP, thing=THING, place=VIEW.item(THING).host),
+            lambda: RequestedAtom(predicate=RequestPredicate.ONTOP, thing=THING, place=VIEW.item(THING).host),
             "is there already|does not go",
         ),
-        (lambda: RequestedAtom(predicate=Wanted.INSIDE, thing=THING, place=THING), "does not go into"),
         (
-            lambda: RequestedAtom(predicate=Wanted.ONTOP, thing=THING, place=HOST, holds=False),
+            lambda: RequestedAtom(predicate=RequestPredicate.INSIDE, thing=THING, place=THING),
+            "does not go into",
+        ),
+        (
+            lambda: RequestedAtom(predicate=RequestPredicate.ONTOP, thing=THING, place=HOST, holds=False),
             "not where it is not to be",
         ),
-        (lambda: RequestedAtom(predicate=Wanted.OPEN, thing=a_door(), place=HOST), "it takes no place"),
-        (lambda: RequestedAtom(predicate=Wanted.OPEN, thing=a_door(), holds=False), "is so already"),
-        (lambda: RequestedAtom(predicate=Wanted.TOGGLED_ON, thing=HOST), "can't be switched"),
-        (lambda: RequestedAtom(predicate=Wanted.COOKED, thing=HOST), "nothing to cook"),
-        (lambda: RequestedAtom(predicate=Wanted.HOT, thing=HOST, holds=False), "not the contrary"),
+        (
+            lambda: RequestedAtom(predicate=RequestPredicate.OPEN, thing=a_door(), place=HOST),
+            "it takes no place",
+        ),
+        (
+            lambda: RequestedAtom(predicate=RequestPredicate.OPEN, thing=a_door(), holds=False),
+            "is so already",
+        ),
+        (lambda: RequestedAtom(predicate=RequestPredicate.TOGGLED_ON, thing=HOST), "can't be switched"),
+        (lambda: RequestedAtom(predicate=RequestPredicate.COOKED, thing=HOST), "nothing to cook"),
+        (lambda: RequestedAtom(predicate=RequestPredicate.HOT, thing=HOST, holds=False), "not the contrary"),
     ],
 )
 def test_wishes_that_the_scene_does_not_allow_are_told_apart(wish, sentence):
-    request = TaskRequest(instruction="Ann asks for it, please.", wishes=(wish(),))
+    request = TaskRequest(instruction="Ann asks for it, please.", constraints=(wish(),))
     with pytest.raises(ValueError, match=sentence):
         check_request(request, VIEW, KNOWN)
 
 
 def test_a_wish_becomes_a_piece_of_a_goal():
-    piece = piece_of(RequestedAtom(predicate=Wanted.OPEN, thing=a_door(), holds=False), VIEW)
+    piece = conjunct_of(RequestedAtom(predicate=RequestPredicate.OPEN, thing=a_door(), holds=False), VIEW)
     assert piece.goal == Not(Atom("open", (a_door(),)))
     assert piece.signs == (f"not open({VIEW.category(a_door())})",)
 

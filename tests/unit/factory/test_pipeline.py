@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from embomatrix.factory.admission import RefusalReason, objection
+from embomatrix.factory.admission import RefusalReason, plan_failure
 from embomatrix.factory.commands.app import app
 from embomatrix.factory.evaluate.admissions import evaluate_admissions
 from embomatrix.factory.layout.organization import LayoutTree, organize
@@ -366,7 +366,7 @@ def test_tasks_of_conversations_are_proved_by_a_robot_in_physics_and_their_trans
         assert transcript.startswith(f"# {record.task.instruction}\n")
         plan = plan_from_json(list(record.oracle), record.task.profile)
         with contextlib.closing(physical_simulator(dataset.read_bundle(record.bundle_digest))) as robot:
-            assert objection(robot, record.task, plan) == ""
+            assert plan_failure(robot, record.task, plan) == ""
 
 
 def test_several_processes_make_the_same_data_set_as_one(folder, dataset, tmp_path):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from embomatrix.factory.pipeline.task_poses import SceneSurvey
-from embomatrix.factory.scenes.rehearsal import Rehearsal
-from embomatrix.factory.scenes.view import AnyRobot, SceneView
-from embomatrix.factory.social.requests import RequestedAtom, TaskRequest, Wanted, check_request
+from embomatrix.factory.scenes.rehearsal import SimulatedRobot
+from embomatrix.factory.scenes.view import CapableRobot, SceneView
+from embomatrix.factory.social.requests import RequestedAtom, RequestPredicate, TaskRequest, check_request
 from embomatrix.factory.writer.tasks import PlainWriter
 from embomatrix.factory.writer.variant import Variant
 from embomatrix.sim.physical.survey import Foresight
@@ -29,7 +29,7 @@ def parted(home: Scene) -> Scene:
 
 
 def test_what_is_served_from_nowhere_is_neither_fetched_nor_a_place_to_put_things(parted: Scene) -> None:
-    with Rehearsal(parted) as robot:
+    with SimulatedRobot(parted) as robot:
         assert robot.fetches("apple_1")
         assert not robot.fetches("apple_2")
         assert robot.puts("apple_1", Relation.ONTOP, "countertop_1")
@@ -37,7 +37,7 @@ def test_what_is_served_from_nowhere_is_neither_fetched_nor_a_place_to_put_thing
 
 
 def test_what_is_so_already_is_nothing_to_bring_about(home: Scene) -> None:
-    with Rehearsal(home) as robot:
+    with SimulatedRobot(home) as robot:
         assert robot.swings("fridge_1", shut=False)
         assert not robot.swings("fridge_1", shut=True)
         assert robot.switches("stove_1", on=True)
@@ -49,14 +49,14 @@ def test_what_is_so_already_is_nothing_to_bring_about(home: Scene) -> None:
 
 
 def test_what_bars_the_arm_on_the_way_to_a_wish_stands_against_it(home: Scene) -> None:
-    with Rehearsal(home, lambda handled: (Handling.OPEN, "fridge_1") in handled) as robot:
+    with SimulatedRobot(home, lambda handled: (Handling.OPEN, "fridge_1") in handled) as robot:
         assert robot.fetches("apple_1")
         assert not robot.fetches("chicken_leg_1")
         assert not robot.exposes("apple_1", "fridge_1", State.FROZEN)
         assert robot.exposes("apple_1", "microwave_1", State.HOT)
 
 
-class Clumsy(AnyRobot):
+class Clumsy(CapableRobot):
     """Gets hold of nothing but mugs, and switches nothing."""
 
     def fetches(self, thing: str) -> bool:
@@ -99,9 +99,12 @@ def test_a_survey_answers_alike_whatever_was_asked_before(home: Scene) -> None:
 @pytest.mark.parametrize(
     ("wish", "sentence"),
     [
-        (RequestedAtom(predicate=Wanted.TOGGLED_ON, thing="stove_1"), "does not get at stove_1"),
-        (RequestedAtom(predicate=Wanted.HOT, thing="apple_1"), "does not get at apple_1"),
-        (RequestedAtom(predicate=Wanted.ONTOP, thing="mug_1", place="stove_1"), "can't bring mug_1 there"),
+        (RequestedAtom(predicate=RequestPredicate.TOGGLED_ON, thing="stove_1"), "does not get at stove_1"),
+        (RequestedAtom(predicate=RequestPredicate.HOT, thing="apple_1"), "does not get at apple_1"),
+        (
+            RequestedAtom(predicate=RequestPredicate.ONTOP, thing="mug_1", place="stove_1"),
+            "can't bring mug_1 there",
+        ),
     ],
 )
 def test_a_model_is_told_what_the_robot_cannot_do(home: Scene, wish: RequestedAtom, sentence: str) -> None:

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.casting import HOBBIES, NAMES, GrammarRolePlayer
-from embomatrix.factory.social.fitting import is_plausible, themes_of, why_of
+from embomatrix.factory.social.fitting import is_plausible, reasons_for, themes_of
 from embomatrix.factory.social.occasions import Theme, occasion_of, occasions, occasions_in
 from embomatrix.factory.social.phrases import (
     CLAUSES,
@@ -22,9 +22,9 @@ from embomatrix.factory.social.phrases import (
     MATTERS,
     NOUNS,
     TURNS,
-    called,
     room_called,
-    said_once,
+    shorten_repeated_rooms,
+    spoken_category,
 )
 from embomatrix.factory.social.values import ROBOT, Act, Cast, DaySlot, Person
 from embomatrix.factory.social.writer import SocialWriter
@@ -145,8 +145,12 @@ def test_every_way_to_ask_of_the_plain_writer_has_its_own_here():
 
 
 def test_people_call_a_category_by_a_name_that_no_other_has():
-    names = Counter(called(name) for name in Catalog.load().category_names)
-    assert {called(name): names[called(name)] for name in NOUNS if names[called(name)] > 1} == {}
+    names = Counter(spoken_category(name) for name in Catalog.load().category_names)
+    assert {
+        spoken_category(name): names[spoken_category(name)]
+        for name in NOUNS
+        if names[spoken_category(name)] > 1
+    } == {}
     assert set(NOUNS) <= set(Catalog.load().category_names)
 
 
@@ -333,9 +337,9 @@ def test_rooms_are_called_as_people_call_them_and_once_in_a_clause():
             "The lamp in bedroom 1; then the one in bedroom 10.",
         ),
     ):
-        assert said_once(text, view) == once
+        assert shorten_repeated_rooms(text, view) == once
 
 
 def test_the_grammar_gives_no_reasons_for_what_it_did_not_make_up():
-    assert why_of("juggling eels") == ()
-    assert "the chain is off" in why_of("mending a bicycle")
+    assert reasons_for("juggling eels") == ()
+    assert "the chain is off" in reasons_for("mending a bicycle")

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from embomatrix.factory.commands.agents import EVERY
 from embomatrix.factory.commands.app import app
 from embomatrix.factory.layout.agent_interfaces import AgentName
-from embomatrix.factory.social.agent_interfaces import SOCIAL_DOORS, SocialAgent
+from embomatrix.factory.social.agent_interfaces import SOCIAL_AGENTS, SocialAgent
 from embomatrix.factory.social.values import SummaryBrief, TalkBrief
 
 BRIEF = '{"scene": "Rs_int", "seed": 1}'
@@ -30,9 +30,9 @@ def test_every_agent_has_a_name_of_its_own() -> None:
 def test_from_a_scene_to_its_people_to_a_conversation_to_an_instruction() -> None:
     people = run("role-player", BRIEF)
     talk = run("social-simulator", people)
-    told = SOCIAL_DOORS[SocialAgent.SUMMARIZER].read(talk)
+    told = SOCIAL_AGENTS[SocialAgent.SUMMARIZER].read(talk)
     assert isinstance(told, SummaryBrief)
-    assert told.cast == SOCIAL_DOORS[SocialAgent.SIMULATOR].read(people).cast
+    assert told.cast == SOCIAL_AGENTS[SocialAgent.SIMULATOR].read(people).cast
     summary = json.loads(run("summarizer", talk))
     assert summary["wishes"] == [*told.conversation.last_wishes]
     assert any(name in summary["instruction"] for name in told.cast.names)
@@ -46,10 +46,10 @@ def test_a_scene_is_told_room_by_room() -> None:
 
 
 def test_a_language_model_plays_the_people_when_it_is_asked(tmp_path: Path) -> None:
-    cast = SOCIAL_DOORS[SocialAgent.SIMULATOR].read(run("role-player", BRIEF)).cast
+    cast = SOCIAL_AGENTS[SocialAgent.SIMULATOR].read(run("role-player", BRIEF)).cast
     with ChatServer("no", cast.model_dump_json()).serving() as url:
         found = run("role-player", BRIEF, "--llm", url, "--model", "small-1")
-    assert SOCIAL_DOORS[SocialAgent.SIMULATOR].read(found) == TalkBrief(scene="Rs_int", cast=cast, seed=1)
+    assert SOCIAL_AGENTS[SocialAgent.SIMULATOR].read(found) == TalkBrief(scene="Rs_int", cast=cast, seed=1)
 
 
 @pytest.mark.parametrize(

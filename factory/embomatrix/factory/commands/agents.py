@@ -13,9 +13,9 @@ import typer
 from embomatrix.factory.commands.asked_model import Key, Tape, chat_model
 from embomatrix.factory.commands.layout import Llm, Model, mended_layout, modelled_agents
 from embomatrix.factory.commands.terminal import fail
-from embomatrix.factory.layout.agent_interfaces import DOORS, MODELLED, AgentName
-from embomatrix.factory.social.agent_interfaces import SOCIAL_DOORS, SocialAgent, asked
-from embomatrix.factory.social.model_agents import ModelAgents
+from embomatrix.factory.layout.agent_interfaces import LAYOUT_AGENTS, MODEL_BACKED, AgentName
+from embomatrix.factory.social.agent_interfaces import SOCIAL_AGENTS, SocialAgent, answer_with_model
+from embomatrix.factory.social.model_agents import SocialModelAgents
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from embomatrix.factory.layout.agent_interfaces import AgentInterface
 
 EVERY: Final[Mapping[str, AgentInterface]] = {
-    **{name.value: door for name, door in SOCIAL_DOORS.items()},
-    **{name.value: door for name, door in DOORS.items()},
+    **{name.value: door for name, door in SOCIAL_AGENTS.items()},
+    **{name.value: door for name, door in LAYOUT_AGENTS.items()},
 }
 """All agents by name, in the order of their work."""
 
@@ -67,16 +67,16 @@ def _of_model(name: str, brief: Any, url: str, model: str, key: str, cassette: P
 
         async def one() -> Any:
             async with chat_model(url, model, key, cassette) as chat:
-                return await asked(ModelAgents(chat), SocialAgent(name), brief)
+                return await answer_with_model(SocialModelAgents(chat), SocialAgent(name), brief)
 
         return asyncio.run(one())
-    if AgentName(name) not in MODELLED:
-        others = ", ".join([*SocialAgent, *sorted(MODELLED)])
+    if AgentName(name) not in MODEL_BACKED:
+        others = ", ".join([*SocialAgent, *sorted(MODEL_BACKED)])
         fail(f"{name} has no form with a language model: leave out --llm; {others} have one")
     with modelled_agents(url, model, key, cassette) as agents:
         answers: dict[AgentName, Callable[[Any], Any]] = {
             AgentName.DISTRIBUTOR: agents.distribute,
             AgentName.ORGANIZER: lambda value: tuple(agents.organize(value).branches()),
-            AgentName.PLANNER: agents.wish,
+            AgentName.PLANNER: agents.choose_constraints,
         }
         return answers[AgentName(name)](brief)

@@ -27,8 +27,8 @@ from embomatrix.factory.commands.layout import (
 from embomatrix.factory.commands.task_import import app as import_app
 from embomatrix.factory.commands.terminal import fail, mended, progress
 from embomatrix.factory.commands.verification import app as verify_app
-from embomatrix.factory.pipeline.build import BuildSummary, Check, build_dataset
-from embomatrix.factory.pipeline.cluster import ClusterJudge
+from embomatrix.factory.pipeline.build import BuildSummary, VariantCheck, build_dataset
+from embomatrix.factory.pipeline.cluster import ClusterCheck
 from embomatrix.factory.pipeline.export import card, encoded, export_rows
 from embomatrix.factory.pipeline.options import Jobs, Physical, is_proved, processes
 from embomatrix.factory.pipeline.settings import SCENE_EXTRACTOR, BuildSettings, WriterKind, scene_ids
@@ -167,12 +167,14 @@ def generate(
         _print_account(ledger)
 
 
-def _second_judge(stack: contextlib.ExitStack, manager: str, token: str, ca: Path | None) -> Check | None:
+def _second_judge(
+    stack: contextlib.ExitStack, manager: str, token: str, ca: Path | None
+) -> VariantCheck | None:
     """The cluster behind a manager, open as long as the stack is; None where there is none. Raises ClusterError, OSError."""
     if not manager:
         return None
     trusted = ca.read_bytes() if ca is not None else b""
-    return stack.enter_context(ClusterJudge(manager, token, trusted)).check
+    return stack.enter_context(ClusterCheck(manager, token, trusted)).check
 
 
 def _layout(
@@ -209,7 +211,7 @@ def _make(
     settings: BuildSettings,
     writer: TaskWriter | None = None,
     jobs: int | None = None,
-    check: Check | None = None,
+    check: VariantCheck | None = None,
     layout: LayoutAgents | None = None,
 ) -> None:
     """A data set in the folder, with progress and a summary."""

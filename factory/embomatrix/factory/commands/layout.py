@@ -11,7 +11,7 @@ from rich.console import Console
 
 from embomatrix.factory.admission import TaskRefusal
 from embomatrix.factory.commands.asked_model import Key, Tape, model_asked
-from embomatrix.factory.layout.agent_interfaces import DOORS, MODELLED, AgentName, BriefError
+from embomatrix.factory.layout.agent_interfaces import LAYOUT_AGENTS, MODEL_BACKED, AgentName, BriefError
 from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.distribution import DistributionError
 from embomatrix.factory.layout.generator import lay as lay_by_tree
@@ -20,7 +20,7 @@ from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pictures.scene import draw_plan
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.sources import ProblemSourceError, read_activity, read_file
-from embomatrix.factory.task_import.task import Manner, import_problem
+from embomatrix.factory.task_import.task import ImportOptions, import_problem
 from embomatrix.llm.values import LlmError
 from embomatrix.world.bddl import BddlError
 from embomatrix.world.catalog import CatalogError
@@ -28,7 +28,7 @@ from embomatrix.world.catalog import CatalogError
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from embomatrix.factory.layout.request import Layout, Record, RequestedObject
+    from embomatrix.factory.layout.request import Layout, LayoutRecord, RequestedObject
     from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.llm.patience import FailureLimit
 
@@ -79,7 +79,7 @@ def lay(
             kept.append(other(editor, items, seed) if other else lay_by_tree(editor, items, seed, agents))
             return kept[-1]
 
-        imported = import_problem(source, build_base_scene(scene), seed=seed, manner=Manner(laying))
+        imported = import_problem(source, build_base_scene(scene), seed=seed, manner=ImportOptions(laying))
         _hand_out(kept, out)
         if isinstance(imported, TaskRefusal):
             _fail(f"{source.name} is refused ({imported.reason}): {imported.sentence}")
@@ -104,22 +104,22 @@ def _show(layout: Layout) -> None:
         typer.echo(tree.drawn(labels))
     for failure in layout.failures:
         typer.echo(
-            f"left out: {failure.thing} {failure.relation} {failure.host}: {failure.reason}, {failure.detail}"
+            f"left out: {failure.object_name} {failure.relation} {failure.host}: {failure.reason}, {failure.detail}"
         )
 
 
-def _write_briefs(out: Path, record: Record) -> None:
+def _write_briefs(out: Path, record: LayoutRecord) -> None:
     """Every brief as the file that ``factory agent NAME --in`` takes."""
     told = [(AgentName.DISTRIBUTOR, record.distribution[0])] if record.distribution else []
     briefs: list[tuple[AgentName, object]] = [
         *told,
         *((AgentName.ORGANIZER, brief) for brief, _ in record.rooms),
-        *((AgentName.PLANNER, brief) for brief, _ in record.company),
+        *((AgentName.PLANNER, brief) for brief, _ in record.constraints),
         *((AgentName.SOLVER, brief) for brief, _ in record.planes),
     ]
     for number, (name, brief) in enumerate(briefs):
         path = out / f"{number:02d}-{name.value}.json"
-        path.write_bytes(DOORS[name].brief.dump_json(brief, indent=1))
+        path.write_bytes(LAYOUT_AGENTS[name].brief.dump_json(brief, indent=1))
 
 
 def modelled_names(forms: list[str]) -> frozenset[AgentName]:
@@ -130,8 +130,8 @@ def modelled_names(forms: list[str]) -> frozenset[AgentName]:
         if name not in set(AgentName) or kind not in ("llm", "rules"):
             _fail(f"--agent {form!r}: expected NAME=llm or NAME=rules, NAME one of {', '.join(AgentName)}")
         if kind == "llm":
-            if AgentName(name) not in MODELLED:
-                _fail(f"{name} has no form with a language model: {', '.join(sorted(MODELLED))} have one")
+            if AgentName(name) not in MODEL_BACKED:
+                _fail(f"{name} has no form with a language model: {', '.join(sorted(MODEL_BACKED))} have one")
             found.add(AgentName(name))
     return frozenset(found)
 

@@ -16,10 +16,10 @@ from embomatrix.factory.commands.terminal import fail, mended, progress
 from embomatrix.factory.metrics.figures import EvaluationError, evaluation_to_json
 from embomatrix.factory.pipeline.options import Jobs, processes
 from embomatrix.factory.pipeline.settings import scene_ids
-from embomatrix.factory.pipeline.store import LineLog
+from embomatrix.factory.pipeline.store import ResumableLog
 from embomatrix.factory.task_import.batch import Verified
 from embomatrix.factory.task_import.dialects import read_problem
-from embomatrix.factory.task_import.importer import Depth, Docket, judging
+from embomatrix.factory.task_import.importer import Depth, ImportSettings, importing
 from embomatrix.factory.task_import.reach import unreachable_atoms
 from embomatrix.factory.task_import.report import (
     ProblemOutcome,
@@ -109,7 +109,7 @@ def import_(
         if out is not None:
             _check_free(out, depth, outcomes)
         sources = _wanted(_sources(bddl, activity, jsonl, eai), reached_by, solids=solids)
-        docket = Docket(scene_ids(scenes), seed, depth, look_ahead)
+        docket = ImportSettings(scene_ids(scenes), seed, depth, look_ahead)
         log = _taken_up(outcomes, sources, docket)
         made = _judged(console, sources[len(log.outcomes) :], docket, processes(jobs), log)
         admitted = out is None or _written(out, made)
@@ -137,10 +137,10 @@ def _written(out: Path, made: Sequence[ImportedTask | Verified | TaskRefusal]) -
 def _taken_up(
     path: Path | None,
     sources: Sequence[SourceText],
-    docket: Docket,
-) -> LineLog[ProblemOutcome]:
+    docket: ImportSettings,
+) -> ResumableLog[ProblemOutcome]:
     """What is known already of the first of the problems. Raises EvaluationError where a file tells of others."""
-    log = LineLog[ProblemOutcome](path)
+    log = ResumableLog[ProblemOutcome](path)
     told = {
         "seed": docket.seed,
         "depth": docket.depth,
@@ -237,14 +237,14 @@ def _given(bddl: Path | None, activity: str, jsonl: Path | None, eai: Path | Non
 def _judged(
     console: Console,
     sources: Sequence[SourceText],
-    docket: Docket,
+    docket: ImportSettings,
     jobs: int,
-    log: LineLog[ProblemOutcome],
+    log: ResumableLog[ProblemOutcome],
 ) -> list[ImportedTask | Verified | TaskRefusal]:
     """What becomes of these problems, but for those that another process has bound; each is added to the log."""
     made: list[ImportedTask | Verified | TaskRefusal] = []
     done = len(log.outcomes)
-    with progress(console) as bars, judging(docket, min(jobs, len(sources) or 1)) as judge:
+    with progress(console) as bars, importing(docket, min(jobs, len(sources) or 1)) as judge:
         bar = bars.add_task("problems", total=done + len(sources), completed=done)
         for judged in judge(sources):
             log.add(judged.outcome)

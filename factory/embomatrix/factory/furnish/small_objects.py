@@ -191,19 +191,21 @@ _APPLIANCES: Final = frozenset(
 
 
 @functools.cache
-def likes(category: str) -> tuple[str, ...]:
+def preferred_hosts(category: str) -> tuple[str, ...]:
     """Furniture that a thing is put on or in, best first; empty when nothing is known."""
     found = hosts_of(category)
     group = next((group for group, members in MEMBERS.items() if category in members), None)
     return tuple(dict.fromkeys((*found, *_BY_GROUP[group].split()))) if group else found
 
 
-def may_hold(host: str, category: str) -> bool:
+def is_usual_host(host: str, category: str) -> bool:
     """Whether people put such a thing on or in such furniture without a second thought."""
     nothing = HOST_GROUPS.get(host) == frozenset() or host in _APPLIANCES
-    return not nothing and suits(category, host) and (host in likes(category) or host not in NO_HOSTS)
+    return (
+        not nothing and suits(category, host) and (host in preferred_hosts(category) or host not in NO_HOSTS)
+    )
 
 
-def on_appliance(host: str) -> bool:
+def is_appliance_top(host: str) -> bool:
     """Whether the top of such furniture is an appliance's."""
     return host in _APPLIANCES

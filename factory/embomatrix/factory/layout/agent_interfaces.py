@@ -11,22 +11,22 @@ from typing import TYPE_CHECKING, Any, Final
 
 from pydantic import TypeAdapter, ValidationError
 
-from embomatrix.factory.layout.constraints import wish
+from embomatrix.factory.layout.constraints import choose_constraints
 from embomatrix.factory.layout.distribution import distribute
 from embomatrix.factory.layout.organization import organize
 from embomatrix.factory.layout.planar import arrange
 from embomatrix.factory.layout.sampling import ObjectSampler
 from embomatrix.factory.layout.values import (
-    Arranged,
     Branch,
+    ConstraintBrief,
     Distribution,
     DistributionBrief,
     PlacementConstraints,
+    PlaneArrangement,
     PlaneBrief,
-    PlaneCompany,
     RoomBrief,
     SampleBrief,
-    Sampled,
+    SampledPose,
 )
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.editor import PlacementError, SceneEditor
@@ -81,7 +81,7 @@ def _branches(brief: RoomBrief) -> tuple[Branch, ...]:
     return tuple(organize(brief).branches())
 
 
-def sample(brief: SampleBrief) -> Sampled:
+def sample(brief: SampleBrief) -> SampledPose:
     """Sample one pose in a base scene, as the object-level agent does."""
     editor = SceneEditor(build_base_scene(brief.scene, seed=brief.seed))
     sampler = ObjectSampler(editor, np.random.default_rng((brief.seed, 3)))
@@ -89,12 +89,12 @@ def sample(brief: SampleBrief) -> Sampled:
     try:
         name = sampler.add(brief.category, brief.model or None, relation, brief.host)
     except PlacementError as error:
-        return Sampled(reason=error.reason, detail=str(error))
+        return SampledPose(reason=error.reason, detail=str(error))
     pose = editor.objects[name].pose_world_asset
-    return Sampled(name, pose.position_m, pose.quat_xyzw, editor.objects[name].room)
+    return SampledPose(name, pose.position_m, pose.quat_xyzw, editor.objects[name].room)
 
 
-DOORS: Final[Mapping[AgentName, AgentInterface]] = {
+LAYOUT_AGENTS: Final[Mapping[AgentName, AgentInterface]] = {
     AgentName.DISTRIBUTOR: AgentInterface(
         "Scene-level Distribution Agent: a room for each thing",
         TypeAdapter(DistributionBrief),
@@ -109,22 +109,22 @@ DOORS: Final[Mapping[AgentName, AgentInterface]] = {
     ),
     AgentName.PLANNER: AgentInterface(
         "Planar-Level Placement Generator, first half: constraints",
-        TypeAdapter(PlaneCompany),
+        TypeAdapter(ConstraintBrief),
         TypeAdapter(PlacementConstraints),
-        wish,
+        choose_constraints,
     ),
     AgentName.SOLVER: AgentInterface(
         "Planar-Level Placement Generator, second half: spots on a plane",
         TypeAdapter(PlaneBrief),
-        TypeAdapter(tuple[Arranged, ...]),
+        TypeAdapter(tuple[PlaneArrangement, ...]),
         arrange,
     ),
     AgentName.SAMPLER: AgentInterface(
         "Object-level Sampling Agent: a pose in a base scene",
         TypeAdapter(SampleBrief),
-        TypeAdapter(Sampled),
+        TypeAdapter(SampledPose),
         sample,
     ),
 }
-MODELLED: Final = frozenset({AgentName.DISTRIBUTOR, AgentName.ORGANIZER, AgentName.PLANNER})
+MODEL_BACKED: Final = frozenset({AgentName.DISTRIBUTOR, AgentName.ORGANIZER, AgentName.PLANNER})
 """Agents that can be a language model."""

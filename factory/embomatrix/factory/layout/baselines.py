@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.layout.organization import in_order
-from embomatrix.factory.layout.request import Layout, Record, thing_of
+from embomatrix.factory.layout.organization import hosts_first
+from embomatrix.factory.layout.request import Layout, LayoutRecord, object_brief
 from embomatrix.factory.layout.sampling import LIFT_M, ObjectSampler
 from embomatrix.factory.scenes.editor import LayoutReason, PlacementError
 from embomatrix.world.geometry import Pose
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from embomatrix.factory.layout.request import RequestedObject
-    from embomatrix.factory.layout.values import Failure
+    from embomatrix.factory.layout.values import LayoutFailure
     from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.world.asset import Asset
 
 TRIES: Final = 10
 """Samples for one thing: what OmniGibson's own sampler is given in the paper's code."""
-ROUNDED_M: Final = 0.05
+GRID_M: Final = 0.05
 """Poses that are written down are round numbers."""
 SPREAD: Final = 0.3
 """Written poses lie this share of a side around the middle of what they are on."""
@@ -45,7 +45,7 @@ def lay_at_random(editor: SceneEditor, items: Sequence[RequestedObject], seed: i
                 return pose
         raise PlacementError(LayoutReason.NO_FREE_SPOT, f"none of {TRIES} random poses at {host} is free")
 
-    return _laid(editor, items, sampler, rng, first_free)
+    return _lay_each(editor, items, sampler, rng, first_free)
 
 
 def lay_by_poses(editor: SceneEditor, items: Sequence[RequestedObject], seed: int) -> Layout:
@@ -56,12 +56,12 @@ def lay_by_poses(editor: SceneEditor, items: Sequence[RequestedObject], seed: in
         if host not in editor.rooms and host not in editor.objects:
             detail = f"what it is to stand at, {host!r}, has no place itself"
             raise PlacementError(LayoutReason.UNKNOWN_HOST, detail)
-        return _written(editor, asset, relation, host, rng)
+        return _rounded_pose(editor, asset, relation, host, rng)
 
-    return _laid(editor, items, ObjectSampler(editor, rng), rng, written)
+    return _lay_each(editor, items, ObjectSampler(editor, rng), rng, written)
 
 
-def _laid(
+def _lay_each(
     editor: SceneEditor,
     items: Sequence[RequestedObject],
     sampler: ObjectSampler,
@@ -70,20 +70,20 @@ def _laid(
 ) -> Layout:
     """Each thing at the pose that is found for it, or left out with the reason."""
     names: dict[str, str] = {}
-    failures: list[Failure] = []
+    failures: list[LayoutFailure] = []
     for item in _hosts_first(items):
         asset = item.asset(0)
-        relation, host = _demand(editor, item, names, rng)
+        relation, host = _requested_place(editor, item, names, rng)
         try:
             pose = pose_for(asset, relation, host)
         except PlacementError as error:
             failures.append(item.failure(host, error.reason, str(error)))
         else:
             names[item.name] = editor.insert(asset, pose, *sampler.rests(relation, host))
-    return Layout(names, {}, tuple(failures), Record())
+    return Layout(names, {}, tuple(failures), LayoutRecord())
 
 
-def _written(
+def _rounded_pose(
     editor: SceneEditor, asset: Asset, relation: Relation | None, host: str, rng: np.random.Generator
 ) -> Pose:
     """A pose at the host's middle, give or take, at the height that its box suggests."""
@@ -105,16 +105,16 @@ def _written(
 
 
 def _rounded(value: float) -> float:
-    return round(value / ROUNDED_M) * ROUNDED_M
+    return round(value / GRID_M) * GRID_M
 
 
 def _hosts_first(items: Sequence[RequestedObject]) -> Iterator[RequestedObject]:
     by_name = {item.name: item for item in items}
-    for thing in in_order([thing_of(item, item.asset(0), {}) for item in items]):
+    for thing in hosts_first([object_brief(item, item.asset(0), {}) for item in items]):
         yield by_name[thing.name]
 
 
-def _demand(
+def _requested_place(
     editor: SceneEditor, item: RequestedObject, names: dict[str, str], rng: np.random.Generator
 ) -> tuple[Relation | None, str]:
     """What the task demands of an item, in the scene's names; else the floor of a room that it may be in."""

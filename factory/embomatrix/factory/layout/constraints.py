@@ -14,7 +14,12 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.factory.furnish.roles import FurnitureRole, role_of
-from embomatrix.factory.layout.values import Arrangement, Kind, PlacementConstraint, PlacementConstraints
+from embomatrix.factory.layout.values import (
+    ConstraintKind,
+    PlacementClass,
+    PlacementConstraint,
+    PlacementConstraints,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -22,8 +27,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from embomatrix.factory.layout.values import (
+        ConstraintBrief,
         ObjectBrief,
-        PlaneCompany,
         PlaneFootprint,
         Size2,
         Size3,
@@ -33,16 +38,16 @@ if TYPE_CHECKING:
     BoolArray = NDArray[np.bool_]
 
 
-WEIGHTS: Final[Mapping[Arrangement, float]] = {
-    Arrangement.EDGE: 2.0,
-    Arrangement.MIDDLE: 1.0,
-    Arrangement.NEAR: 0.5,
-    Arrangement.FAR: 0.5,
-    Arrangement.IN_FRONT_OF: 0.5,
-    Arrangement.SIDE_OF: 0.5,
-    Arrangement.CENTER_ALIGNED: 1.5,
-    Arrangement.FACE_TO: 1.5,
-    Arrangement.NEXT_TO: 1.5,
+WEIGHTS: Final[Mapping[ConstraintKind, float]] = {
+    ConstraintKind.EDGE: 2.0,
+    ConstraintKind.MIDDLE: 1.0,
+    ConstraintKind.NEAR: 0.5,
+    ConstraintKind.FAR: 0.5,
+    ConstraintKind.IN_FRONT_OF: 0.5,
+    ConstraintKind.SIDE_OF: 0.5,
+    ConstraintKind.CENTER_ALIGNED: 1.5,
+    ConstraintKind.FACE_TO: 1.5,
+    ConstraintKind.NEXT_TO: 1.5,
 }
 EDGE_M: Final = 0.10
 EDGE_SHARE: Final = 0.15
@@ -59,8 +64,8 @@ NEXT_SHARE: Final = 1 / 6
 NEXT_M: Final = (0.05, 0.5)
 """The engine's rule for ``nextto``: a sixth of the mean of the six extents, within these bounds."""
 NEXT_SLACK: Final = 0.8
-"""Round things are farther apart than their boxes: only this much of what the engine allows is used."""
-SHADE: Final = 0.3
+"""Round objects are farther apart than their boxes: only this much of what the engine allows is used."""
+GRADED_SHARE: Final = 0.3
 """How much of a weight is given by degrees, so that what is nearly so counts for more than what is not at all."""
 
 
@@ -103,66 +108,66 @@ def gaps(spots: SpotCandidates, other: PlaneFootprint) -> FloatArray:
 
 
 def near_m(plane_m: Size2) -> float:
-    """How far apart two things on a plane of these sides may be and still be near one another, in metres."""
+    """How far apart two objects on a plane of these sides may be and still be near one another, in metres."""
     return min(NEAR_M, NEAR_SHARE * math.hypot(*plane_m))
 
 
 def holds(
-    wish: PlacementConstraint,
+    constraint: PlacementConstraint,
     spots: SpotCandidates,
     plane_m: Size2,
     size_m: Size3,
     other: PlaneFootprint | None,
 ) -> BoolArray:
-    """At which spots a wish holds, shape (n,). A wish about an object that is not on the plane holds nowhere."""
-    if wish.kind is Arrangement.EDGE:
+    """At which spots a constraint holds, shape (n,). A constraint about an object that is not on the plane holds nowhere."""
+    if constraint.kind is ConstraintKind.EDGE:
         return margins(spots, plane_m) <= min(EDGE_M, EDGE_SHARE * min(plane_m))
-    if wish.kind is Arrangement.MIDDLE:
+    if constraint.kind is ConstraintKind.MIDDLE:
         return np.asarray((np.abs(spots.center) <= MIDDLE_SHARE * np.asarray(plane_m)).all(axis=1))
     if other is None:
         return np.zeros(len(spots), dtype=bool)
-    match wish.kind:
-        case Arrangement.NEAR:
+    match constraint.kind:
+        case ConstraintKind.NEAR:
             return np.asarray(gaps(spots, other) <= near_m(plane_m))
-        case Arrangement.FAR:
+        case ConstraintKind.FAR:
             return np.asarray(gaps(spots, other) > near_m(plane_m))
-        case Arrangement.NEXT_TO:
+        case ConstraintKind.NEXT_TO:
             return _beside(spots, size_m, other)
-        case Arrangement.IN_FRONT_OF:
+        case ConstraintKind.IN_FRONT_OF:
             return np.asarray(_off_front(spots, other) <= FRONT_RAD)
-        case Arrangement.SIDE_OF:
+        case ConstraintKind.SIDE_OF:
             angle = _off_front(spots, other)
             return np.asarray((angle > FRONT_RAD) & (angle < math.pi - FRONT_RAD))
-        case Arrangement.FACE_TO:
+        case ConstraintKind.FACE_TO:
             return np.asarray(_off_gaze(spots, other) <= FACE_RAD)
         case _:
             return np.asarray(_off_axis(spots, other) <= ALIGNED_RAD)
 
 
-def degrees(
-    wish: PlacementConstraint,
+def satisfaction(
+    constraint: PlacementConstraint,
     spots: SpotCandidates,
     plane_m: Size2,
     size_m: Size3,
     other: PlaneFootprint | None,
 ) -> FloatArray:
-    """How far a wish is met, from 0 to 1, shape (n,): falls off gently where it does not hold."""
-    if wish.kind is Arrangement.EDGE:
+    """How far a constraint is met, from 0 to 1, shape (n,): falls off gently where it does not hold."""
+    if constraint.kind is ConstraintKind.EDGE:
         return np.asarray(np.exp(-np.maximum(margins(spots, plane_m), 0.0) / (0.25 * max(plane_m))))
-    if wish.kind is Arrangement.MIDDLE:
+    if constraint.kind is ConstraintKind.MIDDLE:
         return np.asarray(1.0 - np.hypot(*(spots.center / np.asarray(plane_m)).T) * math.sqrt(2))
     if other is None:
         return np.zeros(len(spots))
-    match wish.kind:
-        case Arrangement.NEAR | Arrangement.NEXT_TO:
+    match constraint.kind:
+        case ConstraintKind.NEAR | ConstraintKind.NEXT_TO:
             return np.asarray(np.exp(-gaps(spots, other) / near_m(plane_m)))
-        case Arrangement.FAR:
+        case ConstraintKind.FAR:
             return np.asarray(1.0 - np.exp(-gaps(spots, other) / near_m(plane_m)))
-        case Arrangement.IN_FRONT_OF:
+        case ConstraintKind.IN_FRONT_OF:
             return np.asarray((1.0 + np.cos(_off_front(spots, other))) / 2)
-        case Arrangement.SIDE_OF:
+        case ConstraintKind.SIDE_OF:
             return np.asarray(np.abs(np.sin(_off_front(spots, other))))
-        case Arrangement.FACE_TO:
+        case ConstraintKind.FACE_TO:
             return np.asarray((1.0 + np.cos(_off_gaze(spots, other))) / 2)
         case _:
             return np.asarray(np.cos(_off_axis(spots, other)) ** 8)
@@ -248,48 +253,48 @@ BACKED: Final = frozenset(_BACKED.split())
 """What stands or lies at an edge, out of the way."""
 
 
-def wish(company: PlaneCompany) -> PlacementConstraints:
+def choose_constraints(brief: ConstraintBrief) -> PlacementConstraints:
     """Constraints for each thing of a plane, the most important first; none for what may stand anywhere."""
     return PlacementConstraints(
-        {thing.name: tuple(dict.fromkeys(_wishes(thing, company))) for thing in company.things}
+        {thing.name: tuple(dict.fromkeys(_constraints_for(thing, brief))) for thing in brief.objects}
     )
 
 
-def _wishes(thing: ObjectBrief, company: PlaneCompany) -> Iterator[PlacementConstraint]:
-    others = dict(company.others)
-    rank = company.things.index(thing)
-    before = {**others, **{each.name: each.category for each in company.things[:rank]}}
+def _constraints_for(thing: ObjectBrief, brief: ConstraintBrief) -> Iterator[PlacementConstraint]:
+    others = dict(brief.others)
+    rank = brief.objects.index(thing)
+    before = {**others, **{each.name: each.category for each in brief.objects[:rank]}}
     for other in thing.beside:
-        yield PlacementConstraint(Arrangement.NEXT_TO, other, required=True)
-    if company.on_floor:
+        yield PlacementConstraint(ConstraintKind.NEXT_TO, other, required=True)
+    if brief.on_floor:
         yield from _on_floor(thing, before)
         return
     alike = next((name for name, category in before.items() if category == thing.category), "")
     if alike:
-        yield PlacementConstraint(Arrangement.NEXT_TO, alike)
-        yield PlacementConstraint(Arrangement.CENTER_ALIGNED, alike)
+        yield PlacementConstraint(ConstraintKind.NEXT_TO, alike)
+        yield PlacementConstraint(ConstraintKind.CENTER_ALIGNED, alike)
         return
-    everyone = {**before, **{each.name: each.category for each in company.things[rank + 1 :]}}
+    everyone = {**before, **{each.name: each.category for each in brief.objects[rank + 1 :]}}
     likes = COMPANIONS.get(thing.category, frozenset())
     friend = next((name for name, category in everyone.items() if category in likes), "")
     if friend:
-        yield PlacementConstraint(Arrangement.NEXT_TO, friend)
-        yield PlacementConstraint(Arrangement.SIDE_OF, friend)
+        yield PlacementConstraint(ConstraintKind.NEXT_TO, friend)
+        yield PlacementConstraint(ConstraintKind.SIDE_OF, friend)
         return
-    if company.host in BOARDS and thing.category in CENTREPIECES:
-        yield PlacementConstraint(Arrangement.MIDDLE)
-    elif thing.category in BACKED or (company.host in BOARDS and thing.category in SEATED):
-        yield PlacementConstraint(Arrangement.EDGE)
+    if brief.host in BOARDS and thing.category in CENTREPIECES:
+        yield PlacementConstraint(ConstraintKind.MIDDLE)
+    elif thing.category in BACKED or (brief.host in BOARDS and thing.category in SEATED):
+        yield PlacementConstraint(ConstraintKind.EDGE)
 
 
 def _on_floor(thing: ObjectBrief, before: Mapping[str, str]) -> Iterator[PlacementConstraint]:
     """Seats go to a table, tables stand in the open, the rest at a wall."""
-    role = role_of(thing.category, thing.size_m, 0.0) if thing.kind is Kind.FURNITURE else None
+    role = role_of(thing.category, thing.size_m, 0.0) if thing.kind is PlacementClass.FURNITURE else None
     table = next((name for name, category in before.items() if category in TABLES), "")
     if role is FurnitureRole.SEAT and table:
-        yield PlacementConstraint(Arrangement.FACE_TO, table)
-        yield PlacementConstraint(Arrangement.NEXT_TO, table)
+        yield PlacementConstraint(ConstraintKind.FACE_TO, table)
+        yield PlacementConstraint(ConstraintKind.NEXT_TO, table)
     elif role in (FurnitureRole.LOW_TABLE, FurnitureRole.OPEN) or thing.category in BOARDS:
-        yield PlacementConstraint(Arrangement.MIDDLE)
+        yield PlacementConstraint(ConstraintKind.MIDDLE)
     else:
-        yield PlacementConstraint(Arrangement.EDGE)
+        yield PlacementConstraint(ConstraintKind.EDGE)

@@ -1,6 +1,6 @@
-"""Scene-level Distribution Agent: which room each of a task's things goes to, by rules as in the paper.
+"""Scene-level Distribution Agent: which room each of a task's objects goes to, by rules as in the paper.
 
-What the task says comes first: things that are in a relation to one another are in one room, with the room of what is there
+What the task says comes first: objects that are in a relation to one another are in one room, with the room of what is there
 already. Then the room's function, its furniture, its size, and how much it was given so far decide.
 """
 
@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.furnish.small_objects import belongs, likes, may_hold
-from embomatrix.factory.layout.values import Distribution, Kind
+from embomatrix.factory.furnish.small_objects import belongs, is_usual_host, preferred_hosts
+from embomatrix.factory.layout.values import Distribution, PlacementClass
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -44,7 +44,7 @@ def distribute(brief: DistributionBrief) -> Distribution:
     given: Counter[str] = Counter()
     found: dict[str, str] = {}
     reasons: dict[str, str] = {}
-    for family in families(brief.things):
+    for family in families(brief.objects):
         allowed, why = _allowed(family, brief, rooms)
         scores = {
             name: _score(family, rooms[name], given[name]) + CHANCE * float(rng.random()) for name in allowed
@@ -57,9 +57,9 @@ def distribute(brief: DistributionBrief) -> Distribution:
     return Distribution(found, reasons)
 
 
-def families(things: Sequence[ObjectBrief]) -> list[tuple[ObjectBrief, ...]]:
+def families(objects: Sequence[ObjectBrief]) -> list[tuple[ObjectBrief, ...]]:
     """Things grouped by the relations that the task puts them in, directly or through others: each group in one room."""
-    leader = {thing.name: thing.name for thing in things}
+    leader = {thing.name: thing.name for thing in objects}
 
     def head(name: str) -> str:
         while leader[name] != name:
@@ -67,13 +67,13 @@ def families(things: Sequence[ObjectBrief]) -> list[tuple[ObjectBrief, ...]]:
         return name
 
     anchors: dict[str, str] = {}
-    for thing in things:
+    for thing in objects:
         for other in filter(None, (thing.host, *thing.beside)):
             # what is there already ties together all that the task puts at it
             tied = other if other in leader else anchors.setdefault(other, thing.name)
             leader[head(thing.name)] = head(tied)
     grouped: dict[str, list[ObjectBrief]] = {}
-    for thing in things:
+    for thing in objects:
         grouped.setdefault(head(thing.name), []).append(thing)
     return [tuple(group) for group in grouped.values()]
 
@@ -114,19 +114,19 @@ def _score(family: Sequence[ObjectBrief], room: LayoutRoomFacts, given: int) -> 
 
 def _welcome(thing: ObjectBrief, room: LayoutRoomFacts) -> float:
     """How much of what the thing likes to stand on or in the room has, from 0 to 1; less where it has nothing at all."""
-    if thing.kind is not Kind.GOODS:
+    if thing.kind is not PlacementClass.GOODS:
         return 0.5
     here = set(room.furniture)
-    if not any(may_hold(host, thing.category) for host in here):
+    if not any(is_usual_host(host, thing.category) for host in here):
         return BARE
-    wanted = likes(thing.category)
+    wanted = preferred_hosts(thing.category)
     return max((1.0 - rank / len(wanted) for rank, host in enumerate(wanted) if host in here), default=0.2)
 
 
 def _because(thing: ObjectBrief, room: LayoutRoomFacts) -> str:
-    liked = next((host for host in likes(thing.category) if host in room.furniture), "")
+    liked = next((host for host in preferred_hosts(thing.category) if host in room.furniture), "")
     if liked:
         return f"{room.name} has a {liked}"
     if belongs(thing.category, room.type):
-        return f"such things belong in a {room.type}"
+        return f"such objects belong in a {room.type}"
     return f"{room.name} has room: {room.area_m2:.0f} m2"

@@ -26,7 +26,7 @@ LOW_SKIRT_M: Final = 0.05
 
 
 def rooms_of(editor: SceneEditor) -> tuple[LayoutRoomFacts, ...]:
-    """All rooms of the scene, with the categories of what could hold things there."""
+    """All rooms of the scene, with the categories of what could hold objects there."""
     furniture: dict[str, list[str]] = {name: [] for name in editor.rooms}
     for item in editor.objects.values():
         asset = editor.asset_of(item.name)
@@ -39,19 +39,19 @@ def rooms_of(editor: SceneEditor) -> tuple[LayoutRoomFacts, ...]:
 
 
 def hosts_in(editor: SceneEditor, room: str, named: Container[str] = ()) -> tuple[HostFacts, ...]:
-    """What could hold things in a room: furniture that people put things on or in, and objects that the task names.
+    """What could hold objects in a room: furniture that people put objects on or in, and objects that the task names.
 
     Left out is what the robot can't get at.
     """
-    guests: dict[str, list[str]] = {}
+    contents: dict[str, list[str]] = {}
     for item in editor.objects.values():
         if item.host:
-            guests.setdefault(item.host, []).append(editor.asset_of(item.name).category)
-    return tuple(_hosts(editor, room, named, guests))
+            contents.setdefault(item.host, []).append(editor.asset_of(item.name).category)
+    return tuple(_hosts(editor, room, named, contents))
 
 
 def _hosts(
-    editor: SceneEditor, room: str, named: Container[str], guests: dict[str, list[str]]
+    editor: SceneEditor, room: str, named: Container[str], contents: dict[str, list[str]]
 ) -> Iterator[HostFacts]:
     for item in editor.objects.values():
         asset = editor.asset_of(item.name)
@@ -65,7 +65,7 @@ def _hosts(
         if shut and not given and not editor.view.opens(item.name):
             offers = tuple(offer for offer in offers if offer.relation is not LayoutRelation.INSIDE)
         if offers:
-            yield HostFacts(item.name, asset.category, offers, tuple(guests.get(item.name, ())), shut)
+            yield HostFacts(item.name, asset.category, offers, tuple(contents.get(item.name, ())), shut)
 
 
 def _offers(asset: Asset, base_m: float, *, asked: bool) -> tuple[HostOffer, ...]:

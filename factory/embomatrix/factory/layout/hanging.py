@@ -1,4 +1,4 @@
-"""Where things hang: on walls at their height, clear of doors and windows, and under the ceiling."""
+"""Where objects hang: on walls at their height, clear of doors and windows, and under the ceiling."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Room-level Organization Agent, by rules: what each thing of a room stands on, in or under, as a layout tree.
 
 Hosts are filtered by footprint, height and free height, as in the paper; what is left is ranked by where people keep such
-things, by how much stands there already, and by what has failed before.
+objects, by how much stands there already, and by what has failed before.
 """
 
 from __future__ import annotations
@@ -13,19 +13,32 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from embomatrix.factory.furnish.hosts import NO_HOSTS, kept_behind_doors
-from embomatrix.factory.furnish.small_objects import likes, on_appliance, suits
-from embomatrix.factory.layout.values import MEANS, Branch, Kind, LayoutRelation, RelationMethod
+from embomatrix.factory.furnish.small_objects import is_appliance_top, preferred_hosts, suits
+from embomatrix.factory.layout.values import (
+    RELATION_METHODS,
+    Branch,
+    LayoutRelation,
+    PlacementClass,
+    RelationMethod,
+)
 from embomatrix.factory.scenes.editor import LayoutReason
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from embomatrix.factory.layout.values import Failure, HostFacts, HostOffer, ObjectBrief, RoomBrief, Size3
+    from embomatrix.factory.layout.values import (
+        HostFacts,
+        HostOffer,
+        LayoutFailure,
+        ObjectBrief,
+        RoomBrief,
+        Size3,
+    )
     from embomatrix.world.scene import SceneObject
 
 
-CHANCES: Final = 3
-AFTERWARDS: Final = frozenset({LayoutReason.UNSTABLE, LayoutReason.NOT_AT_HAND})
+MAX_ATTEMPTS: Final = 3
+SPOT_REASONS: Final = frozenset({LayoutReason.UNSTABLE, LayoutReason.NOT_AT_HAND})
 """Reasons that speak against a spot and not against its host."""
 HIGHEST_M: Final = 1.5
 """Nothing is put higher than this: the paper's bound."""
@@ -46,38 +59,38 @@ _FLOOR_GOODS: Final = (
     "tote_bag ashcan recycling_bin trash_can plastic_bin broom mop vacuum watering_can basketball soccer_ball cage "
     "cooler crate"
 )
-FLOOR_GOODS: Final = frozenset(_FLOOR_GOODS.split())
+FLOOR_OBJECTS: Final = frozenset(_FLOOR_GOODS.split())
 """What people put on the floor."""
 SHUT: Final = -0.5
 """Things lie in the open rather than behind doors, unless that is where they are kept."""
 CROWD: Final = 0.12
 COMPANY: Final = 0.35
-"""Equal things stand together."""
+"""Equal objects stand together."""
 CHANCE: Final = 0.45
 
 
 def organize(brief: RoomBrief) -> LayoutTree:
     """A layout tree that holds every thing of the brief for which any host is left; hosts hang on the floor, the root."""
     rng = np.random.default_rng((brief.seed, len(brief.failures), 7))
-    guests = {host.name: Counter(host.guests) for host in brief.hosts}
+    contents = {host.name: Counter(host.contents) for host in brief.hosts}
     hung: dict[str, Branch] = {
         host.name: Branch(brief.room.name, LayoutRelation.ONTOP, host.name) for host in brief.hosts
     }
-    for thing in in_order(brief.things):
+    for thing in hosts_first(brief.objects):
         options = list(choices(brief, thing, hung))
         if not options:
             continue
-        worths = [_worth(brief, thing, branch, guests) for branch in options]
+        worths = [_worth(brief, thing, branch, contents) for branch in options]
         best = options[int(np.argmax(np.asarray(worths) + CHANCE * rng.random(len(options))))]
         hung[thing.name] = best
-        guests.setdefault(best.parent, Counter())[thing.category] += 1
+        contents.setdefault(best.parent, Counter())[thing.category] += 1
     return LayoutTree.of(brief.room.name, hung.values())
 
 
-def in_order(things: Sequence[ObjectBrief]) -> list[ObjectBrief]:
+def hosts_first(objects: Sequence[ObjectBrief]) -> list[ObjectBrief]:
     """Things such that each comes after what the task puts it at, as far as that is one of them; the given order else."""
     order: list[ObjectBrief] = []
-    waiting = list(things)
+    waiting = list(objects)
     while waiting:
         names = {thing.name for thing in waiting}
         ready = next((thing for thing in waiting if not names & {thing.host, *thing.beside}), waiting[0])
@@ -91,7 +104,7 @@ def choices(brief: RoomBrief, thing: ObjectBrief, hung: Mapping[str, Branch]) ->
 
     ``hung`` are the branches of the tree so far, by child.
     """
-    failed = Counter((item.host, item.relation) for item in brief.failures if item.thing == thing.name)
+    failed = Counter((item.host, item.relation) for item in brief.failures if item.object_name == thing.name)
     for branch in _open_choices(brief, thing, hung):
         here = branch.parent == brief.room.name or branch.parent in hung
         if here and failed[branch.parent, branch.relation] < _chances(branch, brief):
@@ -103,34 +116,34 @@ def _chances(branch: Branch, brief: RoomBrief) -> int:
     reasons = {
         item.reason
         for item in brief.failures
-        if (item.thing, item.host, item.relation) == (branch.child, branch.parent, branch.relation)
+        if (item.object_name, item.host, item.relation) == (branch.child, branch.parent, branch.relation)
     }
-    return CHANCES if reasons and reasons <= AFTERWARDS else 1
+    return MAX_ATTEMPTS if reasons and reasons <= SPOT_REASONS else 1
 
 
 def _open_choices(brief: RoomBrief, thing: ObjectBrief, hung: Mapping[str, Branch]) -> Iterator[Branch]:
     floor = Branch(brief.room.name, LayoutRelation.ONTOP, thing.name)
     if thing.relation is not None:
-        if MEANS[thing.relation] is not RelationMethod.NONE:
+        if RELATION_METHODS[thing.relation] is not RelationMethod.NONE:
             yield Branch(thing.host or brief.room.name, thing.relation, thing.name)
         return
     beside = next((hung[other] for other in thing.beside if other in hung), None)
     if beside is not None:
         yield replace(beside, child=thing.name)
         return
-    if thing.kind in (Kind.HUNG, Kind.OVERHEAD):
+    if thing.kind in (PlacementClass.HUNG, PlacementClass.OVERHEAD):
         yield replace(floor, relation=LayoutRelation.ATTACHED)
         return
-    if thing.kind is Kind.GOODS:
+    if thing.kind is PlacementClass.GOODS:
         for host in brief.hosts:
             for offer in host.offers:
-                if offer.relation is not LayoutRelation.UNDER and takes(offer, thing.size_m):
+                if offer.relation is not LayoutRelation.UNDER and fits_offer(offer, thing.size_m):
                     yield Branch(host.name, offer.relation, thing.name)
     yield floor
 
 
-def takes(offer: HostOffer, size_m: Size3) -> bool:
-    """Whether any space of an offer is larger than a thing, turned either way, and no higher than things are put."""
+def fits_offer(offer: HostOffer, size_m: Size3) -> bool:
+    """Whether any space of an offer is larger than a thing, turned either way, and no higher than objects are put."""
     if not LOWEST_M <= offer.height_m <= HIGHEST_M:
         return False
     short, long = sorted(size_m[:2])
@@ -140,11 +153,11 @@ def takes(offer: HostOffer, size_m: Size3) -> bool:
     )
 
 
-def _worth(brief: RoomBrief, thing: ObjectBrief, branch: Branch, guests: Mapping[str, Counter[str]]) -> float:
+def _worth(brief: RoomBrief, thing: ObjectBrief, branch: Branch, contents: Mapping[str, Counter[str]]) -> float:
     host = next((item for item in brief.hosts if item.name == branch.parent), None)
     if host is None:
-        return LIKED if thing.kind is not Kind.GOODS or thing.category in FLOOR_GOODS else FLOOR
-    there = guests[host.name]
+        return LIKED if thing.kind is not PlacementClass.GOODS or thing.category in FLOOR_OBJECTS else FLOOR
+    there = contents[host.name]
     crowd = CROWD * sum(there.values()) - COMPANY * (there[thing.category] > 0)
     tired = sum(item.host == host.name for item in brief.failures)
     return liking(thing.category, host, branch.relation) - crowd - 0.5 * tired
@@ -152,24 +165,24 @@ def _worth(brief: RoomBrief, thing: ObjectBrief, branch: Branch, guests: Mapping
 
 def liking(category: str, host: HostFacts, relation: LayoutRelation) -> float:
     """How much people would have such a thing there."""
-    if category in FLOOR_GOODS or not suits(category, host.category):
+    if category in FLOOR_OBJECTS or not suits(category, host.category):
         return UNSUITED
-    wanted = likes(category)
-    if relation is LayoutRelation.ONTOP and on_appliance(host.category):
+    wanted = preferred_hosts(category)
+    if relation is LayoutRelation.ONTOP and is_appliance_top(host.category):
         worth = UNLIKED
     elif host.category in wanted:
         worth = LIKED - LIKED_STEP * wanted.index(host.category)
     else:
         worth = UNLIKED if host.category in NO_HOSTS else STRANGE
     if relation is LayoutRelation.INSIDE and not kept_behind_doors(category, host.category):
-        worth += UNSUITED if on_appliance(host.category) and host.category not in wanted else SHUT
+        worth += UNSUITED if is_appliance_top(host.category) and host.category not in wanted else SHUT
     return worth
 
 
-def described(failures: Sequence[Failure]) -> str:
+def describe_failures(failures: Sequence[LayoutFailure]) -> str:
     """What has failed, a line each, for people and models."""
     return "\n".join(
-        f"- {item.thing} {item.relation.value} {item.host}: {item.reason.value}, {item.detail}"
+        f"- {item.object_name} {item.relation.value} {item.host}: {item.reason.value}, {item.detail}"
         for item in failures
     )
 

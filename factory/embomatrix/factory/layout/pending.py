@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.furnish.roles import FurnitureRole, role_of
-from embomatrix.factory.layout.request import kind_of
-from embomatrix.factory.layout.values import Failure, Kind, LayoutRelation
+from embomatrix.factory.layout.request import placement_class_of
+from embomatrix.factory.layout.values import LayoutFailure, LayoutRelation, PlacementClass
 from embomatrix.factory.scenes.editor import LayoutReason
 from embomatrix.world.state import Relation
 
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Pose
 
-CLEARED: Final = 3
+MAX_REMOVALS: Final = 3
 """Things of the base scene that are taken away from a full host, for what the task puts there."""
-MOVES: Final = 2
+MAX_MOVES: Final = 2
 """Times that a thing is put elsewhere because the robot does not get at what is on or in it."""
-RESIGNED: Final = 2
+MAX_UNREACHED: Final = 2
 """After so many places at which the robot does not get at a thing, one is taken as it is: verification tells."""
-STANDS_M: Final = 0.05
+FLOOR_CONTACT_M: Final = 0.05
 """What begins below this stands on the floor."""
 MOVABLE: Final = frozenset(
     {
@@ -50,7 +50,7 @@ FAR: Final = frozenset({LayoutReason.OUT_OF_REACH, LayoutReason.NOT_AT_HAND})
 
 
 @dataclass(frozen=True, slots=True)
-class Seat:
+class Support:
     """What a thing was put on, in, under or next to, in the scene's names; without a relation, the floor of a room."""
 
     relation: Relation | None
@@ -58,7 +58,7 @@ class Seat:
 
 
 @dataclass(slots=True)
-class Guest:
+class PendingObject:
     """An item, which of its models is tried, where it is, and why it had no place before."""
 
     item: RequestedObject
@@ -68,8 +68,8 @@ class Guest:
     moved: int = 0
     unreached: int = 0
     crowded: bool = False
-    seat: Seat | None = None
-    last: Failure | None = None
+    support: Support | None = None
+    last_failure: LayoutFailure | None = None
 
     def choose(self, choice: int) -> None:
         """Try another of its models."""
@@ -83,14 +83,14 @@ class Guest:
         )
 
     @property
-    def is_resigned(self) -> bool:
+    def accepts_unreachable(self) -> bool:
         """Whether it is to be taken as it is, though the robot does not get at it."""
-        return self.unreached >= RESIGNED
+        return self.unreached >= MAX_UNREACHED
 
-    def failure(self, room: str) -> Failure:
+    def failure(self, room: str) -> LayoutFailure:
         """Why it found no place in a room."""
-        if self.last is not None:
-            return self.last
+        if self.last_failure is not None:
+            return self.last_failure
         size = " x ".join(f"{extent:.2f}" for extent in self.asset.size_m)
         detail = (
             f"nothing in {room} takes {self.asset.asset_id}, {size} m: try another room or a smaller model"
@@ -98,137 +98,139 @@ class Guest:
         return self.item.failure(self.item.host or room, LayoutReason.NO_HOST, detail)
 
 
-class Seating:
+class PendingObjects:
     """The items of one room: ``waiting`` and ``placed`` by name, ``names`` of the placed in the scene, what failed so far."""
 
     def __init__(self, editor: SceneEditor, room: str, items: Sequence[RequestedObject]) -> None:
         self.names: dict[str, str] = {}
-        self.waiting = {item.name: Guest(item, item.asset(0)) for item in items}
-        self.placed: dict[str, Guest] = {}
-        self.failures: list[Failure] = []
-        self.given_up: list[Failure] = []
+        self.waiting = {item.name: PendingObject(item, item.asset(0)) for item in items}
+        self.placed: dict[str, PendingObject] = {}
+        self.failures: list[LayoutFailure] = []
+        self.abandoned: list[LayoutFailure] = []
         self._editor = editor
         self._room = room
-        self._barring = False
+        self._may_block = False
 
-    def owners(self) -> dict[str, str]:
+    def items_by_scene_name(self) -> dict[str, str]:
         """Placed items by their names in the scene."""
         return {there: name for name, there in self.names.items()}
 
-    def seat(self, name: str, pose: Pose, rests: tuple[Relation | None, str], at: Seat) -> str:
+    def place(self, name: str, pose: Pose, rests: tuple[Relation | None, str], at: Support) -> str:
         """Put a waiting item into the scene at a pose, and return its name there. ``rests`` is what it is on or in."""
-        guest = self.placed[name] = self.waiting.pop(name)
-        guest.seat = at
-        self.names[name] = self._editor.insert(guest.asset, pose, *rests, self._room)
+        pending = self.placed[name] = self.waiting.pop(name)
+        pending.support = at
+        self.names[name] = self._editor.insert(pending.asset, pose, *rests, self._room)
         return self.names[name]
 
-    def refuse(
+    def record_failure(
         self, name: str, relation: LayoutRelation, host: str, reason: LayoutReason, detail: str
     ) -> None:
         """Keep why a waiting item can't be at a host."""
-        failure = Failure(name, relation, host, reason, detail)
-        guest = self.waiting[name]
-        guest.last = failure
-        guest.crowded |= reason in CROWDED
+        failure = LayoutFailure(name, relation, host, reason, detail)
+        pending = self.waiting[name]
+        pending.last_failure = failure
+        pending.crowded |= reason in CROWDED
         self.failures.append(failure)
 
-    def unseat(self, name: str, reason: LayoutReason, detail: str) -> None:
+    def withdraw(self, name: str, reason: LayoutReason, detail: str) -> None:
         """Take a placed item out again, with all that rests on it, and keep why it can't be there."""
-        item, seat = self._editor.known(self.names[name]), self.placed[name].seat
+        item, seat = self._editor.known(self.names[name]), self.placed[name].support
         if seat is not None and seat.relation is Relation.UNDER:
             relation, host = LayoutRelation.UNDER, seat.host
         else:
             relation = LayoutRelation(item.relation.value) if item.relation else LayoutRelation.ONTOP
             host = item.host or self._room
-        self._take_out(name)
-        self.refuse(name, relation, host, reason, detail)
+        self._remove(name)
+        self.record_failure(name, relation, host, reason, detail)
 
     def next_model(self, name: str) -> None:
         """Try an item with its next model, as if nothing had been tried; give it up after the last, if nothing makes way."""
-        guest = self.waiting[name]
-        if guest.choice + 1 < len(guest.item.models):
-            guest.choose(guest.choice + 1)
+        pending = self.waiting[name]
+        if pending.choice + 1 < len(pending.item.models):
+            pending.choose(pending.choice + 1)
             self._forget((name,))
-        elif self.waiting.keys() & {guest.item.host, *guest.item.beside}:
+        elif self.waiting.keys() & {pending.item.host, *pending.item.beside}:
             return  # what it is to stand at has no place yet
-        elif not any(way(guest) for way in (self.offer_another, self._narrow, self._bar, self._make_room)):
+        elif not any(way(pending) for way in (self.replace_host, self._shrink_sibling, self._allow_blocking, self._remove_spare)):
             del self.waiting[name]
-            self.given_up.append(guest.failure(self._room))
+            self.abandoned.append(pending.failure(self._room))
 
-    def offer_another(self, guest: Guest) -> bool:
+    def replace_host(self, pending: PendingObject) -> bool:
         """Exchange what an item is to be at for its next model, or put it elsewhere; False where it is not of the task."""
-        host = self.placed.get(guest.item.host)
+        host = self.placed.get(pending.item.host)
         if host is None:
             return False
         if host.choice + 1 < len(host.item.models):
-            self._exchange(host)
+            self._replace_host_model(host)
             return True
-        if guest.last is None or guest.last.reason not in FAR or host.moved == MOVES:
+        if pending.last_failure is None or pending.last_failure.reason not in FAR or host.moved == MAX_MOVES:
             return False
         host.moved += 1
-        detail = f"the robot gets at nothing {guest.last.relation.value} it there"
-        self.unseat(host.item.name, LayoutReason.NOT_AT_HAND, detail)
-        self._start_anew(host)
+        detail = f"the robot gets at nothing {pending.last_failure.relation.value} it there"
+        self.withdraw(host.item.name, LayoutReason.NOT_AT_HAND, detail)
+        self._restart_others(host)
         return True
 
-    def _exchange(self, host: Guest) -> None:
-        self._take_out(host.item.name)
-        self._start_anew(host)
+    def _replace_host_model(self, host: PendingObject) -> None:
+        self._remove(host.item.name)
+        self._restart_others(host)
         self.next_model(host.item.name)
 
-    def _start_anew(self, host: Guest) -> None:
+    def _restart_others(self, host: PendingObject) -> None:
         """All that waits but one is tried with its first model, as if nothing had been tried."""
         others = [name for name in self.waiting if name != host.item.name]
         for name in others:
             self.waiting[name].choose(0)
         self._forget(others)
 
-    def _narrow(self, guest: Guest) -> bool:
+    def _shrink_sibling(self, pending: PendingObject) -> bool:
         """Exchange the widest other thing at a full host that the task demands for the narrowest model; False without one."""
-        if guest.last is None or guest.last.reason not in FULL or not guest.item.host:
+        if pending.last_failure is None or pending.last_failure.reason not in FULL or not pending.item.host:
             return False
         others = [
             other
             for other in self.placed.values()
-            if (other.item.host, other.item.relation) == (guest.item.host, guest.item.relation)
+            if (other.item.host, other.item.relation) == (pending.item.host, pending.item.relation)
             and other.choice + 1 < len(other.item.models)
         ]
         if not others:
             return False
         widest = max(others, key=lambda other: math.prod(other.asset.size_m[:2]))
-        self._take_out(widest.item.name)
+        self._remove(widest.item.name)
         widest.choose(widest.narrowest(widest.choice + 1))
-        guest.choose(0)
-        self._forget((guest.item.name, widest.item.name))
+        pending.choose(0)
+        self._forget((pending.item.name, widest.item.name))
         return True
 
-    def make_way(self, guest: Guest) -> bool:
+    def clear_floor(self, pending: PendingObject) -> bool:
         """Take the largest spare piece of furniture off a floor where the robot does not get at an item; False without one."""
-        if not self._is_on_floor(guest):
+        if not self._is_on_floor(pending):
             return False
-        guest.crowded = True
-        return self._make_room(guest)
+        pending.crowded = True
+        return self._remove_spare(pending)
 
-    def _make_room(self, guest: Guest) -> bool:
+    def _remove_spare(self, pending: PendingObject) -> bool:
         """Take the largest spare thing from a full host that the task demands, or from a full floor; False without one."""
-        host = self.names.get(guest.item.host, guest.item.host)
-        if not guest.crowded or guest.cleared == CLEARED:
+        host = self.names.get(pending.item.host, pending.item.host)
+        if not pending.crowded or pending.cleared == MAX_REMOVALS:
             return False
-        spare = self._furniture() if self._is_on_floor(guest) else self._loose_on(host) if host else []
+        spare = self._removable_furniture() if self._is_on_floor(pending) else self._loose_on(host) if host else []
         if not spare:
             return False
         self._editor.remove(max(spare, key=lambda name: math.prod(self._editor.box_of(name).size_m)))
-        guest.cleared += 1
-        self._try_again(guest)
+        pending.cleared += 1
+        self._restart(pending)
         return True
 
-    def _is_on_floor(self, guest: Guest) -> bool:
+    def _is_on_floor(self, pending: PendingObject) -> bool:
         """Whether an item is to stand on the room's floor."""
-        host = guest.item.host
-        return host in self._editor.rooms or (not host and kind_of(guest.asset) is Kind.FURNITURE)
+        host = pending.item.host
+        return host in self._editor.rooms or (
+            not host and placement_class_of(pending.asset) is PlacementClass.FURNITURE
+        )
 
     def _loose_on(self, host: str) -> list[str]:
-        """Loose things at a host that the task is not about."""
+        """Loose objects at a host that the task is not about."""
         editor = self._editor
         return [
             name
@@ -236,7 +238,7 @@ class Seating:
             if item.host == host and not item.fixed and editor.is_spare(name)
         ]
 
-    def _furniture(self) -> list[str]:
+    def _removable_furniture(self) -> list[str]:
         """What stands on the room's floor, with nothing on or over it that the task is about, and is not built in."""
         editor = self._editor
         return [
@@ -245,38 +247,38 @@ class Seating:
             if item.room == self._room
             and not item.host
             and editor.is_spare(name)
-            and editor.box_of(name).low_m[2] < STANDS_M
+            and editor.box_of(name).low_m[2] < FLOOR_CONTACT_M
             and _is_movable(editor.asset_of(name))
         ]
 
-    def _bar(self, guest: Guest) -> bool:
+    def _allow_blocking(self, pending: PendingObject) -> bool:
         """Let what must stand on a narrow floor bar the robot's way to what the task is not about; False once it may."""
-        if guest.last is None or guest.last.reason is not LayoutReason.BARS_THE_WAY or self._barring:
+        if pending.last_failure is None or pending.last_failure.reason is not LayoutReason.BARS_THE_WAY or self._may_block:
             return False
-        self._barring = True
+        self._may_block = True
         editor = self._editor
         editor.given_up.update(
             name for name, item in editor.objects.items() if item.room == self._room and editor.is_spare(name)
         )
-        self._try_again(guest)
+        self._restart(pending)
         return True
 
-    def _try_again(self, guest: Guest) -> None:
+    def _restart(self, pending: PendingObject) -> None:
         """With its first model, as if nothing had been tried."""
-        guest.choose(0)
-        guest.crowded = False
-        self._forget((guest.item.name,))
+        pending.choose(0)
+        pending.crowded = False
+        self._forget((pending.item.name,))
 
-    def _take_out(self, name: str) -> None:
+    def _remove(self, name: str) -> None:
         """Remove an item from the scene, with all that rests on it: they wait again."""
-        owners = self.owners()
+        items_by_scene_name = self.items_by_scene_name()
         for gone in self._editor.remove(self.names[name]):
-            owner = owners[gone]
+            owner = items_by_scene_name[gone]
             del self.names[owner]
             self.waiting[owner] = self.placed.pop(owner)
 
     def _forget(self, names: Sequence[str]) -> None:
-        self.failures = [failure for failure in self.failures if failure.thing not in names]
+        self.failures = [failure for failure in self.failures if failure.object_name not in names]
 
 
 def _is_movable(asset: Asset) -> bool:

@@ -1,7 +1,7 @@
-"""Planar-Level Placement Generator: several things on one plane, by a grid of spots and a beam search.
+"""Planar-Level Placement Generator: several objects on one plane, by a grid of spots and a beam search.
 
-Two constraints are hard, as in the paper: a thing meets nothing, and the robot can stand where it reaches it. Required wishes
-are hard as well; the others add their weights to a score. Boxes around turned footprints stand for the things: what is found
+Two constraints are hard, as in the paper: a thing meets nothing, and the robot can stand where it reaches it. Required constraints
+are hard as well; the others add their weights to a score. Boxes around turned footprints stand for the objects: what is found
 free is free, what is found taken may not be.
 """
 
@@ -14,18 +14,18 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.factory.layout.constraints import (
-    SHADE,
+    GRADED_SHARE,
     WEIGHTS,
     SpotCandidates,
-    degrees,
     gaps,
     half_extents,
     holds,
     margins,
+    satisfaction,
 )
 from embomatrix.factory.layout.values import (
-    Arranged,
-    Arrangement,
+    ConstraintKind,
+    PlaneArrangement,
     PlaneBrief,
     PlaneFootprint,
     PlaneSpot,
@@ -61,7 +61,7 @@ BACK: Final = 1.5
 CHANCE: Final = 0.25
 """Scores vary by this much, so that not every table looks the same."""
 LEFT_OUT: Final = 6.0
-"""A thing without a spot costs more than any wish."""
+"""A thing without a spot costs more than any constraint."""
 BATCH: Final = 96
 """Spots whose reach is looked at together, the best first."""
 SCANNED: Final = 12 * BATCH
@@ -77,20 +77,20 @@ class _Beam:
     left_out: tuple[tuple[str, LayoutReason], ...] = ()
 
 
-def arrange(brief: PlaneBrief) -> tuple[Arranged, ...]:
-    """Joint arrangements of the brief's things, the best first; each says what it left out. At least one."""
+def arrange(brief: PlaneBrief) -> tuple[PlaneArrangement, ...]:
+    """Joint arrangements of the brief's objects, the best first; each says what it left out. At least one."""
     grown = [_Beam()]
-    for thing in _in_order(brief.things):
+    for thing in _in_order(brief.objects):
         grown = sorted(
             (child for beam in grown[:BEAMS] for child in _grown(brief, thing, beam)),
             key=lambda beam: -beam.score,
         )
-    return tuple(Arranged(beam.spots, beam.score, dict(beam.left_out)) for beam in grown[:RESULTS])
+    return tuple(PlaneArrangement(beam.spots, beam.score, dict(beam.left_out)) for beam in grown[:RESULTS])
 
 
-def _in_order(things: Sequence[PlaneThing]) -> list[PlaneThing]:
-    """The largest first, but none before what its wishes are about."""
-    waiting = sorted(things, key=lambda thing: -thing.size_m[0] * thing.size_m[1])
+def _in_order(objects: Sequence[PlaneThing]) -> list[PlaneThing]:
+    """The largest first, but none before what its constraints are about."""
+    waiting = sorted(objects, key=lambda thing: -thing.size_m[0] * thing.size_m[1])
     order: list[PlaneThing] = []
     while waiting:
         left = {thing.name for thing in waiting}
@@ -98,7 +98,7 @@ def _in_order(things: Sequence[PlaneThing]) -> list[PlaneThing]:
             (
                 thing
                 for thing in waiting
-                if not any(wish.other in left - {thing.name} for wish in thing.wishes)
+                if not any(constraint.other in left - {thing.name} for constraint in thing.constraints)
             ),
             waiting[0],
         )
@@ -146,8 +146,8 @@ class _Search:
         spots = spots.at(~self._taken(spots))
         if not len(spots):
             return LayoutReason.NO_FREE_SPOT
-        held = [self._holds(number, spots) for number in range(len(self._thing.wishes))]
-        needed = [row for row, wish in zip(held, self._thing.wishes, strict=True) if wish.required]
+        held = [self._holds(number, spots) for number in range(len(self._thing.constraints))]
+        needed = [row for row, constraint in zip(held, self._thing.constraints, strict=True) if constraint.required]
         if needed:
             fits = np.logical_and.reduce(needed)
             spots, held = spots.at(fits), [row[fits] for row in held]
@@ -156,21 +156,21 @@ class _Search:
         return self._chosen(spots, held, self._scores(spots, held))
 
     def _candidates(self) -> SpotCandidates:
-        """Grid points, with lines through the middles of what wishes are about, at all turns; gazes at what is to be faced."""
+        """Grid points, with lines through the middles of what constraints are about, at all turns; gazes at what is to be faced."""
         brief = self._brief
         width, depth = brief.size_m
         most = FLOOR_CELLS if brief.on_floor else SURFACE_CELLS
         step = max(STEP_M[brief.on_floor], math.sqrt(width * depth / most))
-        about = [self._others[w.other] for w in self._thing.wishes if w.other in self._others]
+        about = [self._others[w.other] for w in self._thing.constraints if w.other in self._others]
         xs, ys = (
             np.unique(np.concatenate([_line(extent, step), [item.center_m[axis] for item in about]]))
             for axis, extent in enumerate((width, depth))
         )
         points = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2)  # (k, 2)
         gazes = [
-            np.arctan2(*(np.asarray(self._others[wish.other].center_m) - points).T[::-1])
-            for wish in self._thing.wishes
-            if wish.kind is Arrangement.FACE_TO and wish.other in self._others
+            np.arctan2(*(np.asarray(self._others[constraint.other].center_m) - points).T[::-1])
+            for constraint in self._thing.constraints
+            if constraint.kind is ConstraintKind.FACE_TO and constraint.other in self._others
         ]
         turns = TURNS if self._thing.has_front else TURNS[:2]
         yaws = np.concatenate([*(np.full(len(points), turn) for turn in turns), *gazes])
@@ -193,23 +193,23 @@ class _Search:
         return np.asarray(meets.any(axis=1))
 
     def _holds(self, number: int, spots: SpotCandidates) -> BoolArray:
-        wish = self._thing.wishes[number]
-        other = self._others.get(wish.other)
-        return holds(wish, spots, self._brief.size_m, self._thing.size_m, other)
+        constraint = self._thing.constraints[number]
+        other = self._others.get(constraint.other)
+        return holds(constraint, spots, self._brief.size_m, self._thing.size_m, other)
 
     def _scores(self, spots: SpotCandidates, held: Sequence[BoolArray]) -> FloatArray:
         brief, thing = self._brief, self._thing
         score = CHANCE * self._rng.random(len(spots))
-        kinds = {wish.kind for wish in thing.wishes}
-        for wish, row in zip(thing.wishes, held, strict=True):
-            shade = degrees(wish, spots, brief.size_m, thing.size_m, self._others.get(wish.other))
-            score += WEIGHTS[wish.kind] * ((1 - SHADE) * row + SHADE * shade)
-        if Arrangement.EDGE not in kinds:
+        kinds = {constraint.kind for constraint in thing.constraints}
+        for constraint, row in zip(thing.constraints, held, strict=True):
+            shade = satisfaction(constraint, spots, brief.size_m, thing.size_m, self._others.get(constraint.other))
+            score += WEIGHTS[constraint.kind] * ((1 - GRADED_SHARE) * row + GRADED_SHARE * shade)
+        if ConstraintKind.EDGE not in kinds:
             score += COMFORT * np.minimum(margins(spots, brief.size_m) / COMFORT_M, 1.0)
         nearest = [gaps(spots, item) for item in self._others.values()]
         if nearest:
             score += COMFORT * np.minimum(np.min(nearest, axis=0) / COMFORT_M, 1.0)
-        if thing.has_front and Arrangement.FACE_TO not in kinds:
+        if thing.has_front and ConstraintKind.FACE_TO not in kinds:
             looks = _inwards(spots, brief.size_m) if brief.on_floor else np.cos(spots.yaw)
             score += (BACK if brief.on_floor else FRONT) * (looks > 0.9)
         elif not thing.has_front and not brief.on_floor:
@@ -229,7 +229,7 @@ class _Search:
                 x, y = spots.center[row].tolist()
                 if any(math.hypot(x - s.center_m[0], y - s.center_m[1]) < apart for s, _ in chosen):
                     continue
-                kept = tuple(w for w, h in zip(self._thing.wishes, held, strict=True) if h[row])
+                kept = tuple(w for w, h in zip(self._thing.constraints, held, strict=True) if h[row])
                 chosen.append(
                     (PlaneSpot(self._thing.name, (x, y), float(spots.yaw[row]), kept), float(scores[row]))
                 )

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Aabb
 
-STANDS: Final = 72
+MAX_STANDS: Final = 72
 """Spots for the robot that a brief holds at most: more add nothing but time."""
 LOWEST_M: Final = 0.05
 HIGHEST_M: Final = 1.75
@@ -38,7 +38,7 @@ _IDENTITY: Final = Pose((0.0, 0.0, 0.0))
 
 @dataclass(frozen=True, slots=True)
 class Plane:
-    """A rectangle that things can stand on; ``pose`` is its middle's, in the world, x and y along its sides.
+    """A rectangle that objects can stand on; ``pose`` is its middle's, in the world, x and y along its sides.
 
     ``host`` is the object whose surface it is, empty for the floor of ``room``.
     """
@@ -86,20 +86,20 @@ def planes_of(editor: SceneEditor, host: str) -> list[Plane]:
 def brief_for(
     editor: SceneEditor,
     plane: Plane,
-    things: Sequence[tuple[ObjectBrief, Asset]],
-    wishes: Mapping[str, tuple[PlacementConstraint, ...]],
+    objects: Sequence[tuple[ObjectBrief, Asset]],
+    constraints: Mapping[str, tuple[PlacementConstraint, ...]],
     seed: int,
 ) -> PlaneBrief:
-    """What the planar generator is told of a plane, as things stand. Wishes name objects as the scene does."""
+    """What the planar generator is told of a plane, as objects stand. Wishes name objects as the scene does."""
     width, depth = plane.size_m
     return PlaneBrief(
         plane=plane.name,
         size_m=(width, depth),
-        things=tuple(
-            PlaneThing(thing.name, _extent(asset), wishes.get(thing.name, ()), thing.has_front)
-            for thing, asset in things
+        objects=tuple(
+            PlaneThing(thing.name, _extent(asset), constraints.get(thing.name, ()), thing.has_front)
+            for thing, asset in objects
         ),
-        obstacles=tuple(_obstacles(editor, plane, max((a.size_m[2] for _, a in things), default=0.0))),
+        obstacles=tuple(_obstacles(editor, plane, max((a.size_m[2] for _, a in objects), default=0.0))),
         zones=tuple(_zones(editor, plane)) if plane.on_floor else (),
         stands=() if plane.on_floor else _stands(editor, plane),
         rim_m=min(FLOOR_RIM_M if plane.on_floor else RIM_M, min(width, depth) / 20),
@@ -125,7 +125,7 @@ def pose_at(
     return plane.pose @ local
 
 
-def company_on(editor: SceneEditor, plane: Plane) -> tuple[tuple[str, str], ...]:
+def objects_on(editor: SceneEditor, plane: Plane) -> tuple[tuple[str, str], ...]:
     """Names and categories of the objects that stand on a plane already."""
     if plane.on_floor:
         names = [n for n, item in editor.objects.items() if item.room == plane.room and not item.host]
@@ -186,5 +186,5 @@ def _stands(editor: SceneEditor, plane: Plane) -> tuple[Size2, ...]:
     local = (cells - (x, y)) @ turn  # rows times the rotation are its inverse applied to columns
     if editor.asset_of(plane.host).joints:
         local = local[local[:, 0] > 0.0]
-    step = max(1, len(local) // STANDS)
-    return tuple((float(a), float(b)) for a, b in local[step // 2 :: step][:STANDS])
+    step = max(1, len(local) // MAX_STANDS)
+    return tuple((float(a), float(b)) for a, b in local[step // 2 :: step][:MAX_STANDS])

@@ -7,21 +7,21 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.furnish.roles import FurnitureRole, role_of
-from embomatrix.factory.layout.constraints import wish
+from embomatrix.factory.layout.constraints import choose_constraints
 from embomatrix.factory.layout.distribution import distribute
 from embomatrix.factory.layout.organization import organize
 from embomatrix.factory.layout.planar import arrange
 from embomatrix.factory.layout.values import (
-    Arranged,
+    ConstraintBrief,
     Distribution,
     DistributionBrief,
-    Failure,
-    Kind,
+    LayoutFailure,
     LayoutRelation,
     ObjectBrief,
+    PlacementClass,
     PlacementConstraints,
+    PlaneArrangement,
     PlaneBrief,
-    PlaneCompany,
     RoomBrief,
 )
 from embomatrix.world.catalog import Catalog
@@ -37,16 +37,16 @@ _FRONTED: Final = (
     "alarm_clock picture_frame radio laptop monitor microwave toaster toaster_oven coffee_maker printer standing_tv "
     "cash_register desk_phone digital_camera loudspeaker table_lamp keyboard teddy_bear"
 )
-FRONTED: Final = frozenset(_FRONTED.split())
-"""Small things and appliances of which it matters where their front looks; of furniture it always does."""
+HAS_FRONT: Final = frozenset(_FRONTED.split())
+"""Small objects and appliances of which it matters where their front looks; of furniture it always does."""
 
 
 _KINDS: Final = {
-    FurnitureRole.SURFACE: Kind.GOODS,
-    FurnitureRole.FITTED: Kind.GOODS,
-    FurnitureRole.WALL: Kind.HUNG,
-    FurnitureRole.HUNG_CABINET: Kind.HUNG,
-    FurnitureRole.CEILING: Kind.OVERHEAD,
+    FurnitureRole.SURFACE: PlacementClass.GOODS,
+    FurnitureRole.FITTED: PlacementClass.GOODS,
+    FurnitureRole.WALL: PlacementClass.HUNG,
+    FurnitureRole.HUNG_CABINET: PlacementClass.HUNG,
+    FurnitureRole.CEILING: PlacementClass.OVERHEAD,
 }
 """Roles of what does not stand on the floor."""
 
@@ -70,14 +70,14 @@ class RequestedObject:
         """The asset of one of its models. Raises IndexError beyond the last one."""
         return build_asset(Catalog.load(), *self.models[choice])
 
-    def failure(self, host: str, reason: LayoutReason, detail: str) -> Failure:
+    def failure(self, host: str, reason: LayoutReason, detail: str) -> LayoutFailure:
         """That it found no place at ``host``, in the relation that the task demands or else on top."""
-        return Failure(self.name, self.relation or LayoutRelation.ONTOP, host, reason, detail)
+        return LayoutFailure(self.name, self.relation or LayoutRelation.ONTOP, host, reason, detail)
 
 
-def thing_of(item: RequestedObject, asset: Asset, names: Mapping[str, str]) -> ObjectBrief:
+def object_brief(item: RequestedObject, asset: Asset, names: Mapping[str, str]) -> ObjectBrief:
     """An item as agents see it; ``names`` are those in the scene of what was placed already."""
-    kind = kind_of(asset)
+    kind = placement_class_of(asset)
     x, y, z = asset.size_m
     return ObjectBrief(
         name=item.name,
@@ -87,14 +87,14 @@ def thing_of(item: RequestedObject, asset: Asset, names: Mapping[str, str]) -> O
         relation=item.relation,
         host=names.get(item.host, item.host),
         beside=tuple(names.get(other, other) for other in item.beside),
-        has_front=kind is Kind.FURNITURE or asset.category in FRONTED,
+        has_front=kind is PlacementClass.FURNITURE or asset.category in HAS_FRONT,
         kind=kind,
     )
 
 
-def kind_of(asset: Asset) -> Kind:
+def placement_class_of(asset: Asset) -> PlacementClass:
     """Where such a thing belongs, by its role in the furnishing of rooms."""
-    return _KINDS.get(role_of(asset.category, asset.size_m, asset.mass_kg), Kind.FURNITURE)
+    return _KINDS.get(role_of(asset.category, asset.size_m, asset.mass_kg), PlacementClass.FURNITURE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,20 +105,20 @@ class LayoutAgents:
     """Scene-level Distribution Agent."""
     organize: Callable[[RoomBrief], LayoutTree] = organize
     """Room-level Organization Agent."""
-    wish: Callable[[PlaneCompany], PlacementConstraints] = wish
+    choose_constraints: Callable[[ConstraintBrief], PlacementConstraints] = choose_constraints
     """Planar-Level Placement Generator: which constraints."""
-    arrange: Callable[[PlaneBrief], tuple[Arranged, ...]] = arrange
+    arrange: Callable[[PlaneBrief], tuple[PlaneArrangement, ...]] = arrange
     """Planar-Level Placement Generator: the solver."""
 
 
 @dataclass(slots=True)
-class Record:
+class LayoutRecord:
     """All that the agents were asked and answered, in order: for people, and for running an agent again alone."""
 
     distribution: tuple[DistributionBrief, Distribution] | None = None
     rooms: list[tuple[RoomBrief, LayoutTree]] = field(default_factory=list)
-    company: list[tuple[PlaneCompany, PlacementConstraints]] = field(default_factory=list)
-    planes: list[tuple[PlaneBrief, tuple[Arranged, ...]]] = field(default_factory=list)
+    constraints: list[tuple[ConstraintBrief, PlacementConstraints]] = field(default_factory=list)
+    planes: list[tuple[PlaneBrief, tuple[PlaneArrangement, ...]]] = field(default_factory=list)
     planar_s: dict[str, float] = field(default_factory=dict)
     """Seconds of CPU that the planar solver took, by room."""
     settled: int = 0
@@ -129,11 +129,11 @@ class Record:
 class Layout:
     """What came of a layout: names in the scene by item, trees by room in those names, and a failure for each item left out.
 
-    ``out_of_hand`` tells of items that were given a place at which the robot does not get at them, as no better one was found.
+    ``unreachable`` tells of items that were given a place at which the robot does not get at them, as no better one was found.
     """
 
     names: Mapping[str, str]
     trees: Mapping[str, LayoutTree]
-    failures: tuple[Failure, ...]
-    record: Record
-    out_of_hand: tuple[Failure, ...] = ()
+    failures: tuple[LayoutFailure, ...]
+    record: LayoutRecord
+    unreachable: tuple[LayoutFailure, ...] = ()

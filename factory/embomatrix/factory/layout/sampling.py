@@ -1,4 +1,4 @@
-"""Object-level Sampling Agent: continuous poses on, in, under and beside things, each free, in reach and barring nothing."""
+"""Object-level Sampling Agent: continuous poses on, in, under and beside objects, each free, in reach and barring nothing."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 
 TRIES: Final = 64
 PACKING_GAP_M: Final = 0.004
-"""Between things that are packed side by side."""
+"""Between objects that are packed side by side."""
 FLOOR_TRIES: Final = 200
-PEEPING: Final = 24
-PEEPING_SHARE: Final = 0.15
+EDGE_POSES: Final = 24
+EDGE_SHARE: Final = 0.15
 """Poses under the edges of a carrier that are looked at, and how much of a thing's width its middle is behind the edge."""
-BARRED: Final = 16
+MAX_BLOCKING: Final = 16
 """Poses that would bar the robot's way after which a search ends: each costs a look at all ways."""
 MODELS: Final = 8
 """Models of a category that are looked at where none is given."""
@@ -40,7 +40,7 @@ LIFT_M: Final = 0.0005
 
 
 @dataclass(slots=True)
-class _Tally:
+class _PoseCounts:
     """How many candidate poses there were, how many of them collided with nothing, and how many of these were in reach."""
 
     seen: int = 0
@@ -49,7 +49,7 @@ class _Tally:
 
 
 class ObjectSampler:
-    """Samples poses for single things in a scene that is being edited. The generator's state decides all."""
+    """Samples poses for single objects in a scene that is being edited. The generator's state decides all."""
 
     def __init__(self, editor: SceneEditor, rng: np.random.Generator) -> None:
         self._editor = editor
@@ -79,7 +79,7 @@ class ObjectSampler:
         return self.first_free(asset, self.poses(asset, relation, host), target)
 
     def pack(self, asset: Asset, host: str) -> Pose:
-        """A pose in a container, in a corner of it or of what is left between things that lie there. Raises PlacementError.
+        """A pose in a container, in a corner of it or of what is left between objects that lie there. Raises PlacementError.
 
         Where no corner takes the thing, any free pose.
         """
@@ -159,7 +159,7 @@ class ObjectSampler:
 
     def first_free(self, asset: Asset, poses: Iterable[Pose], target: str) -> Pose:
         """The first of some poses at which nothing stands against a thing. Raises PlacementError."""
-        tally = _Tally()
+        tally = _PoseCounts()
         for pose in poses:
             tally.seen += 1
             objection = self._editor.objection(asset, pose, target)
@@ -167,17 +167,17 @@ class ObjectSampler:
                 return pose
             tally.free += objection is not LayoutReason.NO_FREE_SPOT
             tally.reached += objection is LayoutReason.BARS_THE_WAY
-            if tally.reached == BARRED:
+            if tally.reached == MAX_BLOCKING:
                 break
-        raise _none_of(tally, asset, target or "the floor")
+        raise _no_pose_error(tally, asset, target or "the floor")
 
     def _peeping(self, asset: Asset, carrier: Asset) -> Iterator[Pose]:
         """Poses in a carrier's frame under its edges, a good third of the thing in the open: so shoes stand under a bed."""
         x, y, z = carrier.size_m
-        for _ in range(PEEPING):
+        for _ in range(EDGE_POSES):
             side, along = int(self._rng.integers(4)), float(self._rng.uniform(-0.4, 0.4))
             turned = float(self._rng.integers(2)) * math.pi / 2
-            depth = asset.size_m[(side >= 2) != (turned > 0)] * PEEPING_SHARE
+            depth = asset.size_m[(side >= 2) != (turned > 0)] * EDGE_SHARE
             px = (x / 2 - depth) * (1, -1)[side] if side < 2 else along * x
             py = (y / 2 - depth) * (1, -1)[side - 2] if side >= 2 else along * y
             yield Pose.from_xyz_yaw(px, py, (asset.size_m[2] - z) / 2 + LIFT_M, turned)
@@ -237,7 +237,7 @@ def assets_of(category: str, model: str | None, rng: np.random.Generator) -> lis
     return [build_asset(catalog, category, models[i].model_id) for i in rng.permutation(len(models))[:MODELS]]
 
 
-def _none_of(tally: _Tally, asset: Asset, host: str) -> PlacementError:
+def _no_pose_error(tally: _PoseCounts, asset: Asset, host: str) -> PlacementError:
     if tally.reached:
         reason = LayoutReason.BARS_THE_WAY
     else:

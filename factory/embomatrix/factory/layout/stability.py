@@ -1,4 +1,4 @@
-"""Whether things stay where they were put, and whether the robot gets at them there: asked of the runtime that executes plans.
+"""Whether objects stay where they were put, and whether the robot gets at them there: asked of the runtime that executes plans.
 
 Rest is proved by geometry where it can be, else the thing is let go in physics.
 """
@@ -9,7 +9,7 @@ import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.scenes.rehearsal import Rehearsal
+from embomatrix.factory.scenes.rehearsal import SimulatedRobot
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.geometry.statics import base_of, is_level, rest_pose
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
     from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.world.geometry import Pose
 
-    Elsewhere = Callable[[str], Iterable[Pose]]
+    AlternativePoses = Callable[[str], Iterable[Pose]]
     """Other free poses for an object at what it is on, in or under."""
 
 
 HIGH_M: Final = 2.0
 """Nobody asks the robot to get at what hangs higher."""
 NO_STAND: Final = "the robot can stand nowhere with a clear way for its arm"
-NOT_FETCHED: Final = "the robot opens what it lies in, and can't take it out"
+CANNOT_TAKE_OUT: Final = "the robot opens what it lies in, and can't take it out"
 
 
 @dataclass(frozen=True, slots=True)
-class Settling:
-    """What came of things that were put down.
+class StabilityReport:
+    """What came of objects that were put down.
 
     ``dropped`` counts those that had to be let go; ``unstable`` tells in words what is wrong with those that don't stay,
     ``unreached`` what with those that the robot can't get at.
@@ -45,19 +45,21 @@ class Settling:
     unreached: Mapping[str, str]
 
 
-def settle(editor: SceneEditor, names: Sequence[str], elsewhere: Elsewhere = lambda _: ()) -> Settling:
+def settle(
+    editor: SceneEditor, names: Sequence[str], elsewhere: AlternativePoses = lambda _: ()
+) -> StabilityReport:
     """Find where objects come to rest, and move them there; tell which don't stay, and which the robot doesn't get at.
 
     What moves less than 1 cm and tilts less than 10 degrees stays. A thing that no standing robot gets at is first tried
     ``elsewhere``. Hosts stand before what rests on them. Raises EngineError where the engine is missing.
     """
     if not names:
-        return Settling(0, {}, {})
-    loose = {name for name in names if not editor.known(name).fixed and not is_proved(editor, name)}
+        return StabilityReport(0, {}, {})
+    loose = {name for name in names if not editor.known(name).fixed and not is_provably_stable(editor, name)}
     rested: dict[str, Pose] = {}
     unstable: dict[str, str] = {}
     with contextlib.closing(BulletEngine(editor.freeze(editor.base.scene_id))) as engine:
-        hands = _Hands(engine)
+        hands = _ReachProbe(engine)
         unreached: dict[str, str] = {}
         for name in [name for name in names if editor.box_of(name).low_m[2] < HIGH_M]:
             if not hands.reach(name):
@@ -72,15 +74,17 @@ def settle(editor: SceneEditor, names: Sequence[str], elsewhere: Elsewhere = lam
                 rested[name] = settled.pose
             else:
                 unstable[name] = f"let go, it moves by {settled.moved_m:.3f} m: try a flatter place"
-        unstable |= _leaning(editor, Relations(engine), [name for name in names if name not in unstable])
+        unstable |= _resting_on_others(
+            editor, Relations(engine), [name for name in names if name not in unstable]
+        )
     editor.move(rested)
     shut_in = [name for name in names if name not in unstable.keys() | unreached.keys()]
-    unreached |= dict.fromkeys(_not_fetched(editor, shut_in), NOT_FETCHED)
-    return Settling(len(loose), unstable, unreached)
+    unreached |= dict.fromkeys(_untakeable(editor, shut_in), CANNOT_TAKE_OUT)
+    return StabilityReport(len(loose), unstable, unreached)
 
 
-def _leaning(editor: SceneEditor, relations: Relations, names: Sequence[str]) -> dict[str, str]:
-    """Those of some things that lie on another loose thing than they are to be on, with the sentence against it.
+def _resting_on_others(editor: SceneEditor, relations: Relations, names: Sequence[str]) -> dict[str, str]:
+    """Those of some objects that lie on another loose thing than they are to be on, with the sentence against it.
 
     What is packed into a basket comes to lie on what is in there already, which nobody could then take out.
     """
@@ -93,8 +97,8 @@ def _leaning(editor: SceneEditor, relations: Relations, names: Sequence[str]) ->
     return found
 
 
-class _Hands:
-    """Where the robot could stand to work on things, in an engine whose objects are being moved."""
+class _ReachProbe:
+    """Where the robot could stand to work on objects, in an engine whose objects are being moved."""
 
     def __init__(self, engine: BulletEngine) -> None:
         self._engine = engine
@@ -118,8 +122,8 @@ class _Hands:
         self._navigator.refresh()
 
 
-def _not_fetched(editor: SceneEditor, names: Sequence[str]) -> tuple[str, ...]:
-    """Those of some things behind doors that the robot fails to fetch in the simulator: an open leaf takes floor."""
+def _untakeable(editor: SceneEditor, names: Sequence[str]) -> tuple[str, ...]:
+    """Those of some objects behind doors that the robot fails to fetch in the simulator: an open leaf takes floor."""
     bearing = {item.host for item in editor.objects.values()}
     behind = [
         name
@@ -128,7 +132,7 @@ def _not_fetched(editor: SceneEditor, names: Sequence[str]) -> tuple[str, ...]:
     ]
     if not behind:
         return ()
-    with Rehearsal(editor.freeze(editor.base.scene_id)) as rehearsal:
+    with SimulatedRobot(editor.freeze(editor.base.scene_id)) as rehearsal:
         return tuple(name for name in behind if not rehearsal.fetches(name))
 
 
@@ -144,7 +148,7 @@ def _is_shut_in(editor: SceneEditor, name: str) -> bool:
     return False
 
 
-def is_proved(editor: SceneEditor, name: str) -> bool:
+def is_provably_stable(editor: SceneEditor, name: str) -> bool:
     """Whether geometry alone tells that an object rests where it is."""
     item, asset = editor.known(name), editor.asset_of(name)
     base = base_of(asset)

@@ -39,7 +39,7 @@ class RelationMethod(StrEnum):
     NONE = "none"  # rigid bodies can't: it takes cloth
 
 
-MEANS: Final = {
+RELATION_METHODS: Final = {
     LayoutRelation.ONTOP: RelationMethod.POSE,
     LayoutRelation.INSIDE: RelationMethod.POSE,
     LayoutRelation.UNDER: RelationMethod.POSE,
@@ -52,8 +52,8 @@ MEANS: Final = {
 }
 
 
-class Kind(StrEnum):
-    """Where things of a sort belong."""
+class PlacementClass(StrEnum):
+    """Where objects of a sort belong."""
 
     GOODS = "goods"  # on and in furniture
     FURNITURE = "furniture"  # on the floor
@@ -62,10 +62,10 @@ class Kind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Failure:
+class LayoutFailure:
     """A thing that could not be where a tree said; what the organizer hears of it in the next round."""
 
-    thing: str
+    object_name: str
     relation: LayoutRelation
     host: str
     reason: LayoutReason
@@ -75,7 +75,7 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class LayoutRoomFacts:
-    """A room, its floor in metres along the world's x and y, and the categories of what can hold things there, one by one."""
+    """A room, its floor in metres along the world's x and y, and the categories of what can hold objects there, one by one."""
 
     name: str
     type: str
@@ -105,7 +105,7 @@ class ObjectBrief:
     host: str = ""
     beside: tuple[str, ...] = ()
     has_front: bool = False
-    kind: Kind = Kind.GOODS
+    kind: PlacementClass = PlacementClass.GOODS
     __pydantic_config__: ClassVar = _STRICT
 
 
@@ -114,7 +114,7 @@ class DistributionBrief:
     """What the Scene-level Distribution Agent decides on. ``homes`` are the rooms of objects that are there already."""
 
     rooms: tuple[LayoutRoomFacts, ...]
-    things: tuple[ObjectBrief, ...]
+    objects: tuple[ObjectBrief, ...]
     homes: dict[str, str] = field(default_factory=dict)
     seed: int = 0
     __pydantic_config__: ClassVar = _STRICT
@@ -131,7 +131,7 @@ class Distribution:
 
 @dataclass(frozen=True, slots=True)
 class HostOffer:
-    """One way to put things at a piece of furniture: on its open surfaces, in its cavities, under it.
+    """One way to put objects at a piece of furniture: on its open surfaces, in its cavities, under it.
 
     ``spaces_m`` are the spaces there: extents along the host's x and y and the free height; ``height_m`` is that of the lowest
     above the floor.
@@ -145,24 +145,24 @@ class HostOffer:
 
 @dataclass(frozen=True, slots=True)
 class HostFacts:
-    """An object of a room that can hold others. ``guests`` are the categories of what it holds already."""
+    """An object of a room that can hold others. ``contents`` are the categories of what it holds already."""
 
     name: str
     category: str
     offers: tuple[HostOffer, ...]
-    guests: tuple[str, ...] = ()
+    contents: tuple[str, ...] = ()
     shut: bool = False
     __pydantic_config__: ClassVar = _STRICT
 
 
 @dataclass(frozen=True, slots=True)
 class RoomBrief:
-    """What the Room-level Organization Agent decides on: things assigned to a room, what could hold them, what has failed."""
+    """What the Room-level Organization Agent decides on: objects assigned to a room, what could hold them, what has failed."""
 
     room: LayoutRoomFacts
     hosts: tuple[HostFacts, ...]
-    things: tuple[ObjectBrief, ...]
-    failures: tuple[Failure, ...] = ()
+    objects: tuple[ObjectBrief, ...]
+    failures: tuple[LayoutFailure, ...] = ()
     seed: int = 0
     __pydantic_config__: ClassVar = _STRICT
 
@@ -177,7 +177,7 @@ class Branch:
     __pydantic_config__: ClassVar = _STRICT
 
 
-class Arrangement(StrEnum):
+class ConstraintKind(StrEnum):
     """Constraints on a plane (EmboMatrix, appendix A, after Holodeck). ``edge`` and ``middle`` are about the plane alone."""
 
     EDGE = "edge"
@@ -191,29 +191,29 @@ class Arrangement(StrEnum):
     NEXT_TO = "next_to"
 
 
-ABOUT_THE_PLANE: Final = frozenset({Arrangement.EDGE, Arrangement.MIDDLE})
+PLANE_CONSTRAINTS: Final = frozenset({ConstraintKind.EDGE, ConstraintKind.MIDDLE})
 
 
 @dataclass(frozen=True, slots=True)
 class PlacementConstraint:
     """A constraint on a thing, against another object of the plane; ``required`` ones must hold."""
 
-    kind: Arrangement
+    kind: ConstraintKind
     other: str = ""
     required: bool = False
     __pydantic_config__: ClassVar = _STRICT
 
 
 @dataclass(frozen=True, slots=True)
-class PlaneCompany:
-    """What shares a plane: things to be put there, and names and categories of what is there already.
+class ConstraintBrief:
+    """What shares a plane: objects to be put there, and names and categories of what is there already.
 
     ``host`` is the category of the furniture whose plane it is; ``on_floor`` tells the floor of a room.
     """
 
     plane: str
     host: str
-    things: tuple[ObjectBrief, ...]
+    objects: tuple[ObjectBrief, ...]
     others: tuple[tuple[str, str], ...] = ()
     on_floor: bool = False
     seed: int = 0
@@ -246,11 +246,11 @@ class PlaneFootprint:
 
 @dataclass(frozen=True, slots=True)
 class PlaneThing:
-    """A thing to be put on a plane, with its wishes, the most important first."""
+    """A thing to be put on a plane, with its constraints, the most important first."""
 
     name: str
     size_m: Size3
-    wishes: tuple[PlacementConstraint, ...] = ()
+    constraints: tuple[PlacementConstraint, ...] = ()
     has_front: bool = False
     __pydantic_config__: ClassVar = _STRICT
 
@@ -259,14 +259,14 @@ class PlaneThing:
 class PlaneBrief:
     """What the Planar-Level Placement Generator decides on, in the plane's frame: origin in its middle, metres, radians.
 
-    ``obstacles`` stand on the plane or reach into the space over it, and wishes may name them; ``zones`` are rectangles
+    ``obstacles`` stand on the plane or reach into the space over it, and constraints may name them; ``zones`` are rectangles
     (x0, y0, x1, y1) that stay clear. ``stands`` are spots on the floor where the robot can stand; empty: reach is not asked.
     ``rim_m`` is the free strip at the plane's edge. ``on_floor`` tells the floor of a room.
     """
 
     plane: str
     size_m: Size2
-    things: tuple[PlaneThing, ...]
+    objects: tuple[PlaneThing, ...]
     obstacles: tuple[PlaneFootprint, ...] = ()
     zones: tuple[tuple[float, float, float, float], ...] = ()
     stands: tuple[Size2, ...] = ()
@@ -278,9 +278,9 @@ class PlaneBrief:
 
 @dataclass(frozen=True, slots=True)
 class PlaneSpot:
-    """Where a thing's middle goes on a plane, how it is turned, and which of its wishes hold there."""
+    """Where a thing's middle goes on a plane, how it is turned, and which of its constraints hold there."""
 
-    thing: str
+    object_name: str
     center_m: Size2
     yaw: float
     held: tuple[PlacementConstraint, ...] = ()
@@ -304,7 +304,7 @@ class SampleBrief:
 
 
 @dataclass(frozen=True, slots=True)
-class Sampled:
+class SampledPose:
     """A pose in the world, or why there is none."""
 
     name: str = ""
@@ -317,8 +317,8 @@ class Sampled:
 
 
 @dataclass(frozen=True, slots=True)
-class Arranged:
-    """One joint arrangement of a plane's things with its score, and what found no place, with the reason."""
+class PlaneArrangement:
+    """One joint arrangement of a plane's objects with its score, and what found no place, with the reason."""
 
     spots: tuple[PlaneSpot, ...]
     score: float

@@ -15,7 +15,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.pipeline.store import BuildStore, Rejection
-from embomatrix.factory.pipeline.variants import TASKS_EACH, VariantMaker, VariantOrder, VariantYield, key_of
+from embomatrix.factory.pipeline.variants import (
+    TASKS_PER_VARIANT,
+    VariantMaker,
+    VariantOrder,
+    VariantYield,
+    uniqueness_key,
+)
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.sim.process_pool import shared_work
@@ -30,7 +36,7 @@ if TYPE_CHECKING:
     from embomatrix.factory.pipeline.settings import BuildSettings
     from embomatrix.factory.writer.tasks import TaskWriter
 
-    Make = Callable[[Sequence[VariantOrder]], Iterator[VariantYield]]
+    MakeVariants = Callable[[Sequence[VariantOrder]], Iterator[VariantYield]]
     """Makes variants; what comes of them comes in the order of the orders."""
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
@@ -39,13 +45,13 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 
-Check = Callable[[VariantYield], VariantYield]
+VariantCheck = Callable[[VariantYield], VariantYield]
 """A second judge: leaves of a variant what is to be kept, and adds its refusals."""
-ROUND: Final = 6
+ROUND_VARIANTS: Final = 6
 """Variants of a round, at most."""
-HOME: Final = 3
+MIN_FURNITURE: Final = 3
 """Pieces of furniture with a surface or a cavity that a scene's rooms must hold for tasks to be written about them."""
-VARIANTS_FOR: Final = 4
+VARIANTS_PER_FULL: Final = 4
 """Variants at most, for each one that would do if every draft were admitted."""
 
 
@@ -75,7 +81,7 @@ def split_rooms(scenes: Sequence[Scene], seed: int) -> dict[str, dict[str, tuple
     for scene in scenes:
         for room in scene.rooms:
             by_type[room.type].append((scene.base, room.name))
-    spared = _Spared(scenes)
+    spared = _HeldOutRooms(scenes)
     for rank, (_, rooms) in enumerate(sorted(by_type.items())):
         if len(rooms) > 1:
             first = (rank + seed) % len(rooms)
@@ -93,12 +99,12 @@ def split_rooms(scenes: Sequence[Scene], seed: int) -> dict[str, dict[str, tuple
     }
 
 
-class _Spared:
+class _HeldOutRooms:
     """Rooms that are held out, and how much each scene keeps to train on."""
 
     def __init__(self, scenes: Sequence[Scene]) -> None:
         self.heldout: set[tuple[str, str]] = set()
-        self._worth = {scene.base: _worth(scene) for scene in scenes}
+        self._worth = {scene.base: _usable_furniture(scene) for scene in scenes}
         self._left = {base: sum(worth.values()) for base, worth in self._worth.items()}
 
     def hold_out(self, rooms: Sequence[tuple[str, str]], count: int) -> None:
@@ -117,7 +123,7 @@ class _Spared:
     def _can_go(self, base: str, room: str) -> bool:
         """A scene that has too little anyhow loses nothing."""
         left, worth = self._left[base], self._worth[base][room]
-        return left < HOME or left - worth >= HOME
+        return left < MIN_FURNITURE or left - worth >= MIN_FURNITURE
 
     def _take(self, base: str, room: str) -> None:
         self.heldout.add((base, room))
@@ -147,7 +153,7 @@ def build_dataset(
     progress: Callable[[str, int], None] = lambda _split, _admitted: None,
     writer: TaskWriter | None = None,
     jobs: int = 1,
-    check: Check | None = None,
+    check: VariantCheck | None = None,
     layout: LayoutAgents | None = None,
 ) -> BuildSummary:
     """Write a data set, or go on with one that was cut short. ``progress`` hears of each split's admitted tasks.
@@ -166,13 +172,13 @@ def build_dataset(
     store.spent_on_scenes(len(bases), time.process_time() - began)
     rooms = split_rooms(bases, settings.seed) if settings.train else _all_held_out(bases)
     with contextlib.ExitStack() as stack:
-        make: Make | None = None
+        make: MakeVariants | None = None
         for split, target in (("heldout", settings.heldout), ("train", settings.train)):
             filler = _SplitFiller(store, bases, rooms[split], split, target)
             while orders := filler.round():
                 progress(split, filler.admitted)
                 if make is None:
-                    make = stack.enter_context(makers(settings, writer, layout, jobs))
+                    make = stack.enter_context(variant_makers(settings, writer, layout, jobs))
                 for made in make(orders):
                     filler.take(made if check is None else check(made))
                     progress(split, filler.admitted)
@@ -194,11 +200,11 @@ class _SplitFiller:
         target: int,
     ) -> None:
         self._store = store
-        self._homes = [base.base for base in bases if _is_home(base, rooms[base.base])]
+        self._homes = [base.base for base in bases if _is_usable(base, rooms[base.base])]
         self._rooms = rooms
         self._split = split
         self._quota = {category: _share(target, index) for index, category in enumerate(TaskCategory)}
-        self._end = VARIANTS_FOR * (target // TASKS_EACH + 1)
+        self._end = VARIANTS_PER_FULL * (target // TASKS_PER_VARIANT + 1)
         self._number = 0
 
     @property
@@ -214,8 +220,8 @@ class _SplitFiller:
             missing = self._missing(self._number)
             if not any(missing.values()):
                 break
-            wanted = -(-sum(missing.values()) // TASKS_EACH)
-            numbers = range(self._number, min(self._number + min(ROUND, wanted), self._end))
+            wanted = -(-sum(missing.values()) // TASKS_PER_VARIANT)
+            numbers = range(self._number, min(self._number + min(ROUND_VARIANTS, wanted), self._end))
             known = self._known(self._number)
             self._number = numbers.stop
             orders = [
@@ -259,16 +265,16 @@ class _SplitFiller:
 
 
 def _key(record: TaskRecord) -> str:
-    return key_of(record.signature, record.task.instruction)
+    return uniqueness_key(record.signature, record.task.instruction)
 
 
-def _is_home(base: Scene, rooms: Sequence[str]) -> bool:
+def _is_usable(base: Scene, rooms: Sequence[str]) -> bool:
     """Whether the rooms hold enough furniture to write tasks about: empty corridors and storage rooms do not."""
-    worth = _worth(base)
-    return sum(worth[room] for room in rooms) >= HOME
+    worth = _usable_furniture(base)
+    return sum(worth[room] for room in rooms) >= MIN_FURNITURE
 
 
-def _worth(base: Scene) -> dict[str, int]:
+def _usable_furniture(base: Scene) -> dict[str, int]:
     """Furniture to write tasks about, by room: what has a surface or holds things."""
     view = SceneView(base)
     return {
@@ -296,9 +302,9 @@ def _summary(store: BuildStore, rooms: Mapping[str, Mapping[str, tuple[str, ...]
 
 
 @contextlib.contextmanager
-def makers(
+def variant_makers(
     settings: BuildSettings, writer: TaskWriter | None, layout: LayoutAgents | None, jobs: int
-) -> Iterator[Make]:
+) -> Iterator[MakeVariants]:
     """For as long as this is held. ``writer`` and ``layout`` work in this process alone: they may hold a connection."""
     if writer is not None or layout is not None:
         with contextlib.closing(VariantMaker(settings, writer, layout)) as maker:

@@ -23,7 +23,7 @@ RUN: Final = "factory"
 """Name of the run on the cluster's pages."""
 
 
-class ClusterJudge:
+class ClusterCheck:
     """Context manager over one event loop and one run of the cluster. ``token`` and ``ca`` (PEM) as clients have them."""
 
     def __init__(self, address: str, token: str = "", ca: bytes = b"") -> None:

@@ -219,7 +219,7 @@ T = TypeVar("T", bound="DataclassInstance")
 
 
 @dataclass
-class LineLog(Generic[T]):
+class ResumableLog(Generic[T]):
     """What decides the outcomes in the first line of a file, an outcome in each other. Without a path, in memory alone."""
 
     path: Path | None = None

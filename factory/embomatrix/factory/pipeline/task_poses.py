@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Needs:
+class PoseNeeds:
     """What one task asks of a cache.
 
     ``about`` are the objects that its goal brings together, ``table`` all its rows; ``beside`` are pairs that it wants next to
@@ -49,7 +49,7 @@ class Needs:
 
     about: tuple[str, ...]
     table: tuple[str, ...]
-    beside: tuple[Beside, ...] = ()
+    beside: tuple[NeighbourPair, ...] = ()
 
 
 class SceneSurvey:
@@ -105,7 +105,7 @@ class SceneSurvey:
 
 
 def cache_poses(
-    view: SceneView, tasks: Iterable[Needs], library: PlacementLibrary, survey: SceneSurvey, seed: int
+    view: SceneView, tasks: Iterable[PoseNeeds], library: PlacementLibrary, survey: SceneSurvey, seed: int
 ) -> PoseCache:
     """Poses for every thing of a task on, or in, whatever of the same task can hold it, and what the survey knows of all rows.
 
@@ -119,7 +119,7 @@ def cache_poses(
         rows.update(dict.fromkeys(task.table))
         placements.update(poses_beside(view, task.beside, library))
         if any(pair.host for pair in task.beside):
-            together = Neighbourhoods(view, library, lambda name: survey.poses([name]).stands[name], seed)
+            together = PairedPlacements(view, library, lambda name: survey.poses([name]).stands[name], seed)
             placements.update(together.poses(task.beside))
         for thing, host, relation in _pairs(view, task.about):
             key = PlacementKey(view.item(thing).asset_id, view.item(host).asset_id, relation)
@@ -130,7 +130,7 @@ def cache_poses(
     return survey.prospects(replace(survey.poses(rows), placements=kept), _placings(view, tasks))
 
 
-def _placings(view: SceneView, tasks: Sequence[Needs]) -> Iterator[Placing]:
+def _placings(view: SceneView, tasks: Sequence[PoseNeeds]) -> Iterator[Placing]:
     """What may be placed where: what a goal brings together first, then what is heated or cooled, then the rest."""
     for task in tasks:
         yield from itertools.starmap(Placing, _pairs(view, task.about))
@@ -148,7 +148,7 @@ def _is_source(asset: Asset) -> bool:
     return heat_source(asset) is not None or cold_source(asset) is not None
 
 
-def _portable_and_holders(view: SceneView, task: Needs) -> tuple[list[str], list[str]]:
+def _portable_and_holders(view: SceneView, task: PoseNeeds) -> tuple[list[str], list[str]]:
     """Rows of a task that can be carried, and those in or on which something can be put."""
     portable = [name for name in task.table if view.is_portable(name)]
     holders = [
@@ -173,7 +173,7 @@ def _pairs(view: SceneView, about: tuple[str, ...]) -> Iterator[tuple[str, str, 
 
 
 @dataclass(frozen=True, slots=True)
-class Beside:
+class NeighbourPair:
     """A goal wants one thing next to another: one that stays where it is, or is carried to ``host`` as the first is."""
 
     thing: str
@@ -181,7 +181,7 @@ class Beside:
     host: str = ""
 
 
-def poses_beside(view: SceneView, pairs: Iterable[Beside], library: PlacementLibrary) -> Poses:
+def poses_beside(view: SceneView, pairs: Iterable[NeighbourPair], library: PlacementLibrary) -> Poses:
     """Poses next to what stays, on or in what that stands on or in."""
     found: Poses = {}
     for pair in pairs:
@@ -197,7 +197,7 @@ def poses_beside(view: SceneView, pairs: Iterable[Beside], library: PlacementLib
     return found
 
 
-class Neighbourhoods:
+class PairedPlacements:
     """Poses of things that are carried to one host, there to stand next to one another."""
 
     def __init__(
@@ -216,7 +216,7 @@ class Neighbourhoods:
         self._taken: list[Aabb] = []
         self._at: dict[tuple[str, str, Relation], Pose] = {}
 
-    def poses(self, pairs: Iterable[Beside]) -> Poses:
+    def poses(self, pairs: Iterable[NeighbourPair]) -> Poses:
         """Of each pair one pose of the neighbour, and those of the thing beside it: of two alike, one of them."""
         found: Poses = {}
         for pair in pairs:
@@ -225,7 +225,7 @@ class Neighbourhoods:
                     found[key] = (*found.get(key, ()), *poses)
         return found
 
-    def _chosen(self, pair: Beside, relation: Relation) -> Poses:
+    def _chosen(self, pair: NeighbourPair, relation: Relation) -> Poses:
         view = self._view
         thing, neighbour, host = (view.asset(name) for name in (pair.thing, pair.neighbour, pair.host))
         known = self._at.get((pair.neighbour, pair.host, relation))
@@ -246,7 +246,7 @@ class Neighbourhoods:
             return {**({} if known else stays), key: near}
         return {}
 
-    def _free(self, pair: Beside, asset: Asset, relation: Relation) -> Iterator[Pose]:
+    def _free(self, pair: NeighbourPair, asset: Asset, relation: Relation) -> Iterator[Pose]:
         """Poses of an asset on or in the host, the nearest to the robot first, where nothing is yet."""
         found = self._library.poses(asset, self._view.asset(pair.host), relation, self._seed)
         for stand in self._stand_at(pair.host)[:1]:
@@ -258,7 +258,7 @@ class Neighbourhoods:
 
             yield from (pose for pose in sorted(found, key=away_m) if self._is_free(pair, asset, pose))
 
-    def _is_free(self, pair: Beside, asset: Asset, pose: Pose) -> bool:
+    def _is_free(self, pair: NeighbourPair, asset: Asset, pose: Pose) -> bool:
         frame = self._view.item(pair.host).pose_world_asset
         met = self._solids.overlaps(placed_parts(asset, frame @ pose))
         box = self._world_box(pair.host, asset, pose)

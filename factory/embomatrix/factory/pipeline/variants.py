@@ -14,12 +14,12 @@ import numpy as np
 from embomatrix.factory.admission import Admitted, TaskRefusal, admit
 from embomatrix.factory.pipeline.settings import WriterKind
 from embomatrix.factory.pipeline.store import Rejection, VariantResult
-from embomatrix.factory.pipeline.task_poses import Needs, SceneSurvey, cache_poses
+from embomatrix.factory.pipeline.task_poses import PoseNeeds, SceneSurvey, cache_poses
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.scenes.rehearsal import Rehearsal
+from embomatrix.factory.scenes.rehearsal import SimulatedRobot
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.writer import SocialWriter
-from embomatrix.factory.writer.tasks import DraftOrder, ManyAtOnce, PlainWriter, is_heldout_signature
+from embomatrix.factory.writer.tasks import BatchTaskWriter, DraftOrder, PlainWriter, is_heldout_signature
 from embomatrix.factory.writer.variant import Variant, build_variant
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.floor.prepared import prepare
@@ -42,9 +42,9 @@ if TYPE_CHECKING:
     from embomatrix.skills.syntax import Plan
     from embomatrix.world.scene import Scene
 
-TASKS_EACH: Final = 8
+TASKS_PER_VARIANT: Final = 8
 """Tasks that one variant is to yield."""
-DRAFTS: Final = 14
+MAX_DRAFTS: Final = 14
 """Drafts that are written for a variant: some are not admitted."""
 WRITE_TRIES: Final = 120
 """Tasks that are written for the drafts: those of the other split's kinds are thrown away."""
@@ -94,7 +94,7 @@ class VariantMaker:
         if writer is None:
             writer = SocialWriter(settings.seed) if settings.writer is WriterKind.SOCIAL else PlainWriter()
         foresight = Foresight() if settings.look_ahead else None
-        self._bench = _Workbench(settings, writer, PlacementLibrary(), foresight)
+        self._bench = _SharedTools(settings, writer, PlacementLibrary(), foresight)
         self._layout = layout
         self._bases: dict[str, Scene] = {}
 
@@ -119,13 +119,13 @@ class VariantMaker:
         self._bench.library.close()
 
 
-def key_of(signature: str, instruction: str) -> str:
+def uniqueness_key(signature: str, instruction: str) -> str:
     """What two tasks of a data set must not have in common."""
     return f"{signature}|{instruction}"
 
 
 @dataclass(frozen=True)
-class _Workbench:
+class _SharedTools:
     """What all variants of a build share."""
 
     settings: BuildSettings
@@ -148,7 +148,7 @@ def _focus(
 class _VariantJob:
     """Writes and judges the tasks of one variant."""
 
-    def __init__(self, variant: Variant, order: VariantOrder, bench: _Workbench) -> None:
+    def __init__(self, variant: Variant, order: VariantOrder, bench: _SharedTools) -> None:
         self._variant = variant
         self._order = order
         self._seed = bench.settings.seed
@@ -165,9 +165,9 @@ class _VariantJob:
         missing = self._order.missing
         scene = self._variant.scene
         with SceneSurvey(scene, self._foresight) as survey:
-            with Rehearsal(scene, survey.bars) as rehearsal:
+            with SimulatedRobot(scene, survey.bars) as rehearsal:
                 drafts = self._write(missing, SceneView(scene, rehearsal), rng)
-            needs = [Needs(draft.about, draft.task.table) for draft in drafts]
+            needs = [PoseNeeds(draft.about, draft.task.table) for draft in drafts]
             poses = cache_poses(SceneView(scene), needs, self._library, survey, self._seed)
         left = dict(missing)
         bundle = Bundle(scene, {}, poses)
@@ -179,7 +179,7 @@ class _VariantJob:
                 else None
             )
             for draft in drafts:
-                if len(self._admitted) == TASKS_EACH:
+                if len(self._admitted) == TASKS_PER_VARIANT:
                     break
                 if left[draft.task.category] > 0 and self._judge(stage, robot, draft):
                     left[draft.task.category] -= 1
@@ -194,26 +194,26 @@ class _VariantJob:
         wanted = [category for category, count in missing.items() if count > 0]
         drafts: list[Draft] = []
         turns = itertools.islice(itertools.cycle(wanted), WRITE_TRIES)
-        while len(drafts) < DRAFTS and (written := self._written(turns, view, len(drafts), rng)):
+        while len(drafts) < MAX_DRAFTS and (written := self._written(turns, view, len(drafts), rng)):
             for category, draft in written:
                 if isinstance(draft, TaskRefusal):
                     self._reject(category, draft)
                 elif draft is not None and self._is_new(draft):
                     named = replace(draft.task, task_id=self._task_id(len(drafts)))
                     drafts.append(replace(draft, task=named))
-                    self._known.add(key_of(draft.signature, draft.task.instruction))
+                    self._known.add(uniqueness_key(draft.signature, draft.task.instruction))
         return drafts
 
     def _written(
         self, turns: Iterator[TaskCategory], view: SceneView, known: int, rng: np.random.Generator
     ) -> list[tuple[TaskCategory, Draft | TaskRefusal | None]]:
         """What comes of the next turn, or of several at once where a writer waits for answers; nothing at their end."""
-        if not isinstance(self._writer, ManyAtOnce):
+        if not isinstance(self._writer, BatchTaskWriter):
             return [
                 (category, self._writer.write(self._variant, view, category, self._task_id(known), rng))
                 for category in itertools.islice(turns, 1)
             ]
-        categories = list(itertools.islice(turns, min(self._writer.at_once, DRAFTS - known)))
+        categories = list(itertools.islice(turns, min(self._writer.at_once, MAX_DRAFTS - known)))
         orders = [
             DraftOrder(category, self._task_id(known + number), each)
             for number, (category, each) in enumerate(
@@ -245,7 +245,7 @@ class _VariantJob:
 
     def _is_new(self, draft: Draft) -> bool:
         """Whether the goal's kind belongs to this split, and nothing like it was asked for in these words."""
-        key = key_of(draft.signature, draft.task.instruction)
+        key = uniqueness_key(draft.signature, draft.task.instruction)
         mine = is_heldout_signature(draft.signature, self._seed) is (self._order.split == "heldout")
         return mine and key not in self._known
 

@@ -39,7 +39,7 @@ SEED: Final = 0
 """Seed of the trials."""
 
 
-class Rehearsal:
+class SimulatedRobot:
     """Tries wishes in a scene, each once. Close it after use; not for use by several threads."""
 
     def __init__(self, scene: Scene, bars: Bars = lambda _: False) -> None:

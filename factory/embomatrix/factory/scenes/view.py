@@ -36,9 +36,9 @@ HUNG_M: Final = 0.05
 class SceneView:
     """A scene indexed for writing tasks. Names are those of scene objects."""
 
-    def __init__(self, scene: Scene, robot: Robot | None = None) -> None:
+    def __init__(self, scene: Scene, robot: RobotFeasibility | None = None) -> None:
         self.scene = scene
-        self.robot: Robot = robot if robot is not None else AnyRobot()
+        self.robot: RobotFeasibility = robot if robot is not None else CapableRobot()
         """Who is to do what is asked for. Without one nobody asks whether it can."""
         self._opens: dict[str, bool] = {}
 
@@ -213,7 +213,7 @@ def is_liftable(size_m: tuple[float, float, float], mass_kg: float) -> bool:
     return mass_kg <= ROBOT.mass_kg and min(size_m) <= ROBOT.grip_m and max(size_m) <= ROBOT.extent_m
 
 
-class Robot(Protocol):
+class RobotFeasibility(Protocol):
     """Answers about one thing at a time, from the start of the scene. Names are those of scene objects."""
 
     def fetches(self, thing: str) -> bool:
@@ -237,7 +237,7 @@ class Robot(Protocol):
         ...
 
 
-class AnyRobot:
+class CapableRobot:
     """One that can do all: nobody was asked."""
 
     def fetches(self, thing: str) -> bool:

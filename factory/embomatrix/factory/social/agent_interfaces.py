@@ -18,7 +18,7 @@ from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.conversing import starting_slots
 from embomatrix.factory.social.facts import SceneFacts, facts_of, with_sights
-from embomatrix.factory.social.fitting import why_of
+from embomatrix.factory.social.fitting import reasons_for
 from embomatrix.factory.social.summary import instruction_of
 from embomatrix.factory.social.values import RequestSummary, SceneBrief, SummaryBrief, TalkBrief
 from embomatrix.factory.social.writer import SocialWriter
@@ -28,7 +28,7 @@ from embomatrix.factory.writer.words import Voice
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from embomatrix.factory.social.model_agents import ModelAgents
+    from embomatrix.factory.social.model_agents import SocialModelAgents
     from embomatrix.factory.social.values import Cast
     from embomatrix.factory.writer.variant import Variant
     from embomatrix.world.scene import Scene
@@ -49,7 +49,7 @@ class SocialAgent(StrEnum):
     SUMMARIZER = "summarizer"
 
 
-class _SameCast:
+class _FixedCast:
     """Role-Playing Agent that has played already."""
 
     def __init__(self, cast: Cast) -> None:
@@ -74,7 +74,7 @@ def simulate(brief: TalkBrief) -> SummaryBrief:
     """Social Simulation Agent. Raises CatalogError, BriefError where nobody comes to such a wish."""
     rng = _rng(brief.scene, brief.seed)
     variant = _variant(brief.scene, brief.seed, rng)
-    writer, view = SocialWriter(brief.seed, _SameCast(brief.cast)), SceneView(variant.scene)
+    writer, view = SocialWriter(brief.seed, _FixedCast(brief.cast)), SceneView(variant.scene)
     for _ in range(TALKS):
         talked = writer.talk(variant, view, brief.category, rng)
         if talked is not None:
@@ -92,12 +92,12 @@ def summarise(brief: SummaryBrief) -> RequestSummary:
     rng = _rng(brief.scene, brief.seed)
     view = SceneView(build_base_scene(brief.scene, seed=brief.seed))
     voice = Voice(rng)
-    why = voice.choose(why_of(brief.conversation.slot.activity) or (NO_REASON,))
+    why = voice.choose(reasons_for(brief.conversation.slot.activity) or (NO_REASON,))
     instruction = instruction_of(brief.conversation, brief.cast, view, voice, why)
     return RequestSummary(instruction=instruction, wishes=brief.conversation.last_wishes)
 
 
-async def asked(agents: ModelAgents, name: SocialAgent, brief: Any) -> Any:
+async def answer_with_model(agents: SocialModelAgents, name: SocialAgent, brief: Any) -> Any:
     """The same of a language model. Raises LlmError, CatalogError."""
     if name in (SocialAgent.EXTRACTOR, SocialAgent.PLAYER):
         scene = build_base_scene(brief.scene, seed=brief.seed)
@@ -134,7 +134,7 @@ def _variant(name: str, seed: int, rng: np.random.Generator) -> Variant:
     return build_variant(base, rooms, f"{base.base}-alone", rng)
 
 
-SOCIAL_DOORS: Final[Mapping[SocialAgent, AgentInterface]] = {
+SOCIAL_AGENTS: Final[Mapping[SocialAgent, AgentInterface]] = {
     SocialAgent.EXTRACTOR: AgentInterface(
         "scene information extraction: rooms, things and what can be done with them",
         TypeAdapter(SceneBrief),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from embomatrix.factory.pictures.sights import sights_of
-from embomatrix.factory.social.model_agents import ModelAgents
+from embomatrix.factory.social.model_agents import SocialModelAgents
 from embomatrix.factory.social.model_writer import ModelWriter
 from embomatrix.llm.cassette import Cassette, CassetteMode
 from embomatrix.llm.endpoint import Endpoint
@@ -45,7 +45,7 @@ def asked_writer(asked: ModelSource) -> Iterator[tuple[ModelWriter, Ledger]]:
             raise ValueError("neither an endpoint nor a cassette is given: nobody can be asked")
         tape = Cassette(asked.cassette, CassetteMode.REPLAY)
         ledger = Ledger(tape)
-        with ModelWriter(ModelAgents(ledger), look=look) as writer:
+        with ModelWriter(SocialModelAgents(ledger), look=look) as writer:
             yield writer, ledger
         return
     endpoint = Endpoint(asked.url, asked.model, api_key=asked.key)
@@ -54,5 +54,5 @@ def asked_writer(asked: ModelSource) -> Iterator[tuple[ModelWriter, Ledger]]:
     model: ChatModel = (
         ledger if asked.cassette is None else Cassette(asked.cassette, CassetteMode.AUTO, ledger)
     )
-    with ModelWriter(ModelAgents(model), endpoint, look) as writer:
+    with ModelWriter(SocialModelAgents(model), endpoint, look) as writer:
         yield writer, ledger

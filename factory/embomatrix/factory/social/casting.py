@@ -116,7 +116,7 @@ def _at(occasion: Occasion, person: Person, room: str, rng: np.random.Generator)
 
 
 @dataclass(frozen=True, slots=True)
-class CastSetting:
+class HouseholdSetting:
     """A setting for a cast in which all of some ties to the first one are found."""
 
     words: str
@@ -147,7 +147,7 @@ class Milieu:
     roles: tuple[SocialRole, ...]
     lived_in: bool = False
     """Whether people sleep and wash there."""
-    households: tuple[CastSetting, ...] = ()
+    households: tuple[HouseholdSetting, ...] = ()
 
 
 GENERATION: Final = 20
@@ -168,11 +168,11 @@ _HOME: Final = Milieu(
     ),
     lived_in=True,
     households=(
-        CastSetting("a home that three generations share", frozenset({"parent", "child"})),
-        CastSetting("a family home", frozenset({"child"})),
-        CastSetting("a home that somebody shares with a parent", frozenset({"parent"})),
-        CastSetting("a house with a lodger", frozenset({"lodger"})),
-        CastSetting("a home that two people share", frozenset({"partner"})),
+        HouseholdSetting("a home that three generations share", frozenset({"parent", "child"})),
+        HouseholdSetting("a family home", frozenset({"child"})),
+        HouseholdSetting("a home that somebody shares with a parent", frozenset({"parent"})),
+        HouseholdSetting("a house with a lodger", frozenset({"lodger"})),
+        HouseholdSetting("a home that two people share", frozenset({"partner"})),
     ),
 )  # fmt: skip
 _RESTAURANT: Final = Milieu(

@@ -16,9 +16,9 @@ from embomatrix.factory.social.phrases import (
     MATTERS,
     QUESTIONS,
     TURNS,
-    called,
-    filled,
-    said_once,
+    fill,
+    shorten_repeated_rooms,
+    spoken_category,
 )
 from embomatrix.factory.social.values import ROBOT, Act, Conversation, DialogueTurn
 from embomatrix.factory.writer.goals import placed_elsewhere
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from embomatrix.factory.scenes.view import SceneView
     from embomatrix.factory.social.values import Cast, DaySlot
-    from embomatrix.factory.writer.goals import GoalConjunct, Workshop
+    from embomatrix.factory.writer.goals import GoalConjunct, GoalContext
     from embomatrix.factory.writer.words import Voice
 
 
@@ -55,7 +55,7 @@ class ConversationScenario:
 class GrammarConversation:
     """One conversation, turn by turn."""
 
-    def __init__(self, scenario: ConversationScenario, shop: Workshop, voice: Voice) -> None:
+    def __init__(self, scenario: ConversationScenario, shop: GoalContext, voice: Voice) -> None:
         self._scenario = scenario
         self._shop = shop
         self._rng = shop.rng
@@ -84,10 +84,10 @@ class GrammarConversation:
     def _open(self, first: GoalConjunct) -> None:
         sign = "place" if first.kind == "place" else first.signs[0].partition("(")[0]
         matters = MATTERS.get(f"{sign} {first.manner}", MATTERS[sign])
-        matter = filled(self._voice.choose(matters), thing=first.thing)
+        matter = fill(self._voice.choose(matters), thing=first.thing)
         slot = self._scenario.slot
         self._say(slot.person, Act.NEED, activity=slot.activity, matter=matter, why=self._scenario.why)
-        question = filled(self._voice.choose(QUESTIONS[first.kind]), thing=first.thing)
+        question = fill(self._voice.choose(QUESTIONS[first.kind]), thing=first.thing)
         self._say(ROBOT, Act.CLARIFY, question=question)
 
     def _earlier(self, first: GoalConjunct) -> GoalConjunct | None:
@@ -101,7 +101,7 @@ class GrammarConversation:
     def _refuse(self, further: list[GoalConjunct]) -> None:
         """Somebody asks for what the robot can't do; it offers the next wish, which is then no longer among the ``further``."""
         slot = self._scenario.slot
-        chore, reason = impossible_chore(self._shop.view, slot.room, self._rng)
+        chore, reason = impossible_request(self._shop.view, slot.room, self._rng)
         self._say(slot.person, Act.ADD, clause=chore)
         self._say(ROBOT, Act.REFUSE, chore=chore, reason=reason)
         if further:
@@ -137,7 +137,7 @@ class GrammarConversation:
         return text
 
     def _say(self, speaker: str, act: Act, **words: str) -> None:
-        text = said_once(filled(self._voice.choose(TURNS[act]), **words), self._shop.view)
+        text = shorten_repeated_rooms(fill(self._voice.choose(TURNS[act]), **words), self._shop.view)
         self._turns.append(DialogueTurn(speaker=speaker, act=act, text=text))
 
 
@@ -164,20 +164,20 @@ _BY_ROOM: Final[Mapping[str, tuple[tuple[str, str], ...]]] = {
     "classroom": (("wipe the board", "I don't wipe"),),
     "private_office": (("call them back", "I don't use the telephone"),),
 }
-HEAVY_KG: Final = 2.0
+HEAVY_LOADS: Final = 2.0
 """So many times the arm's load: nobody doubts that it is too heavy."""
 
 
-def impossible_chore(view: SceneView, room: str, rng: np.random.Generator) -> tuple[str, str]:
+def impossible_request(view: SceneView, room: str, rng: np.random.Generator) -> tuple[str, str]:
     """A chore and why the robot can't do it; furniture of the room counts, if it is too heavy."""
     types = {item.name: item.type for item in view.scene.rooms}
     options = [*_ANYWHERE, *_BY_ROOM.get(types.get(room, ""), ())]
     options += [
         (
-            f"push the {called(view.category(name))} to the other wall",
+            f"push the {spoken_category(view.category(name))} to the other wall",
             f"it weighs more than the {ROBOT_LIMITS.mass_kg:g} kg that my arm lifts",
         )
         for name in view.in_room.get(room, ())
-        if view.asset(name).mass_kg > HEAVY_KG * ROBOT_LIMITS.mass_kg and len(view.alike(name)) == 1
+        if view.asset(name).mass_kg > HEAVY_LOADS * ROBOT_LIMITS.mass_kg and len(view.alike(name)) == 1
     ]
     return options[int(rng.integers(len(options)))]

@@ -300,7 +300,7 @@ def best_slot(
     return max(found, key=lambda item: item[0]) if found else None
 
 
-def why_of(activity: str) -> tuple[str, ...]:
+def reasons_for(activity: str) -> tuple[str, ...]:
     """Reasons to want help with something else; none where the grammar does not know the activity."""
     occasion: Occasion | None = occasion_of(activity)
     return occasion.why if occasion is not None else ()

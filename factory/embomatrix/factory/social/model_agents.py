@@ -49,7 +49,7 @@ class RoomSighting(BaseModel):
     rooms: dict[str, Annotated[str, Field(min_length=10, max_length=300, pattern=r"^[^\n<>]*$")]]
 
 
-class Talk(BaseModel):
+class ConversationAnswer(BaseModel):
     """What the model writes of a conversation."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -59,7 +59,7 @@ class Talk(BaseModel):
     last_wishes: tuple[str, ...] = Field(min_length=1, max_length=6)
 
 
-class ModelAgents:
+class SocialModelAgents:
     """All three agents on one model; ``temperature`` is that of what is made up, ``max_tokens`` bounds an answer."""
 
     def __init__(
@@ -106,7 +106,7 @@ class ModelAgents:
     ) -> Conversation:
         """Several rounds between people and the robot, in which a request takes shape. Raises LlmError."""
 
-        def check(talk: Talk) -> None:
+        def check(talk: ConversationAnswer) -> None:
             speakers = {turn.speaker for turn in talk.turns}
             if unknown := sorted(speakers - {ROBOT, *cast.names}):
                 raise ValueError(
@@ -131,7 +131,9 @@ class ModelAgents:
             hint=CATEGORY_HINTS[category.value],
         )
         request = self._request(TALK, TALK_SYSTEM.format(limits=ROBOT_LIMITS), user, seed)
-        talk = (await ask(self._model, request, Talk, check=check, attempts=self._attempts)).value
+        talk = (
+            await ask(self._model, request, ConversationAnswer, check=check, attempts=self._attempts)
+        ).value
         return Conversation(
             slot=slot, turns=talk.turns, first_wish=talk.first_wish, last_wishes=talk.last_wishes
         )

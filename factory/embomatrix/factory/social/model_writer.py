@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.factory.admission import RefusalReason, TaskRefusal
 from embomatrix.factory.social.conversing import starting_slots
 from embomatrix.factory.social.facts import facts_of, with_sights
-from embomatrix.factory.social.requests import piece_of
+from embomatrix.factory.social.requests import conjunct_of
 from embomatrix.factory.social.summary import transcript_of
-from embomatrix.factory.writer.goals import Workshop
+from embomatrix.factory.writer.goals import GoalContext
 from embomatrix.factory.writer.tasks import Draft, DraftOrder, draft_of
 from embomatrix.llm.loop import OnOneLoop
 from embomatrix.llm.patience import FailureLimit
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from embomatrix.factory.scenes.view import SceneView
     from embomatrix.factory.social.facts import SceneFacts
-    from embomatrix.factory.social.model_agents import ModelAgents
+    from embomatrix.factory.social.model_agents import SocialModelAgents
     from embomatrix.factory.social.values import Cast
     from embomatrix.factory.writer.variant import Variant
     from embomatrix.world.scene import Scene
@@ -47,7 +47,7 @@ class ModelWriter(OnOneLoop):
 
     def __init__(
         self,
-        agents: ModelAgents,
+        agents: SocialModelAgents,
         endpoint: AbstractAsyncContextManager[object] | None = None,
         look: Callable[[Scene], tuple[bytes, ...]] | None = None,
     ) -> None:
@@ -119,9 +119,9 @@ class ModelWriter(OnOneLoop):
             request = await self._agents.summarise(facts, view, conversation, seed)
         except LlmError as error:
             return error
-        pieces = [piece_of(wish, view) for wish in request.wishes]
+        pieces = [conjunct_of(wish, view) for wish in request.wishes]
         transcript = transcript_of(cast, conversation, request.instruction, pieces)
-        shop = Workshop(view, variant, order.rng)
+        shop = GoalContext(view, variant, order.rng)
         return draft_of(shop, order.category, order.task_id, pieces, request.instruction, transcript)
 
     async def _seen(self, scene: Scene, facts: SceneFacts, seed: int) -> Mapping[str, str]:

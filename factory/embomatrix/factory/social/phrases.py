@@ -282,7 +282,7 @@ WHENCE: Final = ("from {room}",)
 _PAUSE: Final = re.compile(r"[,;:.?]")
 
 
-def called(category: str) -> str:
+def spoken_category(category: str) -> str:
     """A category as people call it."""
     return NOUNS.get(category, spoken(category))
 
@@ -292,7 +292,7 @@ def room_called(view: SceneView, room: str) -> str:
     return spoken(room_words(view, room)).replace("childs", "child's")
 
 
-def said_once(text: str, view: SceneView) -> str:
+def shorten_repeated_rooms(text: str, view: SceneView) -> str:
     """The text with ``there`` for a room that was the last one to be named, once in a clause."""
     rooms = sorted((room_called(view, room.name) for room in view.scene.rooms), key=len, reverse=True)
     named = re.compile(
@@ -313,7 +313,7 @@ def said_once(text: str, view: SceneView) -> str:
     return named.sub(shown, text)
 
 
-def filled(template: str, **words: str) -> str:
+def fill(template: str, **words: str) -> str:
     """The template with its words, each also with a capital where the template's name has one."""
     capitals = {name.capitalize(): capital(text) for name, text in words.items()}
     return template.format(**words, **capitals)

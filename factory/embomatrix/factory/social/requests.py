@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from embomatrix.factory.scenes.view import SceneView
 
 
-class Wanted(StrEnum):
+class RequestPredicate(StrEnum):
     """Predicates that a request may use; the robot's skills bring all of them about."""
 
     ONTOP = "ontop"
@@ -27,8 +27,8 @@ class Wanted(StrEnum):
     FROZEN = "frozen"
 
 
-PLACED: Final = frozenset({Wanted.ONTOP, Wanted.INSIDE})
-THERMAL: Final = frozenset({Wanted.COOKED, Wanted.HOT, Wanted.FROZEN})
+PLACED: Final = frozenset({RequestPredicate.ONTOP, RequestPredicate.INSIDE})
+THERMAL: Final = frozenset({RequestPredicate.COOKED, RequestPredicate.HOT, RequestPredicate.FROZEN})
 
 
 class RequestedAtom(BaseModel):
@@ -36,7 +36,7 @@ class RequestedAtom(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    predicate: Wanted
+    predicate: RequestPredicate
     thing: str
     place: str = ""
     holds: bool = True
@@ -75,7 +75,7 @@ def _problem(wish: RequestedAtom, view: SceneView, known: frozenset[str]) -> str
         if not view.asset(wish.thing).can("cookable"):
             return f"{wish.thing} is nothing to cook, heat or freeze"
         return "" if view.robot.fetches(wish.thing) else _beyond(wish.thing)
-    if wish.predicate is Wanted.OPEN:
+    if wish.predicate is RequestPredicate.OPEN:
         if not view.is_openable(wish.thing):
             return f"{wish.thing} has no door or drawer"
         done, works = view.is_open(wish.thing), view.robot.swings(wish.thing, shut=not wish.holds)
@@ -93,7 +93,7 @@ def _placing_problem(wish: RequestedAtom, view: SceneView) -> str:
         return "say where the thing is to be, not where it is not to be"
     if not wish.place:
         return "it takes a place"
-    inside = wish.predicate is Wanted.INSIDE
+    inside = wish.predicate is RequestPredicate.INSIDE
     hosts = (
         view.is_container(wish.place) or view.is_basket(wish.place) if inside else view.is_surface(wish.place)
     )
@@ -112,7 +112,7 @@ def _beyond(name: str) -> str:
     return f"the robot tried, and does not get at {name}: ask for something else"
 
 
-def piece_of(wish: RequestedAtom, view: SceneView) -> GoalConjunct:
+def conjunct_of(wish: RequestedAtom, view: SceneView) -> GoalConjunct:
     """The wish as a piece of a goal. Its words stand in the request's instruction."""
     names = (wish.thing, wish.place) if wish.place else (wish.thing,)
     atom: Formula = Atom(wish.predicate.value, names)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from embomatrix.factory.social.phrases import INSTRUCTIONS, JOINS, filled, room_called, said_once
+from embomatrix.factory.social.phrases import INSTRUCTIONS, JOINS, fill, room_called, shorten_repeated_rooms
 from embomatrix.factory.social.values import ROBOT
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def instruction_of(conversation: Conversation, cast: Cast, view: SceneView, voic
     what = conversation.last_wishes[0]
     for clause in conversation.last_wishes[1:]:
         what += voice.choose(JOINS) + clause
-    text = filled(
+    text = fill(
         voice.choose(INSTRUCTIONS),
         who=who.name,
         other=others[int(voice.rng.integers(len(others)))],
@@ -37,7 +37,7 @@ def instruction_of(conversation: Conversation, cast: Cast, view: SceneView, voic
         hobby=who.hobby,
         why=why,
     )
-    return said_once(text, view)
+    return shorten_repeated_rooms(text, view)
 
 
 def transcript_of(

@@ -12,11 +12,11 @@ import numpy as np
 
 from embomatrix.factory.social.casting import GrammarRolePlayer
 from embomatrix.factory.social.conversing import ConversationScenario, GrammarConversation
-from embomatrix.factory.social.fitting import best_slot, why_of
+from embomatrix.factory.social.fitting import best_slot, reasons_for
 from embomatrix.factory.social.phrases import CLAUSES, MANNERS, NOUNS, WHENCE, WHERE, room_called
 from embomatrix.factory.social.summary import instruction_of, transcript_of
-from embomatrix.factory.writer.goals import Workshop
-from embomatrix.factory.writer.tasks import Draft, draft_of, pieces_of
+from embomatrix.factory.writer.goals import GoalContext
+from embomatrix.factory.writer.tasks import Draft, draft_of, draw_conjuncts
 from embomatrix.factory.writer.words import FreshVoice
 
 if TYPE_CHECKING:
@@ -37,12 +37,12 @@ GOALS_TRIED: Final = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Talked:
+class Talk:
     """A conversation with what led to it; ``shop`` and ``voice`` are for what is still to be said."""
 
     scenario: ConversationScenario
     conversation: Conversation
-    shop: Workshop
+    shop: GoalContext
     voice: FreshVoice
 
 
@@ -88,13 +88,13 @@ class SocialWriter:
 
     def talk(
         self, variant: Variant, view: SceneView, category: TaskCategory, rng: np.random.Generator
-    ) -> Talked | None:
+    ) -> Talk | None:
         """A conversation that comes to a wish of this category; None where nobody would have one."""
         cast = self.cast_of(variant.scene)
         said = self._said_in(variant)
         voice = FreshVoice(rng, said)
         phrases = {**CLAUSES, **MANNERS}
-        shop = Workshop(
+        shop = GoalContext(
             view,
             variant,
             rng,
@@ -112,7 +112,7 @@ class SocialWriter:
         said.update((slot.person, slot.activity, _wish_of(pieces)))
         used = frozenset(name for piece in pieces for name in piece.objects)
         talk = GrammarConversation(chosen, dataclasses.replace(shop, used=used), voice).run()
-        return Talked(chosen, talk, shop, voice)
+        return Talk(chosen, talk, shop, voice)
 
 
 def _wish_of(pieces: Sequence[GoalConjunct]) -> str:
@@ -121,7 +121,7 @@ def _wish_of(pieces: Sequence[GoalConjunct]) -> str:
 
 
 def _scenario(
-    cast: Cast, shop: Workshop, category: TaskCategory, said: Counter[str]
+    cast: Cast, shop: GoalContext, category: TaskCategory, said: Counter[str]
 ) -> ConversationScenario | None:
     """Of some goals that the scene allows, that which suits best somebody's day; None where nobody would wish for any.
 
@@ -129,7 +129,7 @@ def _scenario(
     """
     best: tuple[float, tuple[GoalConjunct, ...], DaySlot] | None = None
     for _ in range(GOALS_TRIED):
-        pieces = tuple(pieces_of(shop, category))
+        pieces = tuple(draw_conjuncts(shop, category))
         found = best_slot(cast, pieces, shop.view, said) if pieces else None
         if found is None or said[_wish_of(pieces)] >= SAME_WISHES:
             continue
@@ -139,4 +139,6 @@ def _scenario(
     if best is None:
         return None
     _, pieces, slot = best
-    return ConversationScenario(cast, slot, pieces, FreshVoice(shop.rng, said).choose(why_of(slot.activity)))
+    return ConversationScenario(
+        cast, slot, pieces, FreshVoice(shop.rng, said).choose(reasons_for(slot.activity))
+    )

@@ -7,14 +7,14 @@ import itertools
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from embomatrix.factory.admission import MOST_HELD, Admitted, RefusalReason, TaskRefusal, admit
-from embomatrix.factory.pipeline.task_poses import Needs, SceneSurvey, cache_poses
+from embomatrix.factory.admission import MAX_HELD_SHARE, Admitted, RefusalReason, TaskRefusal, admit
+from embomatrix.factory.pipeline.task_poses import PoseNeeds, SceneSurvey, cache_poses
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.neighbours import neighbours_of
-from embomatrix.factory.task_import.size_requirements import demands_of
+from embomatrix.factory.task_import.size_requirements import requirements_of
 from embomatrix.factory.task_import.sources import BEHAVIOR, EAI
-from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
+from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.floor.prepared import prepare
 from embomatrix.sim.planner.oracle import find_plan
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from embomatrix.world.task import Task
 
 
-OF_THE_PROBLEM: Final = frozenset(
+SCENE_INDEPENDENT: Final = frozenset(
     {
         RefusalReason.UNKNOWN_TYPE,
         RefusalReason.SUBSTANCE,
@@ -44,7 +44,7 @@ OF_THE_PROBLEM: Final = frozenset(
     }
 )
 """Reasons that are the same in every scene."""
-DRAWS: Final = 3
+OWN_SCENE_DRAWS: Final = 3
 """Ways to lay a problem out in its first scene, from seeds of their own, before another scene is looked at."""
 MOST_UNSOLVED: Final = 6
 """Scenes in which a problem is laid out and not solved before it is given up: what stops it is then no scene's fault.
@@ -53,7 +53,7 @@ So many more are looked at with a snug layout, where things are to share a cavit
 """
 MOST_ALIKE: Final = 3
 """Such scenes in a row of which the same is told."""
-STRIDE: Final = 1_000_003
+SEED_STRIDE: Final = 1_000_003
 """Between the seeds of two draws: no other problem is imported with such a one."""
 MOST_MISFITS: Final = 12
 """Scenes with all rooms and furniture in which a problem's things find no place, before the next way is tried: laying out forty
@@ -72,17 +72,17 @@ class Verified:
 
 
 def bind_first(
-    source: SourceText, bases: Sequence[Scene], *, seed: int = 0, manner: Manner | None = None
+    source: SourceText, bases: Sequence[Scene], *, seed: int = 0, manner: ImportOptions | None = None
 ) -> ImportedTask | TaskRefusal:
     """The problem in the first scene that it can be bound to, else the refusal that came furthest. Raises BddlError.
 
     The scene that it was written for comes first, then those that have all furniture, then those that lack some.
     """
-    return _first(imports(source, bases, seed=seed, manner=manner or Manner()))
+    return _first(imports(source, bases, seed=seed, manner=manner or ImportOptions()))
 
 
 def imports(
-    source: SourceText, bases: Sequence[Scene], *, seed: int, manner: Manner, draws: int = 1
+    source: SourceText, bases: Sequence[Scene], *, seed: int, manner: ImportOptions, draws: int = 1
 ) -> Iterator[ImportedTask | TaskRefusal]:
     """The problem in each scene as it is, then, where the manner says so, in each with the furniture that it lacks.
 
@@ -93,10 +93,10 @@ def imports(
     others = [base for base in bases if base.base != source.scene]
     as_it_is = replace(manner, furnishing=False)
     for draw, base in itertools.product(range(draws), own):
-        drawn = seed + draw * STRIDE
+        drawn = seed + draw * SEED_STRIDE
         outcome = import_problem(source, base, seed=drawn, manner=as_it_is)
         yield outcome
-        if isinstance(outcome, TaskRefusal) and outcome.reason in OF_THE_PROBLEM:
+        if isinstance(outcome, TaskRefusal) and outcome.reason in SCENE_INDEPENDENT:
             return
         if isinstance(outcome, TaskRefusal) and manner.furnishing:
             yield import_problem(source, base, seed=drawn, manner=manner)
@@ -110,7 +110,7 @@ def imports(
             yield outcome
             if not isinstance(outcome, TaskRefusal):
                 continue
-            if outcome.reason in OF_THE_PROBLEM:
+            if outcome.reason in SCENE_INDEPENDENT:
                 return
             misfits += outcome.reason is RefusalReason.DOES_NOT_FIT
             if misfits == MOST_MISFITS:
@@ -124,7 +124,7 @@ def verify_first(
     foresight: Foresight | None,
     *,
     seed: int = 0,
-    manner: Manner | None = None,
+    manner: ImportOptions | None = None,
 ) -> Verified | TaskRefusal:
     """The problem in the first scene in which it is admitted, else the refusal that came furthest. Raises BddlError.
 
@@ -132,10 +132,10 @@ def verify_first(
     """
 
     def judged() -> Iterator[Verified | TaskRefusal]:
-        given = manner or Manner()
-        for tried in (given, replace(given, snug=True)) if shares_room(source) else (given,):
+        given = manner or ImportOptions()
+        for tried in (given, replace(given, snug=True)) if has_shared_host(source) else (given,):
             laid_out, misfits, told = 0, 0, list[str]()
-            for imported in imports(source, bases, seed=seed, manner=tried, draws=DRAWS):
+            for imported in imports(source, bases, seed=seed, manner=tried, draws=OWN_SCENE_DRAWS):
                 if isinstance(imported, TaskRefusal):
                     misfits += imported.reason is RefusalReason.DOES_NOT_FIT
                     yield imported
@@ -153,10 +153,10 @@ def verify_first(
     return _first(judged())
 
 
-def shares_room(source: SourceText) -> bool:
+def has_shared_host(source: SourceText) -> bool:
     """Whether a problem has more than one thing in or on another, at the start or in the end. Raises BddlError."""
     problem, _ = read_problem(source)
-    return any(max(len(each.contents), len(each.burden)) > 1 for each in demands_of(problem).values())
+    return any(max(len(each.contents), len(each.burden)) > 1 for each in requirements_of(problem).values())
 
 
 T = TypeVar("T", ImportedTask, Verified)
@@ -180,7 +180,9 @@ def verify(
     """Judge an imported task by execution, and pack it when it is admitted. Without ``foresight`` the arm is not asked."""
     poses = poses_for(imported, SceneView(imported.scene), library, foresight, seed)
     with contextlib.closing(Simulator(Bundle(imported.scene, {}, poses))) as stage:
-        verdict = admit(stage, imported.task, find_plan, imported.init, most_held=most_held_in(imported.task))
+        verdict = admit(
+            stage, imported.task, find_plan, imported.init, most_held=max_held_share(imported.task)
+        )
         if not isinstance(verdict, Admitted):
             return verdict
         bundle = Bundle(imported.scene, {imported.task.task_id: imported.task}, poses)
@@ -201,11 +203,11 @@ def poses_for(
 ) -> PoseCache:
     """The pose cache of an imported task's scene."""
     task = imported.task
-    needs = Needs(imported.about, task.table, neighbours_of(task.goal, task.types, view.is_portable))
+    needs = PoseNeeds(imported.about, task.table, neighbours_of(task.goal, task.types, view.is_portable))
     with SceneSurvey(imported.scene, foresight) as survey:
         return cache_poses(view, [needs], library, survey, seed)
 
 
-def most_held_in(task: Task) -> float:
+def max_held_share(task: Task) -> float:
     """Share of a task's atoms that may hold at the start: the questions of published benchmarks are as they are."""
-    return 1.0 if task.source in (BEHAVIOR, EAI) else MOST_HELD
+    return 1.0 if task.source in (BEHAVIOR, EAI) else MAX_HELD_SHARE

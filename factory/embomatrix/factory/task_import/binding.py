@@ -14,7 +14,7 @@ from embomatrix.factory.admission import RefusalReason, RefusedError
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.expressible import AGENT, FLOORS, check_evaluable, check_expressible
 from embomatrix.factory.task_import.reach import pieces_of
-from embomatrix.factory.task_import.search import needs_of, search
+from embomatrix.factory.task_import.search import abilities_needed, search
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.state import Relation
 from embomatrix.world.substances import is_substance
@@ -100,14 +100,14 @@ def bind(
     rooms, found = search(
         problem, view, inroom, fixtures, rng, furnishing=furnishing, renumbering=renumbering, shunned=shunned
     )
-    problem = _spelt_out(problem, view, rooms, found)
+    problem = _with_wildcards_expanded(problem, view, rooms, found)
     floors = {name: rooms[room] for name, room in inroom.items() if problem.objects.get(name) in FLOORS}
     loose = {name: rooms[inroom[name]] for name in fixtures if name not in found}
     additions = _in_order(problem, placed, found, floors, loose)
     return Binding(problem, found, floors, additions, rooms, _robot_room(problem, placed, floors, scene))
 
 
-def _spelt_out(
+def _with_wildcards_expanded(
     problem: BddlProblem, view: SceneView, rooms: Mapping[str, str], found: dict[str, str]
 ) -> BddlProblem:
     """The problem with wildcards replaced by all further objects of the type in the room, which are added to ``found``."""
@@ -146,7 +146,7 @@ def _in_order(
     loose: Mapping[str, str],
 ) -> tuple[Addition, ...]:
     """Additions such that each host is there before its guest. What the start places nowhere may be anywhere."""
-    needs = needs_of(problem)
+    needs = abilities_needed(problem)
     additions: list[Addition] = []
     ready = {*found, *floors}
     waiting = _to_add(problem, ready)

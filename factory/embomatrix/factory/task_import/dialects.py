@@ -146,8 +146,8 @@ _SWITCHED: Final = re.compile(r"\(\s*toggled_on\s+\??([a-z_\-]+\.n\.\d+)", re.IG
 def read_problem(source: SourceText) -> tuple[BddlProblem, tuple[str, ...]]:
     """The problem of a source in the words of the catalog, whole, and what was read into it. Raises BddlError."""
     words = GROUPS if source.source == EAI else RENAMED
-    text, replaced = in_catalog_words(source.text, {**words, **_lamps_for(source.text)})
-    problem, added = said_whole(parse_problem(text))
+    text, replaced = translate_types(source.text, {**words, **_lamps_for(source.text)})
+    problem, added = with_implied_rooms(parse_problem(text))
     return problem, (*replaced, *added)
 
 
@@ -157,7 +157,7 @@ def _lamps_for(text: str) -> dict[str, tuple[str, ...]]:
     return {name: lamps for name, lamps in LAMPS.items() if name in switched}
 
 
-def in_catalog_words(text: str, words: Mapping[str, tuple[str, ...]]) -> tuple[str, tuple[str, ...]]:
+def translate_types(text: str, words: Mapping[str, tuple[str, ...]]) -> tuple[str, tuple[str, ...]]:
     """BDDL with types replaced by what they stand for, and a sentence for each replacement. Names of objects stay."""
     found = dict.fromkeys(name.lower() for name in _TYPE.findall(text))
     chosen: dict[str, str] = {}
@@ -170,7 +170,7 @@ def in_catalog_words(text: str, words: Mapping[str, tuple[str, ...]]) -> tuple[s
     return _TYPE.sub(lambda match: chosen.get(match[1].lower(), match[1]), text), notes
 
 
-def said_whole(problem: BddlProblem) -> tuple[BddlProblem, tuple[str, ...]]:
+def with_implied_rooms(problem: BddlProblem) -> tuple[BddlProblem, tuple[str, ...]]:
     """The problem with what it leaves unsaid, and a sentence for each addition.
 
     A room in the place of a host is the room that the thing is in. A floor whose room is not told is the floor of the room

@@ -6,7 +6,7 @@ import difflib
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.admission import RefusalReason, RefusedError
-from embomatrix.factory.task_import.reach import FUTURE, HELD, INSOURCE, Horizon, pieces_of
+from embomatrix.factory.task_import.reach import FUTURE, HELD, INSOURCE, Reachability, pieces_of
 from embomatrix.world.bddl import is_room_instance
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.evaluate import atoms_of, render
@@ -64,7 +64,7 @@ def _close_synsets(type_name: str) -> str:
 
 
 def _check_goal(problem: BddlProblem) -> None:
-    obstacle = Horizon(problem).obstacle(problem.goal)
+    obstacle = Reachability(problem).obstacle(problem.goal)
     if obstacle is not None:
         solid = not any(
             is_substance(_type(problem, arg)) for atom in atoms_of(obstacle) for arg in atom.args[:1]

@@ -11,7 +11,7 @@ from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.batch import Verified, bind_first, verify_first
 from embomatrix.factory.task_import.report import ProblemOutcome, outcome_of
-from embomatrix.factory.task_import.task import ImportedTask, Manner
+from embomatrix.factory.task_import.task import ImportedTask, ImportOptions
 from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.process_pool import shared_work
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from embomatrix.factory.admission import TaskRefusal
     from embomatrix.factory.task_import.sources import SourceText
 
-    Judging = Callable[[Sequence[SourceText]], Iterator["ImportOutcome"]]
+    ImportMany = Callable[[Sequence[SourceText]], Iterator["ImportOutcome"]]
     """Imports problems; what comes of them comes in their order."""
 
 
@@ -35,7 +35,7 @@ class Depth(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Docket:
+class ImportSettings:
     """What decides the imports of one command."""
 
     scenes: tuple[str, ...]
@@ -55,7 +55,7 @@ class ImportOutcome:
 class ProblemImporter:
     """Imports problems one after the other, with the base scenes and a client to settle things in. Close it after use."""
 
-    def __init__(self, docket: Docket) -> None:
+    def __init__(self, docket: ImportSettings) -> None:
         self._docket = docket
         self._bases = [build_base_scene(scene_id) for scene_id in docket.scenes]
         self._foresight = Foresight() if docket.look_ahead else None
@@ -73,7 +73,7 @@ class ProblemImporter:
         seed = self._docket.seed
         match self._docket.depth:
             case Depth.INSTANTIATE:
-                return bind_first(source, self._bases, seed=seed, manner=Manner(reachable=False))
+                return bind_first(source, self._bases, seed=seed, manner=ImportOptions(reachable=False))
             case Depth.BIND:
                 return bind_first(source, self._bases, seed=seed)
             case Depth.VERIFY:
@@ -81,18 +81,18 @@ class ProblemImporter:
 
 
 @contextlib.contextmanager
-def judging(docket: Docket, jobs: int) -> Iterator[Judging]:
+def importing(docket: ImportSettings, jobs: int) -> Iterator[ImportMany]:
     """For as long as this is held. Raises EvaluationError when one of several processes dies."""
     died = EvaluationError(
         "a process that imports problems died, perhaps for want of memory: call the same command with fewer --jobs"
     )
     with shared_work(
-        jobs, ProblemImporter, ProblemImporter.judge if jobs == 1 else _sent, docket, died=died
+        jobs, ProblemImporter, ProblemImporter.judge if jobs == 1 else _picklable_import, docket, died=died
     ) as judge:
         yield judge
 
 
-def _sent(judge: ProblemImporter, source: SourceText) -> ImportOutcome:
+def _picklable_import(judge: ProblemImporter, source: SourceText) -> ImportOutcome:
     """What another process tells."""
     judged = judge.judge(source)
     return ImportOutcome(judged.outcome, None) if isinstance(judged.item, ImportedTask) else judged

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.scenes.view import is_liftable
-from embomatrix.factory.task_import.search import serves
-from embomatrix.factory.task_import.size_requirements import CavityFit, Demand, floor_needed_m2, room_for
+from embomatrix.factory.task_import.search import has_abilities
+from embomatrix.factory.task_import.size_requirements import CavityFit, Requirement, floor_needed_m2, room_for
 from embomatrix.sim.geometry.candidates import candidates, surfaces_for
 from embomatrix.sim.planner.ways import CANDIDATES, MIDDLE
 from embomatrix.world.catalog import Catalog
@@ -31,7 +31,7 @@ LOOKED_AT: Final = 4 * MODEL_TRIES
 """Models of which it is asked whether they can do what they must."""
 
 
-def models_for(addition: Addition, rng: np.random.Generator, demand: Demand) -> list[Model]:
+def models_for(addition: Addition, rng: np.random.Generator, demand: Requirement) -> list[Model]:
     """At most five models of the type that can do what is asked, the liftable ones before furniture.
 
     Of what can be lifted large ones come first where it bears others, else small ones. Of furniture two of a middling
@@ -53,7 +53,7 @@ def models_for(addition: Addition, rng: np.random.Generator, demand: Demand) -> 
         else:
             heavy.append((volume, model))
     order = [*_ranked(light), *(_ranked(heavy) if addition.host else _middling_first(heavy))]
-    able = [model for model in order[:LOOKED_AT] if serves(_asset(model), addition.needs)]
+    able = [model for model in order[:LOOKED_AT] if has_abilities(_asset(model), addition.needs)]
     if demand.contents:
         # A sort that keeps the order: among those that take everything, and among the others.
         carried = [model for _, model in light] if demand.carried else []
@@ -61,7 +61,7 @@ def models_for(addition: Addition, rng: np.random.Generator, demand: Demand) -> 
     return able[:MODEL_TRIES]
 
 
-def _room(model: Model, demand: Demand) -> CavityFit:
+def _room(model: Model, demand: Requirement) -> CavityFit:
     return room_for(_asset(model), demand.contents)
 
 
@@ -98,10 +98,10 @@ class HostPlacement:
     share: float
 
 
-def sized(
+def with_sizes(
     orders: Mapping[str, Sequence[Model]],
     additions: Sequence[Addition],
-    demands: Mapping[str, Demand],
+    demands: Mapping[str, Requirement],
     found: Mapping[str, Asset],
     *,
     snug: bool = False,
@@ -121,13 +121,13 @@ def sized(
             if (host := found.get(name) or _first(chosen.get(name, ()))) is not None
         ]
         models = _ordered(chosen[addition.name], demand, places)
-        if snug and (demand.contents or demand.burden) and not _suits(models[0], demand, places):
-            models = [*_grown(models, demand, places), *models]
+        if snug and (demand.contents or demand.burden) and not _meets(models[0], demand, places):
+            models = [*_enlarged(models, demand, places), *models]
         chosen[addition.name] = models
     return chosen
 
 
-def _share_of_all(host: Asset, demand: Demand) -> float:
+def _share_of_all(host: Asset, demand: Requirement) -> float:
     """Share of their size at which all that goes into or onto a host has floor there; no limit where all has it."""
     least = math.inf
     for relation, types in ((Relation.INSIDE, demand.contents), (Relation.ONTOP, demand.burden)):
@@ -138,35 +138,35 @@ def _share_of_all(host: Asset, demand: Demand) -> float:
     return least
 
 
-def _ordered(models: list[Model], demand: Demand, places: Sequence[HostPlacement]) -> list[Model]:
+def _ordered(models: list[Model], demand: Requirement, places: Sequence[HostPlacement]) -> list[Model]:
     most = max(SMALLER[-1], min((place.share for place in places), default=math.inf))
-    fit = [model for model in models if model.share <= most and _suits(model, demand, places)]
+    fit = [model for model in models if model.share <= most and _meets(model, demand, places)]
     if fit:
         return [*fit, *(model for model in models if model not in fit)]
     made = [
-        model for model in _resized(models, demand) if model.share <= most and _suits(model, demand, places)
+        model for model in _resized(models, demand) if model.share <= most and _meets(model, demand, places)
     ]
     if not made and demand.carried:
         # what does not do all of it is at least to be carried
-        made = [model for model in (*models, *_resized(models, Demand())) if _is_liftable(model)]
+        made = [model for model in (*models, *_resized(models, Requirement())) if _is_liftable(model)]
     return [*made[:KEPT], *models]
 
 
-def _grown(models: Sequence[Model], demand: Demand, places: Sequence[HostPlacement]) -> list[Model]:
+def _enlarged(models: Sequence[Model], demand: Requirement, places: Sequence[HostPlacement]) -> list[Model]:
     """The models as large as can be, for more than any has room for: what goes in is made smaller too."""
     largest = [model.at(LARGER[-1]) for model in models if model.share == 1]
     less = replace(demand, contents=(), burden=())
-    return [model for model in largest if _suits(model, less, places)][:KEPT]
+    return [model for model in largest if _meets(model, less, places)][:KEPT]
 
 
-def _resized(models: Sequence[Model], demand: Demand) -> Iterator[Model]:
+def _resized(models: Sequence[Model], demand: Requirement) -> Iterator[Model]:
     """The models at other shares of their size: larger ones of what others go into, then smaller ones."""
     for share in (*(LARGER if demand.contents or demand.burden else ()), *SMALLER):
         for model in models:
             yield model.at(share)
 
 
-def _suits(model: Model, demand: Demand, places: Sequence[HostPlacement]) -> bool:
+def _meets(model: Model, demand: Requirement, places: Sequence[HostPlacement]) -> bool:
     asset = _asset(model)
     if demand.carried and not _is_liftable(model):
         return False
@@ -174,7 +174,7 @@ def _suits(model: Model, demand: Demand, places: Sequence[HostPlacement]) -> boo
         return False
     if demand.burden and room_for(asset, demand.burden, Relation.ONTOP) is not CavityFit.FOR_ALL:
         return False
-    return all(_goes(asset, place) for place in places)
+    return all(_fits_host(asset, place) for place in places)
 
 
 def _is_liftable(model: Model) -> bool:
@@ -182,7 +182,7 @@ def _is_liftable(model: Model) -> bool:
     return is_liftable(asset.size_m, asset.mass_kg)
 
 
-def _goes(asset: Asset, place: HostPlacement) -> bool:
+def _fits_host(asset: Asset, place: HostPlacement) -> bool:
     """Whether a thing has a pose on or in its host, by geometry alone."""
     return next(candidates(asset, place.host, place.relation, MIDDLE, CANDIDATES), None) is not None
 

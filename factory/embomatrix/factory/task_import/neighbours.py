@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from typing import TYPE_CHECKING
 
-from embomatrix.factory.pipeline.task_poses import Beside
+from embomatrix.factory.pipeline.task_poses import NeighbourPair
 from embomatrix.factory.task_import.reach import literals
 from embomatrix.world.state import Relation
 
@@ -22,7 +22,7 @@ BORNE = (Relation.ONTOP, Relation.INSIDE, Relation.TOUCHING)
 
 def neighbours_of(
     goal: Formula, types: Mapping[str, tuple[str, ...]], can_carry: Callable[[str], bool]
-) -> tuple[Beside, ...]:
+) -> tuple[NeighbourPair, ...]:
     """Pairs of which the goal wants the first next to the second, which stays where it is, or goes where the first goes.
 
     Of a statement about all or some of a type there are pairs for each of them. Where nothing of a pair can be carried, or
@@ -30,7 +30,7 @@ def neighbours_of(
     """
     wanted = tuple(_grounded(goal, types))
     places = _places(wanted, can_carry)
-    found: dict[Beside, None] = {}
+    found: dict[NeighbourPair, None] = {}
     for pair in dict.fromkeys(args for predicate, args in wanted if predicate == Relation.NEXTTO):
         if pair[0] != pair[1]:
             found.update(dict.fromkeys(_ways(pair, places, can_carry)[:1]))
@@ -39,16 +39,16 @@ def neighbours_of(
 
 def _ways(
     pair: tuple[str, ...], places: Mapping[str, Mapping[str, None]], can_carry: Callable[[str], bool]
-) -> list[Beside]:
+) -> list[NeighbourPair]:
     """Ways in which two things come to be neighbours: where one of them is carried to first, before where one stays."""
     orders = [(mover, neighbour) for mover, neighbour in (pair, pair[::-1]) if can_carry(mover)]
     going = [
-        Beside(mover, neighbour, host)
+        NeighbourPair(mover, neighbour, host)
         for mover, neighbour in orders
         for host in places.get(neighbour, {})
         if host != mover and host in places.get(mover, {host: None})
     ]
-    return going + [Beside(mover, neighbour) for mover, neighbour in orders if neighbour not in places]
+    return going + [NeighbourPair(mover, neighbour) for mover, neighbour in orders if neighbour not in places]
 
 
 def _places(wanted: Atoms, can_carry: Callable[[str], bool]) -> dict[str, dict[str, None]]:

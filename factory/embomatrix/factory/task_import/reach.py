@@ -76,7 +76,7 @@ def unreachable_atoms(problem: BddlProblem, profile: Profile) -> tuple[str, ...]
 
     A literal about a variable counts when that is so for all that the variable ranges over.
     """
-    horizon = Horizon(problem, profile)
+    horizon = Reachability(problem, profile)
     found = [
         render(atom if positive else Not(atom))
         for atom, positive, scope in literals(problem.goal, True, {})
@@ -109,13 +109,13 @@ def literals(
             yield from literals(body, positive, {**scope, a: kind_a, b: kind_b})
 
 
-class Horizon:
+class Reachability:
     """What can become of the objects of one problem by the skills of a profile."""
 
     def __init__(self, problem: BddlProblem, profile: Profile = Profile.HOUSEHOLD) -> None:
         self._problem = problem
         self._profile = profile
-        self._true = {_meaning(item.atom, problem) for item in problem.init if item.positive}
+        self._true = {_canonical(item.atom, problem) for item in problem.init if item.positive}
         self._pieces = pieces_of(problem)
         self._halves = {half for halves in self._pieces.values() for half in halves}
 
@@ -181,7 +181,7 @@ class Horizon:
         """Whether the atom can be true in the end, and whether it can be false."""
         if atom.predicate not in HELD:
             return False, False
-        known = _meaning(atom, self._problem)
+        known = _canonical(atom, self._problem)
         at_start = known in self._true
         if atom.predicate == REAL:
             at_start = Atom(FUTURE, atom.args) not in self._true
@@ -244,7 +244,7 @@ def _type_can(type_name: str, ability: str) -> bool:
     return any(ability in catalog.category(name).abilities for name in catalog.categories_of(type_name))
 
 
-def _meaning(atom: Atom, problem: BddlProblem) -> Atom:
+def _canonical(atom: Atom, problem: BddlProblem) -> Atom:
     """The atom in one dialect: substances by their synsets, ``dusty`` and the like as facts about them, sources as holders."""
     names = tuple(
         problem.objects[arg] if is_substance(problem.objects.get(arg, "")) and index else arg

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.admission import RefusalReason, RefusedError
 from embomatrix.factory.scenes.view import is_liftable
-from embomatrix.factory.task_import.size_requirements import demand_on, demands_of, room_for
+from embomatrix.factory.task_import.size_requirements import requirement_on, requirements_of, room_for
 from embomatrix.world.bddl import is_room_instance
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.evaluate import atoms_of
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 MAX_STEPS: Final = 20_000
 """Assignments that are looked at before a scene counts as lacking the objects."""
-ALIKE: Final[Mapping[str, str]] = {
+SIMILAR_ROOMS: Final[Mapping[str, str]] = {
     "television_room": "living_room",
     "childs_room": "bedroom",
     "pantry_room": "storage_room",
@@ -61,7 +61,7 @@ def search(
     words = sorted(set(inroom.values()))
     find = _renumbered if renumbering else _rooms_for
     options = {word: find(view.scene, word, rng) for word in words}
-    needs = needs_of(problem)
+    needs = abilities_needed(problem)
     best: tuple[int, dict[str, str], dict[str, str]] | None = None
     lacking = ""
     for rooms in itertools.islice(_room_choices(words, options), MAX_CHOICES):
@@ -98,7 +98,7 @@ def _rooms_for(scene: Scene, word: str, rng: np.random.Generator) -> list[str]:
 def _renumbered(scene: Scene, word: str, rng: np.random.Generator) -> list[str]:
     stem = word.rpartition("_")[0] if is_room_instance(word) else word
     if not any(room.type == stem for room in scene.rooms):
-        stem = ALIKE.get(stem, stem)
+        stem = SIMILAR_ROOMS.get(stem, stem)
     return sorted(_rooms_for(scene, stem, rng), key=lambda name: name == word)
 
 
@@ -112,7 +112,7 @@ def _room_choices(words: list[str], options: Mapping[str, list[str]]) -> Iterato
                 yield {words[0]: room, **rest}
 
 
-def needs_of(problem: BddlProblem) -> Mapping[str, frozenset[str]]:
+def abilities_needed(problem: BddlProblem) -> Mapping[str, frozenset[str]]:
     """What an object, or a whole type, must be able to do for start and goal to make sense."""
     needs: defaultdict[str, set[str]] = defaultdict(set)
     for atom in (*atoms_of(problem.goal), *(item.atom for item in problem.init if item.positive)):
@@ -162,18 +162,18 @@ def _domains(
         for item in problem.init
         if item.positive and item.atom.predicate in {Relation.ONTOP, Relation.INSIDE}
     }
-    demands = demands_of(problem)
+    demands = requirements_of(problem)
     domains: dict[str, list[str]] = {}
     missing: list[str] = []
     for name, room in wanted.items():
-        contents = demand_on(demands, name, problem.objects[name]).contents
+        contents = requirement_on(demands, name, problem.objects[name]).contents
         categories = set(catalog.categories_of(problem.objects[name]))
         fits = [
             other
             for other in view.in_room.get(room, ())
             if view.category(other) in categories
             and other not in shunned
-            and serves(view.asset(other), needs.get(name, frozenset()))
+            and has_abilities(view.asset(other), needs.get(name, frozenset()))
         ]
         if fits:
             order = [str(other) for other in rng.permutation(fits)]
@@ -233,7 +233,7 @@ def _backtrack(
     return failed
 
 
-def serves(asset: Asset, needs: Iterable[str]) -> bool:
+def has_abilities(asset: Asset, needs: Iterable[str]) -> bool:
     """Whether an asset can do all that is asked of it; a container has a cavity."""
     return all(bool(asset.interiors) if need == "container" else asset.can(need) for need in needs)
 

@@ -31,7 +31,7 @@ PLACED: Final = frozenset(set(Relation) - {Relation.INROOM})
 
 
 @dataclass(frozen=True, slots=True)
-class Demand:
+class Requirement:
     """What is asked of one thing, or of all of a type.
 
     ``contents`` are the types of what goes into it, one for each thing: those of the start, or those of the goal.
@@ -48,7 +48,7 @@ class Demand:
     """Types of what goes on top of it, one for each thing, as ``contents``."""
 
 
-def demands_of(problem: BddlProblem) -> Mapping[str, Demand]:
+def requirements_of(problem: BddlProblem) -> Mapping[str, Requirement]:
     """Demands on objects, and on types that the goal's variables range over, by name."""
     fixtures = {item.atom.args[0] for item in problem.init if item.atom.predicate == Relation.INROOM}
     bears: set[str] = set()
@@ -58,7 +58,7 @@ def demands_of(problem: BddlProblem) -> Mapping[str, Demand]:
     places: defaultdict[str, dict[tuple[Relation, str], None]] = defaultdict(dict)
     goal = list(literals(problem.goal, True, {}))
     for atom, positive, _ in goal:
-        if not positive and atom.predicate in PLACED and _is_so(problem, atom):
+        if not positive and atom.predicate in PLACED and _holds_at_start(problem, atom):
             carried.add(atom.args[0].lstrip("?"))
     moments = (
         (started, [item.atom for item in problem.init if item.positive]),
@@ -69,7 +69,7 @@ def demands_of(problem: BddlProblem) -> Mapping[str, Demand]:
             if atom.predicate not in PLACED:
                 continue
             thing, host = (name.lstrip("?") for name in atom.args)
-            if borne is ended and not _is_so(problem, atom):
+            if borne is ended and not _holds_at_start(problem, atom):
                 # of two that are to be neighbours, what the rooms don't have already
                 carried.add(host if atom.predicate == Relation.NEXTTO and thing in fixtures else thing)
             if atom.predicate in (Relation.INSIDE, Relation.ONTOP):
@@ -84,14 +84,14 @@ def demands_of(problem: BddlProblem) -> Mapping[str, Demand]:
             else tuple(ended[relation, name])
             for relation in (Relation.INSIDE, Relation.ONTOP)
         )
-        found[name] = Demand(name in bears, contents, name in carried, tuple(places[name]), burden)
+        found[name] = Requirement(name in bears, contents, name in carried, tuple(places[name]), burden)
     return found
 
 
-def demand_on(demands: Mapping[str, Demand], name: str, type_name: str) -> Demand:
+def requirement_on(demands: Mapping[str, Requirement], name: str, type_name: str) -> Requirement:
     """What is asked of an object by its own name and by its type's."""
-    own, all_alike = demands.get(name, Demand()), demands.get(type_name, Demand())
-    return Demand(
+    own, all_alike = demands.get(name, Requirement()), demands.get(type_name, Requirement())
+    return Requirement(
         own.bears or all_alike.bears,
         max(own.contents, all_alike.contents, key=len),
         own.carried or all_alike.carried,
@@ -150,7 +150,7 @@ def smallest_m(type_name: str) -> Vec3 | None:
     return min(models, key=lambda pair: (pair[0], math.prod(pair[1][:2])))[1]
 
 
-def _is_so(problem: BddlProblem, atom: Atom) -> bool:
+def _holds_at_start(problem: BddlProblem, atom: Atom) -> bool:
     """Whether the start says so of everything that an atom of the goal is about."""
     first, second = (problem.types.get(name.lstrip("?"), (name.lstrip("?"),)) for name in atom.args)
     told = {

@@ -41,7 +41,7 @@ _NAMESAKES: Final = (
     "re_shelving_library_books rearranging_furniture serving_hors_d_oeuvres setting_mousetraps sorting_mail "
     "storing_food thawing_frozen_food unpacking_suitcase vacuuming_floors washing_floor washing_pots_and_pans"
 )
-NAMESAKES: Final = frozenset(_NAMESAKES.split())
+EAI_NAMESAKES: Final = frozenset(_NAMESAKES.split())
 """Activities of BEHAVIOR-1K that are called as tasks of EAI's: who was trained on them could not be examined by those."""
 
 
@@ -65,7 +65,7 @@ class SourceText:
     @property
     def examines(self) -> bool:
         """Whether it is a task of EAI's, or is called like one: kept for examinations, never trained on."""
-        return self.source == EAI or self.name.replace("-", "_") in NAMESAKES
+        return self.source == EAI or self.name.replace("-", "_") in EAI_NAMESAKES
 
 
 def activity_names() -> tuple[str, ...]:

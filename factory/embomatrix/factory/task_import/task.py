@@ -22,10 +22,10 @@ from embomatrix.factory.scenes.view import SceneView, is_liftable
 from embomatrix.factory.task_import.binding import bind
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.expressible import AGENT, FLOORS
-from embomatrix.factory.task_import.models import models_for, sized
+from embomatrix.factory.task_import.models import models_for, with_sizes
 from embomatrix.factory.task_import.neighbours import neighbours_of
 from embomatrix.factory.task_import.reach import FUTURE, INSOURCE, REAL, pieces_of, profile_for
-from embomatrix.factory.task_import.size_requirements import demand_on, demands_of
+from embomatrix.factory.task_import.size_requirements import requirement_on, requirements_of
 from embomatrix.factory.task_import.start_state import with_robot_in, with_states
 from embomatrix.factory.task_import.task_fields import (
     SWITCHED,
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from embomatrix.factory.layout.request import Layout
-    from embomatrix.factory.layout.values import Failure
+    from embomatrix.factory.layout.values import LayoutFailure
     from embomatrix.factory.task_import.binding import Addition, Binding
     from embomatrix.factory.task_import.sources import SourceText
     from embomatrix.world.asset import Asset
@@ -63,9 +63,9 @@ class Lay(Protocol):
     def __call__(self, editor: SceneEditor, items: Sequence[RequestedObject], seed: int) -> Layout: ...
 
 
-SHUNNED: Final = 3
+MAX_EXCLUDED: Final = 3
 """Pieces of furniture that are given up for a problem at most, because they can't hold what it puts there."""
-REDRAWN: Final = 3
+MAX_REDRAWN: Final = 3
 """Layouts that are drawn anew at most, where the robot does not get at all that was laid out."""
 
 
@@ -89,7 +89,7 @@ class ImportedTask:
 
 
 @dataclass(frozen=True, slots=True)
-class Manner:
+class ImportOptions:
     """How problems are given scenes: by which method, and whether rooms get the furniture that they lack."""
 
     lay: Lay = lay
@@ -103,14 +103,14 @@ class Manner:
 
 
 def import_problem(
-    source: SourceText, base: Scene, *, seed: int = 0, manner: Manner | None = None
+    source: SourceText, base: Scene, *, seed: int = 0, manner: ImportOptions | None = None
 ) -> ImportedTask | TaskRefusal:
     """Bind a problem to a base scene and lay out what the scene lacks. Raises BddlError when the text can't be read."""
     problem, notes = read_problem(source)
     digest = hashlib.sha256(f"{seed} {base.scene_id} {source.text}".encode()).digest()
     rng = np.random.default_rng(np.random.SeedSequence(list(digest[:8])))
     try:
-        imported = _Binder(source, problem, base, rng, digest.hex()[:6], manner or Manner()).imported()
+        imported = _Binder(source, problem, base, rng, digest.hex()[:6], manner or ImportOptions()).imported()
         return dataclasses.replace(imported, notes=(*notes, *imported.notes), examines=source.examines)
     except RefusedError as error:
         return error.refusal
@@ -126,7 +126,7 @@ class _Binder:
         base: Scene,
         rng: np.random.Generator,
         key: str,
-        manner: Manner,
+        manner: ImportOptions,
     ) -> None:
         self._source = source
         self._problem = problem
@@ -135,7 +135,7 @@ class _Binder:
         self._rng = rng
         self._manner = manner
         self._scene_id = f"{base.base}-{_slug(source.name)}-{key}"
-        self._demands = demands_of(problem)
+        self._demands = requirements_of(problem)
 
     def imported(self) -> ImportedTask:
         binding, editor, names = self._bound()
@@ -171,15 +171,15 @@ class _Binder:
             layout = self._laid(editor, binding)
             if not layout.failures:
                 bound = binding, editor, {**binding.found, **layout.names}
-                if not layout.out_of_hand:
+                if not layout.unreachable:
                     return bound
-                if len(layout.out_of_hand) < least:
-                    least, resort = len(layout.out_of_hand), bound
-            wrong = (*layout.failures, *layout.out_of_hand)[0]
+                if len(layout.unreachable) < least:
+                    least, resort = len(layout.unreachable), bound
+            wrong = (*layout.failures, *layout.unreachable)[0]
             first = first or _misfit(wrong)
-            if wrong.host in binding.found.values() and len(shunned) < SHUNNED:
+            if wrong.host in binding.found.values() and len(shunned) < MAX_EXCLUDED:
                 shunned.add(wrong.host)
-            elif not layout.failures and redrawn < REDRAWN:
+            elif not layout.failures and redrawn < MAX_REDRAWN:
                 redrawn += 1
             elif resort is not None:
                 return resort
@@ -237,7 +237,7 @@ class _Binder:
     def _to_be_loose(self, editor: SceneEditor, names: Mapping[str, str]) -> Iterator[str]:
         """Appliances of which a scene makes fixtures, a kettle or a toaster, that this problem wants carried."""
         for name, type_name in self._problem.objects.items():
-            if demand_on(self._demands, name, type_name).carried and name in names:
+            if requirement_on(self._demands, name, type_name).carried and name in names:
                 asset = editor.asset_of(names[name])
                 if _is_liftable(asset) and not is_portable(asset):
                     yield names[name]
@@ -252,7 +252,7 @@ class _Binder:
     def _models(self, binding: Binding, editor: SceneEditor) -> Mapping[str, Sequence[Model]]:
         """Models to try for each addition, the best first; some at another size than the catalog's."""
         demands = {
-            name: demand_on(self._demands, name, type_name)
+            name: requirement_on(self._demands, name, type_name)
             for name, type_name in self._problem.objects.items()
         }
         orders = {each.name: models_for(each, self._rng, demands[each.name]) for each in binding.additions}
@@ -264,7 +264,7 @@ class _Binder:
                     f"{addition.name!r} has no place: its type has no model{asked if addition.needs else ''}",
                 )
         found = {name: editor.asset_of(there) for name, there in binding.found.items()}
-        return sized(orders, binding.additions, demands, found, snug=self._manner.snug)
+        return with_sizes(orders, binding.additions, demands, found, snug=self._manner.snug)
 
     def _item(self, addition: Addition, binding: Binding, models: Sequence[Model]) -> RequestedObject:
         rooms = (addition.room,) if addition.room else tuple(dict.fromkeys(binding.rooms.values()))
@@ -390,10 +390,10 @@ def _renamed(literal: InitLiteral, names: dict[str, str]) -> Atom:
     )
 
 
-def _misfit(wrong: Failure) -> RefusedError:
+def _misfit(wrong: LayoutFailure) -> RefusedError:
     return RefusedError(
         RefusalReason.DOES_NOT_FIT,
-        f"{wrong.thing!r} has no place {wrong.relation} {wrong.host}: {wrong.detail}",
+        f"{wrong.object_name!r} has no place {wrong.relation} {wrong.host}: {wrong.detail}",
     )
 
 

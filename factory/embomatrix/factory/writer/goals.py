@@ -25,7 +25,7 @@ TAP: Final = "tap"
 DRAWERS: Final = "drawers"
 MAX_ALIKE: Final = 4
 """Furniture of one category in one room, of which a goal may mean any."""
-PICKS: Final = 4
+MAX_PICKS: Final = 4
 """Objects that the robot tries before a wish is given up."""
 
 
@@ -48,7 +48,7 @@ class GoalConjunct:
 
 
 @dataclass(frozen=True)
-class Workshop:
+class GoalContext:
     """What the makers of pieces draw from. ``used`` are objects that earlier pieces of the same goal are about.
 
     ``phrases`` are the ways to ask for an atom, by predicate, or by predicate and manner where they know some; ``where`` those
@@ -95,7 +95,7 @@ class Workshop:
     def pick(self, names: Sequence[str], works: Callable[[str], bool] = lambda _: True) -> str | None:
         """One of some objects, none that is used already, with which it works; None where the first few do not."""
         fresh = [name for name in names if name not in self.used]
-        order = self.rng.permutation(len(fresh))[:PICKS]
+        order = self.rng.permutation(len(fresh))[:MAX_PICKS]
         return next((fresh[index] for index in order if works(fresh[index])), None)
 
     def fixtures(self, wanted: Callable[[str], bool]) -> list[str]:
@@ -113,17 +113,17 @@ class Workshop:
         return [name for name in self.variant.added if self.view.is_portable(name) and name not in hosts]
 
 
-def place_piece(shop: Workshop) -> GoalConjunct | None:
+def placement_goal(shop: GoalContext) -> GoalConjunct | None:
     """Put a thing on or in another: furniture, an appliance or a basket."""
     thing = shop.pick(
         [name for name in shop.things() if not shop.view.is_basket(name)], shop.view.robot.fetches
     )
     if thing is None:
         return None
-    return _placed(shop, thing, shop.refer_taken(thing))
+    return _place_goal(shop, thing, shop.refer_taken(thing))
 
 
-def _placed(shop: Workshop, thing: str, called: str) -> GoalConjunct | None:
+def _place_goal(shop: GoalContext, thing: str, called: str) -> GoalConjunct | None:
     """Put the thing, called so in the request, on or in something that it is not at already and that is large enough."""
     view, rng = shop.view, shop.rng
     inside = rng.random() < 0.5
@@ -147,7 +147,7 @@ def _placed(shop: Workshop, thing: str, called: str) -> GoalConjunct | None:
     if target is None:
         return None
     predicate = relation.value
-    goal, types, objects, place = _one_of(shop, target, lambda host: Atom(predicate, (thing, host)))
+    goal, types, objects, place = _any_alike(shop, target, lambda host: Atom(predicate, (thing, host)))
     return GoalConjunct(
         goal=goal,
         clause=shop.phrase(predicate, thing=called, place=place),
@@ -159,16 +159,16 @@ def _placed(shop: Workshop, thing: str, called: str) -> GoalConjunct | None:
     )
 
 
-def placed_elsewhere(shop: Workshop, piece: GoalConjunct) -> GoalConjunct | None:
+def placed_elsewhere(shop: GoalContext, piece: GoalConjunct) -> GoalConjunct | None:
     """The thing of a piece put in another place than the piece says; None where it is about no thing to be placed."""
     if piece.kind != "place":
         return None
     other = dataclasses.replace(shop, used=shop.used | frozenset(piece.objects[1:]))
-    return _placed(other, piece.objects[0], piece.thing)
+    return _place_goal(other, piece.objects[0], piece.thing)
 
 
-def _one_of(
-    shop: Workshop, target: str, atom: Callable[[str], Formula]
+def _any_alike(
+    shop: GoalContext, target: str, atom: Callable[[str], Formula]
 ) -> tuple[Formula, Mapping[str, tuple[str, ...]], tuple[str, ...], str]:
     """The atom about the target, or about any of those that the same words mean; with the words."""
     view = shop.view
@@ -185,7 +185,7 @@ def _one_of(
     )
 
 
-def switch_piece(shop: Workshop) -> GoalConjunct | None:
+def switch_goal(shop: GoalContext) -> GoalConjunct | None:
     """Open or close a door, switch an appliance or a light on or off."""
     view, rng = shop.view, shop.rng
     name = shop.pick(shop.fixtures(view.is_switchable))
@@ -209,7 +209,7 @@ def switch_piece(shop: Workshop) -> GoalConjunct | None:
     def atom(target: str) -> Formula:
         return Not(Atom(predicate, (target,))) if holds else Atom(predicate, (target,))
 
-    goal, types, objects, words = _one_of(shop, name, atom)
+    goal, types, objects, words = _any_alike(shop, name, atom)
     manner = _manner(view, name, predicate)
     return GoalConjunct(
         goal=goal,
@@ -235,7 +235,7 @@ def _holds(view: SceneView, predicate: str, name: str) -> bool:
     return view.is_open(name) if predicate == "open" else view.is_on(name)
 
 
-def thermal_piece(shop: Workshop) -> GoalConjunct | None:
+def thermal_goal(shop: GoalContext) -> GoalConjunct | None:
     """Heat, cook or freeze food with a source of the variant's rooms, and now and then leave it there."""
     view, rng = shop.view, shop.rng
     foods = [name for name in shop.things() if view.asset(name).can("cookable")]
@@ -253,7 +253,7 @@ def thermal_piece(shop: Workshop) -> GoalConjunct | None:
     return _thermal(shop, food, source, effects[int(rng.integers(len(effects)))].value)
 
 
-def _thermal(shop: Workshop, food: str, source: str, predicate: str) -> GoalConjunct:
+def _thermal(shop: GoalContext, food: str, source: str, predicate: str) -> GoalConjunct:
     view, rng = shop.view, shop.rng
     place = shop.refer(source)
     goal: Formula = Atom(predicate, (food,))
@@ -269,13 +269,13 @@ def _thermal(shop: Workshop, food: str, source: str, predicate: str) -> GoalConj
     return GoalConjunct(goal, clause, (*objects, *(view.alike(source))), signs, "thermal", called)
 
 
-def serve_piece(shop: Workshop) -> GoalConjunct | None:
+def serving_goal(shop: GoalContext) -> GoalConjunct | None:
     """Heat, cook or freeze food, then put it somewhere else."""
-    first = thermal_piece(shop)
+    first = thermal_goal(shop)
     if first is None or isinstance(first.goal, And):
         return None
     food = first.objects[0]
-    second = _placed(shop, food, "it")
+    second = _place_goal(shop, food, "it")
     if second is None or set(second.objects[1:]) & set(first.objects[1:]):
         return None
     return GoalConjunct(

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
 
 from embomatrix.factory.writer.goals import (
     GoalConjunct,
-    Workshop,
-    place_piece,
-    serve_piece,
-    switch_piece,
-    thermal_piece,
+    GoalContext,
+    placement_goal,
+    serving_goal,
+    switch_goal,
+    thermal_goal,
 )
 from embomatrix.factory.writer.words import sentence
 from embomatrix.world.evaluate import render
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from embomatrix.factory.scenes.view import SceneView
     from embomatrix.factory.writer.variant import Variant
 
-    Maker = Callable[[Workshop], GoalConjunct | None]
+    Maker = Callable[[GoalContext], GoalConjunct | None]
 
 ROWS: Final = (16, 24)
 """Rows of an object table, least and most, where the rooms hold enough."""
@@ -39,23 +39,23 @@ HELDOUT_OF: Final = 4
 
 _RECIPES: Final[Mapping[TaskCategory, tuple[tuple[Maker, ...], ...]]] = {
     TaskCategory.PICK_AND_PLACE: (
-        (place_piece,),
-        (place_piece,),
-        (place_piece, place_piece),
+        (placement_goal,),
+        (placement_goal,),
+        (placement_goal, placement_goal),
     ),
     TaskCategory.APPLIANCE_USE: (
-        (switch_piece,),
-        (switch_piece, switch_piece),
-        (switch_piece, switch_piece),
+        (switch_goal,),
+        (switch_goal, switch_goal),
+        (switch_goal, switch_goal),
     ),
-    TaskCategory.KITCHEN_OPERATION: ((thermal_piece,), (thermal_piece,), (serve_piece,)),
+    TaskCategory.KITCHEN_OPERATION: ((thermal_goal,), (thermal_goal,), (serving_goal,)),
     TaskCategory.COMPOUND: (
-        (place_piece, switch_piece),
-        (switch_piece, place_piece),
-        (thermal_piece, switch_piece),
-        (thermal_piece, place_piece),
-        (serve_piece, switch_piece),
-        (place_piece, place_piece, switch_piece),
+        (placement_goal, switch_goal),
+        (switch_goal, placement_goal),
+        (thermal_goal, switch_goal),
+        (thermal_goal, placement_goal),
+        (serving_goal, switch_goal),
+        (placement_goal, placement_goal, switch_goal),
     ),
 }
 """The pieces that make up a goal of each category; those written twice are twice as likely."""
@@ -104,7 +104,7 @@ class TaskWriter(Protocol):
 
 
 @runtime_checkable
-class ManyAtOnce(Protocol):
+class BatchTaskWriter(Protocol):
     """A writer that waits for somebody's answers, and so asks for several drafts at once."""
 
     at_once: int
@@ -128,24 +128,24 @@ class PlainWriter:
         task_id: str,
         rng: np.random.Generator,
     ) -> Draft | None:
-        shop = Workshop(view, variant, rng)
-        pieces = pieces_of(shop, category)
+        shop = GoalContext(view, variant, rng)
+        pieces = draw_conjuncts(shop, category)
         if not pieces:
             return None
         return draft_of(shop, category, task_id, pieces, sentence([piece.clause for piece in pieces], rng))
 
 
-def pieces_of(shop: Workshop, category: TaskCategory) -> list[GoalConjunct]:
+def draw_conjuncts(shop: GoalContext, category: TaskCategory) -> list[GoalConjunct]:
     """Pieces that make up a goal of the category; none where the variant's rooms hold nothing for one."""
     recipes = _RECIPES[category]
     for _ in range(TRIES):
-        pieces = _made(shop, recipes[int(shop.rng.integers(len(recipes)))])
+        pieces = _drawn(shop, recipes[int(shop.rng.integers(len(recipes)))])
         if pieces:
             return pieces
     return []
 
 
-def _made(shop: Workshop, recipe: Sequence[Maker]) -> list[GoalConjunct]:
+def _drawn(shop: GoalContext, recipe: Sequence[Maker]) -> list[GoalConjunct]:
     """One piece by each maker about objects of its own, or none at all."""
     pieces: list[GoalConjunct] = []
     for make in recipe:
@@ -160,7 +160,7 @@ def _made(shop: Workshop, recipe: Sequence[Maker]) -> list[GoalConjunct]:
 
 
 def draft_of(
-    shop: Workshop,
+    shop: GoalContext,
     category: TaskCategory,
     task_id: str,
     pieces: Sequence[GoalConjunct],
@@ -213,7 +213,7 @@ def object_table(view: SceneView, needed: Sequence[str], rng: np.random.Generato
         add(name)
     rooms = dict.fromkeys(view.room(name) for name in needed)
     others = [name for room in rooms for name in view.in_room.get(room, ())]
-    telling = [name for name in others if _is_telling(view, name)]
+    telling = [name for name in others if _is_useful(view, name)]
     wanted = int(rng.integers(ROWS[0], ROWS[1] + 1))
     for name in rng.permutation(telling) if telling else ():
         if len(rows) >= wanted:
@@ -223,7 +223,7 @@ def object_table(view: SceneView, needed: Sequence[str], rng: np.random.Generato
     return tuple(table[int(index)] for index in rng.permutation(len(table)))[:MAX_TABLE]
 
 
-def _is_telling(view: SceneView, name: str) -> bool:
+def _is_useful(view: SceneView, name: str) -> bool:
     """Whether a plan could have any use for the object: pictures and blinds fill a table with noise."""
     return (
         view.is_portable(name)

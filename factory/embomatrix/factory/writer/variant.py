@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 
-THINGS: Final = 12
+SMALL_OBJECTS: Final = 12
 """Small things that a variant adds, over all its rooms."""
 TRIES: Final = 3
 """Models that are tried for one thing before it is left out."""
@@ -97,7 +97,7 @@ def _things(view: SceneView, rooms: Sequence[str], rng: np.random.Generator) -> 
     for room in rooms:
         if rng.random() < BASKET_SHARE:
             chosen.setdefault(BASKETS[int(rng.integers(len(BASKETS)))], (room,))
-        share = max(4, round(THINGS / len(rooms)))
+        share = max(4, round(SMALL_OBJECTS / len(rooms)))
         fresh = (name for name in _categories(types[room], rng) if name not in present | chosen.keys())
         for name in itertools.islice(fresh, share):
             chosen[name] = tuple(each for each in rooms if belongs(name, types[each]))
@@ -131,7 +131,7 @@ def _set_doors_and_lights(
 ) -> None:
     """Open some doors that have room, switch some things on. What runs only when closed stays off: its door may be open."""
     names = [name for room in rooms for name in view.in_room[room]]
-    starts = OpenStarts(editor, filter(view.is_openable, names))
+    starts = DoorOpener(editor, filter(view.is_openable, names))
     for name in names:
         if view.is_openable(name) and rng.random() < OPEN_SHARE:
             starts.open(name)
@@ -143,7 +143,7 @@ SWEEP: Final = (1 / 3, 2 / 3, 1.0)
 """Shares of a travel at which a door is looked at while it swings."""
 
 
-class OpenStarts:
+class DoorOpener:
     """Opens doors in an editor's scene. ``doors`` are those that tasks may ask to open."""
 
     def __init__(self, editor: SceneEditor, doors: Iterable[str]) -> None:
