@@ -64,7 +64,7 @@ def test_a_changed_task_is_told(corpus):
     freeze(corpus)
     path = corpus / VERIFIED / "tasks.jsonl"
     path.write_text(path.read_text().replace('"signature":"d"', '"signature":"z"'))
-    with pytest.raises(DatasetError, match="is not what was frozen"):
+    with pytest.raises(DatasetError, match="differs from the frozen corpus"):
         check_frozen(corpus)
 
 
@@ -88,7 +88,7 @@ def test_more_than_half_in_scenes_of_training_is_refused(corpus, kitchen):
 
 
 def test_what_was_never_frozen_is_told(corpus):
-    with pytest.raises(DatasetError, match="does not tell what was frozen"):
+    with pytest.raises(DatasetError, match="does not describe a frozen corpus"):
         check_frozen(corpus)
 
 

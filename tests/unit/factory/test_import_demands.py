@@ -102,7 +102,7 @@ def test_of_a_type_without_models_nothing_is_known() -> None:
 def test_the_scene_of_a_problem_comes_first_with_other_draws(home: Scene, flat: Scene) -> None:
     item = source(PROBLEM)
     at_home = type(item)(item.name, item.text, item.source, item.request, scene=home.base)
-    asked = list(batch.imports(at_home, [flat, home], seed=0, manner=ImportOptions(), draws=2))
+    asked = list(batch.imports(at_home, [flat, home], seed=0, options=ImportOptions(), draws=2))
     first = [found.scene.base for found in asked[:2] if isinstance(found, ImportedTask)]
     assert first == [home.base] * 2
     one, other = (found.scene for found in asked[:2])
@@ -115,7 +115,7 @@ def test_what_no_skill_reaches_is_tried_in_no_further_scene(home: Scene, flat: S
     )
     item = source(text)
     at_home = type(item)(item.name, item.text, item.source, item.request, scene=home.base)
-    (only,) = batch.imports(at_home, [flat, home], seed=0, manner=ImportOptions(), draws=3)
+    (only,) = batch.imports(at_home, [flat, home], seed=0, options=ImportOptions(), draws=3)
     assert isinstance(only, TaskRefusal)
     assert only.reason is RefusalReason.INEXPRESSIBLE
 

@@ -110,8 +110,10 @@ def test_a_goal_that_no_skill_reaches_is_bound_where_it_need_only_be_told(home: 
     refused = import_problem(item, home)
     assert isinstance(refused, TaskRefusal)
     assert refused.reason is RefusalReason.INEXPRESSIBLE
-    assert isinstance(import_problem(item, home, manner=EVALUABLE), ImportedTask)
-    folded = import_problem(source(PROBLEM.replace("(not (open ?", "(not (folded ?")), home, manner=EVALUABLE)
+    assert isinstance(import_problem(item, home, options=EVALUABLE), ImportedTask)
+    folded = import_problem(
+        source(PROBLEM.replace("(not (open ?", "(not (folded ?")), home, options=EVALUABLE
+    )
     assert isinstance(folded, TaskRefusal)
 
 
@@ -155,7 +157,7 @@ def test_eai_s_tasks_are_bound_to_the_scene_that_they_were_written_for(
     eai: Path, flat: Scene, home: Scene
 ) -> None:
     (item,) = read_eai(eai)
-    imported = bind_first(item, [home, flat], manner=EVALUABLE)
+    imported = bind_first(item, [home, flat], options=EVALUABLE)
     assert isinstance(imported, ImportedTask)
     assert imported.scene.base == "Rs_int"
     assert imported.task.instruction == "Put the toys on the dusted table."
@@ -166,7 +168,7 @@ def test_eai_s_tasks_are_bound_to_the_scene_that_they_were_written_for(
 
 def test_the_report_counts_refusals_and_lists_what_no_skill_reaches(eai: Path, flat: Scene) -> None:
     (item,) = read_eai(eai)
-    bound = outcome_of(item, bind_first(item, [flat], manner=EVALUABLE))
+    bound = outcome_of(item, bind_first(item, [flat], options=EVALUABLE))
     refused = outcome_of(item, TaskRefusal(RefusalReason.DOES_NOT_FIT, "no room"))
     told = report_to_json([bound, refused])
     assert (told["problems"], told["bound"], told["refused"]) == (2, 1, {"does_not_fit": 1})

@@ -20,7 +20,7 @@ from embomatrix.world.task import TaskCategory
 
 
 def refusal(text: str, scene: Scene) -> TaskRefusal:
-    outcome = import_problem(source(text), scene, manner=ImportOptions(furnishing=False))
+    outcome = import_problem(source(text), scene, options=ImportOptions(furnishing=False))
     assert isinstance(outcome, TaskRefusal)
     return outcome
 
@@ -147,7 +147,9 @@ def test_furniture_that_the_room_lacks_is_brought_in_where_that_is_allowed(home:
     chair = imported.scene.by_name["armchair_1"]
     assert (chair.room, chair.fixed) == ("kitchen_0", True)
     assert imported.scene.by_name["apple_3"].host == "armchair_1"
-    assert isinstance(import_problem(source(text), home, manner=ImportOptions(furnishing=False)), TaskRefusal)
+    assert isinstance(
+        import_problem(source(text), home, options=ImportOptions(furnishing=False)), TaskRefusal
+    )
 
 
 def test_states_of_the_start_are_set_and_taken_away(home: Scene) -> None:

@@ -14,7 +14,7 @@ from embomatrix.factory.commands.app import app
 from embomatrix.factory.inspection.page import task_page, transcript_html
 from embomatrix.factory.inspection.plan_view import PlanView
 from embomatrix.factory.inspection.playing import play_oracle
-from embomatrix.factory.pipeline.export import FIELDS, card, encoded, export_rows
+from embomatrix.factory.pipeline.export import FIELDS, dataset_card, encode_rows, export_rows
 from embomatrix.world.dataset import Dataset, DatasetError
 
 EVIL = '</script><script>alert(1)</script><b onclick="x">'
@@ -137,7 +137,7 @@ def test_every_task_is_exported_with_every_field(dataset):
     rows = export_rows(dataset)
     assert [row["task_id"] for row in rows] == [record.task.task_id for record in dataset.records]
     assert all(list(row) == list(FIELDS) for row in rows)
-    assert [json.loads(line) for line in encoded(rows, ".jsonl").decode().splitlines()] == rows
+    assert [json.loads(line) for line in encode_rows(rows, ".jsonl").decode().splitlines()] == rows
 
 
 def test_parquet_holds_the_same_rows(dataset, tmp_path):
@@ -146,17 +146,17 @@ def test_parquet_holds_the_same_rows(dataset, tmp_path):
     )
     rows = export_rows(dataset)
     path = tmp_path / "tasks.parquet"
-    path.write_bytes(encoded(rows, ".parquet"))
+    path.write_bytes(encode_rows(rows, ".parquet"))
     assert parquet.read_table(path).to_pylist() == rows
 
 
 def test_other_forms_are_refused_with_the_known_ones(dataset):
     with pytest.raises(DatasetError, match=r"expected \.jsonl or \.parquet"):
-        encoded(export_rows(dataset), ".csv")
+        encode_rows(export_rows(dataset), ".csv")
 
 
 def test_the_card_counts_what_is_there_and_explains_every_field(dataset):
-    text = card(dataset, "tasks.jsonl", b"abc")
+    text = dataset_card(dataset, "tasks.jsonl", b"abc")
     assert "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad" in text
     assert f"| all | {len(dataset.train)} | {len(dataset.heldout)} |" in text
     assert all(f"| `{name}` |" in text for name in FIELDS)

@@ -31,7 +31,7 @@ def named(scene: Scene, category: str) -> str:
 
 
 @pytest.fixture
-def seating(flat: Scene) -> PendingObjects:
+def pending(flat: Scene) -> PendingObjects:
     bowls = sorted(models("bowl"), key=lambda each: -Catalog.load().model(*each).size_m[0])
     items = [
         RequestedObject("backpack", models("backpack")[:1]),
@@ -59,50 +59,50 @@ def test_shoes_under_a_bed_and_food_in_a_box_with_a_lid_are_at_hand(flat: Scene)
         assert robot.fetches(layout.names["apple"])
 
 
-def test_what_holds_a_thing_that_nobody_reaches_is_put_elsewhere_a_few_times(seating: PendingObjects) -> None:
+def test_what_holds_a_thing_that_nobody_reaches_is_put_elsewhere_a_few_times(pending: PendingObjects) -> None:
     for _ in range(MAX_MOVES):
-        seating.seat("backpack", Pose((0.0, 0.0, 1.0)), (None, ""), FLOOR)
-        seating.refuse("book", IN, "backpack_1", LayoutReason.NOT_AT_HAND, "too deep")
-        assert seating.offer_another(seating.waiting["book"])
-        failure = seating.failures[-1]
+        pending.place("backpack", Pose((0.0, 0.0, 1.0)), (None, ""), FLOOR)
+        pending.record_failure("book", IN, "backpack_1", LayoutReason.INACCESSIBLE, "too deep")
+        assert pending.replace_host(pending.waiting["book"])
+        failure = pending.failures[-1]
         assert (failure.object_name, failure.host, failure.reason) == (
             "backpack",
             "living_room_0",
-            LayoutReason.NOT_AT_HAND,
+            LayoutReason.INACCESSIBLE,
         )
-        assert "backpack" in seating.waiting
-        assert "backpack" not in seating.names
-    seating.seat("backpack", Pose((0.0, 0.0, 1.0)), (None, ""), FLOOR)
-    seating.refuse("book", IN, "backpack_3", LayoutReason.NOT_AT_HAND, "too deep")
-    assert not seating.offer_another(seating.waiting["book"])
+        assert "backpack" in pending.waiting
+        assert "backpack" not in pending.names
+    pending.place("backpack", Pose((0.0, 0.0, 1.0)), (None, ""), FLOOR)
+    pending.record_failure("book", IN, "backpack_3", LayoutReason.INACCESSIBLE, "too deep")
+    assert not pending.replace_host(pending.waiting["book"])
 
 
-def test_a_wide_thing_makes_way_for_another_at_the_host_that_both_need(seating: PendingObjects) -> None:
-    seating.seat("wide", Pose((0.0, 0.0, 1.0)), (None, ""), Support(Relation.INSIDE, "cabinet_1"))
-    before = seating.placed["wide"].asset.size_m[0]
-    seating.refuse("other", IN, "cabinet_1", LayoutReason.NO_FREE_SPOT, "full")
-    seating.next_model("other")
-    assert seating.waiting["wide"].asset.size_m[0] < before
-    assert not seating.given_up
-    assert not seating.failures
-    seating.seat("wide", Pose((0.0, 0.0, 1.0)), (None, ""), Support(Relation.INSIDE, "cabinet_1"))
-    seating.refuse("other", IN, "cabinet_1", LayoutReason.NO_FREE_SPOT, "full")
-    seating.next_model("other")
-    assert [failure.object_name for failure in seating.given_up] == ["other"]
+def test_a_wide_thing_makes_way_for_another_at_the_host_that_both_need(pending: PendingObjects) -> None:
+    pending.place("wide", Pose((0.0, 0.0, 1.0)), (None, ""), Support(Relation.INSIDE, "cabinet_1"))
+    before = pending.placed["wide"].asset.size_m[0]
+    pending.record_failure("other", IN, "cabinet_1", LayoutReason.NO_FREE_SPOT, "full")
+    pending.next_model("other")
+    assert pending.waiting["wide"].asset.size_m[0] < before
+    assert not pending.abandoned
+    assert not pending.failures
+    pending.place("wide", Pose((0.0, 0.0, 1.0)), (None, ""), Support(Relation.INSIDE, "cabinet_1"))
+    pending.record_failure("other", IN, "cabinet_1", LayoutReason.NO_FREE_SPOT, "full")
+    pending.next_model("other")
+    assert [failure.object_name for failure in pending.abandoned] == ["other"]
 
 
 def test_what_a_task_puts_into_a_full_room_makes_furniture_of_the_room_go(flat: Scene) -> None:
     editor = SceneEditor(flat)
-    seating = PendingObjects(
+    pending = PendingObjects(
         editor, "living_room_0", [RequestedObject("bed", models("bed")[:1], rooms=("living_room_0",))]
     )
     before = [item for item in flat.objects if item.room == "living_room_0" and item.fixed]
-    seating.refuse("bed", ON, "living_room_0", LayoutReason.NO_FREE_SPOT, "full")
-    seating.next_model("bed")
+    pending.record_failure("bed", ON, "living_room_0", LayoutReason.NO_FREE_SPOT, "full")
+    pending.next_model("bed")
     gone = [item for item in before if item.name not in editor.objects]
     assert len([item for item in gone if not item.host]) == 1
-    assert seating.waiting["bed"].last is not None
-    assert not seating.failures
+    assert pending.waiting["bed"].last_failure is not None
+    assert not pending.failures
 
 
 def test_furniture_goes_for_what_the_robot_does_not_get_at_on_a_full_floor_but_not_for_what_stands_on_other(
@@ -114,30 +114,30 @@ def test_furniture_goes_for_what_the_robot_does_not_get_at_on_a_full_floor_but_n
         RequestedObject("bag", models("backpack")[:1], ON, "living_room_0"),
         RequestedObject("cup", models("mug")[:1], ON, table),
     ]
-    seating = PendingObjects(editor, "living_room_0", items)
+    pending = PendingObjects(editor, "living_room_0", items)
     before = len(editor.objects)
-    seating.refuse("cup", ON, table, LayoutReason.NOT_AT_HAND, "too far")
-    assert not seating.make_way(seating.waiting["cup"])
+    pending.record_failure("cup", ON, table, LayoutReason.INACCESSIBLE, "too far")
+    assert not pending.clear_floor(pending.waiting["cup"])
     assert len(editor.objects) == before
-    seating.refuse("bag", ON, "living_room_0", LayoutReason.NOT_AT_HAND, "behind a sofa")
-    assert seating.make_way(seating.waiting["bag"])
+    pending.record_failure("bag", ON, "living_room_0", LayoutReason.INACCESSIBLE, "behind a sofa")
+    assert pending.clear_floor(pending.waiting["bag"])
     assert len(editor.objects) < before
-    assert [failure.object_name for failure in seating.failures] == ["cup"]
+    assert [failure.object_name for failure in pending.failures] == ["cup"]
 
 
 def test_furniture_that_the_task_is_about_stays_reachable_when_the_rest_may_be_barred(flat: Scene) -> None:
     editor = SceneEditor(flat)
     editor.keep([named(flat, "fridge")])
     kitchen = editor.objects[named(flat, "fridge")].room
-    seating = PendingObjects(editor, kitchen, [RequestedObject("booth", models("booth"), ON, kitchen)])
+    pending = PendingObjects(editor, kitchen, [RequestedObject("booth", models("booth"), ON, kitchen)])
     stove = next(
         name for name, item in editor.objects.items() if item.room == kitchen and editor.is_spare(name)
     )
-    seating.refuse("booth", ON, kitchen, LayoutReason.BARS_THE_WAY, "narrow")
-    seating.next_model("booth")
-    assert "booth" in seating.waiting
-    assert stove in editor.given_up
-    assert named(flat, "fridge") not in editor.given_up
+    pending.record_failure("booth", ON, kitchen, LayoutReason.BLOCKS_PATH, "narrow")
+    pending.next_model("booth")
+    assert "booth" in pending.waiting
+    assert stove in editor.abandoned
+    assert named(flat, "fridge") not in editor.abandoned
 
 
 def test_many_things_for_one_basket_are_packed(flat: Scene) -> None:
@@ -168,23 +168,23 @@ def test_furniture_at_which_nobody_reaches_a_thing_is_left_for_other_and_kept_as
 ) -> None:
     asked: list[str] = []
 
-    def out_of_hand_at(bad: int):
+    def unreachable_at(bad: int):
         def method(editor, items, seed):
             asked.append(next((item.host for item in items if item.name.startswith("sandal")), ""))
             layout = lay(editor, items, seed)
-            wrong = LayoutFailure("sandal.n.01_1", ON, asked[-1], LayoutReason.NOT_AT_HAND, "too far")
+            wrong = LayoutFailure("sandal.n.01_1", ON, asked[-1], LayoutReason.INACCESSIBLE, "too far")
             return replace(layout, unreachable=(wrong,)) if len(asked) <= bad else layout
 
         return method
 
     text = SourceText("shoes", SHOE, "embomatrix")
-    second = import_problem(text, flat, manner=ImportOptions(out_of_hand_at(1), reachable=False))
+    second = import_problem(text, flat, options=ImportOptions(unreachable_at(1), reachable=False))
     assert isinstance(second, ImportedTask)
     assert len(asked) == 2
     assert asked[0] != asked[1]
     asked.clear()
     assert isinstance(
-        import_problem(text, flat, manner=ImportOptions(out_of_hand_at(99), reachable=False)), ImportedTask
+        import_problem(text, flat, options=ImportOptions(unreachable_at(99), reachable=False)), ImportedTask
     )
     assert len(asked) > 1
 
@@ -197,11 +197,13 @@ def test_a_layout_in_which_something_stays_out_of_hand_is_drawn_anew_and_the_bes
     def worst_at_first(editor, items, seed):
         layout = lay(editor, items, seed)
         drawn.append(editor.objects[layout.names["sandal.n.01_1"]].pose_world_asset)
-        wrong = LayoutFailure("sandal.n.01_1", ON, "living_room_0", LayoutReason.NOT_AT_HAND, "behind a sofa")
+        wrong = LayoutFailure(
+            "sandal.n.01_1", ON, "living_room_0", LayoutReason.INACCESSIBLE, "behind a sofa"
+        )
         return replace(layout, unreachable=(wrong,) * (2 if len(drawn) == 1 else 1))
 
     imported = import_problem(
-        SourceText("shoes", SHOE_ON_FLOOR, "embomatrix"), flat, manner=ImportOptions(worst_at_first)
+        SourceText("shoes", SHOE_ON_FLOOR, "embomatrix"), flat, options=ImportOptions(worst_at_first)
     )
     assert isinstance(imported, ImportedTask)
     assert len(drawn) == len(set(drawn)) == 1 + MAX_REDRAWN

@@ -20,7 +20,7 @@ from embomatrix.factory.layout.values import (
     PlacementConstraint,
     PlaneBrief,
     PlaneFootprint,
-    PlaneThing,
+    PlaneObject,
 )
 from embomatrix.factory.scenes.editor import LayoutReason
 from embomatrix.skills.limits import ROBOT
@@ -102,7 +102,7 @@ def a_brief(seed: int) -> PlaneBrief:
     rng = np.random.default_rng(seed)
     kinds = [*ConstraintKind]
     objects = tuple(
-        PlaneThing(
+        PlaneObject(
             f"thing_{n}",
             tuple(rng.uniform(0.04, 0.3, 3).tolist()),
             (PlacementConstraint(kinds[int(rng.integers(len(kinds)))], f"thing_{int(rng.integers(4))}"),),
@@ -149,7 +149,12 @@ def test_what_is_arranged_meets_nothing_lies_on_the_plane_and_is_in_reach(seed):
         sizes = {thing.name: thing.size_m for thing in brief.objects}
         placed = [
             PlaneFootprint(
-                spot.object_name, spot.center_m, spot.yaw, sizes[spot.object_name][:2], 0.0, sizes[spot.object_name][2]
+                spot.object_name,
+                spot.center_m,
+                spot.yaw,
+                sizes[spot.object_name][:2],
+                0.0,
+                sizes[spot.object_name][2],
             )
             for spot in way.spots
         ]
@@ -168,11 +173,11 @@ def test_equal_briefs_are_arranged_equally_and_other_seeds_otherwise():
 
 
 def test_wishes_that_can_hold_do():
-    plate = PlaneThing("plate", (0.24, 0.24, 0.02), (PlacementConstraint(ConstraintKind.EDGE),))
-    fork = PlaneThing(
+    plate = PlaneObject("plate", (0.24, 0.24, 0.02), (PlacementConstraint(ConstraintKind.EDGE),))
+    fork = PlaneObject(
         "fork", (0.18, 0.03, 0.02), (PlacementConstraint(ConstraintKind.NEXT_TO, "plate", required=True),)
     )
-    vase = PlaneThing("vase", (0.1, 0.1, 0.3), (PlacementConstraint(ConstraintKind.MIDDLE),))
+    vase = PlaneObject("vase", (0.1, 0.1, 0.3), (PlacementConstraint(ConstraintKind.MIDDLE),))
     best = arrange(PlaneBrief("table", PLANE, (fork, plate, vase)))[0]
     assert all(spot.held for spot in best.spots)
     assert not best.left_out
@@ -187,7 +192,7 @@ def test_wishes_that_can_hold_do():
         (
             {
                 "objects": (
-                    PlaneThing(
+                    PlaneObject(
                         "cup", CUP, (PlacementConstraint(ConstraintKind.NEXT_TO, "x", required=True),)
                     ),
                 )
@@ -197,5 +202,5 @@ def test_wishes_that_can_hold_do():
     ],
 )
 def test_what_finds_no_spot_says_why(change, reason):
-    brief = PlaneBrief("table", PLANE, (PlaneThing("cup", CUP),))
+    brief = PlaneBrief("table", PLANE, (PlaneObject("cup", CUP),))
     assert arrange(dataclasses.replace(brief, **change))[0].left_out == {"cup": reason}

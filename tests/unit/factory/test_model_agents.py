@@ -44,7 +44,7 @@ HOST = next(
     for name in VIEW.in_room[room]
     if VIEW.is_surface(name) and VIEW.takes(name, THING, inside=False) and VIEW.item(THING).host != name
 )
-KNOWN = frozenset(FACTS.objects)
+KNOWN = frozenset(FACTS.things)
 
 CAST = json.dumps(
     {
@@ -71,7 +71,7 @@ TALK = json.dumps(
 GOOD = json.dumps(
     {
         "instruction": "Ann wants it out of the way: put it over there.",
-        "constraints": [{"predicate": "ontop", "thing": THING, "place": HOST}],
+        "wishes": [{"predicate": "ontop", "thing": THING, "place": HOST}],
     }
 )
 
@@ -245,7 +245,7 @@ def test_what_a_model_is_told_names_every_thing_that_it_may_use():
     text = FACTS.described()
     assert all(f"- {name} (" in text for name in KNOWN)
     assert all(f"[{room}]" in text for room in VARIANT.rooms)
-    assert all(len(room.objects) <= MOST_IN_ROOM for room in FACTS.rooms)
+    assert all(len(room.things) <= MOST_IN_ROOM for room in FACTS.rooms)
 
 
 def a_door():
@@ -283,7 +283,7 @@ def a_door():
     ],
 )
 def test_wishes_that_the_scene_does_not_allow_are_told_apart(wish, sentence):
-    request = TaskRequest(instruction="Ann asks for it, please.", constraints=(wish(),))
+    request = TaskRequest(instruction="Ann asks for it, please.", wishes=(wish(),))
     with pytest.raises(ValueError, match=sentence):
         check_request(request, VIEW, KNOWN)
 

@@ -289,7 +289,7 @@ def test_nobody_wants_the_water_to_run_who_only_tidies_up():
     assert sinks
     for sink in sinks:
         sign = f"toggled_on({sink})"
-        piece = GoalConjunct(Atom("toggled_on", (sink,)), "", (sink,), (sign,), "switch", "it", manner="tap")
+        piece = GoalConjunct(Atom("toggled_on", (sink,)), "", (sink,), (sign,), "switch", "it", options="tap")
         assert Theme.TIDYING not in themes_of(piece, Flat()), sink
 
 

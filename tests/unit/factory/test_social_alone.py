@@ -7,7 +7,7 @@ import pytest
 from tests.fakes.chat_server import ChatServer
 from typer.testing import CliRunner
 
-from embomatrix.factory.commands.agents import EVERY
+from embomatrix.factory.commands.agents import ALL_AGENTS
 from embomatrix.factory.commands.app import app
 from embomatrix.factory.layout.agent_interfaces import AgentName
 from embomatrix.factory.social.agent_interfaces import SOCIAL_AGENTS, SocialAgent
@@ -23,8 +23,8 @@ def run(name: str, brief: str, *more: str) -> str:
 
 
 def test_every_agent_has_a_name_of_its_own() -> None:
-    assert set(EVERY) == {*SocialAgent, *AgentName}
-    assert len(EVERY) == len(SocialAgent) + len(AgentName)
+    assert set(ALL_AGENTS) == {*SocialAgent, *AgentName}
+    assert len(ALL_AGENTS) == len(SocialAgent) + len(AgentName)
 
 
 def test_from_a_scene_to_its_people_to_a_conversation_to_an_instruction() -> None:

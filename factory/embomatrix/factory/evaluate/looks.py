@@ -115,7 +115,7 @@ async def evaluate_looks(
         for number, method in enumerate(methods):
             names: list[str] = []
             laid = _noting(method, names)
-            imported = import_problem(task.source, base, seed=seed, manner=ImportOptions(laid))
+            imported = import_problem(task.source, base, seed=seed, options=ImportOptions(laid))
             if isinstance(imported, ImportedTask) and names:
                 try:
                     impression = await impression_of(model, imported.scene, names, seed)

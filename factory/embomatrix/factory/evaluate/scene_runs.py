@@ -28,7 +28,7 @@ class OutcomeLog(ResumableLog[LayoutOutcome]):
     def open(path: Path, seed: int) -> OutcomeLog:
         """Start a log or take one up. A last line that was cut short is dropped. Raises EvaluationError, OSError."""
         log = OutcomeLog(path)
-        log.take_up({"seed": seed}, _outcome)
+        log.resume({"seed": seed}, _outcome)
         return log
 
 

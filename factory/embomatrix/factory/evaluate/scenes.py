@@ -137,7 +137,7 @@ def judge(
     """Lay a task out by a method, look at the scene, and execute the oracle's plan in it."""
     timed = _Timed(METHODS[method])
     began = time.process_time()
-    imported = import_problem(task.source, base, seed=seed, manner=ImportOptions(timed))
+    imported = import_problem(task.source, base, seed=seed, options=ImportOptions(timed))
     spent = time.process_time() - began
 
     def outcome(

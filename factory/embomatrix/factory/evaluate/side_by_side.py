@@ -42,7 +42,7 @@ def draw_side_by_side(task: SceneTask, seed: int) -> Image.Image:
     base = build_base_scene(task.scene)
     panels = []
     for method, lay in METHODS.items():
-        imported = import_problem(task.source, base, seed=seed, manner=ImportOptions(lay))
+        imported = import_problem(task.source, base, seed=seed, options=ImportOptions(lay))
         if isinstance(imported, TaskRefusal):
             panels.append(_reason(method, imported))
         else:

@@ -1,6 +1,6 @@
-"""The agents' doors: briefs and answers as JSON, checked by pydantic; inside they are plain frozen values.
+"""Interfaces of the layout agents: briefs and answers as JSON, validated by pydantic.
 
-Four agents by the paper's names. Three of them can be a language model; poses are always sampled by code.
+The four agents follow the paper. Three of them can be a language model; poses are always sampled by code.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ import numpy as np
 
 
 class AgentName(StrEnum):
-    """Agents that can be run alone."""
+    """Layout agent that ``factory agent`` can run."""
 
     DISTRIBUTOR = "scene-distributor"
     ORGANIZER = "room-organizer"
@@ -49,12 +49,12 @@ class AgentName(StrEnum):
 
 
 class BriefError(ValueError):
-    """A brief that an agent can't read; one sentence for a person."""
+    """Brief that an agent can't read. The message is one sentence for the user."""
 
 
 @dataclass(frozen=True, slots=True)
 class AgentInterface:
-    """What an agent takes and gives, and its rules."""
+    """Types of an agent's brief and answer, and the rules that answer without a language model."""
 
     about: str
     brief: TypeAdapter[Any]
@@ -62,18 +62,18 @@ class AgentInterface:
     rules: Callable[[Any], Any]
 
     def read(self, text: str) -> Any:
-        """A brief from JSON. Raises BriefError naming the field."""
+        """Parse a brief from JSON. Raise BriefError that names the field."""
         try:
             return self.brief.validate_json(text)
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             where = ".".join(map(str, first["loc"])) or "the brief"
             raise BriefError(
-                f"{where}: {first['msg'].lower()}; `--schema` prints what is expected"
+                f"{where}: {first['msg'].lower()}; `--schema` prints the expected schema"
             ) from error
 
-    def written(self, answer: Any) -> str:
-        """An answer as JSON."""
+    def to_json(self, answer: Any) -> str:
+        """Return an answer as JSON."""
         return self.answer.dump_json(answer, indent=1).decode()
 
 
@@ -82,7 +82,7 @@ def _branches(brief: RoomBrief) -> tuple[Branch, ...]:
 
 
 def sample(brief: SampleBrief) -> SampledPose:
-    """Sample one pose in a base scene, as the object-level agent does."""
+    """Sample one pose in a base scene with the object-level agent."""
     editor = SceneEditor(build_base_scene(brief.scene, seed=brief.seed))
     sampler = ObjectSampler(editor, np.random.default_rng((brief.seed, 3)))
     relation = Relation(brief.relation.value) if brief.relation else None
@@ -96,31 +96,31 @@ def sample(brief: SampleBrief) -> SampledPose:
 
 LAYOUT_AGENTS: Final[Mapping[AgentName, AgentInterface]] = {
     AgentName.DISTRIBUTOR: AgentInterface(
-        "Scene-level Distribution Agent: a room for each thing",
+        "Scene-level Distribution Agent: room of each object",
         TypeAdapter(DistributionBrief),
         TypeAdapter(Distribution),
         distribute,
     ),
     AgentName.ORGANIZER: AgentInterface(
-        "Room-level Organization Agent: a layout tree, as branches",
+        "Room-level Organization Agent: branches of a layout tree",
         TypeAdapter(RoomBrief),
         TypeAdapter(tuple[Branch, ...]),
         _branches,
     ),
     AgentName.PLANNER: AgentInterface(
-        "Planar-Level Placement Generator, first half: constraints",
+        "Planar-Level Placement Generator, choice of constraints",
         TypeAdapter(ConstraintBrief),
         TypeAdapter(PlacementConstraints),
         choose_constraints,
     ),
     AgentName.SOLVER: AgentInterface(
-        "Planar-Level Placement Generator, second half: spots on a plane",
+        "Planar-Level Placement Generator, solver",
         TypeAdapter(PlaneBrief),
         TypeAdapter(tuple[PlaneArrangement, ...]),
         arrange,
     ),
     AgentName.SAMPLER: AgentInterface(
-        "Object-level Sampling Agent: a pose in a base scene",
+        "Object-level Sampling Agent: pose in a base scene",
         TypeAdapter(SampleBrief),
         TypeAdapter(SampledPose),
         sample,

@@ -1,6 +1,6 @@
-"""Two simpler ways to lay a task out, in the paper's comparison: sampling without a tree, and poses without a solver.
+"""Baselines of the paper's comparison: random sampling without a tree, and written poses without a solver.
 
-Neither looks at where the robot can stand, neither hears what failed. They take the same items and the same models as ``lay``.
+Both ignore robot positions and earlier failures. They use the same objects and models as ``generator.lay``.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ if TYPE_CHECKING:
     from embomatrix.world.asset import Asset
 
 TRIES: Final = 10
-"""Samples for one thing: what OmniGibson's own sampler is given in the paper's code."""
+"""Samples per object, as for OmniGibson's sampler in the paper's code."""
 GRID_M: Final = 0.05
-"""Poses that are written down are round numbers."""
+"""Grid of written poses."""
 SPREAD: Final = 0.3
-"""Written poses lie this share of a side around the middle of what they are on."""
+"""Maximum distance of a written pose from the host's centre, as a share of each side."""
 
 
 def lay_at_random(editor: SceneEditor, items: Sequence[RequestedObject], seed: int) -> Layout:
-    """Without tree: each thing at the first random pose that is free, in the relation that the task demands or on a floor."""
+    """Place each object at the first collision-free random pose, in the demanded relation or on a floor."""
     rng = np.random.default_rng((seed, 17))
     sampler = ObjectSampler(editor, rng)
 
@@ -49,12 +49,12 @@ def lay_at_random(editor: SceneEditor, items: Sequence[RequestedObject], seed: i
 
 
 def lay_by_poses(editor: SceneEditor, items: Sequence[RequestedObject], seed: int) -> Layout:
-    """As LayoutGPT has a model write them: round absolute poses at what the task names, which nothing looks at."""
+    """Place each object at an unchecked pose rounded to a grid, as a language model writes them in LayoutGPT."""
     rng = np.random.default_rng((seed, 19))
 
     def written(asset: Asset, relation: Relation | None, host: str) -> Pose:
         if host not in editor.rooms and host not in editor.objects:
-            detail = f"what it is to stand at, {host!r}, has no place itself"
+            detail = f"its host {host!r} has no place itself"
             raise PlacementError(LayoutReason.UNKNOWN_HOST, detail)
         return _rounded_pose(editor, asset, relation, host, rng)
 
@@ -68,7 +68,7 @@ def _lay_each(
     rng: np.random.Generator,
     pose_for: Callable[[Asset, Relation | None, str], Pose],
 ) -> Layout:
-    """Each thing at the pose that is found for it, or left out with the reason."""
+    """Place each object at the pose found for it, or leave it out with the reason."""
     names: dict[str, str] = {}
     failures: list[LayoutFailure] = []
     for item in _hosts_first(items):
@@ -86,7 +86,7 @@ def _lay_each(
 def _rounded_pose(
     editor: SceneEditor, asset: Asset, relation: Relation | None, host: str, rng: np.random.Generator
 ) -> Pose:
-    """A pose at the host's middle, give or take, at the height that its box suggests."""
+    """Return a pose near the host's centre, at the height of its box for the relation."""
     if host in editor.rooms:
         (x, y), (width, depth) = editor.rooms[host].center_m, editor.rooms[host].size_m
         bottom = 0.0
@@ -117,7 +117,7 @@ def _hosts_first(items: Sequence[RequestedObject]) -> Iterator[RequestedObject]:
 def _requested_place(
     editor: SceneEditor, item: RequestedObject, names: dict[str, str], rng: np.random.Generator
 ) -> tuple[Relation | None, str]:
-    """What the task demands of an item, in the scene's names; else the floor of a room that it may be in."""
+    """Return the relation and host that the task demands, in scene names; otherwise the floor of a permitted room."""
     if item.relation is not None:
         host = names.get(item.host, item.host)
         floor = host in editor.rooms

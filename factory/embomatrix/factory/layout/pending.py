@@ -1,7 +1,7 @@
-"""Who has a place in a room and who waits for one, and what makes way for those that wait.
+"""Requested objects of one room: pending and placed ones, and the fallbacks that make room for pending ones.
 
-What was placed is exchanged for its next model, put down elsewhere, or exchanged for a narrower one; what the task does not
-need is taken away.
+A placed object can be replaced by its next model, moved, or replaced by a narrower model. Objects that the task
+doesn't need can be removed.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import Pose
 
 MAX_REMOVALS: Final = 3
-"""Things of the base scene that are taken away from a full host, for what the task puts there."""
+"""Maximum number of scene objects removed from a full host for one requested object."""
 MAX_MOVES: Final = 2
-"""Times that a thing is put elsewhere because the robot does not get at what is on or in it."""
+"""Maximum number of moves of an object whose contents the robot can't reach."""
 MAX_UNREACHED: Final = 2
-"""After so many places at which the robot does not get at a thing, one is taken as it is: verification tells."""
+"""Number of unreachable places after which an object is accepted as unreachable. Verification then judges the task."""
 FLOOR_CONTACT_M: Final = 0.05
-"""What begins below this stands on the floor."""
+"""Objects whose lower end is below this height stand on the floor."""
 MOVABLE: Final = frozenset(
     {
         FurnitureRole.SEAT,
@@ -43,15 +43,15 @@ MOVABLE: Final = frozenset(
     }
 )
 PLUMBED: Final = frozenset({"toilet", "urinal", "pedestal_sink"})
-"""Furniture of these roles people would carry out of a room to make place for other, but for what a bathroom needs."""
+"""Furniture of these categories is never removed from a room, although its role is movable."""
 FULL: Final = frozenset({LayoutReason.NO_FREE_SPOT, LayoutReason.TOO_LARGE})
-CROWDED: Final = frozenset({LayoutReason.NO_FREE_SPOT, LayoutReason.BARS_THE_WAY})
-FAR: Final = frozenset({LayoutReason.OUT_OF_REACH, LayoutReason.NOT_AT_HAND})
+CROWDED: Final = frozenset({LayoutReason.NO_FREE_SPOT, LayoutReason.BLOCKS_PATH})
+FAR: Final = frozenset({LayoutReason.OUT_OF_REACH, LayoutReason.INACCESSIBLE})
 
 
 @dataclass(frozen=True, slots=True)
 class Support:
-    """What a thing was put on, in, under or next to, in the scene's names; without a relation, the floor of a room."""
+    """Support of a placed object, in scene names. Without a relation, ``host`` is the room whose floor it stands on."""
 
     relation: Relation | None
     host: str
@@ -59,7 +59,7 @@ class Support:
 
 @dataclass(slots=True)
 class PendingObject:
-    """An item, which of its models is tried, where it is, and why it had no place before."""
+    """Requested object with its current model, its support once placed, and its last failure."""
 
     item: RequestedObject
     asset: Asset
@@ -72,11 +72,11 @@ class PendingObject:
     last_failure: LayoutFailure | None = None
 
     def choose(self, choice: int) -> None:
-        """Try another of its models."""
+        """Switch to another model."""
         self.choice, self.asset = choice, self.item.asset(choice)
 
     def narrowest(self, first: int) -> int:
-        """Which of its models from the ``first`` on takes the least room."""
+        """Return the index of the model with the smallest footprint, starting at ``first``."""
         return min(
             range(first, len(self.item.models)),
             key=lambda choice: math.prod(self.item.asset(choice).size_m[:2]),
@@ -84,22 +84,22 @@ class PendingObject:
 
     @property
     def accepts_unreachable(self) -> bool:
-        """Whether it is to be taken as it is, though the robot does not get at it."""
+        """True if the object is accepted although the robot can't reach it."""
         return self.unreached >= MAX_UNREACHED
 
     def failure(self, room: str) -> LayoutFailure:
-        """Why it found no place in a room."""
+        """Return the reason for the missing place in a room."""
         if self.last_failure is not None:
             return self.last_failure
         size = " x ".join(f"{extent:.2f}" for extent in self.asset.size_m)
-        detail = (
-            f"nothing in {room} takes {self.asset.asset_id}, {size} m: try another room or a smaller model"
-        )
+        detail = f"no host in {room} has space for {self.asset.asset_id}, {size} m: try another room or a smaller model"
         return self.item.failure(self.item.host or room, LayoutReason.NO_HOST, detail)
 
 
 class PendingObjects:
-    """The items of one room: ``waiting`` and ``placed`` by name, ``names`` of the placed in the scene, what failed so far."""
+    """Requested objects of one room: ``waiting`` and ``placed`` by name, scene ``names`` of the placed ones, and
+    failures.
+    """
 
     def __init__(self, editor: SceneEditor, room: str, items: Sequence[RequestedObject]) -> None:
         self.names: dict[str, str] = {}
@@ -112,11 +112,13 @@ class PendingObjects:
         self._may_block = False
 
     def items_by_scene_name(self) -> dict[str, str]:
-        """Placed items by their names in the scene."""
+        """Names of the placed objects by scene name."""
         return {there: name for name, there in self.names.items()}
 
     def place(self, name: str, pose: Pose, rests: tuple[Relation | None, str], at: Support) -> str:
-        """Put a waiting item into the scene at a pose, and return its name there. ``rests`` is what it is on or in."""
+        """Insert a waiting object into the scene and return its scene name. ``rests`` is the relation and host that
+        support it.
+        """
         pending = self.placed[name] = self.waiting.pop(name)
         pending.support = at
         self.names[name] = self._editor.insert(pending.asset, pose, *rests, self._room)
@@ -125,7 +127,7 @@ class PendingObjects:
     def record_failure(
         self, name: str, relation: LayoutRelation, host: str, reason: LayoutReason, detail: str
     ) -> None:
-        """Keep why a waiting item can't be at a host."""
+        """Record the reason why a waiting object can't be at a host."""
         failure = LayoutFailure(name, relation, host, reason, detail)
         pending = self.waiting[name]
         pending.last_failure = failure
@@ -133,7 +135,7 @@ class PendingObjects:
         self.failures.append(failure)
 
     def withdraw(self, name: str, reason: LayoutReason, detail: str) -> None:
-        """Take a placed item out again, with all that rests on it, and keep why it can't be there."""
+        """Remove a placed object with all objects on it, and record the reason."""
         item, seat = self._editor.known(self.names[name]), self.placed[name].support
         if seat is not None and seat.relation is Relation.UNDER:
             relation, host = LayoutRelation.UNDER, seat.host
@@ -144,19 +146,26 @@ class PendingObjects:
         self.record_failure(name, relation, host, reason, detail)
 
     def next_model(self, name: str) -> None:
-        """Try an item with its next model, as if nothing had been tried; give it up after the last, if nothing makes way."""
+        """Switch an object to its next model and clear its failures. After the last model, try the fallbacks, then
+        abandon it.
+        """
         pending = self.waiting[name]
         if pending.choice + 1 < len(pending.item.models):
             pending.choose(pending.choice + 1)
             self._forget((name,))
         elif self.waiting.keys() & {pending.item.host, *pending.item.beside}:
-            return  # what it is to stand at has no place yet
-        elif not any(way(pending) for way in (self.replace_host, self._shrink_sibling, self._allow_blocking, self._remove_spare)):
+            return  # its host or neighbour has no place yet
+        elif not any(
+            way(pending)
+            for way in (self.replace_host, self._shrink_sibling, self._allow_blocking, self._remove_spare)
+        ):
             del self.waiting[name]
             self.abandoned.append(pending.failure(self._room))
 
     def replace_host(self, pending: PendingObject) -> bool:
-        """Exchange what an item is to be at for its next model, or put it elsewhere; False where it is not of the task."""
+        """Switch the object's host to its next model, or move the host. Return False if the task doesn't bring the
+        host.
+        """
         host = self.placed.get(pending.item.host)
         if host is None:
             return False
@@ -166,8 +175,8 @@ class PendingObjects:
         if pending.last_failure is None or pending.last_failure.reason not in FAR or host.moved == MAX_MOVES:
             return False
         host.moved += 1
-        detail = f"the robot gets at nothing {pending.last_failure.relation.value} it there"
-        self.withdraw(host.item.name, LayoutReason.NOT_AT_HAND, detail)
+        detail = f"the robot can't reach objects {pending.last_failure.relation.value} it there"
+        self.withdraw(host.item.name, LayoutReason.INACCESSIBLE, detail)
         self._restart_others(host)
         return True
 
@@ -177,14 +186,14 @@ class PendingObjects:
         self.next_model(host.item.name)
 
     def _restart_others(self, host: PendingObject) -> None:
-        """All that waits but one is tried with its first model, as if nothing had been tried."""
+        """Reset all other waiting objects to their first model and clear their failures."""
         others = [name for name in self.waiting if name != host.item.name]
         for name in others:
             self.waiting[name].choose(0)
         self._forget(others)
 
     def _shrink_sibling(self, pending: PendingObject) -> bool:
-        """Exchange the widest other thing at a full host that the task demands for the narrowest model; False without one."""
+        """Replace the widest other object at a full host by its narrowest model. Return False if there is none."""
         if pending.last_failure is None or pending.last_failure.reason not in FULL or not pending.item.host:
             return False
         others = [
@@ -203,18 +212,26 @@ class PendingObjects:
         return True
 
     def clear_floor(self, pending: PendingObject) -> bool:
-        """Take the largest spare piece of furniture off a floor where the robot does not get at an item; False without one."""
+        """Remove the largest spare furniture from a floor on which the object is unreachable. Return False if there
+        is none.
+        """
         if not self._is_on_floor(pending):
             return False
         pending.crowded = True
         return self._remove_spare(pending)
 
     def _remove_spare(self, pending: PendingObject) -> bool:
-        """Take the largest spare thing from a full host that the task demands, or from a full floor; False without one."""
+        """Remove the largest spare object from a full host or floor. Return False if there is none."""
         host = self.names.get(pending.item.host, pending.item.host)
         if not pending.crowded or pending.cleared == MAX_REMOVALS:
             return False
-        spare = self._removable_furniture() if self._is_on_floor(pending) else self._loose_on(host) if host else []
+        spare = (
+            self._removable_furniture()
+            if self._is_on_floor(pending)
+            else self._loose_on(host)
+            if host
+            else []
+        )
         if not spare:
             return False
         self._editor.remove(max(spare, key=lambda name: math.prod(self._editor.box_of(name).size_m)))
@@ -223,14 +240,14 @@ class PendingObjects:
         return True
 
     def _is_on_floor(self, pending: PendingObject) -> bool:
-        """Whether an item is to stand on the room's floor."""
+        """True if the object must stand on the room's floor."""
         host = pending.item.host
         return host in self._editor.rooms or (
             not host and placement_class_of(pending.asset) is PlacementClass.FURNITURE
         )
 
     def _loose_on(self, host: str) -> list[str]:
-        """Loose objects at a host that the task is not about."""
+        """Return loose objects at a host that the task doesn't name."""
         editor = self._editor
         return [
             name
@@ -239,7 +256,7 @@ class PendingObjects:
         ]
 
     def _removable_furniture(self) -> list[str]:
-        """What stands on the room's floor, with nothing on or over it that the task is about, and is not built in."""
+        """Return furniture on the room's floor that is movable and supports nothing that the task names."""
         editor = self._editor
         return [
             name
@@ -252,8 +269,14 @@ class PendingObjects:
         ]
 
     def _allow_blocking(self, pending: PendingObject) -> bool:
-        """Let what must stand on a narrow floor bar the robot's way to what the task is not about; False once it may."""
-        if pending.last_failure is None or pending.last_failure.reason is not LayoutReason.BARS_THE_WAY or self._may_block:
+        """Let a floor object block the path to objects that the task doesn't name. Return False if that is already
+        allowed.
+        """
+        if (
+            pending.last_failure is None
+            or pending.last_failure.reason is not LayoutReason.BLOCKS_PATH
+            or self._may_block
+        ):
             return False
         self._may_block = True
         editor = self._editor
@@ -264,13 +287,13 @@ class PendingObjects:
         return True
 
     def _restart(self, pending: PendingObject) -> None:
-        """With its first model, as if nothing had been tried."""
+        """Reset the object to its first model and clear its failures."""
         pending.choose(0)
         pending.crowded = False
         self._forget((pending.item.name,))
 
     def _remove(self, name: str) -> None:
-        """Remove an item from the scene, with all that rests on it: they wait again."""
+        """Remove an object and all objects on it from the scene. They become waiting again."""
         items_by_scene_name = self.items_by_scene_name()
         for gone in self._editor.remove(self.names[name]):
             owner = items_by_scene_name[gone]

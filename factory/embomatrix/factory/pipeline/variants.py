@@ -1,4 +1,4 @@
-"""One variant of a base scene at a time: furnished with small things, written about, judged, and bundled."""
+"""Scene variants: one variant at a time is furnished with small objects, described by tasks, judged and bundled."""
 
 from __future__ import annotations
 
@@ -43,18 +43,20 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 TASKS_PER_VARIANT: Final = 8
-"""Tasks that one variant is to yield."""
+"""Number of tasks that a variant should yield."""
 MAX_DRAFTS: Final = 14
-"""Drafts that are written for a variant: some are not admitted."""
+"""Number of drafts per variant. Some are not admitted."""
 WRITE_TRIES: Final = 120
-"""Tasks that are written for the drafts: those of the other split's kinds are thrown away."""
+"""Maximum number of tasks written for the drafts. Tasks with signatures of the other split are discarded."""
 FOCUS_ROOMS: Final = 3
-"""Rooms that a variant furnishes with small things, and whose things its tasks are about."""
+"""Number of rooms that get small objects and that the variant's tasks are about."""
 
 
 @dataclass(frozen=True, slots=True)
 class VariantOrder:
-    """One variant to make, of a base scene. ``rooms`` are those of its split; ``known`` are tasks that exist already."""
+    """Order for one variant of a base scene. ``rooms`` are those of its split; ``known`` holds keys of existing
+    tasks.
+    """
 
     split: str
     number: int
@@ -66,9 +68,9 @@ class VariantOrder:
 
 @dataclass(frozen=True, slots=True)
 class VariantYield:
-    """What came of it: records, the bundle that they run in, and transcripts and layout trees by task id.
+    """Result of a variant: records, their bundle, and transcripts and layout trees by task id.
 
-    ``cpu_s`` is the processor time that it took, no part of what the variant is.
+    ``cpu_s`` is the CPU time and does not affect equality.
     """
 
     result: VariantResult
@@ -79,10 +81,10 @@ class VariantYield:
 
 
 class VariantMaker:
-    """Makes variants in this process; what one finds out about furniture and places serves the next ones.
+    """Maker of variants in this process. Placement results are reused between variants.
 
-    ``writer`` stands in for the one that the settings name, ``layout`` for agents that are rules; with a language model only
-    they can be given. Each answer follows from settings and order alone. Close it after use.
+    ``writer`` replaces the writer of the settings, ``layout`` the rule-based layout agents. Each result depends only
+    on the settings and the order. Close the maker after use.
     """
 
     def __init__(
@@ -120,13 +122,13 @@ class VariantMaker:
 
 
 def uniqueness_key(signature: str, instruction: str) -> str:
-    """What two tasks of a data set must not have in common."""
+    """Return the key that must be unique among the tasks of a dataset."""
     return f"{signature}|{instruction}"
 
 
 @dataclass(frozen=True)
 class _SharedTools:
-    """What all variants of a build share."""
+    """Objects shared by all variants of a build."""
 
     settings: BuildSettings
     writer: TaskWriter
@@ -137,7 +139,7 @@ class _SharedTools:
 def _focus(
     base: Scene, rooms: Sequence[str], missing: Mapping[TaskCategory, int], rng: np.random.Generator
 ) -> tuple[str, ...]:
-    """Rooms of a variant: a kitchen while kitchen tasks are wanted, and others at random."""
+    """Return the rooms of a variant: a kitchen while kitchen tasks are missing, and random others."""
     types = {room.name: room.type for room in base.rooms}
     order = [str(name) for name in rng.permutation(list(rooms))]
     wants_kitchen = missing[TaskCategory.KITCHEN_OPERATION] > 0
@@ -146,7 +148,7 @@ def _focus(
 
 
 class _VariantJob:
-    """Writes and judges the tasks of one variant."""
+    """Writing and judging of one variant's tasks."""
 
     def __init__(self, variant: Variant, order: VariantOrder, bench: _SharedTools) -> None:
         self._variant = variant
@@ -161,11 +163,11 @@ class _VariantJob:
         self._rejections: list[Rejection] = []
 
     def run(self, rng: np.random.Generator) -> VariantYield:
-        """The variant's records with their bundle, the missing categories in turns."""
+        """Return the variant's records with their bundle. The missing categories take turns."""
         missing = self._order.missing
         scene = self._variant.scene
         with SceneSurvey(scene, self._foresight) as survey:
-            with SimulatedRobot(scene, survey.bars) as rehearsal:
+            with SimulatedRobot(scene, survey.blocks) as rehearsal:
                 drafts = self._write(missing, SceneView(scene, rehearsal), rng)
             needs = [PoseNeeds(draft.about, draft.task.table) for draft in drafts]
             poses = cache_poses(SceneView(scene), needs, self._library, survey, self._seed)
@@ -190,7 +192,7 @@ class _VariantJob:
     def _write(
         self, missing: Mapping[TaskCategory, int], view: SceneView, rng: np.random.Generator
     ) -> list[Draft]:
-        """Drafts whose kinds of goal belong to this split, all different, the missing categories in turns."""
+        """Return distinct drafts with signatures of this split. The missing categories take turns."""
         wanted = [category for category, count in missing.items() if count > 0]
         drafts: list[Draft] = []
         turns = itertools.islice(itertools.cycle(wanted), WRITE_TRIES)
@@ -207,7 +209,7 @@ class _VariantJob:
     def _written(
         self, turns: Iterator[TaskCategory], view: SceneView, known: int, rng: np.random.Generator
     ) -> list[tuple[TaskCategory, Draft | TaskRefusal | None]]:
-        """What comes of the next turn, or of several at once where a writer waits for answers; nothing at their end."""
+        """Write the next draft, or several at once if the writer waits for answers. Empty after the last turn."""
         if not isinstance(self._writer, BatchTaskWriter):
             return [
                 (category, self._writer.write(self._variant, view, category, self._task_id(known), rng))
@@ -227,11 +229,11 @@ class _VariantJob:
         return f"{self._variant.scene.scene_id}-{number:02d}"
 
     def _transcripts(self) -> dict[str, str]:
-        """Of the admitted tasks that somebody talked about, by task id."""
+        """Return the transcripts of the admitted tasks by task id."""
         return {draft.task.task_id: draft.transcript for draft, _ in self._admitted if draft.transcript}
 
     def _trees(self) -> dict[str, Mapping[str, Any]]:
-        """How what was added in the rooms of an admitted task hangs together, by task id."""
+        """Return the layout trees of the admitted tasks' rooms, by task id."""
         trees = self._variant.trees
         return {
             draft.task.task_id: {
@@ -244,7 +246,7 @@ class _VariantJob:
         }
 
     def _is_new(self, draft: Draft) -> bool:
-        """Whether the goal's kind belongs to this split, and nothing like it was asked for in these words."""
+        """True if the signature belongs to this split and the task is not known yet."""
         key = uniqueness_key(draft.signature, draft.task.instruction)
         mine = is_heldout_signature(draft.signature, self._seed) is (self._order.split == "heldout")
         return mine and key not in self._known

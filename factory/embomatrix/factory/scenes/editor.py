@@ -46,9 +46,9 @@ class LayoutReason(StrEnum):
     TOO_LARGE = "too_large"
     NO_FREE_SPOT = "no_free_spot"
     OUT_OF_REACH = "out_of_reach"
-    BARS_THE_WAY = "bars_the_way"
+    BLOCKS_PATH = "blocks_path"
     UNSTABLE = "unstable"
-    NOT_AT_HAND = "not_at_hand"
+    INACCESSIBLE = "inaccessible"
     RELATION_NOT_HELD = "relation_not_held"
 
 
@@ -139,7 +139,7 @@ class SceneEditor:
             return LayoutReason.NO_FREE_SPOT
         if not self._in_reach(box, target):
             return LayoutReason.OUT_OF_REACH
-        return None if self._leaves_ways(asset, pose, box, room) else LayoutReason.BARS_THE_WAY
+        return None if self._leaves_ways(asset, pose, box, room) else LayoutReason.BLOCKS_PATH
 
     def insert(self, asset: Asset, pose: Pose, relation: Relation | None, host: str, room: str = "") -> str:
         """Add an object at a pose, looked at or not, and return its name, ``category_N``.

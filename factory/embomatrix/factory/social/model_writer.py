@@ -54,7 +54,7 @@ class ModelWriter(OnOneLoop):
         super().__init__(endpoint)
         self._agents = agents
         self._look = look
-        self._patience = FailureLimit()
+        self._failure_limit = FailureLimit()
         self._casts: dict[str, Cast] = {}
         self._sights: dict[str, Mapping[str, str]] = {}
 
@@ -81,9 +81,9 @@ class ModelWriter(OnOneLoop):
 
     def _told(self, order: DraftOrder, answer: Draft | LlmError) -> Draft | TaskRefusal:
         if isinstance(answer, EndpointError):
-            self._patience.unanswered(answer)
+            self._failure_limit.unanswered(answer)
             return _refused(order.task_id, RefusalReason.NO_ANSWER, answer)
-        self._patience.answered()
+        self._failure_limit.answered()
         if isinstance(answer, LlmError):
             return _refused(order.task_id, RefusalReason.UNUSABLE_ANSWER, answer)
         return answer

@@ -72,41 +72,41 @@ class Verified:
 
 
 def bind_first(
-    source: SourceText, bases: Sequence[Scene], *, seed: int = 0, manner: ImportOptions | None = None
+    source: SourceText, bases: Sequence[Scene], *, seed: int = 0, options: ImportOptions | None = None
 ) -> ImportedTask | TaskRefusal:
     """The problem in the first scene that it can be bound to, else the refusal that came furthest. Raises BddlError.
 
     The scene that it was written for comes first, then those that have all furniture, then those that lack some.
     """
-    return _first(imports(source, bases, seed=seed, manner=manner or ImportOptions()))
+    return _first(imports(source, bases, seed=seed, options=options or ImportOptions()))
 
 
 def imports(
-    source: SourceText, bases: Sequence[Scene], *, seed: int, manner: ImportOptions, draws: int = 1
+    source: SourceText, bases: Sequence[Scene], *, seed: int, options: ImportOptions, draws: int = 1
 ) -> Iterator[ImportedTask | TaskRefusal]:
-    """The problem in each scene as it is, then, where the manner says so, in each with the furniture that it lacks.
+    """The problem in each scene as it is, then, where the options says so, in each with the furniture that it lacks.
 
     Last come the same scenes with their rooms counted otherwise. The scene that it was written for comes before all that,
     in both ways, ``draws`` times; once no scene would do, none is looked at further.
     """
     own = [base for base in bases if base.base == source.scene]
     others = [base for base in bases if base.base != source.scene]
-    as_it_is = replace(manner, furnishing=False)
+    as_it_is = replace(options, furnishing=False)
     for draw, base in itertools.product(range(draws), own):
         drawn = seed + draw * SEED_STRIDE
-        outcome = import_problem(source, base, seed=drawn, manner=as_it_is)
+        outcome = import_problem(source, base, seed=drawn, options=as_it_is)
         yield outcome
         if isinstance(outcome, TaskRefusal) and outcome.reason in SCENE_INDEPENDENT:
             return
-        if isinstance(outcome, TaskRefusal) and manner.furnishing:
-            yield import_problem(source, base, seed=drawn, manner=manner)
+        if isinstance(outcome, TaskRefusal) and options.furnishing:
+            yield import_problem(source, base, seed=drawn, options=options)
     rounds = [(as_it_is, others)]
-    if manner.furnishing:
-        rounds += [(manner, others), (replace(manner, renumbering=True), [*own, *others])]
+    if options.furnishing:
+        rounds += [(options, others), (replace(options, renumbering=True), [*own, *others])]
     for tried, scenes in rounds:
         misfits = 0
         for base in scenes:
-            outcome = import_problem(source, base, seed=seed, manner=tried)
+            outcome = import_problem(source, base, seed=seed, options=tried)
             yield outcome
             if not isinstance(outcome, TaskRefusal):
                 continue
@@ -124,7 +124,7 @@ def verify_first(
     foresight: Foresight | None,
     *,
     seed: int = 0,
-    manner: ImportOptions | None = None,
+    options: ImportOptions | None = None,
 ) -> Verified | TaskRefusal:
     """The problem in the first scene in which it is admitted, else the refusal that came furthest. Raises BddlError.
 
@@ -132,10 +132,10 @@ def verify_first(
     """
 
     def judged() -> Iterator[Verified | TaskRefusal]:
-        given = manner or ImportOptions()
+        given = options or ImportOptions()
         for tried in (given, replace(given, snug=True)) if has_shared_host(source) else (given,):
             laid_out, misfits, told = 0, 0, list[str]()
-            for imported in imports(source, bases, seed=seed, manner=tried, draws=OWN_SCENE_DRAWS):
+            for imported in imports(source, bases, seed=seed, options=tried, draws=OWN_SCENE_DRAWS):
                 if isinstance(imported, TaskRefusal):
                     misfits += imported.reason is RefusalReason.DOES_NOT_FIT
                     yield imported

@@ -73,7 +73,7 @@ class ProblemImporter:
         seed = self._docket.seed
         match self._docket.depth:
             case Depth.INSTANTIATE:
-                return bind_first(source, self._bases, seed=seed, manner=ImportOptions(reachable=False))
+                return bind_first(source, self._bases, seed=seed, options=ImportOptions(reachable=False))
             case Depth.BIND:
                 return bind_first(source, self._bases, seed=seed)
             case Depth.VERIFY:

@@ -103,14 +103,16 @@ class ImportOptions:
 
 
 def import_problem(
-    source: SourceText, base: Scene, *, seed: int = 0, manner: ImportOptions | None = None
+    source: SourceText, base: Scene, *, seed: int = 0, options: ImportOptions | None = None
 ) -> ImportedTask | TaskRefusal:
     """Bind a problem to a base scene and lay out what the scene lacks. Raises BddlError when the text can't be read."""
     problem, notes = read_problem(source)
     digest = hashlib.sha256(f"{seed} {base.scene_id} {source.text}".encode()).digest()
     rng = np.random.default_rng(np.random.SeedSequence(list(digest[:8])))
     try:
-        imported = _Binder(source, problem, base, rng, digest.hex()[:6], manner or ImportOptions()).imported()
+        imported = _Binder(
+            source, problem, base, rng, digest.hex()[:6], options or ImportOptions()
+        ).imported()
         return dataclasses.replace(imported, notes=(*notes, *imported.notes), examines=source.examines)
     except RefusedError as error:
         return error.refusal
@@ -126,14 +128,14 @@ class _Binder:
         base: Scene,
         rng: np.random.Generator,
         key: str,
-        manner: ImportOptions,
+        options: ImportOptions,
     ) -> None:
         self._source = source
         self._problem = problem
         self._substances = {name: synset for name, synset in problem.objects.items() if is_substance(synset)}
         self._base = base
         self._rng = rng
-        self._manner = manner
+        self._manner = options
         self._scene_id = f"{base.base}-{_slug(source.name)}-{key}"
         self._demands = requirements_of(problem)
 
@@ -188,14 +190,14 @@ class _Binder:
 
     def _bound_to_furniture(self, shunned: set[str]) -> Binding:
         """The problem bound to other furniture of the scene than is shunned. Raises RefusedError."""
-        manner = self._manner
+        options = self._manner
         return bind(
             self._problem,
             self._base,
             self._rng,
-            furnishing=manner.furnishing,
-            reachable=manner.reachable,
-            renumbering=manner.renumbering,
+            furnishing=options.furnishing,
+            reachable=options.reachable,
+            renumbering=options.renumbering,
             shunned=shunned,
         )
 
