@@ -131,7 +131,7 @@ def test_a_tap_joins_the_table_where_something_must_be_wet(home: Scene) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "origin", "examines"),
+    ("name", "origin", "is_held_out"),
     [
         ("toys", "eai", True),
         ("re-shelving_library_books", "embomatrix", True),
@@ -139,11 +139,11 @@ def test_a_tap_joins_the_table_where_something_must_be_wet(home: Scene) -> None:
         ("cook_a_turkey", "behavior-1k", False),
     ],
 )
-def test_what_examines_is_not_trained_on(home: Scene, name: str, origin: str, examines: bool) -> None:
+def test_what_examines_is_not_trained_on(home: Scene, name: str, origin: str, is_held_out: bool) -> None:
     item = type(source())(name, PROBLEM, origin)
     imported = import_problem(item, home)
     assert isinstance(imported, ImportedTask)
-    assert imported.examines is examines
+    assert imported.is_held_out is is_held_out
 
 
 def test_the_namesakes_are_activities_of_the_package() -> None:

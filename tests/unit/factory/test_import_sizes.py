@@ -25,13 +25,13 @@ CATALOG = Catalog.load()
 
 
 def chosen(
-    categories: dict[str, str], demands: dict[str, Requirement], *, snug: bool = False
+    categories: dict[str, str], demands: dict[str, Requirement], *, compact: bool = False
 ) -> dict[str, list[Model]]:
     """Models for things of some categories, all of which are additions."""
     orders = {name: CATALOG.models_of(category) for name, category in categories.items()}
     additions = [Addition(name, "", None, "", "") for name in categories]
     wanted = {name: demands.get(name, Requirement()) for name in categories}
-    return with_sizes(orders, additions, wanted, {}, snug=snug)
+    return with_sizes(orders, additions, wanted, {}, compact=compact)
 
 
 def asset_of(model: Model) -> Asset:
@@ -107,4 +107,4 @@ def test_things_that_share_a_host_have_more_room_when_it_is_to_be_snug(relation:
         floor_m2 = sum(math.prod(each.size_m) for each in surfaces_for(asset_of(found["host"][0]), relation))
         return sum(math.prod(found[name][0].size_m[:2]) for name in names) / floor_m2
 
-    assert filled(chosen(categories, demands, snug=True)) < filled(chosen(categories, demands))
+    assert filled(chosen(categories, demands, compact=True)) < filled(chosen(categories, demands))

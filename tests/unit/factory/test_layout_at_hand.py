@@ -55,8 +55,8 @@ def test_shoes_under_a_bed_and_food_in_a_box_with_a_lid_are_at_hand(flat: Scene)
     )
     assert (layout.failures, layout.unreachable) == ((), ())
     with SimulatedRobot(editor.freeze("laid")) as robot:
-        assert robot.fetches(layout.names["shoe"])
-        assert robot.fetches(layout.names["apple"])
+        assert robot.can_pick_up(layout.names["shoe"])
+        assert robot.can_pick_up(layout.names["apple"])
 
 
 def test_what_holds_a_thing_that_nobody_reaches_is_put_elsewhere_a_few_times(pending: PendingObjects) -> None:

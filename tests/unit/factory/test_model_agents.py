@@ -14,7 +14,7 @@ from embomatrix.factory.pipeline.settings import BuildSettings
 from embomatrix.factory.pipeline.variants import VariantMaker, VariantOrder
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
-from embomatrix.factory.social.facts import MOST_IN_ROOM, facts_of
+from embomatrix.factory.social.facts import MAX_OBJECTS_IN_ROOM, facts_of
 from embomatrix.factory.social.model_agents import SocialModelAgents
 from embomatrix.factory.social.model_writer import ModelWriter
 from embomatrix.factory.social.requests import (
@@ -245,7 +245,7 @@ def test_what_a_model_is_told_names_every_thing_that_it_may_use():
     text = FACTS.described()
     assert all(f"- {name} (" in text for name in KNOWN)
     assert all(f"[{room}]" in text for room in VARIANT.rooms)
-    assert all(len(room.things) <= MOST_IN_ROOM for room in FACTS.rooms)
+    assert all(len(room.things) <= MAX_OBJECTS_IN_ROOM for room in FACTS.rooms)
 
 
 def a_door():
@@ -263,7 +263,7 @@ def a_door():
         ),
         (
             lambda: RequestedAtom(predicate=RequestPredicate.INSIDE, thing=THING, place=THING),
-            "does not go into",
+            "does not fit into",
         ),
         (
             lambda: RequestedAtom(predicate=RequestPredicate.ONTOP, thing=THING, place=HOST, holds=False),
@@ -275,10 +275,10 @@ def a_door():
         ),
         (
             lambda: RequestedAtom(predicate=RequestPredicate.OPEN, thing=a_door(), holds=False),
-            "is so already",
+            "already in this state",
         ),
         (lambda: RequestedAtom(predicate=RequestPredicate.TOGGLED_ON, thing=HOST), "can't be switched"),
-        (lambda: RequestedAtom(predicate=RequestPredicate.COOKED, thing=HOST), "nothing to cook"),
+        (lambda: RequestedAtom(predicate=RequestPredicate.COOKED, thing=HOST), "can't be cooked"),
         (lambda: RequestedAtom(predicate=RequestPredicate.HOT, thing=HOST, holds=False), "not the contrary"),
     ],
 )

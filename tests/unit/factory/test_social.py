@@ -18,8 +18,8 @@ from embomatrix.factory.social.fitting import is_plausible, reasons_for, themes_
 from embomatrix.factory.social.occasions import Theme, occasion_of, occasions, occasions_in
 from embomatrix.factory.social.phrases import (
     CLAUSES,
-    MANNERS,
-    MATTERS,
+    MANNER_CLAUSES,
+    NEEDS,
     NOUNS,
     TURNS,
     room_called,
@@ -155,8 +155,8 @@ def test_people_call_a_category_by_a_name_that_no_other_has():
 
 
 def test_taps_are_turned_and_drawers_pulled_out(drafts):
-    assert {key.rpartition(" ")[0] for key in MANNERS} <= set(CLAUSES)
-    assert set(MANNERS) <= set(MATTERS)
+    assert {key.rpartition(" ")[0] for key in MANNER_CLAUSES} <= set(CLAUSES)
+    assert set(MANNER_CLAUSES) <= set(NEEDS)
     found, _ = drafts
     for draft in found:
         assert not re.search(r"sinks? (over )?(in [\w ]+ )?(switched )?(on|off)\b", draft.task.instruction)
@@ -172,12 +172,12 @@ SLOT = DaySlot(time="07:30", person="Ann", room="kitchen_0", activity="making br
 @pytest.mark.parametrize(
     ("values", "sentence"),
     [
-        ({"people": (ANN, ANN)}, "two people are called 'Ann'"),
+        ({"people": (ANN, ANN)}, "two people have the name 'Ann'"),
         (
             {"people": (BO, ANN.model_copy(update={"name": "Cy"}))},
-            "Bo is tied to 'Ann': expected another one of",
+            "Bo has a tie to 'Ann': expected another person of",
         ),
-        ({"day": (SLOT.model_copy(update={"person": "Zed"}),)}, "'Zed' has something to do at 07:30"),
+        ({"day": (SLOT.model_copy(update={"person": "Zed"}),)}, "the slot at 07:30 names 'Zed'"),
         ({"people": (ANN,)}, "at least 2 items"),
         ({"day": ()}, "at least 1 item"),
     ],

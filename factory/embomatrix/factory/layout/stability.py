@@ -134,7 +134,7 @@ def _untakeable(editor: SceneEditor, names: Sequence[str]) -> tuple[str, ...]:
     if not behind:
         return ()
     with SimulatedRobot(editor.freeze(editor.base.scene_id)) as rehearsal:
-        return tuple(name for name in behind if not rehearsal.fetches(name))
+        return tuple(name for name in behind if not rehearsal.can_pick_up(name))
 
 
 def _is_behind_door(editor: SceneEditor, name: str) -> bool:

@@ -1,4 +1,6 @@
-"""Imports of many problems: each is bound to the first scene that has what it needs, then judged in the simulator."""
+"""Import of problems over many scenes: each problem is bound to the first suitable scene and verified in the
+simulator.
+"""
 
 from __future__ import annotations
 
@@ -43,40 +45,38 @@ SCENE_INDEPENDENT: Final = frozenset(
         RefusalReason.AGENT_IN_GOAL,
     }
 )
-"""Reasons that are the same in every scene."""
+"""Reasons that do not depend on the scene."""
 OWN_SCENE_DRAWS: Final = 3
-"""Ways to lay a problem out in its first scene, from seeds of their own, before another scene is looked at."""
-MOST_UNSOLVED: Final = 6
-"""Scenes in which a problem is laid out and not solved before it is given up: what stops it is then no scene's fault.
+"""Number of layouts drawn in the problem's own scene before other scenes are tried."""
+MAX_UNSOLVED: Final = 6
+"""Maximum number of scenes in which a problem is laid out but not solved. Then the problem itself is the cause.
 
-So many more are looked at with a snug layout, where things are to share a cavity or a surface.
+The same number of scenes is tried again with a compact layout if objects share a cavity or a surface.
 """
-MOST_ALIKE: Final = 3
-"""Such scenes in a row of which the same is told."""
+MAX_SAME_REFUSAL: Final = 3
+"""Maximum number of such scenes in a row with the same refusal."""
 SEED_STRIDE: Final = 1_000_003
-"""Between the seeds of two draws: no other problem is imported with such a one."""
-MOST_MISFITS: Final = 12
-"""Scenes with all rooms and furniture in which a problem's things find no place, before the next way is tried: laying out forty
-things takes seconds.
-"""
+"""Distance between the seeds of two draws. No other import uses such a seed."""
+MAX_MISFITS: Final = 12
+"""Maximum number of scenes per round in which the objects find no place. Laying out forty objects takes seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """An imported task that was admitted, with its bundle."""
+    """Admitted task with its bundle."""
 
     record: TaskRecord
     bundle: bytes
     notes: tuple[str, ...] = ()
-    """As those of the import."""
+    """Notes of the import."""
 
 
 def bind_first(
     source: SourceText, bases: Sequence[Scene], *, seed: int = 0, options: ImportOptions | None = None
 ) -> ImportedTask | TaskRefusal:
-    """The problem in the first scene that it can be bound to, else the refusal that came furthest. Raises BddlError.
+    """Bind the problem to the first suitable scene. Otherwise return the refusal that came furthest. Raise BddlError.
 
-    The scene that it was written for comes first, then those that have all furniture, then those that lack some.
+    The problem's own scene comes first, then scenes with all furniture, then scenes that lack some.
     """
     return _first(imports(source, bases, seed=seed, options=options or ImportOptions()))
 
@@ -84,10 +84,11 @@ def bind_first(
 def imports(
     source: SourceText, bases: Sequence[Scene], *, seed: int, options: ImportOptions, draws: int = 1
 ) -> Iterator[ImportedTask | TaskRefusal]:
-    """The problem in each scene as it is, then, where the options says so, in each with the furniture that it lacks.
+    """Yield imports of the problem into each scene as it is, and with missing furniture added if the options allow
+    it.
 
-    Last come the same scenes with their rooms counted otherwise. The scene that it was written for comes before all that,
-    in both ways, ``draws`` times; once no scene would do, none is looked at further.
+    The problem's own scene is tried ``draws`` times before all others. The last round renumbers rooms. Refusals that
+    do not depend on the scene end the search.
     """
     own = [base for base in bases if base.base == source.scene]
     others = [base for base in bases if base.base != source.scene]
@@ -113,7 +114,7 @@ def imports(
             if outcome.reason in SCENE_INDEPENDENT:
                 return
             misfits += outcome.reason is RefusalReason.DOES_NOT_FIT
-            if misfits == MOST_MISFITS:
+            if misfits == MAX_MISFITS:
                 break
 
 
@@ -126,15 +127,16 @@ def verify_first(
     seed: int = 0,
     options: ImportOptions | None = None,
 ) -> Verified | TaskRefusal:
-    """The problem in the first scene in which it is admitted, else the refusal that came furthest. Raises BddlError.
+    """Import the problem into the first scene in which it is admitted. Otherwise return the refusal that came
+    furthest.
 
-    The scene that it was written for comes first, then those that have all furniture, then those that lack some.
+    The order of the scenes is that of `bind_first`. Raise BddlError.
     """
 
     def judged() -> Iterator[Verified | TaskRefusal]:
         given = options or ImportOptions()
-        for tried in (given, replace(given, snug=True)) if has_shared_host(source) else (given,):
-            laid_out, misfits, told = 0, 0, list[str]()
+        for tried in (given, replace(given, compact=True)) if has_shared_host(source) else (given,):
+            laid_out, misfits, sentences = 0, 0, list[str]()
             for imported in imports(source, bases, seed=seed, options=tried, draws=OWN_SCENE_DRAWS):
                 if isinstance(imported, TaskRefusal):
                     misfits += imported.reason is RefusalReason.DOES_NOT_FIT
@@ -143,9 +145,9 @@ def verify_first(
                 judged = verify(imported, library, foresight, seed=seed)
                 yield judged
                 laid_out += 1
-                told.append(judged.sentence if isinstance(judged, TaskRefusal) else "")
-                alike = told[-MOST_ALIKE:].count(told[-1])
-                if laid_out == MOST_UNSOLVED or alike == MOST_ALIKE:
+                sentences.append(judged.sentence if isinstance(judged, TaskRefusal) else "")
+                repeated = sentences[-MAX_SAME_REFUSAL:].count(sentences[-1])
+                if laid_out == MAX_UNSOLVED or repeated == MAX_SAME_REFUSAL:
                     break
             if not laid_out and not misfits:
                 return
@@ -154,7 +156,7 @@ def verify_first(
 
 
 def has_shared_host(source: SourceText) -> bool:
-    """Whether a problem has more than one thing in or on another, at the start or in the end. Raises BddlError."""
+    """True if several objects share a host at the start or in the goal. Raise BddlError."""
     problem, _ = read_problem(source)
     return any(max(len(each.contents), len(each.burden)) > 1 for each in requirements_of(problem).values())
 
@@ -169,7 +171,7 @@ def _first(outcomes: Iterable[T | TaskRefusal]) -> T | TaskRefusal:
             return outcome
         refusals.append(outcome)
     if not refusals:
-        raise ValueError("no scene to bind to: expected at least one")
+        raise ValueError("found no base scene: expected at least one")
     order = list(RefusalReason)
     return max(refusals, key=lambda refusal: order.index(refusal.reason))
 
@@ -177,7 +179,7 @@ def _first(outcomes: Iterable[T | TaskRefusal]) -> T | TaskRefusal:
 def verify(
     imported: ImportedTask, library: PlacementLibrary, foresight: Foresight | None, *, seed: int = 0
 ) -> Verified | TaskRefusal:
-    """Judge an imported task by execution, and pack it when it is admitted. Without ``foresight`` the arm is not asked."""
+    """Verify an imported task by execution, and pack its bundle. Without ``foresight``, the arm is not analysed."""
     poses = poses_for(imported, SceneView(imported.scene), library, foresight, seed)
     with contextlib.closing(Simulator(Bundle(imported.scene, {}, poses))) as stage:
         verdict = admit(
@@ -190,7 +192,7 @@ def verify(
     record = TaskRecord(
         task=imported.task,
         bundle_digest=bundle_digest(data),
-        split="heldout" if imported.examines else "train",
+        split="heldout" if imported.is_held_out else "train",
         oracle=tuple(plan_to_json(verdict.plan)),
         rooms=imported.rooms,
         signature=imported.signature,
@@ -201,7 +203,7 @@ def verify(
 def poses_for(
     imported: ImportedTask, view: SceneView, library: PlacementLibrary, foresight: Foresight | None, seed: int
 ) -> PoseCache:
-    """The pose cache of an imported task's scene."""
+    """Return the pose cache of an imported task's scene."""
     task = imported.task
     needs = PoseNeeds(imported.about, task.table, neighbours_of(task.goal, task.types, view.is_portable))
     with SceneSurvey(imported.scene, foresight) as survey:
@@ -209,5 +211,5 @@ def poses_for(
 
 
 def max_held_share(task: Task) -> float:
-    """Share of a task's atoms that may hold at the start: the questions of published benchmarks are as they are."""
+    """Return the share of a task's atoms that may hold at the start. Tasks of published benchmarks have no limit."""
     return 1.0 if task.source in (BEHAVIOR, EAI) else MAX_HELD_SHARE

@@ -1,4 +1,4 @@
-"""What a goal wants next to one another, and which of the two is carried there."""
+"""Pairs of objects that a goal wants next to each other, and the object of each pair that is carried."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from embomatrix.world.goal import Formula
 
     Atoms = Iterable[tuple[str, tuple[str, ...]]]
-    """Predicates and arguments."""
+    """Predicates with their arguments."""
 
 BORNE = (Relation.ONTOP, Relation.INSIDE, Relation.TOUCHING)
 
@@ -23,10 +23,10 @@ BORNE = (Relation.ONTOP, Relation.INSIDE, Relation.TOUCHING)
 def neighbours_of(
     goal: Formula, types: Mapping[str, tuple[str, ...]], can_carry: Callable[[str], bool]
 ) -> tuple[NeighbourPair, ...]:
-    """Pairs of which the goal wants the first next to the second, which stays where it is, or goes where the first goes.
+    """Return the pairs that the goal wants next to each other. The neighbour stays, or both are carried to one host.
 
-    Of a statement about all or some of a type there are pairs for each of them. Where nothing of a pair can be carried, or
-    both are, to different places, there is none.
+    Quantified statements yield a pair for each combination. Pairs are left out if neither object can be carried, or
+    if both are carried to different hosts.
     """
     wanted = tuple(_grounded(goal, types))
     places = _places(wanted, can_carry)
@@ -40,7 +40,7 @@ def neighbours_of(
 def _ways(
     pair: tuple[str, ...], places: Mapping[str, Mapping[str, None]], can_carry: Callable[[str], bool]
 ) -> list[NeighbourPair]:
-    """Ways in which two things come to be neighbours: where one of them is carried to first, before where one stays."""
+    """Return the possible pairs. Those with a neighbour that is carried come first."""
     orders = [(mover, neighbour) for mover, neighbour in (pair, pair[::-1]) if can_carry(mover)]
     going = [
         NeighbourPair(mover, neighbour, host)
@@ -52,7 +52,7 @@ def _ways(
 
 
 def _places(wanted: Atoms, can_carry: Callable[[str], bool]) -> dict[str, dict[str, None]]:
-    """What things are to be carried to."""
+    """Return the hosts that each object is carried to."""
     places: dict[str, dict[str, None]] = {}
     for predicate, args in wanted:
         if predicate in BORNE and can_carry(args[0]):
@@ -61,7 +61,7 @@ def _places(wanted: Atoms, can_carry: Callable[[str], bool]) -> dict[str, dict[s
 
 
 def _grounded(goal: Formula, types: Mapping[str, tuple[str, ...]]) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Predicates and arguments of all that is to hold."""
+    """Yield the predicates and arguments of all positive ground atoms."""
     for atom, positive, scope in literals(goal, True, {}):
         if positive:
             for names in itertools.product(*(types[kind] for kind in scope.values())):

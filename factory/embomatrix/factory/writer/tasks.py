@@ -1,4 +1,4 @@
-"""The task writer: seeded tasks over what a scene variant holds, in the paper's four categories."""
+"""Task writer: seeded tasks about the objects of a scene variant, in the paper's four categories."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ if TYPE_CHECKING:
     Maker = Callable[[GoalContext], GoalConjunct | None]
 
 ROWS: Final = (16, 24)
-"""Rows of an object table, least and most, where the rooms hold enough."""
+"""Minimum and maximum number of rows of an object table."""
 TRIES: Final = 12
 HELDOUT_OF: Final = 4
-"""One goal signature in this many belongs to the held-out split."""
+"""One in this many goal signatures belongs to the held-out split."""
 
 _RECIPES: Final[Mapping[TaskCategory, tuple[tuple[Maker, ...], ...]]] = {
     TaskCategory.PICK_AND_PLACE: (
@@ -58,14 +58,14 @@ _RECIPES: Final[Mapping[TaskCategory, tuple[tuple[Maker, ...], ...]]] = {
         (placement_goal, placement_goal, switch_goal),
     ),
 }
-"""The pieces that make up a goal of each category; those written twice are twice as likely."""
+"""Conjuncts of a goal by category. Repeated recipes are twice as likely."""
 
 
 @dataclass(frozen=True, slots=True)
 class Draft:
-    """A written task, not yet known to be feasible.
+    """Written task whose feasibility is not yet verified.
 
-    ``about`` are the goal's objects and the appliances that it takes, ``rooms`` the rooms that they are in.
+    ``about`` lists the goal's objects and the appliances that it needs, ``rooms`` their rooms.
     """
 
     task: Task
@@ -73,12 +73,12 @@ class Draft:
     rooms: tuple[str, ...]
     signature: str
     transcript: str = ""
-    """How the request came about, in Markdown; empty where nobody talked."""
+    """Conversation behind the request in Markdown; empty if there is none."""
 
 
 @dataclass(frozen=True, slots=True)
 class DraftOrder:
-    """One draft that is asked for. The generator decides all that is drawn for it."""
+    """Order for one draft. The random generator decides everything drawn for it."""
 
     category: TaskCategory
     task_id: str
@@ -86,7 +86,7 @@ class DraftOrder:
 
 
 class TaskWriter(Protocol):
-    """Writes tasks about the things of a variant."""
+    """Writer of tasks about the objects of a variant."""
 
     def write(
         self,
@@ -96,29 +96,30 @@ class TaskWriter(Protocol):
         task_id: str,
         rng: np.random.Generator,
     ) -> Draft | TaskRefusal | None:
-        """A task of the category, None when the variant's rooms hold nothing for one. The generator decides all.
+        """Return a task of the category, or None if the variant's rooms hold nothing for one. The generator decides
+        all draws.
 
-        A refusal tells why whoever was asked for a task gave none.
+        A refusal gives the reason why a language model produced no draft.
         """
         ...
 
 
 @runtime_checkable
 class BatchTaskWriter(Protocol):
-    """A writer that waits for somebody's answers, and so asks for several drafts at once."""
+    """Writer that waits for answers and therefore requests several drafts at once."""
 
     at_once: int
-    """Drafts that are worth asking for together."""
+    """Number of drafts to request together."""
 
     def write_all(
         self, variant: Variant, view: SceneView, orders: Sequence[DraftOrder]
     ) -> Sequence[Draft | TaskRefusal]:
-        """What came of the first so many of the orders, of one at least: a draft, or why there is none."""
+        """Return a draft or a refusal for each order; at least for the first one."""
         ...
 
 
 class PlainWriter:
-    """Asks for what a goal says in a bounded vocabulary, and no more."""
+    """Writer that states the goal in a bounded vocabulary."""
 
     def write(
         self,
@@ -128,58 +129,60 @@ class PlainWriter:
         task_id: str,
         rng: np.random.Generator,
     ) -> Draft | None:
-        shop = GoalContext(view, variant, rng)
-        pieces = draw_conjuncts(shop, category)
-        if not pieces:
+        context = GoalContext(view, variant, rng)
+        conjuncts = draw_conjuncts(context, category)
+        if not conjuncts:
             return None
-        return draft_of(shop, category, task_id, pieces, sentence([piece.clause for piece in pieces], rng))
+        return draft_of(
+            context, category, task_id, conjuncts, sentence([conjunct.clause for conjunct in conjuncts], rng)
+        )
 
 
-def draw_conjuncts(shop: GoalContext, category: TaskCategory) -> list[GoalConjunct]:
-    """Pieces that make up a goal of the category; none where the variant's rooms hold nothing for one."""
+def draw_conjuncts(context: GoalContext, category: TaskCategory) -> list[GoalConjunct]:
+    """Return the conjuncts of a goal of the category; empty if the variant's rooms hold nothing for one."""
     recipes = _RECIPES[category]
     for _ in range(TRIES):
-        pieces = _drawn(shop, recipes[int(shop.rng.integers(len(recipes)))])
-        if pieces:
-            return pieces
+        conjuncts = _drawn(context, recipes[int(context.rng.integers(len(recipes)))])
+        if conjuncts:
+            return conjuncts
     return []
 
 
-def _drawn(shop: GoalContext, recipe: Sequence[Maker]) -> list[GoalConjunct]:
-    """One piece by each maker about objects of its own, or none at all."""
-    pieces: list[GoalConjunct] = []
+def _drawn(context: GoalContext, recipe: Sequence[Maker]) -> list[GoalConjunct]:
+    """Return one conjunct per maker, each about different objects, or an empty list."""
+    conjuncts: list[GoalConjunct] = []
     for make in recipe:
-        used = frozenset(name for piece in pieces for name in piece.objects)
-        piece = make(dataclasses.replace(shop, used=used))
-        if piece is None or any(set(piece.types) & set(other.types) for other in pieces):
+        used = frozenset(name for conjunct in conjuncts for name in conjunct.objects)
+        conjunct = make(dataclasses.replace(context, used=used))
+        if conjunct is None or any(set(conjunct.types) & set(other.types) for other in conjuncts):
             return []
-        if used & set(piece.objects):
+        if used & set(conjunct.objects):
             return []
-        pieces.append(piece)
-    return pieces
+        conjuncts.append(conjunct)
+    return conjuncts
 
 
 def draft_of(
-    shop: GoalContext,
+    context: GoalContext,
     category: TaskCategory,
     task_id: str,
-    pieces: Sequence[GoalConjunct],
+    conjuncts: Sequence[GoalConjunct],
     instruction: str,
     transcript: str = "",
 ) -> Draft:
-    """The task that asks for these pieces in these words."""
-    view = shop.view
-    goal = _conjunction([piece.goal for piece in pieces])
-    types = {key: names for piece in pieces for key, names in piece.types.items()}
-    needed = dict.fromkeys(name for piece in pieces for name in piece.objects)
+    """Return the task with these conjuncts and this instruction."""
+    view = context.view
+    goal = _conjunction([conjunct.goal for conjunct in conjuncts])
+    types = {key: names for conjunct in conjuncts for key, names in conjunct.types.items()}
+    needed = dict.fromkeys(name for conjunct in conjuncts for name in conjunct.objects)
     task = Task(
         task_id=task_id,
-        scene_id=shop.variant.scene.scene_id,
+        scene_id=context.variant.scene.scene_id,
         instruction=instruction,
         category=category,
         goal=goal,
         goal_bddl=render(goal),
-        table=object_table(view, tuple(needed), shop.rng),
+        table=object_table(view, tuple(needed), context.rng),
         types=types,
         source="writer",
     )
@@ -187,7 +190,7 @@ def draft_of(
         task=task,
         about=tuple(needed),
         rooms=tuple(sorted({view.room(name) for name in needed})),
-        signature=" ".join(sorted(sign for piece in pieces for sign in piece.signs)),
+        signature=" ".join(sorted(sign for conjunct in conjuncts for sign in conjunct.signs)),
         transcript=transcript,
     )
 
@@ -200,9 +203,9 @@ def _conjunction(parts: list[Formula]) -> Formula:
 
 
 def object_table(view: SceneView, needed: Sequence[str], rng: np.random.Generator) -> tuple[str, ...]:
-    """The needed objects with all that they rest on or in, and distractors of the same rooms, shuffled.
+    """Return the needed objects with their supports, and distractors of the same rooms, shuffled.
 
-    Distractors bring their own hosts along, so a row's place can always be told.
+    Distractors are added with their supports, so the place of each row can always be stated.
     """
     rows: dict[str, None] = {}
 
@@ -224,7 +227,7 @@ def object_table(view: SceneView, needed: Sequence[str], rng: np.random.Generato
 
 
 def _is_useful(view: SceneView, name: str) -> bool:
-    """Whether a plan could have any use for the object: pictures and blinds fill a table with noise."""
+    """True if a plan can use the object. Pictures and blinds would only add noise."""
     return (
         view.is_portable(name)
         or view.is_surface(name)
@@ -235,6 +238,6 @@ def _is_useful(view: SceneView, name: str) -> bool:
 
 
 def is_heldout_signature(signature: str, seed: int) -> bool:
-    """Whether goals of this signature belong to the held-out split: a fair draw by hash, fixed for a seed."""
+    """True if goals of this signature belong to the held-out split: a hash draw that is fixed for a seed."""
     digest = hashlib.sha256(f"{seed} {signature}".encode()).digest()
     return digest[0] % HELDOUT_OF == 0
