@@ -14,6 +14,7 @@ from embomatrix.proto.v1 import (
 )
 from embomatrix.rpc.channel import SERVER_OPTIONS, TOKEN_KEY
 from embomatrix.rpc.status import NotFoundError, NotSignedInError, translate
+from embomatrix.rpc.versions import PROTOCOL_VERSION
 from embomatrix.rpc.wire.batch import batch_from_proto
 from embomatrix.rpc.wire.outcome import rollout_result_to_proto
 from embomatrix.rpc.wire.values import Cancelled, RolloutResult
@@ -39,6 +40,11 @@ class FakeCluster(
     def _check(self, context):
         if self.token and (TOKEN_KEY, f"Bearer {self.token}") not in context.invocation_metadata():
             raise NotSignedInError("no such token: ask the operator for one")
+
+    async def GetCapabilities(self, request, context):
+        return rollout_service_pb2.GetCapabilitiesResponse(
+            protocol_low=PROTOCOL_VERSION, protocol_high=PROTOCOL_VERSION
+        )
 
     async def OpenRun(self, request, context):
         async with translate(context):

@@ -53,8 +53,6 @@ class FakeWorker:
     token: str = ""
     join_token: str = ""
     ca: bytes = b""
-    through: type = lambda channel: channel
-    """What its channel is wrapped in, such as one that lets through an older protocol alone."""
     protocol: int = PROTOCOL_VERSION
     boot_id: str = ""
     poison: set = field(default_factory=set)
@@ -76,7 +74,7 @@ class FakeWorker:
     labels: dict = field(default_factory=dict)
 
     async def __aenter__(self):
-        self._channel = self.through(open_channel(self.address, self.token, self.ca))
+        self._channel = open_channel(self.address, self.token, self.ca)
         self._stub = worker_service_pb2_grpc.WorkerServiceStub(self._channel)
         self._outgoing = asyncio.Queue()
         self._free = asyncio.Queue()

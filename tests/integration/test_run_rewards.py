@@ -1,20 +1,19 @@
-"""Coefficients of a run's reward: who scores with them, what becomes of bad ones, and of workers that know none."""
+"""Reward coefficients of a run reach its workers, and bad ones are refused."""
 
 import asyncio
 
 import pytest
-from tests.fakes.cluster import FakeCluster
-from tests.fakes.version_one import NarrowChannel, serving_version_one
 from tests.fakes.worker import FakeWorker
-from tests.integration.test_manager_service import BUNDLES, KITCHEN, batch, manager, outcomes, until
+from tests.integration.test_manager_service import BUNDLES, batch, manager, outcomes, until
 
 from embomatrix.proto.v1 import rollout_service_pb2, rollout_service_pb2_grpc, types_pb2
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.admin import AdminClient
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.client import ClusterClient
-from embomatrix.rpc.status import ConflictError, InvalidRequestError, PreconditionError, cluster_errors
-from embomatrix.rpc.wire.values import Completed, GroupPolicy, InfraFailure, LookaheadEntry, RunTerms, Warmth
+from embomatrix.rpc.status import ConflictError, InvalidRequestError, cluster_errors
+from embomatrix.rpc.versions import PROTOCOL_VERSION
+from embomatrix.rpc.wire.values import Completed, GroupPolicy, RunTerms
 
 pytestmark = pytest.mark.timeout(60)
 OWN = RewardSettings(unparsable=-2.0, format=1.0, relevance_per_object=0.0, relevance_limit=0.0, goal=8.0)
@@ -71,42 +70,6 @@ async def test_a_rollout_that_is_leased_again_keeps_its_run_s_coefficients_also_
         assert totals(await outcomes(client, batch(2))) == {5.0}
 
 
-async def test_a_worker_of_the_version_before_is_left_out_and_the_run_says_why_it_waits(tmp_path):
-    async with (
-        manager(tmp_path) as at,
-        ClusterClient(at.address) as client,
-        FakeWorker(at.address, worker_id="old", through=NarrowChannel, protocol=1) as old,
-    ):
-        await open_run(client, TERMS)
-        answers = await client.announce_window("r1", 1, [LookaheadEntry(1, KITCHEN, 4)])
-        assert answers[0].warmth is Warmth.UNPLACEABLE
-        assert "upgrade one with `pip install --upgrade 'embomatrix[worker]'`" in answers[0].reason
-        running = asyncio.create_task(outcomes(client, batch(4)))
-        while not (infos := await _runs(at.address))[0].waits_for:  # noqa: ASYNC110  # nothing tells of it
-            await asyncio.sleep(0.02)
-        assert "workers of protocol 1 do not know" in infos[0].waits_for
-        await open_run(client, RunTerms(), "r2")
-        assert totals(await outcomes(client, batch(2, batch_id="b2", run_id="r2"))) == {0.5 + 0.2 + 15.0}
-        async with FakeWorker(at.address, worker_id="new") as new:
-            assert totals(await running) == {5.0}
-            assert len(new.executed) == 4
-        assert sorted(old.executed) == ["b2-0", "b2-1"]
-        assert (await _runs(at.address))[0].waits_for == ""
-
-
-async def test_rollouts_that_no_worker_can_score_end_without_a_reward_and_with_the_reason(tmp_path):
-    async with (
-        manager(tmp_path, no_capacity_s=0.3) as at,
-        ClusterClient(at.address) as client,
-        FakeWorker(at.address, through=NarrowChannel, protocol=1),
-    ):
-        await open_run(client, TERMS)
-        results = await outcomes(client, batch(1))
-        (outcome,) = (result.outcome for result in results.values())
-        assert isinstance(outcome, InfraFailure)
-        assert "reward coefficients of its own" in outcome.message
-
-
 async def test_coefficients_that_make_no_reward_are_refused_when_the_run_is_opened(tmp_path):
     async with manager(tmp_path) as at, open_channel(at.address) as channel:
         stub = rollout_service_pb2_grpc.RolloutServiceStub(channel)
@@ -115,7 +78,12 @@ async def test_coefficients_that_make_no_reward_are_refused_when_the_run_is_open
             pytest.raises(InvalidRequestError, match=r"reward\.goal: is -30: a tier pays 0 or more"),
             cluster_errors(at.address),
         ):
-            await stub.OpenRun(rollout_service_pb2.OpenRunRequest(run_id="r1", reward=bad), timeout=5)
+            await stub.OpenRun(
+                rollout_service_pb2.OpenRunRequest(
+                    run_id="r1", protocol_version=PROTOCOL_VERSION, reward=bad
+                ),
+                timeout=5,
+            )
         assert await _runs(at.address) == ()
 
 
@@ -126,15 +94,3 @@ async def test_a_run_that_is_open_keeps_its_coefficients_and_whoever_asks_for_ot
         assert await client.open_run("whatever it has", "r1") == "r1"
         with pytest.raises(ConflictError, match=r"'r1' was opened with other reward coefficients"):
             await client.open_run("others", "r1", RunTerms(reward=RewardSettings(goal=1.0)))
-
-
-async def test_a_manager_of_the_version_before_is_not_trusted_with_coefficients():
-    async with (
-        serving_version_one(FakeCluster(), "RolloutService") as (address, called),
-        ClusterClient(address) as client,
-    ):
-        with pytest.raises(
-            PreconditionError, match=r"speaks protocol 1, which has no coefficients .* upgrade it"
-        ):
-            await client.open_run("test", "r1", TERMS)
-    assert "OpenRun" not in called

@@ -31,6 +31,7 @@ from embomatrix.rpc.status import (
     NotAllowedError,
 )
 from embomatrix.rpc.trust import Invitation, fetch_ca, fingerprint_of
+from embomatrix.rpc.versions import PROTOCOL_VERSION
 from embomatrix.rpc.wire.session import lease_result_to_proto
 from embomatrix.rpc.wire.values import Batch, Completed
 from embomatrix.world.inflation import bundle_digest
@@ -85,7 +86,7 @@ def register(name, **fields):
     return worker_service_pb2.RegisterRequest(
         worker_id=name,
         boot_id="intruder",
-        protocol_version=2,
+        protocol_version=PROTOCOL_VERSION,
         resources=types_pb2.Resources(slots=1),
         **fields,
     )

@@ -1,32 +1,22 @@
-"""Acceptance test A10: sides of this version and of the one before, in every pairing, and sides that are further apart."""
+"""Acceptance test A10: version negotiation, and a worker that is replaced during a batch."""
 
 import asyncio
 
-import numpy as np
 import pytest
-from tests.fakes.cluster import FakeCluster
 from tests.fakes.guarded import packed
-from tests.fakes.simulation import PROGRAM
-from tests.fakes.version_one import NarrowChannel, VersionOneManager, serving_version_one
 from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import manager, until
 
 from embomatrix.proto.v1 import (
     rollout_service_pb2,
     rollout_service_pb2_grpc,
-    scene_service_pb2,
-    scene_service_pb2_grpc,
 )
 from embomatrix.rpc.capabilities import capabilities_of
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import PreconditionError, cluster_errors
 from embomatrix.rpc.versions import SPOKEN, VersionRange, agree
-from embomatrix.rpc.wire.batch import batch_to_proto
-from embomatrix.rpc.wire.outcome import rollout_result_from_proto
-from embomatrix.rpc.wire.values import Batch, Completed, Resources, Rollout
-from embomatrix.worker.host.settings import WorkerSettings
-from embomatrix.worker.link.daemon import Daemon
+from embomatrix.rpc.wire.values import Batch, Completed, Rollout
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -38,53 +28,11 @@ def batch(count, batch_id="b1"):
     return Batch("r1", batch_id, 1, rollouts)
 
 
-def old_worker(at, name="old", **options):
-    return FakeWorker(at.address, worker_id=name, through=NarrowChannel, protocol=1, **options)
-
-
-class OldTrainer:
-    """A trainer of version 1: it says nothing of versions, asks nothing about them, and reads results alone."""
-
-    def __init__(self, address):
-        self._address = address
-
-    async def __aenter__(self):
-        self._channel = NarrowChannel(open_channel(self._address))
-        self._rollouts = rollout_service_pb2_grpc.RolloutServiceStub(self._channel)
-        scenes = scene_service_pb2_grpc.SceneServiceStub(self._channel)
-        # Of the newer version, to see that it does not reach the manager.
-        newer = rollout_service_pb2.OpenRunRequest(run_id="r1", protocol_version=99, weight=-1.0)
-        await self._rollouts.OpenRun(newer, timeout=5)
-        put = scene_service_pb2.PutBundleRequest(bundle_digest=KITCHEN, chunk=DATA)
-
-        async def chunks():
-            yield put
-
-        await scenes.PutBundle(chunks(), timeout=5)
-        return self
-
-    async def __aexit__(self, *_):
-        await self._channel.close()
-
-    async def outcomes(self, submitted):
-        stream = self._rollouts.Execute(batch_to_proto(submitted), timeout=30)
-        return [rollout_result_from_proto(found) async for answer in stream for found in answer.results]
-
-
-async def test_workers_and_trainers_of_the_version_before_work_with_this_manager(tmp_path):
-    async with manager(tmp_path) as at, OldTrainer(at.address) as trainer, old_worker(at, slots=2) as worker:
-        results = await trainer.outcomes(batch(100))
-    assert len({result.rollout_id for result in results}) == len(results) == 100
-    assert all(isinstance(result.outcome, Completed) for result in results)
-    assert len(worker.executed) == 100
-
-
-async def test_an_upgrade_machine_by_machine_drops_no_rollout(tmp_path, capsys):
-    """Old and new workers side by side; in the middle of a batch the old one is replaced by a new one of its name."""
+async def test_replacing_a_worker_during_a_batch_drops_no_rollout(tmp_path, capsys):
     async with manager(tmp_path) as at, ClusterClient(at.address) as client:
         await client.open_run("upgrade", "r1")
         await client.put_bundles({KITCHEN: DATA})
-        old = await old_worker(at, "w1", slots=2, execute_s=0.02).__aenter__()
+        old = await FakeWorker(at.address, worker_id="w1", slots=2, execute_s=0.02).__aenter__()
         running = asyncio.create_task(collected(client, batch(200)))
         await until(lambda: len(old.executed) > 20)
         async with FakeWorker(at.address, worker_id="w2", slots=2, execute_s=0.01):
@@ -104,37 +52,6 @@ async def test_an_upgrade_machine_by_machine_drops_no_rollout(tmp_path, capsys):
 
 async def collected(client, submitted):
     return [result async for result in client.execute(submitted, deadline_s=40)]
-
-
-async def test_this_worker_works_with_a_manager_of_the_version_before_and_leaves_it_cleanly(tmp_path):
-    before = VersionOneManager()
-    digest = before.bundle(b"ok")
-    async with serving_version_one(before, "WorkerService") as (address, called):
-        settings = WorkerSettings(manager=address, name="w1", cache_dir=tmp_path, state_dir=tmp_path)
-        daemon = Daemon(settings, Resources(2, 2, 500), np.random.default_rng(0), program=PROGRAM)
-        working = asyncio.create_task(daemon.run())
-        await until(lambda: before.states, within_s=20)
-        before.want(digest)
-        for number in range(20):
-            before.lease(f"l{number}", digest)
-        await until(lambda: len(before.results) == 20 and "Heartbeat" in called, within_s=20)
-        daemon.stop()
-        await working
-    assert called.count("Register") == 2, "it asks by its own version first, then by the one before"
-    assert [request.protocol_version for request in before.registrations] == [1]
-    assert all(isinstance(result.outcome, Completed) for result in before.results)
-    assert "Deregister" not in called
-
-
-async def test_this_trainer_works_with_a_manager_of_the_version_before():
-    before = FakeCluster()
-    async with (
-        serving_version_one(before, "RolloutService", "SceneService") as (address, _),
-        ClusterClient(address) as client,
-    ):
-        assert await client.open_run("test", "r1") == "r1"
-        await client.put_bundles({KITCHEN: DATA})
-        assert len(await collected(client, batch(10))) == 10
 
 
 async def test_a_manager_tells_what_it_speaks_before_it_asks_for_anything(tmp_path):

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import grpc
-
 from embomatrix.proto.v1 import rollout_service_pb2 as pb
 from embomatrix.rpc.status import cluster_errors
-from embomatrix.rpc.versions import PROTOCOL_OLDEST, SPOKEN, VersionRange, agree
+from embomatrix.rpc.versions import SPOKEN, VersionRange, agree
 
 if TYPE_CHECKING:
     from embomatrix.proto.v1.rollout_service_pb2_grpc import RolloutServiceAsyncStub
@@ -17,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """A manager's answer. Limits of 0 were not told: the manager is older than this question."""
+    """Versions, limits and certificate authority of a manager."""
 
     protocol: VersionRange
     release: str = ""
@@ -28,14 +26,9 @@ class Capabilities:
 
 
 async def capabilities_of(stub: RolloutServiceAsyncStub, address: str, *, timeout_s: float) -> Capabilities:
-    """Ask the manager behind the stub. One of the version before can't answer, and that is told by its silence."""
+    """Ask the manager behind the stub. Raises ClusterError."""
     with cluster_errors(address):
-        try:
-            answer = await stub.GetCapabilities(pb.GetCapabilitiesRequest(), timeout=timeout_s)
-        except grpc.aio.AioRpcError as error:
-            if error.code() is not grpc.StatusCode.UNIMPLEMENTED:
-                raise
-            return Capabilities(VersionRange(PROTOCOL_OLDEST, PROTOCOL_OLDEST))
+        answer = await stub.GetCapabilities(pb.GetCapabilitiesRequest(), timeout=timeout_s)
     return Capabilities(
         VersionRange(answer.protocol_low, answer.protocol_high),
         answer.version,

@@ -26,12 +26,10 @@ from embomatrix.rpc.status import (
     InternalError,
     NotFoundError,
     OverloadedError,
-    PreconditionError,
     UnavailableError,
     cluster_error,
     cluster_errors,
 )
-from embomatrix.rpc.versions import SCORES_SINCE
 from embomatrix.rpc.wire.batch import batch_to_proto
 from embomatrix.rpc.wire.outcome import rollout_result_from_proto
 from embomatrix.rpc.wire.rollout import each, inside
@@ -113,20 +111,12 @@ class ClusterClient(FleetClient):
 
     @of_the_leader
     async def open_run(self, name: str, run_id: str = "", terms: RunTerms = DEFAULT_TERMS) -> str:
-        """Open a run, or attach to the one of this id, which keeps its terms; returns its id.
-
-        PreconditionError for coefficients of the reward that are not the paper's at a manager which knows no others.
-        """
+        """Open a run and return its id. An open run of the same id is attached to and keeps its terms."""
         request = run_terms_to_proto(terms)
         request.name, request.run_id = name, run_id
         request.protocol_version = await version_with(
             self._rollouts, self._address, timeout_s=self._limits.call_s
         )
-        if request.protocol_version < SCORES_SINCE and request.HasField("reward"):
-            raise PreconditionError(
-                f"the manager at {self._address} speaks protocol {request.protocol_version}, which has no coefficients of "
-                "the reward: upgrade it with `pip install --upgrade 'embomatrix[manager]'`, or leave them out"
-            )
         with cluster_errors(self._address):
             answer = await self._rollouts.OpenRun(request, timeout=self._limits.call_s)
         return str(answer.run_id)

@@ -1,7 +1,7 @@
-"""Versions of the protocol: which ones this release speaks, and the one that two sides agree on.
+"""Protocol versions that this release speaks, and the negotiation between two sides.
 
-Messages only ever gain fields, so two versions differ in what each side may rely on. A release speaks its own version and the
-one before, so that a cluster is upgraded one machine at a time.
+Messages only gain fields, so two versions differ in what each side may rely on. A release may speak a range of versions: a
+cluster can then be upgraded one machine at a time.
 """
 
 from __future__ import annotations
@@ -13,11 +13,6 @@ from typing import Final
 from embomatrix.rpc.status import PreconditionError
 
 PROTOCOL_VERSION: Final = 2
-"""1: sessions, leases, batches. 2: credentials, leaving, progress of leases, coefficients of a run, policies of groups,
-reports of training."""
-PROTOCOL_OLDEST: Final = 1
-SCORES_SINCE: Final = 2
-"""Workers of an older version score with the paper's coefficients, whatever a lease asks for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +28,7 @@ class VersionRange:
 
 _EXTRAS: Final = ("manager", "worker", "trainer")
 
-SPOKEN: Final = VersionRange(PROTOCOL_OLDEST, PROTOCOL_VERSION)
+SPOKEN: Final = VersionRange(PROTOCOL_VERSION, PROTOCOL_VERSION)
 
 
 def agree(ours: VersionRange, theirs: VersionRange, *, us: str, them: str, their_release: str = "") -> int:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from embomatrix.rpc.versions import PROTOCOL_VERSION
-
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -29,8 +27,6 @@ class WorkerJoined:
 
     worker_id: str
     resources: Resources
-    protocol: int = PROTOCOL_VERSION
-    """The version that it speaks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,8 +200,6 @@ class DemandObserved:
     idle: frozenset[str] = frozenset()
     runs: Mapping[str, str] = field(default_factory=dict)
     rendering: frozenset[str] = frozenset()
-    scored: frozenset[str] = frozenset()
-    """Scenes that only runs with coefficients of their own wait for."""
     lags: Mapping[str, float] = field(default_factory=dict)
     """How many times slower than others those workers are that plainly are."""
 

@@ -39,7 +39,6 @@ from embomatrix.manager.runtime.runs import RunLimits, Runs
 from embomatrix.manager.store.timed import timed_store
 from embomatrix.manager.web.views import UNAUDITED
 from embomatrix.rpc.status import SupersededError, UnavailableError
-from embomatrix.rpc.versions import PROTOCOL_VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -135,14 +134,11 @@ class ManagerRuntime:
         resources: Resources,
         *,
         credential_id: str = "",
-        protocol: int = PROTOCOL_VERSION,
     ) -> tuple[WorkerSession, float]:
         """Open a session for a worker; returns it and the heartbeat's interval in seconds once the worker is noted."""
         if self._lapsed_s() > LET_GO_S:
             raise UnavailableError(STORE_AWAY)
-        session, commands = self._intake.register(
-            worker_id, boot_id, resources, now_s=time.monotonic(), protocol=protocol
-        )
+        session, commands = self._intake.register(worker_id, boot_id, resources, now_s=time.monotonic())
         session.credential_id = credential_id
         self._close_link(worker_id)
         self.chronicle.fleet.joined(worker_id, resources, now_s=time.monotonic())

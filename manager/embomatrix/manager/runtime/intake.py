@@ -16,7 +16,6 @@ from embomatrix.manager.control.events import (
     WorkerLost,
     WorkerReported,
 )
-from embomatrix.rpc.versions import PROTOCOL_VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -60,12 +59,9 @@ class Intake:
         resources: Resources,
         *,
         now_s: float,
-        protocol: int = PROTOCOL_VERSION,
     ) -> tuple[WorkerSession, list[Command]]:
-        """Open a session for a worker, which speaks this version."""
-        session, events = self.registry.register(
-            worker_id, boot_id, resources, now_s=now_s, protocol=protocol
-        )
+        """Open a session for a worker."""
+        session, events = self.registry.register(worker_id, boot_id, resources, now_s=now_s)
         return session, self.feed(*events, now_s=now_s)
 
     def report(

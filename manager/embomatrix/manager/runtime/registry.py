@@ -20,7 +20,6 @@ from embomatrix.manager.control.events import (
     WorkerSuspected,
 )
 from embomatrix.rpc.status import NotFoundError, SupersededError, UnknownSessionError
-from embomatrix.rpc.versions import PROTOCOL_VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -87,8 +86,6 @@ class WorkerSession:
     """An operator takes it out."""
     load: float = 0.0
     memory_used_mb: int = 0
-    protocol: int = PROTOCOL_VERSION
-    """The version that both sides speak."""
     credential_id: str = ""
     """The token that opened it: no other speaks for it."""
     asked: set[str] = field(default_factory=set)
@@ -142,7 +139,6 @@ class Registry:
         resources: Resources,
         *,
         now_s: float,
-        protocol: int = PROTOCOL_VERSION,
     ) -> tuple[WorkerSession, list[Event]]:
         """Open a session; an older one of the same worker ends. The same process keeps its leases, another one loses them."""
         before = self._sessions.get(worker_id)
@@ -155,7 +151,6 @@ class Registry:
             epoch=self._epoch,
             resources=resources,
             last_seen_s=now_s,
-            protocol=protocol,
         )
         self._sessions[worker_id] = self._by_silence[worker_id] = session
         self._by_silence.move_to_end(worker_id)
@@ -169,7 +164,7 @@ class Registry:
                 session.standing = before.standing
                 return session, []
         lost = [WorkerLost(worker_id, "a newer session of the same worker took over")] if alive else []
-        return session, [*lost, WorkerJoined(worker_id, resources, protocol)]
+        return session, [*lost, WorkerJoined(worker_id, resources)]
 
     def find(self, session_id: str, epoch: int) -> WorkerSession:
         """The live session of that name; raises ``SupersededError`` for one that ended, so that its worker stops.

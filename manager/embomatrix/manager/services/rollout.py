@@ -10,7 +10,7 @@ from embomatrix.proto.v1 import rollout_service_pb2 as pb
 from embomatrix.proto.v1 import rollout_service_pb2_grpc
 from embomatrix.rpc.logs import bind
 from embomatrix.rpc.status import NotFoundError, TrimmedError, translate
-from embomatrix.rpc.versions import PROTOCOL_OLDEST, SPOKEN, VersionRange, agree, software_version
+from embomatrix.rpc.versions import SPOKEN, VersionRange, agree, software_version
 from embomatrix.rpc.wire.batch import batch_with
 from embomatrix.rpc.wire.rollout import each, rollout_from_proto
 from embomatrix.rpc.wire.run import (
@@ -64,8 +64,7 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
         self, request: pb.OpenRunRequest, context: grpc.aio.ServicerContext
     ) -> pb.OpenRunResponse:
         async with translate(context):
-            # A trainer of version 1 does not say which it speaks.
-            spoken = request.protocol_version or PROTOCOL_OLDEST
+            spoken = request.protocol_version
             agree(SPOKEN, VersionRange(spoken, spoken), us="this manager", them="the trainer")
             run_id = await self._runs.open_run(request.name, request.run_id, run_terms_from_proto(request))
         return pb.OpenRunResponse(run_id=run_id)

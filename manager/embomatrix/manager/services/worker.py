@@ -76,14 +76,13 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
                 request.boot_id,
                 resources,
                 credential_id=admission.token_id,
-                protocol=protocol,
             )
         return pb.RegisterResponse(
             session_id=session.session_id,
             session_epoch=session.epoch,
             heartbeat_interval_s=interval_s,
             lease_ttl_s=self._lease_ttl_s,
-            protocol_version=session.protocol,
+            protocol_version=protocol,
             credential=admission.credential,
         )
 

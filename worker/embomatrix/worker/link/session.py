@@ -18,11 +18,10 @@ from embomatrix.rpc.status import (
     ClusterError,
     DeadlineError,
     NotFoundError,
-    PreconditionError,
     UnavailableError,
     cluster_errors,
 )
-from embomatrix.rpc.versions import PROTOCOL_OLDEST, PROTOCOL_VERSION
+from embomatrix.rpc.versions import PROTOCOL_VERSION
 from embomatrix.rpc.wire.rollout import each
 from embomatrix.rpc.wire.session import (
     lease_from_proto,
@@ -70,8 +69,6 @@ class Registration:
     epoch: int
     heartbeat_s: float
     lease_ttl_s: float
-    protocol: int
-    """The version that both sides speak."""
     credential: str = field(default="", repr=False)
     """What this worker shows from here on; empty when that does not change."""
 
@@ -82,38 +79,22 @@ async def register(membership: Membership, *, boot_id: str, resources: Resources
         worker_id=membership.name,
         boot_id=boot_id,
         protocol_version=PROTOCOL_VERSION,
-        protocol_low=PROTOCOL_OLDEST,
+        protocol_low=PROTOCOL_VERSION,
         resources=resources_to_proto(resources),
         join_token=membership.token if membership.joining else "",
     )
     shown = "" if membership.joining else membership.token
     async with open_channel(membership.manager, shown, membership.ca) as channel:
         stub = worker_service_pb2_grpc.WorkerServiceStub(channel)
-        try:
-            answer = await _announce(stub, request, membership.manager)
-        except PreconditionError as error:
-            # A manager of the version before takes no range, only a version that is exactly its own.
-            request.protocol_version, request.protocol_low = PROTOCOL_OLDEST, 0
-            try:
-                answer = await _announce(stub, request, membership.manager)
-            except PreconditionError:
-                raise error from None
+        with cluster_errors(membership.manager):
+            answer: pb.RegisterResponse = await stub.Register(request, timeout=REGISTER_S)
     return Registration(
         answer.session_id,
         answer.session_epoch,
         answer.heartbeat_interval_s,
         answer.lease_ttl_s,
-        answer.protocol_version or PROTOCOL_OLDEST,
         answer.credential,
     )
-
-
-async def _announce(
-    stub: worker_service_pb2_grpc.WorkerServiceAsyncStub, request: pb.RegisterRequest, address: str
-) -> pb.RegisterResponse:
-    with cluster_errors(address):
-        answer: pb.RegisterResponse = await stub.Register(request, timeout=REGISTER_S)
-    return answer
 
 
 class ManagerSession:
@@ -206,8 +187,6 @@ class ManagerSession:
 
     async def leave(self) -> None:
         """Say that this worker is gone for good, so that nobody waits for it; a manager that can't hear it will find out."""
-        if self._registration.protocol <= PROTOCOL_OLDEST:
-            return
         request = pb.DeregisterRequest(
             session_id=self._registration.session_id, session_epoch=self._registration.epoch
         )

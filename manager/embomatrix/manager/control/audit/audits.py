@@ -265,7 +265,6 @@ class Audits:
             name not in check.barred
             and not (worker.quarantined or worker.draining)
             and (worker.render_slots > 0 or not check.rollout.render)
-            and (worker.scores or not check.lane.scored)
             for name, worker in self._desk.fleet.workers.items()
         )
 

@@ -14,7 +14,6 @@ from embomatrix.manager.control.events import (
     WorkerResumed,
     WorkerSuspected,
 )
-from embomatrix.rpc.versions import SCORES_SINCE
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure, ResidentState
 
 if TYPE_CHECKING:
@@ -39,7 +38,6 @@ class Attendance:
             resources.slots,
             resources.render_slots,
             resources.versions,
-            scores=event.protocol >= SCORES_SINCE,
         )
         self._desk.audits.joined(joined)
 

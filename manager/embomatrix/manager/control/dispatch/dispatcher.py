@@ -149,7 +149,6 @@ class Dispatcher:
             lags=dict(desk.fleet.lags),
             runs={heads[0].scene: heads[0].key.run_id for heads in lanes},
             rendering=frozenset(h.scene for heads in lanes for h in heads if h.rollout.render),
-            scored=frozenset(heads[0].scene for heads in lanes if all(h.lane.scored for h in heads)),
         )
 
     @property

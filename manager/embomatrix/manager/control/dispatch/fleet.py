@@ -44,8 +44,6 @@ class Fleet:
         slots: int,
         render_slots: int = 0,
         versions: Mapping[str, str] | None = None,
-        *,
-        scores: bool = True,
     ) -> WorkerRecord:
         """A new worker, which can take nothing until it has reported."""
         slots = max(slots, 1)
@@ -55,7 +53,6 @@ class Fleet:
             credits=2 * slots,
             render_slots=min(render_slots, slots),
             versions=versions or {},
-            scores=scores,
         )
         self.workers[worker_id] = record
         self._live.add(worker_id)

@@ -49,8 +49,6 @@ class Lane(NamedTuple):
     run_id: str
     render: bool
     barred: frozenset[str]
-    scored: bool
-    """Its run has reward coefficients other than the paper's."""
 
 
 class DispatchPhase(Enum):
@@ -95,8 +93,7 @@ class RolloutRecord:
     lane: Lane = field(init=False)
 
     def __post_init__(self) -> None:
-        # Computed once: comparing rewards is slow.
-        self.lane = Lane(self.key.run_id, self.rollout.render, self.barred, self.reward != PAPER)
+        self.lane = Lane(self.key.run_id, self.rollout.render, self.barred)
 
     @property
     def scene(self) -> str:
@@ -159,8 +156,6 @@ class WorkerRecord:
     """It was found to give wrong results."""
     versions: Mapping[str, str] = field(default_factory=dict)
     """Of what its results depend on."""
-    scores: bool = True
-    """It scores with the coefficients that a lease asks for; workers of protocol 1 know only the paper's."""
     log_lag: float = 0.0
     reluctance_s: float = 0.0
     """It takes only rollouts that have waited for so long: the time that it needs longer than others."""
@@ -234,8 +229,6 @@ class WorkerRecord:
         if self.avoids(record, now_s):
             return False
         if now_s - record.submitted_s < self.reluctance_s:
-            return False
-        if not self.scores and record.lane.scored:
             return False
         if record.rollout.render and self.rendering >= self.render_slots:
             return False

@@ -41,8 +41,6 @@ class SchedulerWorker:
     """Its results were found to be wrong."""
     score_limit: float = math.inf
     loading_since_s: dict[str, float] = field(default_factory=dict)
-    scores: bool = True
-    """It scores with the coefficients that a lease asks for."""
 
     @property
     def usable(self) -> bool:
@@ -139,9 +137,9 @@ class Holders:
         self._memory_mb: Counter[int] = Counter()
         self._slow: set[str] = set()
 
-    def join(self, worker_id: str, resources: Resources, *, scores: bool = True) -> None:
+    def join(self, worker_id: str, resources: Resources) -> None:
         self.leave(worker_id)
-        self.by_id[worker_id] = SchedulerWorker(worker_id, resources, scores=scores)
+        self.by_id[worker_id] = SchedulerWorker(worker_id, resources)
         self._memory_mb[resources.memory_mb] += 1
 
     def leave(self, worker_id: str) -> None:
@@ -256,7 +254,6 @@ class Places:
         self._retry_s = retry_s
         self._large: list[tuple[str, float]] = []
         self._rendering: frozenset[str] = frozenset()
-        self._scored: frozenset[str] = frozenset()
 
     def refuse_where_too_large(self, needs: Iterable[Need], size_mb: Mapping[str, float]) -> None:
         """Scenes that were measured and found larger than all the memory of a worker are not tried there again."""
@@ -267,10 +264,6 @@ class Places:
     def refuse_where_nothing_renders(self, needs: Iterable[Need]) -> None:
         """Scenes whose rollouts render go to workers that can."""
         self._rendering = frozenset(need.bundle_digest for need in needs if need.render)
-
-    def refuse_where_nothing_scores(self, scenes: frozenset[str]) -> None:
-        """Scenes of runs with coefficients of their own go to workers that know them."""
-        self._scored = scenes
 
     @property
     def ids(self) -> Iterable[str]:
@@ -300,8 +293,6 @@ class Places:
         failed.update(scene for scene, size in self._large if size > holder.resources.memory_mb)
         if self._rendering and not holder.renders:
             failed.update(self._rendering)
-        if not holder.scores:
-            failed.update(self._scored)
         return frozenset(failed)
 
     def having(self, scene: str) -> Iterable[str]:

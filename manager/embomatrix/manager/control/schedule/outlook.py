@@ -72,7 +72,7 @@ class Outlook:
         return load_s * (1 + ahead // holder.slots)
 
 
-def why_not(holders: Holders, scene: str, size_mb: float, *, renders: bool, scored: bool) -> str:
+def why_not(holders: Holders, scene: str, size_mb: float, *, renders: bool) -> str:
     """Why no worker takes the scene, in words."""
     failing = (holders.by_id[name].failed_words for name in sorted(holders.failing))
     errors = [words[scene] for words in failing if scene in words]
@@ -80,11 +80,6 @@ def why_not(holders: Holders, scene: str, size_mb: float, *, renders: bool, scor
         return f"scene {scene} fails to load: {next(filter(None, errors), 'no reason given')}"
     if renders and not any(holder.renders for holder in holders.by_id.values()):
         return f"scene {scene} needs slots that render on a GPU, and no worker has any"
-    if scored and not any(holder.scores for holder in holders.by_id.values()):
-        return (
-            "the run has reward coefficients of its own, which workers of protocol 1 do not know, and no other is there: "
-            "upgrade one with `pip install --upgrade 'embomatrix[worker]'`"
-        )
     return (
         f"scene {scene} needs {size_mb:.0f} MB and the largest worker gives {holders.most_memory_mb} MB: "
         f"raise a worker's memory limit"

@@ -39,8 +39,6 @@ from embomatrix.manager.control.schedule.placement import Need, needs_of, place
 from embomatrix.manager.control.schedule.prewarm import PrewarmLedger
 from embomatrix.manager.control.schedule.scene_costs import SceneCosts
 from embomatrix.manager.control.shares import RunShare
-from embomatrix.reward.settings import PAPER
-from embomatrix.rpc.versions import SCORES_SINCE
 from embomatrix.rpc.wire.values import Batch, Completed, Resident, RunTerms
 
 DEFAULT_TERMS: Final = RunTerms()
@@ -149,7 +147,6 @@ class Scheduler:
         places = Places(self._holders, now_s, self._demand.in_use, self._limits.retry_load_s)
         places.refuse_where_too_large(needs, self._costs.known_mb)
         places.refuse_where_nothing_renders(needs)
-        places.refuse_where_nothing_scores(self._scored())
         placement = place(places, needs, self._costs.size_mb)
         self._holders.fresh.clear()
         self.unplaceable = {
@@ -205,8 +202,8 @@ class Scheduler:
     def _on_presence(self, event: WorkerJoined | WorkerLost) -> Urgency:
         self.prewarm.lost(event.worker_id)
         match event:
-            case WorkerJoined(worker_id, resources, protocol):
-                self._holders.join(worker_id, resources, scores=protocol >= SCORES_SINCE)
+            case WorkerJoined(worker_id, resources):
+                self._holders.join(worker_id, resources)
                 return Urgency.NONE
             case WorkerLost(worker_id):
                 self._holders.leave(worker_id)
@@ -288,20 +285,7 @@ class Scheduler:
     def _why_not(self, scene: str) -> str:
         announced = {e.bundle_digest for w in self.windows.values() for e in w.entries if e.render}
         renders = scene in announced or scene in self._demand.rendering
-        return why_not(
-            self._holders, scene, self._costs.size_mb(scene), renders=renders, scored=scene in self._scored()
-        )
-
-    def _scored(self) -> frozenset[str]:
-        """Scenes that only runs with coefficients of their own wait for or announced."""
-        own = {run_id for run_id, terms in self._terms.items() if terms.reward != PAPER}
-        if not own:
-            return frozenset()
-        plain = self._demand.pending.keys() - self._demand.scored
-        wanted = set(self._demand.scored)
-        for run_id, window in self.windows.items():
-            (wanted if run_id in own else plain).update(entry.bundle_digest for entry in window.entries)
-        return frozenset(wanted - plain)
+        return why_not(self._holders, scene, self._costs.size_mb(scene), renders=renders)
 
     def _order(self, name: str, scenes: tuple[str, ...]) -> SetDesired | None:
         """Tell the worker, if the set or the order of what it still has to load is another than it was told."""
