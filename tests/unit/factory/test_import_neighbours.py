@@ -1,4 +1,4 @@
-"""What a goal wants beside something gets places there, so that a plan can bring it about."""
+"""Pairs that a goal wants next to each other get suitable poses, so that a plan can succeed."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ PROBLEM = """(define (problem lay_the_money_down) (:domain omnigibson)
         ("(nextto stove_1 stove_1)", ()),
     ],
 )
-def test_what_is_carried_goes_beside_what_stays_or_goes_there_too(
+def test_carried_object_goes_beside_a_static_or_carried_neighbour(
     goal: str, pairs: tuple[NeighbourPair, ...]
 ) -> None:
     formula = parse_formula(goal, NAMES)
@@ -72,7 +72,7 @@ def test_what_is_carried_goes_beside_what_stays_or_goes_there_too(
     ],
     ids=["on a table", "on the floor", "two alike that are carried", "two others that are carried"],
 )
-def test_a_plan_brings_things_next_to_one_another(home: Scene, goal: str) -> None:
+def test_plan_brings_objects_next_to_each_other(home: Scene, goal: str) -> None:
     outcome = verify_first(source(PROBLEM.format(goal=goal)), [home], PlacementLibrary(), None)
     assert isinstance(outcome, Verified), outcome
     assert "nextto" in outcome.record.signature

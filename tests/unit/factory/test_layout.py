@@ -1,4 +1,4 @@
-"""Rooms, trees and poses of a task's objects: each level alone, and all of them in one flat."""
+"""Layout levels one by one: room distribution, layout trees and object poses; then complete layouts in one flat."""
 
 import json
 from typing import TYPE_CHECKING
@@ -52,12 +52,12 @@ def branch_to(name: str, tree: LayoutTree) -> Branch | None:
     return next((branch for branch in tree.branches() if branch.child == name), None)
 
 
-def test_every_relation_of_a_tree_has_its_means():
+def test_every_tree_relation_has_a_method():
     assert set(RELATION_METHODS) == set(LayoutRelation)
     assert len(LayoutRelation) == 9
 
 
-def test_a_tree_is_read_back_from_its_branches_and_tells_parents_before_children():
+def test_tree_round_trips_through_its_branches_with_parents_first():
     branches = [
         Branch("kitchen_0", ON, "table_1"),
         Branch("table_1", ON, "bowl_1"),
@@ -75,16 +75,16 @@ def test_a_tree_is_read_back_from_its_branches_and_tells_parents_before_children
     ("branches", "problem"),
     [
         ([("a", "b"), ("a", "c"), ("root", "a"), ("c", "b")], "give every object one parent"),
-        ([("a", "b"), ("b", "a")], "does not lead to the root"),
-        ([("a", "root")], "being the root"),
+        ([("a", "b"), ("b", "a")], "is not connected to the root"),
+        ([("a", "root")], "as the root"),
     ],
 )
-def test_branches_that_make_no_tree_are_told(branches, problem):
+def test_invalid_branches_raise_tree_error(branches, problem):
     with pytest.raises(TreeError, match=problem):
         LayoutTree.of("root", [Branch(parent, ON, child) for parent, child in branches])
 
 
-def test_things_go_where_people_keep_them_and_with_what_they_belong_to():
+def test_objects_go_to_usual_rooms_and_stay_with_related_objects():
     objects = (
         PLATE,
         ObjectBrief("alarm_clock_1", "alarm_clock", (0.05, 0.1, 0.1)),
@@ -94,7 +94,7 @@ def test_things_go_where_people_keep_them_and_with_what_they_belong_to():
     assert found == {"plate_1": "kitchen_0", "alarm_clock_1": "bedroom_0", "apple_1": "kitchen_0"}
 
 
-def test_what_belongs_together_and_is_wanted_apart_is_told():
+def test_contradicting_room_demands_raise_distribution_error():
     objects = (
         ObjectBrief("plate_1", "plate", (0.24, 0.24, 0.02), rooms=("kitchen_0",)),
         ObjectBrief(
@@ -105,7 +105,7 @@ def test_what_belongs_together_and_is_wanted_apart_is_told():
         distribute(DistributionBrief((KITCHEN, BEDROOM), objects))
 
 
-def test_a_host_that_failed_is_not_asked_again_and_what_fits_nowhere_is_left_out():
+def test_failed_host_is_not_tried_again_and_unplaceable_object_is_left_out():
     brief = RoomBrief(KITCHEN, (TABLE,), (PLATE,))
     assert branch_to("plate_1", organize(brief)) == Branch("breakfast_table_1", ON, "plate_1")
     failed = LayoutFailure("plate_1", ON, "breakfast_table_1", LayoutReason.NO_FREE_SPOT, "full")
@@ -115,7 +115,7 @@ def test_a_host_that_failed_is_not_asked_again_and_what_fits_nowhere_is_left_out
     assert branch_to("plate_1", organize(RoomBrief(KITCHEN, (TABLE,), (PLATE,), (failed, nowhere)))) is None
 
 
-def test_what_the_task_demands_is_no_choice():
+def test_task_demands_override_host_choice():
     milk = ObjectBrief("milk_1", "carton_of_milk", (0.1, 0.1, 0.2), relation=IN, host="fridge_1")
     assert branch_to("milk_1", organize(RoomBrief(KITCHEN, (TABLE, FRIDGE), (milk,)))) == Branch(
         "fridge_1", IN, "milk_1"
@@ -137,7 +137,7 @@ def items(flat: "Scene") -> list[RequestedObject]:
     ]
 
 
-def test_a_task_is_laid_out_soundly_and_equally_for_equal_seeds(flat: "Scene") -> None:
+def test_layout_is_collision_free_and_deterministic(flat: "Scene") -> None:
     editor = SceneEditor(flat)
     layout = lay(editor, items(flat), 3)
     scene = editor.freeze("laid")
@@ -152,7 +152,7 @@ def test_a_task_is_laid_out_soundly_and_equally_for_equal_seeds(flat: "Scene") -
     assert again.freeze("laid") == scene
 
 
-def test_what_fits_nowhere_is_left_out_with_its_reason_and_the_rest_is_laid(flat: "Scene") -> None:
+def test_unplaceable_object_is_reported_and_others_are_placed(flat: "Scene") -> None:
     fridge = next(item.name for item in flat.objects if item.name.startswith("fridge"))
     layout = lay(
         SceneEditor(flat),
@@ -165,7 +165,7 @@ def test_what_fits_nowhere_is_left_out_with_its_reason_and_the_rest_is_laid(flat
 
 
 @pytest.mark.parametrize("method", [lay_at_random, lay_by_poses])
-def test_the_ways_that_layouts_are_compared_with_take_the_same_items(flat: "Scene", method) -> None:
+def test_baseline_methods_accept_the_same_items(flat: "Scene", method) -> None:
     editor = SceneEditor(flat)
     layout = method(editor, items(flat), 0)
     assert layout.names.keys() | {failure.object_name for failure in layout.failures} == {
@@ -174,13 +174,13 @@ def test_the_ways_that_layouts_are_compared_with_take_the_same_items(flat: "Scen
 
 
 @pytest.mark.parametrize("name", AgentName)
-def test_every_agent_has_a_door_that_names_what_is_wrong_with_a_brief(name):
+def test_agent_interface_names_the_invalid_field_of_a_brief(name):
     with pytest.raises(BriefError, match="--schema"):
         LAYOUT_AGENTS[name].read('{"nonsense": 1}')
     assert LAYOUT_AGENTS[name].about
 
 
-def test_what_hangs_high_elsewhere_hangs_where_the_robot_gets_at_it(home):
+def test_wall_object_hangs_within_the_robots_reach(home):
     catalog = Catalog.load()
     camera = build_asset(catalog, "security_camera", catalog.models_of("security_camera")[0].model_id)
     editor = SceneEditor(home)
@@ -188,7 +188,7 @@ def test_what_hangs_high_elsewhere_hangs_where_the_robot_gets_at_it(home):
     assert pose.position_m[2] < ROBOT.reach_high_m < wall_height_m("security_camera")
 
 
-def test_a_brief_goes_through_its_door_unchanged():
+def test_brief_round_trips_through_its_interface():
     door = LAYOUT_AGENTS[AgentName.ORGANIZER]
     brief = RoomBrief(KITCHEN, (TABLE, FRIDGE), (PLATE,))
     assert door.read(door.brief.dump_json(brief).decode()) == brief
@@ -209,7 +209,7 @@ def branch(parent: str, child: str = "plate_1") -> str:
     return json.dumps({"branches": [{"parent": parent, "relation": "ontop", "child": child}]})
 
 
-def test_a_model_organizes_a_room_and_hears_what_is_wrong():
+def test_model_organizes_a_room_after_feedback():
     tree, server = organized("I think", branch("unicorn_1"), branch("fridge_1"), branch("breakfast_table_1"))
     assert branch_to("plate_1", tree) in (
         Branch("breakfast_table_1", ON, "plate_1"),
@@ -217,16 +217,16 @@ def test_a_model_organizes_a_room_and_hears_what_is_wrong():
     )
     told = [request["messages"][-1]["content"] for request in server.requests]
     assert "no complete JSON value" in told[1]
-    assert "does not lead to the root" in told[2]
+    assert "is not connected to the root" in told[2]
 
 
-def test_rules_stand_in_for_a_model_that_stays_wrong():
+def test_rules_replace_a_model_with_unusable_answers():
     tree, server = organized("no", "no", "no")
     assert branch_to("plate_1", tree) == Branch("breakfast_table_1", ON, "plate_1")
     assert len(server.requests) == 3
 
 
-def test_a_dead_endpoint_is_told_of_and_where_patience_is_had_rules_stand_in():
+def test_dead_endpoint_raises_or_falls_back_to_rules_within_the_failure_limit():
     broken = (500, {}, "broken", 0.0)
     with pytest.raises(EndpointError, match=r"room-organizer: the endpoint .* answered 500"):
         organized(broken)
@@ -235,7 +235,7 @@ def test_a_dead_endpoint_is_told_of_and_where_patience_is_had_rules_stand_in():
     assert len(server.requests) == 2
 
 
-def test_a_model_s_tree_is_taken_when_it_is_allowed():
+def test_valid_tree_of_a_model_is_accepted():
     tree, server = organized(branch("kitchen_0"))
     assert branch_to("plate_1", tree) == Branch("kitchen_0", ON, "plate_1")
     assert "<brief>" in server.requests[0]["messages"][1]["content"]

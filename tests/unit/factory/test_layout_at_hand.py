@@ -1,4 +1,4 @@
-"""What the robot has to get at is put where it does: by the runtime's own standing poses, not by a guess."""
+"""Placed objects are reachable, judged by the standing poses of the runtime."""
 
 from dataclasses import replace
 
@@ -42,7 +42,7 @@ def pending(flat: Scene) -> PendingObjects:
     return PendingObjects(SceneEditor(flat), "living_room_0", items)
 
 
-def test_shoes_under_a_bed_and_food_in_a_box_with_a_lid_are_at_hand(flat: Scene) -> None:
+def test_shoes_under_a_bed_and_food_in_a_box_with_a_lid_are_reachable(flat: Scene) -> None:
     editor = SceneEditor(flat)
     layout = lay(
         editor,
@@ -59,7 +59,7 @@ def test_shoes_under_a_bed_and_food_in_a_box_with_a_lid_are_at_hand(flat: Scene)
         assert robot.can_pick_up(layout.names["apple"])
 
 
-def test_what_holds_a_thing_that_nobody_reaches_is_put_elsewhere_a_few_times(pending: PendingObjects) -> None:
+def test_host_of_an_unreachable_object_is_moved_a_limited_number_of_times(pending: PendingObjects) -> None:
     for _ in range(MAX_MOVES):
         pending.place("backpack", Pose((0.0, 0.0, 1.0)), (None, ""), FLOOR)
         pending.record_failure("book", IN, "backpack_1", LayoutReason.INACCESSIBLE, "too deep")
@@ -77,7 +77,7 @@ def test_what_holds_a_thing_that_nobody_reaches_is_put_elsewhere_a_few_times(pen
     assert not pending.replace_host(pending.waiting["book"])
 
 
-def test_a_wide_thing_makes_way_for_another_at_the_host_that_both_need(pending: PendingObjects) -> None:
+def test_wide_object_is_replaced_to_fit_another_at_a_shared_host(pending: PendingObjects) -> None:
     pending.place("wide", Pose((0.0, 0.0, 1.0)), (None, ""), Support(Relation.INSIDE, "cabinet_1"))
     before = pending.placed["wide"].asset.size_m[0]
     pending.record_failure("other", IN, "cabinet_1", LayoutReason.NO_FREE_SPOT, "full")
@@ -91,7 +91,7 @@ def test_a_wide_thing_makes_way_for_another_at_the_host_that_both_need(pending: 
     assert [failure.object_name for failure in pending.abandoned] == ["other"]
 
 
-def test_what_a_task_puts_into_a_full_room_makes_furniture_of_the_room_go(flat: Scene) -> None:
+def test_object_in_a_full_room_replaces_spare_furniture(flat: Scene) -> None:
     editor = SceneEditor(flat)
     pending = PendingObjects(
         editor, "living_room_0", [RequestedObject("bed", models("bed")[:1], rooms=("living_room_0",))]
@@ -105,7 +105,7 @@ def test_what_a_task_puts_into_a_full_room_makes_furniture_of_the_room_go(flat: 
     assert not pending.failures
 
 
-def test_furniture_goes_for_what_the_robot_does_not_get_at_on_a_full_floor_but_not_for_what_stands_on_other(
+def test_spare_furniture_is_removed_for_unreachable_floor_objects_only(
     flat: Scene,
 ) -> None:
     editor = SceneEditor(flat)
@@ -125,7 +125,7 @@ def test_furniture_goes_for_what_the_robot_does_not_get_at_on_a_full_floor_but_n
     assert [failure.object_name for failure in pending.failures] == ["cup"]
 
 
-def test_furniture_that_the_task_is_about_stays_reachable_when_the_rest_may_be_barred(flat: Scene) -> None:
+def test_named_furniture_stays_reachable_when_paths_to_other_furniture_may_be_blocked(flat: Scene) -> None:
     editor = SceneEditor(flat)
     editor.keep([named(flat, "fridge")])
     kitchen = editor.objects[named(flat, "fridge")].room
@@ -136,12 +136,12 @@ def test_furniture_that_the_task_is_about_stays_reachable_when_the_rest_may_be_b
     pending.record_failure("booth", ON, kitchen, LayoutReason.BLOCKS_PATH, "narrow")
     pending.next_model("booth")
     assert "booth" in pending.waiting
-    assert stove in editor.abandoned
-    assert named(flat, "fridge") not in editor.abandoned
+    assert stove in editor.given_up
+    assert named(flat, "fridge") not in editor.given_up
 
 
-def test_many_things_for_one_basket_are_packed(flat: Scene) -> None:
-    """Four oranges of 8.5 cm in a basket whose floor is 20 cm wide: only beside one another they fit."""
+def test_many_objects_for_one_basket_are_packed(flat: Scene) -> None:
+    """Four oranges of 8.5 cm only fit side by side in a basket with a floor 20 cm wide."""
     oranges = [
         RequestedObject(f"orange_{number}", (("orange", "ucstpm"),), IN, "basket") for number in range(4)
     ]
@@ -163,7 +163,7 @@ SHOE_ON_FLOOR = (
 )
 
 
-def test_furniture_at_which_nobody_reaches_a_thing_is_left_for_other_and_kept_as_the_last_resort(
+def test_furniture_with_unreachable_contents_is_excluded_and_kept_as_fallback(
     flat: Scene,
 ) -> None:
     asked: list[str] = []
@@ -189,7 +189,7 @@ def test_furniture_at_which_nobody_reaches_a_thing_is_left_for_other_and_kept_as
     assert len(asked) > 1
 
 
-def test_a_layout_in_which_something_stays_out_of_hand_is_drawn_anew_and_the_best_is_taken(
+def test_layout_with_unreachable_objects_is_redrawn_and_the_best_is_used(
     flat: Scene,
 ) -> None:
     drawn: list[Pose] = []

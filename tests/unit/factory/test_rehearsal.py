@@ -1,4 +1,4 @@
-"""Wishes are tried before anybody writes them down, in the simulator that executes plans."""
+"""Wishes are tested for feasibility in the simulator before they are written."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def parted(home: Scene) -> Scene:
     return replace(home, objects=(*home.objects, other))
 
 
-def test_what_is_served_from_nowhere_is_neither_fetched_nor_a_place_to_put_things(parted: Scene) -> None:
+def test_unreachable_furniture_is_infeasible_as_source_and_target(parted: Scene) -> None:
     with SimulatedRobot(parted) as robot:
         assert robot.can_pick_up("apple_1")
         assert not robot.can_pick_up("apple_2")
@@ -36,7 +36,7 @@ def test_what_is_served_from_nowhere_is_neither_fetched_nor_a_place_to_put_thing
         assert not robot.can_place("apple_1", Relation.ONTOP, "coffee_table_1")
 
 
-def test_what_is_so_already_is_nothing_to_bring_about(home: Scene) -> None:
+def test_fulfilled_wish_is_infeasible(home: Scene) -> None:
     with SimulatedRobot(home) as robot:
         assert robot.can_swing("fridge_1", shut=False)
         assert not robot.can_swing("fridge_1", shut=True)
@@ -48,7 +48,7 @@ def test_what_is_so_already_is_nothing_to_bring_about(home: Scene) -> None:
         assert robot.can_treat("chicken_leg_1", "microwave_1", State.HOT)
 
 
-def test_what_bars_the_arm_on_the_way_to_a_wish_stands_against_it(home: Scene) -> None:
+def test_blocked_arm_makes_a_wish_infeasible(home: Scene) -> None:
     with SimulatedRobot(home, lambda handled: (Handling.OPEN, "fridge_1") in handled) as robot:
         assert robot.can_pick_up("apple_1")
         assert not robot.can_pick_up("chicken_leg_1")
@@ -57,7 +57,7 @@ def test_what_bars_the_arm_on_the_way_to_a_wish_stands_against_it(home: Scene) -
 
 
 class Clumsy(CapableRobot):
-    """Gets hold of nothing but mugs, and switches nothing."""
+    """Robot that grasps only mugs and switches nothing."""
 
     def can_pick_up(self, thing: str) -> bool:
         return thing.startswith("mug")
@@ -69,7 +69,7 @@ class Clumsy(CapableRobot):
         return False
 
 
-def test_nothing_is_asked_for_that_the_robot_cannot_do(home: Scene) -> None:
+def test_infeasible_wishes_are_never_written(home: Scene) -> None:
     view, rooms = SceneView(home, Clumsy()), tuple(room.name for room in home.rooms)
     variant = Variant(home, rooms, tuple(item.name for item in home.objects if not item.fixed))
     goals = {
@@ -86,7 +86,7 @@ def test_nothing_is_asked_for_that_the_robot_cannot_do(home: Scene) -> None:
     assert not goals[TaskCategory.KITCHEN_OPERATION]
 
 
-def test_a_survey_answers_alike_whatever_was_asked_before(home: Scene) -> None:
+def test_survey_answers_do_not_depend_on_the_order_of_queries(home: Scene) -> None:
     names = ("apple_1", "stove_1")
     foresight = Foresight()
     with SceneSurvey(home, foresight) as at_once, SceneSurvey(home, foresight) as bit_by_bit:
@@ -107,7 +107,7 @@ def test_a_survey_answers_alike_whatever_was_asked_before(home: Scene) -> None:
         ),
     ],
 )
-def test_a_model_is_told_what_the_robot_cannot_do(home: Scene, wish: RequestedAtom, sentence: str) -> None:
+def test_model_is_told_the_infeasible_wish(home: Scene, wish: RequestedAtom, sentence: str) -> None:
     request = TaskRequest(instruction="Please do this for me.", wishes=(wish,))
     with pytest.raises(ValueError, match=f"the robot tried and {sentence}"):
         check_request(request, SceneView(home, Clumsy()), frozenset(home.by_name))
