@@ -5,7 +5,7 @@ from dataclasses import replace
 from tests.fakes.worker import completed
 
 from embomatrix.manager.control.commands import GiveLease
-from embomatrix.manager.control.dispatch.ledger import LeaseRecord, RolloutKey, RolloutRecord
+from embomatrix.manager.control.dispatch.records import LeaseRecord, RolloutKey, RolloutRecord
 from embomatrix.manager.observe.archive import RunArchive
 from embomatrix.manager.observe.chronicle import EVENTS_KEPT, LEAST_KEPT, Chronicle
 from embomatrix.rpc.leases import LeaseOrigin, LeaseRef, LeaseResult

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from embomatrix.manager.control.commands import DeliverResult, GiveLease
-    from embomatrix.manager.control.dispatch.ledger import LeaseRecord
+    from embomatrix.manager.control.dispatch.records import LeaseRecord
     from embomatrix.rpc.leases import LeaseResult
     from embomatrix.rpc.run_log import EventPage
     from embomatrix.rpc.wire.values import Batch

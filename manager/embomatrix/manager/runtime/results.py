@@ -8,7 +8,7 @@ import contextlib
 import time
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.control.dispatch.group_ends import GroupEnds
+from embomatrix.manager.control.dispatch.batches import GroupEnds
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
