@@ -9,8 +9,8 @@ import grpc
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.rpc.channel import SERVER_OPTIONS, chunks_of
-from embomatrix.rpc.leases import Lease, LeaseRef
 from embomatrix.rpc.status import NotFoundError, SupersededError, translate
+from embomatrix.rpc.wire.leases import Lease, LeaseRef
 from embomatrix.rpc.wire.session import (
     lease_ref_to_proto,
     lease_result_from_proto,

@@ -11,7 +11,7 @@ from tests.integration.test_rest import http_at
 
 from embomatrix.manager.web.rewards import REWARDS, RUN_ID
 from embomatrix.rpc.reward_label import RewardLabel
-from embomatrix.rpc.roles import AccessRole
+from embomatrix.rpc.wire.tokens import AccessRole
 from embomatrix.world.task import Profile
 
 pytestmark = pytest.mark.timeout(60)

@@ -12,9 +12,9 @@ from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import BEDROOM, KITCHEN, batch, manager, open_run, outcomes
 
 from embomatrix.manager.web.rest import PREFIX, VIEWERS
-from embomatrix.rpc.admin import AdminClient
+from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.status import NotFoundError
-from embomatrix.rpc.training import RewardTiers, SampledPlan, TrainingReport
+from embomatrix.rpc.wire.training import RewardTiers, SampledPlan, TrainingReport
 from embomatrix.rpc.wire.values import LookaheadEntry
 
 pytestmark = pytest.mark.timeout(60)

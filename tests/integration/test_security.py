@@ -22,8 +22,6 @@ from tests.fakes.worker import completed
 
 from embomatrix.proto.v1 import admin_service_pb2, rollout_service_pb2, types_pb2, worker_service_pb2
 from embomatrix.rpc.client import ClientLimits, ClusterClient
-from embomatrix.rpc.leases import LeaseRef, LeaseResult
-from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.status import (
     ERROR_KEY,
     InvalidRequestError,
@@ -32,7 +30,9 @@ from embomatrix.rpc.status import (
 )
 from embomatrix.rpc.trust import Invitation, fetch_ca, fingerprint_of
 from embomatrix.rpc.versions import PROTOCOL_VERSION
+from embomatrix.rpc.wire.leases import LeaseRef, LeaseResult
 from embomatrix.rpc.wire.session import lease_result_to_proto
+from embomatrix.rpc.wire.tokens import AccessRole
 from embomatrix.rpc.wire.values import Batch, Completed
 from embomatrix.world.inflation import bundle_digest
 
@@ -104,7 +104,7 @@ async def grpc_cases(at, victim, other):
     late_join = await at.issue(AccessRole.JOIN, valid_s=0.05)
     revoked = await at.issue(AccessRole.TRAINER)
     async with at.operator() as operator:
-        await operator.revoke(revoked.partition(".")[0])
+        await operator.revoke_token(revoked.partition(".")[0])
     await asyncio.sleep(0.06)
     session = {"session_id": victim.session[0], "session_epoch": victim.session[1]}
     state = worker_service_pb2.WorkerState()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import grpc
 
-from embomatrix.rpc.wire.rollout import ConvertError
+from embomatrix.rpc.wire.codec import ConvertError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator, Mapping

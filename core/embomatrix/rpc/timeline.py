@@ -7,12 +7,12 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
-from embomatrix.rpc.run_log import EventKind
+from embomatrix.rpc.wire.run_log import EventKind
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from embomatrix.rpc.run_log import RunEvent
+    from embomatrix.rpc.wire.run_log import RunEvent
 
 
 class SlotKey(NamedTuple):

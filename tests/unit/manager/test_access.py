@@ -17,8 +17,8 @@ from embomatrix.proto.v1 import (
     scene_service_pb2,
     worker_service_pb2,
 )
-from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.status import InvalidRequestError, NotAllowedError, NotFoundError, NotSignedInError
+from embomatrix.rpc.wire.tokens import AccessRole
 
 HOUR = 3600.0
 MODULES = (worker_service_pb2, rollout_service_pb2, scene_service_pb2, admin_service_pb2)

@@ -4,7 +4,7 @@ import pytest
 
 from embomatrix.manager.control.dispatch.fleet import CANDIDATES, SEEKERS, Fleet
 from embomatrix.manager.control.dispatch.ledger import AHEAD_S, BEHIND, LeaseRecord, RolloutKey, RolloutRecord
-from embomatrix.rpc.leases import LeaseRef
+from embomatrix.rpc.wire.leases import LeaseRef
 from embomatrix.rpc.wire.values import Rollout
 
 MANY = 3 * CANDIDATES

@@ -14,10 +14,10 @@ from tests.fakes.worker import completed
 from typer.testing import CliRunner
 
 from embomatrix.manager.commands.app import app
-from embomatrix.manager.observe.meter import Meter, quantile
+from embomatrix.manager.observe.metrics import Meter, quantile
 from embomatrix.manager.runtime.bundles import BundleStore
-from embomatrix.manager.runtime.records import group_and_kind, result_row, timed_row
 from embomatrix.manager.runtime.results import PER_MESSAGE, BatchLog, ResultLogs
+from embomatrix.manager.runtime.serialization import group_and_kind, result_row, timed_row
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.manager.store.protocol import ResultRow
 from embomatrix.proto.v1.types_pb2 import RolloutResult as RolloutResultMessage

@@ -3,9 +3,9 @@
 import asyncio
 
 from embomatrix.manager.control.commands import AcknowledgeLease, CancelLease
-from embomatrix.manager.runtime.links import WorkerLink
 from embomatrix.manager.runtime.registry import LivenessLimits, Registry
-from embomatrix.rpc.leases import LeaseRef
+from embomatrix.manager.runtime.worker_link import WorkerLink
+from embomatrix.rpc.wire.leases import LeaseRef
 from embomatrix.rpc.wire.values import Resources
 
 FIRST, SECOND = LeaseRef("l-1", 1), LeaseRef("l-2", 2)

@@ -4,7 +4,7 @@ import socket
 
 import pytest
 
-from embomatrix.manager.runtime.listen import PortInUseError, bound_socket
+from embomatrix.manager.services.listen import PortInUseError, bound_socket
 from embomatrix.manager.store.url import without_password
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from embomatrix.manager.control.cluster_state import ClusterState
-from embomatrix.manager.observe.archive import RunArchive
-from embomatrix.manager.observe.effort import Effort
+from embomatrix.manager.observe.metrics import ManagerLoad
+from embomatrix.manager.observe.run_archive import RunArchive
 from embomatrix.manager.runtime.bundles import BundleStore
 from embomatrix.manager.runtime.event_loop import ManagerRuntime
 from embomatrix.manager.runtime.registry import LivenessLimits, Registry
@@ -47,7 +47,7 @@ async def test_every_state_and_outcome_is_told_before_it_first_happens(page):
 
 
 def test_overhead_is_of_the_last_minute():
-    effort = Effort()
+    effort = ManagerLoad()
     effort.sample(0.0, 0.0, 0.0)
     assert effort.overhead() == 0.0
     effort.sample(10.0, 9.0, 1.0)

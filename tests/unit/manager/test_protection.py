@@ -16,9 +16,9 @@ from embomatrix.manager.access.protection import protection_of
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.manager.store.memory import MemoryStore
 from embomatrix.manager.store.protocol import Candidate
-from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.rpc.trust import Invitation, fingerprint_of, read_ca, read_token
+from embomatrix.rpc.wire.tokens import AccessRole
 
 NOW = datetime(2026, 11, 1, tzinfo=UTC)
 

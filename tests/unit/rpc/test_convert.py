@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
-from embomatrix.rpc.wire import batch as convert_batch
 from embomatrix.rpc.wire import outcome as convert_outcome
 from embomatrix.rpc.wire import rollout as convert
 from embomatrix.rpc.wire import run as convert_run
 from embomatrix.rpc.wire import session as convert_session
-from embomatrix.rpc.wire.rollout import ConvertError
+from embomatrix.rpc.wire.codec import ConvertError
 from embomatrix.rpc.wire.values import (
     Batch,
     Cancelled,
@@ -120,7 +119,7 @@ def test_every_skill_call_comes_back_equal(call):
 @given(st.lists(ROLLOUTS, max_size=4, unique_by=lambda rollout: rollout.rollout_id).map(tuple), NAMES, UINT64)
 def test_a_batch_comes_back_equal(rollouts, name, step):
     batch = Batch("run-1", name, step, rollouts)
-    assert convert_batch.batch_from_proto(_over_the_wire(convert_batch.batch_to_proto(batch))) == batch
+    assert convert.batch_from_proto(_over_the_wire(convert.batch_to_proto(batch))) == batch
 
 
 @given(RESULTS)
@@ -281,7 +280,7 @@ def test_a_malformed_plan_names_the_field(calls, field):
     rollout = types_pb2.Rollout(rollout_id="r", group_id="g", bundle_digest="d", task_id="t", plan=calls)
     request = rollout_service_pb2.ExecuteRequest(run_id="run", batch_id="b", rollouts=[rollout])
     with pytest.raises(ConvertError) as caught:
-        convert_batch.batch_from_proto(request)
+        convert.batch_from_proto(request)
     assert caught.value.field == field
     assert str(caught.value).startswith(f"{field}: ")
 
@@ -290,7 +289,7 @@ def test_two_rollouts_of_one_id_are_refused():
     rollout = types_pb2.Rollout(rollout_id="r", group_id="g", bundle_digest="d", task_id="t")
     request = rollout_service_pb2.ExecuteRequest(run_id="run", batch_id="b", rollouts=[rollout, rollout])
     with pytest.raises(ConvertError, match=r"rollouts\[1\].rollout_id: 'r' stands twice"):
-        convert_batch.batch_from_proto(request)
+        convert.batch_from_proto(request)
 
 
 def test_a_result_without_an_outcome_is_refused():

@@ -6,7 +6,9 @@ from hypothesis import strategies as st
 
 from embomatrix.proto.v1 import worker_service_pb2
 from embomatrix.reward.breakdown import RewardBreakdown
-from embomatrix.rpc.leases import (
+from embomatrix.rpc.wire import session as convert
+from embomatrix.rpc.wire.codec import ConvertError
+from embomatrix.rpc.wire.leases import (
     Lease,
     LeaseClaim,
     LeaseOrigin,
@@ -15,8 +17,6 @@ from embomatrix.rpc.leases import (
     LeaseResult,
     WorkerState,
 )
-from embomatrix.rpc.wire import session as convert
-from embomatrix.rpc.wire.rollout import ConvertError
 from embomatrix.rpc.wire.values import (
     Completed,
     InfraCode,

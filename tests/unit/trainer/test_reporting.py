@@ -7,7 +7,7 @@ from tests.unit.trainer.test_loop import TASKS, run
 from tests.unit.trainer.test_rollout import outcomes
 
 from embomatrix.rpc.status import PreconditionError, UnavailableError
-from embomatrix.rpc.training import TrainingReport
+from embomatrix.rpc.wire.training import TrainingReport
 from embomatrix.trainer.grpo.records import GroupLog
 from embomatrix.trainer.grpo.rollout import REPORTS_KEPT, Gateway
 from embomatrix.trainer.logging.reporting import SHOWN, Reporter

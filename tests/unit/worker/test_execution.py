@@ -10,7 +10,7 @@ from collections import Counter
 import pytest
 from tests.unit.worker.test_slots import running
 
-from embomatrix.rpc.leases import Lease, LeaseRef
+from embomatrix.rpc.wire.leases import Lease, LeaseRef
 from embomatrix.rpc.wire.session import lease_from_proto, lease_to_proto
 from embomatrix.rpc.wire.values import (
     Completed,

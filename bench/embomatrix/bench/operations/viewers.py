@@ -22,7 +22,7 @@ from embomatrix.pages.figures import Better, Figure
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.rpc.channel import open_channel
-from embomatrix.rpc.leases import WorkerState
+from embomatrix.rpc.wire.leases import WorkerState
 from embomatrix.rpc.wire.session import worker_state_to_proto
 from embomatrix.rpc.wire.values import Resident, ResidentState, Resources
 from embomatrix.worker.link.membership import Membership

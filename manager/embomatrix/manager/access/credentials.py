@@ -14,7 +14,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.store.protocol import ShelfRow
-from embomatrix.rpc.roles import AccessRole, TokenInfo
 from embomatrix.rpc.status import (
     InvalidRequestError,
     NotAllowedError,
@@ -22,6 +21,7 @@ from embomatrix.rpc.status import (
     NotSignedInError,
     OverloadedError,
 )
+from embomatrix.rpc.wire.tokens import AccessRole, TokenInfo
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

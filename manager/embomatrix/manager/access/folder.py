@@ -19,8 +19,8 @@ from embomatrix.manager.access.certificates import (
 )
 from embomatrix.manager.access.credentials import LONGEST_JOIN_S, Credential, CredentialBook
 from embomatrix.manager.store.protocol import ShelfRow
-from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.trust import fingerprint_of
+from embomatrix.rpc.wire.tokens import AccessRole
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -19,7 +19,6 @@ from embomatrix.manager.access.folder import AccessError
 from embomatrix.manager.access.roles import OPEN, may_call, who_may
 from embomatrix.manager.store.protocol import Shelf, StateError
 from embomatrix.rpc.channel import TOKEN_KEY, token_of
-from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.status import (
     ClusterError,
     NotAllowedError,
@@ -27,15 +26,15 @@ from embomatrix.rpc.status import (
     PreconditionError,
     UnavailableError,
 )
+from embomatrix.rpc.wire.tokens import AccessRole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     import grpc
 
-    from embomatrix.manager.runtime.registry import WorkerSession
     from embomatrix.manager.store.protocol import StateStore
-    from embomatrix.rpc.roles import TokenInfo
+    from embomatrix.rpc.wire.tokens import TokenInfo
 
 logger = logging.getLogger(__name__)
 
@@ -145,11 +144,11 @@ class Gate:
             self._book.check_name(caller.token_id, caller.worker_id, worker_id)
         return Admission(caller.token_id)
 
-    def check_session(self, context: grpc.aio.ServicerContext, session: WorkerSession) -> None:
-        """Raises NotAllowedError unless the caller's credential is the one that opened the session."""
-        if self.caller_of(context).token_id != session.credential_id:
+    def check_session(self, context: grpc.aio.ServicerContext, worker_id: str, credential_id: str) -> None:
+        """Raise NotAllowedError unless the caller's credential is the one that opened the worker's session."""
+        if self.caller_of(context).token_id != credential_id:
             raise NotAllowedError(
-                f"the session of worker {session.worker_id} was opened with another credential: register with this one"
+                f"the session of worker {worker_id} was opened with another credential: register with this one"
             )
 
     async def issue(self, role: AccessRole, *, valid_s: float, label: str) -> tuple[str, str]:

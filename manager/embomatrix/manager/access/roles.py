@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.rpc.roles import AccessRole
+from embomatrix.rpc.wire.tokens import AccessRole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from embomatrix.manager.settings import ManagerSettings
-    from embomatrix.rpc.roles import AccessRole
+    from embomatrix.rpc.wire.tokens import AccessRole
 
 app = typer.Typer(
     help="Serve a Simulation Manager, or ask one how the cluster does.",
@@ -125,7 +125,7 @@ def status(manager: Manager = "127.0.0.1:50070", token: Token = "", ca: Ca = Non
     """Show workers and runs of a manager."""
     import asyncio
 
-    from embomatrix.manager.services.status_table import show_status
+    from embomatrix.manager.commands.status_table import show_status
     from embomatrix.rpc.status import ClusterError
     from embomatrix.rpc.trust import read_ca
 
@@ -171,7 +171,7 @@ def _parcel(text: str) -> tuple[AccessRole, Path]:
     """What ``ROLE:FOLDER`` asks for."""
     from pathlib import Path
 
-    from embomatrix.rpc.roles import AccessRole
+    from embomatrix.rpc.wire.tokens import AccessRole
 
     name, _, target = text.partition(":")
     if name not in (AccessRole.WORKER, AccessRole.TRAINER, AccessRole.VIEWER, AccessRole.ADMIN) or not target:
@@ -212,8 +212,8 @@ def _serve(settings: ManagerSettings) -> None:
     import asyncio
 
     from embomatrix.manager.access.folder import AccessError
-    from embomatrix.manager.runtime.app import Endpoints, serve
-    from embomatrix.manager.runtime.listen import PortInUseError
+    from embomatrix.manager.services.app import Endpoints, serve
+    from embomatrix.manager.services.listen import PortInUseError
     from embomatrix.manager.store.protocol import StateError
     from embomatrix.manager.store.url import without_password
 

@@ -10,8 +10,8 @@ import typer
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine
 
-    from embomatrix.rpc.roles import TokenInfo
-    from embomatrix.rpc.token_client import TokenClient
+    from embomatrix.rpc.admin_client import AdminClient
+    from embomatrix.rpc.wire.tokens import TokenInfo
 
 app = typer.Typer(
     help="Hand out tokens, look them over, take them back.",
@@ -50,14 +50,14 @@ def issue(
     ca: Ca = None,
 ) -> None:
     """Hand out a token. It is told once: the manager keeps only its hash."""
-    from embomatrix.rpc.roles import AccessRole
     from embomatrix.rpc.trust import Invitation, fingerprint_of, read_ca
+    from embomatrix.rpc.wire.tokens import AccessRole
 
     if role not in list(AccessRole):
         _refuse(f"--role {role!r}: expected {', '.join(AccessRole)}")
     wanted = AccessRole(role)
     new, token_id = _ask(
-        manager, token, ca, lambda client: client.issue(wanted, valid_s=hours * 3600.0, label=label)
+        manager, token, ca, lambda client: client.issue_token(wanted, valid_s=hours * 3600.0, label=label)
     )
     if wanted is not AccessRole.JOIN:
         print(new)
@@ -75,7 +75,7 @@ def list_(manager: Manager = "127.0.0.1:50070", token: Token = "", ca: Ca = None
     from rich.table import Table
 
     table = Table("id", "role", "label", "valid for", "worker")
-    for info in _ask(manager, token, ca, lambda client: client.listed()):
+    for info in _ask(manager, token, ca, lambda client: client.list_tokens()):
         table.add_row(info.token_id, info.role, info.label, _left(info), info.worker_id)
     Console().print(table)
 
@@ -88,7 +88,7 @@ def revoke(
     ca: Ca = None,
 ) -> None:
     """Make a token void. Sessions of workers that it opened end at once."""
-    _ask(manager, token, ca, lambda client: client.revoke(token_id))
+    _ask(manager, token, ca, lambda client: client.revoke_token(token_id))
     print(f"revoked {token_id}")
 
 
@@ -96,16 +96,16 @@ def _left(info: TokenInfo) -> str:
     return f"{info.left_s / 3600:.1f} h" if info.left_s else "until revoked"
 
 
-def _ask(manager: str, token: str, ca: Path | None, question: Callable[[TokenClient], Awaitable[T]]) -> T:
+def _ask(manager: str, token: str, ca: Path | None, question: Callable[[AdminClient], Awaitable[T]]) -> T:
     """One call to the manager; whatever is wrong ends as a sentence."""
     import asyncio
 
+    from embomatrix.rpc.admin_client import AdminClient
     from embomatrix.rpc.status import ClusterError
-    from embomatrix.rpc.token_client import TokenClient
     from embomatrix.rpc.trust import read_ca, read_token
 
     async def ask() -> T:
-        async with TokenClient(manager, read_token(token), ca=read_ca(ca)) as client:
+        async with AdminClient(manager, read_token(token), ca=read_ca(ca)) as client:
             return await question(client)
 
     call: Coroutine[Any, Any, T] = ask()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from embomatrix.reward.settings import PAPER, RewardSettings
 
 if TYPE_CHECKING:
-    from embomatrix.rpc.leases import LeaseOrigin, LeaseRef
+    from embomatrix.rpc.wire.leases import LeaseOrigin, LeaseRef
     from embomatrix.rpc.wire.values import Rollout, RolloutResult
 
 

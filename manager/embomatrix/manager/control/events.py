@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from embomatrix.manager.control.audit.auditor import Repute
-    from embomatrix.rpc.leases import LeaseClaim, LeaseProgress, LeaseRef
+    from embomatrix.rpc.wire.leases import LeaseClaim, LeaseProgress, LeaseRef
     from embomatrix.rpc.wire.values import (
         Batch,
         Completed,

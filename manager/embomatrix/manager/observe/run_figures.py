@@ -6,8 +6,8 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.observe.histogram import Histogram
-from embomatrix.rpc.run_log import PhaseSummary, RolloutPhase, RunEvent, RunSeries, RunWorker
+from embomatrix.manager.histogram import Histogram
+from embomatrix.rpc.wire.run_log import PhaseSummary, RolloutPhase, RunEvent, RunSeries, RunWorker
 
 if TYPE_CHECKING:
     from embomatrix.rpc.wire.values import Timings

@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.rpc.status import NotFoundError
-from embomatrix.rpc.training import FIGURES, PLANS, SampledPlan
+from embomatrix.rpc.wire.training import FIGURES, PLANS, SampledPlan
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from embomatrix.rpc.training import TrainingReport
+    from embomatrix.rpc.wire.training import TrainingReport
 
 RUNS_KEPT: Final = 16
 PHASES_KEPT: Final = 4

@@ -23,38 +23,36 @@ from embomatrix.manager.control.commands import (
     SetDesired,
 )
 from embomatrix.manager.control.events import DispatchPaused, DispatchResumed
-from embomatrix.manager.observe.chronicle import Chronicle
-from embomatrix.manager.observe.effort import Effort
-from embomatrix.manager.observe.history import RunHistory
-from embomatrix.manager.observe.meter import Meter
+from embomatrix.manager.observe.event_log import RunEventLog
+from embomatrix.manager.observe.metrics import ManagerLoad, Meter
+from embomatrix.manager.observe.run_archive import RunHistory
 from embomatrix.manager.observe.training_reports import TrainingBook
-from embomatrix.manager.runtime.delivery import ResultDelivery
 from embomatrix.manager.runtime.garbage import Collector
 from embomatrix.manager.runtime.intake import TICK_S, Heartbeat, Intake
-from embomatrix.manager.runtime.keeper import Keeper
-from embomatrix.manager.runtime.links import WorkerLink
 from embomatrix.manager.runtime.registry import WorkerStanding
-from embomatrix.manager.runtime.results import ResultLogs
+from embomatrix.manager.runtime.results import ResultDelivery, ResultLogs
 from embomatrix.manager.runtime.runs import RunLimits, Runs
+from embomatrix.manager.runtime.state_journal import StateJournal
+from embomatrix.manager.runtime.worker_link import WorkerLink
 from embomatrix.manager.store.timed import timed_store
-from embomatrix.manager.web.views import UNAUDITED
 from embomatrix.rpc.status import SupersededError, UnavailableError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from embomatrix.manager.control.cluster_state import ClusterState
-    from embomatrix.manager.observe.archive import RunArchive
+    from embomatrix.manager.observe.run_archive import RunArchive
     from embomatrix.manager.runtime.bundles import BundleStore
-    from embomatrix.manager.runtime.links import WorkerCommand
     from embomatrix.manager.runtime.registry import Registry, WorkerSession
+    from embomatrix.manager.runtime.worker_link import WorkerCommand
     from embomatrix.manager.store.protocol import StateStore
-    from embomatrix.rpc.leases import LeaseResult, WorkerState
     from embomatrix.rpc.status import ClusterError
+    from embomatrix.rpc.wire.leases import LeaseResult, WorkerState
     from embomatrix.rpc.wire.values import Resources
 
 logger = logging.getLogger(__name__)
 
+UNAUDITED: Final = "results are not audited: that takes a second worker"
 CLEANUP_S: Final = 5.0
 STOOD_STILL_S: Final = 1.0
 """A tick that comes so late says that nobody was heard meanwhile."""
@@ -94,16 +92,16 @@ class ManagerRuntime:
         bundles.keep(cluster.needed_scenes)
         self.meter = Meter()
         self.training = TrainingBook()
-        self.effort = Effort()
-        store = timed_store(store, self.effort.operated)
+        self.load = ManagerLoad()
+        store = timed_store(store, self.load.operated)
         self.started_s = time.monotonic()
         self._collector = Collector(self.started_s)
-        self.chronicle = Chronicle(epoch_s=time.time() - self.started_s)
-        self.history = RunHistory(self.chronicle, archive, cluster)
+        self.event_log = RunEventLog(epoch_s=time.time() - self.started_s)
+        self.history = RunHistory(self.event_log, archive, cluster)
         self.runs = Runs(cluster, store, bundles, logs, self._carry_out, limits or RunLimits(), self.history)
         self._intake = Intake(cluster, registry)
-        self._keeper = Keeper(store, registry, cluster)
-        self._delivery = ResultDelivery(store, logs, self._say, self.chronicle.in_log)
+        self._journal = StateJournal(store, registry, cluster)
+        self._delivery = ResultDelivery(store, logs, self._say, self.event_log.in_log)
         self._links: dict[str, WorkerLink] = {}
         self._lapsed_s = lapsed_s
         self._unrenewed = unrenewed
@@ -113,8 +111,8 @@ class ManagerRuntime:
 
     async def start(self) -> None:
         """Take the state up where a former manager left it."""
-        self._carry_out(self._intake.feed(await self._keeper.reputes(), now_s=time.monotonic()))
-        self._paused = await self._keeper.paused()
+        self._carry_out(self._intake.feed(await self._journal.reputes(), now_s=time.monotonic()))
+        self._paused = await self._journal.paused()
         self._dispatch_or_not()
         await self.runs.restore()
 
@@ -123,7 +121,7 @@ class ManagerRuntime:
         async with asyncio.TaskGroup() as group:
             group.create_task(self._keep_time())
             group.create_task(self._clean_up())
-            group.create_task(self._keeper.serve())
+            group.create_task(self._journal.serve())
             group.create_task(self._delivery.serve())
             group.create_task(self.runs.serve())
 
@@ -141,10 +139,10 @@ class ManagerRuntime:
         session, commands = self._intake.register(worker_id, boot_id, resources, now_s=time.monotonic())
         session.credential_id = credential_id
         self._close_link(worker_id)
-        self.chronicle.fleet.joined(worker_id, resources, now_s=time.monotonic())
+        self.event_log.fleet.joined(worker_id, resources, now_s=time.monotonic())
         self._carry_out(commands)
         logger.info("worker registered worker=%s slots=%d", worker_id, resources.slots)
-        await self._keeper.noted(worker_id)
+        await self._journal.noted(worker_id)
         return session, self.registry.interval_s
 
     @contextlib.contextmanager
@@ -169,10 +167,10 @@ class ManagerRuntime:
         """What a worker says on its stream, or a part of it; ``deliver`` follows the last. ``resync`` for the first of all."""
         now_s, worker_id = time.monotonic(), link.session.worker_id
         ended = (*state.finished, *results) if state is not None else results
-        self.chronicle.reported(worker_id, ended, self.cluster.dispatcher.live_leases, now_s=now_s)
+        self.event_log.reported(worker_id, ended, self.cluster.dispatcher.live_leases, now_s=now_s)
         commands = self._intake.report(link.session, state, results, resync=resync, now_s=now_s)
         if state is not None:
-            self.chronicle.fleet.residents(worker_id, state.residents, now_s=now_s)
+            self.event_log.fleet.residents(worker_id, state.residents, now_s=now_s)
         self._carry_out(commands, more=True)
 
     def deliver(self) -> None:
@@ -210,7 +208,7 @@ class ManagerRuntime:
         self._carry_out(self._intake.feed(*self.registry.resume(worker_id), now_s=time.monotonic()))
         if worker_id in self._links:
             self._links[worker_id].resume()
-        self._keeper.hurry()
+        self._journal.hurry()
 
     @property
     def paused(self) -> bool:
@@ -231,13 +229,13 @@ class ManagerRuntime:
         """
         self._paused = True
         self._dispatch_or_not()
-        await self._keeper.note_pause(True)
+        await self._journal.note_pause(True)
 
     async def resume_dispatch(self) -> None:
         """Leases are given again, unless the store is away. UnavailableError as above."""
         self._paused = False
         self._dispatch_or_not()
-        await self._keeper.note_pause(False)
+        await self._journal.note_pause(False)
 
     def _dispatch_or_not(self) -> None:
         event = DispatchPaused() if self._paused or self._suspended else DispatchResumed()
@@ -252,18 +250,18 @@ class ManagerRuntime:
                 case GiveLease():
                     self._say(command)
                     if not command.audit:
-                        self.chronicle.leased(command, now_s=now_s)
+                        self.event_log.leased(command, now_s=now_s)
                 case AcknowledgeLease():
                     self._delivery.put_acknowledgement(command)
                 case DeliverResult():
                     self.meter.observe(command.run_id, command.result, now_s)
-                    self.chronicle.delivered(command, now_s=now_s)
+                    self.event_log.delivered(command, now_s=now_s)
                     self._delivery.put(command)
                 case FinishBatch():
                     self._delivery.put(command)
                 case QuarantineWorker():
                     logger.error("worker quarantined worker=%s: %s", command.worker_id, command.reason)
-                    self._keeper.hurry()
+                    self._journal.hurry()
         if not more:
             self._delivery.hurry()
 
@@ -301,7 +299,7 @@ class ManagerRuntime:
             due_s = time.monotonic() + TICK_S
             await asyncio.sleep(TICK_S)
             late_s = time.monotonic() - due_s
-            self.effort.lag.observe(late_s)
+            self.load.lag.observe(late_s)
             if late_s >= STOOD_STILL_S:
                 logger.warning(
                     "the manager stood still for %.1f s: is its machine paused, or short of memory?", late_s
@@ -312,13 +310,13 @@ class ManagerRuntime:
             lost, commands = self._intake.tick(now_s=time.monotonic())
             for event in lost:
                 logger.warning("worker lost worker=%s: %s", event.worker_id, event.reason)
-                self.chronicle.fleet.lost(event.worker_id, event.reason, now_s=time.monotonic())
+                self.event_log.fleet.lost(event.worker_id, event.reason, now_s=time.monotonic())
                 self._close_link(event.worker_id)
             self._carry_out(commands)
 
     async def _clean_up(self) -> None:
         while True:
-            self.effort.sample(time.monotonic(), time.process_time(), self.chronicle.execute_s)
+            self.load.sample(time.monotonic(), time.process_time(), self.event_log.execute_s)
             await asyncio.sleep(CLEANUP_S)
             await self._delivery.give_up_outdated(time.monotonic())
             await self.runs.close_idle(time.monotonic())

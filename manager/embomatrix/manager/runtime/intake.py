@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.control.cluster_state import ClusterState
     from embomatrix.manager.control.commands import Command
     from embomatrix.manager.runtime.registry import Registry, WorkerSession
-    from embomatrix.rpc.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
+    from embomatrix.rpc.wire.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
     from embomatrix.rpc.wire.values import Resources
 
 

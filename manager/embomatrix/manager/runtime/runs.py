@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import re
 import secrets
 import time
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.control.dispatch.group_ends import group_sizes
 from embomatrix.manager.control.events import (
     BatchCancelled,
+    BatchContinued,
     BatchRestored,
+    BatchSubmitted,
     LookaheadAnnounced,
     RunOpened,
     WorkersExpected,
 )
-from embomatrix.manager.runtime.records import (
+from embomatrix.manager.runtime.results import BatchLog
+from embomatrix.manager.runtime.serialization import (
     announced_in,
     batch_of,
     batch_row,
@@ -27,8 +32,6 @@ from embomatrix.manager.runtime.records import (
     terms_of,
     terms_payload,
 )
-from embomatrix.manager.runtime.results import BatchLog
-from embomatrix.manager.runtime.submissions import Submissions
 from embomatrix.manager.store.protocol import PutOutcome, RunRow, Shelf, StateError, StateFullError
 from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.status import (
@@ -47,7 +50,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.control.cluster_state import ClusterState
     from embomatrix.manager.control.commands import Command
     from embomatrix.manager.control.events import Event
-    from embomatrix.manager.observe.history import RunHistory
+    from embomatrix.manager.observe.run_archive import RunHistory
     from embomatrix.manager.runtime.bundles import BundleStore
     from embomatrix.manager.runtime.results import ResultLogs
     from embomatrix.manager.store.protocol import StateStore
@@ -281,3 +284,37 @@ def _store_errors() -> Iterator[None]:
         raise OverloadedError(str(error)) from error
     except StateError as error:
         raise UnavailableError(str(error)) from error
+
+
+PIECE: Final = 256
+"""Rollouts that are queued at once: some three milliseconds, in which nothing else is decided."""
+
+
+class Submissions:
+    """``feed`` tells the state machines of an event. Batches that enter at the same time take turns, piece by piece."""
+
+    def __init__(self, feed: Callable[[Event], None]) -> None:
+        self._feed = feed
+        self._entering: deque[tuple[str, str, int]] = deque()
+        self._more = asyncio.Event()
+
+    def enter(self, batch: Batch) -> None:
+        """The first piece at once, the others as ``serve`` comes to them."""
+        self._feed(BatchSubmitted(batch, PIECE))
+        left = len(batch.rollouts) - PIECE
+        if left > 0:
+            self._entering.append((batch.run_id, batch.batch_id, left))
+            self._more.set()
+
+    async def serve(self) -> None:
+        """Go on with what has begun to enter, until cancelled."""
+        while True:
+            await self._more.wait()
+            self._more.clear()
+            while self._entering:
+                # Whatever came meanwhile is heard between two pieces.
+                await asyncio.sleep(0)
+                run_id, batch_id, left = self._entering.popleft()
+                self._feed(BatchContinued(run_id, batch_id, PIECE))
+                if left > PIECE:
+                    self._entering.append((run_id, batch_id, left - PIECE))

@@ -11,8 +11,8 @@ from embomatrix.proto.v1 import rollout_service_pb2_grpc
 from embomatrix.rpc.logs import bind
 from embomatrix.rpc.status import NotFoundError, TrimmedError, translate
 from embomatrix.rpc.versions import SPOKEN, VersionRange, agree, software_version
-from embomatrix.rpc.wire.batch import batch_with
-from embomatrix.rpc.wire.rollout import each, rollout_from_proto
+from embomatrix.rpc.wire.codec import each
+from embomatrix.rpc.wire.rollout import batch_with, rollout_from_proto
 from embomatrix.rpc.wire.run import (
     group_done_to_proto,
     lookahead_answer_to_proto,

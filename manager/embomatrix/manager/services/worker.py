@@ -19,7 +19,7 @@ from embomatrix.rpc.status import (
     translate,
 )
 from embomatrix.rpc.versions import SPOKEN, VersionRange, agree
-from embomatrix.rpc.wire.rollout import each, inside
+from embomatrix.rpc.wire.codec import each, inside
 from embomatrix.rpc.wire.session import (
     lease_progress_from_proto,
     lease_ref_from_proto,
@@ -37,8 +37,9 @@ if TYPE_CHECKING:
 
     from embomatrix.manager.access.gate import Gate
     from embomatrix.manager.runtime.event_loop import ManagerRuntime
-    from embomatrix.manager.runtime.links import OutgoingMessage, WorkerLink
-    from embomatrix.rpc.leases import Lease, LeaseResult
+    from embomatrix.manager.runtime.registry import WorkerSession
+    from embomatrix.manager.runtime.worker_link import OutgoingMessage, WorkerLink
+    from embomatrix.rpc.wire.leases import Lease, LeaseResult
 
 FIRST_STATE_S: Final = 10.0
 """A session stream must begin with the worker's state within this time."""
@@ -92,7 +93,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
         async with translate(context):
             first = await _first_state(request_iterator)
             session = self._runtime.registry.find(first.session_id, first.session_epoch)
-            self._gate.check_session(context, session)
+            self._check_session(context, session)
             bind("worker", session.worker_id)
             bind("session", session.session_id[:SESSION_SHOWN])
             with self._runtime.attached(session) as link:
@@ -103,7 +104,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
         self, request: pb.HeartbeatRequest, context: grpc.aio.ServicerContext
     ) -> pb.HeartbeatResponse:
         async with translate(context):
-            self._gate.check_session(context, self._runtime.registry.holder(request.session_id))
+            self._check_session(context, self._runtime.registry.holder(request.session_id))
             interval_s = self._runtime.take_heartbeat(
                 request.session_id,
                 request.session_epoch,
@@ -121,7 +122,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
     ) -> AsyncIterator[pb.FetchBundleResponse]:
         async with translate(context):
             session = self._runtime.registry.holder(request.session_id)
-            self._gate.check_session(context, session)
+            self._check_session(context, session)
             if request.bundle_digest not in session.asked:
                 raise NotAllowedError(
                     f"worker {session.worker_id} was not asked to hold bundle {request.bundle_digest[:80]!r}"
@@ -134,10 +135,13 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
     ) -> pb.DeregisterResponse:
         async with translate(context):
             session = self._runtime.registry.find(request.session_id, request.session_epoch)
-            self._gate.check_session(context, session)
+            self._check_session(context, session)
             left = SupersededError(f"worker {session.worker_id} said that it leaves: its session is over")
             self._runtime.end_session(session, "it left", left, WorkerStanding.LEFT)
         return pb.DeregisterResponse()
+
+    def _check_session(self, context: grpc.aio.ServicerContext, session: WorkerSession) -> None:
+        self._gate.check_session(context, session.worker_id, session.credential_id)
 
     async def _listen(self, link: WorkerLink, requests: AsyncIterator[pb.SessionRequest]) -> None:
         async for request in requests:

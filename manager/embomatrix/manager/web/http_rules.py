@@ -10,11 +10,10 @@ from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse
 
 from embomatrix.manager.settings import is_loopback
-from embomatrix.manager.web.page import STATIC
 from embomatrix.manager.web.rewards import REWARDS
 from embomatrix.rpc.channel import token_of
-from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.status import NotSignedInError
+from embomatrix.rpc.wire.tokens import AccessRole
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Receive, Scope, Send
@@ -22,6 +21,8 @@ if TYPE_CHECKING:
     from embomatrix.manager.access.gate import Gate
     from embomatrix.manager.access.protection import Tls
 
+STATIC: Final = "/static/"
+"""Prefix of the page's files, which hold nothing about the cluster and need no token."""
 OPEN_PATHS: Final = frozenset({"/", "/healthz"})
 """The empty page, which asks for the token itself, and the health check; the page's own files lie below ``STATIC``."""
 READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})

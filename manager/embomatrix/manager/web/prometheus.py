@@ -12,10 +12,10 @@ from prometheus_client import CollectorRegistry, ProcessCollector, generate_late
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.registry import Collector
 
-from embomatrix.manager.observe.histogram import BOUNDS_S
-from embomatrix.manager.observe.history import manager_version
+from embomatrix.manager.histogram import BOUNDS_S
+from embomatrix.manager.observe.run_archive import manager_version
 from embomatrix.manager.runtime.registry import WorkerStanding
-from embomatrix.manager.web.views import standing_counts
+from embomatrix.manager.web.cluster_view import standing_counts
 from embomatrix.rpc.wire.values import InfraCode, ResidentState
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from prometheus_client.metrics_core import Metric
 
     from embomatrix.manager.control.dispatch.ledger import WorkerRecord
-    from embomatrix.manager.observe.histogram import Histogram
+    from embomatrix.manager.histogram import Histogram
     from embomatrix.manager.runtime.event_loop import ManagerRuntime
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
@@ -65,13 +65,13 @@ class _Cluster(Collector):
         )
         found = {state.value: residents[state.value] for state in ResidentState}
         yield _gauges("embo_residents", "Scenes on workers by state.", "state", found)
-        loads = self._runtime.chronicle.fleet.scene_load
+        loads = self._runtime.event_log.fleet.scene_load
         yield _histograms(
             "embo_scene_load_seconds", "Time that workers took to load a scene.", "", {"": loads}
         )
 
     def _work(self) -> Iterator[Metric]:
-        runtime, chronicle = self._runtime, self._runtime.chronicle
+        runtime, chronicle = self._runtime, self._runtime.event_log
         dispatcher, totals = runtime.cluster.dispatcher, runtime.cluster.totals()
         yield _gauge("embo_runs", "Open runs.", len(runtime.runs.open))
         yield _gauge("embo_queue_depth", "Rollouts that wait for a lease.", dispatcher.queued)
@@ -104,15 +104,15 @@ class _Cluster(Collector):
 
     def _manager(self) -> Iterator[Metric]:
         runtime = self._runtime
-        share = runtime.effort.overhead()
+        share = runtime.load.overhead()
         text = "CPU time of the manager over that of the manager and the slots, in the last minute."
         yield _gauge("embo_manager_overhead_ratio", text, share)
-        lag = {"": runtime.effort.lag}
+        lag = {"": runtime.load.lag}
         yield _histograms("embo_manager_lag_seconds", "How late the manager's clock ticked.", "", lag)
-        operations = runtime.effort.store
+        operations = runtime.load.store
         yield _histograms("embo_store_op_seconds", "Time of the state store's operations.", "op", operations)
-        dropped = sum(run.ring.dropped for run in runtime.chronicle.runs.values())
-        dropped += runtime.chronicle.dropped + runtime.chronicle.fleet.ring.dropped
+        dropped = sum(run.ring.dropped for run in runtime.event_log.runs.values())
+        dropped += runtime.event_log.dropped + runtime.event_log.fleet.ring.dropped
         yield _counter("embo_events_dropped", "Events of logs that made room for later ones.", dropped)
 
     def _slot_states(self) -> dict[str, int]:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from embomatrix.reward.breakdown import RewardBreakdown
     from embomatrix.reward.settings import RewardSettings
-    from embomatrix.rpc.training import TrainingReport
+    from embomatrix.rpc.wire.training import TrainingReport
     from embomatrix.rpc.wire.values import Outcome, RolloutResult, Warmth
     from embomatrix.skills.prompt import Situation
     from embomatrix.skills.syntax import Plan

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import torch
 
-from embomatrix.rpc.nameless import nameless_file
+from embomatrix.host.anonymous_memory import nameless_file
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

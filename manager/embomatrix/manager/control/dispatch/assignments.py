@@ -30,7 +30,7 @@ from embomatrix.manager.control.dispatch.ledger import (
 from embomatrix.manager.control.dispatch.pending import PendingQueues
 from embomatrix.manager.control.dispatch.run_book import RunBook
 from embomatrix.manager.control.schedule.load_failures import LoadFailures
-from embomatrix.rpc.leases import LeaseOrigin
+from embomatrix.rpc.wire.leases import LeaseOrigin
 from embomatrix.rpc.wire.values import (
     Cancelled,
     InfraCode,

@@ -8,14 +8,14 @@ from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.control.dispatch.ledger import DispatchPhase, LeaseRecord, RolloutRecord, WorkerRecord
-from embomatrix.rpc.leases import LeaseRef
+from embomatrix.rpc.wire.leases import LeaseRef
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from embomatrix.manager.control.dispatch.fleet import Fleet
     from embomatrix.manager.control.dispatch.run_book import RunBook
-    from embomatrix.rpc.leases import LeaseProgress
+    from embomatrix.rpc.wire.leases import LeaseProgress
 
 STALE_MEMORY: Final = 65_536
 """Ended leases of which the book still knows the run, to count a late result where it belongs."""

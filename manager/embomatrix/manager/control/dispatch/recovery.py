@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.control.dispatch.assignments import Assignments
     from embomatrix.manager.control.dispatch.ledger import RolloutKey, RolloutRecord, WorkerRecord
     from embomatrix.manager.control.events import BatchRestored
-    from embomatrix.rpc.leases import LeaseOrigin, LeaseRef
+    from embomatrix.rpc.wire.leases import LeaseOrigin, LeaseRef
 
 
 class Recovery:

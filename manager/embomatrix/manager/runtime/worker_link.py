@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.control.commands import AcknowledgeLease, CancelLease, GiveLease, SetDesired
-from embomatrix.rpc.leases import Lease
+from embomatrix.rpc.wire.leases import Lease
 
 if TYPE_CHECKING:
     from embomatrix.manager.runtime.registry import WorkerSession
-    from embomatrix.rpc.leases import LeaseRef
     from embomatrix.rpc.status import ClusterError
+    from embomatrix.rpc.wire.leases import LeaseRef
 
 ACKNOWLEDGE_S: Final = 0.2
 """An acknowledgement waits for this long for something else to say: the worker only forgets a result with it. While work goes

@@ -14,9 +14,9 @@ from embomatrix.manager.control.audit.auditor import Repute
 from embomatrix.manager.control.events import LookaheadAnnounced
 from embomatrix.manager.store.protocol import BatchRow, ResultRow, ShelfRow
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
-from embomatrix.rpc.wire.batch import batch_from_proto, batch_to_proto
+from embomatrix.rpc.wire.codec import each
 from embomatrix.rpc.wire.outcome import rollout_result_to_proto
-from embomatrix.rpc.wire.rollout import each
+from embomatrix.rpc.wire.rollout import batch_from_proto, batch_to_proto
 from embomatrix.rpc.wire.run import (
     lookahead_entry_from_proto,
     lookahead_entry_to_proto,

@@ -10,7 +10,7 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.control.events import ReputesKnown
-from embomatrix.manager.runtime.records import repute_of, repute_row, window_row
+from embomatrix.manager.runtime.serialization import repute_of, repute_row, window_row
 from embomatrix.manager.store.protocol import Shelf, ShelfRow, StateError
 from embomatrix.rpc.status import UnavailableError
 
@@ -28,7 +28,7 @@ _DISPATCH: Final = "dispatch"
 _PAUSED: Final = b"paused"
 
 
-class Keeper:
+class StateJournal:
     """Writes beside the decisions, and never holds them up. What the store could not take is written when it is back."""
 
     def __init__(self, store: StateStore, registry: Registry, cluster: ClusterState) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import grpc
 
-from embomatrix.manager.web.door import BoundedListener
+from embomatrix.manager.web.connections import BoundedListener
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

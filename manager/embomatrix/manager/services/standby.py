@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import grpc
 from fastapi import FastAPI
+from google.protobuf import descriptor_pool
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
-from embomatrix.manager.runtime.listen import bind_server
-from embomatrix.manager.services.refusal import refusing
+from embomatrix.manager.services.listen import bind_server
 from embomatrix.rpc.channel import SERVER_OPTIONS
-from embomatrix.rpc.status import StandbyError
+from embomatrix.rpc.status import StandbyError, translate
 
 if TYPE_CHECKING:
     from embomatrix.manager.access.protection import Tls
+    from embomatrix.rpc.status import ClusterError
 
 
 class Standby:
@@ -65,3 +66,31 @@ class _Refusal(grpc.GenericRpcHandler):  # type: ignore[misc]  # grpc is untyped
             return None
         refusal = StandbyError(self._standby.sentence, self._standby.leader)
         return refusing(handler_call_details.method, refusal)
+
+
+def refusing(method: str, refusal: ClusterError) -> grpc.RpcMethodHandler:
+    """A handler for ``/package.Service/Method`` that refuses, of the method's own kind.
+
+    gRPC answers a unary method's caller only through a unary handler. It has no deserializer: a stranger's message stays bytes.
+    """
+
+    async def refuse(_: Any, context: grpc.aio.ServicerContext) -> None:
+        async with translate(context):
+            raise refusal
+
+    makers = {
+        (False, False): grpc.unary_unary_rpc_method_handler,
+        (False, True): grpc.unary_stream_rpc_method_handler,
+        (True, False): grpc.stream_unary_rpc_method_handler,
+        (True, True): grpc.stream_stream_rpc_method_handler,
+    }
+    return makers[_streams(method)](refuse)
+
+
+def _streams(method: str) -> tuple[bool, bool]:
+    """Whether requests and answers of the method are streams; taken for both where nobody knows the method."""
+    try:
+        found = descriptor_pool.Default().FindMethodByName(method.lstrip("/").replace("/", "."))
+    except KeyError:
+        return True, True
+    return found.client_streaming, found.server_streaming

@@ -2,26 +2,43 @@
 
 from __future__ import annotations
 
+import asyncio
+import gzip
 import itertools
 import logging
+import os
+import re
 import time
+import zlib
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.observe.chronicle import PAGE
+from google.protobuf.message import DecodeError
+
+from embomatrix.manager.observe.event_log import PAGE
 from embomatrix.manager.observe.run_figures import summary_of
-from embomatrix.rpc.run_log import EventPage, RunSummary
+from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.rpc.status import NotFoundError
+from embomatrix.rpc.wire.codec import ConvertError, each
+from embomatrix.rpc.wire.run_log import (
+    EventPage,
+    PhaseSummary,
+    RunEvent,
+    RunSummary,
+    run_event_from_proto,
+    run_event_to_proto,
+    run_summary_from_proto,
+    run_summary_to_proto,
+)
 from embomatrix.rpc.wire.values import RunInfo
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
     from embomatrix.manager.control.cluster_state import ClusterState
-    from embomatrix.manager.observe.archive import RunArchive
-    from embomatrix.manager.observe.chronicle import Chronicle, RunRecord
+    from embomatrix.manager.observe.event_log import RunEventLog, RunRecord
     from embomatrix.reward.settings import RewardSettings
-    from embomatrix.rpc.run_log import PhaseSummary, RunEvent
     from embomatrix.rpc.wire.values import Batch, RunStats
 
 logger = logging.getLogger(__name__)
@@ -30,19 +47,19 @@ logger = logging.getLogger(__name__)
 class RunHistory:
     """Reads the process's own clocks: it is told of runs by their door, not by a state machine."""
 
-    def __init__(self, chronicle: Chronicle, archive: RunArchive, cluster: ClusterState) -> None:
-        self._chronicle = chronicle
+    def __init__(self, chronicle: RunEventLog, archive: RunArchive, cluster: ClusterState) -> None:
+        self._event_log = chronicle
         self._archive = archive
         self._cluster = cluster
 
     def opened(self, run_id: str, name: str, reward: RewardSettings) -> None:
         logger.info("run opened run=%s: %s", run_id, name or "no name")
-        self._chronicle.open_run(
+        self._event_log.open_run(
             run_id, name, now_s=time.monotonic(), cpu_s=time.process_time(), reward=reward
         )
 
     def submitted(self, batch: Batch) -> None:
-        self._chronicle.submitted(batch, now_s=time.monotonic())
+        self._event_log.submitted(batch, now_s=time.monotonic())
 
     def leads(self, run_id: str) -> PhaseSummary:
         """How long before their demand the run's scenes were warm; gone once the run is closed."""
@@ -50,7 +67,7 @@ class RunHistory:
 
     async def closed(self, run_id: str, stats: RunStats, leads: PhaseSummary) -> None:
         """The run is over, with these counters: it goes to the archive."""
-        record = self._chronicle.close_run(run_id, now_s=time.monotonic())
+        record = self._event_log.close_run(run_id, now_s=time.monotonic())
         logger.info(
             "run closed run=%s: %d outcomes, %d failures", run_id, stats.delivered, stats.infra_failures
         )
@@ -60,7 +77,7 @@ class RunHistory:
 
     async def summary(self, run_id: str) -> RunSummary:
         """What a run came to, so far or in the end. Raises ``NotFoundError``."""
-        record = self._chronicle.runs.get(run_id)
+        record = self._event_log.runs.get(run_id)
         if record is not None:
             return self._summed(record, self.info(record), self.leads(run_id))
         kept = await self._archive.load(run_id)
@@ -80,7 +97,7 @@ class RunHistory:
     async def events(self, run_id: str, after: int, limit: int) -> EventPage:
         """A page of the run's log, or of the fleet's for an empty id. Raises ``NotFoundError``."""
         limit = min(limit or PAGE, PAGE)
-        page = self._chronicle.page(run_id, after, limit)
+        page = self._event_log.page(run_id, after, limit)
         if page is not None:
             return page
         kept = await self._archive.load(run_id)
@@ -92,7 +109,7 @@ class RunHistory:
 
     async def latest(self, run_id: str, seconds: float) -> EventPage:
         """The last of a run's log: events of so many seconds before its last. Raises ``NotFoundError``."""
-        record = self._chronicle.runs.get(run_id)
+        record = self._event_log.runs.get(run_id)
         if record is not None:
             events: Sequence[RunEvent] = record.ring.events
             dropped = record.ring.dropped
@@ -115,13 +132,13 @@ class RunHistory:
             failures=tuple(figures.failures),
             manager_cpu_s=time.process_time() - record.cpu_s,
             prewarm_lead=leads,
-            scene_load=summary_of(self._chronicle.fleet.scene_load),
+            scene_load=summary_of(self._event_log.fleet.scene_load),
             events_dropped=record.ring.dropped,
             version=manager_version(),
         )
 
     def _info(self, record: RunRecord, stats: RunStats, *, pending: int, closed_s: float = 0.0) -> RunInfo:
-        opened_s = self._chronicle.epoch_s + record.opened_s
+        opened_s = self._event_log.epoch_s + record.opened_s
         return RunInfo(
             record.run_id,
             record.name,
@@ -146,3 +163,71 @@ def _unknown(run_id: str) -> NotFoundError:
     return NotFoundError(
         f"no run {run_id!r} is open or kept: `embomatrix cluster runs --closed` lists those that are kept"
     )
+
+
+RUNS_KEPT: Final = 50
+SUFFIX: Final = ".run.gz"
+_RUN_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+
+
+class RunArchive:
+    """A folder with one file for each of the ``kept`` runs that were closed last.
+
+    What can't be written or read is said in the log and left out: no run fails for the sake of its history.
+    """
+
+    def __init__(self, folder: Path, *, kept: int = RUNS_KEPT) -> None:
+        self._folder = folder
+        self._kept = kept
+
+    async def keep(self, summary: RunSummary, events: Sequence[RunEvent]) -> None:
+        """Write a run that was closed; an earlier one of the same id is replaced."""
+        await asyncio.to_thread(self._write, summary, events)
+
+    async def summaries(self) -> list[RunSummary]:
+        """What is kept, the run that was closed last first."""
+        return await asyncio.to_thread(self._read_all)
+
+    async def load(self, run_id: str) -> tuple[RunSummary, tuple[RunEvent, ...]] | None:
+        """A run that is kept; None when there is none of that id."""
+        # What callers send becomes a file's name: only what can be a run's id does.
+        if not _RUN_ID.fullmatch(run_id):
+            return None
+        return await asyncio.to_thread(self._read, self._path(run_id))
+
+    def _path(self, run_id: str) -> Path:
+        return self._folder / f"{run_id}{SUFFIX}"
+
+    def _write(self, summary: RunSummary, events: Sequence[RunEvent]) -> None:
+        message = pb.KeptRun(summary=run_summary_to_proto(summary), events=map(run_event_to_proto, events))
+        path = self._path(summary.run.run_id)
+        fresh = path.with_suffix(".new")
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            fresh.write_bytes(gzip.compress(message.SerializeToString(), compresslevel=3))
+            os.replace(fresh, path)
+            for old in self._files()[self._kept :]:
+                old.unlink(missing_ok=True)
+        except OSError as error:
+            logger.warning("history not kept run=%s: %s", summary.run.run_id, error)
+
+    def _files(self) -> list[Path]:
+        """The latest first."""
+        found = self._folder.glob(f"*{SUFFIX}")
+        return sorted(found, key=lambda path: (path.stat().st_mtime_ns, path.name), reverse=True)
+
+    def _read_all(self) -> list[RunSummary]:
+        found = (self._read(path) for path in self._files())
+        return [entry[0] for entry in found if entry is not None]
+
+    def _read(self, path: Path) -> tuple[RunSummary, tuple[RunEvent, ...]] | None:
+        try:
+            message = pb.KeptRun.FromString(gzip.decompress(path.read_bytes()))
+            return run_summary_from_proto(message.summary), each(
+                "events", run_event_from_proto, message.events
+            )
+        except FileNotFoundError:
+            return None
+        except (OSError, EOFError, zlib.error, DecodeError, ConvertError) as error:
+            logger.warning("history can't be read file=%s: %s", path.name, error)
+            return None

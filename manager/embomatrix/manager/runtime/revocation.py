@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.runtime.event_loop import ManagerRuntime
 
 
-class Expulsion:
+class Revocation:
     """Ends sessions and voids what they were opened with."""
 
     def __init__(self, sessions: ManagerRuntime, gate: Gate) -> None:

@@ -19,24 +19,22 @@ from embomatrix.manager.control.audit.auditor import AuditRules
 from embomatrix.manager.control.cluster_state import ClusterState
 from embomatrix.manager.control.dispatch.assignments import DispatchLimits
 from embomatrix.manager.control.schedule.scheduler import ScheduleLimits
-from embomatrix.manager.observe.archive import RunArchive
+from embomatrix.manager.observe.run_archive import RunArchive
 from embomatrix.manager.runtime.bundles import BundleStore
 from embomatrix.manager.runtime.event_loop import ManagerRuntime
 from embomatrix.manager.runtime.garbage import only_young
-from embomatrix.manager.runtime.leadership import Leadership
-from embomatrix.manager.runtime.listen import bound_socket
+from embomatrix.manager.runtime.leadership import Leadership, note_folder, warn_of_another_folder
 from embomatrix.manager.runtime.registry import LivenessLimits, Registry
-from embomatrix.manager.runtime.shared_folder import note_folder, warn_of_another_folder
-from embomatrix.manager.runtime.standby import Standby
-from embomatrix.manager.services.expulsion import Expulsion
+from embomatrix.manager.runtime.revocation import Revocation
+from embomatrix.manager.services.listen import bound_socket
 from embomatrix.manager.services.server import build_server
+from embomatrix.manager.services.standby import Standby
 from embomatrix.manager.settings import is_every_address, is_loopback
 from embomatrix.manager.store.protocol import Candidate, StateError
 from embomatrix.manager.store.url import open_store
 from embomatrix.manager.web.api import build_api
-from embomatrix.manager.web.http_connections import allow_files, connections_through
+from embomatrix.manager.web.connections import allow_files, connections_through
 from embomatrix.manager.web.http_rules import HttpRules, allowed_hosts
-from embomatrix.manager.web.no_gallery import NoGallery
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
@@ -49,7 +47,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.access.protection import Tls
     from embomatrix.manager.settings import ManagerSettings
     from embomatrix.manager.store.protocol import StateStore
-    from embomatrix.manager.web.door import BoundedListener
+    from embomatrix.manager.web.connections import BoundedListener
     from embomatrix.manager.web.gallery import Gallery
 
 logger = logging.getLogger(__name__)
@@ -133,7 +131,7 @@ async def running(
         await gate.open(protection.first)
         server, port = await build_server(runtime, gate, protection.tls, settings)
         rules = HttpRules(gate, hosts=allowed_hosts(settings.http_host, protection.tls))
-        http.show(build_api(runtime, rules, Expulsion(runtime, gate), _gallery(settings.dataset)))
+        http.show(build_api(runtime, rules, Revocation(runtime, gate), _gallery(settings.dataset)))
         group.create_task(leadership.keep())
         group.create_task(runtime.serve())
         await server.start()
@@ -150,10 +148,10 @@ def _page_url(host: str, port: int, tls: Tls | None) -> str:
     return f"{'http' if tls is None else 'https'}://{host}:{port}/"
 
 
-def _gallery(dataset: Path | None) -> Gallery | NoGallery:
+def _gallery(dataset: Path | None) -> Gallery | None:
     if dataset is None:
-        return NoGallery()
-    # What reads scenes comes with numpy, and only where scenes are to be shown.
+        return None
+    # Imported here: reading scenes needs numpy, which the manager's image lacks.
     from embomatrix.manager.web.gallery import Gallery
 
     return Gallery(dataset)
