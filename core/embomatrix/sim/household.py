@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.skills.appliances import coverings, liquids_given, taken_off
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.household import coverings, liquids_given, taken_off
 from embomatrix.skills.syntax import PlaceRelation
 from embomatrix.skills.view import preposition, refuse, source_of, target_of
 from embomatrix.world.geometry import Pose
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from embomatrix.sim.live_world import LiveWorld
-    from embomatrix.sim.state.footing import Host
+    from embomatrix.sim.state.supports import Host
     from embomatrix.skills.syntax import SkillCall
     from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.geometry import Aabb

@@ -6,14 +6,17 @@ Every solid is a body without a collision shape. Shapes are shared; objects can 
 from __future__ import annotations
 
 import math
+import tempfile
 import zlib
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from scipy.spatial import ConvexHull
 
 from embomatrix.sim.bullet.client import pybullet
-from embomatrix.sim.bullet.robot_figure import RobotFigure
+from embomatrix.sim.bullet.robot import spread
+from embomatrix.sim.bullet.robot_model import ARM_JOINTS, BASE_JOINTS, FINGER_JOINTS, LIFT_JOINTS, robot_urdf
 from embomatrix.sim.engine import EngineError
 from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion
 from embomatrix.skills.limits import ROBOT
@@ -25,6 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from embomatrix.sim.bullet.robot import Posture
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import ConvexPart, Vec3
     from embomatrix.world.scene import Scene, SceneObject
@@ -56,6 +60,10 @@ _CLOTH: Final = frozenset({"bed", "sofa", "armchair", "ottoman", "carpet", "boot
 _LEAF_M: Final = 0.1
 _PANE_M: Final = 0.03
 """Walls thinner than the first are leaves of doors, thinner than the second panes of windows."""
+
+
+_CHASSIS: Final = (0.78, 0.16, 0.14, 1.0)
+_OWN_LINKS: Final = frozenset({"base", "stage", "carriage"})
 
 
 class VisualScene:
@@ -250,3 +258,39 @@ def _hue(share: float) -> Rgba:
 def _lighter(color: Rgba) -> Rgba:
     red, green, blue = (channel + 0.3 * (1.0 - channel) for channel in color[:3])
     return (red, green, blue, 1.0)
+
+
+class RobotFigure:
+    """One robot in a client that has Bullet's renderer. It lives as long as the client."""
+
+    def __init__(self, client: int) -> None:
+        """Load the robot, out of sight. Raises EngineMissingError where its description is not installed."""
+        self._bullet = bullet = pybullet()
+        self._client = client
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "robot.urdf"
+            path.write_text(robot_urdf(visuals=True))
+            self._body = int(bullet.loadURDF(str(path), useFixedBase=True, physicsClientId=client))
+        joints: dict[str, int] = {}
+        for number in range(bullet.getNumJoints(self._body, physicsClientId=client)):
+            info = bullet.getJointInfo(self._body, number, physicsClientId=client)
+            joints[info[1].decode()] = number
+            if info[12].decode() in _OWN_LINKS:
+                bullet.changeVisualShape(self._body, number, rgbaColor=_CHASSIS, physicsClientId=client)
+        self._driven = [joints[name] for name in (*BASE_JOINTS, *LIFT_JOINTS, *ARM_JOINTS, *FINGER_JOINTS)]
+        self.leave()
+
+    def stand(self, posture: Posture) -> None:
+        """Show the robot in a posture."""
+        self._put(0.0)
+        for joint, value in zip(self._driven, spread(posture), strict=True):
+            self._bullet.resetJointState(self._body, joint, value, physicsClientId=self._client)
+
+    def leave(self) -> None:
+        """Take it out of sight: the robot does not see itself."""
+        self._put(-100.0)
+
+    def _put(self, height_m: float) -> None:
+        self._bullet.resetBasePositionAndOrientation(
+            self._body, (0.0, 0.0, height_m), (0.0, 0.0, 0.0, 1.0), physicsClientId=self._client
+        )
