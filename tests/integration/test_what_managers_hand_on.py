@@ -9,7 +9,7 @@ from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import BUNDLES, batch, manager, outcomes, until
 
 from embomatrix.cli.local_cluster import free_port
-from embomatrix.manager.store.url import open_store
+from embomatrix.manager.store.opening import open_store
 from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import UnavailableError

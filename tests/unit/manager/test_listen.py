@@ -5,7 +5,7 @@ import socket
 import pytest
 
 from embomatrix.manager.services.listen import PortInUseError, bound_socket
-from embomatrix.manager.store.url import without_password
+from embomatrix.manager.store.opening import without_password
 
 
 def test_free_port_is_bound_and_given_back():

@@ -242,7 +242,9 @@ def test_an_answer_to_the_look_ahead_comes_back_equal(answer):
 
 @pytest.mark.parametrize("warmth", Warmth)
 def test_every_warmth_comes_back_equal(warmth):
-    assert convert_run.warmth_from_proto(convert_run.warmth_to_proto(warmth)) is warmth
+    answer = LookaheadAnswer("sha256:0", warmth)
+    message = _over_the_wire(convert_run.lookahead_answer_to_proto(answer))
+    assert convert_run.lookahead_answer_from_proto(message) == answer
 
 
 def test_every_enum_value_of_the_wire_has_a_meaning_here():
@@ -288,7 +290,7 @@ def test_a_malformed_plan_names_the_field(calls, field):
 def test_two_rollouts_of_one_id_are_refused():
     rollout = types_pb2.Rollout(rollout_id="r", group_id="g", bundle_digest="d", task_id="t")
     request = rollout_service_pb2.ExecuteRequest(run_id="run", batch_id="b", rollouts=[rollout, rollout])
-    with pytest.raises(ConvertError, match=r"rollouts\[1\].rollout_id: 'r' stands twice"):
+    with pytest.raises(ConvertError, match=r"rollouts\[1\].rollout_id: 'r' occurs twice"):
         convert.batch_from_proto(request)
 
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.rpc.wire.codec import converters, enum_member, enum_numbers
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 
 class AccessRole(StrEnum):
@@ -35,7 +38,7 @@ class TokenInfo:
 
 
 ROLE_NUMBERS: Final = enum_numbers(AccessRole, pb.Role, "ROLE")
-_ROLES: Final = {number: role for role, number in ROLE_NUMBERS.items()}
+_ROLES: Final[Mapping[int, AccessRole]] = {number: role for role, number in ROLE_NUMBERS.items()}
 
 token_info_to_proto, token_info_from_proto = converters(
     TokenInfo, pb.TokenInfo, required_names=("token_id",), enums={"role": ROLE_NUMBERS}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from embomatrix.manager.commands.token import app as token_app
-from embomatrix.rpc.logs import LogFormat, hide, log_to_stderr
+from embomatrix.rpc.logs import LogFormat, hide, log_to_stderr, without_secrets
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -215,13 +215,12 @@ def _serve(settings: ManagerSettings) -> None:
     from embomatrix.manager.services.app import Endpoints, serve
     from embomatrix.manager.services.listen import PortInUseError
     from embomatrix.manager.store.protocol import StateError
-    from embomatrix.manager.store.url import without_password
 
     def on_ready(endpoints: Endpoints) -> None:
         kept = (
             "nowhere: it is lost on restart"
             if settings.state_url == "memory:"
-            else f"in {without_password(settings.state_url)}"
+            else f"in {without_secrets(settings.state_url)}"
         )
         print(
             f"manager serves at {endpoints.address}, status page {endpoints.status_url}, state {kept}",

@@ -34,7 +34,7 @@ from embomatrix.manager.runtime.results import ResultDelivery, ResultLogs
 from embomatrix.manager.runtime.runs import RunLimits, Runs
 from embomatrix.manager.runtime.state_journal import StateJournal
 from embomatrix.manager.runtime.worker_link import WorkerLink
-from embomatrix.manager.store.timed import timed_store
+from embomatrix.manager.store.opening import timed_store
 from embomatrix.rpc.status import SupersededError, UnavailableError
 
 if TYPE_CHECKING:

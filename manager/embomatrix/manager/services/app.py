@@ -30,8 +30,8 @@ from embomatrix.manager.services.listen import bound_socket
 from embomatrix.manager.services.server import build_server
 from embomatrix.manager.services.standby import Standby
 from embomatrix.manager.settings import is_every_address, is_loopback
+from embomatrix.manager.store.opening import open_store
 from embomatrix.manager.store.protocol import Candidate, StateError
-from embomatrix.manager.store.url import open_store
 from embomatrix.manager.web.api import build_api
 from embomatrix.manager.web.connections import allow_files, connections_through
 from embomatrix.manager.web.http_rules import HttpRules, allowed_hosts

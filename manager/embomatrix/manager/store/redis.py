@@ -30,7 +30,7 @@ from embomatrix.manager.store.protocol import (
     StateError,
     StateFullError,
 )
-from embomatrix.manager.store.url import without_password
+from embomatrix.rpc.logs import without_secrets
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Collection, Sequence
@@ -150,7 +150,7 @@ class RedisStore:
     """``url`` as in ``redis://HOST:PORT/DB``. Every call is bounded by ``timeout_s``; failures are ``StateError``."""
 
     def __init__(self, url: str, *, prefix: str = "embomatrix", timeout_s: float = 5.0) -> None:
-        self._shown = without_password(url)
+        self._shown = without_secrets(url)
         self._prefix = prefix
         self._epoch = 0
         self._candidate: Candidate | None = None

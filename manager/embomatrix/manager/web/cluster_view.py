@@ -181,7 +181,7 @@ class Snapshots:
         if key not in self._pages:
             if len(self._pages) >= PAGES_KEPT:
                 self._pages.clear()
-            text = json.dumps(make(seen), default=dataclasses.asdict, separators=(",", ":"))  # type: ignore[call-overload]
+            text = json.dumps(make(seen), default=dataclasses.asdict, separators=(",", ":"))
             self._pages[key] = text.encode()
         return self._pages[key]
 

@@ -80,5 +80,5 @@ def _shown(gallery: Gallery | None) -> Gallery:
 
 
 def _json(value: object) -> Response:
-    text = json.dumps(value, default=dataclasses.asdict, separators=(",", ":"))  # type: ignore[call-overload]
+    text = json.dumps(value, default=dataclasses.asdict, separators=(",", ":"))
     return Response(text, media_type="application/json")
