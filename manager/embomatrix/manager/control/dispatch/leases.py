@@ -1,4 +1,4 @@
-"""Live leases: given under an epoch that is never used again, renewed by heartbeats, due when silent or too old."""
+"""Lease table of the dispatcher."""
 
 from __future__ import annotations
 
@@ -7,31 +7,30 @@ import itertools
 from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.control.dispatch.ledger import DispatchPhase, LeaseRecord, RolloutRecord, WorkerRecord
+from embomatrix.manager.control.dispatch.records import DispatchPhase, LeaseRecord, RolloutRecord
 from embomatrix.rpc.wire.leases import LeaseRef
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from embomatrix.manager.control.dispatch.fleet import Fleet
-    from embomatrix.manager.control.dispatch.run_book import RunBook
+    from embomatrix.manager.control.dispatch.fair_share import RunAccounts
+    from embomatrix.manager.control.workers import WorkerPool, WorkerRecord
     from embomatrix.rpc.wire.leases import LeaseProgress
 
 STALE_MEMORY: Final = 65_536
-"""Ended leases of which the book still knows the run, to count a late result where it belongs."""
+"""Ended leases remembered, to count a late result for its run."""
 
 
-class LeaseBook:
-    """``boot_id`` makes the lease ids of this manager's process unlike those of any other.
+class LeaseTable:
+    """Live leases. Each has an epoch that is never used again; epochs below ``first_epoch`` are a former manager's.
 
-
-    Epochs rise from ``first_epoch``: what lies below was given by a former manager.
+    ``boot_id`` keeps the lease ids of different manager processes apart.
     """
 
     def __init__(
         self,
-        fleet: Fleet,
-        runs: RunBook,
+        pool: WorkerPool,
+        runs: RunAccounts,
         *,
         boot_id: str,
         ttl_s: float,
@@ -39,12 +38,13 @@ class LeaseBook:
         first_epoch: int = 1,
     ) -> None:
         self.live: dict[str, LeaseRecord] = {}
+        #: Equals the union of ``WorkerRecord.held`` over all workers.
         self.expired = 0
-        """Leases whose time was up, so far."""
+        """Leases that expired, so far."""
         self.in_use: Counter[tuple[str, str]] = Counter()
         """Live leases by (worker, scene)."""
         self._used: set[tuple[str, str]] = set()
-        self._fleet = fleet
+        self._pool = pool
         self._runs = runs
         self._boot_id = boot_id
         self._ttl_s = ttl_s
@@ -52,14 +52,16 @@ class LeaseBook:
         self._first_epoch = first_epoch
         self._epochs = itertools.count(first_epoch)
         self._due: list[tuple[float, int, LeaseRecord]] = []
+        #: Has an entry for each live lease, at or before its ``due_s``; ended leases leave it at the head.
         self._ended: OrderedDict[str, str] = OrderedDict()
+        """Run ids of ended leases, by lease id."""
 
-    def give(self, record: RolloutRecord, worker: WorkerRecord, now_s: float) -> LeaseRecord:
-        """Lease the rollout to the worker: one that no one holds, or one that is to run twice at once."""
+    def grant(self, record: RolloutRecord, worker: WorkerRecord, now_s: float) -> LeaseRecord:
+        """Create a lease with a new epoch."""
         epoch = next(self._epochs)
-        return self.note(LeaseRef(f"{self._boot_id}-{epoch}", epoch), record, worker, now_s)
+        return self.enter(LeaseRef(f"{self._boot_id}-{epoch}", epoch), record, worker, now_s)
 
-    def note(self, ref: LeaseRef, record: RolloutRecord, worker: WorkerRecord, now_s: float) -> LeaseRecord:
+    def enter(self, ref: LeaseRef, record: RolloutRecord, worker: WorkerRecord, now_s: float) -> LeaseRecord:
         """Enter a lease that the worker holds from now on, or held under a former manager."""
         lease = LeaseRecord(
             ref=ref,
@@ -73,40 +75,34 @@ class LeaseBook:
         record.leases.append(lease)
         self._runs.charge(lease)
         self.live[lease.ref.lease_id] = lease
-        self._fleet.hold(worker, lease)
+        self._pool.add_lease(worker, lease)
         heapq.heappush(self._due, (lease.due_s, ref.lease_epoch, lease))
         self._used.add((worker.worker_id, record.scene))
         self.in_use[worker.worker_id, record.scene] += 1
         return lease
 
     def is_former(self, ref: LeaseRef) -> bool:
-        """Whether a former manager gave it."""
+        """True if a former manager granted the lease."""
         return ref.lease_epoch < self._first_epoch
 
-    def disown(self, ref: LeaseRef, run_id: str) -> None:
-        """A lease that is not taken up: a result of it is stale."""
-        self._ended[ref.lease_id] = run_id
-        self._forget_ended()
+    def reject(self, ref: LeaseRef, run_id: str) -> None:
+        """Remember a former manager's lease that is not adopted: its result counts as stale."""
+        self._remember_ended(ref.lease_id, run_id)
 
     def end(self, lease: LeaseRecord, now_s: float) -> None:
-        """The lease is over, whatever its worker still does. What becomes of the rollout, its caller decides."""
+        """Remove a live lease; the caller decides about its rollout."""
         lease.record.leases.remove(lease)
         del self.live[lease.ref.lease_id]
-        self._fleet.release(lease, now_s)
+        self._pool.remove_lease(lease, now_s)
         self._runs.settle(lease, now_s)
         pair = (lease.worker_id, lease.record.scene)
         self.in_use[pair] -= 1
         if not self.in_use[pair]:
             del self.in_use[pair]
-        self._ended[lease.ref.lease_id] = lease.record.key.run_id
-        self._forget_ended()
-
-    def _forget_ended(self) -> None:
-        while len(self._ended) > STALE_MEMORY:
-            self._ended.popitem(last=False)
+        self._remember_ended(lease.ref.lease_id, lease.record.key.run_id)
 
     def find(self, worker_id: str, ref: LeaseRef) -> LeaseRecord | None:
-        """The live lease of that name, epoch and worker; None for a stale one."""
+        """Return the live lease with this id, epoch and worker; None for a stale one."""
         lease = self.live.get(ref.lease_id)
         return lease if lease is not None and lease.ref == ref and lease.worker_id == worker_id else None
 
@@ -114,16 +110,17 @@ class LeaseBook:
         return self._ended.get(ref.lease_id)
 
     def renew(self, worker_id: str, held: Iterable[LeaseRef], now_s: float) -> None:
-        """The worker says that it still holds these."""
         for ref in held:
             lease = self.find(worker_id, ref)
             if lease is not None:
                 lease.expires_s = now_s + self._ttl_s
 
-    def note_progress(self, worker_id: str, told: Iterable[LeaseProgress], now_s: float) -> list[LeaseRecord]:
-        """Take in how far the worker's leases have come; returns those of them that are live."""
+    def note_progress(
+        self, worker_id: str, reported: Iterable[LeaseProgress], now_s: float
+    ) -> list[LeaseRecord]:
+        """Record the steps of the worker's leases; return those of the leases that are live."""
         running: list[LeaseRecord] = []
-        for progress in told:
+        for progress in reported:
             lease = self.find(worker_id, progress.ref)
             if lease is None:
                 continue
@@ -132,10 +129,9 @@ class LeaseBook:
             running.append(lease)
         return running
 
-    def due(self, now_s: float) -> list[LeaseRecord]:
-        """Live leases whose time is up."""
-        late: list[LeaseRecord] = []
-        # Ended leases leave as soon as they reach the head, so that they don't pile up until their expiry.
+    def take_expired(self, now_s: float) -> list[LeaseRecord]:
+        """Return the live leases that are due; they stay live until they are ended."""
+        expired: list[LeaseRecord] = []
         while self._due and (self._due[0][0] <= now_s or self._due[0][2].ref.lease_id not in self.live):
             _, epoch, lease = heapq.heappop(self._due)
             if lease.ref.lease_id not in self.live:
@@ -143,11 +139,31 @@ class LeaseBook:
             if lease.due_s > now_s:
                 heapq.heappush(self._due, (lease.due_s, epoch, lease))
             else:
-                late.append(lease)
-        self.expired += len(late)
-        return late
+                expired.append(lease)
+        self.expired += len(expired)
+        return expired
 
     def take_used(self) -> frozenset[tuple[str, str]]:
-        """The (worker, scene) pairs that were given a lease since the last call."""
+        """Return the (worker, scene) pairs that got a lease since the last call."""
         used, self._used = frozenset(self._used), set()
         return used
+
+    def check_invariants(self) -> None:
+        """Raise AssertionError if the table disagrees with the workers or the rollouts."""
+        held = {name for worker in self._pool.workers.values() for name in worker.held}
+        assert held == set(self.live)
+        pairs = Counter((lease.worker_id, lease.record.scene) for lease in self.live.values())
+        assert pairs == self.in_use
+        assert set(self.live) <= {lease.ref.lease_id for _, _, lease in self._due}
+        for lease in self.live.values():
+            record = lease.record
+            assert lease in record.leases, record.key
+            assert record.phase is DispatchPhase.LEASED, record.key
+            assert (
+                len({other.worker_id for other in record.leases}) == len(record.leases) <= 1 + record.hedged
+            )
+
+    def _remember_ended(self, lease_id: str, run_id: str) -> None:
+        self._ended[lease_id] = run_id
+        while len(self._ended) > STALE_MEMORY:
+            self._ended.popitem(last=False)
