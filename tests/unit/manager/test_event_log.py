@@ -6,7 +6,7 @@ from tests.fakes.worker import completed
 
 from embomatrix.manager.control.commands import GiveLease
 from embomatrix.manager.control.dispatch.records import LeaseRecord, RolloutKey, RolloutRecord
-from embomatrix.manager.observe.event_log import EVENTS_KEPT, LEAST_KEPT, Chronicle
+from embomatrix.manager.observe.event_log import EVENTS_KEPT, LEAST_KEPT, RunEventLog
 from embomatrix.manager.observe.run_archive import RunArchive
 from embomatrix.rpc.wire.leases import LeaseOrigin, LeaseRef, LeaseResult
 from embomatrix.rpc.wire.run_log import EventKind, PhaseSummary, RunSeries, RunSummary
@@ -25,7 +25,7 @@ EPOCH_S = 1_000.0
 
 
 def chronicle(*run_ids):
-    told = Chronicle(epoch_s=EPOCH_S)
+    told = RunEventLog(epoch_s=EPOCH_S)
     for run_id in run_ids:
         told.open_run(run_id, "a run", now_s=1.0, cpu_s=0.0)
     return told
