@@ -13,7 +13,7 @@ from embomatrix.factory.task_import.binding import Addition
 from embomatrix.factory.task_import.models import sized
 from embomatrix.factory.task_import.size_requirements import Demand
 from embomatrix.sim.geometry.candidates import candidates, surfaces_for
-from embomatrix.sim.planner.ways import CANDIDATES, MIDDLE
+from embomatrix.sim.planner.subgoals import CANDIDATES, MIDDLE
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.state import Relation
 

@@ -12,10 +12,8 @@ from typing import TYPE_CHECKING, Final, Self
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.sim.actions import HANDLINGS
 from embomatrix.sim.planner.calls import StuckError
-from embomatrix.sim.planner.errands import Errands, Warming
 from embomatrix.sim.planner.script import PlanScript
-from embomatrix.sim.planner.ways import PlacementGoal
-from embomatrix.sim.planner.wishes import GoalLiterals
+from embomatrix.sim.planner.subgoals import Exposure, PlacementGoal, Subgoals
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.evaluate import evaluate, render
@@ -61,31 +59,27 @@ class Rehearsal:
 
     def puts(self, thing: str, relation: Relation, host: str) -> bool:
         """Whether it brings the thing on or into another, where it is not yet."""
-        placed = Errands((PlacementGoal(thing, relation, host),), (), {}, {}, ())
+        placed = Subgoals(placements=(PlacementGoal(thing, relation, host),))
         return self._brings_about(Atom(relation.value, (thing, host)), placed, thing, host)
 
     def swings(self, name: str, *, shut: bool) -> bool:
         """Whether it opens, or shuts, all doors and drawers of an object that is not so yet."""
         atom = Atom(State.OPEN.value, (name,))
-        return self._brings_about(
-            Not(atom) if shut else atom, Errands((), (), {name: not shut}, {}, ()), name
-        )
+        return self._brings_about(Not(atom) if shut else atom, Subgoals(open={name: not shut}), name)
 
     def switches(self, name: str, *, on: bool) -> bool:
         """Whether it switches an object on, or off, that is not so yet."""
         atom = Atom(State.TOGGLED_ON.value, (name,))
-        return self._brings_about(atom if on else Not(atom), Errands((), (), {}, {name: on}, ()), name)
+        return self._brings_about(atom if on else Not(atom), Subgoals(on={name: on}), name)
 
     def exposes(self, thing: str, source: str, state: State) -> bool:
         """Whether the thing becomes hot, cooked or frozen at a source, and is not so yet."""
-        warming = Warming(thing, source, hot=state is not State.FROZEN)
-        return self._brings_about(
-            Atom(state.value, (thing,)), Errands((), (warming,), {}, {}, ()), thing, source
-        )
+        exposure = Exposure(thing, source, hot=state is not State.FROZEN)
+        return self._brings_about(Atom(state.value, (thing,)), Subgoals(exposures=(exposure,)), thing, source)
 
-    def _brings_about(self, goal: Formula, errands: Errands, *names: str) -> bool:
+    def _brings_about(self, goal: Formula, subgoals: Subgoals, *names: str) -> bool:
         simulator = self._simulator
-        return self._tries(render(goal), names, goal, lambda script: errands.run(script, simulator))
+        return self._tries(render(goal), names, goal, lambda script: subgoals.run(script, simulator))
 
     def _tries(
         self, deed: str, names: tuple[str, ...], goal: Formula | None, do: Callable[[PlanScript], None]
@@ -100,7 +94,7 @@ class Rehearsal:
         self, names: tuple[str, ...], goal: Formula | None, do: Callable[[PlanScript], None]
     ) -> bool:
         task = self._task_about(names)
-        script = PlanScript(self._simulator, task, SEED, GoalLiterals())
+        script = PlanScript(self._simulator, task, SEED)
         if goal is not None and evaluate(goal, self._simulator.facts, {}):
             return False
         try:

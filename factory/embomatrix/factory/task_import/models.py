@@ -11,7 +11,7 @@ from embomatrix.factory.scenes.view import is_liftable
 from embomatrix.factory.task_import.search import serves
 from embomatrix.factory.task_import.size_requirements import CavityFit, Demand, floor_needed_m2, room_for
 from embomatrix.sim.geometry.candidates import candidates, surfaces_for
-from embomatrix.sim.planner.ways import CANDIDATES, MIDDLE
+from embomatrix.sim.planner.subgoals import CANDIDATES, MIDDLE
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.state import Relation
 
