@@ -8,18 +8,28 @@ PIP_FLAGS := $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX),)
 BIN := $(VENV)/bin
 ARGS ?=
 
-.PHONY: run test test-slow lint types contracts proto proto-check check site diagrams compose-check pictures clean
+DEFAULT_TESTS := not slow and not docker and not hf and not eai and not peers
+
+.PHONY: run test test-unit test-slow test-random house lint types contracts proto proto-check check site diagrams compose-check pictures clean
 
 run: $(VENV)/.runtime
 	$(BIN)/embomatrix demo $(ARGS)
 
-# A process for each core, eight at most; a file's tests stay together, for they share what is costly. `ARGS=-n0` runs
-# all of them in one process, which prints what the tests print.
+# All default tests, one process per core and at most eight. Tests of one file share costly fixtures, so a file stays in one
+# process. `ARGS=-n0` runs everything in one process and shows what tests print.
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -n logical --maxprocesses=8 --dist=loadfile -m "not slow and not docker and not hf and not eai and not peers" $(ARGS)
+	$(BIN)/python -m pytest -n logical --maxprocesses=8 --dist=loadfile -m "$(DEFAULT_TESTS)" $(ARGS)
+
+# Tests without physics and without processes, in a minute.
+test-unit: $(VENV)/.dev
+	$(BIN)/python -m pytest tests/unit -n logical --maxprocesses=8 --dist=loadfile -m "$(DEFAULT_TESTS)" $(ARGS)
 
 test-slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -m "slow or hf or eai or peers" $(ARGS)
+
+# Property tests with new inputs in every run. `ARGS="-k lease"` narrows the search.
+test-random: $(VENV)/.dev
+	HYPOTHESIS_PROFILE=random $(BIN)/python -m pytest -n logical --maxprocesses=8 --dist=loadfile -m "hypothesis and not docker" $(ARGS)
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
@@ -38,6 +48,10 @@ proto-check: $(VENV)/.dev
 	proto/check.sh $(BIN)/buf
 
 check: lint types contracts proto-check
+
+# Figures of the code base: lines, modules per folder, import cycles, name clashes, banned docstring openings, unit-test time.
+house: $(VENV)/.dev
+	$(BIN)/python bench/house.py $(ARGS)
 
 # The documentation site, in build/site. `make site ARGS=serve` shows it while it is written.
 site: $(VENV)/.dev

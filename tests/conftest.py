@@ -1,6 +1,7 @@
-"""Make the repository's root importable: tests import their fakes as ``from tests.fakes.scenes import kitchen_scene``."""
+"""Settings shared by all tests: import path, profiles of the property tests, logging."""
 
 import logging
+import os
 import sys
 from pathlib import Path
 
@@ -11,14 +12,18 @@ ROOT = str(Path(__file__).resolve().parents[1])
 if ROOT not in sys.path:
     sys.path.insert(0, ROOT)
 
-# No test is timed: a busy machine that draws inputs slowly says nothing about the code.
-settings.register_profile("shared", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("shared")
+# The default suite draws the same inputs in every run: a red run then points at a change, never at luck. An input that
+# once failed is kept beside its test as an ``@example``. ``HYPOTHESIS_PROFILE=random`` searches anew (`make test-random`).
+# No profile has deadlines: a busy machine says nothing about the code.
+_UNTIMED = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
+settings.register_profile("default", derandomize=True, **_UNTIMED)
+settings.register_profile("random", derandomize=False, print_blob=True, **_UNTIMED)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 
 @pytest.fixture(autouse=True)
-def _logs_stay_with_their_test():
-    """A command that a test runs in this process says where logs go: what a later test reads shall not hold them."""
+def _remove_log_handlers():
+    """Remove the log handlers that a command installed, so that later tests don't read its lines."""
     yield
     root = logging.getLogger()
     for handler in root.handlers[:]:

@@ -5,8 +5,8 @@ from dataclasses import replace
 from tests.fakes.plans import plan_of
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.planner.oracle import find_plan
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import TaskRecord, write_dataset
@@ -22,7 +22,7 @@ def write_kitchen_dataset(folder):
     bundle = Bundle(scene, tasks)
     data = encode_bundle(bundle)
     digest = bundle_digest(data)
-    simulator = Simulator(bundle)
+    simulator = load_simulator(bundle)
     records = [
         TaskRecord(
             task,

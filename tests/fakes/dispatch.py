@@ -3,8 +3,8 @@
 from tests.fakes.worker import completed
 
 from embomatrix.manager.control.commands import DeliverResult, GiveLease
-from embomatrix.manager.control.dispatch.assignments import DispatchLimits
 from embomatrix.manager.control.dispatch.dispatcher import Dispatcher
+from embomatrix.manager.control.dispatch.state import DispatchLimits
 from embomatrix.manager.control.events import (
     BatchSubmitted,
     LeaseFinished,

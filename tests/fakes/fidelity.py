@@ -8,7 +8,7 @@ import time
 from typing import TYPE_CHECKING
 
 from embomatrix.sim.actions import CachedActor
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Skill
 from embomatrix.skills.view import refuse, target_of
@@ -17,6 +17,7 @@ from embomatrix.world.geometry import Pose
 if TYPE_CHECKING:
     import numpy as np
 
+    from embomatrix.sim.executor import Simulator
     from embomatrix.sim.live_world import LiveWorld
     from embomatrix.skills.syntax import SkillCall
     from embomatrix.skills.view import SkillRefusal
@@ -72,20 +73,20 @@ class RaisingActor(CachedActor):
 
 
 def clumsy(bundle: Bundle) -> Simulator:
-    return Simulator(bundle, actor=ClumsyActor())
+    return load_simulator(bundle, actor=ClumsyActor())
 
 
 def sloppy(bundle: Bundle) -> Simulator:
-    return Simulator(bundle, actor=SloppyActor())
+    return load_simulator(bundle, actor=SloppyActor())
 
 
 def dying(bundle: Bundle) -> Simulator:
-    return Simulator(bundle, actor=DyingActor())
+    return load_simulator(bundle, actor=DyingActor())
 
 
 def hanging(bundle: Bundle) -> Simulator:
-    return Simulator(bundle, actor=HangingActor())
+    return load_simulator(bundle, actor=HangingActor())
 
 
 def raising(bundle: Bundle) -> Simulator:
-    return Simulator(bundle, actor=RaisingActor())
+    return load_simulator(bundle, actor=RaisingActor())

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from tests.fakes import furniture as make
 from tests.fakes.scenes import kitchen_scene, placed, upright
 
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import parse_plan
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.evaluate import render
@@ -18,6 +18,7 @@ from embomatrix.world.task import Profile, Task, TaskCategory
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from embomatrix.sim.executor import Simulator
     from embomatrix.skills.syntax import Plan
     from embomatrix.skills.trace import Trace
     from embomatrix.world.asset import Asset
@@ -104,7 +105,7 @@ def executed(simulator: Simulator, text: str, goal: Formula = NOTHING, seed: int
 
 def executed_alone(scene: Scene, text: str) -> Trace:
     """Trace of a plan in words, in a simulator of its own."""
-    simulator = Simulator(Bundle(scene, {}))
+    simulator = load_simulator(Bundle(scene, {}))
     try:
         return executed(simulator, text)
     finally:

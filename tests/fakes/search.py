@@ -17,9 +17,9 @@ from tests.fakes import furniture as make
 from tests.fakes.plans import task_over, words_of
 from tests.fakes.scenes import NORTH, SOUTH, WEST, placed, scene_of, upright
 
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.placing.pose_cache import build_pose_cache
 from embomatrix.sim.planner.oracle import PROOF_SEEDS, PlanNotFound, find_plan
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.check import check
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
 from embomatrix.world.bundle import Bundle
@@ -30,6 +30,7 @@ from embomatrix.world.state import Relation, State
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from embomatrix.sim.executor import Simulator
     from embomatrix.sim.live_world import LiveWorld
     from embomatrix.skills.syntax import Plan
     from embomatrix.world.asset import Asset
@@ -140,7 +141,7 @@ def beside_atoms(scene: Scene) -> tuple[Atom, ...]:
 def small_scene(rng: np.random.Generator, number: int) -> Scene:
     """Four pieces of furniture and three small things in the flat, stirred by random calls."""
     scene = scene_of(f"small_{number}", _objects(rng))
-    with contextlib.closing(Simulator(Bundle(scene, {}))) as simulator:
+    with contextlib.closing(load_simulator(Bundle(scene, {}))) as simulator:
         task = task_over(scene)
         for _ in range(STIRRED):
             simulator.reset(task, SEED)
@@ -291,7 +292,7 @@ def compare(number: int, goals: int, limit: int, depth: int = 9) -> Comparison:
     scene = small_scene(rng, number)
     small = [item.name for item in scene.objects if not item.fixed]
     poses = build_pose_cache(scene, small, [item.name for item in scene.objects], seed=0)
-    with contextlib.closing(Simulator(Bundle(scene, {}, poses))) as simulator:
+    with contextlib.closing(load_simulator(Bundle(scene, {}, poses))) as simulator:
         task = task_over(scene)
         atoms = atoms_over(scene)
         pool = likely_atoms(simulator, task, (*atoms, *beside_atoms(scene)), rng)

@@ -22,9 +22,9 @@ from embomatrix.rpc.wire.values import (
     ResidentState,
     Rollout,
 )
-from embomatrix.sim.executor import Simulator
-from embomatrix.sim.floor.prepared import prepare
+from embomatrix.sim.live_world import prepare
 from embomatrix.sim.placing.pose_cache import build_pose_cache
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.sim.zygote import private_mb
 from embomatrix.skills.syntax import MAX_STEPS
 from embomatrix.worker.slots.pool import SlotPool
@@ -51,7 +51,7 @@ def kitchen():
     tasks = {task.task_id: task for task in kitchen_tasks(scene)}
     movable, supports = ("apple_1", "bowl_1", "mug_1"), ("countertop_1", "shelf_1", "coffee_table_1")
     bundle = Bundle(scene, tasks, build_pose_cache(scene, movable, supports, seed=0))
-    with contextlib.closing(Simulator(bundle)) as simulator:
+    with contextlib.closing(load_simulator(bundle)) as simulator:
         return prepare(bundle, simulator.world)
 
 
@@ -124,11 +124,11 @@ async def running(folder, bundle, slots=1):
 FRESH = """
 import sys
 from pathlib import Path
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import parse_plan
 from embomatrix.world.bundle import read_bundle
 bundle = read_bundle(Path(sys.argv[1]))
-simulator = Simulator(bundle)
+simulator = load_simulator(bundle)
 task = next(iter(bundle.tasks.values()))
 for text in sys.argv[2:]:
     print(simulator.execute(task, parse_plan(text), 1).digest)

@@ -15,8 +15,8 @@ from tests.fakes.two_judges import cause, names_of, with_ways
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.sources import read_eai
 from embomatrix.reward.hierarchy import score
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.syntax import PlaceRelation
 from embomatrix.trainer.eai.environment import install
 from embomatrix.trainer.eai.judge import NativeJudge
@@ -59,7 +59,7 @@ def judged(source, native, judge, base, library):
         deeds = from_eai(native.human, task.table, names, homes_of(bundle.scene, task.table))
     except UntoldError as error:
         return "no word", str(error)
-    with contextlib.closing(Simulator(bundle)) as simulator:
+    with contextlib.closing(load_simulator(bundle)) as simulator:
         trace = simulator.execute(task, with_ways(deeds), 0)
         ours = score(task, trace.touched, simulator.facts).success
     verdict = judge.judge(native.demo, native.human)

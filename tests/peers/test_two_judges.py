@@ -23,8 +23,8 @@ from tests.fakes.two_judges import (
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.sources import read_eai
 from embomatrix.reward.hierarchy import score
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import plan_from_json
 from embomatrix.trainer.eai.environment import install
 from embomatrix.trainer.eai.judge import NativeJudge
@@ -54,7 +54,7 @@ def compared(imported, found, native, judge):
     rows = [row for row, name in enumerate(table) if name in names]
     rng = np.random.default_rng(0)
     plans = [Mutant("whole", deeds), *(each for _ in range(ROUNDS) for each in mutants(deeds, rows, rng))]
-    with contextlib.closing(Simulator(decode_bundle(found.bundle))) as simulator:
+    with contextlib.closing(load_simulator(decode_bundle(found.bundle))) as simulator:
         for plan in plans:
             try:
                 steps = in_eai(plan.deeds, table, names)

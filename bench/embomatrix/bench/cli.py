@@ -52,9 +52,9 @@ from embomatrix.bench.report.figures import (
 from embomatrix.bench.report.output import console, errors, hand_in, refusals, write
 from embomatrix.bench.report.page import hand_parts, render_page
 from embomatrix.bench.trainer.cli import trainer
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.fidelity.report import report_on
 from embomatrix.sim.physical.actor import physical_simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.dataset import Dataset
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ FIDELITY_DATASET = Path("build/scenes")
 FIDELITY_OUT = Path("build/fidelity")
 PAGE = Path("docs/benchmarks.md")
 SPEEDUP = "skill_speedup_min"
-MODES = Modes(cached=Simulator, physical=physical_simulator)
+MODES = Modes(cached=load_simulator, physical=physical_simulator)
 
 app.command()(cluster)
 app.command()(operations)

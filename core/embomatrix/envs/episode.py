@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, Self
 
 from embomatrix.reward.hierarchy import score
 from embomatrix.reward.settings import PAPER
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.prompt import Codec, prompt_for, situation_of
 from embomatrix.skills.syntax import MAX_STEPS
 from embomatrix.world.dataset import Dataset
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from embomatrix.reward.breakdown import RewardBreakdown
     from embomatrix.reward.settings import RewardSettings
+    from embomatrix.sim.executor import Simulator
     from embomatrix.skills.prompt import Prompt, Situation
     from embomatrix.skills.syntax import Plan, SkillCall
     from embomatrix.skills.trace import Step, Trace
@@ -100,7 +101,7 @@ class Household:
         self,
         dataset: str | Path,
         reward: RewardSettings = PAPER,
-        simulate: Callable[[Bundle], Simulator] = Simulator,
+        simulate: Callable[[Bundle], Simulator] = load_simulator,
     ) -> None:
         self._dataset = Dataset.load(dataset)
         self._reward = reward

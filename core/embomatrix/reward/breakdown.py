@@ -1,4 +1,4 @@
-"""The three tiers of a rollout's reward, with what they were made of."""
+"""Three tiers of a rollout's reward and the atoms behind them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class AtomResult:
-    """One scored sub-goal: its text, and whether it holds in the final state."""
+    """One scored sub-goal: its text, and its truth in the final state."""
 
     text: str
     holds: bool
@@ -15,7 +15,7 @@ class AtomResult:
 
 @dataclass(frozen=True, slots=True)
 class RewardBreakdown:
-    """``total = format + relevance + goal``. ``success`` means that the whole formula holds."""
+    """Reward of one rollout: ``total = format + relevance + goal``. ``success``: the whole goal formula holds."""
 
     format: float
     relevance: float

@@ -1,4 +1,4 @@
-"""The hierarchical reward: format, relevance and goal, with the paper's constants as defaults."""
+"""Hierarchical reward: format, relevance and goal, with the paper's constants as defaults."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ if TYPE_CHECKING:
 def score(
     task: Task, touched: frozenset[str], facts: Facts, settings: RewardSettings = PAPER
 ) -> RewardBreakdown:
-    """Reward of an executed plan: ``touched`` names the objects on which a call succeeded, ``facts`` is the final state.
+    """Return the reward of an executed plan.
 
-    Raises GoalError when the goal quantifies over a type that the task does not list.
+    ``touched`` names the objects on which a call succeeded; ``facts`` is the final state. Raises GoalError if the goal
+    quantifies over a type that the task does not list.
     """
     relevant = len(task.goal_objects & touched)
     atoms = tuple(AtomResult(text, evaluate(atom, facts, task.types)) for atom, text in task.goal_atoms)
@@ -33,5 +34,5 @@ def score(
 
 
 def unparsable(settings: RewardSettings = PAPER) -> RewardBreakdown:
-    """Reward of a text in which no plan was found. It was never executed, so it has no atoms."""
+    """Return the reward of a text without a plan. It was never executed, so it has no atoms."""
     return RewardBreakdown(format=settings.unparsable, relevance=0.0, goal=0.0, atoms=(), success=False)

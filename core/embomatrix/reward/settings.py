@@ -1,4 +1,4 @@
-"""Coefficients of the three tiers. The defaults are the paper's; a run may ask for others."""
+"""Coefficients of the three reward tiers. The defaults are the paper's; a run may change them."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from typing import Final
 
 LARGEST: Final = 1e6
-"""Coefficients beyond this are taken for a mistake: rewards are compared to six decimal places."""
+"""Largest allowed coefficient: rewards are compared to six decimal places."""
 
 
 class RewardSettingsError(ValueError):
-    """``field`` names the coefficient, ``problem`` what is wrong with it and what is expected."""
+    """Raised for an invalid coefficient. ``problem`` states the value found and the value expected."""
 
     def __init__(self, field: str, problem: str) -> None:
         super().__init__(f"{field} {problem}")
@@ -22,17 +22,17 @@ class RewardSettingsError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class RewardSettings:
-    """Constants of the three tiers; a tier of 0 is left out. Raises RewardSettingsError for what is no reward."""
+    """Coefficients of the reward. A coefficient of 0 disables its tier. Raises RewardSettingsError for an invalid one."""
 
     unparsable: float = -1.0
-    """Whole reward of a text that is no plan."""
+    """Total reward of a text that is not a plan."""
     format: float = 0.5
-    """For a text that is a plan, whatever it does."""
+    """Reward of any text that is a plan."""
     relevance_per_object: float = 0.2
-    """For each object of the goal on which a skill call succeeded."""
+    """Reward for each goal object on which a skill call succeeded."""
     relevance_limit: float = 1.0
     goal: float = 30.0
-    """For a goal whose atoms all hold; each atom earns its equal share."""
+    """Reward of a goal whose atoms all hold. Each atom earns an equal share."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -47,7 +47,7 @@ class RewardSettings:
             raise RewardSettingsError(
                 "unparsable",
                 f"is {self.unparsable:g} and format {self.format:g}: "
-                f"a text that is no plan may not be paid more than a plan, lower it",
+                f"expected at most the reward of a plan; lower it",
             )
 
 

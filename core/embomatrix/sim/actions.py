@@ -6,10 +6,10 @@ import itertools
 import math
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.floor.barriers import no_way_for_arm, no_way_into, no_way_to, no_way_to_place
+from embomatrix.sim.blockers import no_way_for_arm, no_way_into, no_way_to, no_way_to_place
+from embomatrix.sim.household import clean, cut, soak
 from embomatrix.sim.joints.panels import Leaves
 from embomatrix.sim.joints.swings import SWING
-from embomatrix.sim.state.household import clean, cut, soak
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Skill
 from embomatrix.skills.view import metres, preposition, refuse, target_of

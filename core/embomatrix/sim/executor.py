@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
+
 from embomatrix.sim.actions import CachedActor
-from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.live_world import LiveWorld
-from embomatrix.sim.placing.draws import Draws
 from embomatrix.skills.check import check
 from embomatrix.skills.describe import ObjectDescription, done, final_lines, gained
 from embomatrix.skills.syntax import Skill
@@ -20,11 +20,9 @@ from embomatrix.world.substances import in_words
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence, Set
 
-    import numpy as np
-
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.state.facts import EngineFacts
-    from embomatrix.sim.state.thermal import Change
+    from embomatrix.sim.state.sources import Change
     from embomatrix.skills.syntax import Plan, SkillCall
     from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.bundle import Bundle
@@ -65,20 +63,41 @@ class Actor(Protocol):
         """Free what the actor holds. It can't be used afterwards."""
 
 
+class Draws:
+    """One generator for all steps. What it gives at a step depends on the seed and the step only."""
+
+    def __init__(self) -> None:
+        self._bits = np.random.PCG64(0)
+        self.generator = np.random.Generator(self._bits)
+
+    def go_to(self, seed: int, step: int) -> None:
+        """Put the generator at the start of a step's stream.
+
+        State and increment of PCG64 (O'Neill 2014) are the two halves of a hash; any state and any odd increment give a
+        full period.
+        """
+        digest = hashlib.sha256(f"{seed}:{step}".encode()).digest()
+        state, increment = (int.from_bytes(half, "little") for half in (digest[:16], digest[16:]))
+        self._bits.state = {
+            "bit_generator": "PCG64",
+            "state": {"state": state, "inc": increment | 1},
+            "has_uint32": 0,
+            "uinteger": 0,
+        }
+
+
 class Simulator:
     """A bundle's scene, loaded once and executed in many times. Not for use by several threads.
 
     ``execute`` runs a whole plan; ``reset`` and ``run_step`` run one call at a time.
     """
 
-    def __init__(
-        self, bundle: Bundle, engine: PhysicsEngine | None = None, actor: Actor | None = None
-    ) -> None:
-        """Load the scene, unless ``engine`` holds it already. Raises EngineError when it can't be loaded.
+    def __init__(self, bundle: Bundle, engine: PhysicsEngine, actor: Actor | None = None) -> None:
+        """``engine`` holds the bundle's scene; ``actor`` is the execution mode, cached by default.
 
-        ``actor`` is the execution mode, cached unless told otherwise. Engine and actor are closed with the simulator.
+        The simulator closes both.
         """
-        self._world = LiveWorld(bundle, engine if engine is not None else BulletEngine(bundle.scene))
+        self._world = LiveWorld(bundle, engine)
         self._tables = [task.table for task in bundle.tasks.values()]
         self._actor: Actor = actor if actor is not None else CachedActor()
         self._draws = Draws()
@@ -128,7 +147,7 @@ class Simulator:
             refusal = self._actor.act(world, call, self._draws.generator)
         if refusal is not None:
             self._hash.update(world.state_bytes() + refusal.reason.encode())
-            return Step(call, refusal.reason, refusal.sentence)
+            return Step(call, refusal.reason, refusal.sentence, refusal.blocker)
         changes = world.let_sources_act() if call.skill in CHANGING else ()
         self._touched.update(filter(None, (target_of(world, call), source_of(world, call))))
         self._hash.update(world.state_bytes())

@@ -3,35 +3,77 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from embomatrix.sim.floor.navigation import Navigator
-from embomatrix.sim.floor.prepared import PreparedScene
+from embomatrix.sim.floor.prepared import PreparedScene, prepared_arrays
 from embomatrix.sim.joints.swings import Swings
 from embomatrix.sim.placing.placement import Placer
-from embomatrix.sim.state.facts import EngineFacts
-from embomatrix.sim.state.hand import Hand
-from embomatrix.sim.state.news import News
+from embomatrix.sim.state.facts import EngineFacts, Symbols
 from embomatrix.sim.state.relations import Relations
-from embomatrix.sim.state.symbols import Symbols
-from embomatrix.sim.state.thermal import Thermal
-from embomatrix.sim.state.water import Water
-from embomatrix.skills.appliance import cold_source, heat_source
+from embomatrix.sim.state.sources import News, Thermal, Water
+from embomatrix.skills.appliances import cold_source, heat_source
 from embomatrix.skills.view import ObjectReach
 from embomatrix.world.state import State
 from embomatrix.world.substances import MEANINGS, facts_of
 
 if TYPE_CHECKING:
-    from collections.abc import Set
+    from collections.abc import Mapping, Sequence, Set
 
     from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.state.thermal import Change
+    from embomatrix.sim.state.sources import Change
     from embomatrix.world.asset import Asset
     from embomatrix.world.bundle import Bundle
+    from embomatrix.world.geometry import Pose
     from embomatrix.world.state import SubstanceFact
     from embomatrix.world.task import Task
 
 SYMBOLIC = frozenset(State) - {State.OPEN} - MEANINGS.keys()
+
+
+class Hand:
+    """Holds one object, with its contents at rest in it. Empty at first."""
+
+    def __init__(self, engine: PhysicsEngine) -> None:
+        self._engine = engine
+        self._pose_held_item: Mapping[str, Pose] = {}
+        self.carried: tuple[str, ...] = ()
+        """What the hand holds, then what lies in it; empty for an empty hand."""
+
+    @property
+    def offsets(self) -> Mapping[str, Pose]:
+        """Poses of what the hand holds, and of what lies in it, in the frame of what it holds."""
+        return self._pose_held_item
+
+    def forget(self) -> None:
+        """Be empty again, without putting anything anywhere: for a world that was reset."""
+        self._hold({})
+
+    def take(self, group: Sequence[str]) -> None:
+        """Take the first object of the group, with the others in it."""
+        back = self._engine.pose(group[0]).inverse()
+        self._hold({item: back @ self._engine.pose(item) for item in group})
+        for item in group:
+            self._engine.park(item)
+
+    def let_go(self, pose: Pose) -> bool:
+        """Stand what is held at a pose, with what lies in it. False, and nothing changed, when the contents do not fit."""
+        held, *contents = self.carried
+        for item in contents:
+            self._engine.set_pose(item, pose @ self._pose_held_item[item])
+        # Set as it was found, not multiplied by its own identity: the placer's pose holds to the last bit.
+        self._engine.set_pose(held, pose)
+        group = frozenset(self.carried)
+        if any(self._engine.penetrates(item, ignore=group) for item in contents):
+            for item in group:
+                self._engine.park(item)
+            return False
+        self._hold({})
+        return True
+
+    def _hold(self, offsets: Mapping[str, Pose]) -> None:
+        self._pose_held_item, self.carried = offsets, tuple(offsets)
 
 
 class LiveWorld:
@@ -170,3 +212,11 @@ class LiveWorld:
         for item in self.scene.objects:
             self.states[item.name] = set(item.states & SYMBOLIC)
             self.substances[item.name] = set(facts_of(item.states, item.substances))
+
+
+def prepare(bundle: Bundle, world: LiveWorld) -> Bundle:
+    """Bundle with the arrays that the simulator derives from its scene. ``world`` holds that scene and is reset."""
+    world.engine.reset()
+    obstacles, grid = world.navigator.ground.at_start
+    arrays = prepared_arrays(world.engine, obstacles, grid)
+    return replace(bundle, prepared=arrays) if arrays else bundle

@@ -9,7 +9,8 @@ import numpy as np
 
 from embomatrix.sim.engine import FLOOR, WALL, EngineError
 from embomatrix.world.geometry import Shape
-from embomatrix.world.tables import MAX_VERTICES, has_volume
+from embomatrix.world.records import MAX_VERTICES
+from embomatrix.world.tables import has_volume
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

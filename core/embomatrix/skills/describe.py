@@ -1,4 +1,4 @@
-"""The simulator's observations in words: what a step did, and how things stand at the end."""
+"""Observations in words: the effect of a step, and the final state of objects."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from embomatrix.skills.syntax import SkillCall
 
 MAX_FINAL_LINES: Final = 24
-"""Objects of the final description at most: more do not fit a prompt."""
+"""Largest number of objects in a final description: more do not fit a prompt."""
 
 DONE: Final[Mapping[Skill, str]] = {
     Skill.MOVE: "stands at {target}",
@@ -33,9 +33,9 @@ DONE: Final[Mapping[Skill, str]] = {
     Skill.GO_TO_ROOM: "stands in {room}",
     Skill.SLICE: "sliced {target}",
     Skill.CLEAN: "cleaned {target}",
-    Skill.SOAK: "held {target} under what flows",
+    Skill.SOAK: "held {target} under the running liquid",
 }
-"""What a call that succeeded says. One sentence for each skill."""
+"""Message of a successful call of each skill."""
 
 WORDS: Final[Mapping[Relation, str]] = {
     Relation.ONTOP: "on",
@@ -45,14 +45,14 @@ WORDS: Final[Mapping[Relation, str]] = {
     Relation.TOUCHING: "touching",
     Relation.INROOM: "in",
 }
-"""Relations as prepositions."""
+"""Preposition of each relation."""
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectDescription:
-    """One object as it is described: where it is, and ``states`` in words in the order in which they are told.
+    """Facts about one object for its description: its place, and its ``states`` in words, in order.
 
-    ``gone`` is True for what is not in the world: a piece that is still to come, or a thing that was cut up.
+    ``gone`` is True for an object that is not in the world: a future piece, or an object that was cut up.
     """
 
     name: str
@@ -65,7 +65,7 @@ class ObjectDescription:
 
 
 def done(call: SkillCall, *, target: str = "", held: str = "", cargo: Sequence[str] = ()) -> str:
-    """What the call did. ``held`` is what the hand held before it, ``cargo`` what lies in the object picked up."""
+    """Return the message of a successful call. ``held`` was in the hand before it; ``cargo`` are the contents of the target."""
     return DONE[call.skill].format(
         target=target,
         held=held,
@@ -78,12 +78,12 @@ def done(call: SkillCall, *, target: str = "", held: str = "", cargo: Sequence[s
 
 
 def gained(changes: Mapping[str, Sequence[str]]) -> str:
-    """What heat, cold and water did: objects and the states that they got; "" when they did nothing."""
+    """Return a message about objects and the states that heat, cold or water gave them; "" for no change."""
     return "; ".join(f"{name} is now {listed(states)}" for name, states in changes.items())
 
 
 def line(sight: ObjectDescription) -> str:
-    """One object on one line: ``apple_1: on table_1 in kitchen_0, hot``."""
+    """Describe one object on one line: ``apple_1: on table_1 in kitchen_0, hot``."""
     if sight.gone:
         return f"{sight.name}: not there"
     if sight.held:
@@ -96,14 +96,14 @@ def line(sight: ObjectDescription) -> str:
 
 
 def final_lines(sights: Sequence[ObjectDescription]) -> tuple[str, ...]:
-    """The first objects, one a line, and how many more there are."""
+    """Describe the first objects, one a line, and add the number of those left out."""
     lines = tuple(line(sight) for sight in sights[:MAX_FINAL_LINES])
     left = len(sights) - len(lines)
     return (*lines, f"and {left} more objects") if left > 0 else lines
 
 
 def call_in_words(call: SkillCall, table: Sequence[str]) -> str:
-    """The call with the objects' names in place of their indices; indices outside the table stay numbers."""
+    """Format a call with object names in place of indices. Indices outside the table stay numbers."""
     words = [call.skill.value]
     for arg in SIGNATURES[call.skill]:
         value = getattr(call, arg.value)
@@ -115,5 +115,5 @@ def call_in_words(call: SkillCall, table: Sequence[str]) -> str:
 
 
 def listed(words: Sequence[str]) -> str:
-    """Words as a list in a sentence: ``a, b and c``."""
+    """Join words as a list in a sentence: ``a, b and c``."""
     return " and ".join(filter(None, [", ".join(words[:-1]), words[-1]])) if words else "nothing"

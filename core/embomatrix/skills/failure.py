@@ -1,4 +1,4 @@
-"""Why a step failed: a closed set, each with a sentence that a person can act on."""
+"""Failure reasons of steps: a closed set, with a message template that names the remedy for each."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ if TYPE_CHECKING:
 
 
 class FailureReason(StrEnum):
+    """Reason of a failed step. The values travel on the wire."""
+
     UNKNOWN_INDEX = "unknown_index"
     NOT_THERE = "not_there"
     UNKNOWN_ROOM = "unknown_room"
@@ -67,11 +69,11 @@ class FailureReason(StrEnum):
 
 SENTENCES: Final[Mapping[FailureReason, str]] = {
     FailureReason.UNKNOWN_INDEX: "there is no object with index {index}: the table has indices 0 to {last}",
-    FailureReason.NOT_THERE: "{target} is not there: it was cut up, or comes only when something else is",
+    FailureReason.NOT_THERE: "{target} is not in the scene: it was cut up, or it appears only when another object is sliced",
     FailureReason.UNKNOWN_ROOM: "there is no room {room}: the rooms are {rooms}",
-    FailureReason.NO_PATH: "the robot can't get to {target}: {other} bars the way",
+    FailureReason.NO_PATH: "the robot can't get to {target}: {other} blocks the way",
     FailureReason.NO_STANDING_POSE: "there is no free place to stand from which {target} can be reached: {other} is in the way",
-    FailureReason.BLOCKED: "something stands in the way {distance} m ahead: turn, or go less far",
+    FailureReason.BLOCKED: "an obstacle is {distance} m ahead: turn, or drive a shorter distance",
     FailureReason.STEP_TOO_LONG: "{distance} m is too far for one step: expected at most {limit} m",
     FailureReason.OUT_OF_REACH: "{target} is {distance} m away and the arm reaches {limit} m: move to it first",
     FailureReason.TOO_HIGH: "{target} is {height} m above the floor and the arm reaches up to {limit} m",
@@ -93,7 +95,7 @@ SENTENCES: Final[Mapping[FailureReason, str]] = {
     FailureReason.ALREADY_OFF: "{target} is off already",
     FailureReason.MUST_BE_CLOSED: "{target} starts only when it is closed: close it first",
     FailureReason.NO_SURFACE: "nothing can be placed {relation} {target}: it has no such surface",
-    FailureReason.NO_CAVITY: "nothing can be placed inside {target}: it has no cavity that {held} fits",
+    FailureReason.NO_CAVITY: "nothing can be placed inside {target}: it has no cavity that fits {held}",
     FailureReason.NO_FREE_POSE: "there is no free place for {held} {relation} {target} within reach",
     FailureReason.PLACE_ON_ITSELF: "{held} can't be placed {relation} itself",
     FailureReason.NOT_A_HEAT_SOURCE: "{source} is not a heat source",
@@ -107,16 +109,16 @@ SENTENCES: Final[Mapping[FailureReason, str]] = {
     FailureReason.NOT_HOT_ENOUGH: "{source} reaches {found} C and {target} needs {needed} C",
     FailureReason.NOT_COLD_ENOUGH: "{source} reaches {found} C and {target} needs {needed} C",
     FailureReason.TOOL_NOT_HELD: "{source} is not in the hand: pick it up first",
-    FailureReason.NOT_A_SLICER: "{source} does not cut: expected a knife or the like",
+    FailureReason.NOT_A_SLICER: "{source} is no cutting tool: expected a knife or the like",
     FailureReason.NOT_SLICEABLE: "{target} can't be sliced",
     FailureReason.ALREADY_SLICED: "{target} is sliced already",
-    FailureReason.NOT_A_CLEANER: "{source} takes nothing off other things: expected a cloth, a brush, a sink or the like",
-    FailureReason.NEEDS_SOAKING: "{source} takes {substance} off only when it is soaked with {needed}",
-    FailureReason.STAYS_ON: "{source} does not take {substance} off {target}",
-    FailureReason.GIVES_NO_LIQUID: "{source} gives no liquid to soak things with",
-    FailureReason.NOT_SOAKABLE: "{target} does not take up a liquid",
+    FailureReason.NOT_A_CLEANER: "{source} is no cleaning tool: expected a cloth, a brush, a sink or the like",
+    FailureReason.NEEDS_SOAKING: "{source} removes {substance} only when it is soaked with {needed}",
+    FailureReason.STAYS_ON: "{source} does not remove {substance} from {target}",
+    FailureReason.GIVES_NO_LIQUID: "{source} gives no liquid",
+    FailureReason.NOT_SOAKABLE: "{target} does not absorb or hold a liquid",
     FailureReason.COLLIDED: "the robot ran into {other} and stopped",
-    FailureReason.ARM_BLOCKED: "the arm finds no free way to {target}: {other} bars it",
+    FailureReason.ARM_BLOCKED: "the arm finds no free path to {target}: {other} blocks it",
     FailureReason.SLIPPED: "{target} slipped out of the hand",
     FailureReason.FELL: "{held} did not stay {relation} {target}",
 }

@@ -1,7 +1,7 @@
-"""The skill library as one table: what each skill does, what must hold before it, what may still stop it.
+"""Skill library: the preconditions, effect and possible failures of each skill in one table.
 
-Angles are relative and in radians, counter-clockwise seen from above: ``turn`` adds to the heading, ``move_forward`` turns
-first and then drives straight on. A skill that fails changes nothing.
+Angles are relative, in radians, counter-clockwise seen from above. ``turn`` adds to the heading; ``move_forward`` turns first
+and then drives straight. A failed skill changes nothing.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ if TYPE_CHECKING:
 
 
 class Precondition(StrEnum):
-    """What a skill asks of the world before it starts. *Target* is the call's object, *source* its source."""
+    """Condition that a skill needs before it starts. *Target* is the call's object, *source* its source."""
 
     OBJECT_LISTED = "the target is a row of the object table, and in the world"
     SOURCE_LISTED = "the source is a row of the object table, and in the world"
     ROOM_KNOWN = "the scene has the room"
-    STEP_SHORT = "the distance is one that can be driven in one step"
-    NOT_CARRIED = "the target is not in the hand, nor in what the hand holds"
+    STEP_SHORT = "the distance is short enough for one step"
+    NOT_CARRIED = "the target is neither in the hand nor inside the held object"
     HAND_FREE = "the hand is empty"
     HAND_HOLDS = "the hand holds something"
-    NOT_ITSELF = "the target is neither what the hand holds nor in it"
+    NOT_ITSELF = "the target is neither the held object nor inside it"
     PORTABLE = "the target is not fixed"
-    LIGHT_ENOUGH = "the target, with what lies in it, is light enough to lift"
-    SMALL_ENOUGH = "the gripper can take the target"
+    LIGHT_ENOUGH = "the target with its contents is light enough to lift"
+    SMALL_ENOUGH = "the target fits the gripper"
     BEARS_NOTHING = "nothing rests on the target"
     IN_REACH = "the arm reaches the target from where the robot stands"
     APPROACHABLE = "no wall and no furniture lies between the robot and the target"
@@ -38,13 +38,13 @@ class Precondition(StrEnum):
     OPENABLE = "the target has a door, a drawer or a lid"
     IS_CLOSED = "the target is closed"
     IS_OPEN = "the target is open"
-    NOT_RUNNING = "the target does not run, if it runs only when closed"
+    NOT_RUNNING = "the target is not running, if it runs only when closed"
     TOGGLEABLE = "the target has a switch"
     IS_OFF = "the target is off"
     IS_ON = "the target is on"
     CLOSED_TO_START = "the target is closed, if it starts only when closed"
-    HAS_CAVITY = "the target has a cavity, if something is to go inside"
-    OPENED_FOR = "the target is open, if something is to go inside"
+    HAS_CAVITY = "the target has a cavity, if the object goes inside"
+    OPENED_FOR = "the target is open, if the object goes inside"
     SOURCE_HEATS = "the source is a heat source"
     SOURCE_COOLS = "the source is a cold source"
     HEATABLE = "the target can be heated"
@@ -52,96 +52,36 @@ class Precondition(StrEnum):
     FREEZABLE = "the target can be frozen"
     SOURCE_IN_REACH = "the arm reaches the source from where the robot stands"
     SOURCE_APPROACHABLE = "no wall and no furniture lies between the robot and the source"
-    AT_SOURCE = "the target is in the source, or on it, as the source asks"
+    AT_SOURCE = "the target is inside or on the source, as the source requires"
     SOURCE_ON = "the source is on, if it works only when on"
     SOURCE_CLOSED = "the source is closed, if it works only when closed"
-    HOT_ENOUGH = "the source is hot enough to make things hot"
+    HOT_ENOUGH = "the source is hot enough to make objects hot"
     COOKS = "the source is hot enough to cook the target"
     COLD_ENOUGH = "the source is cold enough to freeze"
-    SOURCE_CUTS = "the source is something to cut with"
+    SOURCE_CUTS = "the source is a cutting tool"
     SLICEABLE = "the target can be sliced"
     NOT_SLICED = "the target is not sliced"
-    SOURCE_HELD = "the source is what the hand holds, unless it washes what lies in it"
-    SOURCE_CLEANS = "the source takes substances off other things, or holds a liquid that may"
-    WORKED_ON = "the arm reaches the target, and no closed container is around it, unless it is washed"
-    WASHED = "the target lies in the source, which runs and is closed if it must be, if the source washes"
-    COMES_OFF = "the source takes off something of what is on the target, soaked or on if it must be"
-    SOURCE_WETS = "the source holds a liquid, or one flows out of it"
-    SOAKABLE = "the target takes up liquids, or holds them"
+    SOURCE_HELD = "the hand holds the source, unless the source washes its contents"
+    SOURCE_CLEANS = "the source removes substances from objects, or holds a liquid that may do so"
+    WORKED_ON = "the arm reaches the target and no closed container is around it, unless the source washes it"
+    WASHED = (
+        "the target lies in the source, which is on, and closed if it must be; applies to sources that wash"
+    )
+    COMES_OFF = "the source removes a substance that covers the target, and is soaked or on if that is needed"
+    SOURCE_WETS = "the source holds a liquid, or a liquid flows out of it"
+    SOAKABLE = "the target absorbs or holds liquids"
     SOURCE_ACCESSIBLE = "no closed container is around the source"
     UNDER_SOURCE = "the target is in the hand, or in the source"
     SOURCE_FLOWS = "the source is on, if it holds no liquid"
 
 
-REASONS: Final[Mapping[Precondition, tuple[FailureReason, ...]]] = {
-    Precondition.OBJECT_LISTED: (FailureReason.UNKNOWN_INDEX, FailureReason.NOT_THERE),
-    Precondition.SOURCE_LISTED: (FailureReason.UNKNOWN_INDEX, FailureReason.NOT_THERE),
-    Precondition.ROOM_KNOWN: (FailureReason.UNKNOWN_ROOM,),
-    Precondition.STEP_SHORT: (FailureReason.STEP_TOO_LONG,),
-    Precondition.NOT_CARRIED: (FailureReason.HAND_FULL,),
-    Precondition.HAND_FREE: (FailureReason.HAND_FULL,),
-    Precondition.HAND_HOLDS: (FailureReason.HAND_EMPTY,),
-    Precondition.NOT_ITSELF: (FailureReason.PLACE_ON_ITSELF,),
-    Precondition.PORTABLE: (FailureReason.NOT_PORTABLE,),
-    Precondition.LIGHT_ENOUGH: (FailureReason.TOO_HEAVY,),
-    Precondition.SMALL_ENOUGH: (FailureReason.TOO_LARGE,),
-    Precondition.BEARS_NOTHING: (FailureReason.SUPPORTS_OTHERS,),
-    Precondition.IN_REACH: (FailureReason.OUT_OF_REACH, FailureReason.TOO_HIGH),
-    Precondition.APPROACHABLE: (FailureReason.NO_LINE_OF_APPROACH,),
-    Precondition.ACCESSIBLE: (FailureReason.CONTAINER_CLOSED,),
-    Precondition.OPENABLE: (FailureReason.NOT_OPENABLE,),
-    Precondition.IS_CLOSED: (FailureReason.ALREADY_OPEN,),
-    Precondition.IS_OPEN: (FailureReason.ALREADY_CLOSED,),
-    Precondition.NOT_RUNNING: (FailureReason.OPENED_WHILE_ON,),
-    Precondition.TOGGLEABLE: (FailureReason.NOT_TOGGLEABLE,),
-    Precondition.IS_OFF: (FailureReason.ALREADY_ON,),
-    Precondition.IS_ON: (FailureReason.ALREADY_OFF,),
-    Precondition.CLOSED_TO_START: (FailureReason.MUST_BE_CLOSED,),
-    Precondition.HAS_CAVITY: (FailureReason.NO_CAVITY,),
-    Precondition.OPENED_FOR: (FailureReason.CONTAINER_CLOSED,),
-    Precondition.SOURCE_HEATS: (FailureReason.NOT_A_HEAT_SOURCE,),
-    Precondition.SOURCE_COOLS: (FailureReason.NOT_A_COLD_SOURCE,),
-    Precondition.HEATABLE: (FailureReason.NOT_HEATABLE,),
-    Precondition.COOKABLE: (FailureReason.NOT_COOKABLE,),
-    Precondition.FREEZABLE: (FailureReason.NOT_FREEZABLE,),
-    Precondition.SOURCE_IN_REACH: (FailureReason.OUT_OF_REACH, FailureReason.TOO_HIGH),
-    Precondition.SOURCE_APPROACHABLE: (FailureReason.NO_LINE_OF_APPROACH,),
-    Precondition.AT_SOURCE: (FailureReason.NOT_AT_SOURCE,),
-    Precondition.SOURCE_ON: (FailureReason.SOURCE_OFF,),
-    Precondition.SOURCE_CLOSED: (FailureReason.SOURCE_OPEN,),
-    Precondition.HOT_ENOUGH: (FailureReason.NOT_HOT_ENOUGH,),
-    Precondition.COOKS: (FailureReason.NOT_HOT_ENOUGH,),
-    Precondition.COLD_ENOUGH: (FailureReason.NOT_COLD_ENOUGH,),
-    Precondition.SOURCE_CUTS: (FailureReason.NOT_A_SLICER,),
-    Precondition.SLICEABLE: (FailureReason.NOT_SLICEABLE,),
-    Precondition.NOT_SLICED: (FailureReason.ALREADY_SLICED,),
-    Precondition.SOURCE_HELD: (FailureReason.TOOL_NOT_HELD,),
-    Precondition.SOURCE_CLEANS: (FailureReason.NOT_A_CLEANER,),
-    Precondition.WORKED_ON: (
-        FailureReason.OUT_OF_REACH,
-        FailureReason.TOO_HIGH,
-        FailureReason.NO_LINE_OF_APPROACH,
-        FailureReason.CONTAINER_CLOSED,
-    ),
-    Precondition.WASHED: (FailureReason.NOT_AT_SOURCE, FailureReason.SOURCE_OFF, FailureReason.SOURCE_OPEN),
-    Precondition.COMES_OFF: (FailureReason.NEEDS_SOAKING, FailureReason.SOURCE_OFF, FailureReason.STAYS_ON),
-    Precondition.SOURCE_WETS: (FailureReason.GIVES_NO_LIQUID,),
-    Precondition.SOAKABLE: (FailureReason.NOT_SOAKABLE,),
-    Precondition.SOURCE_ACCESSIBLE: (FailureReason.CONTAINER_CLOSED,),
-    Precondition.UNDER_SOURCE: (FailureReason.NOT_AT_SOURCE,),
-    Precondition.SOURCE_FLOWS: (FailureReason.SOURCE_OFF,),
-}
-"""Reasons with which a call fails when the precondition does not hold."""
-
-
 @dataclass(frozen=True, slots=True)
-class Entry:
-    """One skill. ``preconditions`` are checked in order, the first that does not hold is the reason of the failure.
+class SkillDefinition:
+    """Definition of one skill. ``preconditions`` are checked in this order; the first that fails gives the reason.
 
-    ``effect`` says what a success changes; ``outcomes`` are reasons that show only when the skill is carried out.
+    ``effect`` states the change after a success. ``outcomes`` are reasons that appear only during execution.
     """
 
-    doc: str
     effect: str
     preconditions: tuple[Precondition, ...]
     outcomes: tuple[FailureReason, ...] = ()
@@ -156,21 +96,18 @@ _SOURCE_AT_HAND: Final = (
     Precondition.SOURCE_CLOSED,
 )
 
-LIBRARY: Final[Mapping[Skill, Entry]] = {
-    Skill.MOVE: Entry(
-        "Drive to a place from which the object can be reached.",
+LIBRARY: Final[Mapping[Skill, SkillDefinition]] = {
+    Skill.MOVE: SkillDefinition(
         "the robot stands beside the object and faces it",
         (Precondition.OBJECT_LISTED, Precondition.NOT_CARRIED),
         (FailureReason.NO_STANDING_POSE, FailureReason.NO_PATH),
     ),
-    Skill.TURN: Entry(
-        "Turn on the spot by an angle in radians, counter-clockwise, relative to the present heading.",
+    Skill.TURN: SkillDefinition(
         "the heading grows by the angle",
         (),
     ),
-    Skill.PICK_UP: Entry(
-        "Take the object into the empty hand, with whatever lies in it.",
-        "the hand holds the object, which is in no relation any more",
+    Skill.PICK_UP: SkillDefinition(
+        "the hand holds the object, and its relations end",
         (
             Precondition.OBJECT_LISTED,
             Precondition.HAND_FREE,
@@ -182,9 +119,8 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
         ),
         (FailureReason.ARM_BLOCKED,),
     ),
-    Skill.PLACE: Entry(
-        "Put what the hand holds on top of, inside or under the object.",
-        "what the hand held stands in the relation to the object, and the hand is empty",
+    Skill.PLACE: SkillDefinition(
+        "the held object is in the relation to the object, and the hand is empty",
         (
             Precondition.OBJECT_LISTED,
             Precondition.HAND_HOLDS,
@@ -195,15 +131,12 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
         ),
         (FailureReason.NO_FREE_POSE, FailureReason.NO_SURFACE, FailureReason.NO_CAVITY),
     ),
-    Skill.MOVE_FORWARD: Entry(
-        "Turn by an angle in radians relative to the present heading, then drive straight on for a distance in metres; "
-        "a negative distance drives backwards.",
-        "the heading grows by the angle and the robot stands further along it",
+    Skill.MOVE_FORWARD: SkillDefinition(
+        "the heading grows by the angle, and the robot stands further along it",
         (Precondition.STEP_SHORT,),
         (FailureReason.BLOCKED,),
     ),
-    Skill.OPEN: Entry(
-        "Open every door, drawer or lid of the object with the empty hand.",
+    Skill.OPEN: SkillDefinition(
         "the object is open",
         (
             Precondition.OBJECT_LISTED,
@@ -215,8 +148,7 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
         ),
         (FailureReason.DOOR_BLOCKED, FailureReason.ARM_BLOCKED),
     ),
-    Skill.CLOSE: Entry(
-        "Close every door, drawer or lid of the object with the empty hand.",
+    Skill.CLOSE: SkillDefinition(
         "the object is closed",
         (
             Precondition.OBJECT_LISTED,
@@ -227,8 +159,7 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
         ),
         (FailureReason.DOOR_BLOCKED, FailureReason.ARM_BLOCKED),
     ),
-    Skill.TOGGLE_ON: Entry(
-        "Switch the object on with the empty hand.",
+    Skill.TOGGLE_ON: SkillDefinition(
         "the object is on",
         (
             Precondition.OBJECT_LISTED,
@@ -240,8 +171,7 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
         ),
         (FailureReason.ARM_BLOCKED,),
     ),
-    Skill.TOGGLE_OFF: Entry(
-        "Switch the object off with the empty hand.",
+    Skill.TOGGLE_OFF: SkillDefinition(
         "the object is off",
         (
             Precondition.OBJECT_LISTED,
@@ -252,8 +182,7 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
         ),
         (FailureReason.ARM_BLOCKED,),
     ),
-    Skill.HEAT: Entry(
-        "Wait beside a working heat source until the object at it is hot.",
+    Skill.HEAT: SkillDefinition(
         "the object is hot, and no longer frozen",
         (
             Precondition.OBJECT_LISTED,
@@ -264,8 +193,7 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
             Precondition.HOT_ENOUGH,
         ),
     ),
-    Skill.COOK: Entry(
-        "Wait beside a working heat source until the food at it is cooked.",
+    Skill.COOK: SkillDefinition(
         "the food is cooked and hot",
         (
             Precondition.OBJECT_LISTED,
@@ -276,8 +204,7 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
             Precondition.COOKS,
         ),
     ),
-    Skill.FREEZE: Entry(
-        "Wait beside a working cold source until the object at it is frozen.",
+    Skill.FREEZE: SkillDefinition(
         "the object is frozen, and no longer hot",
         (
             Precondition.OBJECT_LISTED,
@@ -288,15 +215,13 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
             Precondition.COLD_ENOUGH,
         ),
     ),
-    Skill.GO_TO_ROOM: Entry(
-        "Drive through the doors to a free spot of the room.",
+    Skill.GO_TO_ROOM: SkillDefinition(
         "the robot stands in the room",
         (Precondition.ROOM_KNOWN,),
         (FailureReason.NO_PATH,),
     ),
-    Skill.SLICE: Entry(
-        "Cut the object with the knife in the hand.",
-        "the object is sliced; if it has pieces, these lie where it was and it is gone",
+    Skill.SLICE: SkillDefinition(
+        "the object is sliced; if it has pieces, they replace it",
         (
             Precondition.OBJECT_LISTED,
             Precondition.SOURCE_LISTED,
@@ -310,9 +235,8 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
         ),
         (FailureReason.NO_FREE_POSE,),
     ),
-    Skill.CLEAN: Entry(
-        "Wipe or brush the object with the tool in the hand, or wait while it is washed in a sink or a machine.",
-        "what the tool takes off is no longer on the object",
+    Skill.CLEAN: SkillDefinition(
+        "the substances that the tool removes are off the object",
         (
             Precondition.OBJECT_LISTED,
             Precondition.SOURCE_LISTED,
@@ -326,9 +250,8 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
             Precondition.COMES_OFF,
         ),
     ),
-    Skill.SOAK: Entry(
-        "Let the liquid of the source run over the object, which is in the hand or in the source.",
-        "a cloth is soaked with what the source gives, a vessel filled with it",
+    Skill.SOAK: SkillDefinition(
+        "a cloth is soaked with the liquid of the source; a vessel is filled with it",
         (
             Precondition.OBJECT_LISTED,
             Precondition.SOURCE_LISTED,
@@ -342,33 +265,3 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
         ),
     ),
 }
-
-
-_AT_WORK: Final = (FailureReason.COLLIDED, FailureReason.ARM_BLOCKED)
-
-MISHAPS: Final[Mapping[Skill, tuple[FailureReason, ...]]] = {
-    Skill.MOVE: (FailureReason.COLLIDED, FailureReason.SLIPPED),
-    Skill.TURN: (FailureReason.COLLIDED, FailureReason.SLIPPED),
-    Skill.PICK_UP: (*_AT_WORK, FailureReason.SLIPPED),
-    Skill.PLACE: (*_AT_WORK, FailureReason.SLIPPED, FailureReason.FELL),
-    Skill.MOVE_FORWARD: (FailureReason.COLLIDED, FailureReason.SLIPPED),
-    Skill.OPEN: _AT_WORK,
-    Skill.CLOSE: _AT_WORK,
-    Skill.TOGGLE_ON: _AT_WORK,
-    Skill.TOGGLE_OFF: _AT_WORK,
-    Skill.HEAT: (),
-    Skill.COOK: (),
-    Skill.FREEZE: (),
-    Skill.GO_TO_ROOM: (FailureReason.COLLIDED, FailureReason.SLIPPED),
-    Skill.SLICE: _AT_WORK,
-    Skill.CLEAN: _AT_WORK,
-    Skill.SOAK: _AT_WORK,
-}
-"""What else stops a skill when a robot really carries it out; cached mode gives what was foreseen of it."""
-
-
-def reasons_of(skill: Skill) -> frozenset[FailureReason]:
-    """Every reason with which a call of the skill can fail."""
-    entry = LIBRARY[skill]
-    foreseen = frozenset(reason for item in entry.preconditions for reason in REASONS[item])
-    return foreseen | frozenset(entry.outcomes) | frozenset(MISHAPS[skill])

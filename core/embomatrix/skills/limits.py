@@ -1,4 +1,4 @@
-"""What the robot can do: one table, kept by both execution modes."""
+"""Limits of the robot: one table for both execution modes."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from typing import Final
 
 @dataclass(frozen=True, slots=True)
 class RobotLimits:
-    """A mobile manipulator on a round holonomic base with a lifting torso and one arm."""
+    """Limits of a mobile manipulator with a round holonomic base, a lifting torso and one arm."""
 
     radius_m: float = 0.27
-    """Radius of the base: the free disc that it needs on the floor."""
+    """Radius of the base, and of the free disc that it needs on the floor."""
     height_m: float = 1.4
-    """Obstacles whose underside is higher than this don't bar the way."""
+    """Obstacles whose underside is higher than this do not block the robot."""
     shoulder_m: float = 0.35
-    """A standing pose is at least this far from the nearest edge of what it serves, measured from the base's centre."""
+    """Least distance of a standing pose, at the centre of the base, from the nearest edge of the object that it serves."""
     reach_m: float = 1.10
-    """Horizontal distance from the base's centre to the nearest point of what is grasped, pressed or pulled."""
+    """Largest horizontal distance from the centre of the base to the nearest point of the object in use."""
     reach_high_m: float = 2.0
     reach_low_m: float = 0.0
-    """Heights between which the gripper works."""
+    """Highest and lowest working height of the gripper."""
     mass_kg: float = 8.0
     grip_m: float = 0.30
-    """The smallest extent of a thing that can be picked up is at most this."""
+    """Largest allowed smallest extent of a portable object."""
     extent_m: float = 0.90
-    """No extent of a thing that can be picked up is larger."""
+    """Largest allowed extent of a portable object."""
     max_step_m: float = 5.0
-    """The longest ``move_forward``."""
+    """Longest ``move_forward``."""
 
 
 ROBOT: Final = RobotLimits()

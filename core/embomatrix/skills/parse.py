@@ -1,9 +1,9 @@
-"""From a model's text to a plan, and back. Text is data: nothing of it is ever evaluated.
+"""Parser and writer of plans in a model's text. Text is data and is never evaluated.
 
-Two forms are read. JSON: an array of calls, or an object that holds one under "action_sequence" or "plan", in a code fence
-or among prose and reasoning; arguments stand beside the action or under "parameters". The last plan of the text counts:
-a model reasons first and answers last. Compact: one call on a line, or between semicolons, ``move 3; place 3 inside``,
-arguments in the order of ``SIGNATURES``. A skill outside the task's profile is as unknown as one that does not exist.
+The parser accepts two forms. JSON: an array of calls, or an object that holds one under "action_sequence" or "plan", in a
+code fence or among prose. Arguments stand beside the action or under "parameters". The last plan of the text counts, because
+a model reasons first and answers last. Compact: calls on lines or between semicolons, ``move 3; place 3 inside``, with
+arguments in the order of ``SIGNATURES``. Skills outside the task's profile count as unknown.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 class PlanReason(StrEnum):
-    """Why a text is no plan. Each of these earns the reward of unparsable text."""
+    """Reason why a text is not a plan. Each earns the reward of unparsable text."""
 
     TOO_LONG = "too_long"
     NO_PLAN = "no_plan"
@@ -45,7 +45,7 @@ class PlanReason(StrEnum):
 
 
 class PlanError(ValueError):
-    """A text can't be parsed. ``reason`` is of a closed set; the message is a sentence for a person."""
+    """Raised for a text that is not a plan. The message is a sentence for people."""
 
     def __init__(self, reason: PlanReason, sentence: str) -> None:
         super().__init__(sentence)
@@ -54,9 +54,9 @@ class PlanError(ValueError):
 
 PLAN_KEYS: Final = ("action_sequence", "plan")
 MAX_INDEX: Final = 2**63 - 1
-"""Indices beyond the wire's 64 bits name nothing."""
+"""Largest index that the wire format carries."""
 _MAX_STARTS: Final = 256
-"""Brackets at which a JSON plan is looked for: bounds the work on adversarial text."""
+"""Most brackets at which the parser looks for JSON: bounds the work on adversarial text."""
 _JSON_START: Final = re.compile(r"\[\s*\{|\{\s*\"")
 _LIST_MARK: Final = re.compile(r"^\s*(?:\d+[.)]|[-*])\s+")
 _WORD: Final = re.compile(r"[A-Za-z_]+")
@@ -66,7 +66,7 @@ _ARGUMENT: Final = re.compile(
 
 
 def parse_plan(text: str, profile: Profile = Profile.PAPER) -> Plan:
-    """The plan that the text ends with. Raises PlanError, and nothing else, for any text."""
+    """Return the last plan in the text. Raises PlanError, and no other exception, for any text."""
     size = len(text.encode("utf-8", errors="replace"))
     if size > MAX_PLAN_BYTES:
         raise PlanError(
@@ -80,7 +80,7 @@ def parse_plan(text: str, profile: Profile = Profile.PAPER) -> Plan:
 
 
 def plan_from_json(value: object, profile: Profile = Profile.PAPER) -> Plan:
-    """A plan from decoded JSON: an array of calls, or an object that holds one. Raises PlanError."""
+    """Return the plan in a decoded JSON value: an array of calls, or an object that holds one. Raises PlanError."""
     steps = _steps_in(value)
     if steps is None:
         raise PlanError(
@@ -92,35 +92,29 @@ def plan_from_json(value: object, profile: Profile = Profile.PAPER) -> Plan:
 
 
 def plan_to_json(plan: Plan) -> list[dict[str, object]]:
-    """JSON values that ``plan_from_json`` reads back to an equal plan."""
+    """Return JSON values that ``plan_from_json`` reads back to an equal plan."""
     return [
-        {
-            "action": call.skill.value,
-            **{arg.value: _plain(argument(call, arg)) for arg in SIGNATURES[call.skill]},
-        }
+        {"action": call.skill.value, **{arg.value: argument(call, arg) for arg in SIGNATURES[call.skill]}}
         for call in plan
     ]
 
 
 def plan_to_lines(plan: Plan) -> str:
-    """Compact text, one call on a line, that ``parse_plan`` reads back to an equal plan."""
+    """Return compact text, one call a line, that ``parse_plan`` reads back to an equal plan."""
     return "\n".join(
-        " ".join([call.skill.value, *(str(_plain(argument(call, arg))) for arg in SIGNATURES[call.skill])])
+        " ".join([call.skill.value, *(str(argument(call, arg)) for arg in SIGNATURES[call.skill])])
         for call in plan
     )
 
 
 def argument(call: SkillCall, arg: Arg) -> int | float | str | None:
-    """The call's value for one argument, None where the skill does not take it."""
-    return cast("int | float | str | None", getattr(call, arg.value))
-
-
-def _plain(value: int | float | str | None) -> int | float | str | None:
+    """Return the call's value for an argument as a plain JSON value, None if the skill does not take it."""
+    value = cast("int | float | str | None", getattr(call, arg.value))
     return value.value if isinstance(value, PlaceRelation) else value
 
 
 def _without_reasoning(text: str) -> str:
-    """What follows the last closed <think>. Reasoning that never ends, or nothing after it, leaves the text as it is."""
+    """Return the text after the last </think>, or all of it if nothing follows."""
     answer = text.rpartition("</think>")[2]
     return answer if answer.strip() else text
 
@@ -135,7 +129,7 @@ def _check_length(count: int) -> None:
 
 
 def _steps_in(value: object) -> Sequence[object] | None:
-    """The array of calls in a JSON value, or None when it holds none."""
+    """Return the array of calls in a JSON value, None if there is none."""
     if isinstance(value, dict):
         return next((value[key] for key in PLAN_KEYS if isinstance(value.get(key), list)), None)
     if isinstance(value, list) and any(isinstance(item, dict) and "action" in item for item in value):
@@ -144,7 +138,7 @@ def _steps_in(value: object) -> Sequence[object] | None:
 
 
 def _last_json_plan(text: str) -> object | None:
-    """The last JSON value that holds a plan; values inside another one are part of it."""
+    """Return the last outermost JSON value that holds a plan."""
     decoder = json.JSONDecoder()
     found: object | None = None
     position = 0
@@ -163,7 +157,7 @@ def _last_json_plan(text: str) -> object | None:
 
 
 def _call_from_json(value: object, number: int, profile: Profile) -> SkillCall:
-    """One call. Keys that no skill knows, such as a comment, change nothing and are passed over."""
+    """Read one call. Unknown keys, such as comments, are ignored."""
     if not isinstance(value, dict) or "action" not in value:
         raise PlanError(PlanReason.MISSING_ARGUMENT, f'step {number} has no "action": name the skill')
     nested = value.get("parameters", {})
@@ -178,7 +172,7 @@ def _call_from_json(value: object, number: int, profile: Profile) -> SkillCall:
 
 
 def _parse_lines(text: str, profile: Profile) -> Plan:
-    """The calls among the lines, in their order; other lines are prose."""
+    """Read the lines that are calls; other lines are prose."""
     calls = [words for words in _segments(text) if _is_call(words, profile)]
     if not calls:
         raise PlanError(
@@ -191,7 +185,7 @@ def _parse_lines(text: str, profile: Profile) -> Plan:
 
 
 def _found_instead(text: str) -> str:
-    """What a text is that holds no plan, for a message."""
+    """Describe a text without a plan, for an error message."""
     content = text.strip()
     if not content:
         return "the text is empty"
@@ -214,7 +208,7 @@ def _segments(text: str) -> Iterator[list[str]]:
 
 
 def _is_call(words: list[str], profile: Profile) -> bool:
-    """A known skill with few words after it, or any word with nothing but numbers and relations after it."""
+    """True for a known skill with at most two words after it, or any word with only numbers and relations after it."""
     skill, *arguments = words
     if skill.lower() in PROFILES[profile] and len(arguments) <= 2:
         return True
@@ -266,7 +260,7 @@ def _build_call(skill: Skill, values: Mapping[str, object], number: int) -> Skil
 
 
 def _checked(arg: Arg, value: object, number: int) -> int | float | str:
-    """The value in its type, or PlanError. A boolean is no number here."""
+    """Return the value in its type. Raises PlanError; a boolean is not a number here."""
     match arg:
         case Arg.OBJECT | Arg.SOURCE:
             if isinstance(value, int) and not isinstance(value, bool) and abs(value) <= MAX_INDEX:
@@ -305,7 +299,7 @@ def _signature(skill: Skill) -> str:
 
 
 def _shown(value: object) -> str:
-    """The value for a message, cut to a readable length."""
+    """Format a value for an error message, at most 60 characters."""
     if isinstance(value, int) and abs(value) > MAX_INDEX:
         return "a number beyond 64 bits"
     text = repr(value) if isinstance(value, str | int | float | bool | None) else type(value).__name__

@@ -1,13 +1,13 @@
-"""Prompts: what a policy is told of a task, and how the plan that it writes names objects.
+"""Prompts: the description of a task for a policy, and the naming of objects in its plans.
 
-Three codecs share one scene description, rooms as a tree with furniture first and contents after it:
+Three codecs share one scene description, a tree of rooms, furniture and contents:
 
-* ``names``: word-level policies. Objects are called by name in the plan; ``with_indices`` maps the names to rows of the
-  object table before the plan is parsed.
-* ``lines``: language models, one call a line, objects called by ``object_index``. The name stands before the index.
-* ``json``: language models, the same calls as a JSON list.
+* ``names``: for word-level policies. Plans name objects; ``with_indices`` maps the names to rows of the object table before
+  the plan is parsed.
+* ``lines``: for language models. One call a line, objects by ``object_index``; the prompt prints the index after each name.
+* ``json``: for language models. The same calls as a JSON list.
 
-A prompt tells of the rows of the task's object table only, and never of the goal formula.
+A prompt covers the rows of the task's object table and never contains the goal formula.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene, SceneObject
     from embomatrix.world.task import Task
 
-    _Caller = Callable[[int | None], str]
+    _RowName = Callable[[int | None], str]
 
 
 class Codec(StrEnum):
-    """How a prompt lists objects and how a plan calls them."""
+    """Form of prompts and plans."""
 
     NAMES = "names"
     LINES = "lines"
@@ -45,14 +45,14 @@ PREPOSITIONS: Final[Mapping[Relation, str]] = {
     Relation.INSIDE: "in",
     Relation.UNDER: "under",
 }
-"""How a row's contents are introduced. Other relations host nothing."""
+"""Preposition before the contents of a row. Objects are listed with their host only for these relations."""
 ABSENT: Final = "absent"
-"""How a row is told that is not in the world yet: a piece of a thing that can be cut."""
+"""State of a row that is not in the world yet: a piece of an object that can be sliced."""
 
 
 @dataclass(frozen=True, slots=True)
 class PromptRow:
-    """One row of the object table as a prompt tells it. ``host`` is the name of another row, or empty."""
+    """One row of the object table in a prompt. ``host`` is the name of another row, or empty."""
 
     index: int
     name: str
@@ -66,10 +66,10 @@ class PromptRow:
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """What a policy may know of a task. ``rows`` are in the order in which a prompt tells them.
+    """Everything that a policy may know about a task. ``rows`` are in prompt order.
 
-    ``table_size`` is the number of rows of the whole table: the first index that names nothing. ``profile`` says which
-    skills the prompt offers.
+    ``table_size`` is the number of rows in the whole object table: the first index without an object. ``profile`` selects the
+    skills that the prompt offers.
     """
 
     rooms: tuple[str, ...]
@@ -82,14 +82,14 @@ class Situation:
 
 @dataclass(frozen=True, slots=True)
 class Prompt:
-    """System text, the same for every task of a codec, and the text of this task."""
+    """System text, equal for all tasks of a codec and profile, and the text of one task."""
 
     system: str
     user: str
 
 
 def situation_of(scene: Scene, task: Task) -> Situation:
-    """The task's table with each object's start: host, relation and visible states."""
+    """Return the rows of a task's object table with their initial host, relation and visible states."""
     listed = set(task.table)
     rows = tuple(_row(index, scene.by_name[name], scene, listed) for index, name in enumerate(task.table))
     rooms = tuple(dict.fromkeys([*(row.room for row in rows if row.room), scene.robot.room]))
@@ -112,7 +112,7 @@ def _row(index: int, item: SceneObject, scene: Scene, listed: set[str]) -> Promp
 
 
 def _visible(item: SceneObject, *, openable: bool, toggleable: bool) -> tuple[str, ...]:
-    """Words for what can be seen of an object: doors and switches in both positions, other states when they hold."""
+    """Return words for visible states: doors and switches in both positions, other states only when they hold."""
     words: list[str] = []
     if openable:
         is_open = State.OPEN in item.states or any(joint > OPEN_FRACTION for joint in item.joints)
@@ -122,17 +122,17 @@ def _visible(item: SceneObject, *, openable: bool, toggleable: bool) -> tuple[st
     if item.absent:
         words.append(ABSENT)
     plain = item.states - {State.OPEN, State.TOGGLED_ON} - MEANINGS.keys()
-    told = (in_words(fact) for fact in sorted(facts_of(item.states, item.substances)))
+    substances = (in_words(fact) for fact in sorted(facts_of(item.states, item.substances)))
     return (
         *words,
-        *sorted([*(state.value for state in plain), *(words.replace(" ", "_") for words in told)]),
+        *sorted([*(state.value for state in plain), *(words.replace(" ", "_") for words in substances)]),
     )
 
 
 def limited(situation: Situation, rows: int) -> Situation:
-    """At most ``rows`` rows: those that the instruction names, then what they rest on, then the rest in order.
+    """Keep at most ``rows`` rows: first those that the instruction names, then their hosts, then the rest in order.
 
-    Only the instruction decides, never the goal: whoever asks for a plan knows no more than that.
+    The choice depends on the instruction and never on the goal, because a policy knows no more than that.
     """
     if len(situation.rows) <= rows:
         return situation
@@ -145,7 +145,7 @@ def limited(situation: Situation, rows: int) -> Situation:
 
 
 def subset(situation: Situation, kept: Iterable[int]) -> Situation:
-    """The situation told with these rows only; what rested on a row that is left out stands in its room."""
+    """Keep only these rows. A row whose host is left out is listed in its room."""
     wanted = set(kept)
     names = {row.name for row in situation.rows if row.index in wanted}
     rows = tuple(
@@ -161,7 +161,7 @@ def _words(text: str) -> list[str]:
 
 
 def labels(situation: Situation) -> dict[int, str]:
-    """Row index to the shortest unique name: the category where it stands alone among the rows told, else the name."""
+    """Map row indices to shortest unique names: the category if only one row has it, else the name."""
     counts: dict[str, int] = {}
     for row in situation.rows:
         counts[row.category] = counts.get(row.category, 0) + 1
@@ -169,15 +169,14 @@ def labels(situation: Situation) -> dict[int, str]:
 
 
 def prompt_for(situation: Situation, codec: Codec) -> Prompt:
-    """The text that a policy completes with a plan."""
+    """Return the prompt that a policy completes with a plan."""
     if codec is Codec.NAMES:
         return Prompt("", _names_text(situation))
     return Prompt(_SYSTEM[codec, situation.profile], _indexed_text(situation))
 
 
 def _tree(situation: Situation) -> dict[str, list[tuple[PromptRow, list[PromptRow]]]]:
-    """Room to its rows, each with its contents. A row that rests on another one is listed with it, and again
-    by itself only when it hosts something."""
+    """Map rooms to their rows with contents. A hosted row gets its own entry only if it hosts other rows."""
     contents: dict[str, list[PromptRow]] = {}
     for row in situation.rows:
         if row.host:
@@ -201,28 +200,28 @@ def _by_relation(contents: list[PromptRow]) -> list[tuple[str, list[PromptRow]]]
 def _names_text(situation: Situation) -> str:
     label = labels(situation)
 
-    def told(row: PromptRow) -> str:
+    def words(row: PromptRow) -> str:
         return " ".join([label[row.index], *row.states])
 
     lines: list[str] = []
     for room, entries in _tree(situation).items():
         lines.append(f"room {room}")
         for row, contents in entries:
-            groups = [f"{word} {' '.join(map(told, rows))}" for word, rows in _by_relation(contents)]
-            lines.append(" ".join([told(row), *groups]))
+            groups = [f"{word} {' '.join(map(words, rows))}" for word, rows in _by_relation(contents)]
+            lines.append(" ".join([words(row), *groups]))
     return "\n".join([*lines, f"robot {situation.robot_room}", f"task {situation.instruction}"])
 
 
 def _indexed_text(situation: Situation) -> str:
-    def told(row: PromptRow) -> str:
+    def words(row: PromptRow) -> str:
         return " ".join([row.category.replace("_", " "), str(row.index), *row.states])
 
     lines = ["Scene:"]
     for room, entries in _tree(situation).items():
         lines.append(f"[{room}]")
         for row, contents in entries:
-            groups = [f"{word}: {', '.join(map(told, rows))}" for word, rows in _by_relation(contents)]
-            lines.append(" ".join([told(row), *groups]))
+            groups = [f"{word}: {', '.join(map(words, rows))}" for word, rows in _by_relation(contents)]
+            lines.append(" ".join([words(row), *groups]))
     lines.append(f"Robot: {situation.robot_room or 'unknown room'}, hand empty")
     lines.append(f"Task: {situation.instruction}")
     return "\n".join(lines)
@@ -245,7 +244,7 @@ EXAMPLES: Final[Mapping[Codec, str]] = {
     '{"action": "move", "object_index": 2}, {"action": "place", "object_index": 2, "relation": "inside"}, '
     '{"action": "close", "object_index": 2}]',
 }
-"""A plan in each codec: put the apple (row 4) into the fridge (row 2)."""
+"""Example plan in each codec: put the apple (row 4) into the fridge (row 2)."""
 
 
 def _skill_lines(profile: Profile) -> str:
@@ -297,22 +296,22 @@ _SYSTEM: Final[Mapping[tuple[Codec, Profile], str]] = {
 
 
 def plan_in_names(plan: Plan, situation: Situation) -> str:
-    """A plan as the ``names`` codec writes it, one call a line. A row that is not told is called ``row_<index>``."""
+    """Write a plan in the ``names`` codec, one call a line. Rows that the situation lacks are named ``row_<index>``."""
     label = labels(situation)
 
-    def called(index: int | None) -> str:
+    def row_name(index: int | None) -> str:
         return label.get(-1 if index is None else index, f"row_{index}")
 
-    return "\n".join(" ".join([call.skill.value, *_arguments(call, called)]) for call in plan)
+    return "\n".join(" ".join([call.skill.value, *_arguments(call, row_name)]) for call in plan)
 
 
-def _arguments(call: SkillCall, called: _Caller) -> list[str]:
+def _arguments(call: SkillCall, row_name: _RowName) -> list[str]:
     words: list[str] = []
     for argument in SIGNATURES[call.skill]:
         if argument is Arg.OBJECT:
-            words.append(called(call.object_index))
+            words.append(row_name(call.object_index))
         elif argument is Arg.SOURCE:
-            words.append(called(call.source_index))
+            words.append(row_name(call.source_index))
         else:
             value = getattr(call, argument.value)
             words.append(f"{value:g}" if isinstance(value, float) else str(value))
@@ -323,10 +322,10 @@ _SKILLS: Final = frozenset(Skill)
 
 
 def with_indices(text: str, situation: Situation) -> str:
-    """A plan of the ``names`` codec in the compact line form, names replaced by row indices.
+    """Replace the names in a plan of the ``names`` codec by row indices.
 
-    A word in an object's place that names nothing becomes the first index after the table: the plan parses, and that
-    step fails as any call to an unknown object does. Text that is no plan stays no plan.
+    An unknown name becomes the first index after the table: the plan parses, and that step fails as unknown object. Text that
+    is not a plan stays unparsable.
     """
     rows = {row.name: row.index for row in situation.rows}
     rows |= {label: index for index, label in labels(situation).items()}

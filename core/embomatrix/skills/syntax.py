@@ -1,4 +1,4 @@
-"""The plan language: the skills of each profile, their arguments, and the calls that make up a plan."""
+"""Plan language: skills, arguments, profiles and calls."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ if TYPE_CHECKING:
 
 MAX_STEPS: Final = 64
 MAX_PLAN_BYTES: Final = 64 * 1024
-"""A longer plan, or a longer text, can't be parsed: it is no plan."""
+"""Plans with more steps and texts with more bytes are not parsable."""
 MAX_ROOM_NAME: Final = 64
-"""Characters."""
+"""Longest room name, in characters."""
 
 
 class Skill(StrEnum):
-    """The paper's skill library, by the paper's names, and three skills for goals that it can't reach."""
+    """The 13 skills of the paper under its names, and three more for goals that those can't reach."""
 
     MOVE = "move"
     TURN = "turn"
@@ -40,10 +40,7 @@ class Skill(StrEnum):
 
 
 class Arg(StrEnum):
-    """Argument names of a call, as they stand in JSON.
-
-    A tool is called by ``source_index`` too, as in the paper's ``cook_object_with_tool``: it is the second object of a call.
-    """
+    """Argument names of a call in JSON. ``source_index`` is the second object of a call: a source or a tool."""
 
     OBJECT = "object_index"
     SOURCE = "source_index"
@@ -54,7 +51,7 @@ class Arg(StrEnum):
 
 
 class PlaceRelation(StrEnum):
-    """What ``place`` can be asked for."""
+    """Relations that ``place`` accepts."""
 
     ONTOP = "ontop"
     INSIDE = "inside"
@@ -85,14 +82,14 @@ PROFILES: Final[Mapping[Profile, tuple[Skill, ...]]] = {
     Profile.PAPER: tuple(skill for skill in Skill if skill not in _ADDED),
     Profile.HOUSEHOLD: tuple(Skill),
 }
-"""The skills that plans of a profile may use, in the order in which a prompt tells them."""
+"""Skills of each profile, in the order in which a prompt lists them."""
 ALIASES: Final[Mapping[str, Arg]] = {"tool_index": Arg.SOURCE}
-"""Other names under which JSON may give an argument."""
+"""Alternative argument names that the JSON form accepts."""
 
 
 @dataclass(frozen=True, slots=True)
 class SkillCall:
-    """One step of a plan. Arguments that the skill does not take stay None. Yaw is in radians, distance in metres."""
+    """One step of a plan. Arguments that the skill does not take are None. Yaw is in radians, distance in metres."""
 
     skill: Skill
     object_index: int | None = None

@@ -1,4 +1,4 @@
-"""Traces: what happened, step by step, as data that travels with the result."""
+"""Traces: the executed steps of a plan and the state reached, as data that travels with the result."""
 
 from __future__ import annotations
 
@@ -12,11 +12,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One executed call. ``message`` says in words what happened, or why it could not."""
+    """One executed call.
+
+    ``message`` tells people what happened, or why the call failed. ``blocker`` names the object at fault in a failure, as
+    `SkillRefusal.blocker` defines it.
+    """
 
     call: SkillCall
     failure: FailureReason | None
     message: str
+    blocker: str = ""
 
     @property
     def ok(self) -> bool:
@@ -25,11 +30,11 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """Steps up to and with the first failure, and the state reached.
+    """Steps up to and including the first failure, and the state reached.
 
-    ``touched`` are the names of the objects on which a call succeeded. ``final`` describes the state of the task's
-    objects in words, one line each. ``digest`` is a hash of every pose and state after every step: equal traces of equal
-    (bundle, plan, seed) on equal platforms have equal digests.
+    ``touched`` are the names of the objects on which a call succeeded. ``final`` describes the task's objects, one line each.
+    ``digest`` is a hash of every pose and state after every step: equal (bundle, plan, seed) on equal platforms give equal
+    digests.
     """
 
     plan: Plan
@@ -40,5 +45,5 @@ class Trace:
 
     @property
     def failure(self) -> FailureReason | None:
-        """Reason of the step that stopped the plan, or None when every step succeeded."""
+        """Reason of the step that stopped the plan, None if every step succeeded."""
         return self.steps[-1].failure if self.steps else None

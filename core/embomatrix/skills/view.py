@@ -1,9 +1,10 @@
-"""What preconditions are decided on: a view of the world, and a refusal when one does not hold."""
+"""View of the world on which preconditions are checked, and the refusal of a call."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from string import Formatter
+from typing import TYPE_CHECKING, Final, Protocol
 
 from embomatrix.skills.failure import SENTENCES, FailureReason
 from embomatrix.skills.syntax import PlaceRelation
@@ -15,21 +16,33 @@ if TYPE_CHECKING:
     from embomatrix.world.asset import Asset
     from embomatrix.world.state import SubstanceFact
 
+_BLOCKERS: Final = ("other", "container", "source", "target")
+"""Fields of a sentence, from the most to the least specific, that name the object at fault."""
+_FIELDS: Final = {
+    reason: {field for _, field, _, _ in Formatter().parse(sentence)}
+    for reason, sentence in SENTENCES.items()
+}
+
 
 @dataclass(frozen=True, slots=True)
 class SkillRefusal:
-    """Why a call can't be carried out, and the same as a sentence about the things at hand."""
+    """Reason why a call can't be carried out, a sentence for people, and the object at fault for code.
+
+    ``blocker`` names the object that blocks the call or must change first: the obstacle, the closed container, the object on
+    top, else the source or the target itself. Obstacles without a name are ``a wall`` or ``something``; "" means no object.
+    """
 
     reason: FailureReason
     sentence: str
+    blocker: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectReach:
-    """How far an object is from the robot.
+    """Distance of an object from the robot.
 
-    ``distance_m`` is horizontal, from the base's centre to the nearest point of the object; ``height_m`` is that of its
-    middle above the floor.
+    ``distance_m`` is horizontal, from the centre of the base to the nearest point of the object. ``height_m`` is the height
+    of the object's centre above the floor.
     """
 
     distance_m: float
@@ -37,18 +50,18 @@ class ObjectReach:
 
 
 class WorldView(Protocol):
-    """What the preconditions ask of the state of a rollout. Objects are called by their names."""
+    """Questions that preconditions ask about the state of a rollout. Objects are identified by name."""
 
     @property
     def table(self) -> tuple[str, ...]:
-        """The task's object table: what indices refer to."""
+        """Object table of the task, to which indices refer."""
 
     @property
     def rooms(self) -> tuple[str, ...]: ...
 
     @property
     def carried(self) -> tuple[str, ...]:
-        """What the hand holds, then what lies in it; empty for an empty hand."""
+        """The held object, then its contents; empty for an empty hand."""
 
     def asset(self, name: str) -> Asset: ...
 
@@ -59,55 +72,59 @@ class WorldView(Protocol):
     def is_on(self, name: str) -> bool: ...
 
     def cargo(self, name: str) -> tuple[str, ...]:
-        """The object and what lies in it: all that is lifted with it."""
+        """The object and its contents: everything that is lifted with it."""
 
     def burden(self, name: str) -> str:
-        """Something that rests on the object and would fall when it is lifted; "" when nothing does."""
+        """An object that rests on this one and would fall if it were lifted; "" for none."""
 
     def closed_around(self, name: str) -> str:
-        """A closed container that the object is in; "" when there is none."""
+        """A closed container around the object; "" for none."""
 
     def reach(self, name: str) -> ObjectReach: ...
 
     def is_approachable(self, name: str) -> bool:
-        """Whether no wall and no furniture lies between the robot and the object."""
+        """True if no wall and no furniture lies between the robot and the object."""
 
     def is_at(self, name: str, source: str) -> bool:
-        """Whether a heat or cold source acts on the object where it lies, were the source running."""
+        """True if a heat or cold source would act on the object at its present place, were the source running."""
 
     def is_real(self, name: str) -> bool:
-        """Whether the object is in the world, be it in the hand: not a piece that is still to come, nor cut up."""
+        """True if the object exists now: neither a future piece nor an object that was cut up."""
 
     def is_sliced(self, name: str) -> bool: ...
 
     def is_inside(self, name: str, container: str) -> bool: ...
 
     def facts_about(self, name: str) -> Set[SubstanceFact]:
-        """What the object is covered, filled and soaked with."""
+        """Substances that cover, fill or soak the object."""
 
 
 def refuse(reason: FailureReason, **values: str) -> SkillRefusal:
-    """Refusal with the reason's sentence filled in. Raises KeyError for a value that the sentence lacks."""
-    return SkillRefusal(reason, SENTENCES[reason].format(**values))
+    """Return a refusal with the values filled into the sentence. Values that the sentence does not use are ignored.
+
+    Raises KeyError if the sentence needs a value that is not given.
+    """
+    blocker = next((values[name] for name in _BLOCKERS if name in _FIELDS[reason]), "")
+    return SkillRefusal(reason, SENTENCES[reason].format(**values), blocker)
 
 
 def target_of(world: WorldView, call: SkillCall) -> str:
-    """Name of the call's object, "" for calls without one or with an index outside the table."""
+    """Name of the call's object; "" if the call has none or its index is outside the table."""
     index, table = call.object_index, world.table
     return table[index] if index is not None and 0 <= index < len(table) else ""
 
 
 def source_of(world: WorldView, call: SkillCall) -> str:
-    """Name of the call's source, "" for calls without one or with an index outside the table."""
+    """Name of the call's source; "" if the call has none or its index is outside the table."""
     index, table = call.source_index, world.table
     return table[index] if index is not None and 0 <= index < len(table) else ""
 
 
 def metres(value: float) -> str:
-    """A length for a sentence, to the centimetre."""
+    """Format a length for a sentence, to the centimetre."""
     return f"{value:.2f}"
 
 
 def preposition(relation: PlaceRelation) -> str:
-    """The relation as a word of a sentence."""
+    """Format a relation for a sentence."""
     return "on top of" if relation is PlaceRelation.ONTOP else relation.value

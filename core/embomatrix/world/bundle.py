@@ -12,13 +12,13 @@ import math
 import struct
 import zlib
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import numpy as np
+from msgspec import Meta
 
-from embomatrix.world.codec import scene_from_json, scene_to_json
-from embomatrix.world.codec_task import poses_from_json, poses_to_json, task_from_json, task_to_json
-from embomatrix.world.field import Field, SceneInvalidError
+from embomatrix.world.codec import scene_of, scene_to_json
+from embomatrix.world.codec_task import poses_of, poses_to_json, task_of, task_to_json
 from embomatrix.world.inflation import (
     DEFAULT_LIMITS,
     BundleError,
@@ -28,6 +28,7 @@ from embomatrix.world.inflation import (
     too_large,
 )
 from embomatrix.world.poses import PoseCache
+from embomatrix.world.records import PosesJson, Record, SceneInvalidError, SceneJson, TaskJson, decode
 from embomatrix.world.tables import Tables, TableWriter
 
 if TYPE_CHECKING:
@@ -62,6 +63,15 @@ class Bundle:
     tasks: Mapping[str, Task]
     poses: PoseCache = field(default_factory=PoseCache)
     prepared: Arrays = field(default_factory=dict, compare=False)
+
+
+class BundleJson(Record):
+    """Head of a bundle. ``arrays`` lists the dtype and the shape of each array."""
+
+    scene: SceneJson
+    tasks: list[TaskJson]
+    poses: PosesJson
+    arrays: dict[str, Annotated[list[str | int], Meta(min_length=2, max_length=5)]]
 
 
 def encode_bundle(bundle: Bundle) -> bytes:
@@ -123,42 +133,41 @@ def _from_content(content: bytes) -> Bundle:
     end = _HEAD.size + text_bytes
     if end > len(content) or end % _ALIGNMENT:
         raise ValueError(f"its JSON has {text_bytes} bytes, {len(content)} are there in all")
-    value = json.loads(content[_HEAD.size : end], parse_constant=_refuse_constant)
-    fields = Field(value, "bundle").record("scene", "tasks", "poses", "arrays")
-    arrays = _arrays(fields["arrays"], memoryview(content)[end:])
+    record = decode(content[_HEAD.size : end], BundleJson, "bundle")
+    arrays = _arrays(record.arrays, memoryview(content)[end:])
     prepared = {
         name.removeprefix(_PREPARED): arrays.pop(name) for name in list(arrays) if name.startswith(_PREPARED)
     }
     tables = Tables(arrays)
-    tasks = [task_from_json(item.value) for item in fields["tasks"].items()]
+    tasks = [task_of(task, f"bundle.tasks[{index}]") for index, task in enumerate(record.tasks)]
     return Bundle(
-        scene=scene_from_json(fields["scene"].value, tables),
+        scene=scene_of(record.scene, tables),
         tasks={task.task_id: task for task in tasks},
-        poses=poses_from_json(fields["poses"].value, tables),
+        poses=poses_of(record.poses, tables),
         prepared=prepared,
     )
 
 
-def _arrays(field: Field, data: memoryview) -> dict[str, NDArray[np.generic]]:
-    """Read-only arrays by name, as the field describes them, one after another."""
+def _arrays(described: Mapping[str, list[str | int]], data: memoryview) -> dict[str, NDArray[np.generic]]:
+    """Read-only arrays by name; their bytes follow one another in ``data``."""
     arrays: dict[str, NDArray[np.generic]] = {}
     first = 0
-    for name, described in field.entries():
-        kind, *extents = described.items(at_most=5)
-        dtype = _DTYPES.get(kind.text())
+    for name, (kind, *extents) in described.items():
+        path = f"bundle.arrays[{name!r}]"
+        dtype = _DTYPES.get(str(kind))
         if dtype is None:
-            kind.fail(f"found {kind.text()[:20]!r}: expected one of {', '.join(_DTYPES)}")
-        shape = tuple(item.integer() for item in extents)
-        if not shape or min(shape) < 0:
-            described.fail(f"found the shape {shape}: expected numbers from 0")
+            raise SceneInvalidError(path, f"found {str(kind)[:20]!r}: expected one of {', '.join(_DTYPES)}")
+        shape = [extent for extent in extents if isinstance(extent, int) and extent >= 0]
+        if len(shape) < len(extents):
+            raise SceneInvalidError(path, f"found the shape {extents}: expected numbers from 0")
         count = math.prod(shape)
         size = count * dtype.itemsize
         if size > len(data) - first:
-            described.fail(f"asks for {size} bytes: there are {len(data) - first} more")
+            raise SceneInvalidError(path, f"asks for {size} bytes: there are {len(data) - first} more")
         arrays[name] = np.frombuffer(data, dtype, count, first).reshape(shape)
         first += size + -size % _ALIGNMENT
     if first != len(data):
-        field.fail(f"describes {first} bytes: there are {len(data)}")
+        raise SceneInvalidError("bundle.arrays", f"describes {first} bytes: there are {len(data)}")
     return arrays
 
 
@@ -182,7 +191,3 @@ def _check_tasks(bundle: Bundle) -> None:
             raise BundleError(
                 f"the table of task {task.task_id!r} names {min(unknown)!r}: the scene has no such object"
             )
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"found {name}, expected finite numbers only")

@@ -1,181 +1,153 @@
-"""Scenes as plain JSON values, and back. Decoding trusts nothing.
-
-The engine that is built from a scene takes what it is given: it drops the seventeenth part of a link in silence and dies of
-a NaN. So every rule that it needs is checked here, and a SceneInvalidError names the field that breaks one.
-"""
+"""Scenes and assets encoded as JSON values and decoded again; ``records`` defines the JSON, ``tables`` the rows of bundles."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from embomatrix.world.codec_asset import (
+import msgspec
+import numpy as np
+from msgspec import UNSET
+
+from embomatrix.world.asset import Asset, Credit, Interior, Joint, Link, SupportSurface
+from embomatrix.world.geometry import ConvexPart, Pose, Shape
+from embomatrix.world.records import (
     MAX_LINKS,
-    asset_from_field,
-    asset_to_json,
-    check_unique,
-    part_from_field,
-    part_to_json,
-    pose_from_field,
-    pose_to_json,
+    AssetJson,
+    LinkJson,
+    ObjectJson,
+    PartJson,
+    SceneInvalidError,
+    SceneJson,
+    convert,
 )
-from embomatrix.world.codec_plain import OBJECT_KEYS, plain_assets, plain_objects
-from embomatrix.world.field import Field, SceneInvalidError
 from embomatrix.world.scene import Doorway, RobotStart, Room, Scene, SceneObject, Window
-from embomatrix.world.state import Relation, State, SubstanceFact, SubstanceRelation
+from embomatrix.world.state import Relation, SubstanceFact
+from embomatrix.world.tables import FLAT_HULL, check_unit, has_volume
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from embomatrix.world.asset import Asset
+    from embomatrix.world.records import PoseNumbers
     from embomatrix.world.tables import Tables, TableWriter
 
     Json = dict[str, Any]
 
-MAX_OBJECTS: Final = 5_000
-MAX_WALLS: Final = 10_000
+T = TypeVar("T")
+R = TypeVar("R")
+
 MAX_FLOOR_M2: Final = 40_000.0
-"""Area of the rectangle around all rooms: the floor is covered with cells of 5 cm."""
+"""Area of the rectangle around all rooms: the navigation grid covers it with cells of 5 cm."""
 RESERVED_NAMES: Final = frozenset(("wall", "floor"))
-"""What the engine calls bodies that are no objects."""
+"""Names of the engine for bodies that are not objects."""
+_RELATIONS: Final = {"": None, **{relation.value: relation for relation in Relation}}
 
 
 def scene_to_json(scene: Scene, tables: TableWriter | None = None) -> Json:
-    """The scene with the assets that its objects use, as JSON values in a fixed order.
-
-    Poses and parts are rows of ``tables`` where they are given.
-    """
+    """Scene and the assets of its objects as JSON values in a fixed order; with ``tables``, poses and parts become rows."""
     value: Json = {
         "scene_id": scene.scene_id,
         "base": scene.base,
         "seed": scene.seed,
-        "rooms": [
-            {"name": room.name, "type": room.type, "low_m": [*room.low_m], "high_m": [*room.high_m]}
-            for room in scene.rooms
-        ],
-        "walls": [part_to_json(part, tables) for part in scene.walls],
-        "doorways": [_doorway_to_json(doorway) for doorway in scene.doorways],
+        "rooms": _builtins(scene.rooms),
+        "walls": [_part_to_json(part, tables) for part in scene.walls],
+        "doorways": _builtins(scene.doorways),
         "objects": [_object_to_json(item, tables) for item in scene.objects],
         "assets": {key: asset_to_json(asset, tables) for key, asset in sorted(scene.assets.items())},
-        "robot": {
-            "x_m": scene.robot.x_m,
-            "y_m": scene.robot.y_m,
-            "yaw": scene.robot.yaw,
-            "room": scene.robot.room,
-        },
+        "robot": _builtins(scene.robot),
         "left_out": [*scene.left_out],
     }
     if scene.windows:
-        value["windows"] = [_window_to_json(window) for window in scene.windows]
+        value["windows"] = _builtins(scene.windows)
     return value
 
 
-def scene_from_json(value: object, tables: Tables | None = None) -> Scene:
-    """A valid scene; ``tables`` hold the rows that it was written with. Raises SceneInvalidError naming the wrong field."""
-    fields = Field(value, "scene", tables=tables).record(
-        "scene_id",
-        "base",
-        "seed",
-        "rooms",
-        "walls",
-        "doorways",
-        "objects",
-        "assets",
-        "robot",
-        "left_out",
-        optional=("windows",),
-    )
-    assets = _assets(fields["assets"])
-    rooms = tuple(_room(item) for item in fields["rooms"].items(at_most=1_000))
+def asset_to_json(asset: Asset, tables: TableWriter | None = None) -> Json:
+    """Asset as JSON values; with ``tables``, parts become rows."""
+    value: Json = {
+        "asset_id": asset.asset_id,
+        "category": asset.category,
+        "synset": asset.synset,
+        "size_m": [*asset.size_m],
+        "mass_kg": asset.mass_kg,
+        "links": [
+            {"name": link.name, "parts": [_part_to_json(part, tables) for part in link.parts]}
+            | ({"joint": _builtins(link.joint)} if link.joint is not None else {})
+            for link in asset.links
+        ],
+        "supports": [_without_empty_link(surface) for surface in asset.supports],
+        "interiors": [_without_empty_link(interior) for interior in asset.interiors],
+        "abilities": {key: dict(sorted(params.items())) for key, params in sorted(asset.abilities.items())},
+    }
+    if asset.credit is not None:
+        value["credit"] = _builtins(asset.credit)
+    return value
+
+
+def scene_from_json(value: object) -> Scene:
+    """Valid scene. Raises SceneInvalidError with the path of the wrong value."""
+    return scene_of(convert(value, SceneJson, "scene"))
+
+
+def asset_from_json(value: object) -> Asset:
+    """Valid asset. Raises SceneInvalidError with the path of the wrong value."""
+    return _each("asset", [convert(value, AssetJson, "asset")], lambda record: _asset(record, None))[0]
+
+
+def scene_of(record: SceneJson, tables: Tables | None = None) -> Scene:
+    """Scene of a record; ``tables`` hold the rows that it was written with. Raises SceneInvalidError."""
+    assets: dict[str, Asset] = {}
+    for key, asset in record.assets.items():
+        try:
+            assets[key] = _asset(asset, tables)
+        except SceneInvalidError as error:
+            raise error.below(f"scene.assets[{key!r}]") from error
+        if key != asset.asset_id:
+            raise SceneInvalidError(
+                "scene.assets", f"asset {asset.asset_id!r} has the key {key!r}: expected its id"
+            )
+    texts: dict[str, str] = {}
     scene = Scene(
-        scene_id=fields["scene_id"].name(),
-        base=fields["base"].text(),
-        seed=fields["seed"].integer(),
-        rooms=rooms,
-        walls=tuple(part_from_field(item) for item in fields["walls"].items(at_most=MAX_WALLS)),
-        doorways=tuple(_doorway(item) for item in fields["doorways"].items()),
-        objects=_objects(fields["objects"], assets),
+        scene_id=record.scene_id,
+        base=record.base,
+        seed=record.seed,
+        rooms=_same(Room, record.rooms),
+        walls=_each("scene.walls", record.walls, lambda part: _part(part, tables)),
+        doorways=_same(Doorway, record.doorways),
+        objects=_each("scene.objects", record.objects, lambda item: _object(item, assets, tables, texts)),
         assets=assets,
-        robot=_robot(fields["robot"]),
-        left_out=fields["left_out"].texts(),
-        windows=tuple(_window(item) for item in fields["windows"].items()) if "windows" in fields else (),
+        robot=RobotStart(*msgspec.structs.astuple(record.robot)),
+        left_out=record.left_out,
+        windows=_same(Window, record.windows),
     )
     _check_references(scene)
     return scene
 
 
-def check_scene(scene: Scene) -> None:
-    """Raise SceneInvalidError where a scene breaks a rule that decoding would refuse."""
-    scene_from_json(scene_to_json(scene))
+def _builtins(value: object) -> Any:
+    return msgspec.to_builtins(value, enc_hook=float)  # numpy's scalars
 
 
-def _room(field: Field) -> Room:
-    fields = field.record("name", "type", "low_m", "high_m")
-    low, high = fields["low_m"].vec2(), fields["high_m"].vec2()
-    if not (low[0] < high[0] and low[1] < high[1]):
-        field.fail(f"low_m {low} must lie below high_m {high} on both axes")
-    return Room(fields["name"].name(), fields["type"].name(), low, high)
+def _without_empty_link(value: SupportSurface | Interior) -> Json:
+    found: Json = _builtins(value)
+    if not value.link:
+        del found["link"]
+    return found
 
 
-def _doorway_to_json(doorway: Doorway) -> Json:
-    return {
-        "rooms": [*doorway.rooms],
-        "center_m": [*doorway.center_m],
-        "width_m": doorway.width_m,
-        "height_m": doorway.height_m,
-        "along": doorway.along,
-        "model": doorway.model,
-    }
+def pose_to_json(pose: Pose, tables: TableWriter | None = None) -> list[float] | int:
+    """Numbers x, y, z in metres and the quaternion x, y, z, w; or the row of ``tables`` that holds them."""
+    if tables is not None:
+        return tables.pose(pose)
+    return [*map(float, pose.position_m), *map(float, pose.quat_xyzw)]
 
 
-def _doorway(field: Field) -> Doorway:
-    fields = field.record("rooms", "center_m", "width_m", "height_m", "along", "model")
-    rooms, along = _wall_between(field, fields)
-    return Doorway(
-        rooms=rooms,
-        center_m=fields["center_m"].vec2(),
-        width_m=fields["width_m"].number(),
-        height_m=fields["height_m"].number(),
-        along=along,
-        model=fields["model"].text(),
-    )
-
-
-def _window_to_json(window: Window) -> Json:
-    return {
-        "rooms": [*window.rooms],
-        "center_m": [*window.center_m],
-        "width_m": window.width_m,
-        "sill_m": window.sill_m,
-        "head_m": window.head_m,
-        "along": window.along,
-        "model": window.model,
-    }
-
-
-def _window(field: Field) -> Window:
-    fields = field.record("rooms", "center_m", "width_m", "sill_m", "head_m", "along", "model")
-    rooms, along = _wall_between(field, fields)
-    sill, head = fields["sill_m"].number(), fields["head_m"].number()
-    if not 0.0 <= sill < head:
-        field.fail(f"found a sill at {sill} m and a head at {head} m: expected 0 <= sill < head")
-    return Window(
-        rooms=rooms,
-        center_m=fields["center_m"].vec2(),
-        width_m=fields["width_m"].number(),
-        sill_m=sill,
-        head_m=head,
-        along=along,
-        model=fields["model"].text(),
-    )
-
-
-def _wall_between(field: Field, fields: Mapping[str, Field]) -> tuple[tuple[str, str], str]:
-    """The rooms on either side of an opening and the axis that its wall runs along."""
-    rooms = fields["rooms"].texts()
-    along = fields["along"].text()
-    if len(rooms) != 2 or along not in {"x", "y"}:
-        field.fail(f"expected two rooms and a wall along x or y, found {list(rooms)} and {along[:20]!r}")
-    return (rooms[0], rooms[1]), along
+def _part_to_json(part: ConvexPart, tables: TableWriter | None) -> Json | int:
+    if tables is not None:
+        return tables.part(part)
+    value: Json = {"shape": part.shape.value, "pose": pose_to_json(part.pose), "size_m": [*part.size_m]}
+    if part.vertices_m:
+        value["vertices_m"] = [[*vertex] for vertex in part.vertices_m]
+    return value
 
 
 def _object_to_json(item: SceneObject, tables: TableWriter | None) -> Json:
@@ -199,109 +171,164 @@ def _object_to_json(item: SceneObject, tables: TableWriter | None) -> Json:
     return value
 
 
-def _assets(field: Field) -> dict[str, Asset]:
-    plain = plain_assets(field.value, field.tables) if field.tables is not None else None
-    if plain is not None:
-        return plain
-    assets = {key: asset_from_field(item) for key, item in field.entries()}
-    for key, asset in assets.items():
-        if key != asset.asset_id:
-            field.fail(f"asset {asset.asset_id!r} stands under the key {key!r}")
-    return assets
+def _same(kind: Callable[..., T], records: Iterable[msgspec.Struct]) -> tuple[T, ...]:
+    """Values of a class with the same fields as the records, in the same order."""
+    return tuple([kind(*msgspec.structs.astuple(record)) for record in records])
 
 
-def _objects(field: Field, assets: Mapping[str, Asset]) -> tuple[SceneObject, ...]:
-    items = field.items(at_most=MAX_OBJECTS)
-    plain = None
-    if field.tables is not None:
-        plain = plain_objects(
-            field.value, assets, field.tables, lambda index: object_from_field(items[index], assets)
+def _each(path: str, records: Sequence[R], build: Callable[[R], T]) -> tuple[T, ...]:
+    """Values built of records; an error gets the path of the record."""
+    made: list[T] = []
+    for record in records:
+        try:
+            made.append(build(record))
+        except SceneInvalidError as error:
+            raise error.below(f"{path}[{len(made)}]") from error
+    return tuple(made)
+
+
+def _pose(value: PoseNumbers | int, tables: Tables | None) -> Pose:
+    if tables is not None:
+        return tables.pose(value)
+    if isinstance(value, int):
+        raise SceneInvalidError("pose", f"found row {value}: expected 7 numbers; only bundles have rows")
+    check_unit("pose", value[3:])
+    return Pose(value[:3], value[3:])
+
+
+def _part(value: PartJson | int, tables: Tables | None) -> ConvexPart:
+    if tables is not None:
+        return tables.part(value)
+    if isinstance(value, int):
+        raise SceneInvalidError("", f"found row {value}: expected an object; only bundles have rows")
+    if value.shape is Shape.HULL and not has_volume(np.asarray(value.vertices_m)):
+        raise SceneInvalidError("vertices_m", FLAT_HULL)
+    return ConvexPart(value.shape, _pose(value.pose, None), value.size_m, value.vertices_m)
+
+
+def _asset(record: AssetJson, tables: Tables | None) -> Asset:
+    links = _each("links", record.links, lambda link: _link(link, tables))
+    if not links or links[0].joint is not None or any(link.joint is None for link in links[1:]):
+        raise SceneInvalidError(
+            "links", "expected a base without a joint first, and a joint for every other link"
         )
-    return plain if plain is not None else tuple(object_from_field(item, assets) for item in items)
+    _check_unique("links", [link.name for link in links], "link")
+    # Bullet makes a body of each hull.
+    bodies = len(links) + sum(part.shape is Shape.HULL for link in links for part in link.parts)
+    if bodies > MAX_LINKS:
+        raise SceneInvalidError(
+            "links", f"make {bodies} bodies: expected at most {MAX_LINKS}; use fewer hulls or links"
+        )
+    interiors = _same(Interior, record.interiors)
+    supports = _same(SupportSurface, record.supports)
+    cavities = {"", *(interior.name for interior in interiors)}
+    moving = {link.name for link in links[1:]}
+    for index, interior in enumerate(interiors):
+        _check_known(f"interiors[{index}].closed_by", interior.closed_by, moving, "moving link")
+        _check_known(f"interiors[{index}].link", (interior.link,), moving | {""}, "moving link")
+    for index, surface in enumerate(supports):
+        _check_known(f"supports[{index}].interior", (surface.interior,), cavities, "interior")
+        _check_known(f"supports[{index}].link", (surface.link,), moving | {""}, "moving link")
+    credit = record.credit
+    return Asset(
+        asset_id=record.asset_id,
+        category=record.category,
+        synset=record.synset,
+        size_m=record.size_m,
+        mass_kg=record.mass_kg,
+        links=links,
+        supports=supports,
+        interiors=interiors,
+        abilities=record.abilities,
+        credit=None if credit is UNSET else Credit(*msgspec.structs.astuple(credit)),
+    )
 
 
-def object_from_field(field: Field, assets: Mapping[str, Asset]) -> SceneObject:
-    """An object of one of the assets, with a joint position for each of its joints."""
-    fields = field.record(*OBJECT_KEYS, optional=("substances", "absent", "pieces"))
-    asset_id = fields["asset_id"].text()
-    if asset_id not in assets:
-        fields["asset_id"].fail(f"unknown asset {asset_id[:80]!r}: the scene carries {len(assets)} others")
-    joints = tuple(item.number() for item in fields["joints"].items(at_most=MAX_LINKS))
-    count = len(assets[asset_id].joints)
-    if len(joints) != count or not all(0.0 <= share <= 1.0 for share in joints):
-        fields["joints"].fail(f"found {list(joints)}: expected {count} shares of travel between 0 and 1")
+def _link(record: LinkJson, tables: Tables | None) -> Link:
+    parts = tuple([_part(part, tables) for part in record.parts])
+    joint = record.joint
+    return Link(record.name, parts, None if joint is UNSET else Joint(*msgspec.structs.astuple(joint)))
+
+
+def _object(
+    record: ObjectJson, assets: Mapping[str, Asset], tables: Tables | None, texts: dict[str, str]
+) -> SceneObject:
+    """Object of one of the assets. ``texts`` keeps one copy of equal texts: a fork then copies fewer pages of memory."""
+    asset = assets.get(record.asset_id)
+    if asset is None:
+        raise SceneInvalidError(
+            "asset_id", f"unknown asset {record.asset_id[:80]!r}: the scene carries {len(assets)} others"
+        )
+    if len(record.joints) != len(asset.joints):
+        raise SceneInvalidError(
+            "joints",
+            f"found {list(record.joints)}: expected {len(asset.joints)} shares of travel between 0 and 1",
+        )
+    if record.relation not in _RELATIONS:
+        raise SceneInvalidError(
+            "relation", f"found {record.relation[:60]!r}: expected one of {', '.join(Relation)}, or nothing"
+        )
     return SceneObject(
-        name=fields["name"].name(),
-        asset_id=asset_id,
-        room=fields["room"].text(),
-        pose_world_asset=pose_from_field(fields["pose"]),
-        fixed=fields["fixed"].flag(),
-        joints=joints,
-        host=fields["host"].text(),
-        relation=fields["relation"].member(Relation) if fields["relation"].text() else None,
-        states=frozenset(item.member(State) for item in fields["states"].items()),
-        substances=frozenset(_substance(item) for item in fields["substances"].items())
-        if "substances" in fields
-        else frozenset(),
-        absent=fields["absent"].flag() if "absent" in fields else False,
-        pieces=fields["pieces"].texts() if "pieces" in fields else (),
+        record.name,
+        asset.asset_id,
+        texts.setdefault(record.room, record.room),
+        _pose(record.pose, tables),
+        record.fixed,
+        record.joints,
+        texts.setdefault(record.host, record.host),
+        _RELATIONS[record.relation],
+        frozenset(record.states),
+        frozenset([SubstanceFact(*fact) for fact in record.substances]),
+        record.absent,
+        record.pieces,
     )
 
 
-def _substance(field: Field) -> SubstanceFact:
-    items = field.items(at_most=2)
-    if len(items) != 2:
-        field.fail(f"has {len(items)} items: expected a relation and a substance")
-    return SubstanceFact(items[0].member(SubstanceRelation), items[1].name())
+def _check_known(path: str, names: Iterable[str], known: set[str], kind: str) -> None:
+    for name in names:
+        if name not in known:
+            raise SceneInvalidError(path, f"unknown {kind} {name[:80]!r}")
 
 
-def _robot(field: Field) -> RobotStart:
-    fields = field.record("x_m", "y_m", "yaw", "room")
-    return RobotStart(
-        fields["x_m"].number(), fields["y_m"].number(), fields["yaw"].number(), fields["room"].text()
-    )
+def _check_unique(path: str, names: Sequence[str], kind: str) -> None:
+    if len(set(names)) < len(names):
+        twice = next(name for index, name in enumerate(names) if name in names[:index])
+        raise SceneInvalidError(path, f"two of them have the {kind} {twice!r}: expected each once")
 
 
 def _check_references(scene: Scene) -> None:
     rooms = [room.name for room in scene.rooms]
     names = [item.name for item in scene.objects]
-    check_unique(Field(None, "scene.rooms"), rooms, "room")
-    check_unique(Field(None, "scene.objects"), names, "object")
-    # To a tenth of a millimetre: things that lie in one another make physics slow without end.
+    _check_unique("scene.rooms", rooms, "room")
+    _check_unique("scene.objects", names, "object")
+    # Physics takes very long over objects at one point; positions are compared to 0.1 mm.
     present = [item.pose_world_asset.position_m for item in scene.objects if not item.absent]
-    places = [f"({x:.4f}, {y:.4f}, {z:.4f})" for x, y, z in present]
-    check_unique(Field(None, "scene.objects"), places, "position")
+    _check_unique("scene.objects", [f"({x:.4f}, {y:.4f}, {z:.4f})" for x, y, z in present], "position")
     _check_floor(scene)
     absent = {item.name for item in scene.objects if item.absent}
     known_rooms, known_names = {"", *rooms}, {"", *names}
     for index, item in enumerate(scene.objects):
+        path = f"scene.objects[{index}]"
         if item.name in RESERVED_NAMES:
-            where = f"scene.objects[{index}].name"
             raise SceneInvalidError(
-                where, f"found {item.name!r}: the engine calls something else so; rename it"
+                f"{path}.name", f"found {item.name!r}: the engine reserves this name; rename it"
             )
-        if item.room not in known_rooms:
-            raise SceneInvalidError(f"scene.objects[{index}].room", f"unknown room {item.room!r}")
-        if item.host not in known_names or item.host == item.name:
-            raise SceneInvalidError(f"scene.objects[{index}].host", f"unknown host {item.host!r}")
-        unknown = set(item.pieces) - absent
-        if unknown:
-            where = f"scene.objects[{index}].pieces"
-            raise SceneInvalidError(where, f"found {min(unknown)!r}: expected an absent object of the scene")
-    sides = {
-        **{f"scene.doorways[{index}].rooms": item.rooms for index, item in enumerate(scene.doorways)},
-        **{f"scene.windows[{index}].rooms": item.rooms for index, item in enumerate(scene.windows)},
-    }
-    for path, beside in sides.items():
-        if not set(beside) <= known_rooms:
-            raise SceneInvalidError(path, f"unknown room in {beside}")
-    if scene.robot.room not in known_rooms:
-        raise SceneInvalidError("scene.robot.room", f"unknown room {scene.robot.room!r}")
+        if item.host == item.name:
+            raise SceneInvalidError(f"{path}.host", f"unknown host {item.host!r}")
+        _check_known(f"{path}.room", (item.room,), known_rooms, "room")
+        _check_known(f"{path}.host", (item.host,), known_names, "host")
+        if item.pieces:
+            _check_known(f"{path}.pieces", item.pieces, absent, "absent object")
+    for index, doorway in enumerate(scene.doorways):
+        _check_known(f"scene.doorways[{index}].rooms", doorway.rooms, known_rooms, "room")
+    for index, window in enumerate(scene.windows):
+        _check_known(f"scene.windows[{index}].rooms", window.rooms, known_rooms, "room")
+    _check_known("scene.robot.room", (scene.robot.room,), known_rooms, "room")
     _check_hosts(scene)
 
 
 def _check_floor(scene: Scene) -> None:
-    """Raise SceneInvalidError unless there is a floor, and one that a machine can hold in memory."""
+    """Raise SceneInvalidError unless the navigation grid of the floor exists and fits in memory."""
     if not scene.rooms:
         raise SceneInvalidError("scene.rooms", "is empty: expected at least one room")
     width, depth = (
@@ -315,15 +342,15 @@ def _check_floor(scene: Scene) -> None:
 
 
 def _check_hosts(scene: Scene) -> None:
-    """Raise SceneInvalidError where things rest on one another in a circle."""
+    """Raise SceneInvalidError for objects that rest on one another in a circle."""
     sound = {""}
     for index, item in enumerate(scene.objects):
         chain: list[str] = []
         name = item.name
         while name not in sound:
             if name in chain:
-                where = f"scene.objects[{index}].host"
-                raise SceneInvalidError(where, f"rests on itself: {' on '.join([*chain[:8], name])}")
+                path = f"scene.objects[{index}].host"
+                raise SceneInvalidError(path, f"rests on itself: {' on '.join([*chain[:8], name])}")
             chain.append(name)
             name = scene.by_name[name].host
         sound.update(chain)

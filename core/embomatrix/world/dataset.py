@@ -10,12 +10,12 @@ import difflib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from embomatrix.world.bundle import decode_bundle
-from embomatrix.world.codec_task import task_from_json, task_to_json
-from embomatrix.world.field import Field, SceneInvalidError
+from embomatrix.world.codec_task import task_of, task_to_json
 from embomatrix.world.inflation import DEFAULT_LIMITS, BundleError
+from embomatrix.world.records import Record, SceneInvalidError, TaskJson, convert
 from embomatrix.world.whole_file import read_whole, write_whole
 
 if TYPE_CHECKING:
@@ -162,22 +162,29 @@ def record_to_json(record: TaskRecord) -> dict[str, Any]:
     }
 
 
+class TaskRecordJson(Record):
+    task: TaskJson
+    bundle: str
+    split: Literal["train", "heldout"]
+    oracle: tuple[dict[str, Any], ...]
+    rooms: tuple[str, ...]
+    signature: str
+
+
 def record_from_json(value: object) -> TaskRecord:
-    """A record. Raises SceneInvalidError."""
-    fields = Field(value, "record").record("task", "bundle", "split", "oracle", "rooms", "signature")
-    split = fields["split"].text()
-    if split not in SPLITS:
-        fields["split"].fail(f"found {split[:40]!r}: expected one of {', '.join(SPLITS)}")
-    if not is_digest(digest := fields["bundle"].name()):
-        fields["bundle"].fail(f"found {digest[:80]!r}: expected 'sha256:' and 64 hexadecimal digits")
-    oracle = [dict(call.entries()) for call in fields["oracle"].items()]
+    """Record of parsed JSON. Raises SceneInvalidError."""
+    record = convert(value, TaskRecordJson, "record")
+    if not is_digest(record.bundle):
+        raise SceneInvalidError(
+            "record.bundle", f"found {record.bundle[:80]!r}: expected 'sha256:' and 64 hexadecimal digits"
+        )
     return TaskRecord(
-        task=task_from_json(fields["task"].value),
-        bundle_digest=digest,
-        split=split,
-        oracle=tuple({key: item.value for key, item in call.items()} for call in oracle),
-        rooms=fields["rooms"].texts(),
-        signature=fields["signature"].text(),
+        task=task_of(record.task, "record.task"),
+        bundle_digest=record.bundle,
+        split=record.split,
+        oracle=record.oracle,
+        rooms=record.rooms,
+        signature=record.signature,
     )
 
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.world.field import SceneInvalidError
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import PlacementKey, StandPose
+from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:

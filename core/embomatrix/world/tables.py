@@ -6,15 +6,22 @@ same numbers as text, and a rule about a column is one comparison.
 
 from __future__ import annotations
 
+import math
 import struct
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
 
-from embomatrix.world.field import Field, SceneInvalidError
 from embomatrix.world.geometry import ConvexPart, Pose, Shape
 from embomatrix.world.placements import SET_NUMBERS, Placements, Stands
+from embomatrix.world.records import (
+    MAX_COORDINATE_M,
+    MAX_VERTICES,
+    MIN_EXTENT_M,
+    UNIT_TOLERANCE,
+    SceneInvalidError,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -25,10 +32,8 @@ if TYPE_CHECKING:
 
     Arrays = Mapping[str, NDArray[np.generic]]
 
-MIN_EXTENT_M: Final = 1e-3
-MAX_COORDINATE_M: Final = 1e4
-QUAT_TOLERANCE: Final = 1e-4
-MAX_VERTICES: Final = 512
+T = TypeVar("T")
+
 MIN_SPREAD_M: Final = 5e-5
 FLAT_HULL: Final = (
     "the hull's vertices lie in one point, on a line or in a plane: expected a body; give it thickness"
@@ -89,7 +94,7 @@ class TableWriter:
 
 
 class Tables:
-    """Rows that were checked, as values. Raises SceneInvalidError for arrays that break a rule."""
+    """Checked rows of a bundle as values. Raises SceneInvalidError for arrays that break a rule."""
 
     def __init__(self, arrays: Arrays) -> None:
         poses = _floats(arrays, "poses", POSE_NUMBERS)
@@ -98,12 +103,8 @@ class Tables:
         _check_poses("poses", poses)
         _check_poses("parts", parts[:, :POSE_NUMBERS])
         sizes = parts[:, POSE_NUMBERS:]
-        _check_rows(
-            "parts", sizes, (sizes.min(axis=1, initial=1) > MIN_EXTENT_M), "an extent of 1 mm or less"
-        )
-        _check_rows(
-            "parts", sizes, (sizes.max(axis=1, initial=1) <= MAX_COORDINATE_M), "an extent above 10 km"
-        )
+        _check_rows("parts", sizes, sizes.min(axis=1, initial=1) > MIN_EXTENT_M, "an extent of 1 mm or less")
+        _check_rows("parts", sizes, sizes.max(axis=1, initial=1) <= MAX_COORDINATE_M, "an extent above 10 km")
         self._poses = [Pose((x, y, z), (a, b, c, d)) for x, y, z, a, b, c, d in poses.tolist()]
         self._stands = _floats(arrays, "stands", 3)
         self._spots = _floats(arrays, "spots", POSE_NUMBERS)
@@ -112,39 +113,39 @@ class Tables:
         self._parts = _parts(parts, _kinds(arrays, len(parts), len(vertices)), vertices)
 
     def placements(self, names: Sequence[str]) -> Placements:
-        """The sets of verified poses, of these assets."""
+        """Sets of verified poses; ``names`` are the assets that the sets refer to."""
         return Placements(names, self._sets, self._spots)
 
-    def pose(self, field: Field) -> Pose:
-        """The pose whose row the field names."""
-        return self._poses[_row(field, len(self._poses))]
+    def pose(self, row: object) -> Pose:
+        """Pose in a row."""
+        return _at(self._poses, row, "pose")
 
-    def part(self, field: Field) -> ConvexPart:
-        """The part whose row the field names."""
-        return self._parts[_row(field, len(self._parts))]
+    def part(self, row: object) -> ConvexPart:
+        """Part in a row."""
+        return _at(self._parts, row, "")
 
-    def poses_at(self, rows: Sequence[int]) -> list[Pose]:
-        """The poses of these rows. Raises ValueError where one is no row."""
-        _check_are_rows(rows, len(self._poses))
-        return [self._poses[row] for row in rows]
+    def stands(self, spans: Mapping[str, tuple[int, int]]) -> Stands:
+        """Standing poses of objects by name; each span is the first row and the number of rows."""
+        for name, (first, count) in spans.items():
+            if first + count > len(self._stands):
+                raise SceneInvalidError(
+                    f"poses.stands[{name!r}]",
+                    f"found rows {first} to {first + count}: there are {len(self._stands)}",
+                )
+        return Stands(spans, self._stands)
 
-    def parts_at(self, rows: Sequence[int]) -> tuple[ConvexPart, ...]:
-        """The parts of these rows. Raises ValueError where one is no row."""
-        _check_are_rows(rows, len(self._parts))
-        return tuple([self._parts[row] for row in rows])
 
-    def stands(self, field: Field) -> Stands:
-        """The standing poses of the objects whose first row and number of rows the field holds by name."""
-        return Stands({name: self._span(item) for name, item in field.entries()}, self._stands)
+def _at(values: Sequence[T], row: object, field: str) -> T:
+    if not isinstance(row, int) or not 0 <= row < len(values):
+        raise SceneInvalidError(field, f"found {str(row)[:40]}: expected a row from 0 to {len(values) - 1}")
+    return values[row]
 
-    def _span(self, field: Field) -> tuple[int, int]:
-        span = field.value
-        if not isinstance(span, list) or len(span) != 2 or set(map(type, span)) != {int}:
-            field.fail(f"found {str(span)[:40]}: expected the first row and the number of rows")
-        first, count = span
-        if min(first, count) < 0 or first + count > len(self._stands):
-            field.fail(f"found rows {first} to {first + count}: there are {len(self._stands)}")
-        return first, count
+
+def check_unit(field: str, quat: Sequence[float]) -> None:
+    """Raise SceneInvalidError unless a quaternion has length 1."""
+    norm = math.hypot(*quat)
+    if not abs(norm - 1.0) <= UNIT_TOLERANCE:
+        raise SceneInvalidError(field, f"the quaternion has length {norm:.6g}: expected 1")
 
 
 def has_volume(vertices: FloatArray) -> bool:
@@ -173,19 +174,6 @@ def _check_hulls(kinds: list[tuple[int, int]], vertices: FloatArray) -> None:
             raise SceneInvalidError(f"tables.parts[{hulls[int(np.argmin(sound))]}]", FLAT_HULL)
 
 
-def _row(field: Field, count: int) -> int:
-    row = field.value
-    if type(row) is not int or not 0 <= row < count:
-        field.fail(f"found {str(row)[:40]}: expected a row from 0 to {count - 1}")
-    return row
-
-
-def _check_are_rows(rows: Sequence[int], count: int) -> None:
-    """For rows of which no one asks where they stand."""
-    if set(map(type, rows)) - {int} or min(rows, default=0) < 0 or max(rows, default=0) >= max(count, 1):
-        raise ValueError(f"expected rows from 0 to {count - 1}")
-
-
 def _floats(arrays: Arrays, name: str, columns: int) -> FloatArray:
     """A float array of that many columns, all finite."""
     array = arrays.get(name)
@@ -202,7 +190,7 @@ def _check_poses(name: str, rows: FloatArray) -> None:
     x, y, z, w = rows[:, 3:].T
     with np.errstate(over="ignore"):  # too long is too long
         off: FloatArray = np.abs(np.sqrt(x * x + y * y + z * z + w * w) - 1.0)  # (n,)
-    _check_rows(name, rows, off <= QUAT_TOLERANCE, "a quaternion whose length is not 1")
+    _check_rows(name, rows, off <= UNIT_TOLERANCE, "a quaternion whose length is not 1")
     x, y, z = np.abs(rows[:, :3]).T
     near = np.maximum(np.maximum(x, y), z) <= MAX_COORDINATE_M
     _check_rows(name, rows, near, f"a position further than {MAX_COORDINATE_M:g} m from the origin")

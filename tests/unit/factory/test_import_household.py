@@ -10,9 +10,9 @@ from embomatrix.factory.task_import.batch import Verified, verify
 from embomatrix.factory.task_import.reach import Horizon
 from embomatrix.factory.task_import.task import ImportedTask, import_problem
 from embomatrix.sim.engine import FLOOR
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bddl import parse_formula, parse_problem
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
 from embomatrix.world.evaluate import evaluate
@@ -90,7 +90,7 @@ def test_a_household_task_is_read_back_and_can_be_done(home: Scene) -> None:
     bundle = decode_bundle(data, digest=bundle_digest(data))
     task = bundle.tasks[imported.task.task_id]
     assert task == imported.task
-    with contextlib.closing(Simulator(bundle)) as simulator:
+    with contextlib.closing(load_simulator(bundle)) as simulator:
         simulator.reset(task, 0)
         for literal in imported.init:
             assert simulator.facts.holds(literal.atom.predicate, literal.atom.args) is literal.positive, (
@@ -131,7 +131,7 @@ def test_a_floor_is_no_obstacle_and_what_stands_in_its_room_is_on_it(home: Scene
     )
     imported = import_problem(source(text), home)
     assert isinstance(imported, ImportedTask)
-    with contextlib.closing(Simulator(Bundle(imported.scene, {}))) as simulator:
+    with contextlib.closing(load_simulator(Bundle(imported.scene, {}))) as simulator:
         engine = simulator.world.engine
         simulator.reset(imported.task, 0)
         assert not engine.penetrates("floors_1", ignore=frozenset({FLOOR}))

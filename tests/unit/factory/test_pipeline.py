@@ -30,8 +30,8 @@ from embomatrix.factory.writer.tasks import is_heldout_signature
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import score
 from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, Outcome, RolloutResult, Timings
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.actor import physical_simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import plan_from_json
 from embomatrix.world.dataset import Dataset, DatasetError
 from embomatrix.world.scene import Room, Scene
@@ -88,7 +88,7 @@ def test_every_oracle_plan_earns_full_success_from_the_bundle_on_disk(dataset: D
     for record in dataset.records:
         bundle = dataset.bundle(record.bundle_digest)
         assert bundle.tasks[record.task.task_id] == record.task
-        simulator = Simulator(bundle)
+        simulator = load_simulator(bundle)
         simulator.execute(record.task, (), 0)
         assert not score(record.task, frozenset(), simulator.facts).success
         trace = simulator.execute(record.task, plan_from_json(list(record.oracle)), 0)

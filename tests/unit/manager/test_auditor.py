@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from tests.fakes.worker import completed
 
-from embomatrix.manager.control.audit.auditor import Auditor, AuditRules, Repute, Ruling, judge, opinion_of
+from embomatrix.manager.control.reputation import Auditor, AuditRules, Reputation, Ruling, judge, opinion_of
 from embomatrix.manager.runtime.serialization import repute_of, repute_row
 from embomatrix.reward.breakdown import AtomResult
 
@@ -50,7 +50,7 @@ def test_a_repute_is_written_when_it_changed_and_read_without_the_disputes_that_
     assert auditor.take_changed() == []
     successor = Auditor(AuditRules(probation=2), b"key")
     successor.know({row.key: repute_of(row) for row in written})
-    assert successor.of("w1") == Repute(taken=1, agreed=1, audited=1)
+    assert successor.of("w1") == Reputation(taken=1, agreed=1, audited=1)
     assert successor.quarantined("w2") == "it contradicts w1 and w3"
     assert successor.take_changed() == []
 

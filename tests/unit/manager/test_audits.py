@@ -7,10 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.fakes.worker import completed
 
-from embomatrix.manager.control.audit.auditor import AuditRules
 from embomatrix.manager.control.cluster_state import ClusterState
 from embomatrix.manager.control.commands import CancelLease, DeliverResult, GiveLease, QuarantineWorker
-from embomatrix.manager.control.dispatch.assignments import DispatchLimits
+from embomatrix.manager.control.dispatch.state import DispatchLimits
 from embomatrix.manager.control.events import (
     BatchCancelled,
     BatchSubmitted,
@@ -24,6 +23,7 @@ from embomatrix.manager.control.events import (
     WorkerReported,
     WorkerResumed,
 )
+from embomatrix.manager.control.reputation import AuditRules
 from embomatrix.manager.simulation.run import simulate
 from embomatrix.manager.simulation.scenario import LOCAL, Faults, SimulationScenario, Trainer
 from embomatrix.rpc.wire.values import (
@@ -181,7 +181,7 @@ def test_two_workers_that_differ_wait_for_a_third_and_then_end_without_a_result(
     bench.answer(lies={"w1"})
     assert not bench.results
     bench.tell(Tick())
-    bench.tell(Tick(), after_s=AuditRules().patience_s)
+    bench.tell(Tick(), after_s=AuditRules().timeout_s)
     assert bench.results["b1-0"].outcome.code is InfraCode.RESULT_MISMATCH
     assert not bench.caught
 
@@ -216,7 +216,7 @@ def test_a_result_whose_second_worker_left_for_good_is_delivered_after_a_while()
     bench.tell(Tick())
     bench.tell(LeasesRenewed("w1", ()))
     assert not bench.results
-    bench.tell(Tick(), after_s=AuditRules().patience_s)
+    bench.tell(Tick(), after_s=AuditRules().timeout_s)
     assert isinstance(bench.results["b1-0"].outcome, Completed)
 
 

@@ -6,8 +6,8 @@ from hypothesis import given
 from tests.fakes.worker import completed
 
 from embomatrix.manager.control.commands import CancelLease, DeliverResult, FinishBatch, GiveLease
-from embomatrix.manager.control.dispatch.assignments import DispatchLimits
 from embomatrix.manager.control.dispatch.dispatcher import Dispatcher
+from embomatrix.manager.control.dispatch.state import DispatchLimits
 from embomatrix.manager.control.events import (
     BatchSubmitted,
     DispatchPaused,
@@ -22,7 +22,7 @@ from embomatrix.manager.control.events import (
     WorkerResumed,
     WorkerSuspected,
 )
-from embomatrix.manager.control.shares import RunShare, in_turns, quotas
+from embomatrix.manager.control.schedule.placement import RunShare, in_turns, quotas
 from embomatrix.rpc.wire.leases import LeaseProgress
 from embomatrix.rpc.wire.values import (
     Batch,

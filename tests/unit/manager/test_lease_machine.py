@@ -21,7 +21,7 @@ from embomatrix.manager.control.commands import (
     GiveLease,
     SetDesired,
 )
-from embomatrix.manager.control.dispatch.assignments import DispatchLimits
+from embomatrix.manager.control.dispatch.state import DispatchLimits
 from embomatrix.manager.control.events import (
     BatchCancelled,
     BatchContinued,
@@ -88,7 +88,7 @@ class LeaseMachine(RuleBasedStateMachine):
 
     @initialize()
     def begin(self):
-        self.cluster = ClusterState(LIMITS, boot_id="boot")
+        self.cluster = ClusterState(LIMITS, boot_id="boot", debug=True)
         self.now_s = 0.0
         self.submitted = {}
         self.delivered = {}
@@ -258,9 +258,9 @@ class LeaseMachine(RuleBasedStateMachine):
 
     def nobody_idles_while_something_waits(self):
         """After a tick a free slot has looked at what waits, whatever kept it from that before."""
-        desk = self.cluster.dispatcher._desk
-        for record in () if desk.paused else desk.pending:
-            for worker in desk.fleet.workers.values():
+        state = self.cluster.dispatcher.state
+        for record in () if state.paused else state.queues:
+            for worker in state.pool.workers.values():
                 fits = record.scene in worker.warm and worker.takes(record, self.now_s)
                 assert not (fits and worker.free_slots > 0), (record.key, worker)
 

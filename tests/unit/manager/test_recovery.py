@@ -12,8 +12,8 @@ from embomatrix.manager.control.commands import (
     FinishBatch,
     GiveLease,
 )
-from embomatrix.manager.control.dispatch.assignments import DispatchLimits
 from embomatrix.manager.control.dispatch.dispatcher import Dispatcher
+from embomatrix.manager.control.dispatch.state import DispatchLimits
 from embomatrix.manager.control.events import (
     BatchCancelled,
     BatchRestored,

@@ -23,6 +23,7 @@ from embomatrix.manager.control.events import (
 )
 from embomatrix.manager.control.schedule.placement import Need, Site, needs_of, place
 from embomatrix.manager.control.schedule.scheduler import ScheduleLimits, Scheduler
+from embomatrix.manager.control.workers import WorkerPool
 from embomatrix.rpc.wire.leases import LeaseRef
 from embomatrix.rpc.wire.values import (
     Batch,
@@ -42,17 +43,32 @@ class Cluster:
     """A scheduler with obedient workers: what they are told to hold they report, loading first and warm when asked."""
 
     def __init__(self):
-        self.scheduler = Scheduler(ScheduleLimits(scene_mb=MB, affinity_wait_s=0.5, retry_load_s=10))
+        self.pool = WorkerPool()
+        self.scheduler = Scheduler(
+            ScheduleLimits(scene_mb=MB, affinity_wait_s=0.5, retry_load_s=10), self.pool.workers
+        )
         self.now_s = 0.0
         self.desired = {}
 
     def tell(self, event, after_s=0.0):
         self.now_s += after_s
-        commands = self.scheduler.handle(event, now_s=self.now_s)
+        self.change_standing(event)
+        urgency = self.scheduler.note(event, now_s=self.now_s)
+        commands = self.scheduler.place(now_s=self.now_s) if urgency else []
         for command in commands:
             assert isinstance(command, SetDesired)
             self.desired[command.worker_id] = command.bundle_digests
         return commands
+
+    def change_standing(self, event):
+        """Apply what the dispatcher would."""
+        match event:
+            case WorkerJoined(worker_id, resources):
+                self.pool.join(worker_id, resources)
+            case WorkerLost(worker_id):
+                self.pool.leave(worker_id)
+            case WorkerReported() | WorkerDrained() | WorkerSuspected():
+                self.pool.workers[event.worker_id].apply(event)
 
     def worker(self, name="w1", slots=1, memory_mb=1000, score=1.0):
         self.tell(WorkerJoined(name, Resources(slots, slots, memory_mb, score)))
@@ -91,7 +107,7 @@ def test_memory_bounds_what_is_loaded_and_the_furthest_use_is_left_out(cluster):
     cluster.worker(memory_mb=250)
     cluster.announce(["a"], ["b"], ["c"])
     assert cluster.desired["w1"] == ("a", "b")
-    assert [cluster.scheduler.outlook.warmth(scene) for scene in "abc"] == [
+    assert [cluster.scheduler.readiness.warmth(scene) for scene in "abc"] == [
         Warmth.WARMING,
         Warmth.WARMING,
         Warmth.QUEUED,
@@ -227,9 +243,9 @@ def test_a_scene_larger_than_every_worker_is_unplaceable_and_says_why(cluster):
     cluster.announce(["a"])
     cluster.report(memory_mb=900.0)
     cluster.tell(Tick())
-    assert cluster.scheduler.outlook.warmth("a") is Warmth.WARM
+    assert cluster.scheduler.readiness.warmth("a") is Warmth.WARM
     cluster.report(scenes=[])
-    assert cluster.scheduler.outlook.warmth("a") is Warmth.UNPLACEABLE
+    assert cluster.scheduler.readiness.warmth("a") is Warmth.UNPLACEABLE
     assert "900 MB" in cluster.scheduler.unplaceable["a"]
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 
 from embomatrix.manager.control.commands import AcknowledgeLease, DeliverResult, FinishBatch, GiveLease
-from embomatrix.manager.control.dispatch.assignments import DispatchLimits
+from embomatrix.manager.control.dispatch.state import DispatchLimits
 from embomatrix.manager.simulation.agenda import Agenda
 from embomatrix.manager.simulation.auditor import BrokenInvariantError, InvariantChecker
 from embomatrix.manager.simulation.line import Line

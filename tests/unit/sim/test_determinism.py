@@ -12,6 +12,7 @@ from tests.fakes.scenes import kitchen_scene
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.placing.pose_cache import analyse_scene
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
 
 PLANS = (
@@ -35,7 +36,7 @@ def bundle():
 
 def digests(bundle, order) -> dict[tuple[int, int], str]:
     """Digest of every plan with every seed, executed in an order, in one simulator."""
-    simulator = Simulator(bundle)
+    simulator = load_simulator(bundle)
     task = task_over(bundle.scene)
     found = {}
     for plan, seed in order:

@@ -7,7 +7,7 @@ from tests.fakes.plans import executed, executed_alone, plan_of, task_over
 from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.reward.hierarchy import score
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.parse import parse_plan
 from embomatrix.skills.prompt import EXAMPLES, Codec
@@ -24,7 +24,7 @@ STOCK = f"{FETCH}; place microwave_1 inside"
 
 @pytest.fixture(scope="module")
 def flat():
-    simulator = Simulator(Bundle(kitchen_scene(), {}))
+    simulator = load_simulator(Bundle(kitchen_scene(), {}))
     yield simulator
     simulator.close()
 

@@ -6,7 +6,7 @@ import pytest
 from tests.fakes.plans import plan_of, task_over
 from tests.fakes.scenes import kitchen_scene
 
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.sim.state.facts import FactError
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.state import Relation, State, SubstanceRelation
@@ -23,7 +23,7 @@ def stained_scene():
 
 @pytest.fixture(scope="module")
 def flat():
-    simulator = Simulator(Bundle(stained_scene(), {}))
+    simulator = load_simulator(Bundle(stained_scene(), {}))
     task = task_over(simulator.world.scene)
     simulator.execute(task, plan_of(task, "move fridge_1; open fridge_1"), 0)
     yield simulator

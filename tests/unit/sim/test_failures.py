@@ -7,31 +7,31 @@ from tests.fakes import furniture as make
 from tests.fakes.household import household_scene
 from tests.fakes.plans import awkward_scene, executed, executed_alone, with_objects
 from tests.fakes.scenes import kitchen_scene, placed, scene_of, upright
+from tests.fakes.skill_reasons import MISHAPS, reasons_of
 
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.library import MISHAPS, reasons_of
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.scene import RobotStart
 
 
 @pytest.fixture(scope="module")
 def flat():
-    simulator = Simulator(Bundle(kitchen_scene(), {}))
+    simulator = load_simulator(Bundle(kitchen_scene(), {}))
     yield simulator
     simulator.close()
 
 
 @pytest.fixture(scope="module")
 def home():
-    simulator = Simulator(Bundle(household_scene(), {}))
+    simulator = load_simulator(Bundle(household_scene(), {}))
     yield simulator
     simulator.close()
 
 
 @pytest.fixture(scope="module")
 def awkward():
-    simulator = Simulator(Bundle(awkward_scene(), {}))
+    simulator = load_simulator(Bundle(awkward_scene(), {}))
     yield simulator
     simulator.close()
 
@@ -144,7 +144,7 @@ def test_every_reason_is_met_by_some_test():
 def test_no_path_leads_into_a_room_without_a_door():
     trace = executed_alone(replace(kitchen_scene(), doorways=()), "move apple_2")
     assert trace.failure is FailureReason.NO_PATH
-    assert trace.steps[0].message == "the robot can't get to apple_2: a wall bars the way"
+    assert trace.steps[0].message == "the robot can't get to apple_2: a wall blocks the way"
 
 
 def test_a_room_without_a_door_can_not_be_entered():
@@ -175,7 +175,7 @@ def test_who_stands_in_the_doorway_is_told(text):
     )
     trace = executed_alone(scene, text)
     assert trace.failure is FailureReason.NO_PATH
-    assert trace.steps[0].message.endswith(": chest_1 bars the way")
+    assert trace.steps[0].message.endswith(": chest_1 blocks the way")
 
 
 def test_the_arm_does_not_reach_through_a_wall():
@@ -231,7 +231,7 @@ def test_a_mug_in_front_of_the_microwave_keeps_its_door_shut():
 
 
 def test_a_door_that_is_blocked_stays_as_it_was():
-    simulator = Simulator(Bundle(in_front_of_the_microwave(), {}))
+    simulator = load_simulator(Bundle(in_front_of_the_microwave(), {}))
     executed(simulator, "move microwave_1; open microwave_1")
     assert not simulator.facts.holds("open", ("microwave_1",))
     simulator.close()

@@ -7,7 +7,6 @@ from tests.fakes.fidelity import clumsy, sloppy
 from tests.fakes.plans import plan_of, task_over
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.fidelity.compare import (
     Comparison,
     FidelityTrial,
@@ -29,6 +28,7 @@ from embomatrix.sim.fidelity.records import (
 from embomatrix.sim.fidelity.report import report_on
 from embomatrix.sim.fidelity.sampler import ROUTINES, SKILLS
 from embomatrix.sim.planner.oracle import find_plan
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Skill
 from embomatrix.world.bundle import Bundle
@@ -47,7 +47,7 @@ def bundle():
 
 @pytest.fixture(scope="module")
 def cached(bundle):
-    simulator = Simulator(bundle)
+    simulator = load_simulator(bundle)
     yield simulator
     simulator.close()
 
@@ -67,7 +67,7 @@ def compared(cached, other, words):
 
 
 def test_a_mode_agrees_with_itself_in_every_step_and_atom(cached, bundle):
-    other = Simulator(bundle)
+    other = load_simulator(bundle)
     comparison = compared(cached, other, CARRY)
     other.close()
     assert comparison.first_difference is None
@@ -85,7 +85,7 @@ def test_the_first_step_that_differs_is_named_with_both_sentences(cached, bundle
     told = disagreement_to_json(comparison)
     assert (told["step"], told["skill"]) == (2, "toggle_on")
     assert "switched table_lamp_1 on" in told["cached"]
-    assert "bars it" in told["physical"]
+    assert "blocks it" in told["physical"]
 
 
 def test_atoms_that_hold_in_one_mode_alone_are_told(cached, bundle):

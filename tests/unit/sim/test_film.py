@@ -9,9 +9,9 @@ from tests.fakes.plans import plan_of, task_over
 from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.bullet.camera import furnish_cutaway, render_egocentric, shoot_oblique
-from embomatrix.sim.bullet.stage import VisualScene
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.bullet.visual_scene import VisualScene
 from embomatrix.sim.film import DRIVE_M_S, FRAMES_PER_S, film_cached
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.poses import StandPose
 
@@ -25,7 +25,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def film(scene):
-    simulator = Simulator(Bundle(scene, {}))
+    simulator = load_simulator(Bundle(scene, {}))
     task = task_over(scene)
     film = film_cached(simulator, task, plan_of(task, PLAN), 0)
     simulator.close()
@@ -55,7 +55,7 @@ def test_a_door_opens_by_and_by(film) -> None:
 
 
 def test_the_film_ends_in_the_state_that_the_plan_reached(film, scene) -> None:
-    simulator = Simulator(Bundle(scene, {}))
+    simulator = load_simulator(Bundle(scene, {}))
     simulator.execute(film.task, film.plan, 0)
     assert film.frames[-1].poses["apple_1"] == simulator.world.engine.pose("apple_1")
     assert film.frames[-1].robot == simulator.world.robot
@@ -63,7 +63,7 @@ def test_the_film_ends_in_the_state_that_the_plan_reached(film, scene) -> None:
 
 
 def test_a_plan_that_fails_is_shown_up_to_its_failure(scene) -> None:
-    simulator = Simulator(Bundle(scene, {}))
+    simulator = load_simulator(Bundle(scene, {}))
     task = task_over(scene)
     film = film_cached(simulator, task, plan_of(task, "pick_up apple_2; move apple_2"), 0)
     simulator.close()

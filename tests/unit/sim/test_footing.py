@@ -8,8 +8,8 @@ from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.state.footing import NOWHERE, Footings
 from embomatrix.sim.state.relations import Relations
+from embomatrix.sim.state.supports import NOWHERE, Footings
 from embomatrix.world.geometry import Pose
 from embomatrix.world.state import Relation
 

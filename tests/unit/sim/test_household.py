@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from tests.fakes.household import household_scene
 from tests.fakes.plans import executed, plan_of, task_over
 
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import PROFILES, Skill
 from embomatrix.world.bundle import Bundle
@@ -15,7 +15,7 @@ from embomatrix.world.task import Profile
 
 @pytest.fixture(scope="module")
 def home():
-    simulator = Simulator(Bundle(household_scene(), {}))
+    simulator = load_simulator(Bundle(household_scene(), {}))
     yield simulator
     simulator.close()
 
@@ -100,7 +100,7 @@ def test_a_dry_cloth_takes_dust_off_and_leaves_stains(home):
     trace = executed(home, f"{RAG}; move plate_2; clean_object_with_tool plate_2 rag_1")
     assert trace.failure is FailureReason.NEEDS_SOAKING
     assert home.facts.holds("stained", ("plate_2",))
-    assert trace.steps[-1].message.startswith("rag_1 takes stain off only when it is soaked with ")
+    assert trace.steps[-1].message.startswith("rag_1 removes stain only when it is soaked with ")
     assert "water" in trace.steps[-1].message
 
 
@@ -123,7 +123,10 @@ def test_soap_from_a_bottle_does_as_well(home):
 def test_a_cup_is_filled_from_a_bottle_or_a_tap_and_wet_by_water_only(home):
     text = "move cup_1; pick_up cup_1; move liquid_soap__bottle_1; soak_object_in_source cup_1 liquid_soap__bottle_1"
     poured = succeeded(home, text)
-    assert poured.steps[-1].message == "held cup_1 under what flows; cup_1 is now filled with liquid soap"
+    assert (
+        poured.steps[-1].message
+        == "held cup_1 under the running liquid; cup_1 is now filled with liquid soap"
+    )
     assert home.facts.holds("filled", ("cup_1", "liquid_soap.n.01"))
     assert not home.facts.holds("saturated", ("cup_1", "liquid_soap.n.01"))
     succeeded(home, f"{TAP}; move cup_1; pick_up cup_1; move sink_1; soak_object_in_source cup_1 sink_1")

@@ -11,8 +11,8 @@ from tests.fakes.furniture import box
 from tests.fakes.plans import executed, plan_of, task_over, with_objects
 from tests.fakes.scenes import NORTH, kitchen_scene, placed, upright
 
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.joints.panels import Leaves
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.bundle import Bundle
@@ -45,7 +45,7 @@ def drawer_scene():
 
 @pytest.fixture(scope="module")
 def flat():
-    simulator = Simulator(Bundle(drawer_scene(), {}))
+    simulator = load_simulator(Bundle(drawer_scene(), {}))
     yield simulator
     simulator.close()
 
@@ -88,7 +88,7 @@ def test_open_drawer_in_an_aisle_bars_the_way_by_name():
     empty = tuple(item for item in scene.objects if item.name != "mug_2")
     scene = dataclasses.replace(scene, objects=empty, walls=(*scene.walls, aisle))
     scene = with_objects(scene, [(at_its_end, can)])
-    simulator = Simulator(Bundle(scene, {}))
+    simulator = load_simulator(Bundle(scene, {}))
     try:
         assert not executed(simulator, "move apple_9").failure
         trace = executed(simulator, f"{OPENED}; move apple_9")
@@ -144,7 +144,7 @@ def test_nothing_is_placed_in_a_shut_drawer(flat):
 def test_a_drawer_that_something_stops_comes_out_up_to_it():
     wall = box((4.0, 0.8, 0.25), (1.0, 0.1, 0.5))
     scene = dataclasses.replace(drawer_scene(), walls=(*drawer_scene().walls, wall))
-    simulator = Simulator(Bundle(scene, {}))
+    simulator = load_simulator(Bundle(scene, {}))
     try:
         leaves = Leaves(simulator.world.engine, simulator.world.relations, "bottom_cabinet_1")
         course = [(share, share) for share in (0.25, 0.5, 0.75, 1.0)]

@@ -3,7 +3,7 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from embomatrix.sim.geometry.neighbourhood import Neighbourhood
+from embomatrix.sim.geometry.spatial_hash import Neighbourhood
 from embomatrix.world.geometry import Aabb
 
 PLACE = st.tuples(*[st.floats(-40.0, 40.0)] * 3)

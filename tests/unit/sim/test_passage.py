@@ -9,10 +9,9 @@ from tests.fakes import furniture as make
 from tests.fakes.scenes import placed, scene_of, upright
 
 from embomatrix.sim.bullet.dynamic import DynamicWorld
-from embomatrix.sim.bullet.robot import Posture
+from embomatrix.sim.bullet.robot import Posture, tucked
 from embomatrix.sim.physical import body
 from embomatrix.sim.physical.motion import STEERED, Mover
-from embomatrix.sim.physical.stage import tucked
 from embomatrix.world.poses import StandPose
 
 OUT = (0.5, 0.0, 1.5, 0.0, -0.2, 0.0, 1.8, 0.785)

@@ -6,11 +6,11 @@ import pytest
 from tests.fakes import furniture as make
 from tests.fakes.plans import executed, with_objects
 from tests.fakes.scenes import kitchen_scene, placed, upright
+from tests.fakes.skill_reasons import MISHAPS, reasons_of
 
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.actor import MOTIONS, PhysicalActor, physical_simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.library import MISHAPS, reasons_of
 from embomatrix.skills.syntax import Skill
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.geometry import Pose
@@ -145,7 +145,7 @@ def test_what_stands_walled_in_by_heavy_things_can_not_be_taken():
 def test_watching_sees_time_pass():
     scene = kitchen_scene()
     actor = PhysicalActor(Bundle(scene, {}))
-    simulator = Simulator(Bundle(scene, {}), actor=actor)
+    simulator = load_simulator(Bundle(scene, {}), actor=actor)
     seen = []
     actor.watch(lambda: seen.append(actor.dynamic.steps))
     try:

@@ -12,6 +12,7 @@ from tests.fakes.scenes import kitchen_scene, placed, scene_of, upright
 
 from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.bullet.robot import tucked
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.doors import Leaf
@@ -19,7 +20,6 @@ from embomatrix.sim.physical.floor import Floor
 from embomatrix.sim.physical.grasp import cross
 from embomatrix.sim.physical.motion import Mover
 from embomatrix.sim.physical.space import boxes_of, strikes, struck
-from embomatrix.sim.physical.stage import tucked
 from embomatrix.sim.state.relations import Relations
 from embomatrix.world.asset import Joint, JointKind, Link
 from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
@@ -64,10 +64,10 @@ def test_the_base_the_lift_and_the_heading_carry_the_tool_along():
 
 
 def test_the_folded_arm_keeps_within_the_robots_disc_and_off_its_own_trunk():
-    from embomatrix.sim.physical.stage import TUCKED
+    from embomatrix.sim.bullet.robot import TUCKED_ARM
     from embomatrix.skills.limits import ROBOT
 
-    posture = np.concatenate([[0.0, 0.0, 0.0, 0.0], TUCKED])[None]
+    posture = np.concatenate([[0.0, 0.0, 0.0, 0.0], np.array(TUCKED_ARM)])[None]
     wide = np.linalg.norm(body.balls(posture)[0, :, :2], axis=1) + body.RADII
     assert wide.max() <= ROBOT.radius_m + 0.005
     assert not body.strikes_itself(posture, body.balls(posture), body.RADII)[0]

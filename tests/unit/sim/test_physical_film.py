@@ -7,9 +7,9 @@ import pytest
 from tests.fakes.plans import plan_of, task_over
 from tests.fakes.scenes import kitchen_scene
 
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.actor import PhysicalActor
 from embomatrix.sim.physical.film import film_physical
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle
 
 
@@ -17,7 +17,7 @@ from embomatrix.world.bundle import Bundle
 def film():
     bundle = Bundle(kitchen_scene(), {})
     actor = PhysicalActor(bundle)
-    simulator = Simulator(bundle, actor=actor)
+    simulator = load_simulator(bundle, actor=actor)
     task = task_over(bundle.scene)
     film = film_physical(simulator, actor, task, plan_of(task, "move apple_1; pick_up apple_1"), 0)
     simulator.close()

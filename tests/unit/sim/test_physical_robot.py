@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from embomatrix.sim.bullet.client import ClientPool
-from embomatrix.sim.bullet.robot import Posture, RobotBody
+from embomatrix.sim.bullet.robot import TUCKED_ARM, Posture, RobotBody
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.grasp import facing
 from embomatrix.sim.physical.reach import ArmReach, HeldGeometry, Track
 from embomatrix.sim.physical.roadmap import way_between
 from embomatrix.sim.physical.space import boxes_of
-from embomatrix.sim.physical.stage import TOOL, TUCKED
+from embomatrix.sim.physical.stage import TOOL
 from embomatrix.sim.robot_dimensions import LIFT_M, MAST_TOP_M, SHOULDER_LOW_M
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Pose
@@ -22,7 +22,7 @@ FLOOR = (Pose((0.0, 0.0, -0.5)), (1e3, 1e3, 1.0), "floor")
 
 
 def shoulder_heights(lift_m):
-    posture = np.concatenate([[0.0, 0.0, 0.0, lift_m], TUCKED])[None]
+    posture = np.concatenate([[0.0, 0.0, 0.0, lift_m], np.array(TUCKED_ARM)])[None]
     turn, place = body.mounts(posture)
     return place[0, 2] + arm.SHOULDER_M * turn[0, 2, 2]
 
@@ -50,7 +50,7 @@ def test_the_shoulder_goes_from_a_shins_height_to_over_a_mans():
 
 
 def test_the_folded_robot_passes_under_what_does_not_bar_its_way():
-    posture = np.concatenate([[0.0, 0.0, 0.0, 0.0], TUCKED])[None]
+    posture = np.concatenate([[0.0, 0.0, 0.0, 0.0], np.array(TUCKED_ARM)])[None]
     assert (body.balls(posture)[0, :, 2] + body.RADII).max() < ROBOT.height_m
     trunk, radii = body.trunk_balls(posture)
     assert (trunk[0, :, 2] + radii).max() < ROBOT.height_m

@@ -7,8 +7,8 @@ import pytest
 from tests.fakes.household import household_scene
 from tests.fakes.plans import task_over, words_of
 
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.planner.oracle import PlanNotFound, find_plan
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.syntax import Skill
 from embomatrix.world.bddl import parse_formula
 from embomatrix.world.bundle import Bundle
@@ -18,7 +18,7 @@ from embomatrix.world.task import Profile
 
 @pytest.fixture(scope="module")
 def home():
-    with contextlib.closing(Simulator(Bundle(household_scene(), {}))) as simulator:
+    with contextlib.closing(load_simulator(Bundle(household_scene(), {}))) as simulator:
         yield simulator
 
 

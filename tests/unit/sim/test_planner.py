@@ -7,9 +7,9 @@ from tests.fakes import furniture as make
 from tests.fakes.plans import awkward_scene, task_over, with_objects, words_of
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks, placed, upright
 
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.placing.pose_cache import build_pose_cache
 from embomatrix.sim.planner.oracle import PROOF_SEEDS, PlanNotFound, find_plan
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.syntax import MAX_STEPS, Skill
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.evaluate import evaluate
@@ -31,7 +31,7 @@ def flat():
     scene = kitchen_scene()
     small = [item.name for item in scene.objects if not item.fixed]
     cache = build_pose_cache(scene, small, [item.name for item in scene.objects], seed=0)
-    simulator = Simulator(Bundle(scene, {}, cache))
+    simulator = load_simulator(Bundle(scene, {}, cache))
     yield simulator
     simulator.close()
 
@@ -252,7 +252,7 @@ def test_a_running_microwave_can_not_end_open_and_on(flat):
 
 
 def test_what_is_stacked_is_taken_off_first():
-    simulator = Simulator(Bundle(awkward_scene(), {}))
+    simulator = load_simulator(Bundle(awkward_scene(), {}))
     plan = oracle(simulator, atom("ontop", "tray_1", "coffee_table_1"))
     simulator.close()
     assert plan == (
@@ -316,7 +316,7 @@ def test_what_has_no_floor_left_in_a_box_is_put_on_what_lies_there():
             (placed("brick_2", brick, "kitchen_0", upright(1.9, 1.6, table_m, brick)), brick),
         ],
     )
-    simulator = Simulator(Bundle(scene, {}, build_pose_cache(scene, (), (), seed=0)))
+    simulator = load_simulator(Bundle(scene, {}, build_pose_cache(scene, (), (), seed=0)))
     plan = oracle(
         simulator, And((atom("inside", "brick_1", "crate_1"), atom("inside", "brick_2", "crate_1")))
     )
@@ -342,7 +342,7 @@ def test_what_would_lie_above_a_box_is_taken_back_until_there_is_room_in_it():
             (placed("brick_1", brick, "kitchen_0", upright(1.9, 1.4, table_m, brick)), brick),
         ],
     )
-    simulator = Simulator(Bundle(scene, {}, build_pose_cache(scene, (), (), seed=0)))
+    simulator = load_simulator(Bundle(scene, {}, build_pose_cache(scene, (), (), seed=0)))
     plan = oracle(simulator, atom("inside", "brick_1", "crate_1"))
     simulator.close()
     assert plan.endswith("pick_up brick_1; move crate_1; place crate_1 inside"), plan
@@ -361,7 +361,7 @@ def test_what_does_not_open_where_it_stands_is_carried_to_where_it_does():
             (placed("post_1", post, "kitchen_0", upright(2.27, 1.4, table_m, post), fixed=True), post),
         ],
     )
-    simulator = Simulator(Bundle(scene, {}, build_pose_cache(scene, (), (), seed=0)))
+    simulator = load_simulator(Bundle(scene, {}, build_pose_cache(scene, (), (), seed=0)))
     plan = oracle(simulator, atom("open", "casket_1"))
     simulator.close()
     assert plan.startswith("move casket_1; pick_up casket_1; move "), plan

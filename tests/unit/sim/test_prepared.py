@@ -11,7 +11,9 @@ from tests.fakes.scenes import kitchen_scene
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.floor.grid import grid_shape
-from embomatrix.sim.floor.prepared import PreparedScene, prepare
+from embomatrix.sim.floor.prepared import PreparedScene
+from embomatrix.sim.live_world import prepare
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
 
 PLANS = (
@@ -28,7 +30,7 @@ def bundle():
     scene = kitchen_scene()
     task = task_over(scene)
     bare = Bundle(scene, {task.task_id: task})
-    with contextlib.closing(Simulator(bare)) as simulator:
+    with contextlib.closing(load_simulator(bare)) as simulator:
         simulator.execute(task, plan_of(task, PLANS[0]), 0)
         return decode_bundle(encode_bundle(prepare(bare, simulator.world)))
 

@@ -10,18 +10,19 @@ from tests.fakes.plans import executed, with_objects
 from tests.fakes.scenes import kitchen_scene, placed, upright
 
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical.prospects import Placing
 from embomatrix.sim.physical.survey import prospects
 from embomatrix.sim.placing.pose_cache import build_pose_cache
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
 from embomatrix.world.codec_task import poses_from_json, poses_to_json
-from embomatrix.world.field import SceneInvalidError
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import PoseCache
+from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.state import Relation
+from embomatrix.world.tables import Tables, TableWriter
 
 ON_COUNTER = Placing("apple_1", "countertop_1", Relation.ONTOP)
 INTO_BOWL = Placing("apple_1", "bowl_1", Relation.INSIDE)
@@ -110,7 +111,7 @@ def test_where_nothing_could_be_taken_from_nothing_is_placed():
     assert other.startswith(("side", "lid", "stand"))
     trace = execute(scene, poses, "move slice_1; pick_up slice_1; move stand_1; place stand_1 ontop")
     assert trace.failure is FailureReason.ARM_BLOCKED
-    assert trace.steps[-1].message == f"the arm finds no free way to a place for slice_1: {other} bars it"
+    assert trace.steps[-1].message == f"the arm finds no free path to a place for slice_1: {other} blocks it"
 
 
 def test_a_place_is_free_again_when_what_barred_it_is_taken_away():
@@ -122,7 +123,7 @@ def test_a_place_is_free_again_when_what_barred_it_is_taken_away():
 
 
 def execute(scene, poses, text):
-    with contextlib.closing(Simulator(Bundle(scene, {}, poses))) as simulator:
+    with contextlib.closing(load_simulator(Bundle(scene, {}, poses))) as simulator:
         return executed(simulator, text)
 
 
@@ -134,7 +135,8 @@ def test_what_the_arm_gets_at_travels_in_the_bundle(known):
 
 @pytest.mark.parametrize("number", ["3", -1, 0.5, True, None])
 def test_a_number_of_a_pose_that_is_none_is_refused_by_name(number):
-    value = poses_to_json(PoseCache(reached={Relation.ONTOP: {"mug_1": {"sink_1": 1}}}))
+    writer = TableWriter()
+    value = poses_to_json(PoseCache(reached={Relation.ONTOP: {"mug_1": {"sink_1": 1}}}), writer)
     value["reached"]["ontop"]["mug_1"]["sink_1"] = number
     with pytest.raises(SceneInvalidError, match="sink_1"):
-        poses_from_json(value)
+        poses_from_json(value, Tables(writer.arrays()))

@@ -12,8 +12,8 @@ from tests.fakes.scenes import kitchen_scene
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.geometry.surfaces import EDGE_M, REST_M, is_shut, surface_under
-from embomatrix.sim.state.footing import Enclosure, Host
 from embomatrix.sim.state.relations import Relations
+from embomatrix.sim.state.supports import Enclosure, Host
 from embomatrix.world.asset import Interior
 from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.state import Relation

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from tests.fakes.plans import executed, plan_of, task_over
 from tests.fakes.scenes import kitchen_scene
 
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle
 
 THINGS = st.sampled_from(["apple_1", "apple_2", "mug_1", "bowl_1", "chicken_leg_1"])
@@ -34,14 +34,14 @@ PROBE = (
 
 @pytest.fixture(scope="module")
 def flat():
-    simulator = Simulator(Bundle(kitchen_scene(), {}))
+    simulator = load_simulator(Bundle(kitchen_scene(), {}))
     yield simulator
     simulator.close()
 
 
 @pytest.fixture(scope="module")
 def probed():
-    simulator = Simulator(Bundle(kitchen_scene(), {}))
+    simulator = load_simulator(Bundle(kitchen_scene(), {}))
     yield executed(simulator, PROBE)
     simulator.close()
 

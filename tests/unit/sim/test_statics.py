@@ -1,9 +1,9 @@
-"""What statics proves, a settle finds; what it can't prove is left to the settle."""
+"""A settle confirms every rest pose that statics proves; statics leaves the other cases to the settle."""
 
 import math
 
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from embomatrix.sim.bullet.client import ClientPool
@@ -15,7 +15,6 @@ from embomatrix.world.geometry import ConvexPart, Pose, Shape
 
 LIFT_M = 0.0005
 EXTENT = st.floats(0.03, 0.3)
-SHAPE = st.sampled_from((Shape.BOX, Shape.CYLINDER))
 
 
 def solid(name, *parts):
@@ -47,17 +46,63 @@ def mini():
     pool.close()
 
 
-@settings(max_examples=60, deadline=None)
+BOX, CYLINDER = SHAPES = (Shape.BOX, Shape.CYLINDER)
+SHAPE = st.sampled_from(SHAPES)
+QUARTER = math.pi / 2
+ROCKING = {
+    "corner at the rim of a disc": (
+        BOX,
+        (0.03, 0.2852, 0.25),
+        CYLINDER,
+        (0.3, 0.3, 0.25),
+        0.0,
+        0.0315,
+        QUARTER,
+    ),
+    "slender block on a disc": (
+        BOX,
+        (0.2726, 0.03125, 0.1932),
+        CYLINDER,
+        (0.3, 0.3, 0.125),
+        0.0,
+        0.0,
+        math.pi,
+    ),
+    "plank beyond an edge": (
+        BOX,
+        (0.03125, 0.3, 0.125),
+        BOX,
+        (0.232, 0.03125, 0.0453),
+        -0.1113,
+        0.0,
+        QUARTER,
+    ),
+    "block over a beam's end": (BOX, (0.03, 0.3, 0.03), BOX, (0.03, 0.25, 0.277), 0.0, 0.1205, math.pi),
+    "disc on a beam": (CYLINDER, (0.117, 0.117, 0.03125), BOX, (0.0411, 0.125, 0.125), -0.003, 0.0, -QUARTER),
+}
+"""Cases that rock by 0.3 to 2 mm in Bullet, found by a search along the edge of the rule."""
+
+
+@pytest.mark.parametrize("case", ROCKING.values(), ids=ROCKING)
+def test_rocking_case_is_left_to_the_settle(case) -> None:
+    shape, size, other_shape, other_size, x, y, yaw = case
+    held, support = solid("held", part(shape, size)), solid("support", part(other_shape, other_size))
+    assert proved(held, support, over(held, support, x, y, yaw)) is None
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])
 @given(
     SHAPE,
     st.tuples(EXTENT, EXTENT, EXTENT),
-    SHAPE,
+    st.just(BOX),
     st.tuples(EXTENT, EXTENT, EXTENT),
-    st.floats(-0.2, 0.2),
-    st.floats(-0.2, 0.2),
-    st.sampled_from((0.0, math.pi / 2, math.pi, -math.pi / 2, 0.4)),
+    st.floats(-0.1, 0.1),
+    st.floats(-0.1, 0.1),
+    st.sampled_from((0.0, QUARTER, math.pi, -QUARTER, 0.4)),
 )
-def test_what_is_proved_to_rest_settles_there(mini, shape, size, other_shape, other_size, x, y, yaw) -> None:
+def test_proved_object_settles_at_its_rest_pose(
+    mini, shape, size, other_shape, other_size, x, y, yaw
+) -> None:
     held, support = solid("held", part(shape, size)), solid("support", part(other_shape, other_size))
     pose = over(held, support, x, y, yaw)
     rest = proved(held, support, pose)
@@ -69,7 +114,7 @@ def test_what_is_proved_to_rest_settles_there(mini, shape, size, other_shape, ot
     assert settled.pose.position_m == pytest.approx((stands @ rest).position_m, abs=3e-4)
 
 
-def test_a_block_rests_on_a_table_half_a_millimetre_lower() -> None:
+def test_block_comes_to_rest_half_a_millimetre_lower() -> None:
     block, table = (
         solid("block", part(Shape.BOX, (0.1, 0.1, 0.1))),
         solid("table", part(Shape.BOX, (1, 1, 0.5))),
@@ -79,7 +124,7 @@ def test_a_block_rests_on_a_table_half_a_millimetre_lower() -> None:
     )
 
 
-def test_a_block_with_its_weight_beyond_the_edge_is_not_proved() -> None:
+def test_block_with_its_weight_beyond_the_edge_is_not_proved() -> None:
     block, table = (
         solid("block", part(Shape.BOX, (0.1, 0.1, 0.1))),
         solid("table", part(Shape.BOX, (1, 1, 0.5))),
@@ -88,7 +133,7 @@ def test_a_block_with_its_weight_beyond_the_edge_is_not_proved() -> None:
     assert proved(block, table, over(block, table, 0.49, 0.0, 0.0)) is None
 
 
-def test_a_rim_beside_a_block_leaves_it_to_the_settle() -> None:
+def test_rim_beside_a_block_requires_a_settle() -> None:
     block = solid("block", part(Shape.BOX, (0.1, 0.1, 0.1)))
     board, rim = part(Shape.BOX, (0.5, 0.5, 0.02)), part(Shape.BOX, (0.02, 0.5, 0.04), (0.24, 0.0, 0.03))
     tray = solid("tray", board, rim)
@@ -98,7 +143,7 @@ def test_a_rim_beside_a_block_leaves_it_to_the_settle() -> None:
 
 
 @pytest.mark.parametrize(
-    "thing",
+    "asset",
     [
         solid("ball", part(Shape.SPHERE, (0.1, 0.1, 0.1))),
         solid(
@@ -112,11 +157,11 @@ def test_a_rim_beside_a_block_leaves_it_to_the_settle() -> None:
         solid("hook", part(Shape.BOX, (0.02, 0.02, 0.1), (0.1, 0.0, 0.0))),
     ],
 )
-def test_what_rolls_or_topples_has_no_base(thing) -> None:
-    assert base_of(thing) is None
+def test_object_that_rolls_or_topples_has_no_base(asset) -> None:
+    assert base_of(asset) is None
 
 
-def test_a_slope_of_a_degree_is_no_level() -> None:
+def test_slope_of_one_degree_is_not_level() -> None:
     half = math.radians(1.1) / 2
     assert is_level(Pose.from_xyz_yaw(1.0, 2.0, 3.0, 0.7))
     assert not is_level(Pose((0.0, 0.0, 0.0), (math.sin(half), 0.0, 0.0, math.cos(half))))

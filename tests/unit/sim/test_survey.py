@@ -9,10 +9,10 @@ from tests.fakes.plans import executed, with_objects
 from tests.fakes.scenes import kitchen_scene, placed, upright
 
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.placing.pose_cache import standing_poses
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
 from embomatrix.world.geometry import Pose
@@ -57,7 +57,7 @@ def surveyed(scene, names, foresight=None):
 
 
 def executed_with(scene, poses, text):
-    simulator = Simulator(Bundle(scene, {}, poses))
+    simulator = load_simulator(Bundle(scene, {}, poses))
     try:
         return executed(simulator, text)
     finally:
@@ -80,7 +80,7 @@ def test_what_is_walled_in_is_barred_and_cached_mode_says_who_bars_it():
     assert other.startswith(("board", "lid"))
     trace = executed_with(scene, poses, "move apple_1; pick_up apple_1")
     assert trace.failure is FailureReason.ARM_BLOCKED
-    assert trace.steps[-1].message == f"the arm finds no free way to apple_1: {other} bars it"
+    assert trace.steps[-1].message == f"the arm finds no free path to apple_1: {other} blocks it"
 
 
 def test_a_thing_is_free_again_when_what_barred_it_is_taken_away():

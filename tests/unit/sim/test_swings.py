@@ -6,6 +6,7 @@ from tests.fakes.scenes import upright
 from tests.unit.sim.test_leaves import drawer_scene
 
 from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle
 
 DRAWERS = "bottom_cabinet_1"
@@ -22,7 +23,7 @@ PLANS = (
 @pytest.fixture(scope="module")
 def both():
     """One simulator that found out ahead, and one that did not."""
-    ahead, then = Simulator(Bundle(drawer_scene(), {})), Simulator(Bundle(drawer_scene(), {}))
+    ahead, then = load_simulator(Bundle(drawer_scene(), {})), load_simulator(Bundle(drawer_scene(), {}))
     for _ in ahead.complete():
         pass
     yield ahead, then
@@ -65,7 +66,7 @@ def test_looking_ahead_leaves_the_scene_as_it_was(both) -> None:
 
 def test_nothing_is_foreseen_in_a_scene_from_which_something_is_gone(both) -> None:
     _, then = both
-    simulator = Simulator(Bundle(drawer_scene(), {}))
+    simulator = load_simulator(Bundle(drawer_scene(), {}))
     try:
         simulator.world.engine.park("mug_2")
         for _ in simulator.complete():

@@ -7,7 +7,7 @@ from tests.fakes import furniture as make
 from tests.fakes.plans import plan_of, task_over, with_objects
 from tests.fakes.scenes import kitchen_scene, placed, upright
 
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.state import State
 
@@ -22,7 +22,7 @@ def scene_with_pan():
 
 @pytest.fixture(scope="module")
 def flat():
-    simulator = Simulator(Bundle(scene_with_pan(), {}))
+    simulator = load_simulator(Bundle(scene_with_pan(), {}))
     yield simulator
     simulator.close()
 

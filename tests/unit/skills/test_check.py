@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.fakes import furniture as make
 from tests.fakes import household
+from tests.fakes.skill_reasons import reasons_of
 
 from embomatrix.skills.check import check
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.library import reasons_of
 from embomatrix.skills.limits import ROBOT
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
 from embomatrix.skills.view import ObjectReach

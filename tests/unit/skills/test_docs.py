@@ -1,4 +1,4 @@
-"""docs/skills.md says what the code does: its tables are compared with the library's, its plans are parsed."""
+"""docs/skills.md agrees with the code: its tables match the library, and its plans parse."""
 
 import dataclasses
 import json
@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 from embomatrix.sim.geometry import surfaces as spots
-from embomatrix.sim.state import relations, thermal
+from embomatrix.sim.state import relations, sources
+from embomatrix.skills.check import RULES
 from embomatrix.skills.failure import SENTENCES
-from embomatrix.skills.library import LIBRARY, REASONS
+from embomatrix.skills.library import LIBRARY, Precondition
 from embomatrix.skills.limits import ROBOT
 from embomatrix.skills.parse import MAX_ROOM_NAME, PlanReason, parse_plan, plan_from_json
 from embomatrix.skills.syntax import MAX_PLAN_BYTES, MAX_STEPS, SIGNATURES, Arg, Skill
@@ -23,12 +24,12 @@ PAGE = (Path(__file__).parents[3] / "docs" / "skills.md").read_text(encoding="ut
 
 
 def fences(language: str) -> list[str]:
-    """What stands in the page's code blocks of this language."""
+    """Return the contents of the page's code blocks in a language."""
     return re.findall(rf"^```{language}\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
 
 
 def rows(first_heading: str) -> dict[str, list[str]]:
-    """The table whose first column has this heading: name of each row to the other cells, without code marks."""
+    """Return the table whose first column has this heading: row names mapped to the other cells, without code marks."""
     found = re.search(rf"^\| {first_heading} \|.*\n\| ---.*\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
     assert found, f"docs/skills.md has no table of {first_heading}"
     cells = [
@@ -42,7 +43,7 @@ def listed(cell: str) -> list[str]:
     return [] if cell == "–" else cell.split(", ")
 
 
-def test_every_skill_stands_there_with_its_arguments_conditions_effect_and_outcomes():
+def test_table_lists_every_skill_with_arguments_preconditions_effect_and_outcomes():
     assert rows("skill") == {
         skill.value: [
             ", ".join(SIGNATURES[skill]),
@@ -54,48 +55,48 @@ def test_every_skill_stands_there_with_its_arguments_conditions_effect_and_outco
     }
 
 
-def test_every_argument_stands_there():
+def test_table_lists_every_argument():
     assert list(rows("argument")) == [*Arg]
     assert f"at most {MAX_ROOM_NAME} characters" in rows("argument")[Arg.ROOM][0]
 
 
-def test_every_condition_stands_there_with_what_it_asks_and_its_reasons():
+def test_table_lists_every_precondition_with_its_text_and_reasons():
     assert {name: (asks, listed(reasons)) for name, (asks, reasons) in rows("condition").items()} == {
-        item.name.lower(): (item.value, [*reasons]) for item, reasons in REASONS.items()
+        item.name.lower(): (item.value, [*RULES[item].reasons]) for item in Precondition
     }
 
 
-def test_every_reason_of_failure_stands_there_with_its_sentence():
+def test_table_lists_every_failure_reason_with_its_sentence():
     table = re.search(r"### Reasons of failure\n\n(.*?)\n\n", PAGE, re.DOTALL)
     assert table
     written = dict(re.findall(r"^\| `(\w+)` \| (.*) \|$", table[1], re.MULTILINE))
     assert written == {reason.value: sentence for reason, sentence in SENTENCES.items()}
 
 
-def test_every_reason_for_which_a_text_is_no_plan_stands_there():
+def test_table_lists_every_plan_error():
     said = rows("reason")
     assert set(said) == set(PlanReason)
     assert f"{MAX_PLAN_BYTES:,} bytes" in said[PlanReason.TOO_LONG][0]
     assert f"{MAX_STEPS} calls" in said[PlanReason.TOO_MANY_STEPS][0]
 
 
-def test_every_limit_of_the_robot_stands_there_with_its_value():
+def test_table_lists_every_robot_limit_with_its_value():
     assert {name: float(value) for name, (value, _) in rows("limit").items()} == dataclasses.asdict(ROBOT)
 
 
-def test_every_relation_and_state_stands_there():
+def test_tables_list_every_relation_and_state():
     assert set(rows("relation")) == set(Relation)
     assert set(rows("state")) == set(State)
 
 
-def test_every_profile_and_every_relation_to_a_substance_stands_there():
+def test_tables_list_every_profile_and_substance_relation():
     assert set(rows("profile")) == set(Profile)
     assert set(rows("fact")) == set(SubstanceRelation)
     for word, fact in MEANINGS.items():
         assert rows("state")[word] == [f"another word for {fact.relation} with {fact.substance}"]
 
 
-def test_every_tolerance_of_a_relation_stands_there_with_its_value():
+def test_table_lists_every_relation_tolerance_with_its_value():
     tolerances = {
         name: value
         for name, value in {**vars(spots), **vars(relations)}.items()
@@ -105,18 +106,18 @@ def test_every_tolerance_of_a_relation_stands_there_with_its_value():
     assert written == pytest.approx(tolerances, rel=1e-3)
 
 
-def test_every_threshold_of_a_state_stands_there_with_its_value():
-    known = {**vars(state), **vars(thermal)}
+def test_table_lists_every_state_threshold_with_its_value():
+    known = {**vars(state), **vars(sources)}
     written = {name: float(value) for name, (value, _) in rows("constant").items()}
     assert written == {name: known[name] for name in written}
     assert {"HOT_C", "COOK_C", "FREEZE_C", "OPEN_FRACTION"} <= set(written)
 
 
-def test_json_plan_on_the_page_parses_whole():
+def test_json_plan_on_the_page_parses_completely():
     (text,) = fences("json")
     assert parse_plan(text) == plan_from_json(json.loads(text))
 
 
-def test_plan_in_lines_on_the_page_parses_whole():
+def test_line_plan_on_the_page_parses_completely():
     (text,) = fences("plan")
     assert len(parse_plan(text)) == len(re.split(r"[;\n]", text.strip()))

@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from embomatrix.skills.failure import SENTENCES, FailureReason
+from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.parse import PlanReason, parse_plan
 from embomatrix.skills.trace import Step
+from embomatrix.skills.view import refuse
 from embomatrix.trainer.evaluation.intervals import IntervalMethod, mean_over_tasks, pass_at, wilson
 from embomatrix.trainer.evaluation.taxonomy import (
     MEANINGS,
@@ -22,9 +23,10 @@ TABLE = ("fridge_1", "apple_1", "table_1", "microwave_1", "bowl_1")
 
 
 def failed(plan, at, reason, **words):
-    """The steps of a plan whose step ``at``, from 1, fails with the reason's own sentence."""
+    """Steps of a plan whose step ``at``, counted from 1, fails as the simulator would report it."""
     steps = [Step(call, None, "") for call in plan[: at - 1]]
-    return (*steps, Step(plan[at - 1], reason, SENTENCES[reason].format(**words)))
+    refusal = refuse(reason, **words)
+    return (*steps, Step(plan[at - 1], reason, refusal.sentence, refusal.blocker))
 
 
 def test_wilson_gives_the_textbook_interval():

@@ -20,10 +20,10 @@ from embomatrix.bench.fidelity.suite import (
     write_all_trials,
 )
 from embomatrix.bench.report.figures import BenchError
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.fidelity.compare import FidelityTrial, PlanKind
 from embomatrix.sim.fidelity.records import trial_from_json, trial_to_json
 from embomatrix.sim.fidelity.sampler import SKILLS
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import parse_plan
 from embomatrix.world.dataset import Dataset
 
@@ -41,7 +41,7 @@ def dataset(tmp_path_factory):
 def suite(dataset, tmp_path_factory):
     """A suite against a mode that can't press switches: its folder and its outcome."""
     folder = tmp_path_factory.mktemp("suite")
-    return folder, run_fidelity(dataset, SMALL, folder, 2, Modes(Simulator, clumsy), QUIET)
+    return folder, run_fidelity(dataset, SMALL, folder, 2, Modes(load_simulator, clumsy), QUIET)
 
 
 def test_a_suite_compares_every_plan_and_writes_the_disagreements(suite):
@@ -73,7 +73,7 @@ def test_a_suite_that_was_cut_short_goes_on_where_it_was(suite, dataset, tmp_pat
     (tmp_path / RESULTS_FILE).write_text("\n".join(lines[:-2]) + "\n" + lines[-2][:40])
     executed = []
     progress = SuiteProgress(written=QUIET.written, executed=lambda done, of: executed.append(done))
-    again = run_fidelity(dataset, SMALL, tmp_path, 1, Modes(Simulator, clumsy), progress)
+    again = run_fidelity(dataset, SMALL, tmp_path, 1, Modes(load_simulator, clumsy), progress)
     assert executed == [len(lines) - 1, len(lines)]
     assert [item.cached.atoms for item in again.comparisons] == [
         item.cached.atoms for item in outcome.comparisons
@@ -87,7 +87,7 @@ def test_a_trial_that_was_lost_is_tried_again_when_the_suite_goes_on(suite, data
     *lines, last = (folder / RESULTS_FILE).read_text().splitlines()
     gone = {**trial_to_json(trial_from_json(json.loads(last))), LOST: "no answer in 180 s"}
     (tmp_path / RESULTS_FILE).write_text("\n".join([*lines, json.dumps(gone)]) + "\n")
-    modes = Modes(Simulator, clumsy)
+    modes = Modes(load_simulator, clumsy)
     assert len(run_fidelity(dataset, SMALL, tmp_path, 0, modes, QUIET).lost) == 1
     again = run_fidelity(dataset, SMALL, tmp_path, 1, modes, QUIET)
     assert (len(again.comparisons), again.lost) == (len(outcome.comparisons), ())
@@ -97,7 +97,7 @@ def test_without_processes_the_results_so_far_are_summed_up(suite, dataset, tmp_
     folder, _ = suite
     for name in (PLANS_FILE, "settings.json"):
         (tmp_path / name).write_text((folder / name).read_text())
-    modes = Modes(Simulator, clumsy)
+    modes = Modes(load_simulator, clumsy)
     with pytest.raises(BenchError, match="no result to sum up"):
         run_fidelity(dataset, SMALL, tmp_path, 0, modes, QUIET)
     lines = (folder / RESULTS_FILE).read_text().splitlines()
@@ -110,12 +110,12 @@ def test_without_processes_the_results_so_far_are_summed_up(suite, dataset, tmp_
 
 def test_a_folder_of_other_settings_is_refused(suite, dataset):
     with pytest.raises(BenchError, match="other settings"):
-        run_fidelity(dataset, FidelitySettings(21, 0, 0), suite[0], 1, Modes(Simulator, clumsy), QUIET)
+        run_fidelity(dataset, FidelitySettings(21, 0, 0), suite[0], 1, Modes(load_simulator, clumsy), QUIET)
 
 
 def test_plans_reach_the_quota_of_every_skill(dataset):
     settings = FidelitySettings(plans=20, calls=8, seed=1)
-    trials = write_all_trials(dataset, settings, Modes(Simulator, clumsy), QUIET)
+    trials = write_all_trials(dataset, settings, Modes(load_simulator, clumsy), QUIET)
     calls = [
         call.skill
         for trial in trials
@@ -123,7 +123,7 @@ def test_plans_reach_the_quota_of_every_skill(dataset):
         for call in trial.plan
     ]
     assert all(calls.count(skill) >= settings.calls for skill in SKILLS)
-    assert trials == write_all_trials(dataset, settings, Modes(Simulator, clumsy), QUIET)
+    assert trials == write_all_trials(dataset, settings, Modes(load_simulator, clumsy), QUIET)
 
 
 def trials_of(dataset, *texts):
@@ -154,7 +154,7 @@ def trials_of(dataset, *texts):
 def test_a_process_that_fails_costs_only_the_trial_that_it_was_at(dataset, physical, reason, limit_s):
     trials = trials_of(dataset, "move fridge", "move fridge\nopen fridge", "turn 1.0")
     values = []
-    pool = FidelityPool(dataset.folder, Modes(Simulator, physical), 1, limit_s)
+    pool = FidelityPool(dataset.folder, Modes(load_simulator, physical), 1, limit_s)
     pool.run([TrialJob(trials[0].bundle_digest, trials)], values.append)
     assert [value["trial"] for value in values] == ["t-0", "t-1", "t-2"]
     assert [LOST in value for value in values] == [False, True, False]
@@ -169,9 +169,9 @@ def test_a_disagreement_is_shown_again_step_by_step(suite, dataset):
         for n, line in enumerate(path.read_text().splitlines(), 1)
         if "toggle_on" in line and '"step"' in line
     )
-    lines = list(replay(dataset, read_disagreement(f"{path}:{number}"), Modes(Simulator, clumsy)))
+    lines = list(replay(dataset, read_disagreement(f"{path}:{number}"), Modes(load_simulator, clumsy)))
     assert any(line.startswith("≠") and "toggle_on" in line for line in lines)
-    assert any("bars it" in line for line in lines)
+    assert any("blocks it" in line for line in lines)
     assert any(line.strip().startswith("cached only:") for line in lines)
 
 
@@ -202,4 +202,4 @@ def test_a_damaged_suite_is_refused_with_its_folder(dataset, suite, tmp_path):
         (tmp_path / name).write_text((suite[0] / name).read_text())
     (tmp_path / RESULTS_FILE).write_text("not JSON\n{}\n")
     with pytest.raises(BenchError, match="damaged"):
-        run_fidelity(dataset, SMALL, tmp_path, 1, Modes(Simulator, clumsy), QUIET)
+        run_fidelity(dataset, SMALL, tmp_path, 1, Modes(load_simulator, clumsy), QUIET)

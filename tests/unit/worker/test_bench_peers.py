@@ -16,7 +16,7 @@ from embomatrix.bench.peers.engine_pool import executed_twice, write_bundles
 from embomatrix.bench.peers.page import contest_figures, contest_lines
 from embomatrix.bench.peers.process_pool import process_pool
 from embomatrix.bench.report.figures import BenchError
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import decode_bundle
 from embomatrix.world.dataset import Dataset
 
@@ -68,7 +68,7 @@ def traces(work):
     """The digest of what each plan of the work leads to."""
     for digest, data in work.bundles.items():
         bundle = decode_bundle(data)
-        with contextlib.closing(Simulator(bundle)) as simulator:
+        with contextlib.closing(load_simulator(bundle)) as simulator:
             for rollout in work.rollouts:
                 if rollout.bundle_digest == digest:
                     yield simulator.execute(bundle.tasks[rollout.task_id], rollout.plan, rollout.seed).digest

@@ -11,8 +11,8 @@ from embomatrix.bench.engine.user_world import UrdfFactory, UrdfFiles, UserWorld
 from embomatrix.sim.bullet.bodies import BodyFactory
 from embomatrix.sim.bullet.client import ClientPool, pybullet
 from embomatrix.sim.bullet.dynamic import DynamicWorld
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.actor import PhysicalActor
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.geometry import Pose
 
@@ -65,7 +65,7 @@ def test_nothing_sleeps_in_the_world_of_a_user(tmp_path):
     bundle = Bundle(scene, {task.task_id: task for task in kitchen_tasks(scene)})
     heights = []
     for world in (DynamicWorld(scene), UserWorld(scene, UrdfFiles(tmp_path))):
-        with contextlib.closing(Simulator(bundle, actor=PhysicalActor(bundle, world))) as simulator:
+        with contextlib.closing(load_simulator(bundle, actor=PhysicalActor(bundle, world))) as simulator:
             simulator.reset(next(iter(bundle.tasks.values())), 0)
             world.bodies.put("apple_1", Pose((0.0, 0.0, 3.0)))
             world.bodies.sleep("apple_1")

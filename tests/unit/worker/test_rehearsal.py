@@ -2,7 +2,7 @@
 
 import contextlib
 
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.syntax import Skill
 from embomatrix.worker.slots.rehearsal import PLANS, REHEARSAL, rehearsal_bundle
 from embomatrix.world.bundle import decode_bundle, encode_bundle
@@ -11,7 +11,7 @@ from embomatrix.world.geometry import Shape
 
 def test_every_step_of_the_rehearsal_succeeds():
     bundle = decode_bundle(encode_bundle(rehearsal_bundle()))
-    with contextlib.closing(Simulator(bundle)) as simulator:
+    with contextlib.closing(load_simulator(bundle)) as simulator:
         for plan in PLANS:
             steps = simulator.execute(bundle.tasks[REHEARSAL], plan, 0).steps
             assert [step.ok for step in steps] == [True] * len(plan)

@@ -4,7 +4,10 @@ import contextlib
 import copy
 import json
 import math
+import subprocess
+import sys
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -12,11 +15,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from embomatrix.world.bundle import Bundle
-from embomatrix.world.codec import check_scene, scene_from_json, scene_to_json
-from embomatrix.world.codec_asset import asset_from_json, asset_to_json
+from embomatrix.world.codec import asset_from_json, asset_to_json, scene_from_json, scene_to_json
 from embomatrix.world.codec_task import poses_from_json, poses_to_json, task_from_json, task_to_json
-from embomatrix.world.field import SceneInvalidError
+from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.scene import Scene, Window
+from embomatrix.world.tables import Tables, TableWriter
 from embomatrix.world.task import Task
 
 
@@ -27,7 +30,9 @@ def through_text(value: Any) -> Any:
 def test_scene_task_assets_and_poses_survive_json(scene: Scene, task: Task, bundle: Bundle) -> None:
     assert scene_from_json(through_text(scene_to_json(scene))) == scene
     assert task_from_json(through_text(task_to_json(task))) == task
-    assert poses_from_json(through_text(poses_to_json(bundle.poses))) == bundle.poses
+    writer = TableWriter()
+    poses = through_text(poses_to_json(bundle.poses, writer))
+    assert poses_from_json(poses, Tables(writer.arrays())) == bundle.poses
     for asset in scene.assets.values():
         assert asset_from_json(through_text(asset_to_json(asset))) == asset
 
@@ -52,10 +57,6 @@ def test_a_window_that_breaks_a_rule_is_named(scene: Scene, window: Window, foun
     with pytest.raises(SceneInvalidError, match=found) as caught:
         scene_from_json(scene_to_json(replace(scene, windows=(window,))))
     assert caught.value.field.startswith("scene.windows[0]")
-
-
-def test_sound_scene_passes_the_check(scene: Scene) -> None:
-    check_scene(scene)
 
 
 BREAKS: dict[str, tuple[list[str | int], Any, str]] = {
@@ -118,10 +119,10 @@ def test_error_names_the_field_that_breaks_a_rule(scene: Scene, name: str) -> No
 
 
 def test_seventeenth_part_of_a_link_is_refused(scene: Scene) -> None:
-    broken = scene_to_json(scene)
+    broken = through_text(scene_to_json(scene))
     parts = broken["assets"]["fridge-abc"]["links"][0]["parts"]
     parts *= 9
-    with pytest.raises(SceneInvalidError, match="at most 16"):
+    with pytest.raises(SceneInvalidError, match="length <= 16"):
         scene_from_json(broken)
 
 
@@ -130,7 +131,7 @@ def test_every_missing_key_is_named(scene: Scene) -> None:
     for key in whole:
         broken = copy.deepcopy(whole)
         del broken[key]
-        with pytest.raises(SceneInvalidError, match=f"lacks '{key}'"):
+        with pytest.raises(SceneInvalidError, match=f"missing required field `{key}`"):
             scene_from_json(broken)
 
 
@@ -145,6 +146,7 @@ def test_table_that_names_an_object_twice_is_refused(task: Task) -> None:
         task_from_json(task_to_json(task) | {"table": ["fridge_1", "fridge_1"]})
 
 
+NO_ROWS = Tables(TableWriter().arrays())
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
@@ -154,7 +156,7 @@ json_values = st.recursive(
 
 @given(json_values)
 def test_any_json_value_is_read_or_refused_by_the_one_error(value: Any) -> None:
-    for read in (scene_from_json, task_from_json, poses_from_json, asset_from_json):
+    for read in (scene_from_json, task_from_json, asset_from_json, partial(poses_from_json, tables=NO_ROWS)):
         with pytest.raises(SceneInvalidError):
             read(value)
 
@@ -220,3 +222,29 @@ SCENE_JSON: dict[str, Any] = {
     "robot": {"x_m": 0.2, "y_m": 0.2, "yaw": 0.0, "room": "r_0"},
     "left_out": [],
 }
+
+
+def test_decoding_survives_garbage_collections() -> None:
+    """msgspec 0.22 crashes in a collection if a record joins a fixed tuple and a bounded integer in one union."""
+    script = (
+        "import gc; gc.set_threshold(1)\n"
+        "from tests.fakes.scenes import kitchen_scene\n"
+        "from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle\n"
+        "from embomatrix.world.dataset import TaskRecordJson\n"
+        "import msgspec\n"
+        "decode_bundle(encode_bundle(Bundle(kitchen_scene(), {})))\n"
+        "msgspec.json.Decoder(TaskRecordJson)\n"
+        "gc.collect()\n"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
+
+
+def test_error_in_a_mapping_names_the_key(scene: Scene) -> None:
+    broken = through_text(scene_to_json(scene))
+    broken["assets"]["fridge-abc"]["mass_kg"] = "heavy"
+    with pytest.raises(SceneInvalidError) as caught:
+        scene_from_json(broken)
+    assert caught.value.field == "scene.assets['fridge-abc'].mass_kg"
+    assert str(caught.value) == (
+        "scene.assets['fridge-abc'].mass_kg: found 'heavy': expected `float`, got `str`"
+    )

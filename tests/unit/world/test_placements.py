@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from embomatrix.world.field import SceneInvalidError
 from embomatrix.world.geometry import Pose
 from embomatrix.world.placements import Placements, Stands, flattened
 from embomatrix.world.poses import PlacementKey, StandPose
+from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.state import Relation
 
 NAME = st.sampled_from(("apple-aa", "table-bb", "footprint-9x9x12cm", "level-floor"))

@@ -14,6 +14,7 @@ from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.floor.prepared import PreparedScene
 from embomatrix.sim.physical.actor import PhysicalActor
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.worker.slots.physics import CLIENTS_PER_SCENE
 from embomatrix.world.bundle import decode_bundle
 
@@ -45,7 +46,7 @@ def naive(rollouts: Sequence[Rollout], bundles: Mapping[str, bytes]) -> list[Nai
 
         def make(bundle: Bundle, actors: list[PhysicalActor] = actors) -> Simulator:
             actors.append(PhysicalActor(bundle))
-            return Simulator(bundle, actor=actors[0])
+            return load_simulator(bundle, actor=actors[0])
 
         seconds = _seconds(rollout, bundles[rollout.bundle_digest], make)
         taken.append(NaiveRollout(rollout, seconds, actors[0].dynamic.steps))

@@ -16,8 +16,8 @@ from embomatrix.sim.bullet.bodies import BodyFactory
 from embomatrix.sim.bullet.client import pybullet
 from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.bullet.dynamic_bodies import DynamicBodies
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.actor import PhysicalActor
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import decode_bundle
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def user_s(taken: Sequence[NaiveRollout], bundles: Mapping[str, bytes], folder: 
         started_s = time.perf_counter()
         bundle = decode_bundle(data, digest=item.rollout.bundle_digest)
         world = UserWorld(bundle.scene, files)
-        with contextlib.closing(Simulator(bundle, actor=PhysicalActor(bundle, world))) as simulator:
+        with contextlib.closing(load_simulator(bundle, actor=PhysicalActor(bundle, world))) as simulator:
             simulator.reset(bundle.tasks[item.rollout.task_id], item.rollout.seed)
             loaded_s = time.perf_counter()
             world.step(STEPS)

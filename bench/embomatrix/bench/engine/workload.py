@@ -17,14 +17,15 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.bench.report.figures import BenchError
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import PlanError, parse_plan, plan_to_lines
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
-from embomatrix.world.field import Field, SceneInvalidError
+from embomatrix.world.records import Name, Record, SceneInvalidError, decode
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+    from embomatrix.sim.executor import Simulator
     from embomatrix.skills.syntax import Plan
     from embomatrix.world.bundle import Bundle
     from embomatrix.world.dataset import Dataset
@@ -42,6 +43,20 @@ CHOICES: Final = 12
 """Things or places that are tried for one step of a plan."""
 TRIES_PER_PLAN: Final = 8
 UNDER_SHARE: Final = 0.1
+
+
+class SceneWorkJson(Record):
+    scene_id: Name
+    bundle: Name
+    bodies: int
+    executions: list[str]
+
+
+class WorkloadJson(Record):
+    format: int
+    seed: int
+    bodies: int
+    scenes: list[SceneWorkJson]
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,41 +159,33 @@ def workload_to_text(workload: Workload) -> str:
 def read_workload(path: Path) -> Workload:
     """The workload in a file. Raises BenchError that names the file and the remedy."""
     try:
-        fields = Field(json.loads(path.read_text(encoding="utf-8")), "workload").record(
-            "format", "seed", "bodies", "scenes"
-        )
-        if fields["format"].integer() != FORMAT:
-            fields["format"].fail(f"found {fields['format'].value}: this version reads {FORMAT}")
-        return Workload(
-            fields["seed"].integer(),
-            fields["bodies"].integer(),
-            tuple(_scene_from_field(item) for item in fields["scenes"].items()),
-        )
+        record = decode(path.read_bytes(), WorkloadJson, "workload")
+        if record.format != FORMAT:
+            raise SceneInvalidError("workload.format", f"found {record.format}: this version reads {FORMAT}")
+        return Workload(record.seed, record.bodies, tuple(map(_scene_work, record.scenes)))
     except (OSError, ValueError, RecursionError) as error:
         raise BenchError(
             f"the workload {path} can't be read ({error}): write it anew with 'embomatrix bench workload'"
         ) from error
 
 
-def _scene_from_field(field: Field) -> SceneWork:
-    fields = field.record("scene_id", "bundle", "bodies", "executions")
-    return SceneWork(
-        fields["scene_id"].name(),
-        fields["bundle"].name(),
-        fields["bodies"].integer(),
-        tuple(_execution(item) for item in fields["executions"].items()),
-    )
+def _scene_work(record: SceneWorkJson) -> SceneWork:
+    executions = tuple(_execution(text, record.scene_id) for text in record.executions)
+    return SceneWork(record.scene_id, record.bundle, record.bodies, executions)
 
 
-def _execution(field: Field) -> Execution:
-    head, _, text = field.text().partition(": ")
+def _execution(line: str, scene_id: str) -> Execution:
+    path = f"workload, scene {scene_id}"
+    head, _, text = line.partition(": ")
     task_id, _, seed = head.rpartition(" ")
     if not (task_id and seed.isdecimal()):
-        field.fail(f"begins with {head[:60]!r}: expected a task's id and a seed")
+        raise SceneInvalidError(
+            path, f"an execution begins with {head[:60]!r}: expected a task's id and a seed"
+        )
     try:
         return Execution(task_id, int(seed), parse_plan(text))
     except PlanError as error:
-        raise SceneInvalidError(field.path, str(error)) from error
+        raise SceneInvalidError(path, str(error)) from error
 
 
 def _digests_of_size(dataset: Dataset, size: int) -> list[str]:
@@ -198,7 +205,7 @@ def _executions(bundle: Bundle, count: int, rng: np.random.Generator) -> Iterato
     """Up to ``count`` plans that differ, the tasks in turns; fewer when too many tries fail."""
     known: set[tuple[str, Plan]] = set()
     tasks = cycle([bundle.tasks[task_id] for task_id in sorted(bundle.tasks)])
-    with contextlib.closing(Simulator(bundle)) as stage:
+    with contextlib.closing(load_simulator(bundle)) as stage:
         for _ in range(count * TRIES_PER_PLAN):
             if len(known) == count:
                 return

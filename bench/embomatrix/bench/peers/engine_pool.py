@@ -19,7 +19,7 @@ from embomatrix.reward.hierarchy import score
 from embomatrix.rpc.wire.outcome import completed_to_proto
 from embomatrix.rpc.wire.rollout import rollout_from_proto
 from embomatrix.rpc.wire.values import Completed, Timings
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.worker.slots.physics import Physics
 from embomatrix.worker.slots.slot_program import COLLECT_EVERY
 from embomatrix.world.bundle import read_bundle
@@ -62,7 +62,7 @@ def execute_fresh(folder: str, request: bytes) -> bytes:
     _note(folder, rollout)
     bundle = read_bundle(Path(folder) / _file(rollout.bundle_digest), digest=rollout.bundle_digest)
     task = bundle.tasks[rollout.task_id]
-    with contextlib.closing(Simulator(bundle)) as simulator:
+    with contextlib.closing(load_simulator(bundle)) as simulator:
         trace = simulator.execute(task, rollout.plan, rollout.seed)
         reward = score(task, trace.touched, simulator.facts)
     completed = Completed(

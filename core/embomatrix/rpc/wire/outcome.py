@@ -54,14 +54,16 @@ def _check_reward(message: types_pb2.Reward) -> None:
 
 def step_to_proto(step: Step) -> types_pb2.StepResult:
     failure = "" if step.failure is None else step.failure.value
-    return types_pb2.StepResult(call=skill_call_to_proto(step.call), failure=failure, message=step.message)
+    return types_pb2.StepResult(
+        call=skill_call_to_proto(step.call), failure=failure, message=step.message, blocker=step.blocker
+    )
 
 
 @functools.lru_cache(KNOWN)
 def _step_of(data: bytes) -> Step:
     message = types_pb2.StepResult.FromString(data)
     call = inside("call", skill_call_from_proto, message.call)
-    return Step(call, _failure_reason(message.failure), message.message)
+    return Step(call, _failure_reason(message.failure), message.message, message.blocker)
 
 
 def _failure_reason(text: str) -> FailureReason | None:

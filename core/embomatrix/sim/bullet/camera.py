@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.bullet.stage import VisualScene
+from embomatrix.sim.bullet.robot import tucked
+from embomatrix.sim.bullet.visual_scene import VisualScene
 from embomatrix.sim.geometry.bounds import IDENTITY
-from embomatrix.sim.physical.stage import tucked
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose
 

@@ -17,6 +17,11 @@ TINY_RENDERER: Final = 2
 """Index of the plugin that draws pictures on the CPU. With it every body costs ten times as much to create."""
 
 
+NEAR_M: Final = 0.005
+_USUAL_M: Final = 0.02
+"""Bullet's own: made for crates and cars. Boxes around bodies are larger by as much, and whose boxes meet wake one another."""
+
+
 @contextlib.contextmanager
 def _stderr_closed() -> Iterator[None]:
     """Discard what C code writes to stderr: pybullet prints its build date when it is imported."""
@@ -101,3 +106,14 @@ def _renders(client: int) -> bool:
     finally:
         bullet.resetSimulation(physicsClientId=client)
     return True
+
+
+@contextlib.contextmanager
+def near_contacts(client: int) -> Iterator[None]:
+    """Look at bodies from 5 mm on: of the things on a crowded table, one that is taken wakes only those that it is close to."""
+    bullet = pybullet()
+    bullet.setPhysicsEngineParameter(contactBreakingThreshold=NEAR_M, physicsClientId=client)
+    try:
+        yield
+    finally:
+        bullet.setPhysicsEngineParameter(contactBreakingThreshold=_USUAL_M, physicsClientId=client)

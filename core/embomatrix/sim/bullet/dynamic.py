@@ -11,8 +11,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.bullet.client import ClientPool, pybullet
-from embomatrix.sim.bullet.contacts import near_contacts
+from embomatrix.sim.bullet.client import ClientPool, near_contacts, pybullet
 from embomatrix.sim.bullet.dynamic_bodies import DynamicBodies, differ
 from embomatrix.sim.bullet.mini_world import GRAVITY_M_S2
 from embomatrix.sim.bullet.passage import Passage

@@ -25,7 +25,7 @@ from embomatrix.sim.engine import (
     Settled,
 )
 from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of, forget
-from embomatrix.sim.geometry.neighbourhood import Neighbourhood
+from embomatrix.sim.geometry.spatial_hash import Neighbourhood
 from embomatrix.sim.validation import check_fractions, check_pose, check_scene
 
 if TYPE_CHECKING:

@@ -24,6 +24,8 @@ from embomatrix.world.geometry import Pose
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+    from embomatrix.world.poses import StandPose
+
 BASE_N: Final = 1000.0
 BASE_NM: Final = 200.0
 LIFT_N: Final = 1500.0
@@ -33,6 +35,9 @@ GRIP_N: Final = 400.0
 GAIN: Final = 0.3
 """Share of the way to its target that a motor takes in a step, as far as its force lets it."""
 FINGERS_OPEN_M: Final = 0.02
+TUCKED_ARM: Final = (-1.57, 1.57, 0.0, -0.4, 0.0, 2.6, 0.785)
+"""Joint angles of the empty arm while the robot drives: upright over the base, within its disc, below what it drives under."""
+TUCKED_LIFT_M: Final = 0.0
 SAG: Final = 1e-3
 """Metres, or radians, by which loads bend joints over their limits."""
 
@@ -55,6 +60,11 @@ class Posture:
     def of(numbers: Sequence[float]) -> Posture:
         x, y, yaw, lift, *arm = map(float, numbers)
         return Posture(x, y, yaw, lift, tuple(arm))
+
+
+def tucked(at: StandPose) -> Posture:
+    """Posture of the robot at a standing pose with its empty arm tucked, as it drives."""
+    return Posture(at.x_m, at.y_m, at.yaw, TUCKED_LIFT_M, TUCKED_ARM)
 
 
 class RobotBody:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.skills.appliance import cold_source, heat_source, starts_closed
+from embomatrix.skills.appliances import cold_source, heat_source, starts_closed
 from embomatrix.skills.check import check, within_reach
 from embomatrix.skills.syntax import PROFILES, PlaceRelation, Skill, SkillCall
 from embomatrix.world.task import Profile

@@ -7,7 +7,6 @@ version of the code that derives it, the same is derived when the scene is loade
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -22,7 +21,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from embomatrix.sim.live_world import LiveWorld
+    from embomatrix.sim.engine import PhysicsEngine
+    from embomatrix.sim.floor.grid import FloorGrid
     from embomatrix.world.bundle import Bundle
     from embomatrix.world.geometry import FloatArray
     from embomatrix.world.scene import Scene
@@ -86,26 +86,25 @@ _KINDS: Final[Mapping[str, str]] = {
 }
 
 
-def prepare(bundle: Bundle, world: LiveWorld) -> Bundle:
-    """The bundle with what the simulator derives from its scene. ``world`` holds that scene; it is reset.
+def prepared_arrays(engine: PhysicsEngine, obstacles: Obstacles, grid: FloorGrid) -> dict[str, NDArray[Any]]:
+    """Arrays for a bundle: boxes, obstacles and floor grid of the engine's scene in its initial state.
 
-    A floor where more than 255 obstacles lie over one another is left to the worker.
+    Empty if more than 255 obstacles overlap anywhere: such a scene is not prepared.
     """
-    world.engine.reset()
-    obstacles, grid = world.navigator.ground.at_start
-    if grid.covered.max(initial=0) > MOST_COVERED:
-        return bundle
-    scene = bundle.scene
+    covered = grid.covered
+    if covered.max(initial=0) > MOST_COVERED:
+        return {}
+    scene = engine.scene
     arrays: dict[str, NDArray[Any]] = {
-        "objects": _rows([world.engine.aabb(item.name) for item in scene.objects]),
+        "objects": _rows([engine.aabb(item.name) for item in scene.objects]),
         "walls": _rows([wall.aabb(IDENTITY) for wall in scene.walls]),
         "obstacles": obstacles.boxes,
         "owners": obstacles.owners,
         "leaves": obstacles.leaves.astype(np.uint8),
-        "covered": grid.covered.astype(np.uint8),
+        "covered": covered.astype(np.uint8),
         "free": np.packbits(grid.free),
     }
-    return replace(bundle, prepared={_key(name): array for name, array in arrays.items()})
+    return {_key(name): array for name, array in arrays.items()}
 
 
 def _key(name: str) -> str:

@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim.actions import ACTIONS
+from embomatrix.sim.blockers import no_way_into, no_way_to
 from embomatrix.sim.bullet.dynamic import DynamicWorld
-from embomatrix.sim.executor import Simulator
-from embomatrix.sim.floor.barriers import no_way_into, no_way_to
 from embomatrix.sim.physical.doors import close_all, open_all
 from embomatrix.sim.physical.hands import pick_up
 from embomatrix.sim.physical.place import place
 from embomatrix.sim.physical.press import press
 from embomatrix.sim.physical.stage import PhysicalStage
 from embomatrix.sim.physical.travel import drive, travel
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Skill
 from embomatrix.skills.view import metres, refuse, source_of, target_of
@@ -30,6 +30,7 @@ from embomatrix.world.poses import StandPose
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from embomatrix.sim.executor import Simulator
     from embomatrix.sim.live_world import LiveWorld
     from embomatrix.skills.syntax import SkillCall
     from embomatrix.skills.view import SkillRefusal
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 
 def physical_simulator(bundle: Bundle) -> Simulator:
     """A simulator that executes plans physically. Raises EngineError when the scene can't be loaded."""
-    return Simulator(bundle, actor=PhysicalActor(bundle))
+    return load_simulator(bundle, actor=PhysicalActor(bundle))
 
 
 class PhysicalActor:

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from embomatrix.sim.bullet.robot import TUCKED_ARM, TUCKED_LIFT_M
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.motion import standing, with_arm
 from embomatrix.sim.physical.reach import AIR_M
 from embomatrix.sim.physical.space import struck
-from embomatrix.sim.physical.stage import TUCKED, TUCKED_LIFT_M, compact
+from embomatrix.sim.physical.stage import compact
 from embomatrix.sim.physical.travel import SOMETHING, travel
 from embomatrix.sim.robot_dimensions import SHOULDER_LOW_M
 from embomatrix.skills.failure import FailureReason
@@ -155,7 +156,7 @@ def _retreats(reach: ArmReach, now: FloatArray, loaded: bool) -> Iterator[FloatA
 def carrying(stage: PhysicalStage, now: FloatArray) -> FloatArray:
     """The posture in which the robot drives: folded when the hand is empty, else with the load upright and near."""
     if stage.grip is None:
-        folded = with_arm(now, TUCKED)
+        folded = with_arm(now, np.array(TUCKED_ARM))
         folded[body.LIFT] = TUCKED_LIFT_M
         return folded
     rotation, where = _carried_to(now)

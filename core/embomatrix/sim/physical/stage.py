@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.bullet.robot import Posture
+from embomatrix.sim.bullet.robot import tucked
 from embomatrix.sim.joints.panels import swing_leaves
 from embomatrix.sim.joints.swings import SWING
 from embomatrix.sim.physical import arm, body
@@ -31,9 +31,6 @@ if TYPE_CHECKING:
     from embomatrix.sim.physical.space import Boxes
     from embomatrix.world.geometry import FloatArray
 
-TUCKED: Final = np.array([-1.57, 1.57, 0.0, -0.4, 0.0, 2.6, 0.785])
-"""The empty arm while driving: upright over the base, within its disc, lower than what the base passes under."""
-TUCKED_LIFT_M: Final = 0.0
 SETTLE_STEPS: Final = 240
 """After a second the world is taken as it is, at rest or not."""
 AROUND_M: Final = 1.9
@@ -62,11 +59,6 @@ class Grip:
         up = None if self.held.up is None else change.rotation @ self.held.up
         held = HeldGeometry(change.apply_all(self.held.centres), self.held.radii, up)
         return Grip(self.name, pose_tool_object, held)
-
-
-def tucked(at: StandPose) -> Posture:
-    """The robot with its empty arm as it is while driving."""
-    return Posture(at.x_m, at.y_m, at.yaw, TUCKED_LIFT_M, tuple(TUCKED.tolist()))
 
 
 class PhysicalStage:

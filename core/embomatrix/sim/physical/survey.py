@@ -16,7 +16,6 @@ import numpy as np
 
 from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.geometry.bounds import IDENTITY
-from embomatrix.sim.geometry.contents import Contents
 from embomatrix.sim.joints.panels import Leaves, swing_leaves
 from embomatrix.sim.joints.swings import SWING
 from embomatrix.sim.physical.doors import STRETCHES, close_all, in_turn, leading, open_all
@@ -26,6 +25,7 @@ from embomatrix.sim.physical.press import pressing
 from embomatrix.sim.physical.prospects import Prospects
 from embomatrix.sim.physical.stage import AROUND_M, PhysicalStage
 from embomatrix.sim.physical.travel import SOMETHING
+from embomatrix.sim.placing.pose_cache import Contents
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.poses import Handling, PoseCache
 

@@ -11,7 +11,7 @@ from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of, parts_of
 from embomatrix.sim.geometry.candidates import candidates
 from embomatrix.sim.geometry.surfaces import is_shut, is_upright, link_frame, links_with_spots
 from embomatrix.sim.joints.behind_panels import behind_leaves
-from embomatrix.sim.placing.repertoire import Repertoire
+from embomatrix.sim.placing.options import Repertoire
 from embomatrix.sim.placing.trial import NEAR_M, Errand, PoseTrial
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.limits import ROBOT
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.floor.navigation import Navigator
     from embomatrix.sim.geometry.batch_poses import BoolArray, Lineup
-    from embomatrix.sim.placing.repertoire import Spots
+    from embomatrix.sim.placing.options import Spots
     from embomatrix.sim.state.relations import Relations
     from embomatrix.world.geometry import Pose
     from embomatrix.world.poses import PoseCache, StandPose

@@ -15,7 +15,6 @@ from embomatrix.sim.engine import TOLERANCE_M
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of
 from embomatrix.sim.geometry.candidates import LIFT_M, beside, candidates, stands_in, surfaces_for
-from embomatrix.sim.geometry.contents import Contents
 from embomatrix.sim.geometry.footprints import LEVEL_FLOOR, Footprint, box_of, footprint_of
 from embomatrix.sim.state.relations import Relations
 from embomatrix.world.geometry import Pose
@@ -41,6 +40,23 @@ CLASS_POSES_MOST: Final = 40
 """Verified poses that are kept for a footprint class: more on larger surfaces."""
 HOPELESS: Final = 12
 """A pair none of whose first candidates is stable is given up."""
+
+
+class Contents:
+    """Digests of assets, each worked out once."""
+
+    def __init__(self) -> None:
+        self._known: dict[int, tuple[Asset, str]] = {}
+
+    def of(self, asset: Asset) -> str:
+        """Return the digest of everything in the asset. The asset is kept, because a freed id could be reused."""
+        known = self._known.get(id(asset))
+        if known is None:
+            # Pose caches draw with seeds from this digest. `Part` is the former name of `ConvexPart`: the digest keeps it.
+            content = repr(asset).replace("ConvexPart(", "Part(")
+            known = (asset, hashlib.sha256(content.encode()).hexdigest())
+            self._known[id(asset)] = known
+        return known[1]
 
 
 class PlacementLibrary:

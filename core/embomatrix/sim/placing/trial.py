@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.placing.repertoire import Repertoire, Spots
+    from embomatrix.sim.placing.options import Repertoire, Spots
     from embomatrix.sim.state.relations import Relations
     from embomatrix.world.geometry import Aabb
     from embomatrix.world.poses import StandPose

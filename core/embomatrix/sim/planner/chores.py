@@ -10,10 +10,8 @@ from enum import StrEnum
 from typing import TYPE_CHECKING
 
 from embomatrix.sim.planner.calls import StuckError
-from embomatrix.skills.household import (
-    cuts,
+from embomatrix.skills.appliances import (
     gives_liquid,
-    is_sliceable,
     liquids_given,
     missing_for,
     soaks_up,
@@ -115,9 +113,11 @@ def means_for(
     """Ways to do a chore with what stands in the object table, the simplest first. ``portable`` can be carried."""
     match chore.work:
         case ChoreKind.SLICE:
-            if not is_sliceable(world.asset(chore.name)):
+            if not world.asset(chore.name).can("sliceable"):
                 return []
-            return [ChoreMethod(tool) for tool in rows if tool in portable and cuts(world.asset(tool))]
+            return [
+                ChoreMethod(tool) for tool in rows if tool in portable and world.asset(tool).can("slicer")
+            ]
         case ChoreKind.CLEAN:
             return [*_wipes(world, rows, chore, portable), *_washes(world, rows, chore, portable)]
         case ChoreKind.WET:

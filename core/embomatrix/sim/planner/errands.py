@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from embomatrix.sim.planner.calls import StuckError
 from embomatrix.sim.planner.chores import do_chores
 from embomatrix.sim.planner.ways import ways
-from embomatrix.skills.appliance import cold_source, heat_source
+from embomatrix.skills.appliances import cold_source, heat_source
 from embomatrix.skills.syntax import PlaceRelation
 from embomatrix.world.state import Relation
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from embomatrix.sim.planner.chores import Chore, ChoreMethod
     from embomatrix.sim.planner.script import PlanScript
     from embomatrix.sim.planner.ways import PlacementGoal
-    from embomatrix.skills.appliance import Source
+    from embomatrix.skills.appliances import ThermalSource
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,5 +157,5 @@ def _carried_of(item: PlacementGoal, world: LiveWorld) -> str:
     return item.target if world.is_fixed(item.name) else item.name
 
 
-def _way_in(source: Source) -> PlaceRelation:
+def _way_in(source: ThermalSource) -> PlaceRelation:
     return PlaceRelation.INSIDE if source.requires_inside else PlaceRelation.ONTOP

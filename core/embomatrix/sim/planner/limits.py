@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.planner.chores import chore_for, is_about_chores, means_for, nothing_for
-from embomatrix.skills.appliance import cold_source, cooks, freezes, heat_source, heats
+from embomatrix.skills.appliances import cold_source, cooks, freezes, heat_source, heats
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.state import Relation, State
 from embomatrix.world.substances import word_of

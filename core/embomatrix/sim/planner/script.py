@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.planner.calls import PlanCalls, StuckError
-from embomatrix.skills.appliance import cold_source, heat_source, starts_closed
+from embomatrix.skills.appliances import cold_source, heat_source, starts_closed
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import PlaceRelation, Skill
 from embomatrix.world.state import Relation
@@ -233,17 +233,13 @@ class PlanScript:
             step = self._calls.use(skill, name)
             if step.ok:
                 return
-            blocker = self._named_in(step, name) if step.failure is FailureReason.DOOR_BLOCKED else ""
+            blocked = step.failure is FailureReason.DOOR_BLOCKED and step.blocker in self._world.scene.by_name
+            blocker = step.blocker if blocked and step.blocker != name else ""
             moved = next((item for item in (blocker, name) if item and not self._world.is_fixed(item)), "")
             if not blocker or not moved or depth == DEPTH:
                 raise StuckError(_sentence(step))
             self.put_away(moved, frozenset((blocker, name)), depth + 1)
         self._use(skill, name)
-
-    def _named_in(self, step: Step, name: str) -> str:
-        """The other object that a refusal's sentence names: refusals carry no fields."""
-        known = self._world.scene.by_name
-        return next((word for word in step.message.split() if word in known and word != name), "")
 
     def _use(self, skill: Skill, name: str) -> None:
         step = self._calls.use(skill, name)

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.surfaces import REST_M, heights_over, is_under
-from embomatrix.sim.state.footing import Footings
+from embomatrix.sim.state.supports import Footings
 from embomatrix.world.state import OPEN_FRACTION, Relation
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.state.footing import Enclosure, Host
+    from embomatrix.sim.state.supports import Enclosure, Host
     from embomatrix.world.geometry import Aabb
 
 TOUCH_M: Final = 0.005

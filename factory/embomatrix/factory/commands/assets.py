@@ -23,7 +23,7 @@ from embomatrix.factory.importers.shelf import save_asset
 from embomatrix.sim.engine import EngineError
 from embomatrix.world.asset import Credit
 from embomatrix.world.catalog import Catalog, CatalogError
-from embomatrix.world.field import SceneInvalidError
+from embomatrix.world.records import SceneInvalidError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

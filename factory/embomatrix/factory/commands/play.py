@@ -18,11 +18,11 @@ from rich.table import Table
 from embomatrix.factory.pictures.film import Caption, FilmError, check_suffix, draw_film, write_film
 from embomatrix.reward.hierarchy import score, unparsable
 from embomatrix.sim.engine import EngineError
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.film import film_cached
 from embomatrix.sim.physical.actor import PhysicalActor
 from embomatrix.sim.physical.film import film_physical
 from embomatrix.sim.planner.oracle import PlanNotFound, find_plan
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.sim.state.facts import FactError
 from embomatrix.skills.describe import call_in_words
 from embomatrix.skills.parse import PlanError, parse_plan
@@ -110,7 +110,7 @@ def _play(task_id: str, plan: str, oracle: bool, folder: Path | None, take: Take
     text = "" if oracle else _text_of(plan)
     _show_task(record.task)
     if oracle:
-        found = find_plan(Simulator(bundle), record.task)
+        found = find_plan(load_simulator(bundle), record.task)
         if isinstance(found, PlanNotFound):
             raise PlayError(f"the oracle finds no plan for {task_id!r}: {found.reason}")
         _run(bundle, record.task, found, take)
@@ -142,7 +142,7 @@ def _text_of(plan: str) -> str:
 
 def _run(bundle: Bundle, task: Task, plan: Plan, take: Take) -> None:
     actor = PhysicalActor(bundle) if take.mode is PlayMode.PHYSICAL else None
-    simulator = Simulator(bundle, actor=actor)
+    simulator = load_simulator(bundle, actor=actor)
     trace = simulator.execute(task, plan, take.seed)
     _show_steps(task, trace)
     console.print("\n[bold]Final state[/bold]")

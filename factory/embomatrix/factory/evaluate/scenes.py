@@ -33,8 +33,8 @@ from embomatrix.factory.task_import.batch import poses_for
 from embomatrix.factory.task_import.sources import SourceText, read_activity
 from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
 from embomatrix.pages.figures import Better, Figure
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.planner.oracle import find_plan
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle
 
 if TYPE_CHECKING:
@@ -174,7 +174,7 @@ def _executed(
     """What speaks against a task when its oracle's plan is executed, None: nothing; and what the robot can't get at."""
     view = SceneView(imported.scene)
     poses = poses_for(imported, view, library, None, seed)
-    with contextlib.closing(Simulator(Bundle(imported.scene, {}, poses))) as stage:
+    with contextlib.closing(load_simulator(Bundle(imported.scene, {}, poses))) as stage:
         verdict = admit(stage, imported.task, find_plan, imported.init)
         lost = out_of_hand(stage, imported.task, view, imported.about)
     return (None if isinstance(verdict, Admitted) else verdict), lost

@@ -23,7 +23,7 @@ from embomatrix.factory.importers.meshes import GROUPED, read_groups
 from embomatrix.factory.importers.model import AxisConvention, Mesh, ModelFileError, RawModel
 from embomatrix.factory.importers.urdf import read_urdf
 from embomatrix.world.asset import Asset, Joint, JointKind, Link
-from embomatrix.world.codec_asset import asset_from_json, asset_to_json
+from embomatrix.world.codec import asset_from_json, asset_to_json
 from embomatrix.world.geometry import Aabb, Shape
 
 if TYPE_CHECKING:

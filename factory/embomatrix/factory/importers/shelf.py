@@ -6,8 +6,8 @@ import json
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.importers.model import ModelFileError
-from embomatrix.world.codec_asset import asset_from_json, asset_to_json
-from embomatrix.world.field import SceneInvalidError
+from embomatrix.world.codec import asset_from_json, asset_to_json
+from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.whole_file import read_whole, write_whole
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from embomatrix.factory.admission import SEED
 from embomatrix.reward.hierarchy import score
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.describe import call_in_words
 from embomatrix.skills.parse import plan_from_json
 from embomatrix.world.evaluate import evaluate, render, scored_atoms
@@ -16,6 +16,7 @@ from embomatrix.world.evaluate import evaluate, render, scored_atoms
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from embomatrix.sim.executor import Simulator
     from embomatrix.world.bundle import Bundle
     from embomatrix.world.dataset import TaskRecord
 
@@ -52,7 +53,7 @@ def play_oracle(record: TaskRecord, bundle: Bundle) -> Show:
     """Execute the record's oracle plan in its bundle. Raises EngineError where the scene can't be loaded."""
     task = record.task
     plan = plan_from_json(list(record.oracle), task.profile)
-    with contextlib.closing(Simulator(bundle)) as simulator:
+    with contextlib.closing(load_simulator(bundle)) as simulator:
         simulator.reset(task, SEED)
         moments = [_moment(simulator, record, "", "")]
         for call in plan:

@@ -10,9 +10,9 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from embomatrix.sim.bullet.camera import furnish_cutaway, furnish_whole, shoot_egocentric, shoot_oblique
-from embomatrix.sim.bullet.stage import VisualScene
+from embomatrix.sim.bullet.robot import tucked
+from embomatrix.sim.bullet.visual_scene import VisualScene
 from embomatrix.sim.film import FRAMES_PER_S
-from embomatrix.sim.physical.stage import tucked
 from embomatrix.sim.process_pool import process_pool
 
 if TYPE_CHECKING:

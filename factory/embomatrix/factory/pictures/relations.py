@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.bullet.stage import VisualScene
+from embomatrix.sim.bullet.visual_scene import VisualScene
 from embomatrix.sim.geometry.bounds import AssetBounds
 from embomatrix.sim.state.relations import Relations
 from embomatrix.world.catalog import Catalog

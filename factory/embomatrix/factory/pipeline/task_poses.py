@@ -17,7 +17,7 @@ from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical.prospects import Placing
 from embomatrix.sim.physical.survey import prospects
 from embomatrix.sim.placing.pose_cache import PLACE_RELATIONS, footprint_placements, standing_poses
-from embomatrix.skills.appliance import cold_source, heat_source
+from embomatrix.skills.appliances import cold_source, heat_source
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.poses import Handling, PlacementKey, PoseCache
 from embomatrix.world.state import Relation

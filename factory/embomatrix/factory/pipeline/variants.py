@@ -21,12 +21,12 @@ from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.factory.writer.tasks import DraftOrder, ManyAtOnce, PlainWriter, is_heldout_signature
 from embomatrix.factory.writer.variant import Variant, build_variant
-from embomatrix.sim.executor import Simulator
-from embomatrix.sim.floor.prepared import prepare
+from embomatrix.sim.live_world import prepare
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.planner.oracle import find_plan
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import TaskRecord
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from embomatrix.factory.layout.request import LayoutAgents
     from embomatrix.factory.pipeline.settings import BuildSettings
     from embomatrix.factory.writer.tasks import Draft, TaskWriter
+    from embomatrix.sim.executor import Simulator
     from embomatrix.skills.syntax import Plan
     from embomatrix.world.scene import Scene
 
@@ -172,7 +173,7 @@ class _VariantJob:
         left = dict(missing)
         bundle = Bundle(scene, {}, poses)
         with contextlib.ExitStack() as stack:
-            stage = stack.enter_context(contextlib.closing(Simulator(bundle)))
+            stage = stack.enter_context(contextlib.closing(load_simulator(bundle)))
             robot = (
                 stack.enter_context(contextlib.closing(physical_simulator(bundle)))
                 if self._physical

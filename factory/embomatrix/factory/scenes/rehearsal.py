@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Final, Self
 
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.sim.actions import HANDLINGS
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.planner.calls import StuckError
 from embomatrix.sim.planner.errands import Errands, Warming
 from embomatrix.sim.planner.script import PlanScript
 from embomatrix.sim.planner.ways import PlacementGoal
 from embomatrix.sim.planner.wishes import GoalLiterals
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.evaluate import evaluate, render
 from embomatrix.world.goal import Atom, Not
@@ -46,7 +46,7 @@ class Rehearsal:
         """``bars`` knows the arm. Raises EngineError when the scene can't be loaded."""
         self._view = SceneView(scene)
         self._bars = bars
-        self._simulator = Simulator(Bundle(scene, {}, PoseCache()))
+        self._simulator = load_simulator(Bundle(scene, {}, PoseCache()))
         self._known: dict[tuple[str, ...], bool] = {}
 
     def __enter__(self) -> Self:

@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.world.codec import scene_from_json, scene_to_json
-from embomatrix.world.field import SceneInvalidError
+from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.whole_file import read_whole, write_whole
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from embomatrix.factory.furnish.small_objects import NEVER_SWITCHED
 from embomatrix.factory.scenes.joints import bumped_into
 from embomatrix.factory.scenes.solids import Solids
 from embomatrix.sim.joints.swings import SWING
-from embomatrix.skills.appliance import cold_source, cooks, freezes, heat_source, heats
+from embomatrix.skills.appliances import cold_source, cooks, freezes, heat_source, heats
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.asset import FLOOR_CATEGORY
 from embomatrix.world.state import OPEN_FRACTION, Relation, State

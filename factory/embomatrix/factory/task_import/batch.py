@@ -15,9 +15,9 @@ from embomatrix.factory.task_import.neighbours import neighbours_of
 from embomatrix.factory.task_import.size_requirements import demands_of
 from embomatrix.factory.task_import.sources import BEHAVIOR, EAI
 from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
-from embomatrix.sim.executor import Simulator
-from embomatrix.sim.floor.prepared import prepare
+from embomatrix.sim.live_world import prepare
 from embomatrix.sim.planner.oracle import find_plan
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import TaskRecord
@@ -179,7 +179,7 @@ def verify(
 ) -> Verified | TaskRefusal:
     """Judge an imported task by execution, and pack it when it is admitted. Without ``foresight`` the arm is not asked."""
     poses = poses_for(imported, SceneView(imported.scene), library, foresight, seed)
-    with contextlib.closing(Simulator(Bundle(imported.scene, {}, poses))) as stage:
+    with contextlib.closing(load_simulator(Bundle(imported.scene, {}, poses))) as stage:
         verdict = admit(stage, imported.task, find_plan, imported.init, most_held=most_held_in(imported.task))
         if not isinstance(verdict, Admitted):
             return verdict

@@ -7,7 +7,7 @@ import re
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.task_import.reach import REAL
-from embomatrix.skills.household import liquids_given
+from embomatrix.skills.appliances import liquids_given
 from embomatrix.world.bddl import ROOM_TYPES, is_room_instance
 from embomatrix.world.evaluate import atoms_of
 from embomatrix.world.state import Relation, State, SubstanceRelation

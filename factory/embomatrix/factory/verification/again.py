@@ -15,10 +15,10 @@ import numpy as np
 
 from embomatrix.factory.admission import SEED, Admitted, admit, objection
 from embomatrix.factory.task_import.batch import most_held_in
-from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.sim.process_pool import process_pool
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import plan_from_json, plan_to_json
 from embomatrix.world.dataset import Dataset, DatasetError
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
+    from embomatrix.sim.executor import Simulator
     from embomatrix.world.bundle import Bundle
     from embomatrix.world.dataset import TaskRecord
 
@@ -125,7 +126,7 @@ def _look_at(order: _Order) -> list[Look]:
     dataset = Dataset.load(order.folder)
     bundle = dataset.read_bundle(order.bundle_digest)
     records = [dataset.find(task) for task in order.tasks]
-    with contextlib.closing(Simulator(bundle)) as stage:
+    with contextlib.closing(load_simulator(bundle)) as stage:
         looks = [_cached(stage, record) for record in records]
     if not order.physical:
         return looks

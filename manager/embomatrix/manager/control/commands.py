@@ -1,64 +1,69 @@
-"""Orders that the manager's state machines give; the runtime carries them out."""
+"""Commands of the manager's state machines; the runtime carries them out."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from embomatrix.reward.settings import PAPER, RewardSettings
 
 if TYPE_CHECKING:
+    from embomatrix.manager.control.events import Event
     from embomatrix.rpc.wire.leases import LeaseOrigin, LeaseRef
     from embomatrix.rpc.wire.values import Rollout, RolloutResult
 
 
 @dataclass(frozen=True, slots=True)
-class SetDesired:
-    """The full set of scenes that the worker should hold, most urgent first; others may be evicted."""
+class CausedCommand:
+    """``caused_by`` is the event that led to the command, set by the state machine that emits it."""
+
+    caused_by: Event | None = field(init=False, compare=False, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class SetDesired(CausedCommand):
+    """The worker should hold these scenes, most urgent first; it may evict all others."""
 
     worker_id: str
     bundle_digests: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class GiveLease:
-    """The worker shall execute the rollout, within ``deadline_s`` seconds of execution.
-
-    ``hedge`` marks the second lease of a rollout whose first is late and still good.
-    """
+class GiveLease(CausedCommand):
+    """The worker executes the rollout within ``deadline_s`` seconds of execution."""
 
     worker_id: str
     ref: LeaseRef
     rollout: Rollout
     deadline_s: float
     origin: LeaseOrigin
-    """Comes back in the worker's claims when another manager asks."""
+    """Returned in the worker's claims after a restart of the manager."""
     hedge: bool = False
+    """Second lease of a rollout whose first is late and still live."""
     audit: bool = False
-    """The result is compared with another's: a worker is not told."""
+    """The result is compared with another worker's. Never sent to the worker."""
     reward: RewardSettings = PAPER
-    """How the run wants it scored."""
 
 
 @dataclass(frozen=True, slots=True)
-class CancelLease:
-    """The lease is void: stop it if it runs, forget it if it waits."""
+class CancelLease(CausedCommand):
+    """The lease is void: the worker stops or forgets it."""
 
     worker_id: str
     ref: LeaseRef
 
 
 @dataclass(frozen=True, slots=True)
-class AcknowledgeLease:
-    """The worker may forget the result; it was taken, or it came too late."""
+class AcknowledgeLease(CausedCommand):
+    """The worker may forget the result: it was taken, or it is stale."""
 
     worker_id: str
     ref: LeaseRef
 
 
 @dataclass(frozen=True, slots=True)
-class DeliverResult:
-    """The one terminal outcome of a rollout."""
+class DeliverResult(CausedCommand):
+    """The one outcome of a rollout."""
 
     run_id: str
     batch_id: str
@@ -66,7 +71,7 @@ class DeliverResult:
 
 
 @dataclass(frozen=True, slots=True)
-class FinishBatch:
+class FinishBatch(CausedCommand):
     """Every rollout of the batch has its outcome."""
 
     run_id: str
@@ -74,13 +79,13 @@ class FinishBatch:
 
 
 @dataclass(frozen=True, slots=True)
-class QuarantineWorker:
-    """The worker's results are wrong: it gets nothing more. Told to people, not to the worker."""
+class QuarantineWorker(CausedCommand):
+    """The worker's results are wrong and it gets no more work. Reported to operators, not to the worker."""
 
     worker_id: str
     reason: str
     audited: int
-    """Executions of it that had been compared, with the one that was wrong."""
+    """Number of its executions compared so far, including the wrong one."""
 
 
 Command = (

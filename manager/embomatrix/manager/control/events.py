@@ -1,4 +1,4 @@
-"""Facts that reach the manager's state machines. Nothing here does I/O; times are seconds of one monotonic clock."""
+"""Events of the manager's state machines. Times are seconds of one monotonic clock."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from embomatrix.manager.control.audit.auditor import Repute
+    from embomatrix.manager.control.reputation import Reputation
     from embomatrix.rpc.wire.leases import LeaseClaim, LeaseProgress, LeaseRef
     from embomatrix.rpc.wire.values import (
         Batch,
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class WorkerJoined:
-    """A worker registered. It gets work once it has reported its state."""
+    """A worker registered. It gets work after its first report."""
 
     worker_id: str
     resources: Resources
@@ -31,24 +31,23 @@ class WorkerJoined:
 
 @dataclass(frozen=True, slots=True)
 class WorkerReported:
-    """The worker's full state. ``resync`` marks the first report of a stream: what it does not hold was never received.
-
-    ``held`` are the leases that run or wait there, and with a first report also those whose results come with it.
-    """
+    """Full state of a worker."""
 
     worker_id: str
     residents: tuple[Resident, ...]
     held: tuple[LeaseRef, ...] = ()
+    """Leases that run or wait there; in a first report, also those whose results come with it."""
     draining: bool = False
     resync: bool = False
+    """First report of a stream: leases missing in ``held`` never arrived."""
     claims: tuple[LeaseClaim, ...] = ()
     paused: str = ""
-    """Why it takes nothing new for now; empty while it works."""
+    """The worker's reason to take nothing new for now; empty while it works."""
 
 
 @dataclass(frozen=True, slots=True)
 class WorkerSuspected:
-    """Heartbeats are missing: no new leases until it is heard again."""
+    """Heartbeats are missing: the worker gets no new leases until it is heard again."""
 
     worker_id: str
 
@@ -62,7 +61,7 @@ class WorkerRecovered:
 
 @dataclass(frozen=True, slots=True)
 class WorkerLost:
-    """The worker is gone: crashed, silent for too long, or replaced by a newer session of the same id."""
+    """The worker crashed, was silent for too long, or was replaced by a newer session."""
 
     worker_id: str
     reason: str
@@ -70,28 +69,21 @@ class WorkerLost:
 
 @dataclass(frozen=True, slots=True)
 class WorkerDrained:
-    """An operator takes the worker out: it finishes what it holds and gets nothing new."""
+    """An operator drains the worker: it finishes its leases and gets nothing new."""
 
     worker_id: str
 
 
 @dataclass(frozen=True, slots=True)
 class WorkerResumed:
-    """An operator takes the drain back."""
-
-    worker_id: str
-
-
-@dataclass(frozen=True, slots=True)
-class WorkerQuarantined:
-    """Its results were found to be wrong: it gets nothing more until an operator resumes it."""
+    """An operator ended the drain, or the quarantine, of the worker."""
 
     worker_id: str
 
 
 @dataclass(frozen=True, slots=True)
 class LeasesRenewed:
-    """A heartbeat named the leases that the worker still holds, and how far those have come that run."""
+    """A heartbeat listed the leases that the worker holds, and the progress of the running ones."""
 
     worker_id: str
     held: tuple[LeaseRef, ...]
@@ -100,7 +92,7 @@ class LeasesRenewed:
 
 @dataclass(frozen=True, slots=True)
 class LeaseFinished:
-    """A worker reported the end of a lease. It may be late or a repetition: the epoch tells."""
+    """A worker reported the end of a lease. Late and repeated reports have an epoch that is not live."""
 
     worker_id: str
     ref: LeaseRef
@@ -109,7 +101,7 @@ class LeaseFinished:
 
 @dataclass(frozen=True, slots=True)
 class RunOpened:
-    """A run asks for these terms. One that never said so has the defaults."""
+    """A run was opened with these terms. Runs that were never opened have the defaults."""
 
     run_id: str
     terms: RunTerms
@@ -117,16 +109,16 @@ class RunOpened:
 
 @dataclass(frozen=True, slots=True)
 class BatchSubmitted:
-    """A trainer wants these plans executed. The first ``count`` are queued now, the others as ``BatchContinued`` says."""
+    """A trainer submitted a batch. The first ``count`` rollouts are queued now, the others by ``BatchContinued``."""
 
     batch: Batch
     count: int | None = None
-    """None for all."""
+    """None queues all."""
 
 
 @dataclass(frozen=True, slots=True)
 class BatchContinued:
-    """The next ``count`` rollouts of a batch are queued: a large one is taken in pieces, with other events between them."""
+    """Queue the next ``count`` rollouts of a large batch. Other events are handled in between."""
 
     run_id: str
     batch_id: str
@@ -135,29 +127,27 @@ class BatchContinued:
 
 @dataclass(frozen=True, slots=True)
 class BatchRestored:
-    """A former manager took this batch. ``delivered`` maps rollouts to the cursors under which it delivered them.
-
-    What is left may run somewhere: it waits for the workers to come back before it is given to others.
-    """
+    """A batch of a former manager. Its other rollouts may still run on workers, so they wait for claims first."""
 
     batch: Batch
     delivered: Mapping[str, int] = field(default_factory=dict)
+    """Cursor of each delivered rollout."""
     infra_failures: int = 0
-    """Of those that were delivered."""
+    """Infrastructure failures among the delivered outcomes."""
 
 
 @dataclass(frozen=True, slots=True)
 class WorkersExpected:
-    """These were there under the former manager: once all of them have reported, nobody else can hold a lease of it."""
+    """Workers of the former manager. After all of them have reported, no other worker can hold a lease of it."""
 
     worker_ids: frozenset[str]
 
 
 @dataclass(frozen=True, slots=True)
-class ReputesKnown:
-    """What former managers found out about workers, by their ids."""
+class ReputationsKnown:
+    """Reputations from former managers, by worker id."""
 
-    reputes: Mapping[str, Repute]
+    reputations: Mapping[str, Reputation]
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,14 +158,14 @@ class BatchCancelled:
 
 @dataclass(frozen=True, slots=True)
 class RunClosed:
-    """The run is over: open batches are cancelled and its look-ahead is forgotten."""
+    """The run ended: its open batches are cancelled and its look-ahead is dropped."""
 
     run_id: str
 
 
 @dataclass(frozen=True, slots=True)
 class LookaheadAnnounced:
-    """The whole window of a run. A version at or below the last one is ignored."""
+    """The whole look-ahead window of a run. A version at or below the last one is ignored."""
 
     run_id: str
     version: int
@@ -184,46 +174,46 @@ class LookaheadAnnounced:
 
 @dataclass(frozen=True, slots=True)
 class DemandObserved:
-    """What the Task-Dispatcher needs now.
-
-    ``pending`` counts waiting rollouts by scene, and those that run for too long and would be started elsewhere as well.
-    ``waited_s`` says how long the first of each has waited, whose turn it is first, and ``runs`` whose it is; ``rendering``
-    are the scenes that need slots which render. ``in_use`` are the (worker, scene) pairs with live leases, ``used`` those
-    that were given a lease since the last observation.
-    ``idle`` are the workers that have a free slot and nothing to do with it; nobody is named while nothing is pending.
-    """
+    """Demand of the Task-Dispatcher for scenes."""
 
     pending: Mapping[str, int]
+    """Waiting rollouts by scene, with late ones that would be hedged."""
     waited_s: Mapping[str, float] = field(default_factory=dict)
+    """Longest wait of each scene's rollouts, in order of turns."""
     in_use: frozenset[tuple[str, str]] = frozenset()
+    """(worker, scene) pairs with live leases."""
     used: frozenset[tuple[str, str]] = frozenset()
+    """(worker, scene) pairs that got a lease since the last observation."""
     idle: frozenset[str] = frozenset()
+    """Workers with a free slot; empty while nothing is pending."""
     runs: Mapping[str, str] = field(default_factory=dict)
+    """Run whose turn is next, by scene."""
     rendering: frozenset[str] = frozenset()
+    """Scenes that need slots that render."""
     lags: Mapping[str, float] = field(default_factory=dict)
-    """How many times slower than others those workers are that plainly are."""
+    """Slowdown of each slow worker against the others."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScenesUnplaceable:
-    """The Resource-Scheduler finds no worker for these scenes; the reason of each, in words."""
+    """Scenes that the Resource-Scheduler finds no worker for, each with the reason."""
 
     reasons: Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True)
 class DispatchPaused:
-    """An operator wants no new leases for now."""
+    """An operator paused dispatch: no new leases."""
 
 
 @dataclass(frozen=True, slots=True)
 class DispatchResumed:
-    """Leases are given again."""
+    """An operator resumed dispatch."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """Time has passed: deadlines and expiries are due."""
+    """Time has passed: deadlines and expiries are checked."""
 
 
 Event = (
@@ -234,7 +224,6 @@ Event = (
     | WorkerLost
     | WorkerDrained
     | WorkerResumed
-    | WorkerQuarantined
     | LeasesRenewed
     | LeaseFinished
     | RunOpened
@@ -242,7 +231,7 @@ Event = (
     | BatchContinued
     | BatchRestored
     | WorkersExpected
-    | ReputesKnown
+    | ReputationsKnown
     | BatchCancelled
     | RunClosed
     | LookaheadAnnounced

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from embomatrix.manager.control.commands import DeliverResult, GiveLease
-    from embomatrix.manager.control.dispatch.ledger import LeaseRecord
+    from embomatrix.manager.control.dispatch.records import LeaseRecord
     from embomatrix.rpc.wire.leases import LeaseResult
     from embomatrix.rpc.wire.values import Batch, Resident, Resources
 

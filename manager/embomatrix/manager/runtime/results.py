@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from embomatrix.manager.control.commands import DeliverResult, FinishBatch
-from embomatrix.manager.control.dispatch.group_ends import GroupEnds
+from embomatrix.manager.control.dispatch.batches import GroupEnds
 from embomatrix.manager.runtime.serialization import result_row, timed_row
 from embomatrix.manager.store.protocol import BatchResults, FencedError, StateError
 from embomatrix.rpc.wire.values import Completed

@@ -12,7 +12,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.control.dispatch.group_ends import group_sizes
+from embomatrix.manager.control.dispatch.batches import group_sizes
 from embomatrix.manager.control.events import (
     BatchCancelled,
     BatchContinued,
@@ -176,7 +176,7 @@ class Runs:
             )
         self._feed(LookaheadAnnounced(run_id, version, entries))
         scenes = dict.fromkeys(entry.bundle_digest for entry in entries)
-        outlook = self._cluster.scheduler.outlook
+        outlook = self._cluster.scheduler.readiness
         return [outlook.answer(scene) for scene in scenes]
 
     async def submit(self, batch: Batch) -> BatchLog:

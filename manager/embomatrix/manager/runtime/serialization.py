@@ -10,8 +10,8 @@ import struct
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.control.audit.auditor import Repute
 from embomatrix.manager.control.events import LookaheadAnnounced
+from embomatrix.manager.control.reputation import Reputation
 from embomatrix.manager.store.protocol import BatchRow, ResultRow, ShelfRow
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.rpc.wire.codec import each
@@ -28,7 +28,7 @@ from embomatrix.rpc.wire.values import Cancelled, Completed, InfraFailure
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from embomatrix.manager.control.schedule.lookahead_window import LookaheadWindow
+    from embomatrix.manager.control.schedule.lookahead import LookaheadWindow
     from embomatrix.manager.store.protocol import RunRow
     from embomatrix.rpc.wire.values import Batch, Outcome, RolloutResult, RunTerms
 
@@ -80,15 +80,15 @@ def timed_row(row: ResultRow, deliver_s: float) -> ResultRow:
     return ResultRow(row.cursor, row.rollout_id, row.payload + _DELIVERED + _DOUBLE.pack(deliver_s))
 
 
-def repute_row(worker_id: str, repute: Repute) -> ShelfRow:
+def repute_row(worker_id: str, repute: Reputation) -> ShelfRow:
     """Disputes end with the manager in which they are open: what they are about is executed again."""
     kept = {name: value for name, value in asdict(repute).items() if name != "disputed"}
     return ShelfRow(worker_id, json.dumps(kept, separators=(",", ":")).encode())
 
 
-def repute_of(row: ShelfRow) -> Repute:
+def repute_of(row: ShelfRow) -> Reputation:
     """What `repute_row` wrote."""
-    return Repute(**json.loads(row.payload))
+    return Reputation(**json.loads(row.payload))
 
 
 def window_row(run_id: str, window: LookaheadWindow) -> ShelfRow:

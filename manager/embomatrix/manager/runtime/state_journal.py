@@ -9,7 +9,7 @@ import contextlib
 import logging
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.control.events import ReputesKnown
+from embomatrix.manager.control.events import ReputationsKnown
 from embomatrix.manager.runtime.serialization import repute_of, repute_row, window_row
 from embomatrix.manager.store.protocol import Shelf, ShelfRow, StateError
 from embomatrix.rpc.status import UnavailableError
@@ -43,10 +43,10 @@ class StateJournal:
         """Set when the workers that are there have been noted next."""
         self._urgent = asyncio.Event()
 
-    async def reputes(self) -> ReputesKnown:
+    async def reputes(self) -> ReputationsKnown:
         """What former managers found out about workers."""
         rows = await self._store.rows(Shelf.REPUTES)
-        return ReputesKnown({row.key: repute_of(row) for row in rows})
+        return ReputationsKnown({row.key: repute_of(row) for row in rows})
 
     async def paused(self) -> bool:
         """Whether an operator paused dispatch and nobody took that back."""

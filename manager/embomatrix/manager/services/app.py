@@ -15,9 +15,9 @@ import uvicorn
 
 from embomatrix.manager.access.gate import Gate
 from embomatrix.manager.access.protection import protection_of
-from embomatrix.manager.control.audit.auditor import AuditRules
 from embomatrix.manager.control.cluster_state import ClusterState
-from embomatrix.manager.control.dispatch.assignments import DispatchLimits
+from embomatrix.manager.control.dispatch.state import DispatchLimits
+from embomatrix.manager.control.reputation import AuditRules
 from embomatrix.manager.control.schedule.scheduler import ScheduleLimits
 from embomatrix.manager.observe.run_archive import RunArchive
 from embomatrix.manager.runtime.bundles import BundleStore

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from embomatrix.manager.control.dispatch.assignments import DispatchLimits
+from embomatrix.manager.control.dispatch.state import DispatchLimits
 from embomatrix.manager.control.schedule.scheduler import ScheduleLimits
 from embomatrix.manager.runtime.registry import LivenessLimits
 from embomatrix.rpc.wire.values import RunTerms

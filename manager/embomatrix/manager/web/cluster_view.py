@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.control.schedule.lookahead_window import LookaheadWindow
+from embomatrix.manager.control.schedule.lookahead import LookaheadWindow
 from embomatrix.manager.observe.metrics import (
     FAILURES_KEPT,
     FailureNote,
@@ -254,7 +254,7 @@ def plan(runtime: ManagerRuntime, run_id: str = "") -> list[PlanCell]:
     if run_id and run_id not in runtime.runs.open:
         raise NotFoundError(f"run {run_id!r} is not open: leave its id out to see all runs")
     windows = scheduler.windows if not run_id else {run_id: scheduler.windows.get(run_id, NO_WINDOW)}
-    return scheduler.outlook.grid(windows)
+    return scheduler.readiness.grid(windows)
 
 
 def worker_infos(runtime: ManagerRuntime) -> list[WorkerInfo]:

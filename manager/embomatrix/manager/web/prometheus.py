@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from prometheus_client.metrics_core import Metric
 
-    from embomatrix.manager.control.dispatch.ledger import WorkerRecord
+    from embomatrix.manager.control.workers import WorkerRecord
     from embomatrix.manager.histogram import Histogram
     from embomatrix.manager.runtime.event_loop import ManagerRuntime
 

@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1f\x65mbomatrix/proto/v1/types.proto\x12\x13\x65mbomatrix.proto.v1\"\x9a\x02\n\tSkillCall\x12-\n\x05skill\x18\x01 \x01(\x0e\x32\x1e.embomatrix.proto.v1.SkillKind\x12\x19\n\x0cobject_index\x18\x02 \x01(\x03H\x00\x88\x01\x01\x12\x19\n\x0csource_index\x18\x03 \x01(\x03H\x01\x88\x01\x01\x12\x15\n\x08relation\x18\x04 \x01(\tH\x02\x88\x01\x01\x12\x10\n\x03yaw\x18\x05 \x01(\x01H\x03\x88\x01\x01\x12\x15\n\x08\x64istance\x18\x06 \x01(\x01H\x04\x88\x01\x01\x12\x16\n\troom_name\x18\x07 \x01(\tH\x05\x88\x01\x01\x42\x0f\n\r_object_indexB\x0f\n\r_source_indexB\x0b\n\t_relationB\x06\n\x04_yawB\x0b\n\t_distanceB\x0c\n\n_room_name\"\xa3\x01\n\x07Rollout\x12\x12\n\nrollout_id\x18\x01 \x01(\t\x12\x10\n\x08group_id\x18\x02 \x01(\t\x12\x15\n\rbundle_digest\x18\x03 \x01(\t\x12\x0f\n\x07task_id\x18\x04 \x01(\t\x12,\n\x04plan\x18\x05 \x03(\x0b\x32\x1e.embomatrix.proto.v1.SkillCall\x12\x0c\n\x04seed\x18\x06 \x01(\x04\x12\x0e\n\x06render\x18\x07 \x01(\x08\")\n\nAtomResult\x12\x0c\n\x04text\x18\x01 \x01(\t\x12\r\n\x05holds\x18\x02 \x01(\x08\"z\n\x06Reward\x12\x0e\n\x06\x66ormat\x18\x01 \x01(\x01\x12\x11\n\trelevance\x18\x02 \x01(\x01\x12\x0c\n\x04goal\x18\x03 \x01(\x01\x12.\n\x05\x61toms\x18\x04 \x03(\x0b\x32\x1f.embomatrix.proto.v1.AtomResult\x12\x0f\n\x07success\x18\x05 \x01(\x08\"\\\n\nStepResult\x12,\n\x04\x63\x61ll\x18\x01 \x01(\x0b\x32\x1e.embomatrix.proto.v1.SkillCall\x12\x0f\n\x07\x66\x61ilure\x18\x02 \x01(\t\x12\x0f\n\x07message\x18\x03 \x01(\t\"b\n\x07Timings\x12\x10\n\x08queued_s\x18\x01 \x01(\x01\x12\x0e\n\x06load_s\x18\x02 \x01(\x01\x12\x11\n\texecute_s\x18\x03 \x01(\x01\x12\x0f\n\x07lease_s\x18\x04 \x01(\x01\x12\x11\n\tdeliver_s\x18\x05 \x01(\x01\"\xe3\x01\n\tCompleted\x12+\n\x06reward\x18\x01 \x01(\x0b\x32\x1b.embomatrix.proto.v1.Reward\x12.\n\x05steps\x18\x02 \x03(\x0b\x32\x1f.embomatrix.proto.v1.StepResult\x12\x13\n\x0b\x66inal_state\x18\x03 \x03(\t\x12\x14\n\x0ctrace_digest\x18\x04 \x01(\t\x12\x11\n\tworker_id\x18\x05 \x01(\t\x12-\n\x07timings\x18\x06 \x01(\x0b\x32\x1c.embomatrix.proto.v1.Timings\x12\x0c\n\x04warm\x18\x07 \x01(\x08\"\x1c\n\x0cRolloutCalls\x12\x0c\n\x04plan\x18\x05 \x03(\x0c\"\x1f\n\x0e\x43ompletedSteps\x12\r\n\x05steps\x18\x02 \x03(\x0c\"`\n\x0cInfraFailure\x12,\n\x04\x63ode\x18\x01 \x01(\x0e\x32\x1e.embomatrix.proto.v1.InfraCode\x12\x0f\n\x07message\x18\x02 \x01(\t\x12\x11\n\tworker_id\x18\x03 \x01(\t\"\x1b\n\tCancelled\x12\x0e\n\x06reason\x18\x01 \x01(\t\"\x87\x02\n\rRolloutResult\x12\x12\n\nrollout_id\x18\x01 \x01(\t\x12\x10\n\x08group_id\x18\x02 \x01(\t\x12\x0e\n\x06\x63ursor\x18\x03 \x01(\x04\x12\x0f\n\x07\x61ttempt\x18\x04 \x01(\r\x12\x33\n\tcompleted\x18\x05 \x01(\x0b\x32\x1e.embomatrix.proto.v1.CompletedH\x00\x12:\n\rinfra_failure\x18\x06 \x01(\x0b\x32!.embomatrix.proto.v1.InfraFailureH\x00\x12\x33\n\tcancelled\x18\x07 \x01(\x0b\x32\x1e.embomatrix.proto.v1.CancelledH\x00\x42\t\n\x07outcome\"\xec\x02\n\tResources\x12\r\n\x05slots\x18\x01 \x01(\r\x12\r\n\x05\x63ores\x18\x02 \x01(\r\x12\x11\n\tmemory_mb\x18\x03 \x01(\x04\x12\r\n\x05score\x18\x04 \x01(\x01\x12\x0b\n\x03gpu\x18\x05 \x01(\t\x12\x0f\n\x07vram_mb\x18\x06 \x01(\x04\x12>\n\x08versions\x18\x07 \x03(\x0b\x32,.embomatrix.proto.v1.Resources.VersionsEntry\x12\x0f\n\x07\x64isk_mb\x18\x08 \x01(\x04\x12\x14\n\x0crender_slots\x18\t \x01(\r\x12:\n\x06labels\x18\n \x03(\x0b\x32*.embomatrix.proto.v1.Resources.LabelsEntry\x1a/\n\rVersionsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\t:\x02\x38\x01\x1a-\n\x0bLabelsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\t:\x02\x38\x01\"y\n\x0eRewardSettings\x12\x12\n\nunparsable\x18\x01 \x01(\x01\x12\x0e\n\x06\x66ormat\x18\x02 \x01(\x01\x12\x1c\n\x14relevance_per_object\x18\x03 \x01(\x01\x12\x17\n\x0frelevance_limit\x18\x04 \x01(\x01\x12\x0c\n\x04goal\x18\x05 \x01(\x01*\x99\x03\n\tSkillKind\x12\x1a\n\x16SKILL_KIND_UNSPECIFIED\x10\x00\x12\x13\n\x0fSKILL_KIND_MOVE\x10\x01\x12\x13\n\x0fSKILL_KIND_TURN\x10\x02\x12\x16\n\x12SKILL_KIND_PICK_UP\x10\x03\x12\x14\n\x10SKILL_KIND_PLACE\x10\x04\x12\x1b\n\x17SKILL_KIND_MOVE_FORWARD\x10\x05\x12\x13\n\x0fSKILL_KIND_OPEN\x10\x06\x12\x14\n\x10SKILL_KIND_CLOSE\x10\x07\x12\x18\n\x14SKILL_KIND_TOGGLE_ON\x10\x08\x12\x19\n\x15SKILL_KIND_TOGGLE_OFF\x10\t\x12\x13\n\x0fSKILL_KIND_HEAT\x10\n\x12\x13\n\x0fSKILL_KIND_COOK\x10\x0b\x12\x15\n\x11SKILL_KIND_FREEZE\x10\x0c\x12\x19\n\x15SKILL_KIND_GO_TO_ROOM\x10\r\x12\x14\n\x10SKILL_KIND_SLICE\x10\x0e\x12\x14\n\x10SKILL_KIND_CLEAN\x10\x0f\x12\x13\n\x0fSKILL_KIND_SOAK\x10\x10*\xa1\x03\n\tInfraCode\x12\x1a\n\x16INFRA_CODE_UNSPECIFIED\x10\x00\x12\x1a\n\x16INFRA_CODE_WORKER_LOST\x10\x01\x12\x1c\n\x18INFRA_CODE_LEASE_EXPIRED\x10\x02\x12\x1b\n\x17INFRA_CODE_SLOT_CRASHED\x10\x03\x12\x1b\n\x17INFRA_CODE_SLOT_TIMEOUT\x10\x04\x12 \n\x1cINFRA_CODE_SCENE_LOAD_FAILED\x10\x05\x12\x1d\n\x19INFRA_CODE_BUNDLE_CORRUPT\x10\x06\x12\x1a\n\x16INFRA_CODE_NO_CAPACITY\x10\x07\x12\x17\n\x13INFRA_CODE_DEADLINE\x10\x08\x12 \n\x1cINFRA_CODE_MANAGER_RESTARTED\x10\t\x12\x16\n\x12INFRA_CODE_STALLED\x10\n\x12\x17\n\x13INFRA_CODE_SLOT_OOM\x10\x0b\x12\x1b\n\x17INFRA_CODE_VERSION_SKEW\x10\x0c\x12\x1e\n\x1aINFRA_CODE_RESULT_MISMATCH\x10\r*p\n\x06Warmth\x12\x16\n\x12WARMTH_UNSPECIFIED\x10\x00\x12\x0f\n\x0bWARMTH_WARM\x10\x01\x12\x12\n\x0eWARMTH_WARMING\x10\x02\x12\x11\n\rWARMTH_QUEUED\x10\x03\x12\x16\n\x12WARMTH_UNPLACEABLE\x10\x04\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1f\x65mbomatrix/proto/v1/types.proto\x12\x13\x65mbomatrix.proto.v1\"\x9a\x02\n\tSkillCall\x12-\n\x05skill\x18\x01 \x01(\x0e\x32\x1e.embomatrix.proto.v1.SkillKind\x12\x19\n\x0cobject_index\x18\x02 \x01(\x03H\x00\x88\x01\x01\x12\x19\n\x0csource_index\x18\x03 \x01(\x03H\x01\x88\x01\x01\x12\x15\n\x08relation\x18\x04 \x01(\tH\x02\x88\x01\x01\x12\x10\n\x03yaw\x18\x05 \x01(\x01H\x03\x88\x01\x01\x12\x15\n\x08\x64istance\x18\x06 \x01(\x01H\x04\x88\x01\x01\x12\x16\n\troom_name\x18\x07 \x01(\tH\x05\x88\x01\x01\x42\x0f\n\r_object_indexB\x0f\n\r_source_indexB\x0b\n\t_relationB\x06\n\x04_yawB\x0b\n\t_distanceB\x0c\n\n_room_name\"\xa3\x01\n\x07Rollout\x12\x12\n\nrollout_id\x18\x01 \x01(\t\x12\x10\n\x08group_id\x18\x02 \x01(\t\x12\x15\n\rbundle_digest\x18\x03 \x01(\t\x12\x0f\n\x07task_id\x18\x04 \x01(\t\x12,\n\x04plan\x18\x05 \x03(\x0b\x32\x1e.embomatrix.proto.v1.SkillCall\x12\x0c\n\x04seed\x18\x06 \x01(\x04\x12\x0e\n\x06render\x18\x07 \x01(\x08\")\n\nAtomResult\x12\x0c\n\x04text\x18\x01 \x01(\t\x12\r\n\x05holds\x18\x02 \x01(\x08\"z\n\x06Reward\x12\x0e\n\x06\x66ormat\x18\x01 \x01(\x01\x12\x11\n\trelevance\x18\x02 \x01(\x01\x12\x0c\n\x04goal\x18\x03 \x01(\x01\x12.\n\x05\x61toms\x18\x04 \x03(\x0b\x32\x1f.embomatrix.proto.v1.AtomResult\x12\x0f\n\x07success\x18\x05 \x01(\x08\"m\n\nStepResult\x12,\n\x04\x63\x61ll\x18\x01 \x01(\x0b\x32\x1e.embomatrix.proto.v1.SkillCall\x12\x0f\n\x07\x66\x61ilure\x18\x02 \x01(\t\x12\x0f\n\x07message\x18\x03 \x01(\t\x12\x0f\n\x07\x62locker\x18\x04 \x01(\t\"b\n\x07Timings\x12\x10\n\x08queued_s\x18\x01 \x01(\x01\x12\x0e\n\x06load_s\x18\x02 \x01(\x01\x12\x11\n\texecute_s\x18\x03 \x01(\x01\x12\x0f\n\x07lease_s\x18\x04 \x01(\x01\x12\x11\n\tdeliver_s\x18\x05 \x01(\x01\"\xe3\x01\n\tCompleted\x12+\n\x06reward\x18\x01 \x01(\x0b\x32\x1b.embomatrix.proto.v1.Reward\x12.\n\x05steps\x18\x02 \x03(\x0b\x32\x1f.embomatrix.proto.v1.StepResult\x12\x13\n\x0b\x66inal_state\x18\x03 \x03(\t\x12\x14\n\x0ctrace_digest\x18\x04 \x01(\t\x12\x11\n\tworker_id\x18\x05 \x01(\t\x12-\n\x07timings\x18\x06 \x01(\x0b\x32\x1c.embomatrix.proto.v1.Timings\x12\x0c\n\x04warm\x18\x07 \x01(\x08\"\x1c\n\x0cRolloutCalls\x12\x0c\n\x04plan\x18\x05 \x03(\x0c\"\x1f\n\x0e\x43ompletedSteps\x12\r\n\x05steps\x18\x02 \x03(\x0c\"`\n\x0cInfraFailure\x12,\n\x04\x63ode\x18\x01 \x01(\x0e\x32\x1e.embomatrix.proto.v1.InfraCode\x12\x0f\n\x07message\x18\x02 \x01(\t\x12\x11\n\tworker_id\x18\x03 \x01(\t\"\x1b\n\tCancelled\x12\x0e\n\x06reason\x18\x01 \x01(\t\"\x87\x02\n\rRolloutResult\x12\x12\n\nrollout_id\x18\x01 \x01(\t\x12\x10\n\x08group_id\x18\x02 \x01(\t\x12\x0e\n\x06\x63ursor\x18\x03 \x01(\x04\x12\x0f\n\x07\x61ttempt\x18\x04 \x01(\r\x12\x33\n\tcompleted\x18\x05 \x01(\x0b\x32\x1e.embomatrix.proto.v1.CompletedH\x00\x12:\n\rinfra_failure\x18\x06 \x01(\x0b\x32!.embomatrix.proto.v1.InfraFailureH\x00\x12\x33\n\tcancelled\x18\x07 \x01(\x0b\x32\x1e.embomatrix.proto.v1.CancelledH\x00\x42\t\n\x07outcome\"\xec\x02\n\tResources\x12\r\n\x05slots\x18\x01 \x01(\r\x12\r\n\x05\x63ores\x18\x02 \x01(\r\x12\x11\n\tmemory_mb\x18\x03 \x01(\x04\x12\r\n\x05score\x18\x04 \x01(\x01\x12\x0b\n\x03gpu\x18\x05 \x01(\t\x12\x0f\n\x07vram_mb\x18\x06 \x01(\x04\x12>\n\x08versions\x18\x07 \x03(\x0b\x32,.embomatrix.proto.v1.Resources.VersionsEntry\x12\x0f\n\x07\x64isk_mb\x18\x08 \x01(\x04\x12\x14\n\x0crender_slots\x18\t \x01(\r\x12:\n\x06labels\x18\n \x03(\x0b\x32*.embomatrix.proto.v1.Resources.LabelsEntry\x1a/\n\rVersionsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\t:\x02\x38\x01\x1a-\n\x0bLabelsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\t:\x02\x38\x01\"y\n\x0eRewardSettings\x12\x12\n\nunparsable\x18\x01 \x01(\x01\x12\x0e\n\x06\x66ormat\x18\x02 \x01(\x01\x12\x1c\n\x14relevance_per_object\x18\x03 \x01(\x01\x12\x17\n\x0frelevance_limit\x18\x04 \x01(\x01\x12\x0c\n\x04goal\x18\x05 \x01(\x01*\x99\x03\n\tSkillKind\x12\x1a\n\x16SKILL_KIND_UNSPECIFIED\x10\x00\x12\x13\n\x0fSKILL_KIND_MOVE\x10\x01\x12\x13\n\x0fSKILL_KIND_TURN\x10\x02\x12\x16\n\x12SKILL_KIND_PICK_UP\x10\x03\x12\x14\n\x10SKILL_KIND_PLACE\x10\x04\x12\x1b\n\x17SKILL_KIND_MOVE_FORWARD\x10\x05\x12\x13\n\x0fSKILL_KIND_OPEN\x10\x06\x12\x14\n\x10SKILL_KIND_CLOSE\x10\x07\x12\x18\n\x14SKILL_KIND_TOGGLE_ON\x10\x08\x12\x19\n\x15SKILL_KIND_TOGGLE_OFF\x10\t\x12\x13\n\x0fSKILL_KIND_HEAT\x10\n\x12\x13\n\x0fSKILL_KIND_COOK\x10\x0b\x12\x15\n\x11SKILL_KIND_FREEZE\x10\x0c\x12\x19\n\x15SKILL_KIND_GO_TO_ROOM\x10\r\x12\x14\n\x10SKILL_KIND_SLICE\x10\x0e\x12\x14\n\x10SKILL_KIND_CLEAN\x10\x0f\x12\x13\n\x0fSKILL_KIND_SOAK\x10\x10*\xa1\x03\n\tInfraCode\x12\x1a\n\x16INFRA_CODE_UNSPECIFIED\x10\x00\x12\x1a\n\x16INFRA_CODE_WORKER_LOST\x10\x01\x12\x1c\n\x18INFRA_CODE_LEASE_EXPIRED\x10\x02\x12\x1b\n\x17INFRA_CODE_SLOT_CRASHED\x10\x03\x12\x1b\n\x17INFRA_CODE_SLOT_TIMEOUT\x10\x04\x12 \n\x1cINFRA_CODE_SCENE_LOAD_FAILED\x10\x05\x12\x1d\n\x19INFRA_CODE_BUNDLE_CORRUPT\x10\x06\x12\x1a\n\x16INFRA_CODE_NO_CAPACITY\x10\x07\x12\x17\n\x13INFRA_CODE_DEADLINE\x10\x08\x12 \n\x1cINFRA_CODE_MANAGER_RESTARTED\x10\t\x12\x16\n\x12INFRA_CODE_STALLED\x10\n\x12\x17\n\x13INFRA_CODE_SLOT_OOM\x10\x0b\x12\x1b\n\x17INFRA_CODE_VERSION_SKEW\x10\x0c\x12\x1e\n\x1aINFRA_CODE_RESULT_MISMATCH\x10\r*p\n\x06Warmth\x12\x16\n\x12WARMTH_UNSPECIFIED\x10\x00\x12\x0f\n\x0bWARMTH_WARM\x10\x01\x12\x12\n\x0eWARMTH_WARMING\x10\x02\x12\x11\n\rWARMTH_QUEUED\x10\x03\x12\x16\n\x12WARMTH_UNPLACEABLE\x10\x04\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -35,12 +35,12 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_RESOURCES_VERSIONSENTRY']._serialized_options = b'8\001'
   _globals['_RESOURCES_LABELSENTRY']._loaded_options = None
   _globals['_RESOURCES_LABELSENTRY']._serialized_options = b'8\001'
-  _globals['_SKILLKIND']._serialized_start=2045
-  _globals['_SKILLKIND']._serialized_end=2454
-  _globals['_INFRACODE']._serialized_start=2457
-  _globals['_INFRACODE']._serialized_end=2874
-  _globals['_WARMTH']._serialized_start=2876
-  _globals['_WARMTH']._serialized_end=2988
+  _globals['_SKILLKIND']._serialized_start=2062
+  _globals['_SKILLKIND']._serialized_end=2471
+  _globals['_INFRACODE']._serialized_start=2474
+  _globals['_INFRACODE']._serialized_end=2891
+  _globals['_WARMTH']._serialized_start=2893
+  _globals['_WARMTH']._serialized_end=3005
   _globals['_SKILLCALL']._serialized_start=57
   _globals['_SKILLCALL']._serialized_end=339
   _globals['_ROLLOUT']._serialized_start=342
@@ -50,27 +50,27 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_REWARD']._serialized_start=550
   _globals['_REWARD']._serialized_end=672
   _globals['_STEPRESULT']._serialized_start=674
-  _globals['_STEPRESULT']._serialized_end=766
-  _globals['_TIMINGS']._serialized_start=768
-  _globals['_TIMINGS']._serialized_end=866
-  _globals['_COMPLETED']._serialized_start=869
-  _globals['_COMPLETED']._serialized_end=1096
-  _globals['_ROLLOUTCALLS']._serialized_start=1098
-  _globals['_ROLLOUTCALLS']._serialized_end=1126
-  _globals['_COMPLETEDSTEPS']._serialized_start=1128
-  _globals['_COMPLETEDSTEPS']._serialized_end=1159
-  _globals['_INFRAFAILURE']._serialized_start=1161
-  _globals['_INFRAFAILURE']._serialized_end=1257
-  _globals['_CANCELLED']._serialized_start=1259
-  _globals['_CANCELLED']._serialized_end=1286
-  _globals['_ROLLOUTRESULT']._serialized_start=1289
-  _globals['_ROLLOUTRESULT']._serialized_end=1552
-  _globals['_RESOURCES']._serialized_start=1555
-  _globals['_RESOURCES']._serialized_end=1919
-  _globals['_RESOURCES_VERSIONSENTRY']._serialized_start=1825
-  _globals['_RESOURCES_VERSIONSENTRY']._serialized_end=1872
-  _globals['_RESOURCES_LABELSENTRY']._serialized_start=1874
-  _globals['_RESOURCES_LABELSENTRY']._serialized_end=1919
-  _globals['_REWARDSETTINGS']._serialized_start=1921
-  _globals['_REWARDSETTINGS']._serialized_end=2042
+  _globals['_STEPRESULT']._serialized_end=783
+  _globals['_TIMINGS']._serialized_start=785
+  _globals['_TIMINGS']._serialized_end=883
+  _globals['_COMPLETED']._serialized_start=886
+  _globals['_COMPLETED']._serialized_end=1113
+  _globals['_ROLLOUTCALLS']._serialized_start=1115
+  _globals['_ROLLOUTCALLS']._serialized_end=1143
+  _globals['_COMPLETEDSTEPS']._serialized_start=1145
+  _globals['_COMPLETEDSTEPS']._serialized_end=1176
+  _globals['_INFRAFAILURE']._serialized_start=1178
+  _globals['_INFRAFAILURE']._serialized_end=1274
+  _globals['_CANCELLED']._serialized_start=1276
+  _globals['_CANCELLED']._serialized_end=1303
+  _globals['_ROLLOUTRESULT']._serialized_start=1306
+  _globals['_ROLLOUTRESULT']._serialized_end=1569
+  _globals['_RESOURCES']._serialized_start=1572
+  _globals['_RESOURCES']._serialized_end=1936
+  _globals['_RESOURCES_VERSIONSENTRY']._serialized_start=1842
+  _globals['_RESOURCES_VERSIONSENTRY']._serialized_end=1889
+  _globals['_RESOURCES_LABELSENTRY']._serialized_start=1891
+  _globals['_RESOURCES_LABELSENTRY']._serialized_end=1936
+  _globals['_REWARDSETTINGS']._serialized_start=1938
+  _globals['_REWARDSETTINGS']._serialized_end=2059
 # @@protoc_insertion_point(module_scope)

@@ -268,9 +268,12 @@ class StepResult(google.protobuf.message.Message):
     CALL_FIELD_NUMBER: builtins.int
     FAILURE_FIELD_NUMBER: builtins.int
     MESSAGE_FIELD_NUMBER: builtins.int
+    BLOCKER_FIELD_NUMBER: builtins.int
     failure: builtins.str
     """Empty when the step succeeded, else a value of the closed set of failure reasons."""
     message: builtins.str
+    blocker: builtins.str
+    """Name of the object that made the step fail: what stands in the way, or what must change first. Empty when the step succeeded."""
     @property
     def call(self) -> Global___SkillCall: ...
     def __init__(
@@ -279,9 +282,10 @@ class StepResult(google.protobuf.message.Message):
         call: Global___SkillCall | None = ...,
         failure: builtins.str = ...,
         message: builtins.str = ...,
+        blocker: builtins.str = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["call", b"call"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["call", b"call", "failure", b"failure", "message", b"message"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["blocker", b"blocker", "call", b"call", "failure", b"failure", "message", b"message"]) -> None: ...
 
 Global___StepResult: typing_extensions.TypeAlias = StepResult
 

@@ -5,12 +5,11 @@ The first thing that went wrong decides. `docs/evaluation.md` tells the rules in
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.skills.failure import SENTENCES, FailureReason
+from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.parse import PlanReason
 from embomatrix.skills.syntax import Skill
 
@@ -55,22 +54,12 @@ MEANINGS: Final[Mapping[Cause, str]] = {
 """Each cause in words."""
 
 
-class ObjectRole(StrEnum):
-    """Which object another step would have had to be about, by its place in the failed step's sentence."""
-
-    TARGET = "target"
-    SOURCE = "source"
-    OTHER = "other"
-    CONTAINER = "container"
-    ANY = "any"
-
-
 @dataclass(frozen=True, slots=True)
 class Remedy:
-    """The call that makes a precondition true: a skill, and which object it is about."""
+    """Skill call that would have made a precondition true. ``any_object``: it need not be about the step's blocker."""
 
     skill: Skill
-    about: ObjectRole
+    any_object: bool = False
 
 
 _PLAN_CAUSES: Final[Mapping[PlanReason, Cause]] = {
@@ -83,20 +72,20 @@ _PLAN_CAUSES: Final[Mapping[PlanReason, Cause]] = {
 }
 
 REMEDIES: Final[Mapping[FailureReason, Remedy]] = {
-    FailureReason.NOT_THERE: Remedy(Skill.SLICE, ObjectRole.ANY),
-    FailureReason.OUT_OF_REACH: Remedy(Skill.MOVE, ObjectRole.TARGET),
-    FailureReason.NO_LINE_OF_APPROACH: Remedy(Skill.MOVE, ObjectRole.TARGET),
-    FailureReason.HAND_FULL: Remedy(Skill.PLACE, ObjectRole.ANY),
-    FailureReason.HAND_EMPTY: Remedy(Skill.PICK_UP, ObjectRole.ANY),
-    FailureReason.SUPPORTS_OTHERS: Remedy(Skill.PICK_UP, ObjectRole.OTHER),
-    FailureReason.CONTAINER_CLOSED: Remedy(Skill.OPEN, ObjectRole.CONTAINER),
-    FailureReason.OPENED_WHILE_ON: Remedy(Skill.TOGGLE_OFF, ObjectRole.TARGET),
-    FailureReason.MUST_BE_CLOSED: Remedy(Skill.CLOSE, ObjectRole.TARGET),
-    FailureReason.SOURCE_OFF: Remedy(Skill.TOGGLE_ON, ObjectRole.SOURCE),
-    FailureReason.SOURCE_OPEN: Remedy(Skill.CLOSE, ObjectRole.SOURCE),
-    FailureReason.NOT_AT_SOURCE: Remedy(Skill.PLACE, ObjectRole.SOURCE),
-    FailureReason.TOOL_NOT_HELD: Remedy(Skill.PICK_UP, ObjectRole.SOURCE),
-    FailureReason.NEEDS_SOAKING: Remedy(Skill.SOAK, ObjectRole.SOURCE),
+    FailureReason.NOT_THERE: Remedy(Skill.SLICE, any_object=True),
+    FailureReason.OUT_OF_REACH: Remedy(Skill.MOVE),
+    FailureReason.NO_LINE_OF_APPROACH: Remedy(Skill.MOVE),
+    FailureReason.HAND_FULL: Remedy(Skill.PLACE, any_object=True),
+    FailureReason.HAND_EMPTY: Remedy(Skill.PICK_UP, any_object=True),
+    FailureReason.SUPPORTS_OTHERS: Remedy(Skill.PICK_UP),
+    FailureReason.CONTAINER_CLOSED: Remedy(Skill.OPEN),
+    FailureReason.OPENED_WHILE_ON: Remedy(Skill.TOGGLE_OFF),
+    FailureReason.MUST_BE_CLOSED: Remedy(Skill.CLOSE),
+    FailureReason.SOURCE_OFF: Remedy(Skill.TOGGLE_ON),
+    FailureReason.SOURCE_OPEN: Remedy(Skill.CLOSE),
+    FailureReason.NOT_AT_SOURCE: Remedy(Skill.PLACE),
+    FailureReason.TOOL_NOT_HELD: Remedy(Skill.PICK_UP),
+    FailureReason.NEEDS_SOAKING: Remedy(Skill.SOAK),
 }
 """Preconditions that another call makes true. Whether the plan holds that call later tells wrong order from missing step."""
 
@@ -169,32 +158,8 @@ def cause_of_trace(plan: Plan, steps: Sequence[Step], table: Sequence[str]) -> C
 
 
 def _is_about(call: SkillCall, remedy: Remedy, failed: Step, table: Sequence[str]) -> bool:
-    """Whether the call is about the object that the failed step lacked something of."""
-    if remedy.about is ObjectRole.ANY:
-        return True
-    assert failed.failure is not None
-    found = _PATTERNS[failed.failure].fullmatch(failed.message)
+    """Return True if the call is about the object that made the failed step fail."""
     index = call.object_index
-    if found is None or index is None or not 0 <= index < len(table):
-        return False
-    return table[index] == found.group(remedy.about.value)
-
-
-def _pattern(sentence: str) -> re.Pattern[str]:
-    """Reads a failure's sentence back: each placeholder is a group."""
-    seen: set[str] = set()
-
-    def group(match: re.Match[str]) -> str:
-        name = match.group(1)
-        again = name in seen
-        seen.add(name)
-        return f"(?P={name})" if again else f"(?P<{name}>.+?)"
-
-    return re.compile(re.sub(r"\\\{(\w+)\\\}", group, re.escape(sentence)))
-
-
-_PATTERNS: Final = {
-    reason: _pattern(SENTENCES[reason])
-    for reason, remedy in REMEDIES.items()
-    if remedy.about is not ObjectRole.ANY
-}
+    if remedy.any_object:
+        return True
+    return index is not None and 0 <= index < len(table) and table[index] == failed.blocker

@@ -1,68 +1,114 @@
-"""How leases end: by a result, by a failure, or too late."""
+"""Ends of leases: results and failures that workers report, revoked leases, and scenes that fail to load."""
 
 from __future__ import annotations
 
 import dataclasses
 from typing import TYPE_CHECKING
 
-from embomatrix.manager.control.commands import AcknowledgeLease
+from embomatrix.manager.control.commands import AcknowledgeLease, CancelLease
+from embomatrix.manager.control.dispatch.audits import finish, hold_for_audit
+from embomatrix.manager.control.dispatch.batches import attempts_allowed
+from embomatrix.manager.control.dispatch.leasing import offer_scene
+from embomatrix.manager.control.dispatch.outcomes import requeue
+from embomatrix.manager.control.dispatch.state import RolloutStep
 from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure
 
 if TYPE_CHECKING:
-    from embomatrix.manager.control.dispatch.assignments import Assignments
-    from embomatrix.manager.control.dispatch.ledger import LeaseRecord
+    from embomatrix.manager.control.dispatch.records import LeaseRecord
+    from embomatrix.manager.control.dispatch.state import DispatchState
     from embomatrix.manager.control.events import LeaseFinished
 
 
-class LeaseEnds:
-    """Takes what workers report of leases to the desk. A result under an epoch that is not live is stale and dropped."""
+def settle_result(state: DispatchState, event: LeaseFinished) -> None:
+    """Acknowledge a reported result, and use it if its lease is live. Any other result is stale and dropped."""
+    state.emit(AcknowledgeLease(event.worker_id, event.ref))
+    lease = state.leases.find(event.worker_id, event.ref)
+    if lease is None:
+        run_id = state.leases.run_of_ended(event.ref)
+        if run_id is not None and run_id in state.runs:
+            state.runs.of(run_id).counters.stale_results += 1
+        return
+    match event.outcome:
+        case Completed() as completed:
+            _complete(state, lease, completed)
+        case InfraFailure() as failure:
+            worker_id = failure.worker_id or event.worker_id
+            _fail(state, lease, dataclasses.replace(failure, worker_id=worker_id))
 
-    def __init__(self, desk: Assignments) -> None:
-        self._desk = desk
 
-    def settle(self, event: LeaseFinished) -> None:
-        """The worker may forget it; what it is worth, the lease's epoch tells."""
-        self._desk.commands.append(AcknowledgeLease(event.worker_id, event.ref))
-        lease = self._desk.leases.find(event.worker_id, event.ref)
-        if lease is None:
-            run_id = self._desk.leases.run_of_ended(event.ref)
-            if run_id is not None and run_id in self._desk.runs:
-                self._desk.runs.of(run_id).counters.stale_results += 1
-            return
-        match event.outcome:
-            case Completed() as completed:
-                self._complete(lease, completed)
-            case InfraFailure() as failure:
-                self._take_failure(
-                    lease, dataclasses.replace(failure, worker_id=failure.worker_id or event.worker_id)
-                )
+def give_back(state: DispatchState, lease: LeaseRecord, failure: InfraFailure, *, counted: bool) -> None:
+    """End a lease that brought no result. The rollout is queued again, or fails after its last attempt.
 
-    def _complete(self, lease: LeaseRecord, completed: Completed) -> None:
-        record = lease.record
-        self._desk.end(lease)
+    Only ``counted`` ends cost an attempt. A lease that ended with its group a moment ago is left alone.
+    """
+    record = lease.record
+    if lease not in record.leases:
+        return
+    state.log(RolloutStep.RETURNED, record.key, lease.worker_id, failure.message)
+    state.end_lease(lease)
+    if counted:
         record.attempts += 1
-        run = self._desk.runs.of(record.key.run_id)
-        self._desk.fleet.time(lease, run.times, self._desk.now_s, lost=False)
-        for other in record.leases:
-            self._desk.fleet.time(other, run.times, self._desk.now_s, lost=True)
-        self._desk.fleet.workers[lease.worker_id].note_completed(completed.timings.execute_s)
-        timings = lease.timings(completed.timings, self._desk.now_s)
-        warm = record.warm and completed.warm
-        noted = completed.noted(timings=timings, warm=warm, worker_id=lease.worker_id)
-        if not record.check:
-            run.counters.warm_starts += record.warm
-            run.counters.cold_starts += not record.warm
-            if self._desk.audits.hold(lease, noted):
-                return
-        self._desk.finish(record, noted)
+        record.out_of_memory |= failure.code is InfraCode.SLOT_OOM
+        if state.pool.live_count > 1:
+            record.failed_on = lease.worker_id
+            record.avoid_until_s = state.now_s + state.limits.elsewhere_s
+    if record.leases or record.held:
+        return
+    policy = state.runs.of(record.key.run_id).terms.group_policy
+    most = attempts_allowed(policy, state.limits.max_attempts)
+    if record.attempts >= most:
+        message = f"{failure.message} (attempt {record.attempts} of {most})"
+        finish(state, record, dataclasses.replace(failure, message=message))
+    else:
+        requeue(state, record)
 
-    def _take_failure(self, lease: LeaseRecord, failure: InfraFailure) -> None:
-        worker = self._desk.fleet.workers[lease.worker_id]
-        scene = lease.record.scene
-        if failure.code in (InfraCode.SCENE_LOAD_FAILED, InfraCode.BUNDLE_CORRUPT):
-            # Until the worker reports again it is not taken for warm: the rollout would come straight back.
-            self._desk.fleet.set_warm(worker, worker.warm - {scene})
-            self._desk.failures.record(scene, worker.worker_id, failure.message, self._desk.now_s)
-        self._desk.give_back(lease, failure, counted=True)
-        self._desk.judge(scene)
-        self._desk.offer(scene)
+
+def take_away(state: DispatchState, lease: LeaseRecord, failure: InfraFailure, *, started: bool) -> None:
+    """Revoke a lease whose worker failed it; another worker gets the rollout."""
+    if lease not in lease.record.leases:
+        return  # it ended with its group a moment ago
+    state.emit(CancelLease(lease.worker_id, lease.ref))
+    give_back(state, lease, failure, counted=started)
+    offer_scene(state, lease.record.scene)
+
+
+def judge_scene(state: DispatchState, scene: str) -> None:
+    """Fail the waiting rollouts of a scene that no worker can load."""
+    if state.pool.has_warm(scene) or not state.queues.count(scene):
+        return
+    verdict = state.load_failures.verdict(
+        scene, live=state.pool.live_count, timeout_s=state.limits.lone_load_failure_s, now_s=state.now_s
+    )
+    while verdict is not None and (record := state.queues.oldest(scene)) is not None:
+        finish(state, record, verdict)
+
+
+def _complete(state: DispatchState, lease: LeaseRecord, completed: Completed) -> None:
+    record = lease.record
+    state.end_lease(lease)
+    record.attempts += 1
+    run = state.runs.of(record.key.run_id)
+    state.pool.note_slot_time(lease, run.times, state.now_s, lost=False)
+    for other in record.leases:
+        state.pool.note_slot_time(other, run.times, state.now_s, lost=True)
+    state.pool.workers[lease.worker_id].note_completed(completed.timings.execute_s)
+    timings = lease.timings(completed.timings, state.now_s)
+    warm = record.warm and completed.warm
+    result = completed.noted(timings=timings, warm=warm, worker_id=lease.worker_id)
+    if not record.check:
+        run.counters.warm_starts += record.warm
+        run.counters.cold_starts += not record.warm
+        if hold_for_audit(state, lease, result):
+            return
+    finish(state, record, result)
+
+
+def _fail(state: DispatchState, lease: LeaseRecord, failure: InfraFailure) -> None:
+    worker, scene = state.pool.workers[lease.worker_id], lease.record.scene
+    if failure.code in (InfraCode.SCENE_LOAD_FAILED, InfraCode.BUNDLE_CORRUPT):
+        # Not warm until the worker reports again: the rollout would come straight back.
+        state.pool.set_warm(worker, worker.warm - {scene})
+        state.load_failures.record(scene, worker.worker_id, failure.message, state.now_s)
+    give_back(state, lease, failure, counted=True)
+    judge_scene(state, scene)
+    offer_scene(state, scene)

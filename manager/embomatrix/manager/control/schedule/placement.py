@@ -1,10 +1,10 @@
-"""Where scenes should be resident: a pure function of what is needed, when, and how much each worker can hold.
+"""Placement of scenes on workers: a pure function of the needs, their times, and the memory of each worker.
 
-Needs are placed in order of their next use, each where it costs least: on a worker that has it already, else on the one
-with the least work. What a worker's memory has no room for is then by construction what is needed last: eviction by
-furthest next use (Belady), which is possible here because the trainer says what comes.
+Needs are placed in order of their next use, each on a worker that has the scene, else on the least loaded one. A worker
+without room therefore evicts the scene with the furthest next use (Belady's rule), which the trainers' look-ahead makes
+possible. Runs share memory and slots by priority, then weight; what one run leaves unused is free for the others.
 
-A placement looks only at workers that get, have or lose something needed: its cost grows with the needs, not with the cluster.
+A placement examines only workers that get, have or lose a needed scene: its cost grows with the needs, not the cluster.
 """
 
 from __future__ import annotations
@@ -15,9 +15,7 @@ import itertools
 import math
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol
-
-from embomatrix.manager.control.shares import RunShare, in_turns, quotas
+from typing import TYPE_CHECKING, Final, Protocol, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
@@ -25,91 +23,140 @@ if TYPE_CHECKING:
     from embomatrix.rpc.wire.values import LookaheadEntry
 
 
+@dataclass(frozen=True, slots=True)
+class RunShare:
+    """A run's claim against other runs."""
+
+    run_id: str = ""
+    weight: float = 1.0
+    priority: int = 0
+
+
+class Claim(Protocol):
+    """A need of a run at its ``rank``-th step from now."""
+
+    @property
+    def rank(self) -> int: ...
+
+    @property
+    def share(self) -> RunShare: ...
+
+
+ClaimT = TypeVar("ClaimT", bound=Claim)
+
+
+def in_turns(claims: Iterable[ClaimT], cost: Callable[[ClaimT], float]) -> list[ClaimT]:
+    """Sort claims by rank, then priority, then the cost over weight that their run has by then.
+
+    Claims of one run keep their order, and claims of equal runs alternate, however many each run has.
+    """
+    spent: dict[str, float] = {}
+    keyed: list[tuple[int, int, float, int, ClaimT]] = []
+    for index, claim in enumerate(claims):
+        share = claim.share
+        spent[share.run_id] = spent.get(share.run_id, 0.0) + cost(claim) / share.weight
+        keyed.append((claim.rank, -share.priority, spent[share.run_id], index, claim))
+    return [claim for *_, claim in sorted(keyed, key=lambda entry: entry[:4])]
+
+
+def quotas(wanted: Mapping[RunShare, int], slots: int) -> dict[RunShare, float]:
+    """Return each run's quota of slots: shared by weight, higher priority first, no run beyond what it wants."""
+    left = float(slots)
+    given: dict[RunShare, float] = {}
+    for priority in sorted({share.priority for share in wanted}, reverse=True):
+        weights = sum(share.weight for share in wanted if share.priority == priority)
+        equals = [share for share in wanted if share.priority == priority]
+        # Runs that want least for their weight are served in full; the others share the rest.
+        for share in sorted(equals, key=lambda share: (wanted[share] / share.weight, share.run_id)):
+            given[share] = min(float(wanted[share]), left * share.weight / weights)
+            left -= given[share]
+            weights -= share.weight
+    return given
+
+
 EVERYONE: Final = RunShare()
 
 
 @dataclass(frozen=True, slots=True)
 class Need:
-    """A scene, how soon it is needed (0: rollouts wait for it; 1: in the next announced step …) and for how many.
-
-    ``at_least`` workers should have it: more than its share when rollouts wait while slots elsewhere are idle. Where they are
-    known, ``load_s`` is what loading it takes and ``work_s`` what its rollouts take on one slot of speed 1. ``turn`` is
-    the place of its first rollout in the queue: what a lost worker left behind comes before what was sent after it.
-    """
+    """A scene that ``count`` rollouts need."""
 
     bundle_digest: str
     rank: int
+    """0: rollouts wait for it now; n: the n-th announced step needs it."""
     count: int
     at_least: int = 1
+    """Smallest number of copies, whatever its share of the slots."""
     load_s: float = 0.0
+    """Load time; 0 if unknown."""
     work_s: float = 0.0
+    """Execution time of its rollouts on one slot of speed 1; 0 if unknown."""
     turn: int = 0
+    """Queue position of its first rollout: re-dispatched rollouts come before later ones."""
     share: RunShare = EVERYONE
-    """Of the run that needs it."""
     render: bool = False
     """Some of its rollouts need slots that render."""
 
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """A worker that can be given scenes. ``residents`` (loading or warm) run from the most to the least recently used.
-
-    ``pinned`` have running rollouts and stay; ``refused`` failed to load there a moment ago.
-    """
+    """A usable worker."""
 
     worker_id: str
     slots: int
     score: float
     memory_mb: float
     residents: tuple[str, ...] = ()
+    """Loading or warm scenes, from the most to the least recently used."""
     pinned: frozenset[str] = frozenset()
+    """Scenes with live leases, which stay."""
     refused: frozenset[str] = frozenset()
+    """Scenes that the worker cannot hold."""
 
     @property
     def capacity(self) -> float:
-        """How many slots of speed 1 it is worth."""
+        """Its slots, in slots of speed 1."""
         return self.slots * max(self.score, 1e-3)
 
 
 class Sites(Protocol):
-    """All workers that can be given scenes, looked at one by one."""
+    """All usable workers, examined one by one."""
 
     @property
     def ids(self) -> Iterable[str]:
-        """Those with the most capacity first."""
+        """Ids, largest capacity first."""
         ...
 
     @property
     def slots(self) -> int:
-        """Of all together."""
+        """Number of slots of all workers."""
         ...
 
     def site(self, worker_id: str) -> Site:
-        """One of them as it is now."""
+        """Return one worker in its present state."""
         ...
 
     def having(self, scene: str) -> Iterable[str]:
-        """Ids of those among whose ``residents`` the scene is."""
+        """Return the ids of workers with the scene among their ``residents``."""
         ...
 
     def changed(self) -> Iterable[str]:
-        """Ids of those to look at though nothing needed is there."""
+        """Return the ids of workers to examine even if they have no needed scene."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class ResidencyPlan:
-    """``desired``: what each worker that was looked at should hold, most urgent first; the others keep what they have.
-
-    ``homeless`` are needs for which no worker has room.
-    """
+    """Result of a placement."""
 
     desired: Mapping[str, tuple[str, ...]]
+    """Scenes of each examined worker, most urgent first; the other workers keep theirs."""
     homeless: tuple[str, ...]
+    """Needed scenes that no worker has room for."""
 
 
 def needs_of(pending: Mapping[str, int], windows: Iterable[Sequence[LookaheadEntry]]) -> list[Need]:
-    """Each scene once, at its next use: what rollouts wait for now, then the announced steps of every run in turn."""
+    """Return each scene once, at its next use: pending rollouts first, then the announced steps of all runs."""
     needs = {scene: Need(scene, 0, count) for scene, count in pending.items() if count > 0}
     for entries in windows:
         ranks = {step: 1 + index for index, step in enumerate(sorted({entry.step for entry in entries}))}
@@ -127,7 +174,7 @@ def needs_of(pending: Mapping[str, int], windows: Iterable[Sequence[LookaheadEnt
 
 
 class _Shelf:
-    """One worker's desired set while it is being filled."""
+    """Desired set of one worker while it is filled."""
 
     def __init__(self, site: Site, size_mb: Callable[[str], float]) -> None:
         self.site = site
@@ -139,7 +186,7 @@ class _Shelf:
             self.take(scene)
 
     def has_room_for(self, scene: str) -> bool:
-        """The first scene always fits: an estimate shall not keep a small worker from trying."""
+        """True if the scene fits. The first always fits, so that an estimate keeps no small worker from trying."""
         return not self.chosen or self._size_mb(scene) <= self.free_mb
 
     def accepts(self, scene: str) -> bool:
@@ -150,18 +197,18 @@ class _Shelf:
         self.free_mb -= self._size_mb(scene)
 
     def keep_the_rest(self) -> None:
-        """What nobody needs stays where there is room, the last used first."""
+        """Keep unneeded residents while there is room, the last used first."""
         for scene in self.site.residents:
             if scene not in self.chosen and self.has_room_for(scene):
                 self.take(scene)
 
     def order(self, unit: float) -> tuple[float, str]:
-        """By the work for each slot of speed 1 that there would be with ``unit`` more: a small worker is full sooner."""
+        """Return the sort key: work per slot of speed 1 after ``unit`` more, so small workers fill up sooner."""
         return (self.work + unit) / self.site.capacity, self.site.worker_id
 
 
 class _Shelves:
-    """Shelves of the workers that were looked at; the rest have no work, and wait in the order of their capacity."""
+    """Shelves of the examined workers. The others have no work and follow in order of capacity."""
 
     def __init__(self, sites: Sites, needs: Sequence[Need], size_mb: Callable[[str], float]) -> None:
         self._sites = sites
@@ -189,11 +236,11 @@ class _Shelves:
         return sorted(shelves, key=lambda shelf: shelf.order(self._unit))
 
     def accepting(self, scene: str) -> Generator[_Shelf]:
-        """Shelves without the scene that accept it, the least loaded first. To be closed when there are enough."""
+        """Yield shelves without the scene that accept it, least loaded first. Close the generator after the last."""
         passed: list[tuple[float, str]] = []
         try:
             while (shelf := self._next()) is not None:
-                # Who has no room for the smallest has none for any: it need not be looked at again.
+                # A shelf without room for the smallest scene is never examined again.
                 if not shelf.chosen or shelf.free_mb >= self._smallest_mb:
                     passed.append(shelf.order(self._unit))
                 if scene not in shelf.chosen and shelf.accepts(scene):
@@ -210,30 +257,30 @@ class _Shelves:
         return {worker_id: tuple(self._opened[worker_id].chosen) for worker_id in sorted(self._opened)}
 
     def _next(self) -> _Shelf | None:
-        """Take the least loaded out of the queue."""
+        """Pop the least loaded shelf."""
         while self._queue:
             order = heapq.heappop(self._queue)
             if order[1] == self._border:
                 self._move_border()
             shelf = self._opened[order[1]]
-            # An entry from before the shelf got more work has a later one behind it.
+            # Entries from before the shelf got more work are stale.
             if order == shelf.order(self._unit):
                 return shelf
         return None
 
     def _move_border(self) -> None:
-        """Open the next of those without work: none of the others comes before it in the queue."""
+        """Open the next worker without work; every other one sorts after it."""
         self._border = next((name for name in self._unopened if name not in self._opened), "")
         if self._border:
             self.of(self._border)
 
 
 def place(sites: Sites, needs: Sequence[Need], size_mb: Callable[[str], float]) -> ResidencyPlan:
-    """What workers should hold. ``size_mb`` estimates the memory of a scene. Deterministic."""
+    """Compute the desired sets. ``size_mb`` estimates the memory of a scene. Deterministic."""
     shelves = _Shelves(sites, needs, size_mb)
     wanted = _SlotsWanted(needs, sites.slots)
     having = {need.bundle_digest: sorted(sites.having(need.bundle_digest)) for need in needs}
-    # Among what is needed now, what is resident goes first: evicting it to load another would only cost a load.
+    # Of equal rank, resident scenes go first: evicting one to load another only costs a load.
     ordered = sorted(
         needs, key=lambda n: (n.rank, not having[n.bundle_digest], n.turn, -n.count, n.bundle_digest)
     )
@@ -241,7 +288,7 @@ def place(sites: Sites, needs: Sequence[Need], size_mb: Callable[[str], float]) 
     homeless: list[str] = []
     for _, group in itertools.groupby(ordered, key=lambda need: need.rank):
         spreads = [_Spread(need, wanted.of(need), shelves, having[need.bundle_digest]) for need in group]
-        # One copy of each before a second of any: a second shall not push out another's only one.
+        # A first copy of each before a second of any: no second copy displaces another scene's only one.
         for spread in spreads:
             spread.place_one()
         for spread in spreads:
@@ -251,13 +298,13 @@ def place(sites: Sites, needs: Sequence[Need], size_mb: Callable[[str], float]) 
 
 
 class _SlotsWanted:
-    """What each need may have of all slots: its part of what its run may have, no more than its rollouts can keep busy."""
+    """Slots wanted for each need: its part of its run's quota, at most one per rollout."""
 
     def __init__(self, needs: Sequence[Need], slots: int) -> None:
         self._totals: dict[int, Counter[RunShare]] = {}
         for need in needs:
             self._totals.setdefault(need.rank, Counter())[need.share] += need.count
-        # Groups of a step come one by one: those that are here share the slots with those that come next.
+        # Groups of a step arrive one by one: those present share the slots with the next ones.
         if 0 in self._totals:
             self._totals[0] += self._totals.get(1, Counter())
         self._quotas = {rank: quotas(totals, slots) for rank, totals in self._totals.items()}
@@ -269,7 +316,7 @@ class _SlotsWanted:
 
 
 class _Spread:
-    """One need on its way to as many workers as it should be on: where it is first, then where there is least to do."""
+    """Placement of one need: first on workers that have the scene, then on the least loaded ones."""
 
     def __init__(self, need: Need, slots: int, shelves: _Shelves, having: Sequence[str]) -> None:
         self.need = need
@@ -279,9 +326,9 @@ class _Spread:
         self._here = [shelves.of(worker_id) for worker_id in having]
 
     def place_one(self) -> None:
-        """Put it on one worker, with all its work."""
+        """Place one copy, with all the work."""
         scene = self.need.bundle_digest
-        # Where rollouts run it stays: that needs no room.
+        # Pinned copies stay and need no room.
         here = sorted(self._shelves.in_order(self._here), key=lambda shelf: scene not in shelf.chosen)
         for shelf in here:
             if scene in shelf.chosen or shelf.accepts(scene):
@@ -293,7 +340,7 @@ class _Spread:
             self._shelves.add_work(self.placed[0], self.need.count)
 
     def place_more(self) -> None:
-        """Put it on more workers while that is worth it, and share the work among them all."""
+        """Place more copies while they pay off, and share the work among all."""
         if not self.placed or not self._wants_more():
             return
         scene = self.need.bundle_digest
@@ -322,7 +369,7 @@ class _Spread:
         self.placed.append(shelf)
 
     def _wants_more(self) -> bool:
-        """Whether it should be on one more: that has slots for it, and is done loading before the others are with the work."""
+        """True if one more copy has slots to use and would load before the others finish the work."""
         if len(self.placed) < self.need.at_least:
             return True
         if sum(shelf.site.slots for shelf in self.placed) >= self._slots:

@@ -1,8 +1,7 @@
 """Resource-Scheduler: decides which scenes each worker holds in memory, ahead of the rollouts that need them.
 
-A pure state machine like the Task-Dispatcher. Trainers announce what the coming steps need, the dispatcher tells what is
-needed now, workers report what they hold and how much memory it takes; the answer is one desired set per worker,
-given again only when it changes.
+A pure state machine like the Task-Dispatcher. Its inputs are the look-ahead of trainers, the demand of the dispatcher and
+the reports of workers. Its output is one desired set per worker, sent again only when it changes.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.control.commands import Command, SetDesired
 from embomatrix.manager.control.events import (
@@ -26,75 +25,73 @@ from embomatrix.manager.control.events import (
     WorkerDrained,
     WorkerJoined,
     WorkerLost,
-    WorkerQuarantined,
     WorkerRecovered,
     WorkerReported,
     WorkerResumed,
     WorkerSuspected,
 )
-from embomatrix.manager.control.schedule.holders import Holders, Places
-from embomatrix.manager.control.schedule.lookahead_window import LookaheadWindow, announcers
-from embomatrix.manager.control.schedule.outlook import Outlook, why_not
-from embomatrix.manager.control.schedule.placement import Need, needs_of, place
-from embomatrix.manager.control.schedule.prewarm import PrewarmLedger
-from embomatrix.manager.control.schedule.scene_costs import SceneCosts
-from embomatrix.manager.control.shares import RunShare
+from embomatrix.manager.control.schedule.lookahead import LookaheadWindow, PrewarmLedger, announcers
+from embomatrix.manager.control.schedule.placement import Need, RunShare, needs_of, place
+from embomatrix.manager.control.schedule.readiness import ReadinessForecast, SceneCosts, refusal_reason
+from embomatrix.manager.control.schedule.residency import Residencies, ResidencySites
 from embomatrix.rpc.wire.values import Batch, Completed, Resident, RunTerms
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.manager.control.workers import WorkerRecord
 
 DEFAULT_TERMS: Final = RunTerms()
 OVERDUE: Final = 3.0
-"""A load that takes so many times longer than usual is not waited for."""
+"""Multiple of the usual load time after which a load is no longer waited for."""
 LEASES_AT_A_TIME: Final = 64
-"""So many leases are told of at the price of looking at one worker."""
+"""Live leases whose cost in a placement equals that of one worker."""
 
 
 class Urgency(IntEnum):
-    """What a fact means for where scenes should be."""
+    """Urgency of a new placement."""
 
     NONE = 0
     LATER = 1
-    """Something may be better elsewhere."""
+    """A scene may be better on another worker."""
     NOW = 2
-    """Something is needed that nobody was told to load."""
+    """A scene is needed that no worker was told to load."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScheduleLimits:
-    """Guesses and bounds of the scheduler; seconds and megabytes."""
+    """Estimates and bounds of the scheduler; seconds and megabytes."""
 
     scene_mb: float = 64.0
-    """Memory of a scene that no worker has loaded yet."""
+    """Assumed memory of a scene that no worker has loaded yet."""
     affinity_wait_s: float = 0.5
-    """Rollouts wait as long as loading their scene takes before idle workers load it too; this long while that isn't known."""
+    """Idle workers load a scene too when its rollouts have waited for its load time, or this long while that is unknown."""
     retry_load_s: float = 10.0
-    """A worker that failed to load a scene is not asked again for this long."""
+    """Pause before a worker that failed to load a scene tries it again."""
 
 
 class Scheduler:
-    """Residents by memory. ``windows``, ``prewarm`` and ``unplaceable`` are for reading."""
+    """``workers`` is the dispatcher's view of them: their standing must be up to date before ``note`` is called."""
 
-    def __init__(self, limits: ScheduleLimits) -> None:
+    def __init__(self, limits: ScheduleLimits, workers: Mapping[str, WorkerRecord]) -> None:
         self.windows: dict[str, LookaheadWindow] = {}
         self.prewarm = PrewarmLedger()
         self.unplaceable: dict[str, str] = {}
-        """Scenes that no worker can hold, with the reason."""
+        """Reason for each scene that no worker can hold."""
         self._limits = limits
-        self._holders = Holders()
+        self._workers = workers
+        self._residencies = Residencies()
         self._terms: dict[str, RunTerms] = {}
         self._demand = DemandObserved({})
         self._peaks: dict[str, int] = {}
         self._copies: dict[str, int] = {}
         self._costs = SceneCosts(limits.scene_mb)
         self._now_s = 0.0
-        self.effort = 0
-        """Needs and workers that the last placement looked at, and what it took to know what is in use."""
-
-    def handle(self, event: Event, *, now_s: float) -> list[Command]:
-        """Take in one fact; returns the desired sets that changed."""
-        return self.place(now_s=now_s) if self.note(event, now_s=now_s) else []
+        self.cost = 0
+        """CPU accounting of the last placement: needs and workers that it examined."""
 
     def note(self, event: Event, *, now_s: float) -> Urgency:
-        """Take in one fact without deciding on it yet; returns how soon it wants a decision."""
+        """Apply an event without a new placement; return the urgency of one."""
         self._now_s = now_s
         match event:
             case DemandObserved():
@@ -104,7 +101,7 @@ class Scheduler:
             case BatchSubmitted():
                 return self._on_submitted(event)
             case BatchRestored(batch):
-                self._come(batch)
+                self._consume(batch)
                 return Urgency.LATER
             case RunOpened(run_id, terms):
                 self._terms[run_id] = terms
@@ -114,26 +111,20 @@ class Scheduler:
             case WorkerReported():
                 return self._on_reported(event)
             case LeaseFinished(outcome=Completed(timings=timings)):
-                self._costs.executed(timings.execute_s * self._holders.speed_of(event.worker_id))
+                self._costs.executed(timings.execute_s * self._residencies.speed_of(event.worker_id))
                 return Urgency.NONE
             case WorkerJoined() | WorkerLost():
                 return self._on_presence(event)
-            case (
-                WorkerDrained()
-                | WorkerResumed()
-                | WorkerSuspected()
-                | WorkerRecovered()
-                | WorkerQuarantined()
-            ):
-                return self._on_standing(event)
+            case WorkerDrained() | WorkerResumed() | WorkerSuspected() | WorkerRecovered():
+                return self.standing_changed(event.worker_id)
             case Tick():
-                return Urgency.LATER if self._demand.pending or self._holders.failing else Urgency.NONE
+                return Urgency.LATER if self._demand.pending or self._residencies.failing else Urgency.NONE
             case _:
                 return Urgency.NONE
         return Urgency.LATER
 
     def place(self, *, now_s: float) -> list[Command]:
-        """Decide where every scene should be; returns the desired sets that changed."""
+        """Place every needed scene; return the desired sets that changed."""
         self._now_s = now_s
         needs = needs_of(self._peaks, [window.entries for window in self.windows.values()])
         owners = {**announcers(self.windows), **self._demand.runs}
@@ -144,38 +135,62 @@ class Scheduler:
             )
             for need in needs
         ]
-        places = Places(self._holders, now_s, self._demand.in_use, self._limits.retry_load_s)
-        places.refuse_where_too_large(needs, self._costs.known_mb)
-        places.refuse_where_nothing_renders(needs)
-        placement = place(places, needs, self._costs.size_mb)
-        self._holders.fresh.clear()
+        sites = ResidencySites(
+            self._residencies,
+            now_s,
+            self._demand.in_use,
+            self._limits.retry_load_s,
+            needs=needs,
+            measured_mb=self._costs.measured_mb,
+        )
+        placement = place(sites, needs, self._costs.size_mb)
+        self._residencies.fresh.clear()
         self.unplaceable = {
-            scene: self._why_not(scene) for scene in placement.homeless if places.nobody_takes(scene)
+            scene: self._refusal_reason(scene) for scene in placement.homeless if sites.all_refuse(scene)
         }
-        self.effort = len(needs) + len(placement.desired) + len(self._demand.in_use) // LEASES_AT_A_TIME
+        self.cost = len(needs) + len(placement.desired) + len(self._demand.in_use) // LEASES_AT_A_TIME
         orders = (self._order(name, scenes) for name, scenes in placement.desired.items())
         return [order for order in orders if order is not None]
 
+    def standing_changed(self, worker_id: str) -> Urgency:
+        """Take over a changed standing of the worker."""
+        residency = self._residencies.by_id.get(worker_id)
+        if residency is None:
+            return Urgency.NONE
+        self._residencies.changed(residency)
+        return Urgency.NOW
+
     @property
-    def outlook(self) -> Outlook:
-        """How far scenes are, at this moment."""
-        return Outlook(self._holders, self.unplaceable, self._costs.usual_load_s, self._now_s)
+    def readiness(self) -> ReadinessForecast:
+        return ReadinessForecast(self._residencies, self.unplaceable, self._costs, self._now_s)
 
     def residents(self, worker_id: str) -> tuple[Resident, ...]:
-        holder = self._holders.by_id.get(worker_id)
-        return tuple(holder.residents.values()) if holder else ()
+        residency = self._residencies.by_id.get(worker_id)
+        return tuple(residency.residents.values()) if residency else ()
 
     def desired(self, worker_id: str) -> tuple[str, ...]:
-        """The last desired set that was given for the worker."""
-        holder = self._holders.by_id.get(worker_id)
-        return (holder.desired or ()) if holder else ()
+        """Return the last desired set of the worker."""
+        residency = self._residencies.by_id.get(worker_id)
+        return (residency.desired or ()) if residency else ()
+
+    def check_invariants(self) -> None:
+        """Raise AssertionError if the workers or an index disagree with the dispatcher's workers."""
+        residencies = self._residencies
+        assert residencies.by_id.keys() == self._workers.keys()
+        for name, residency in residencies.by_id.items():
+            assert residency.worker is self._workers[name], name
+            assert residency.listed == residency.worker.usable, name
+        assert [(-r.capacity, name) for name, r in sorted(residencies.by_id.items()) if r.listed] == sorted(
+            residencies.order, key=lambda entry: entry[1]
+        )
+        assert residencies.order == sorted(residencies.order)
 
     def _on_demand(self, event: DemandObserved) -> None:
         self._demand = event
-        self._holders.limit_scores(event.lags)
+        self._residencies.limit_scores(event.lags)
         self.prewarm.used(event.used)
-        self._holders.touch(event.used)
-        # By its peak and not by what is left: a scene's copies shall not come and go while a batch runs down.
+        self._residencies.touch(event.used)
+        # Peaks, not what is left: the number of copies must not change while a batch runs down.
         self._peaks = {scene: max(count, self._peaks.get(scene, 0)) for scene, count in event.pending.items()}
         self._copies = {scene: self._copies[scene] for scene in event.pending if scene in self._copies}
 
@@ -189,89 +204,72 @@ class Scheduler:
         batch, urgency = event.batch, Urgency.LATER
         for scene in dict.fromkeys(rollout.bundle_digest for rollout in batch.rollouts):
             self.prewarm.demanded(batch.run_id, self._warm_since(scene), self._now_s)
-            if not self._holders.having(scene):
+            if not self._residencies.having(scene):
                 urgency = Urgency.NOW
-        self._come(batch)
+        self._consume(batch)
         return urgency
 
-    def _come(self, batch: Batch) -> None:
+    def _consume(self, batch: Batch) -> None:
         window = self.windows.get(batch.run_id)
         if window is not None:
-            window.come(batch)
+            window.consume(batch)
 
     def _on_presence(self, event: WorkerJoined | WorkerLost) -> Urgency:
         self.prewarm.lost(event.worker_id)
         match event:
-            case WorkerJoined(worker_id, resources):
-                self._holders.join(worker_id, resources)
+            case WorkerJoined(worker_id):
+                if worker_id in self._workers:
+                    self._residencies.join(self._workers[worker_id])
                 return Urgency.NONE
             case WorkerLost(worker_id):
-                self._holders.leave(worker_id)
+                self._residencies.leave(worker_id)
                 return Urgency.NOW
 
-    def _on_standing(
-        self,
-        event: WorkerDrained | WorkerResumed | WorkerSuspected | WorkerRecovered | WorkerQuarantined,
-    ) -> Urgency:
-        holder = self._holders.by_id.get(event.worker_id)
-        if holder is None:
-            return Urgency.NONE
-        match event:
-            case WorkerDrained() | WorkerResumed():
-                holder.drained = isinstance(event, WorkerDrained)
-                holder.quarantined = holder.quarantined and isinstance(event, WorkerDrained)
-            case WorkerQuarantined():
-                holder.quarantined = True
-            case WorkerSuspected() | WorkerRecovered():
-                holder.suspect = isinstance(event, WorkerSuspected)
-        self._holders.changed(holder)
-        return Urgency.NOW
-
     def _on_reported(self, event: WorkerReported) -> Urgency:
-        holder = self._holders.by_id.get(event.worker_id)
-        if holder is None:
+        residency = self._residencies.by_id.get(event.worker_id)
+        if residency is None:
             return Urgency.NONE
-        was_usable, holder.reported = holder.usable, True
-        holder.leaving, holder.paused = event.draining, bool(event.paused)
-        urgency = Urgency.LATER if holder.usable == was_usable else Urgency.NOW
+        urgency = Urgency.LATER if residency.worker.usable == residency.listed else Urgency.NOW
         if event.resync:
-            # Whatever was told before may be lost: the desired set is given again.
-            holder.desired, urgency = None, Urgency.NOW
+            # Earlier orders may be lost: the desired set is sent again.
+            residency.desired, urgency = None, Urgency.NOW
         reported = {resident.bundle_digest: resident for resident in event.residents}
-        for scene in holder.residents.keys() - reported.keys():
-            holder.warm_since_s.pop(scene, None)
-            holder.loading_since_s.pop(scene, None)
+        for scene in residency.residents.keys() - reported.keys():
+            residency.warm_since_s.pop(scene, None)
+            residency.loading_since_s.pop(scene, None)
             self.prewarm.evicted(event.worker_id, scene)
-        known = [scene for scene in holder.residents if scene in reported]
-        holder.residents = {scene: reported[scene] for scene in dict.fromkeys([*known, *reported])}
+        known = [scene for scene in residency.residents if scene in reported]
+        residency.residents = {scene: reported[scene] for scene in dict.fromkeys([*known, *reported])}
         for resident in event.residents:
-            holder.note(resident, self._now_s)
+            residency.note(resident, self._now_s)
             self._costs.learn(resident)
-        self._holders.changed(holder)
+        self._residencies.changed(residency)
         return urgency
 
     def _warm_since(self, scene: str) -> float | None:
-        names = self._holders.warm_on(scene)
-        return min((self._holders.by_id[name].warm_since_s[scene] for name in names), default=None)
+        names = self._residencies.warm_on(scene)
+        return min((self._residencies.by_id[name].warm_since_s[scene] for name in names), default=None)
 
     def _share(self, run_id: str) -> RunShare:
         terms = self._terms.get(run_id, DEFAULT_TERMS)
         return RunShare(run_id, terms.weight, terms.priority)
 
     def _spread(self, need: Need, turn: int, share: RunShare) -> Need:
-        """One worker more for a scene whose rollouts wait while others are idle, unless one is loading it already."""
+        """Complete a need; ask for one more copy if rollouts wait while workers idle and none is loading the scene."""
         scene = need.bundle_digest
         waited_s = self._demand.waited_s.get(scene, 0.0)
-        told = [holder for holder in self._holders.having(scene) if scene in (holder.desired or ())]
-        # What a slow worker needed to load it says nothing of the others.
+        ordered = [r for r in self._residencies.having(scene) if scene in (r.desired or ())]
+        # The load time on slow workers says nothing about the others.
         load_s = (
-            self._costs.typical_load_s if all(h.is_slow for h in told) else self._costs.load_s.get(scene, 0.0)
+            self._costs.typical_load_s
+            if all(r.is_slow for r in ordered)
+            else self._costs.load_s.get(scene, 0.0)
         )
         if waited_s >= (load_s or self._limits.affinity_wait_s):
             overdue_s = max(OVERDUE * self._costs.usual_load_s(scene), self._limits.affinity_wait_s)
-            loading = any(holder.will_have(scene, self._now_s, overdue_s) for holder in told)
-            if not loading and not self._demand.idle <= {holder.worker_id for holder in told}:
-                self._copies[scene] = len(told) + 1
+            loading = any(r.loads_in_time(scene, self._now_s, overdue_s) for r in ordered)
+            if not loading and not self._demand.idle <= {r.worker_id for r in ordered}:
+                self._copies[scene] = len(ordered) + 1
         return dataclasses.replace(
             need,
             at_least=self._copies.get(scene, 1),
@@ -282,29 +280,30 @@ class Scheduler:
             render=need.render or scene in self._demand.rendering,
         )
 
-    def _why_not(self, scene: str) -> str:
+    def _refusal_reason(self, scene: str) -> str:
         announced = {e.bundle_digest for w in self.windows.values() for e in w.entries if e.render}
         renders = scene in announced or scene in self._demand.rendering
-        return why_not(self._holders, scene, self._costs.size_mb(scene), renders=renders)
+        size_mb = self._costs.size_mb(scene)
+        return refusal_reason(self._residencies, scene, size_mb, renders=renders)
 
     def _order(self, name: str, scenes: tuple[str, ...]) -> SetDesired | None:
-        """Tell the worker, if the set or the order of what it still has to load is another than it was told."""
-        holder = self._holders.by_id[name]
-        before = holder.desired
+        """Return the order for a worker; None if neither the set nor the order of its loads changes."""
+        residency = self._residencies.by_id[name]
+        before = residency.desired
         if (
             before is not None
             and set(before) == set(scenes)
-            and holder.to_load(before) == holder.to_load(scenes)
+            and residency.to_load(before) == residency.to_load(scenes)
         ):
             return None
-        for scene in holder.to_load(before or ()):
-            if scene not in scenes and scene not in holder.residents:
+        for scene in residency.to_load(before or ()):
+            if scene not in scenes and scene not in residency.residents:
                 self.prewarm.withdrawn(name, scene)
-        for scene in holder.to_load(scenes):
+        for scene in residency.to_load(scenes):
             run_id = next((run for run, window in self.windows.items() if window.announces(scene)), None)
             if run_id is not None and not self._demand.pending.get(scene):
                 self.prewarm.ordered(name, scene, run_id)
-        holder.desired = scenes
-        self._holders.changed(holder)
-        self._holders.fresh.discard(name)
+        residency.desired = scenes
+        self._residencies.changed(residency)
+        self._residencies.fresh.discard(name)
         return SetDesired(name, scenes)

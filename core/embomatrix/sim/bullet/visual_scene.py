@@ -1,0 +1,296 @@
+"""Visual bodies of a scene in a client of their own, for pictures: the simulation carries no visuals.
+
+Every solid is a body without a collision shape. Shapes are shared; objects can be moved, opened and hidden between pictures.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import zlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from embomatrix.sim.bullet.client import pybullet
+from embomatrix.sim.bullet.robot import spread
+from embomatrix.sim.bullet.robot_model import ARM_JOINTS, BASE_JOINTS, FINGER_JOINTS, LIFT_JOINTS, robot_urdf
+from embomatrix.sim.engine import EngineError
+from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion
+from embomatrix.skills.limits import ROBOT
+from embomatrix.world.geometry import Pose, Shape
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from types import TracebackType
+
+    from numpy.typing import NDArray
+
+    from embomatrix.sim.bullet.robot import Posture
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.geometry import ConvexPart, Vec3
+    from embomatrix.world.scene import Scene, SceneObject
+
+    FloatArray = NDArray[np.float64]
+    Rgba = tuple[float, float, float, float]
+
+OUT_OF_SIGHT: Final = Pose((0.0, 0.0, -100.0))
+
+_WALL: Final[Rgba] = (0.86, 0.86, 0.84, 1.0)
+_FLOORS: Final[tuple[Rgba, ...]] = (
+    (0.80, 0.70, 0.56, 1.0),
+    (0.70, 0.76, 0.80, 1.0),
+    (0.78, 0.74, 0.66, 1.0),
+    (0.72, 0.78, 0.70, 1.0),
+    (0.80, 0.72, 0.72, 1.0),
+)
+_OPENS: Final[Rgba] = (0.80, 0.58, 0.34, 1.0)
+_WORKS: Final[Rgba] = (0.45, 0.60, 0.74, 1.0)
+_RESTS: Final[Rgba] = (0.60, 0.47, 0.38, 1.0)
+_SOFT: Final[Rgba] = (0.45, 0.50, 0.62, 1.0)
+_DOOR: Final[Rgba] = (0.55, 0.30, 0.18, 1.0)
+_GLASS: Final[Rgba] = (0.66, 0.84, 0.93, 1.0)
+_LEAVES: Final[Rgba] = (0.42, 0.58, 0.36, 1.0)
+_PLANTS: Final = frozenset(
+    {"tree", "low_resolution_tree", "bush", "pot_plant", "hanging_plant", "greenery", "vine"}
+)
+_CLOTH: Final = frozenset({"bed", "sofa", "armchair", "ottoman", "carpet", "booth", "bench", "pillow"})
+_LEAF_M: Final = 0.1
+_PANE_M: Final = 0.03
+"""Walls thinner than the first are leaves of doors, thinner than the second panes of windows."""
+
+
+_CHASSIS: Final = (0.78, 0.16, 0.14, 1.0)
+_OWN_LINKS: Final = frozenset({"base", "stage", "carriage"})
+
+
+class VisualScene:
+    """Visual bodies of one scene in one client. Use as a context manager: leaving it frees the client."""
+
+    def __init__(self, scene: Scene) -> None:
+        """Connect an empty client. Raises EngineError where pybullet is missing."""
+        self.scene = scene
+        self._bullet = pybullet()
+        self._client = int(self._bullet.connect(self._bullet.DIRECT))
+        if self._client < 0:
+            raise EngineError("Bullet opened no physics client: close engines that are not in use")
+        self._shapes: dict[tuple[object, ...], int] = {}
+        self._solids: dict[str, list[tuple[int, ConvexPart]]] = {}
+
+    def __enter__(self) -> VisualScene:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bullet.disconnect(physicsClientId=self._client)
+
+    def add_floors(self) -> None:
+        """A slab for each room, in colours that tell neighbours apart."""
+        for number, room in enumerate(self.scene.rooms):
+            size = (room.size_m[0] + 0.12, room.size_m[1] + 0.12, 0.04)
+            self.add_solid(Shape.BOX, size, Pose((*room.center_m, -0.02)), _FLOORS[number % len(_FLOORS)])
+
+    def add_walls(self, seen_as: Callable[[ConvexPart], ConvexPart | None]) -> None:
+        """The walls, each as ``seen_as`` wants to see it; None leaves it out."""
+        for wall in self.scene.walls:
+            seen = seen_as(wall)
+            if seen is not None:
+                self._add_part(seen, IDENTITY, _material(wall))
+
+    def add_objects(self, visible: Callable[[SceneObject], bool] = lambda item: True) -> None:
+        """The objects at their places at the start; absent ones are out of sight."""
+        for item in self.scene.objects:
+            if not visible(item):
+                continue
+            asset = self.scene.assets[item.asset_id]
+            color = color_of(asset)
+            # Leaves and drawers stand out from the body that they close.
+            self._solids[item.name] = [
+                (self._add_part(part, OUT_OF_SIGHT, color if number == 0 else _lighter(color)), part)
+                for number, link in enumerate(asset.links)
+                for part in link.parts
+            ]
+            if not item.absent:
+                self.put(item.name, item.pose_world_asset, item.joints)
+
+    def put(self, name: str, pose: Pose, fractions: Sequence[float] = ()) -> None:
+        """Show an object at a pose in the world, its joints at shares of their travel; one without solids stays unseen."""
+        solids = iter(self._solids.get(name, ()))
+        asset = self.scene.asset_of(name)
+        shares = iter(fractions or (0.0,) * len(asset.joints))
+        for link in asset.links:
+            frame = pose if link.joint is None else pose @ joint_motion(link.joint, next(shares))
+            for _, (body, part) in zip(link.parts, solids, strict=False):
+                self._place(body, frame @ part.pose)
+
+    def hide(self, name: str) -> None:
+        """Take an object out of sight."""
+        for body, _ in self._solids.get(name, ()):
+            self._place(body, OUT_OF_SIGHT)
+
+    def add_robot(self) -> RobotFigure:
+        """The robot, out of sight at first."""
+        return RobotFigure(self._client)
+
+    def add_solid(
+        self, shape: Shape, size_m: Vec3, pose: Pose, color: Rgba, vertices_m: tuple[Vec3, ...] = ()
+    ) -> int:
+        """One visual body; its id."""
+        key = (shape, size_m, vertices_m, color)
+        if key not in self._shapes:
+            self._shapes[key] = self._visual(shape, size_m, color, vertices_m)
+        body = self._bullet.createMultiBody(
+            0.0,
+            -1,
+            self._shapes[key],
+            basePosition=pose.position_m,
+            baseOrientation=pose.quat_xyzw,
+            physicsClientId=self._client,
+        )
+        return int(body)
+
+    def shoot(
+        self, view: Sequence[float], lens: Sequence[float], width_px: int, height_px: int
+    ) -> NDArray[np.uint8]:
+        """A picture through a view and a projection matrix: RGB values, shape (height, width, 3)."""
+        image = self._bullet.getCameraImage(
+            width_px,
+            height_px,
+            view,
+            lens,
+            shadow=0,
+            lightDirection=(0.5, -0.8, 2.0),
+            renderer=self._bullet.ER_TINY_RENDERER,
+            flags=self._bullet.ER_NO_SEGMENTATION_MASK,
+            physicsClientId=self._client,
+        )
+        pixels = np.asarray(image[2], dtype=np.uint8).reshape(height_px, width_px, 4)
+        return np.ascontiguousarray(pixels[..., :3])
+
+    def look_at(self, eye: Sequence[float], target: Sequence[float]) -> list[float]:
+        """View matrix of a camera at ``eye`` that looks at ``target``, z up."""
+        return list(self._bullet.computeViewMatrix(list(eye), list(target), [0.0, 0.0, 1.0]))
+
+    def lens(self, field_of_view_deg: float, aspect: float, near_m: float, far_m: float) -> list[float]:
+        """Projection matrix of a perspective camera; the field of view is vertical."""
+        return list(self._bullet.computeProjectionMatrixFOV(field_of_view_deg, aspect, near_m, far_m))
+
+    def _add_part(self, part: ConvexPart, frame: Pose, color: Rgba) -> int:
+        return self.add_solid(part.shape, part.size_m, frame @ part.pose, color, part.vertices_m)
+
+    def _place(self, body: int, pose: Pose) -> None:
+        self._bullet.resetBasePositionAndOrientation(
+            body, pose.position_m, pose.quat_xyzw, physicsClientId=self._client
+        )
+
+    def _visual(self, shape: Shape, size_m: Vec3, color: Rgba, vertices_m: tuple[Vec3, ...]) -> int:
+        bullet = self._bullet
+        look: dict[str, Any] = {
+            "rgbaColor": color,
+            "specularColor": (0, 0, 0),
+            "physicsClientId": self._client,
+        }
+        match shape:
+            case Shape.BOX:
+                half = tuple(max(extent, 0.002) / 2 for extent in size_m)
+                return int(bullet.createVisualShape(bullet.GEOM_BOX, halfExtents=half, **look))
+            case Shape.CYLINDER:
+                size = {"radius": size_m[0] / 2, "length": size_m[2]}
+                return int(bullet.createVisualShape(bullet.GEOM_CYLINDER, **size, **look))
+            case Shape.SPHERE:
+                return int(bullet.createVisualShape(bullet.GEOM_SPHERE, radius=size_m[0] / 2, **look))
+            case Shape.HULL:
+                mesh = _faces(np.asarray(vertices_m))
+                return int(bullet.createVisualShape(bullet.GEOM_MESH, **mesh, **look))
+
+
+def _faces(points: FloatArray) -> dict[str, list[Any]]:
+    """Outward triangles of a convex hull, each with its own three vertices and its normal."""
+    hull = ConvexHull(points)
+    triangles = points[hull.simplices]  # (f, 3, 3)
+    normals = hull.equations[:, :3]
+    inward = (
+        np.einsum(
+            "fi,fi->f",
+            np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]),
+            normals,
+        )
+        < 0
+    )
+    triangles[inward] = triangles[inward][:, ::-1]
+    count = len(triangles) * 3
+    return {
+        "vertices": triangles.reshape(-1, 3).tolist(),
+        "indices": list(range(count)),
+        "normals": np.repeat(normals, 3, axis=0).tolist(),
+    }
+
+
+def _material(wall: ConvexPart) -> Rgba:
+    """Colour of a wall's part by what its thickness makes it."""
+    thickness = min(wall.size_m[:2])
+    if thickness < _PANE_M:
+        return _GLASS
+    return _DOOR if thickness < _LEAF_M else _WALL
+
+
+def color_of(asset: Asset) -> Rgba:
+    """Colour by what the object is for; small things get a lively one that their category decides."""
+    if max(asset.size_m) < 0.6 and asset.mass_kg <= ROBOT.mass_kg:
+        return _hue(zlib.crc32(asset.category.encode()) / 2**32)
+    if asset.category in _CLOTH:
+        return _SOFT
+    if asset.category in _PLANTS:
+        return _LEAVES
+    if asset.can("openable"):
+        return _OPENS
+    return _WORKS if asset.can("toggleable") or asset.can("heatSource") else _RESTS
+
+
+def _hue(share: float) -> Rgba:
+    red, green, blue = (0.5 + 0.4 * math.cos(2 * math.pi * (share + shift)) for shift in (0.0, 1 / 3, 2 / 3))
+    return (red, green, blue, 1.0)
+
+
+def _lighter(color: Rgba) -> Rgba:
+    red, green, blue = (channel + 0.3 * (1.0 - channel) for channel in color[:3])
+    return (red, green, blue, 1.0)
+
+
+class RobotFigure:
+    """One robot in a client that has Bullet's renderer. It lives as long as the client."""
+
+    def __init__(self, client: int) -> None:
+        """Load the robot, out of sight. Raises EngineMissingError where its description is not installed."""
+        self._bullet = bullet = pybullet()
+        self._client = client
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "robot.urdf"
+            path.write_text(robot_urdf(visuals=True))
+            self._body = int(bullet.loadURDF(str(path), useFixedBase=True, physicsClientId=client))
+        joints: dict[str, int] = {}
+        for number in range(bullet.getNumJoints(self._body, physicsClientId=client)):
+            info = bullet.getJointInfo(self._body, number, physicsClientId=client)
+            joints[info[1].decode()] = number
+            if info[12].decode() in _OWN_LINKS:
+                bullet.changeVisualShape(self._body, number, rgbaColor=_CHASSIS, physicsClientId=client)
+        self._driven = [joints[name] for name in (*BASE_JOINTS, *LIFT_JOINTS, *ARM_JOINTS, *FINGER_JOINTS)]
+        self.leave()
+
+    def stand(self, posture: Posture) -> None:
+        """Show the robot in a posture."""
+        self._put(0.0)
+        for joint, value in zip(self._driven, spread(posture), strict=True):
+            self._bullet.resetJointState(self._body, joint, value, physicsClientId=self._client)
+
+    def leave(self) -> None:
+        """Take it out of sight: the robot does not see itself."""
+        self._put(-100.0)
+
+    def _put(self, height_m: float) -> None:
+        self._bullet.resetBasePositionAndOrientation(
+            self._body, (0.0, 0.0, height_m), (0.0, 0.0, 0.0, 1.0), physicsClientId=self._client
+        )

@@ -1,0 +1,17 @@
+"""Simulators on PyBullet: the place that joins the executor with a concrete physics engine."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.executor import Simulator
+
+if TYPE_CHECKING:
+    from embomatrix.sim.executor import Actor
+    from embomatrix.world.bundle import Bundle
+
+
+def load_simulator(bundle: Bundle, actor: Actor | None = None) -> Simulator:
+    """Load a bundle's scene into a new PyBullet engine. Raises EngineError for a scene that can't be loaded."""
+    return Simulator(bundle, BulletEngine(bundle.scene), actor)

@@ -1,0 +1,246 @@
+"""Sources that change objects by themselves: heat, cold and water.
+
+The effects follow from the state alone, whichever call caused it, and are immediate. Hot objects stay hot and frozen ones stay
+frozen until a source undoes it: a rollout is shorter than cooling. Cooked objects stay cooked. Nothing dries or empties.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.skills.appliances import (
+    cold_source,
+    cooks,
+    coverings,
+    freezes,
+    heat_source,
+    heats,
+    liquids_given,
+    soaked_with,
+    washed_away,
+    washing,
+)
+from embomatrix.world.geometry import Aabb
+from embomatrix.world.state import Relation, State, SubstanceFact, SubstanceRelation
+from embomatrix.world.substances import flows_from, in_words, word_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, MutableMapping, Set
+
+    from embomatrix.sim.engine import PhysicsEngine
+    from embomatrix.sim.state.relations import Relations
+    from embomatrix.skills.appliances import ThermalSource, Washing
+    from embomatrix.world.asset import Asset
+
+VESSEL_M: Final = 0.3
+"""Largest height over a source of the underside of an object that stands in a vessel on the source."""
+
+
+class News:
+    """Reads an engine's journal. A reset is no news: what follows it is."""
+
+    def __init__(self, engine: PhysicsEngine) -> None:
+        self.again = False
+        """Whether the engine was reset between the last two looks."""
+        self._engine = engine
+        self._round = engine.journal.rounds
+        self._read = 0
+        self._names: set[str] = set()
+        self._places: list[Aabb] = []
+
+    def read(self) -> None:
+        """Go on to what changed since the last call."""
+        journal = self._engine.journal
+        self.again = journal.rounds != self._round
+        if self.again:
+            self._round, self._read = journal.rounds, 0
+        names = self._names = set[str]()
+        self._places.clear()
+        for name, box in journal.entries[self._read :]:
+            if name not in names:
+                names.add(name)
+                if box is not None:
+                    self._places.append(box)
+        self._read = len(journal.entries)
+        self._places += [self._engine.aabb(name) for name in names if not self._engine.is_parked(name)]
+
+    def concerns(self, name: str, area: Aabb) -> bool:
+        """Whether the object is among what changed, or anything in an area before or after it changed."""
+        return name in self._names or any(area.overlaps(box) for box in self._places)
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What became of an object, as words that follow "is now": ``hot``, ``soaked``."""
+
+    name: str
+    words: str
+
+
+class Thermal:
+    """The sources of a scene and what they do. ``states`` maps each object to its symbolic states, and is changed."""
+
+    def __init__(
+        self, engine: PhysicsEngine, relations: Relations, states: MutableMapping[str, set[State]]
+    ) -> None:
+        self._engine = engine
+        self._relations = relations
+        self._scene = engine.scene
+        self._states = states
+        self._sources: list[tuple[str, ThermalSource]] = []
+        self._acted = False
+        for item in self._scene.objects:
+            asset = self._scene.assets[item.asset_id]
+            found = (heat_source(asset), cold_source(asset))
+            self._sources += [(item.name, source) for source in found if source is not None]
+
+    def apply(self, news: News) -> list[Change]:
+        """Let every working source act. Returns what changed, in scene order of the sources."""
+        changes: list[Change] = []
+        first, self._acted = not self._acted, True
+        for name, source in self._sources:
+            # One that acts by itself has acted on all that is there, unless something has changed there since.
+            if not self.works(name, source):
+                continue
+            if first or source.requires_on or news.concerns(name, self._area(name)):
+                for item in self._acted_on(name, source):
+                    changes += self._expose(item, source)
+        return changes
+
+    def works(self, name: str, source: ThermalSource) -> bool:
+        """Whether the source is on and closed, as far as it must be."""
+        # The switch first: most sources of a scene are off, and all are asked after every change.
+        if source.requires_on and State.TOGGLED_ON not in self._states.get(name, ()):
+            return False
+        if self._engine.is_parked(name):
+            return False
+        return not (source.requires_closed and self._relations.open(name))
+
+    def is_at(self, item: str, name: str, source: ThermalSource) -> bool:
+        """Whether the source acts on the object where it lies: inside it, or on it, or in or on a vessel on it."""
+        if source.requires_inside:
+            return self._relations.inside(item, name)
+        if self._relations.ontop(item, name):
+            return True
+        vessels = self._above(name)
+        return any(
+            self._relations.ontop(vessel, name) and self._bears(vessel, item)
+            for vessel in vessels
+            if vessel != item
+        )
+
+    def _acted_on(self, name: str, source: ThermalSource) -> Iterator[str]:
+        """Objects where the source acts, of those that it would change."""
+        for item in self._above(name):
+            if self._gained(item, source) and self.is_at(item, name, source):
+                yield item
+
+    def _above(self, name: str) -> tuple[str, ...]:
+        """Movable objects in or near the source's box, or above it as far as vessels reach."""
+        near = self._engine.near(self._area(name), frozenset((name,)))
+        return tuple(item for item in near if not self._scene.by_name[item].fixed)
+
+    def _area(self, name: str) -> Aabb:
+        """The source's box, and as far above it as vessels reach."""
+        box = self._engine.aabb(name)
+        x, y, z = box.high_m
+        return Aabb(box.low_m, (x, y, z + VESSEL_M))
+
+    def _bears(self, vessel: str, item: str) -> bool:
+        return self._relations.holds(Relation.INSIDE, item, vessel) or self._relations.ontop(item, vessel)
+
+    def _gained(self, item: str, source: ThermalSource) -> list[State]:
+        """States that the object would get from the source and does not have."""
+        states = self._states.get(item, ())
+        return [state for state in _states_at(self._scene.asset_of(item), source) if state not in states]
+
+    def _expose(self, item: str, source: ThermalSource) -> list[Change]:
+        """Give the object the states of the source's temperature that its asset can have."""
+        gained, states = self._gained(item, source), self._states[item]
+        if State.HOT in gained:
+            states.discard(State.FROZEN)
+        if State.FROZEN in gained:
+            states.discard(State.HOT)
+        states.update(gained)
+        return [Change(item, state.value) for state in gained]
+
+
+def _states_at(asset: Asset, source: ThermalSource) -> list[State]:
+    found: list[State] = []
+    if heats(source) and asset.can("heatable"):
+        found.append(State.HOT)
+    if cooks(source, asset):
+        found.append(State.COOKED)
+    if freezes(source) and asset.can("freezable"):
+        found.append(State.FROZEN)
+    return found
+
+
+class Water:
+    """The sinks and washing machines of a scene. ``substances`` maps each object to facts, and is changed."""
+
+    def __init__(
+        self,
+        engine: PhysicsEngine,
+        relations: Relations,
+        states: Mapping[str, Set[State]],
+        substances: MutableMapping[str, set[SubstanceFact]],
+    ) -> None:
+        self._engine = engine
+        self._relations = relations
+        self._scene = engine.scene
+        self._states = states
+        self._substances = substances
+        self._changes: list[Change] = []
+        self._acting: set[str] = set()
+        self._acting_at_start: frozenset[str] | None = None
+        self._sources: list[tuple[str, Washing | None]] = []
+        for item in self._scene.objects:
+            asset = self._scene.assets[item.asset_id]
+            machine = washing(asset)
+            if machine is not None or flows_from(asset.synset):
+                self._sources.append((item.name, machine))
+
+    def apply(self, news: News) -> list[Change]:
+        """Let every source that runs act on what lies in it. Returns what changed since the last time, by hand or by itself."""
+        if news.again and self._acting_at_start is not None:
+            self._acting = set(self._acting_at_start)
+        for name, machine in self._sources:
+            if State.TOGGLED_ON not in self._states.get(name, ()) or not self._runs(name, machine):
+                self._acting.discard(name)
+            # What a source did to a thing nothing undoes: it acts again when it was started, or something came.
+            elif name not in self._acting or news.concerns(name, self._engine.aabb(name)):
+                self._acting.add(name)
+                self._act(name, machine)
+        if self._acting_at_start is None:
+            self._acting_at_start = frozenset(self._acting)
+        changes, self._changes = self._changes, []
+        return changes
+
+    def _runs(self, name: str, machine: Washing | None) -> bool:
+        """Whether a source that is switched on is in the world, and closed if it must be."""
+        if self._engine.is_parked(name):
+            return False
+        return machine is None or not machine.requires_closed or not self._relations.open(name)
+
+    def _act(self, name: str, machine: Washing | None) -> None:
+        liquids = liquids_given(self._scene.asset_of(name), (), on=True)
+        for item in self._engine.near(self._engine.aabb(name), frozenset((name,))):
+            if self._scene.by_name[item].fixed or not self._relations.inside(item, name):
+                continue
+            if machine is not None:
+                self.take_off(item, washed_away(machine, coverings(self._substances[item])))
+            self.wet(item, liquids)
+
+    def wet(self, name: str, liquids: tuple[str, ...]) -> None:
+        """Let liquids run over an object."""
+        gained = soaked_with(self._scene.asset_of(name), liquids) - self._substances[name]
+        self._substances[name] |= gained
+        self._changes += [Change(name, in_words(fact)) for fact in sorted(gained)]
+
+    def take_off(self, name: str, covering: tuple[str, ...]) -> None:
+        """Take substances off an object that is covered with them."""
+        lost = {SubstanceFact(SubstanceRelation.COVERED, substance) for substance in covering}
+        self._substances[name] -= lost
+        self._changes += [Change(name, f"free of {word_of(fact.substance)}") for fact in sorted(lost)]

@@ -1,0 +1,239 @@
+"""Audits: an audited result is compared with a second execution on another worker, and with a third on a mismatch.
+
+A check is a rollout record of its own, in no batch; its worker cannot tell it from any other rollout. In a run that asks
+for verified results, the check is queued and the result is held back. In other runs, the check gets a slot that is idle.
+"""
+
+from __future__ import annotations
+
+from itertools import islice
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.control.commands import CancelLease, QuarantineWorker
+from embomatrix.manager.control.dispatch.leasing import (
+    grant,
+    offer_scene,
+    queue_rollouts,
+    revoke,
+    with_free_slot_for,
+)
+from embomatrix.manager.control.dispatch.outcomes import close_case, deliver, return_lease
+from embomatrix.manager.control.dispatch.records import RolloutRecord
+from embomatrix.manager.control.dispatch.state import AuditCase, RolloutStep
+from embomatrix.manager.control.reputation import Ruling, judge, opinion_of
+from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure
+
+if TYPE_CHECKING:
+    from embomatrix.manager.control.dispatch.records import LeaseRecord
+    from embomatrix.manager.control.dispatch.state import DispatchState
+    from embomatrix.manager.control.workers import WorkerRecord
+    from embomatrix.rpc.wire.values import Outcome
+
+LOOKED_AT: Final = 256
+"""Audits examined at each tick, in rotation."""
+
+
+def finish(state: DispatchState, record: RolloutRecord, outcome: Outcome) -> None:
+    """End a rollout with its outcome, or a check with what it says about its case."""
+    if record.check:
+        _check_ended(state, record, outcome)
+    else:
+        deliver(state, record, outcome)
+
+
+def hold_for_audit(state: DispatchState, lease: LeaseRecord, completed: Completed) -> bool:
+    """Open an audit case if the result is to be audited; True if the result is held back meanwhile."""
+    record, worker_id = lease.record, lease.worker_id
+    if record.held:
+        return True  # the case of its other lease decides
+    auditor = state.auditor
+    verified = state.runs.of(record.key.run_id).terms.verified
+    if not auditor.wants(worker_id, lease.ref.lease_id, verified=verified):
+        return False
+    if record.key in state.cases or (not verified and len(state.cases) >= auditor.rules.backlog):
+        return False
+    check = _make_check(state, record, frozenset({worker_id}))
+    if not _can_execute(state, check):
+        auditor.lone = True
+        return False
+    auditor.lone = False
+    auditor.took(worker_id)
+    opinion = opinion_of(worker_id, state.pool.workers[worker_id].resources.versions, completed)
+    case = AuditCase(
+        record.key, record if verified else None, check, [opinion], [completed] if verified else []
+    )
+    state.cases[case.key] = case
+    record.held = verified
+    if verified:
+        state.log(RolloutStep.HELD, record.key, worker_id, "another worker checks the result")
+        for other in list(record.leases):
+            revoke(state, other, "another lease brought a result")
+        queue_rollouts(state, [check])
+    return verified
+
+
+def drop_run(state: DispatchState, run_id: str) -> None:
+    """End the audits of a closed run."""
+    for case in [case for case in state.cases.values() if case.key.run_id == run_id]:
+        close_case(state, case)
+
+
+def restore_quarantine(state: DispatchState, worker: WorkerRecord) -> None:
+    """Apply what is known of the worker from earlier sessions."""
+    worker.quarantined = bool(state.auditor.quarantined(worker.worker_id))
+    state.pool.update_standing(worker)
+
+
+def tick_audits(state: DispatchState) -> None:
+    """Give idle slots to checks that can wait, and end cases that no worker could check for long enough."""
+    some = list(islice(state.cases.items(), LOOKED_AT))
+    for key, case in some:
+        del state.cases[key]
+        state.cases[key] = case
+    for _, case in some:
+        if case.check.leases or state.cases.get(case.key) is not case:
+            continue
+        if _can_execute(state, case.check):
+            case.alone_s = None
+            if case.held is None:
+                _use_idle_slot(state, case.check)
+            continue
+        case.alone_s = state.now_s if case.alone_s is None else case.alone_s
+        if state.now_s - case.alone_s < state.auditor.rules.timeout_s:
+            continue
+        if len(case.opinions) > 1:
+            _give_up(state, case, _mismatch(case))
+        else:
+            # Nobody can compare: the one result is taken as it is.
+            state.auditor.lone = True
+            _close_and_deliver(state, case, case.results[0] if case.results else None)
+
+
+def _check_ended(state: DispatchState, check: RolloutRecord, outcome: Outcome) -> None:
+    case = state.cases.get(check.key)
+    if case is None or case.check is not check:
+        return
+    if not isinstance(outcome, Completed):
+        failure = (
+            outcome if isinstance(outcome, InfraFailure) else InfraFailure(InfraCode.DEADLINE, "no audit")
+        )
+        _give_up(state, case, failure)
+        return
+    versions = state.pool.workers[outcome.worker_id].resources.versions
+    case.opinions.append(opinion_of(outcome.worker_id, versions, outcome))
+    if case.held is not None:
+        case.results.append(outcome)
+    _rule(state, case)
+
+
+def _rule(state: DispatchState, case: AuditCase) -> None:
+    """Decide the case by its opinions, or ask a further worker."""
+    verdict = judge(case.opinions)
+    match verdict.ruling:
+        case Ruling.OPEN:
+            case.disputed = tuple(opinion.worker_id for opinion in case.opinions)
+            for worker_id in case.disputed:
+                state.auditor.of(worker_id).disputed += 1
+            case.check = _make_check(state, case.check, frozenset(case.disputed))
+            case.alone_s = None
+            if case.held is not None:
+                queue_rollouts(state, [case.check])
+        case Ruling.SPLIT:
+            _give_up(state, case, _mismatch(case))
+        case Ruling.AGREED:
+            _count(state, case, mismatch=len(case.opinions) > 2)
+            for at in verdict.right:
+                state.auditor.agreed(case.opinions[at].worker_id)
+            _close_and_deliver(state, case, case.results[verdict.right[0]] if case.results else None)
+            for at in verdict.wrong:
+                _convict(state, case.opinions[at].worker_id, case)
+
+
+def _convict(state: DispatchState, worker_id: str, case: AuditCase) -> None:
+    """Quarantine a worker, and execute again what it did and nobody has confirmed yet."""
+    others = " and ".join(o.worker_id for o in case.opinions if o.worker_id != worker_id)
+    reason = f"its result of rollout {case.key.rollout_id} of run {case.key.run_id} contradicts {others}"
+    known = state.auditor.quarantined(worker_id)
+    state.auditor.convict(worker_id, known or reason)
+    if known:
+        return  # a second wrong result that was under way
+    state.emit(QuarantineWorker(worker_id, reason, state.auditor.of(worker_id).audited))
+    again = [other for other in state.cases.values() if other.opinions[0].worker_id == worker_id]
+    for other in again:
+        held = other.held
+        close_case(state, other)
+        if held is not None:
+            held.held = False
+            state.runs.of(other.key.run_id).counters.redispatched += 1
+            state.log(RolloutStep.QUEUED, held.key, text=f"again, because {worker_id} is in quarantine")
+            queue_rollouts(state, [held])
+    worker = state.pool.workers.get(worker_id)
+    if worker is not None:
+        worker.quarantined = True
+        state.pool.update_standing(worker)
+        leases = list(worker.held.values())
+        for lease in leases:
+            state.emit(CancelLease(worker_id, lease.ref))
+            return_lease(state, lease, "its worker is in quarantine")
+        for scene in dict.fromkeys(lease.record.scene for lease in leases):
+            offer_scene(state, scene)
+
+
+def _give_up(state: DispatchState, case: AuditCase, failure: InfraFailure) -> None:
+    """End a case undecided: a held rollout fails, and no worker is blamed."""
+    if len(case.opinions) > 1:
+        _count(state, case, mismatch=True)
+        failure = _mismatch(case)
+    _close_and_deliver(state, case, failure)
+
+
+def _close_and_deliver(state: DispatchState, case: AuditCase, outcome: Outcome | None) -> None:
+    """Close the case, and deliver the outcome of a rollout that was held back."""
+    held = case.held
+    close_case(state, case)
+    if held is not None and outcome is not None:
+        held.held = False
+        deliver(state, held, outcome)
+
+
+def _mismatch(case: AuditCase) -> InfraFailure:
+    names = ", ".join(opinion.worker_id for opinion in case.opinions)
+    return InfraFailure(
+        InfraCode.RESULT_MISMATCH, f"{names} came to different results, and no two others agree with either"
+    )
+
+
+def _count(state: DispatchState, case: AuditCase, *, mismatch: bool) -> None:
+    counters = state.runs.of(case.key.run_id).counters
+    counters.audited += 1
+    counters.audit_mismatches += mismatch
+
+
+def _make_check(state: DispatchState, record: RolloutRecord, excluded: frozenset[str]) -> RolloutRecord:
+    return RolloutRecord(
+        key=record.key,
+        rollout=record.rollout,
+        sequence=record.sequence,
+        submitted_s=state.now_s,
+        warm=record.warm,
+        check=True,
+        excluded_workers=excluded,
+        reward=record.reward,
+    )
+
+
+def _can_execute(state: DispatchState, check: RolloutRecord) -> bool:
+    """True if some worker may execute the check, now or later."""
+    queue = check.queue
+    return any(
+        name not in queue.excluded_workers
+        and not (worker.quarantined or worker.draining)
+        and (worker.render_slots > 0 or not queue.render)
+        for name, worker in state.pool.workers.items()
+    )
+
+
+def _use_idle_slot(state: DispatchState, check: RolloutRecord) -> None:
+    worker = state.pool.least_busy(check.scene, with_free_slot_for(state, check))
+    if worker is not None and not state.paused and not state.queues.count(check.scene):
+        grant(state, check, worker, "audit on an idle slot")

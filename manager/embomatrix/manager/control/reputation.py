@@ -1,0 +1,200 @@
+"""Reputation of workers: choice of the results to audit, comparison of executions, and quarantine.
+
+A worker is on probation until ``AuditRules.probation`` of its executions were compared with another worker's. Later, a share
+of its results is compared, drawn by a keyed hash of the lease, which the worker cannot predict. Probation of 50 executions
+catches 1 - 0.9^50 = 99.5 % of the workers that falsify a tenth of their results (acceptance test A17).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from enum import Enum, auto
+from itertools import combinations
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from embomatrix.rpc.wire.values import Completed
+
+PLATFORM: Final = "platform"
+"""Name of the platform fingerprint among a worker's versions."""
+REWARD_DIGITS: Final = 6
+"""Decimal places to which rewards of different platforms are compared: they are sums of the same few terms."""
+OPINIONS: Final = 3
+"""Executions after which a case without two that agree is given up."""
+
+
+@dataclass(frozen=True, slots=True)
+class AuditRules:
+    """Rules for choosing results to audit. Runs that ask for verified results are always audited."""
+
+    probation: int = 50
+    """Number of first executions of a new worker that are all compared."""
+    share: float = 0.05
+    """Share of its later results that is compared."""
+    background: bool = False
+    """Audit other runs as well, after delivery and on idle slots."""
+    backlog: int = 4096
+    """Most background audits that may wait; further results are not audited."""
+    timeout_s: float = 10.0
+    """Longest wait while no worker can execute the check."""
+
+
+@dataclass(frozen=True, slots=True)
+class Opinion:
+    """Comparable digest of one execution. Across platforms only ``facts`` is compared."""
+
+    worker_id: str
+    platform: Mapping[str, str]
+    """Versions of the worker. Without a fingerprint, its platform equals no other."""
+    trace: tuple[str, float, float, float]
+    """Digest of the trace, and the exact three tiers of the reward."""
+    facts: str
+    """Digest of atoms, success, step failures and the rounded reward."""
+
+    def agrees(self, other: Opinion) -> bool:
+        """True if both executions agree in everything that must be equal for equal plans."""
+        if self.facts != other.facts:
+            return False
+        known = bool(self.platform.get(PLATFORM))
+        return self.trace == other.trace if known and self.platform == other.platform else True
+
+
+def opinion_of(worker_id: str, platform: Mapping[str, str], completed: Completed) -> Opinion:
+    """Return the comparable part of a result, without texts and durations."""
+    reward = completed.reward
+    tiers = (reward.format, reward.relevance, reward.goal)
+    facts = (
+        [(atom.text, atom.holds) for atom in reward.atoms],
+        reward.success,
+        [step.failure for step in completed.steps],
+        [round(tier, REWARD_DIGITS) for tier in tiers],
+    )
+    digest = hashlib.blake2b(repr(facts).encode(), digest_size=16).hexdigest()
+    return Opinion(worker_id, platform, (completed.trace_digest, *tiers), digest)
+
+
+class Ruling(Enum):
+    """Decision of a case."""
+
+    OPEN = auto()
+    """Another execution must decide."""
+    AGREED = auto()
+    SPLIT = auto()
+    """All of them differ."""
+
+
+@dataclass(frozen=True, slots=True)
+class AuditVerdict:
+    """``right`` and ``wrong`` index the opinions; both are empty unless the ruling is AGREED."""
+
+    ruling: Ruling
+    right: tuple[int, ...] = ()
+    wrong: tuple[int, ...] = ()
+
+
+def judge(opinions: Sequence[Opinion]) -> AuditVerdict:
+    """Decide a case: two opinions that agree are right, and only an opinion that contradicts both is wrong."""
+    for one, two in combinations(range(len(opinions)), 2):
+        if opinions[one].agrees(opinions[two]):
+            others = [at for at in range(len(opinions)) if at not in (one, two)]
+            right = [opinions[one], opinions[two]]
+            wrong = tuple(at for at in others if not any(opinions[at].agrees(o) for o in right))
+            return AuditVerdict(
+                Ruling.AGREED, tuple(at for at in range(len(opinions)) if at not in wrong), wrong
+            )
+    return AuditVerdict(Ruling.SPLIT if len(opinions) >= OPINIONS else Ruling.OPEN)
+
+
+@dataclass(slots=True)
+class Reputation:
+    """Audit record of a worker id; it survives sessions."""
+
+    taken: int = 0
+    """Results chosen for comparison."""
+    agreed: int = 0
+    """Executions confirmed by another worker since probation began."""
+    audited: int = 0
+    disputed: int = 0
+    """Contradicted results that wait for a third opinion. Not kept across managers."""
+    mismatches: int = 0
+    """Audited executions that were wrong."""
+    quarantine: str = ""
+    """Reason of its quarantine; empty if it is in none."""
+
+
+class Auditor:
+    """Reputations of all workers. ``key`` is secret: it tells which leases are audited."""
+
+    def __init__(self, rules: AuditRules, key: bytes) -> None:
+        self.rules = rules
+        self.lone = False
+        """True if the last result to audit found no second worker."""
+        self._key = key
+        self._reputations: dict[str, Reputation] = {}
+        self._changed: dict[str, None] = {}
+
+    def know(self, reputations: Mapping[str, Reputation]) -> None:
+        """Take over reputations from former managers."""
+        self._reputations.update(reputations)
+
+    def note(self, *worker_ids: str) -> None:
+        """Mark the reputations of these workers as changed."""
+        self._changed.update(dict.fromkeys(worker_ids))
+
+    def take_changed(self) -> list[str]:
+        """Return the workers whose reputation changed since the last call."""
+        changed, self._changed = self._changed, {}
+        return list(changed)
+
+    def of(self, worker_id: str) -> Reputation:
+        return self._reputations.setdefault(worker_id, Reputation())
+
+    def quarantined(self, worker_id: str) -> str:
+        """Return the reason of the worker's quarantine; empty if it is in none."""
+        found = self._reputations.get(worker_id)
+        return found.quarantine if found is not None else ""
+
+    def wants(self, worker_id: str, lease_id: str, *, verified: bool) -> bool:
+        """True if this result should be audited; in a ``verified`` run before its delivery."""
+        if not (verified or self.rules.background):
+            return False
+        reputation = self.of(worker_id)
+        if reputation.disputed:
+            return True  # its honesty is in doubt, whatever its record
+        known = reputation.agreed if verified else reputation.taken
+        return known < self.rules.probation or self._drawn(lease_id)
+
+    def took(self, worker_id: str) -> None:
+        """Count a result of the worker that is audited."""
+        self.of(worker_id).taken += 1
+        self.note(worker_id)
+
+    def agreed(self, worker_id: str) -> None:
+        """Count a confirmed execution."""
+        self.note(worker_id)
+        reputation = self.of(worker_id)
+        reputation.agreed += 1
+        reputation.audited += 1
+
+    def convict(self, worker_id: str, reason: str) -> None:
+        """Count a wrong execution, and put the worker in quarantine."""
+        self.note(worker_id)
+        reputation = self.of(worker_id)
+        reputation.audited += 1
+        reputation.mismatches += 1
+        reputation.quarantine = reason
+
+    def pardon(self, worker_id: str) -> None:
+        """End the quarantine of a worker: it is on probation again."""
+        reputation = self._reputations.get(worker_id)
+        if reputation is not None and reputation.quarantine:
+            self.note(worker_id)
+            reputation.taken = reputation.agreed = 0
+            reputation.quarantine = ""
+
+    def _drawn(self, lease_id: str) -> bool:
+        digest = hashlib.blake2b(lease_id.encode(), key=self._key, digest_size=8).digest()
+        return int.from_bytes(digest) < self.rules.share * 2.0**64
