@@ -131,8 +131,7 @@ _TLS_TROUBLES: Final[Mapping[str, str]] = {
 
 @contextlib.asynccontextmanager
 async def translate(context: grpc.aio.ServicerContext) -> AsyncIterator[None]:
-    """Turn errors of a servicer's body into gRPC status codes. Unexpected errors are logged and become ``INTERNAL``.
-    """
+    """Turn errors of a servicer's body into gRPC status codes. Unexpected errors are logged and become ``INTERNAL``."""
     try:
         yield
     except ClusterError as error:

@@ -58,8 +58,7 @@ def read_ca(path: Path | None) -> bytes:
 
 
 def fingerprint_of(pem: str) -> str:
-    """Return the SHA-256 of the first certificate in the text, as hexadecimal digits. Raises ValueError without one.
-    """
+    """Return the SHA-256 of the first certificate in the text, as hexadecimal digits. Raises ValueError without one."""
     found = _CERTIFICATE.search(pem)
     if found is None:
         raise ValueError("there is no certificate in it")

@@ -31,8 +31,7 @@ class LeaseOrigin:
 
 @dataclass(frozen=True, slots=True)
 class LeaseClaim:
-    """Claim of a worker to a lease that it runs or has finished. A manager that did not give the lease may adopt it.
-    """
+    """Claim of a worker to a lease that it runs or has finished. A manager that did not give the lease may adopt it."""
 
     ref: LeaseRef
     origin: LeaseOrigin
