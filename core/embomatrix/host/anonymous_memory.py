@@ -1,4 +1,4 @@
-"""Memory that processes share by handing on a file descriptor: it has no name, and ends with its last user."""
+"""Anonymous memory that processes share by passing a file descriptor. It is freed with its last descriptor."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import tempfile
 
 
 def nameless_file(label: str, size: int) -> int:
-    """A descriptor of so many bytes of 0, in memory only where the system offers that.
+    """Return a descriptor of ``size`` zero bytes, in memory where the system has ``memfd_create``.
 
-    A container's /dev/shm, which is small, has no part in it. ``label`` is what the system shows. Raises OSError.
+    It does not use /dev/shm, which is small in containers. ``label`` is the name that the system shows. Raises
+    OSError.
     """
     if hasattr(os, "memfd_create"):
         fd = os.memfd_create(label)

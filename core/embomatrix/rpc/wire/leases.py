@@ -1,4 +1,4 @@
-"""What manager and workers tell one another of leases, as values; ``rpc.convert_session`` maps them to the wire."""
+"""Lease values that manager and workers exchange; ``wire.session`` converts them to and from protobuf."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class LeaseRef:
-    """Names a lease. A result counts only under the epoch that the manager holds."""
+    """Name of a lease. A result counts only under the epoch that the manager holds."""
 
     lease_id: str
     lease_epoch: int
@@ -21,7 +21,7 @@ class LeaseRef:
 
 @dataclass(frozen=True, slots=True)
 class LeaseOrigin:
-    """Which rollout a lease is for, and which attempt at it, from 1."""
+    """Rollout that a lease is for, and the attempt at it, from 1."""
 
     run_id: str
     batch_id: str
@@ -31,7 +31,7 @@ class LeaseOrigin:
 
 @dataclass(frozen=True, slots=True)
 class LeaseClaim:
-    """A worker holds this lease, or its result: a manager that did not give it may take it up."""
+    """Claim of a worker to a lease that it runs or has finished. A manager that did not give the lease may adopt it."""
 
     ref: LeaseRef
     origin: LeaseOrigin
@@ -39,22 +39,22 @@ class LeaseClaim:
 
 @dataclass(frozen=True, slots=True)
 class Lease:
-    """The right to execute one rollout. ``deadline_s`` is how long the execution may take, from its start."""
+    """Right to execute one rollout. ``deadline_s`` limits the execution time."""
 
     ref: LeaseRef
     rollout: Rollout
     deadline_s: float
     origin: LeaseOrigin | None = None
-    """None from a manager that does not take leases up."""
+    """None in a message without it."""
     reward: RewardSettings = PAPER
-    """How the run wants it scored."""
+    """Reward coefficients of the run."""
 
 
 @dataclass(frozen=True, slots=True)
 class LeaseResult:
-    """What became of a lease. It ran in ``slot``, counted from 1, for ``held_s`` seconds; 0 when it never ran.
+    """Result of a lease, which ran in ``slot`` (from 1; 0: never) for ``held_s`` seconds.
 
-    ``origin`` stays with the worker, and travels in its claims.
+    ``origin`` stays on the worker and travels in its claims.
     """
 
     ref: LeaseRef
@@ -66,7 +66,7 @@ class LeaseResult:
 
 @dataclass(frozen=True, slots=True)
 class LeaseProgress:
-    """Steps of the plan that a lease which runs has done; the number never falls."""
+    """Number of plan steps that a running lease has executed. It never falls."""
 
     ref: LeaseRef
     steps: int
@@ -74,9 +74,9 @@ class LeaseProgress:
 
 @dataclass(frozen=True, slots=True)
 class WorkerState:
-    """Everything that a worker holds. ``finished`` are results that no one has acknowledged yet.
+    """Full state of a worker. ``finished`` are results without acknowledgement.
 
-    ``claims`` tell what the leases of both are for; only the first state of a stream has them.
+    ``claims`` give the origin of running and finished leases. Only the first state of a stream has them.
     """
 
     residents: tuple[Resident, ...] = ()
@@ -84,5 +84,5 @@ class WorkerState:
     finished: tuple[LeaseResult, ...] = ()
     draining: bool = False
     paused: str = ""
-    """Why the worker takes nothing new for now, though it stays; empty while it works."""
+    """Reason why the worker accepts no new leases; empty while it accepts them."""
     claims: tuple[LeaseClaim, ...] = ()

@@ -1,4 +1,4 @@
-"""What a manager is protected by: certificates, tokens, both, or on loopback nothing. Anything less is refused at start."""
+"""Protection of a manager: TLS and tokens, which only loopback addresses may lack."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Tls:
-    """A certificate to serve with. ``chain``, ``key`` and ``authority`` are PEM; the last is empty where it isn't known."""
+    """Certificate of the server. ``chain``, ``key`` and ``authority`` are PEM; an unknown authority is empty."""
 
     chain_file: Path
     key_file: Path
@@ -36,7 +36,7 @@ class Tls:
 
 @dataclass(frozen=True, slots=True)
 class Protection:
-    """``first`` are the tokens that ``manager init`` made; ``guarded`` says whether tokens are asked for."""
+    """``first`` are the tokens of ``manager init``; ``guarded`` if tokens are required."""
 
     tls: Tls | None
     first: tuple[Credential, ...]
@@ -44,7 +44,9 @@ class Protection:
 
 
 def protection_of(settings: ManagerSettings) -> Protection:
-    """What the settings and the data folder give. Raises AccessError if it is too little for the addresses that are served."""
+    """Return the protection that settings and data folder provide. Raises AccessError if the served addresses need
+    more.
+    """
     folder = AccessFolder(settings.data_dir)
     tls = _tls(settings, folder)
     first = folder.first_credentials()

@@ -1,8 +1,8 @@
-"""`embomatrix manager`: serve a Simulation Manager, or ask one how it does."""
+"""`embomatrix manager`: serve a manager, or show its state."""
 
 from __future__ import annotations
 
-from pathlib import Path  # typer reads the annotation when the command runs
+from pathlib import Path  # typer evaluates the annotation
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
@@ -122,7 +122,7 @@ def serve(
 
 @app.command()
 def status(manager: Manager = "127.0.0.1:50070", token: Token = "", ca: Ca = None) -> None:
-    """Show workers and runs of a manager."""
+    """Show the workers and runs of a manager."""
     import asyncio
 
     from embomatrix.manager.commands.status_table import show_status
@@ -149,7 +149,7 @@ def init(
         ),
     ] = None,
 ) -> None:
-    """Make certificates and first tokens for a manager that is served beyond this machine. What is there stays as it is."""
+    """Create certificates and first tokens for a manager that other machines reach. Existing files stay."""
     from embomatrix.manager.access.folder import FIRST_ROLES, AccessError, hand_out_to, prepare
 
     folder = _settings({} if data_dir is None else {"data_dir": data_dir}).data_dir
@@ -168,7 +168,7 @@ def init(
 
 
 def _parcel(text: str) -> tuple[AccessRole, Path]:
-    """What ``ROLE:FOLDER`` asks for."""
+    """Parse ``ROLE:FOLDER``."""
     from pathlib import Path
 
     from embomatrix.rpc.wire.tokens import AccessRole
@@ -203,7 +203,7 @@ def _settings(options: Mapping[str, object]) -> ManagerSettings:
             _refuse(expected)
         name = str(first["loc"][0])
         if name == "token":
-            # What was found stays untold: it may be nearly the secret.
+            # The value is not shown: it may be almost the secret.
             _refuse("--token: expected visible ASCII characters without spaces")
         _refuse(f"--{name.replace('_', '-')} {first['input']!r}: {expected[:1].lower()}{expected[1:]}")
 
@@ -240,7 +240,7 @@ def _serve(settings: ManagerSettings) -> None:
 
 
 def _first_of(group: BaseExceptionGroup[BaseException]) -> BaseException:
-    """The first failure, however deep task groups have wrapped it."""
+    """Return the first failure in nested groups."""
     first = group.exceptions[0]
     return _first_of(first) if isinstance(first, BaseExceptionGroup) else first
 
@@ -253,6 +253,6 @@ def _log_to_stderr(level: str, log_format: LogFormat) -> None:
 
 
 def _refuse(sentence: str) -> NoReturn:
-    """One sentence and exit status 2: what a person can mend gets no traceback."""
+    """Print one sentence and exit with status 2, without a traceback."""
     typer.echo(f"embomatrix manager: {sentence}", err=True)
     raise typer.Exit(2)

@@ -1,4 +1,4 @@
-"""What `embomatrix manager status` prints."""
+"""Tables of `embomatrix manager status`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 async def show_status(address: str, token: str, ca: bytes = b"") -> None:
-    """Print the workers and runs of the manager at HOST:PORT; raises ``ClusterError`` when it can't be asked."""
+    """Print the workers and runs of the manager at HOST:PORT. Raises ClusterError."""
     async with ClusterClient(address, token, ca=ca) as client:
         workers, runs = await client.list_workers(), await client.list_runs()
     console = Console()

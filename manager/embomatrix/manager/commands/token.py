@@ -1,8 +1,8 @@
-"""`embomatrix manager token`: hand out tokens of a role, look them over, take them back."""
+"""`embomatrix manager token`: issue, list and revoke tokens."""
 
 from __future__ import annotations
 
-from pathlib import Path  # typer reads the annotation when the command runs
+from pathlib import Path  # typer evaluates the annotation
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import typer
@@ -49,7 +49,7 @@ def issue(
     token: Token = "",
     ca: Ca = None,
 ) -> None:
-    """Hand out a token. It is told once: the manager keeps only its hash."""
+    """Issue a token. It is shown once: the manager keeps only a hash."""
     from embomatrix.rpc.trust import Invitation, fingerprint_of, read_ca
     from embomatrix.rpc.wire.tokens import AccessRole
 
@@ -70,7 +70,7 @@ def issue(
 
 @app.command(name="list")
 def list_(manager: Manager = "127.0.0.1:50070", token: Token = "", ca: Ca = None) -> None:
-    """Show the tokens that are valid, by id."""
+    """List the valid tokens by id."""
     from rich.console import Console
     from rich.table import Table
 
@@ -87,7 +87,7 @@ def revoke(
     token: Token = "",
     ca: Ca = None,
 ) -> None:
-    """Make a token void. Sessions of workers that it opened end at once."""
+    """Revoke a token. Worker sessions that it opened end at once."""
     _ask(manager, token, ca, lambda client: client.revoke_token(token_id))
     print(f"revoked {token_id}")
 
@@ -97,7 +97,7 @@ def _left(info: TokenInfo) -> str:
 
 
 def _ask(manager: str, token: str, ca: Path | None, question: Callable[[AdminClient], Awaitable[T]]) -> T:
-    """One call to the manager; whatever is wrong ends as a sentence."""
+    """Call the manager; errors end the command with one sentence."""
     import asyncio
 
     from embomatrix.rpc.admin_client import AdminClient

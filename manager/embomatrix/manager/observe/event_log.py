@@ -1,7 +1,6 @@
-"""What happened, by run: a bounded log of events and the figures beside it. It decides nothing.
+"""Run history log: bounded events and figures of each open run, and of workers and scenes. It decides nothing.
 
-The runtime tells it what goes in and out of the state machines. Leases outnumber everything else: of each there are two
-events, and of a rollout a handful of counts.
+The runtime reports the events and commands of the state machines. Each lease has two events.
 """
 
 from __future__ import annotations
@@ -30,17 +29,17 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 EVENTS_KEPT: Final = 32_768
-"""Events of all open runs together, at about 350 bytes each; every run may keep at least ``LEAST_KEPT`` of its own."""
+"""Events of all open runs together, about 350 bytes each. Every run may keep at least ``LEAST_KEPT``."""
 LEAST_KEPT: Final = 256
 HEDGES_KEPT: Final = 4096
 PAGE: Final = 4096
-"""Events that a message carries at most."""
+"""Events of one page at most."""
 MESSAGE_CHARS: Final = 500
 
 
 @dataclass(frozen=True, slots=True)
 class RunRecord:
-    """An open run. ``cpu_s`` is what the manager had used when it was opened; ``opened_s`` is of the monotonic clock."""
+    """Open run. ``cpu_s`` is the manager's CPU time when it was opened; ``opened_s`` is on the monotonic clock."""
 
     run_id: str
     name: str
@@ -52,37 +51,37 @@ class RunRecord:
 
 
 class RunEventLog:
-    """``epoch_s`` is the wall clock's time at second 0 of the monotonic clock that every ``now_s`` is of."""
+    """``epoch_s`` is the wall-clock time at second 0 of the monotonic clock of every ``now_s``."""
 
     def __init__(self, *, epoch_s: float) -> None:
         self.epoch_s = epoch_s
         self._sequences = itertools.count(1)
         self.fleet = FleetLog(self._sequences, epoch_s=epoch_s)
         self.attempts: Counter[int] = Counter()
-        """Rollouts by the attempt that brought their outcome."""
+        """Rollouts by number of attempts."""
         self.execute_s = 0.0
-        """Seconds that slots worked for results."""
+        """Seconds that slots spent on results."""
         self.hedges_won = 0
-        """Results of second leases, given while the first was late and still good."""
+        """Results of hedge leases that arrived first."""
         self._hedges: OrderedDict[str, None] = OrderedDict()
-        """Second leases that may still bring one."""
+        """Hedge leases that may still deliver."""
         self.dropped = 0
-        """Events that logs of runs which are closed by now had dropped."""
+        """Events that were discarded from the logs of closed runs."""
         self._runs: dict[str, RunRecord] = {}
         self._closed: dict[RolloutPhase, Histogram] = {phase: Histogram() for phase in RolloutPhase}
 
     @property
     def runs(self) -> Mapping[str, RunRecord]:
-        """Those that are open."""
+        """Open runs by id."""
         return self._runs
 
     def phases(self) -> dict[RolloutPhase, Histogram]:
-        """Of all runs that this manager has seen."""
+        """Return the durations of all runs of this manager, by phase."""
         every = [self._closed, *(run.figures.phases for run in self._runs.values())]
         return {phase: merged(phases[phase] for phases in every) for phase in RolloutPhase}
 
     def page(self, run_id: str, after: int, limit: int = PAGE) -> EventPage | None:
-        """Events of an open run, or of the fleet for an empty id; None when no such run is open."""
+        """Return events of an open run, or of workers and scenes for an empty id; None if the run is not open."""
         if not run_id:
             return self.fleet.ring.after(after, limit)
         return self._runs[run_id].ring.after(after, limit) if run_id in self._runs else None
@@ -90,7 +89,7 @@ class RunEventLog:
     def open_run(
         self, run_id: str, name: str, *, now_s: float, cpu_s: float, reward: RewardSettings = PAPER
     ) -> None:
-        """Begin a log; one that was begun goes on."""
+        """Start the log of a run, unless it exists."""
         if run_id in self._runs:
             return
         limit = max(LEAST_KEPT, EVENTS_KEPT // (len(self._runs) + 1))
@@ -102,7 +101,7 @@ class RunEventLog:
         self._note(EventKind.RUN_OPENED, run_id, now_s=now_s, message=name)
 
     def close_run(self, run_id: str, *, now_s: float) -> RunRecord | None:
-        """End a log and forget it here; None when there is none."""
+        """End a run's log and remove it; None if there is none."""
         self._note(EventKind.RUN_CLOSED, run_id, now_s=now_s)
         run = self._runs.pop(run_id, None)
         if run is not None:
@@ -142,7 +141,7 @@ class RunEventLog:
     def reported(
         self, worker_id: str, results: Iterable[LeaseResult], live: Mapping[str, LeaseRecord], *, now_s: float
     ) -> None:
-        """A worker tells how leases ended; to be called before the state machines hear of it and end them."""
+        """Log the ended leases of a worker's report. Call it before the state machines end these leases."""
         for result in results:
             lease = live.get(result.ref.lease_id)
             if lease is None or lease.record.check:
@@ -151,7 +150,7 @@ class RunEventLog:
                 self._ended_lease(result, lease, now_s)
 
     def delivered(self, command: DeliverResult, *, now_s: float) -> None:
-        """A rollout reached its outcome."""
+        """Log the outcome of a rollout."""
         run = self._runs.get(command.run_id)
         if run is None:
             return
@@ -170,7 +169,7 @@ class RunEventLog:
                 self._end(command, now_s, "cancelled", "", "")
 
     def in_log(self, run_id: str, durations_s: Sequence[float]) -> None:
-        """So long after their arrival, results of the run were in the log for its trainer."""
+        """Count the delivery times, in seconds, of results that reached the run's result log."""
         run = self._runs.get(run_id)
         if run is not None:
             histogram = run.figures.phases[RolloutPhase.DELIVER]
@@ -240,7 +239,7 @@ class RunEventLog:
         message: str = "",
         size: int = 0,
     ) -> RunEvent:
-        """An event that is rare."""
+        """Log an infrequent event."""
         event = RunEvent(
             next(self._sequences),
             self.epoch_s + now_s,
@@ -275,7 +274,7 @@ def _say_failed(event: RunEvent) -> None:
 
 
 class EventRing:
-    """Events by rising sequence. ``limit`` may be changed; the oldest make room."""
+    """Events by rising sequence number. Beyond ``limit``, which may change, the oldest are discarded."""
 
     __slots__ = ("dropped", "events", "limit")
 
@@ -291,7 +290,7 @@ class EventRing:
             self.dropped += 1
 
     def after(self, sequence: int, limit: int) -> EventPage:
-        """The first events beyond the sequence."""
+        """Return the first events after the sequence number."""
         found: list[RunEvent] = []
         for event in self.events:
             if event.sequence > sequence:
@@ -305,9 +304,9 @@ FLEET_EVENTS_KEPT: Final = 4096
 
 
 class FleetLog:
-    """Belongs to no run. ``sequences`` is shared with the logs of runs, so that their events can be put in one order.
+    """Events of workers and scenes. ``sequences`` is shared with the logs of runs, so that all events have one order.
 
-    ``epoch_s`` is the wall clock's time at second 0 of the monotonic clock that every ``now_s`` is of.
+    ``epoch_s`` is the wall-clock time at second 0 of the monotonic clock of every ``now_s``.
     """
 
     def __init__(self, sequences: Iterator[int], *, epoch_s: float) -> None:
@@ -326,7 +325,7 @@ class FleetLog:
         self._note(EventKind.WORKER_LOST, worker_id, now_s=now_s, message=reason)
 
     def residents(self, worker_id: str, residents: Sequence[Resident], *, now_s: float) -> None:
-        """The worker's scenes, as it reports them: what changed since its last report is told."""
+        """Log the changes of a worker's scenes since its last report."""
         before = self._residents.get(worker_id, {})
         after = {resident.bundle_digest: resident.state for resident in residents}
         self._residents[worker_id] = after

@@ -1,4 +1,4 @@
-"""What serving costs the manager itself: its share of the CPU time, how late its clock ticks, how long its store takes."""
+"""Load of the manager (CPU accounting, clock lag, store latency), and counters of delivered results."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 WINDOW_S: Final = 60.0
 OPERATIONS: Final = 64
-"""Kinds of operations that a store may have; more would be a defect."""
+"""Kinds of store operations at most."""
 
 
 class _Sample(NamedTuple):
-    """At a time of the monotonic clock: CPU time of the manager and of the slots so far, in seconds."""
+    """CPU time of the manager and of the slots so far, in seconds, at a time of the monotonic clock."""
 
     at_s: float
     manager_s: float
@@ -29,32 +29,32 @@ class _Sample(NamedTuple):
 
 
 class ManagerLoad:
-    """Told by the runtime, every few seconds and with every operation."""
+    """CPU accounting, clock lag and store latency of the manager."""
 
     def __init__(self) -> None:
         self.lag = Histogram()
-        """Seconds by which a tick came late: more than a few hundredths mean that the event loop is full."""
+        """Lag of each tick in seconds. More than a few hundredths mean that the event loop is saturated."""
         self._store: dict[str, Histogram] = {}
         self._samples: deque[_Sample] = deque()
 
     @property
     def store(self) -> Mapping[str, Histogram]:
-        """Seconds that the store's operations took, by name."""
+        """Durations of store operations in seconds, by name."""
         return self._store
 
     def operated(self, operation: str, seconds: float) -> None:
-        """An operation of the store took so long."""
+        """Count an operation of the store."""
         if operation in self._store or len(self._store) < OPERATIONS:
             self._store.setdefault(operation, Histogram()).observe(seconds)
 
     def sample(self, now_s: float, manager_s: float, slots_s: float) -> None:
-        """CPU time so far. A slot executes on one core, so its time in a rollout is its CPU time."""
+        """Note the CPU time so far. A slot runs on one core, so its busy time counts as CPU time."""
         self._samples.append(_Sample(now_s, manager_s, slots_s))
         while len(self._samples) > 2 and self._samples[1].at_s <= now_s - WINDOW_S:
             self._samples.popleft()
 
     def overhead(self) -> float:
-        """The manager's part of the CPU time that it and the slots used in the last minute; 0 when nothing ran."""
+        """Return the manager's share of the CPU time of manager and slots in the last minute; 0 if nothing ran."""
         if len(self._samples) < 2:
             return 0.0
         first, last = self._samples[0], self._samples[-1]
@@ -63,16 +63,16 @@ class ManagerLoad:
 
 
 THROUGHPUT_S: Final = 120
-"""Length of the throughput's history."""
+"""Seconds of throughput history."""
 SAMPLES: Final = 2048
 FAILURES_KEPT: Final = 50
 WORKERS_KEPT: Final = 20_000
-"""Names of workers whose results are counted; those that were seen first make room."""
+"""Workers whose results are counted at most; the first seen are dropped."""
 
 
 @dataclass(frozen=True, slots=True)
 class FailureNote:
-    """A failure of the infrastructure, as the dashboard shows it. ``at_s`` is seconds since the epoch."""
+    """Infrastructure failure for the dashboard. ``at_s`` is seconds since the epoch."""
 
     at_s: float
     code: str
@@ -83,12 +83,12 @@ class FailureNote:
 
 
 class Meter:
-    """Takes every delivered result. The clock of its history is the caller's monotonic one."""
+    """Counters of delivered results. Times are on the caller's monotonic clock."""
 
     def __init__(self) -> None:
         self.outcomes: Counter[str] = Counter()
         self.completed_by: Counter[str] = Counter()
-        """By worker, whether it is still there or not."""
+        """Completed rollouts by worker, connected or not."""
         self.failures: deque[FailureNote] = deque(maxlen=FAILURES_KEPT)
         self._latency_s: deque[float] = deque(maxlen=SAMPLES)
         self._per_second: deque[tuple[int, int]] = deque(maxlen=THROUGHPUT_S)
@@ -111,12 +111,12 @@ class Meter:
                 self.outcomes["cancelled"] += 1
 
     def throughput(self, now_s: float) -> list[int]:
-        """Completed rollouts of each of the last ``THROUGHPUT_S`` whole seconds, oldest first."""
+        """Return the completed rollouts of each of the last ``THROUGHPUT_S`` whole seconds, oldest first."""
         counts = dict(self._per_second)
         return [counts.get(second, 0) for second in range(int(now_s) - THROUGHPUT_S, int(now_s))]
 
     def latency_s(self, share: float) -> float:
-        """The latency that this share of the latest rollouts did not exceed; 0 before the first."""
+        """Return the latency in seconds that this share of recent rollouts does not exceed; 0 before the first."""
         return quantile(sorted(self._latency_s), share)
 
     def _count(self, second: int) -> None:

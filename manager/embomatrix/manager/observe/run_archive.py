@@ -1,4 +1,4 @@
-"""Runs as people look back on them: those that are open from the chronicle, those that were closed from the archive."""
+"""History of runs: open runs from the event log, closed runs from an archive on disk."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ logger = logging.getLogger(__name__)
 
 
 class RunHistory:
-    """Reads the process's own clocks: it is told of runs by their door, not by a state machine."""
+    """History of open and closed runs. Reads the process's own clocks."""
 
     def __init__(self, chronicle: RunEventLog, archive: RunArchive, cluster: ClusterState) -> None:
         self._event_log = chronicle
@@ -62,11 +62,11 @@ class RunHistory:
         self._event_log.submitted(batch, now_s=time.monotonic())
 
     def leads(self, run_id: str) -> PhaseSummary:
-        """How long before their demand the run's scenes were warm; gone once the run is closed."""
+        """Return how long before their demand the run's scenes were warm. Available until the run is closed."""
         return summary_of(self._cluster.scheduler.prewarm.counters(run_id).leads)
 
     async def closed(self, run_id: str, stats: RunStats, leads: PhaseSummary) -> None:
-        """The run is over, with these counters: it goes to the archive."""
+        """Move a closed run, with its final counters, to the archive."""
         record = self._event_log.close_run(run_id, now_s=time.monotonic())
         logger.info(
             "run closed run=%s: %d outcomes, %d failures", run_id, stats.delivered, stats.infra_failures
@@ -76,7 +76,7 @@ class RunHistory:
             await self._archive.keep(self._summed(record, info, leads), tuple(record.ring.events))
 
     async def summary(self, run_id: str) -> RunSummary:
-        """What a run came to, so far or in the end. Raises ``NotFoundError``."""
+        """Return the totals of an open or archived run. Raises NotFoundError."""
         record = self._event_log.runs.get(run_id)
         if record is not None:
             return self._summed(record, self.info(record), self.leads(run_id))
@@ -86,16 +86,16 @@ class RunHistory:
         return kept[0]
 
     def info(self, record: RunRecord) -> RunInfo:
-        """Of an open run."""
+        """Return the listing of an open run."""
         pending = self._cluster.dispatcher.pending_of(record.run_id)
         return self._info(record, self._cluster.stats(record.run_id), pending=pending)
 
     async def kept(self) -> list[RunInfo]:
-        """Runs that are kept, the one that was closed last first."""
+        """Return the archived runs, the last closed first."""
         return [summary.run for summary in await self._archive.summaries()]
 
     async def events(self, run_id: str, after: int, limit: int) -> EventPage:
-        """A page of the run's log, or of the fleet's for an empty id. Raises ``NotFoundError``."""
+        """Return a page of the run's log, or of workers and scenes for an empty id. Raises NotFoundError."""
         limit = min(limit or PAGE, PAGE)
         page = self._event_log.page(run_id, after, limit)
         if page is not None:
@@ -108,7 +108,7 @@ class RunHistory:
         return EventPage(tuple(beyond[:limit]), summary.events_dropped)
 
     async def latest(self, run_id: str, seconds: float) -> EventPage:
-        """The last of a run's log: events of so many seconds before its last. Raises ``NotFoundError``."""
+        """Return the events of the last seconds before the run's last event. Raises NotFoundError."""
         record = self._event_log.runs.get(run_id)
         if record is not None:
             events: Sequence[RunEvent] = record.ring.events
@@ -152,7 +152,7 @@ class RunHistory:
 
 
 def manager_version() -> str:
-    """Of the installed package."""
+    """Return the version of the installed package."""
     try:
         return version("embomatrix")
     except PackageNotFoundError:
@@ -171,9 +171,9 @@ _RUN_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
 
 class RunArchive:
-    """A folder with one file for each of the ``kept`` runs that were closed last.
+    """Folder with one file for each of the ``kept`` last closed runs.
 
-    What can't be written or read is said in the log and left out: no run fails for the sake of its history.
+    Read and write errors are logged and ignored: no run fails for its history.
     """
 
     def __init__(self, folder: Path, *, kept: int = RUNS_KEPT) -> None:
@@ -181,16 +181,16 @@ class RunArchive:
         self._kept = kept
 
     async def keep(self, summary: RunSummary, events: Sequence[RunEvent]) -> None:
-        """Write a run that was closed; an earlier one of the same id is replaced."""
+        """Write a closed run. It replaces an earlier run of the same id."""
         await asyncio.to_thread(self._write, summary, events)
 
     async def summaries(self) -> list[RunSummary]:
-        """What is kept, the run that was closed last first."""
+        """Return the archived runs, the last closed first."""
         return await asyncio.to_thread(self._read_all)
 
     async def load(self, run_id: str) -> tuple[RunSummary, tuple[RunEvent, ...]] | None:
-        """A run that is kept; None when there is none of that id."""
-        # What callers send becomes a file's name: only what can be a run's id does.
+        """Return an archived run; None if there is none of that id."""
+        # The id becomes a file name, so only valid run ids are accepted.
         if not _RUN_ID.fullmatch(run_id):
             return None
         return await asyncio.to_thread(self._read, self._path(run_id))
@@ -212,7 +212,7 @@ class RunArchive:
             logger.warning("history not kept run=%s: %s", summary.run.run_id, error)
 
     def _files(self) -> list[Path]:
-        """The latest first."""
+        """Return the files, newest first."""
         found = self._folder.glob(f"*{SUFFIX}")
         return sorted(found, key=lambda path: (path.stat().st_mtime_ns, path.name), reverse=True)
 

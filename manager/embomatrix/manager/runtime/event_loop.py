@@ -1,6 +1,6 @@
-"""The one owner of the state machines: feeds them events, carries out their commands, and keeps the clock going.
+"""Owner of the state machines: feeds them events, executes their commands, and drives the clock.
 
-Everything here runs on one event loop and never awaits between an event and its commands, so no lock is needed.
+Everything runs on one event loop and never awaits between an event and its commands, so it needs no lock.
 """
 
 from __future__ import annotations
@@ -55,9 +55,10 @@ logger = logging.getLogger(__name__)
 UNAUDITED: Final = "results are not audited: that takes a second worker"
 CLEANUP_S: Final = 5.0
 STOOD_STILL_S: Final = 1.0
-"""A tick that comes so late says that nobody was heard meanwhile."""
+"""A tick that is this late means that no worker was heard meanwhile."""
 LET_GO_S: Final = 30.0
-"""A manager that is cut off from its store for so long has its workers turn to another. As long as a lease lives."""
+"""A manager without its store for this long disconnects its workers, which then turn to another manager. Equals the
+life of a lease."""
 STORE_AWAY: Final = (
     "the manager is cut off from its store, and another one may lead: try again, or try the others"
 )
@@ -65,10 +66,10 @@ _SUSPENSION: Final = {True: ("suspended", "is away"), False: ("goes on", "is bac
 
 
 class ManagerRuntime:
-    """What the services call. ``start`` before the first call, ``serve`` for as long as it shall work.
+    """Entry point of the services. Call ``start`` first, then run ``serve``.
 
-    Results are kept for ``results_ttl_s`` after their batch ended, and at most ``results_kept`` of them. ``lapsed_s`` tells
-    for how long another manager may have had the lead, and ``unrenewed`` why: nothing is dispatched meanwhile.
+    Results are kept for ``results_ttl_s`` after their batch ended, ``results_kept`` of them at most. ``lapsed_s``
+    returns how long another manager may have led, and ``unrenewed`` why; nothing is dispatched meanwhile.
     """
 
     def __init__(
@@ -110,14 +111,14 @@ class ManagerRuntime:
         self._said_unaudited = False
 
     async def start(self) -> None:
-        """Take the state up where a former manager left it."""
+        """Restore the state of a former manager."""
         self._carry_out(self._intake.feed(await self._journal.reputes(), now_s=time.monotonic()))
         self._paused = await self._journal.paused()
         self._dispatch_or_not()
         await self.runs.restore()
 
     async def serve(self) -> None:
-        """Keep time and write results until cancelled. Ends with ``FencedError`` when another manager took over."""
+        """Drive the clock and write results until cancelled. Raises FencedError after another manager took over."""
         async with asyncio.TaskGroup() as group:
             group.create_task(self._keep_time())
             group.create_task(self._clean_up())
@@ -133,7 +134,9 @@ class ManagerRuntime:
         *,
         credential_id: str = "",
     ) -> tuple[WorkerSession, float]:
-        """Open a session for a worker; returns it and the heartbeat's interval in seconds once the worker is noted."""
+        """Open a session for a worker. Return it and the heartbeat interval in seconds after the worker has been
+        journaled.
+        """
         if self._lapsed_s() > LET_GO_S:
             raise UnavailableError(STORE_AWAY)
         session, commands = self._intake.register(worker_id, boot_id, resources, now_s=time.monotonic())
@@ -147,7 +150,7 @@ class ManagerRuntime:
 
     @contextlib.contextmanager
     def attached(self, session: WorkerSession) -> Iterator[WorkerLink]:
-        """The worker's stream is open for as long as this is held."""
+        """Hold the worker's stream open."""
         self._close_link(session.worker_id)
         link = self._links[session.worker_id] = WorkerLink(session)
         self.registry.attach(session, now_s=time.monotonic())
@@ -164,7 +167,9 @@ class ManagerRuntime:
     def take_report(
         self, link: WorkerLink, state: WorkerState | None, results: Sequence[LeaseResult], *, resync: bool
     ) -> None:
-        """What a worker says on its stream, or a part of it; ``deliver`` follows the last. ``resync`` for the first of all."""
+        """Process a worker's message, or a slice of it; ``deliver`` follows the last slice. ``resync`` marks the
+        first message.
+        """
         now_s, worker_id = time.monotonic(), link.session.worker_id
         ended = (*state.finished, *results) if state is not None else results
         self.event_log.reported(worker_id, ended, self.cluster.dispatcher.live_leases, now_s=now_s)
@@ -174,11 +179,11 @@ class ManagerRuntime:
         self._carry_out(commands, more=True)
 
     def deliver(self) -> None:
-        """A worker's message is heard to its end: results go on their way, in one transaction for all that it brought."""
+        """Write the results of a worker's message in one transaction, after its last slice."""
         self._delivery.hurry()
 
     def take_heartbeat(self, session_id: str, epoch: int, beat: Heartbeat) -> float:
-        """Renew the leases that the worker names; returns the seconds until the next heartbeat."""
+        """Renew the leases that the worker names. Return the seconds until the next heartbeat."""
         interval_s, commands = self._intake.heartbeat(session_id, epoch, beat, now_s=time.monotonic())
         self._carry_out(commands)
         return interval_s
@@ -190,7 +195,7 @@ class ManagerRuntime:
         error: ClusterError,
         standing: WorkerStanding = WorkerStanding.LOST,
     ) -> None:
-        """The session is over at once: its stream ends with the error, and what it held goes to others."""
+        """End the session at once: its stream ends with the error and its leases are re-dispatched."""
         events = self.registry.end(session, reason, standing)
         if events:
             logger.info("session ended worker=%s: %s", session.worker_id, reason)
@@ -198,13 +203,13 @@ class ManagerRuntime:
             self._close_link(session.worker_id, error)
 
     def drain_worker(self, worker_id: str) -> None:
-        """The worker gets nothing new, and leaves when it has finished what it holds."""
+        """Give the worker no new leases, and have it leave after its last one."""
         self._carry_out(self._intake.feed(*self.registry.drain(worker_id), now_s=time.monotonic()))
         if worker_id in self._links:
             self._links[worker_id].drain()
 
     def resume_worker(self, worker_id: str) -> None:
-        """Take a drain back; a worker that has left stays away."""
+        """Cancel the drain of a worker that has not left."""
         self._carry_out(self._intake.feed(*self.registry.resume(worker_id), now_s=time.monotonic()))
         if worker_id in self._links:
             self._links[worker_id].resume()
@@ -212,27 +217,27 @@ class ManagerRuntime:
 
     @property
     def paused(self) -> bool:
-        """Whether an operator stopped dispatch."""
+        """True if an operator paused dispatch."""
         return self._paused
 
     @property
     def store_problem(self) -> str:
-        """Why nothing can be written down, while that is so."""
+        """Problem of the state store; empty while it can be written."""
         if self._suspended and not self._delivery.problem:
             return self._unrenewed() or "the state store is away"
         return self._delivery.problem
 
     async def pause_dispatch(self) -> None:
-        """No new leases are given, also by the managers that come after this one; what runs goes on.
+        """Stop giving leases, also under later managers. Live leases continue.
 
-        UnavailableError where those could not be told.
+        Raises UnavailableError if later managers could not be told.
         """
         self._paused = True
         self._dispatch_or_not()
         await self._journal.note_pause(True)
 
     async def resume_dispatch(self) -> None:
-        """Leases are given again, unless the store is away. UnavailableError as above."""
+        """Give leases again, unless the store is away. Raises UnavailableError like ``pause_dispatch``."""
         self._paused = False
         self._dispatch_or_not()
         await self._journal.note_pause(False)
@@ -266,7 +271,9 @@ class ManagerRuntime:
             self._delivery.hurry()
 
     def _say(self, command: WorkerCommand) -> None:
-        """Without a stream the command is lost; the worker's next full state shows that, and it is given again."""
+        """Send a command. Without a stream the command is lost; the worker's next full state shows that, and it is
+        repeated.
+        """
         link = self._links.get(command.worker_id)
         if link is not None:
             link.put(command)
@@ -278,7 +285,7 @@ class ManagerRuntime:
             link.close(reason or SupersededError(taken))
 
     def _watch_the_lead(self) -> None:
-        """Dispatch nothing while another manager may; after some time leave the workers to it."""
+        """Suspend dispatch while another manager may lead, and disconnect the workers after ``LET_GO_S``."""
         lapsed_s = self._lapsed_s()
         if (lapsed_s > 0.0) != self._suspended:
             self._suspended = not self._suspended

@@ -1,4 +1,4 @@
-"""Result logs: what was delivered, by batch, for trainers to read from any cursor for as long as it is kept."""
+"""Result logs of batches, and the delivery of results from outcome to log."""
 
 from __future__ import annotations
 
@@ -27,14 +27,13 @@ logger = logging.getLogger(__name__)
 
 PER_MESSAGE: Final = 256
 LINGER_S: Final = 0.1
-"""Results are sent at once when a message is full or the batch at its end, else one message in this time: a batch that
-trickles shall not send one by one."""
+"""A full message, or the end of the batch, is sent at once; other results at most one message in this interval."""
 
 
 class BatchLog:
-    """The results of one batch in the order of their cursors.
+    """Results of one batch, ordered by cursor.
 
-    These rise from 1, without gaps unless the store lost its last second: what was lost comes again under later ones.
+    Cursors rise from 1 without gaps, unless the store lost its last second: lost results return under later cursors.
     """
 
     def __init__(
@@ -45,17 +44,17 @@ class BatchLog:
         rows: Sequence[ResultRow] = (),
         groups: Mapping[str, int] | None = None,
     ) -> None:
-        """``groups`` tells how many rollouts each has."""
+        """``groups`` gives the number of rollouts in each group."""
         self.run_id = run_id
         self.batch_id = batch_id
         self.digest = digest
         self.rows = list(rows)
         self.ends = GroupEnds(groups or {})
-        """Told of each result before it is appended."""
+        """Receives each result before it is appended."""
         self.finished_s: float | None = None
-        """When every rollout had its outcome; None before."""
+        """Time at which every rollout had its outcome; None before."""
         self.dropped = False
-        """The run was closed, or the log was given up: nothing more will come."""
+        """The run was closed, or the log was discarded: no more results follow."""
         self._changed = asyncio.Event()
         self._over = asyncio.Event()
 
@@ -78,7 +77,9 @@ class BatchLog:
         return self.dropped or self.finished_s is not None
 
     async def messages(self, cursor: int) -> AsyncIterator[list[ResultRow]]:
-        """All results beyond the cursor, to the end of the batch: the first at once, then as ``LINGER_S`` allows."""
+        """Yield all results after the cursor until the batch ends: the first at once, later ones as ``LINGER_S``
+        allows.
+        """
         due_s = 0.0
         while rows := await self.after(cursor, due_s):
             cursor = rows[-1].cursor
@@ -86,10 +87,10 @@ class BatchLog:
             yield rows
 
     async def after(self, cursor: int, due_s: float | None = None) -> list[ResultRow]:
-        """Waits for results beyond the cursor; returns some of them, or nothing when the batch is at its end.
+        """Wait for results after the cursor and return some of them; nothing once the batch has ended.
 
-        Others are waited for until ``due_s`` on the monotonic clock, by default as long as results linger. The wait ends
-        with the batch, whose rollouts have deadlines, or with the caller's own.
+        Further results are awaited until ``due_s`` on the monotonic clock, by default for ``LINGER_S``. The wait ends
+        with the batch, whose rollouts have deadlines, or with the caller's deadline.
         """
         while self.last_cursor <= cursor and not self.ended:
             await self._changed.wait()
@@ -103,7 +104,7 @@ class BatchLog:
 
     @property
     def last_cursor(self) -> int:
-        """Of the newest result; 0 before the first."""
+        """Cursor of the newest result; 0 before the first."""
         return self.rows[-1].cursor if self.rows else 0
 
     def _position(self, cursor: int) -> int:
@@ -115,7 +116,7 @@ class BatchLog:
 
 
 class ResultLogs:
-    """All logs, bounded: finished ones go after ``ttl_s``, or earlier when more than ``limit`` results are kept."""
+    """All logs. Finished logs are discarded after ``ttl_s``, or earlier if more than ``limit`` results are kept."""
 
     def __init__(self, *, ttl_s: float, limit: int) -> None:
         self._ttl_s = ttl_s
@@ -140,7 +141,7 @@ class ResultLogs:
             self.remove(log)
 
     def outdated(self, now_s: float) -> list[BatchLog]:
-        """Finished logs that are to be given up, oldest first."""
+        """Return the finished logs to discard, oldest first."""
         finished = sorted(
             (log for log in self if log.finished_s is not None), key=lambda log: log.finished_s or 0.0
         )
@@ -155,15 +156,14 @@ class ResultLogs:
 
 
 STORE_RETRY_S: Final = 0.5
-"""Between two attempts to write while the store is away."""
+"""Seconds between two attempts to write while the store is away."""
 
 
 class ResultDelivery:
-    """Owns the way of results. What a trainer saw, a restarted manager knows, so no cursor is ever given twice.
+    """Delivery of results. They are stored before a trainer sees them, so a restarted manager never reuses a cursor.
 
-    A worker hears that it may forget a result (``acknowledge``) only after the store has it: until then it is not lost
-    with the manager. ``on_logged`` is told of each run whose results are in their log, and how many seconds each of the
-    completed took.
+    A worker's result is acknowledged only after it is stored: until then the worker keeps it. ``on_logged`` receives
+    the run of logged results and the delivery time in seconds of each completed one.
     """
 
     def __init__(
@@ -181,23 +181,23 @@ class ResultDelivery:
         self._acknowledgements: list[AcknowledgeLease] = []
         self._fresh = asyncio.Event()
         self.problem = ""
-        """Why results wait for the store, while they do."""
+        """Reason why results wait for the store; empty while they do not."""
 
     def put(self, command: DeliverResult | FinishBatch) -> None:
-        """Queue a result, or the end of a batch. There are never more than there are rollouts in the cluster."""
+        """Queue a result, or the end of a batch. The queue is bounded by the number of rollouts in the cluster."""
         self._waiting.append(_Waiting(command, time.monotonic()))
 
     def put_acknowledgement(self, command: AcknowledgeLease) -> None:
-        """Queue what a worker may forget; said once everything that was queued before is written."""
+        """Queue an acknowledgement, which is sent after everything queued before it is stored."""
         self._acknowledgements.append(command)
 
     def hurry(self) -> None:
-        """Nothing more comes with what is queued: have it written."""
+        """Start to write the queue: no related results follow."""
         if self._waiting or self._acknowledgements:
             self._fresh.set()
 
     async def serve(self) -> None:
-        """Write until cancelled; ends with ``FencedError`` when another manager took the store over."""
+        """Write until cancelled. Raises FencedError after another manager took over."""
         while True:
             await self._fresh.wait()
             self._fresh.clear()
@@ -215,14 +215,16 @@ class ResultDelivery:
                 self._acknowledge(acknowledgement)
 
     async def give_up_outdated(self, now_s: float) -> None:
-        """Drop logs that are too old, or too many."""
+        """Discard logs that are too old or too many."""
         for log in self._logs.outdated(now_s):
             self._logs.remove(log)
             with contextlib.suppress(StateError):
                 await self._store.drop_batch(log.run_id, log.batch_id)
 
     async def _write(self, pages: Sequence[_Page]) -> None:
-        """Write what is new of all batches at once: a commit costs about the same for one row as for hundreds."""
+        """Write the new results of all batches in one transaction, since a commit of one row costs about as much as
+        one of hundreds.
+        """
         while parts := [page.part for page in pages if page.rows and not page.log.dropped]:
             try:
                 await self._store.append_results(parts)
@@ -252,7 +254,7 @@ class ResultDelivery:
 
 
 class _Waiting(NamedTuple):
-    """A command that waits to be written, and when it came, on the monotonic clock."""
+    """Queued command and its arrival time on the monotonic clock."""
 
     command: DeliverResult | FinishBatch
     arrived_s: float
@@ -260,7 +262,7 @@ class _Waiting(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Page:
-    """What is new in one batch: results with the time at which each came, and whether they are the last."""
+    """New results of one batch with their arrival times; ``last`` if the batch ends with them."""
 
     log: BatchLog
     results: Sequence[tuple[RolloutResult, float]]

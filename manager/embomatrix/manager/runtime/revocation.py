@@ -1,4 +1,4 @@
-"""Sending a worker away for good, whoever asks for it: by gRPC or by REST."""
+"""Revocation of tokens and workers, for gRPC and REST."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ if TYPE_CHECKING:
 
 
 class Revocation:
-    """Ends sessions and voids what they were opened with."""
+    """Revokes credentials and ends the sessions that they opened."""
 
     def __init__(self, sessions: ManagerRuntime, gate: Gate) -> None:
         self._sessions = sessions
         self._gate = gate
 
     async def revoke_worker(self, worker_id: str, reason: str) -> None:
-        """Its credential is void, its name barred until it joins anew, and its session ends.
+        """Revoke the worker's credential, block its name until it joins again, and end its session.
 
-        Raises NotFoundError for a name that nobody knows: what was mistyped would go on working.
+        Raises NotFoundError for an unknown name, since a mistyped worker would keep working.
         """
         registry = self._sessions.registry
         if not self._gate.knows_worker(worker_id) and worker_id not in registry.sessions:
@@ -34,7 +34,7 @@ class Revocation:
         self._end(worker_id, reason)
 
     async def revoke_token(self, token_id: str) -> None:
-        """The token is void, and every session that was opened with it ends."""
+        """Revoke the token and end every session that was opened with it."""
         await self._gate.revoke(token_id)
         for session in list(self._sessions.registry.sessions.values()):
             if session.credential_id == token_id:

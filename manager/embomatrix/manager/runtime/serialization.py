@@ -1,5 +1,6 @@
-"""Batches, results, windows and reputes as bytes: what the store keeps, and what a result's stream sends without converting it
-again.
+"""Serialized rows of the state store: batches, results, look-ahead windows and reputations.
+
+Result streams send the stored bytes without parsing them.
 """
 
 from __future__ import annotations
@@ -37,16 +38,16 @@ _KINDS: Final[Mapping[str, type[Outcome]]] = {
     "infra_failure": InfraFailure,
     "cancelled": Cancelled,
 }
-"""By the name of the field that has it."""
+"""Kind of outcome by the name of its protobuf field."""
 _DOUBLE: Final = struct.Struct("<d")
 _DELIVERED: Final = types_pb2.RolloutResult(
     completed=types_pb2.Completed(timings=types_pb2.Timings(deliver_s=1.0))
 ).SerializeToString()[: -_DOUBLE.size]
-"""What stands before the number in a message that tells nothing but how long a delivery took."""
+"""Tags and lengths that precede the delivery time in a message that holds nothing else."""
 
 
 def batch_row(batch: Batch) -> BatchRow:
-    """Equal batches give equal digests."""
+    """Return the batch's row. Equal batches give equal digests."""
     payload = batch.wire or batch_to_proto(batch).SerializeToString(deterministic=True)
     return BatchRow(batch.run_id, batch.batch_id, hashlib.sha256(payload).hexdigest(), payload)
 
@@ -56,7 +57,7 @@ def batch_of(row: BatchRow) -> Batch:
 
 
 def failed_rows(rows: Iterable[ResultRow]) -> int:
-    """How many of these ended as a failure of the infrastructure."""
+    """Return how many of these results are infrastructure failures."""
     results = (types_pb2.RolloutResult.FromString(row.payload) for row in rows)
     return sum(result.WhichOneof("outcome") == "infra_failure" for result in results)
 
@@ -66,40 +67,39 @@ def result_row(result: RolloutResult) -> ResultRow:
 
 
 def group_and_kind(row: ResultRow) -> tuple[str, type[Outcome]]:
-    """Of which group the rollout was, and what kind of outcome it had."""
+    """Return the group and the kind of outcome of a result."""
     message = types_pb2.RolloutResult.FromString(row.payload)
     return message.group_id, _KINDS[message.WhichOneof("outcome") or "cancelled"]
 
 
 def timed_row(row: ResultRow, deliver_s: float) -> ResultRow:
-    """A completed rollout's row with how long its way into the log took: known only then, so the store's row lacks it.
+    """Return a completed rollout's row with its delivery time, which is unknown when the row is stored.
 
-    Bytes of the same message that follow one another are one message (protobuf, "last one wins", merging nested ones),
-    so a row of kilobytes isn't parsed for one number.
+    Concatenated bytes of protobuf messages merge, so the row is extended without parsing it.
     """
     return ResultRow(row.cursor, row.rollout_id, row.payload + _DELIVERED + _DOUBLE.pack(deliver_s))
 
 
 def repute_row(worker_id: str, repute: Reputation) -> ShelfRow:
-    """Disputes end with the manager in which they are open: what they are about is executed again."""
+    """Return the row of a reputation. Open disputes are dropped, since their rollouts are executed again."""
     kept = {name: value for name, value in asdict(repute).items() if name != "disputed"}
     return ShelfRow(worker_id, json.dumps(kept, separators=(",", ":")).encode())
 
 
 def repute_of(row: ShelfRow) -> Reputation:
-    """What `repute_row` wrote."""
+    """Return the reputation of `repute_row`."""
     return Reputation(**json.loads(row.payload))
 
 
 def window_row(run_id: str, window: LookaheadWindow) -> ShelfRow:
-    """What the run announced last, as far as it has not come."""
+    """Return the row of a run's remaining look-ahead window."""
     entries = [lookahead_entry_to_proto(entry) for entry in window.entries]
     message = rollout_service_pb2.AnnounceLookaheadRequest(version=window.version, entries=entries)
     return ShelfRow(run_id, message.SerializeToString())
 
 
 def announced_in(row: ShelfRow) -> LookaheadAnnounced:
-    """What `window_row` wrote, as it was announced."""
+    """Return the window of `window_row`, as an announcement."""
     message = rollout_service_pb2.AnnounceLookaheadRequest.FromString(row.payload)
     entries = each("entries", lookahead_entry_from_proto, message.entries)
     return LookaheadAnnounced(row.key, message.version, entries)
@@ -110,5 +110,5 @@ def terms_payload(terms: RunTerms) -> bytes:
 
 
 def terms_of(row: RunRow) -> RunTerms:
-    """What a run asked for; the defaults for one that an older manager noted."""
+    """Return the terms of a stored run."""
     return run_terms_from_proto(rollout_service_pb2.OpenRunRequest.FromString(row.terms))

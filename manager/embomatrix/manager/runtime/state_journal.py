@@ -1,6 +1,4 @@
-"""What a manager notes for those that come after it: who is there, what is known of them, what runs announced, and whether
-dispatch is paused.
-"""
+"""State journal for later managers: present workers, reputations, look-ahead windows, and the dispatch pause."""
 
 from __future__ import annotations
 
@@ -23,13 +21,13 @@ logger = logging.getLogger(__name__)
 
 ROSTER_S: Final = 0.5
 NOTED_S: Final = 2.0
-"""A worker that joins waits this long to be noted: while the store is away, workers join all the same."""
+"""Limit of a joining worker's wait for its journal entry; workers also join while the store is away."""
 _DISPATCH: Final = "dispatch"
 _PAUSED: Final = b"paused"
 
 
 class StateJournal:
-    """Writes beside the decisions, and never holds them up. What the store could not take is written when it is back."""
+    """Writes beside the decisions and never delays them. Failed writes are repeated when the store is back."""
 
     def __init__(self, store: StateStore, registry: Registry, cluster: ClusterState) -> None:
         self._store = store
@@ -37,23 +35,23 @@ class StateJournal:
         self._dispatcher = cluster.dispatcher
         self._windows = cluster.scheduler.windows
         self._announced: dict[str, int] = {}
-        """Of each run the version of the window that was noted."""
+        """Version of the journaled window of each run."""
         self._present: frozenset[str] | None = None
         self._written = asyncio.Event()
-        """Set when the workers that are there have been noted next."""
+        """Set after the next write of the present workers."""
         self._urgent = asyncio.Event()
 
     async def reputes(self) -> ReputationsKnown:
-        """What former managers found out about workers."""
+        """Return the reputations that former managers stored."""
         rows = await self._store.rows(Shelf.REPUTES)
         return ReputationsKnown({row.key: repute_of(row) for row in rows})
 
     async def paused(self) -> bool:
-        """Whether an operator paused dispatch and nobody took that back."""
+        """Return True if an operator paused dispatch and did not resume it."""
         return ShelfRow(_DISPATCH, _PAUSED) in await self._store.rows(Shelf.SWITCHES)
 
     async def note_pause(self, paused: bool) -> None:
-        """Raises UnavailableError where it can't be noted: it then holds as long as this process."""
+        """Store the pause. Raises UnavailableError if that fails: the pause then holds for this process only."""
         row = ShelfRow(_DISPATCH, _PAUSED if paused else b"")
         try:
             await self._store.put_rows(Shelf.SWITCHES, [row])
@@ -64,13 +62,14 @@ class StateJournal:
             ) from error
 
     def hurry(self) -> None:
-        """What changed is to be noted at once: a worker was put in quarantine, or taken out of it."""
+        """Write changes now, such as a worker's quarantine."""
         self._urgent.set()
 
     async def noted(self, worker_id: str) -> None:
-        """Return when the manager that comes after this one would wait for the worker.
+        """Return after the worker is journaled, so that a later manager waits for it.
 
-        It gets no lease before: what it holds would be given out a second time. Workers that join together are noted together.
+        It gets no lease earlier, since a later manager would re-dispatch it at once. Workers that join together are
+        journaled together.
         """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(NOTED_S):
@@ -79,7 +78,7 @@ class StateJournal:
                     await self._written.wait()
 
     async def serve(self) -> None:
-        """Note what changed, again and again, and once more when this is cancelled: a manager that is killed loses a moment."""
+        """Write changes until cancelled, and once more at the end."""
         try:
             while True:
                 with contextlib.suppress(TimeoutError):
@@ -94,7 +93,7 @@ class StateJournal:
             await self._note_windows()
 
     async def _note_present(self) -> None:
-        """For the manager that comes after this one: whom it waits for."""
+        """Store the workers that a later manager must wait for."""
         present = self._registry.present | self._dispatcher.expected
         if present != self._present:
             with contextlib.suppress(StateError):
@@ -104,7 +103,7 @@ class StateJournal:
                 self._written = asyncio.Event()
 
     async def _note_windows(self) -> None:
-        """What runs announced since the last time: scenes go on being loaded ahead though their trainers say nothing anew."""
+        """Store windows that changed, so that preloading continues under a later manager."""
         now = {run_id: window.version for run_id, window in self._windows.items()}
         rows = [
             window_row(run_id, self._windows[run_id])

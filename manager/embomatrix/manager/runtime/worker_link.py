@@ -1,4 +1,4 @@
-"""The way to one worker: what waits to be said to it, gathered until its stream can take it."""
+"""Outbox of one worker: commands that wait for its stream."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ if TYPE_CHECKING:
     from embomatrix.rpc.wire.leases import LeaseRef
 
 ACKNOWLEDGE_S: Final = 0.2
-"""An acknowledgement waits for this long for something else to say: the worker only forgets a result with it. While work goes
-on, the next leases come sooner, and a message less is a wake-up less at both ends."""
+"""An acknowledgement waits this long to travel with other commands. While work goes on, leases leave sooner, and each
+message saved is a wake-up less at both ends."""
 
 WorkerCommand = SetDesired | GiveLease | CancelLease | AcknowledgeLease
 
 
 @dataclass(slots=True)
 class OutgoingMessage:
-    """One message to a worker. ``desired`` is None when it did not change."""
+    """One message to a worker. ``desired`` is None if it did not change."""
 
     desired: tuple[str, ...] | None = None
     leases: list[Lease] = field(default_factory=list)
@@ -34,7 +34,7 @@ class OutgoingMessage:
 
 
 class WorkerLink:
-    """An open session stream. Its outbox is bounded by the worker's credits; a later desired set replaces an earlier."""
+    """Open session stream. The worker's credits bound its outbox; a later desired set replaces an earlier one."""
 
     def __init__(self, session: WorkerSession) -> None:
         self.session = session
@@ -67,17 +67,17 @@ class WorkerLink:
         self._ready.set()
 
     def resume(self) -> None:
-        """Take a drain back."""
+        """Cancel a drain."""
         self._outbox.drain, self._outbox.resume = False, True
         self._ready.set()
 
     def close(self, reason: ClusterError) -> None:
-        """The stream must end; whoever waits in ``take`` gets the reason."""
+        """End the stream: a waiting ``take`` raises the reason."""
         self._closed = reason
         self._ready.set()
 
     async def take(self) -> OutgoingMessage:
-        """Waits until there is something to say; the wait ends with the stream."""
+        """Wait for commands and return them. Raises the reason when the stream is closed."""
         await self._ready.wait()
         if self._closed is not None:
             raise self._closed

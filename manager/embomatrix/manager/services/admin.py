@@ -1,4 +1,4 @@
-"""AdminService: what the cluster is doing, and a way to take a worker out."""
+"""AdminService: lists, logs, operator commands, and tokens."""
 
 from __future__ import annotations
 

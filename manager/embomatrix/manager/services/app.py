@@ -1,4 +1,4 @@
-"""Puts a manager together, serves until it is told to stop, and takes it apart again."""
+"""Process of a manager: election, gRPC server, HTTP server, and shutdown."""
 
 from __future__ import annotations
 
@@ -53,13 +53,13 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 STOP_GRACE_S: Final = 0.5
-"""Calls may end by themselves for this long; workers and trainers attach again to whoever comes next."""
+"""Calls may finish during this time; workers and trainers then attach to the next manager."""
 MEGABYTE: Final = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class Endpoints:
-    """Where a manager serves."""
+    """Addresses that a manager serves."""
 
     address: str
     """HOST:PORT of the gRPC services."""
@@ -71,9 +71,9 @@ async def serve(
     on_ready: Callable[[Endpoints], None],
     on_standby: Callable[[str], None] = lambda leader: None,
 ) -> None:
-    """Serve until SIGINT or SIGTERM. ``AccessError``, ``StateError`` and ``PortInUseError`` tell a person what to mend.
+    """Serve until SIGINT or SIGTERM. Raises AccessError, StateError or PortInUseError with a remedy.
 
-    ``on_standby`` hears the leader's address while another manager leads.
+    ``on_standby`` receives the leader's address while another manager leads.
     """
     allow_files()
     stop = asyncio.Event()
@@ -94,7 +94,7 @@ async def serve(
     await asyncio.wait((leading, stopping), return_when=asyncio.FIRST_COMPLETED)
     stopping.cancel()
     if not leads.is_set():
-        leading.cancel()  # it stands by, or ended: there is nothing to be brought to its end
+        leading.cancel()  # A standby has nothing to finish.
     with contextlib.suppress(asyncio.CancelledError):
         await leading
 
@@ -103,18 +103,18 @@ async def serve(
 async def running(
     settings: ManagerSettings, on_standby: Callable[[str], None] = lambda leader: None
 ) -> AsyncIterator[Endpoints]:
-    """A manager that leads for as long as this is held. While another one leads, it stands by before it is entered."""
+    """Run a manager while the context is held. It is entered when this manager leads."""
     protection = protection_of(settings)
     with _folder_errors(settings):
         total_bytes = settings.bundle_total_mb * MEGABYTE
         bundles = BundleStore(settings.data_dir / "bundles", total_bytes=total_bytes)
     async with contextlib.AsyncExitStack() as stack:
-        # Ports first: a manager that can't serve must not take the state from one that does.
+        # Ports are bound first: a manager that cannot serve must not take over the state.
         http_socket = stack.enter_context(
             bound_socket(settings.http_host, settings.http_port, option="http-")
         )
         with bound_socket(settings.host, settings.port) as probe:
-            # gRPC binds it again below, and would not tell why it can't.
+            # gRPC binds it again below, with less specific errors.
             settings = settings.model_copy(update={"port": probe.getsockname()[1]})
         store = open_store(settings.state_url)
         stack.push_async_callback(store.close)
@@ -141,7 +141,9 @@ async def running(
 
 
 def _page_url(host: str, port: int, tls: Tls | None) -> str:
-    """What a person opens: served on every address, it goes by a name in the certificate, else by this machine's."""
+    """Return the dashboard's URL. For a wildcard address its host is a name in the certificate, else this machine's
+    name.
+    """
     if is_every_address(host):
         names = () if tls is None else tls.names
         host = next((name for name in names if not is_loopback(name)), socket.gethostname())
@@ -158,8 +160,8 @@ def _gallery(dataset: Path | None) -> Gallery | None:
 
 
 def _candidate(settings: ManagerSettings) -> Candidate:
-    # Nobody else can serve at this address of this machine while this process is bound to it: a lead of that
-    # holder is that of its own former life.
+    # Only one process can be bound to this address, so a leader lease of the same holder belongs to an earlier
+    # process of this manager.
     holder = f"{socket.gethostname()}/{settings.address}"
     return Candidate(holder, settings.address, settings.leader_ttl_s)
 
@@ -170,7 +172,7 @@ async def _win(
     settings: ManagerSettings,
     on_standby: Callable[[str], None],
 ) -> int:
-    """Lead, at once or after having stood by; returns the epoch."""
+    """Wait until this manager leads and return its epoch."""
     server: grpc.aio.Server | None = None
 
     async def stand_by(leader: str) -> None:
@@ -214,7 +216,7 @@ async def _start_runtime(
         lost_after_s=settings.lost_after_s,
         stream_grace_s=settings.stream_grace_s,
     )
-    # Epochs of this manager's sessions and leases lie above those of every manager before it.
+    # Epochs of sessions and leases exceed those of all earlier managers.
     first_epoch = (epoch << 32) + 1
     registry = Registry(liveness, first_epoch=first_epoch)
     cluster = ClusterState(
@@ -240,7 +242,7 @@ async def _start_runtime(
 
 
 class _HttpServer:
-    """Uvicorn on a socket that is bound already, without its signal handlers: the manager has its own."""
+    """Uvicorn on a bound socket, without its signal handlers, since the manager has its own."""
 
     def __init__(self, app: FastAPI, bound: BoundedListener, tls: Tls | None) -> None:
         self._socket = bound
@@ -249,7 +251,7 @@ class _HttpServer:
             self._answer,
             interface="asgi3",
             http=connections_through(bound),
-            # Its lines go where ours go, in the same form.
+            # Uvicorn's log lines go through our handlers.
             log_config=None,
             log_level="warning",
             access_log=False,
@@ -262,7 +264,7 @@ class _HttpServer:
         self._server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign,assignment]
 
     def show(self, app: FastAPI) -> None:
-        """Answer by this application from now on."""
+        """Serve this application from now on."""
         self._app = app
 
     async def serve(self) -> None:
@@ -274,7 +276,7 @@ class _HttpServer:
 
 @contextlib.asynccontextmanager
 async def _stopped_at_exit() -> AsyncIterator[asyncio.TaskGroup]:
-    """A task group whose tasks are cancelled when the block ends, and whose first failure ends the block."""
+    """Task group whose tasks are cancelled when the block ends. The first failing task ends the block."""
     try:
         async with asyncio.TaskGroup() as group:
             yield group
@@ -284,7 +286,7 @@ async def _stopped_at_exit() -> AsyncIterator[asyncio.TaskGroup]:
 
 
 class _BlockEndedError(Exception):
-    """The block ended; not an error."""
+    """Signal that the block ended."""
 
 
 @contextlib.contextmanager

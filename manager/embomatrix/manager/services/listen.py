@@ -1,4 +1,4 @@
-"""Sockets that the manager listens on, and what a person can do when they can't be had."""
+"""Listening sockets of the manager, with remedies for addresses that cannot be bound."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class PortInUseError(Exception):
-    """The address can't be bound; the sentence says which and what to do."""
+    """Address that cannot be bound. The message names a remedy."""
 
 
 REMEDIES: Final[Mapping[int, str]] = {
@@ -30,7 +30,7 @@ REMEDIES: Final[Mapping[int, str]] = {
 
 @contextlib.contextmanager
 def bound_socket(host: str, port: int, *, option: str = "") -> Iterator[BoundedListener]:
-    """A socket bound to the address, closed on exit; ``option`` is what the names of its options begin with.
+    """Yield a socket bound to the address. ``option`` is the prefix of its command-line options.
 
     Raises PortInUseError.
     """
@@ -48,7 +48,7 @@ def bound_socket(host: str, port: int, *, option: str = "") -> Iterator[BoundedL
 
 
 def bind_server(server: grpc.aio.Server, host: str, port: int, tls: Tls | None) -> int:
-    """Have a gRPC server listen there, by TLS if there is a certificate; returns its port. Raises PortInUseError."""
+    """Bind a gRPC server, with TLS if there is a certificate. Return its port. Raises PortInUseError."""
     address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
     try:
         if tls is None:

@@ -1,4 +1,4 @@
-"""The gRPC server: all services of the manager on one port, with health and reflection."""
+"""gRPC server with all services on one port, health checks, reflection, and access control."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ SERVICES: Final = tuple(
 async def build_server(
     runtime: ManagerRuntime, gate: Gate, tls: Tls | None, settings: ManagerSettings
 ) -> tuple[grpc.aio.Server, int]:
-    """A server that is bound but not started, and its port (``port`` 0 takes a free one).
+    """Return a bound server that is not started, and its port.
 
     Raises PortInUseError.
     """
@@ -78,7 +78,7 @@ async def _add_health(server: grpc.aio.Server) -> None:
 
 
 class RoleInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc is untyped
-    """Lets a call through if the gate has nothing against it; what it carries is not parsed before that."""
+    """Rejects calls that the gate refuses, before their messages are parsed."""
 
     def __init__(self, gate: Gate) -> None:
         self._gate = gate

@@ -1,4 +1,4 @@
-"""What a manager serves while another one leads: it refuses every call, and names the leader."""
+"""Server of a standby manager, which refuses every call and names the leader."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Standby:
-    """``leader`` is the address of the manager that leads; set it whenever that changes."""
+    """Standby server. ``leader`` is the address of the current leader."""
 
     def __init__(self, tls: Tls | None = None) -> None:
         self._tls = tls
@@ -30,7 +30,7 @@ class Standby:
         return f"this manager stands by, the one at {self.leader} leads: pass both to --manager, as in A:PORT,B:PORT"
 
     async def serve_calls(self, host: str, port: int) -> grpc.aio.Server:
-        """A server that runs, with health ``NOT_SERVING``. Raises PortInUseError."""
+        """Return a running server with health ``NOT_SERVING``. Raises PortInUseError."""
         server = grpc.aio.server(options=SERVER_OPTIONS)
         servicer = health.aio.HealthServicer()
         health_pb2_grpc.add_HealthServicer_to_server(servicer, server)
@@ -41,7 +41,7 @@ class Standby:
         return server
 
     def page(self) -> FastAPI:
-        """The status page meanwhile. The manager is healthy: it does what it should."""
+        """Return the HTTP application of a standby. Its health check succeeds."""
         app = FastAPI(title="EmboMatrix manager", docs_url=None, redoc_url=None, openapi_url=None)
 
         @app.get("/")
@@ -56,7 +56,7 @@ class Standby:
 
 
 class _Refusal(grpc.GenericRpcHandler):  # type: ignore[misc]  # grpc is untyped
-    """Answers every method of every service."""
+    """Handler of every method of every service."""
 
     def __init__(self, standby: Standby) -> None:
         self._standby = standby
@@ -69,9 +69,9 @@ class _Refusal(grpc.GenericRpcHandler):  # type: ignore[misc]  # grpc is untyped
 
 
 def refusing(method: str, refusal: ClusterError) -> grpc.RpcMethodHandler:
-    """A handler for ``/package.Service/Method`` that refuses, of the method's own kind.
+    """Return a handler of the method's own kind that refuses every call.
 
-    gRPC answers a unary method's caller only through a unary handler. It has no deserializer: a stranger's message stays bytes.
+    gRPC delivers errors of unary methods only through unary handlers. The handler does not parse requests.
     """
 
     async def refuse(_: Any, context: grpc.aio.ServicerContext) -> None:
@@ -88,7 +88,7 @@ def refusing(method: str, refusal: ClusterError) -> grpc.RpcMethodHandler:
 
 
 def _streams(method: str) -> tuple[bool, bool]:
-    """Whether requests and answers of the method are streams; taken for both where nobody knows the method."""
+    """Return whether requests and answers of the method are streams; both for unknown methods."""
     try:
         found = descriptor_pool.Default().FindMethodByName(method.lstrip("/").replace("/", "."))
     except KeyError:

@@ -1,4 +1,4 @@
-"""How many connections the HTTP port holds, and for how long one may say nothing."""
+"""Limits of the HTTP port: connections, TLS handshakes, and silent clients."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ if TYPE_CHECKING:
     from uvicorn.server import ServerState
 
 CONNECTIONS: Final = 2048
-"""At most. A page opens six, a stream of events holds one."""
+"""Connections at most. A page opens six, an event stream holds one."""
 SILENT_S: Final = 10.0
-"""From a connection's beginning to its first whole request."""
+"""Seconds from the start of a connection to its first whole request."""
 FILES: Final = 65_536
-"""Open files that the manager asks for: sockets of workers, trainers and viewers, bundles, the store."""
+"""Requested limit of open files: sockets of workers, trainers and viewers, bundles, and the store."""
 
 
 class BoundedConnections(H11Protocol):
-    """One connection. It is closed at once where too many are open, and soon where nothing is asked on it."""
+    """HTTP connection that is closed at once above ``CONNECTIONS``, and after ``SILENT_S`` without a request."""
 
     most = CONNECTIONS
     silent_s = SILENT_S
     door: BoundedListener | None = None
-    """Through which they come."""
+    """Listener that accepted the connections."""
 
     def __init__(
         self,
@@ -43,7 +43,7 @@ class BoundedConnections(H11Protocol):
         self._patience: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        # A protocol takes any transport; uvicorn's takes a stream's alone, which is what a server opens.
+        # uvicorn narrows the parameter's type; a server passes a stream transport only.
         super().connection_made(cast("asyncio.Transport", transport))
         if self.door is not None:
             self.door.entered(transport.get_extra_info("peername"))
@@ -58,18 +58,18 @@ class BoundedConnections(H11Protocol):
         super().connection_lost(exc)
 
     def _close_silent(self) -> None:
-        # The first whole request makes it.
+        # The first whole request creates the cycle.
         if self.cycle is None:
             self.transport.abort()
 
 
 def connections_through(door: BoundedListener) -> type[BoundedConnections]:
-    """Those of a server that listens at this door."""
+    """Return the connection class of a server that uses this listener."""
     return type("ConnectionsThroughADoor", (BoundedConnections,), {"door": door})
 
 
 def allow_files() -> None:
-    """Raise this process's own limit of open files towards ``FILES``, as far as the system lets it."""
+    """Raise the process's limit of open files towards ``FILES``, as far as the system allows."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = FILES if hard == resource.RLIM_INFINITY else min(FILES, hard)
     if soft != resource.RLIM_INFINITY and soft < wanted:
@@ -77,15 +77,17 @@ def allow_files() -> None:
 
 
 WAITING: Final = 256
-"""Connections at most that were accepted and have not shaken hands. TLS takes 300 kB for one before it has said a word."""
+"""Accepted connections without a finished handshake at most. TLS takes 300 kB for each."""
 HANDSHAKE_S: Final = 10.0
-"""A handshake may take so long."""
+"""Time limit of a handshake, in seconds."""
 TURNED_AWAY_AT_A_TIME: Final = 256
-"""Then other work of the process gets its turn."""
+"""Rejected connections before other work of the process gets a turn."""
 
 
 class BoundedListener(socket.socket):
-    """For an asyncio server, which calls ``accept`` within its loop. Who comes when it is full is turned away at once."""
+    """Listening socket for an asyncio server. When too many handshakes are pending, new connections are closed at
+    once.
+    """
 
     most = WAITING
     patience_s = HANDSHAKE_S
@@ -103,7 +105,7 @@ class BoundedListener(socket.socket):
         raise BlockingIOError
 
     def entered(self, peer: object) -> None:
-        """The connection from this address shook hands, or is over: it waits no longer."""
+        """Note that the connection from this address finished its handshake, or is closed."""
         timer = self._waiting.pop(peer, None)
         if timer is not None:
             timer.cancel()
@@ -115,7 +117,7 @@ class BoundedListener(socket.socket):
 
 
 class _Guest(socket.socket):
-    """An accepted connection, which tells when it is over."""
+    """Accepted connection that reports its end."""
 
     def __init__(self, plain: socket.socket, on_close: Callable[[], None]) -> None:
         super().__init__(plain.family, plain.type, plain.proto, fileno=plain.detach())
@@ -126,6 +128,6 @@ class _Guest(socket.socket):
         super().close()
 
     def send_away(self) -> None:
-        """End it so that whoever waits for its words hears of it."""
+        """Shut the connection down, which wakes its readers."""
         with contextlib.suppress(OSError):
             self.shutdown(socket.SHUT_RDWR)

@@ -1,4 +1,4 @@
-"""Who may ask the manager's HTTP port for what: decided from the head of a request, before anything reads its body."""
+"""Access rules of the HTTP port, decided from a request's head before its body is read."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 STATIC: Final = "/static/"
 """Prefix of the page's files, which hold nothing about the cluster and need no token."""
 OPEN_PATHS: Final = frozenset({"/", "/healthz"})
-"""The empty page, which asks for the token itself, and the health check; the page's own files lie below ``STATIC``."""
+"""Page and health check, which need no token."""
 READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 VIEWERS: Final = frozenset({AccessRole.VIEWER, AccessRole.TRAINER, AccessRole.ADMIN})
 TRAINERS: Final = frozenset({AccessRole.TRAINER, AccessRole.ADMIN})
@@ -33,7 +33,7 @@ LOOPBACK_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
 
 
 class HttpRefusal(NamedTuple):
-    """Why a request gets no answer: the HTTP status, and a sentence for whoever asked."""
+    """HTTP status and message of a refused request."""
 
     status: int
     sentence: str
@@ -41,16 +41,16 @@ class HttpRefusal(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class HttpRules:
-    """``hosts`` are the names that this server answers to; empty: to any."""
+    """``hosts`` are the names that this server answers to; empty: any name."""
 
     gate: Gate
     hosts: frozenset[str]
 
     def refusal(self, method: str, path: str, headers: Headers) -> HttpRefusal | None:
-        """Why the request is refused; None if it isn't."""
+        """Return the reason to refuse the request; None if it is allowed."""
         host = headers.get("host", "")
         if self.hosts and _name_of(host) not in self.hosts:
-            # A page elsewhere must not reach this one under a name of its own (DNS rebinding).
+            # Prevents DNS rebinding: a foreign page must not reach this server under its own name.
             return HttpRefusal(
                 400, f"this server is not called {host[:100]!r}: add the name with `manager init --san`"
             )
@@ -72,7 +72,7 @@ class HttpRules:
 
 
 class Guard:
-    """ASGI middleware that keeps the rules; what comes over a WebSocket is refused, nothing here speaks it."""
+    """ASGI middleware that applies the rules. WebSockets are refused."""
 
     def __init__(self, app: ASGIApp, rules: HttpRules) -> None:
         self._app = app
@@ -91,7 +91,7 @@ class Guard:
 
 
 def allowed_hosts(bound: str, tls: Tls | None) -> frozenset[str]:
-    """The names to answer to: those in the certificate, those of loopback, or any where neither says."""
+    """Return the names to answer to: those of the certificate and of loopback; any name if neither applies."""
     if tls is not None:
         return LOOPBACK_NAMES | {name.lower() for name in tls.names}
     return LOOPBACK_NAMES if is_loopback(bound) else frozenset()
@@ -104,7 +104,7 @@ def _allowed(path: str, *, changes: bool) -> frozenset[AccessRole]:
 
 
 def _is_foreign(headers: Headers, host: str) -> bool:
-    """Whether a page of another origin sent this: browsers say so, other programs send neither header."""
+    """Return True if a page of another origin sent the request. Programs other than browsers send neither header."""
     origin = headers.get("origin")
     if origin is not None:
         return urlsplit(origin).netloc.lower() != host.lower()
@@ -112,5 +112,5 @@ def _is_foreign(headers: Headers, host: str) -> bool:
 
 
 def _name_of(host: str) -> str:
-    """The ``Host`` header without its port."""
+    """Return the ``Host`` header without its port."""
     return (urlsplit(f"//{host}").hostname or "").lower()

@@ -1,6 +1,6 @@
-"""The metrics page. It is made from the manager's own counters when somebody asks, so it costs nothing between two scrapes.
+"""Prometheus metrics, made from the manager's counters on each scrape.
 
-No label ever carries an id of a run, rollout, worker or scene: each has a closed set of values.
+Labels have closed sets of values; none carries the id of a run, rollout, worker or scene.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SLOT_STATES: Final = ("idle", "warming", "warm", "running", "quarantined")
 
 
 def metrics_page(runtime: ManagerRuntime) -> str:
-    """What Prometheus scrapes: the cluster, and the manager's own process."""
+    """Return the metrics of the cluster and of the manager's process."""
     registry = CollectorRegistry(auto_describe=False)
     registry.register(_Cluster(runtime))
     ProcessCollector(registry=registry)
@@ -41,7 +41,7 @@ def metrics_page(runtime: ManagerRuntime) -> str:
 
 
 class _Cluster(Collector):
-    """Metric families of one moment; ``docs/operations.md`` says what each is for."""
+    """Metric families of one moment, listed in ``docs/operations.md``."""
 
     def __init__(self, runtime: ManagerRuntime) -> None:
         self._runtime = runtime
@@ -124,7 +124,7 @@ class _Cluster(Collector):
         return {state: states[state] for state in SLOT_STATES}
 
     def _state_of_free(self, worker: WorkerRecord) -> str:
-        """What a slot without a rollout could do: start one at once, soon, or not."""
+        """Return the state of a slot without a rollout."""
         if worker.quarantined:
             return "quarantined"
         states = {resident.state for resident in self._runtime.cluster.scheduler.residents(worker.worker_id)}
@@ -156,7 +156,7 @@ def _counters(name: str, text: str, label: str, values: Mapping[str, float]) -> 
 
 
 def _histograms(name: str, text: str, label: str, values: Mapping[str, Histogram]) -> Metric:
-    """One histogram for each value of the label; without a label, the one under the empty name."""
+    """Return a family with one histogram per label value; without a label, the one under the empty name."""
     family = HistogramMetricFamily(name, text, labels=[label] if label else [])
     for key, histogram in values.items():
         counts = zip(BOUNDS_S, histogram.cumulative(), strict=True)
