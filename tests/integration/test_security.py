@@ -338,7 +338,7 @@ async def test_an_invitation_leads_to_its_own_manager_and_to_no_other(tmp_path):
     async with guarded(tmp_path / "one") as at, guarded(tmp_path / "two") as elsewhere:
         pinned = fingerprint_of(at.ca.decode())
         assert await fetch_ca(Invitation(at.address, "a.b", pinned)) == at.ca
-        with pytest.raises(NotAllowedError, match="not the manager that this invitation is from"):
+        with pytest.raises(NotAllowedError, match="not the manager of this invitation"):
             await fetch_ca(Invitation(elsewhere.address, "a.b", pinned))
         with pytest.raises(ManagerUnreachableError, match="no manager answers"):
             await fetch_ca(Invitation("127.0.0.1:1", "a.b", pinned))

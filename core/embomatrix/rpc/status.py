@@ -111,18 +111,18 @@ _NAMED: Final[Mapping[str, type[ClusterError]]] = {"unknown-session": UnknownSes
 _NAMES: Final = {error: name for name, error in _NAMED.items()}
 
 _TLS_TROUBLES: Final[Mapping[str, str]] = {
-    "WRONG_VERSION_NUMBER": "what answers at {address} does not speak TLS: leave --ca out, or check the port",
+    "WRONG_VERSION_NUMBER": "the server at {address} does not speak TLS: leave --ca out, or check the port",
     "[Hh]andshake failed": (
         "the certificate at {address} is not signed by the authority in --ca, or has expired: pass the ca.pem of that manager, "
         "or renew it with `embomatrix manager init`"
     ),
     "Hostname Verification": (
-        "the certificate at {address} is for other names: call the manager by one of them, or add this one with "
+        "the certificate at {address} is for other names: use one of them, or add this one with "
         "`embomatrix manager init --san NAME`"
     ),
     # Only while connecting: a manager that dies closes its connections too.
     "failed to connect .*Socket closed": (
-        "what answers at {address} closed the connection: if it speaks TLS, pass --ca, or set EMBOMATRIX_CA, to the ca.pem "
+        "the server at {address} closed the connection: if it speaks TLS, pass --ca, or set EMBOMATRIX_CA, to the ca.pem "
         "of that manager"
     ),
 }
@@ -141,7 +141,7 @@ async def translate(context: grpc.aio.ServicerContext) -> AsyncIterator[None]:
     except grpc.aio.AbortError:
         raise
     except Exception:
-        logger.exception("defect while serving a call")
+        logger.exception("unexpected error while serving a call")
         await _abort(
             context, grpc.StatusCode.INTERNAL, "the manager failed on this call: its log has the details"
         )
@@ -191,7 +191,7 @@ def cluster_error(error: grpc.aio.AioRpcError, address: str) -> ClusterError:
             )
         case grpc.StatusCode.UNIMPLEMENTED:
             return PreconditionError(
-                f"what listens at {address} is no manager of this version ({details}): "
+                f"the server at {address} is no manager of this version ({details}): "
                 "check --manager and update both"
             )
         case _:

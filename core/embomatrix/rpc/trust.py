@@ -122,8 +122,8 @@ async def _fetch_from(address: str, fingerprint: str) -> bytes:
         if fingerprint_of(answer.ca_certificate) == fingerprint:
             return str(answer.ca_certificate).encode("ascii")
     raise NotAllowedError(
-        f"who answers at {address} is not the manager that this invitation is from: its authority has another "
-        "fingerprint. Ask the operator for a new invitation, and how the network lets another machine answer"
+        f"the server at {address} is not the manager of this invitation: its authority has another "
+        "fingerprint. Ask the operator for a new invitation, and why another machine answers at this address"
     )
 
 
@@ -142,7 +142,7 @@ def _certificate_at(address: str) -> bytes:
             shown = tls.getpeercert(binary_form=True)
     except ssl.SSLError as error:
         raise ManagerUnreachableError(
-            f"what answers at {address} does not speak TLS, and the invitation says that the manager does: check its port"
+            f"the server at {address} does not speak TLS, but the invitation requires it: check the port"
         ) from error
     except OSError as error:
         raise ManagerUnreachableError(

@@ -207,7 +207,7 @@ async def test_a_folder_that_is_gone_is_named(tmp_path):
 
 async def test_a_bundle_that_was_never_put_is_not_found(tmp_path):
     store = BundleStore(tmp_path, total_bytes=1000)
-    with pytest.raises(NotFoundError, match="put it first"):
+    with pytest.raises(NotFoundError, match="upload it first"):
         await anext(store.get(digest_of(b"nothing")))
 
 

@@ -69,7 +69,7 @@ def test_ten_silent_seconds_lose_a_worker(registry):
     registry.tick(now_s=5.0)
     (lost,) = registry.tick(now_s=10.0)
     assert isinstance(lost, WorkerLost)
-    with pytest.raises(SupersededError, match="given up"):
+    with pytest.raises(SupersededError, match="is lost"):
         registry.find(session.session_id, session.epoch)
 
 

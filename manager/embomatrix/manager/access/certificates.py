@@ -63,7 +63,9 @@ def make_server_certificate(authority: KeyPair, names: Iterable[str], now: datet
     issuer = x509.load_pem_x509_certificate(authority.certificate)
     issuer_key = serialization.load_pem_private_key(authority.key, password=None)
     if not isinstance(issuer_key, ec.EllipticCurvePrivateKey):
-        raise ValueError("the authority's key is of another kind than this version makes")
+        raise ValueError(
+            "the authority's key is no elliptic-curve key: let `embomatrix manager init` make another authority"
+        )
     key = ec.generate_private_key(ec.SECP256R1())
     alternatives = [general_name(name) for name in names]
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "EmboMatrix manager")])

@@ -32,10 +32,10 @@ REMEMBERED_S: Final = 30 * 86_400.0
 LIMIT: Final = 100_000
 LABEL_LENGTH: Final = 200
 NO_TOKEN: Final = (
-    "no token, or a wrong one: pass --token, or set EMBOMATRIX_TOKEN to the token of this manager; for a worker that is to "
-    "join, ask the operator for another string (`embomatrix manager token issue --role join`)"
+    "missing or unknown token: pass --token, or set EMBOMATRIX_TOKEN to a token of this manager; to join a worker, "
+    "ask the operator for an invitation (`embomatrix manager token issue --role join`)"
 )
-_REPLACED: Final = "its worker asked for another before it had shown it"
+_REPLACED: Final = "its worker requested another before it used this one"
 _NOTHING: Final = hashlib.sha256(b"").hexdigest()
 
 
@@ -137,10 +137,10 @@ class CredentialBook:
             valid_s = valid_s or LONGEST_JOIN_S
             if valid_s > LONGEST_JOIN_S:
                 raise InvalidRequestError(
-                    f"a token to join is asked to be valid for {valid_s:.0f} s: at most {LONGEST_JOIN_S:.0f} s"
+                    f"a join token cannot be valid for {valid_s:.0f} s: at most {LONGEST_JOIN_S:.0f} s"
                 )
         if len(self._by_id) >= LIMIT:
-            raise OverloadedError(f"{len(self._by_id)} tokens are known, which is the most: revoke some")
+            raise OverloadedError(f"{len(self._by_id)} tokens exist, which is the limit: revoke some")
         secret = self._make_secret()
         credential = Credential(
             token_id=self._make_id(),
@@ -170,7 +170,7 @@ class CredentialBook:
             again = (join.worker_id, join.boot_id) == (worker_id, boot_id) and bool(boot_id)
             if not again or any(c.revoked or c.token_id in self._seen for c in given):
                 raise NotSignedInError(
-                    f"this token to join was used already, by worker {join.worker_id}: ask the operator for another "
+                    f"this join token was used already, by worker {join.worker_id}: ask the operator for another "
                     "(`embomatrix manager token issue --role join`)"
                 )
             changed = tuple(replace(c, revoked=_REPLACED) for c in given)
@@ -195,11 +195,11 @@ class CredentialBook:
         holder = self._holder(worker_id)
         if not bound_to and holder is not None and holder.token_id != credential_id:
             raise NotAllowedError(
-                f"the name {worker_id} belongs to a machine that joined with a credential of its own: pass another --name"
+                f"the name {worker_id} belongs to a machine that joined with its own credential: pass another --name"
             )
         if not bound_to and any(c.revoked for c in self._of_worker.get(worker_id, {}).values()):
             raise NotAllowedError(
-                f"worker {worker_id} was revoked: let it join anew (`embomatrix manager token issue --role join`)"
+                f"worker {worker_id} was revoked: let it join again (`embomatrix manager token issue --role join`)"
             )
 
     def revoke(self, token_id: str, reason: str) -> Credential:

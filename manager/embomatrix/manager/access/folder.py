@@ -118,7 +118,7 @@ def hand_out_to(data_dir: Path, role: AccessRole, target: Path) -> None:
             write_private(target / "token", folder.token(role).read_bytes())
     except FileNotFoundError as error:
         raise AccessError(
-            f"{error.filename} is not there any more: issue a token with `embomatrix manager token issue --role {role}`"
+            f"{error.filename} no longer exists: issue a token with `embomatrix manager token issue --role {role}`"
         ) from error
     except OSError as error:
         raise AccessError(f"{error.filename or target} can't be written ({error.strerror})") from error
@@ -172,7 +172,7 @@ def _certify(
             return
     if not authority.key:
         raise AccessError(
-            f"{folder.ca_key} is missing, so no certificate can be signed: bring it back for as long as this takes"
+            f"{folder.ca_key} is missing, so no certificate can be signed: restore the file for this command"
         )
     names = tuple(dict.fromkeys((*before, *sans, *LOCAL_NAMES, *_own_names())))
     try:
@@ -208,7 +208,7 @@ def _first_tokens(
         write_private(path, f"{token}{pinned}\n".encode())
         credentials.append(credential)
         made.append(
-            f"a token of the role {role}: {path}" + (", good for one worker and a day" if valid_s else "")
+            f"a token of the role {role}: {path}" + (", valid for one worker and one day" if valid_s else "")
         )
     if len(credentials) > len(known):
         rows = [asdict(credential) for credential in credentials]

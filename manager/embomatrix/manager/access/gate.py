@@ -98,8 +98,8 @@ class Gate:
             self._book.keep(*fresh)
         if self._shared.partition(".")[0] in self._book:
             raise AccessError(
-                "--token, or EMBOMATRIX_TOKEN, holds a token that this cluster issued for a role, and would make it an "
-                "admin's: leave it out, or pass another secret"
+                "--token, or EMBOMATRIX_TOKEN, holds a token that this cluster issued for a role, and would grant it the "
+                "role of an admin: leave it out, or pass another secret"
             )
 
     def caller(self, token: str) -> Caller:
@@ -124,7 +124,7 @@ class Gate:
         if method in OPEN or may_call(caller.role, method):
             return None
         return NotAllowedError(
-            f"a token of the role {caller.role} may not call {method.rpartition('/')[2]}: it takes {who_may(method)}"
+            f"a token of the role {caller.role} may not call {method.rpartition('/')[2]}: it needs {who_may(method)}"
         )
 
     def caller_of(self, context: grpc.aio.ServicerContext) -> Caller:
@@ -138,7 +138,7 @@ class Gate:
         caller = self.caller(token_of(_header(context)) or join_token)
         if not may_call(caller.role, _REGISTER):
             raise NotAllowedError(
-                f"a token of the role {caller.role} may not register workers: it takes {who_may(_REGISTER)}"
+                f"a token of the role {caller.role} may not register workers: it needs {who_may(_REGISTER)}"
             )
         if caller.role is AccessRole.JOIN:
             return await self._join(token_of(_header(context)) or join_token, worker_id, boot_id)
@@ -150,7 +150,7 @@ class Gate:
         """Raise NotAllowedError unless the caller's credential is the one that opened the worker's session."""
         if self.caller_of(context).token_id != credential_id:
             raise NotAllowedError(
-                f"the session of worker {worker_id} was opened with another credential: register with this one"
+                f"the session of worker {worker_id} was opened with another credential: register again with this one"
             )
 
     async def issue(self, role: AccessRole, *, valid_s: float, label: str) -> tuple[str, str]:
@@ -210,8 +210,8 @@ class Gate:
     def _need_guard(self) -> None:
         if not self._guarded:
             raise PreconditionError(
-                "this manager asks nobody for a token, so there are none to hand out or take back: run "
-                "`embomatrix manager init` for its data folder and start it again"
+                "this manager requires no tokens, so none can be issued or revoked: run "
+                "`embomatrix manager init` for its data folder and restart it"
             )
 
 

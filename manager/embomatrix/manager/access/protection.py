@@ -78,7 +78,7 @@ def _tls(settings: ManagerSettings, folder: AccessFolder) -> Tls | None:
             fingerprint_of(authority.decode("ascii"))
     except ssl.SSLError as error:
         raise AccessError(
-            f"{key_file} is not the key of the certificate {chain_file} ({error.reason}): pass two that belong together"
+            f"{key_file} is not the key of the certificate {chain_file} ({error.reason}): pass a matching pair"
         ) from error
     except OSError as error:
         raise AccessError(
@@ -89,8 +89,8 @@ def _tls(settings: ManagerSettings, folder: AccessFolder) -> Tls | None:
         raise AccessError(f"{chain_file} or {ca_file} holds no certificate (PEM): {error}") from error
     if left < timedelta(0):
         raise AccessError(
-            f"the certificate {chain_file} expired {-left.days} days ago: `embomatrix manager init` makes that of the data "
-            "folder anew"
+            f"the certificate {chain_file} expired {-left.days} days ago: `embomatrix manager init` renews the one of the "
+            "data folder"
         )
     if left < RENEWAL:
         logger.warning("the certificate %s expires in %d days: renew it", chain_file, left.days)

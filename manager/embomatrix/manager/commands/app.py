@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from embomatrix.rpc.wire.tokens import AccessRole
 
 app = typer.Typer(
-    help="Serve a Simulation Manager, or ask one how the cluster does.",
+    help="Serve a manager, or show the state of one.",
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -25,9 +25,7 @@ app = typer.Typer(
 
 app.add_typer(token_app, name="token")
 
-Token = Annotated[
-    str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="A token, or @FILE that holds it.", show_default=False)
-]
+Token = Annotated[str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="Token, or @FILE.", show_default=False)]
 Manager = Annotated[
     str,
     typer.Option("--manager", "--address", help="HOST:PORT of the manager.", envvar="EMBOMATRIX_MANAGER"),
@@ -35,55 +33,64 @@ Manager = Annotated[
 Ca = Annotated[
     Path | None,
     typer.Option(
-        envvar="EMBOMATRIX_CA", help="The ca.pem of a manager that serves by TLS.", show_default=False
+        envvar="EMBOMATRIX_CA", help="CA certificate (ca.pem) of a manager with TLS.", show_default=False
     ),
 ]
-DataDir = Annotated[Path | None, typer.Option(help="Folder of bundles and state.", show_default=False)]
+DataDir = Annotated[
+    Path | None, typer.Option(help="Folder of bundles and the state file.", show_default=False)
+]
 ShownDataset = Annotated[
-    Path | None, typer.Option(help="Folder of a dataset whose tasks the dashboard shows.", show_default=False)
+    Path | None, typer.Option(help="Dataset whose tasks the dashboard shows.", show_default=False)
 ]
 State = Annotated[
     str,
     typer.Option(help="memory: | sqlite:PATH | redis://HOST:PORT/DB. Default: a file in the data folder."),
 ]
 Advertise = Annotated[
-    str, typer.Option(help="HOST:PORT under which others reach this manager, if not where it serves.")
+    str,
+    typer.Option(
+        help="HOST:PORT under which others reach this manager, if different from the serving address."
+    ),
 ]
 SharedToken = Annotated[
     str,
     typer.Option(
         envvar="EMBOMATRIX_TOKEN",
-        help="One secret that is an admin's for everybody, beside the tokens of roles; or @FILE that holds it.",
+        help="Shared secret with the role of an admin, in addition to issued tokens; or @FILE.",
         show_default=False,
     ),
 ]
 TlsCert = Annotated[
-    Path | None, typer.Option(help="Certificate (PEM), else that of `init`.", show_default=False)
+    Path | None, typer.Option(help="Certificate chain (PEM). Default: the one of `init`.", show_default=False)
 ]
-TlsKey = Annotated[Path | None, typer.Option(help="Its private key.", show_default=False)]
-TlsCa = Annotated[Path | None, typer.Option(help="Certificate of who signed it.", show_default=False)]
+TlsKey = Annotated[
+    Path | None, typer.Option(help="Private key of the certificate (PEM).", show_default=False)
+]
+TlsCa = Annotated[
+    Path | None, typer.Option(help="Certificate of the signing authority (PEM).", show_default=False)
+]
 InsecureBind = Annotated[
-    bool, typer.Option("--insecure-bind", help="Serve outside this machine without TLS or tokens.")
+    bool, typer.Option("--insecure-bind", help="Serve beyond loopback without TLS or tokens.")
 ]
 Audit = Annotated[
     bool | None,
     typer.Option(
         "--audit/--no-audit",
-        help="Compare results of every run between workers; by default where others may join.",
+        help="Audit the results of all runs on other workers. Default: if other machines may join.",
         show_default=False,
     ),
 ]
 LogLines = Annotated[
-    LogFormat, typer.Option(help="Log lines for people, or as JSON.", envvar="EMBOMATRIX_LOG_FORMAT")
+    LogFormat, typer.Option(help="Format of log lines: human or json.", envvar="EMBOMATRIX_LOG_FORMAT")
 ]
 
 
 @app.command()
 def serve(
-    host: Annotated[str, typer.Option(help="Address for workers and trainers.")] = "127.0.0.1",
+    host: Annotated[str, typer.Option(help="Address of the gRPC services.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="gRPC port; 0 takes a free one.")] = 50070,
-    http_host: Annotated[str, typer.Option(help="Address of the status page.")] = "127.0.0.1",
-    http_port: Annotated[int, typer.Option(help="Port of the status page; 0 takes a free one.")] = 8070,
+    http_host: Annotated[str, typer.Option(help="Address of the dashboard.")] = "127.0.0.1",
+    http_port: Annotated[int, typer.Option(help="Port of the dashboard; 0 takes a free one.")] = 8070,
     state: State = "",
     advertise: Advertise = "",
     data_dir: DataDir = None,
@@ -140,12 +147,14 @@ def init(
     data_dir: DataDir = None,
     san: Annotated[
         list[str] | None,
-        typer.Option(help="A further name or address that clients call this machine by.", show_default=False),
+        typer.Option(help="Additional name or address of this machine; may be repeated.", show_default=False),
     ] = None,
     hand_out: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="ROLE:FOLDER", help="Put ca.pem and a token of the role there too.", show_default=False
+            metavar="ROLE:FOLDER",
+            help="Also copy ca.pem and a token of the role to FOLDER.",
+            show_default=False,
         ),
     ] = None,
 ) -> None:
@@ -228,7 +237,7 @@ def _serve(settings: ManagerSettings) -> None:
         )
 
     def on_standby(leader: str) -> None:
-        print(f"manager stands by: the one at {leader} leads", flush=True)
+        print(f"manager stands by: the manager at {leader} leads", flush=True)
 
     problem = ""
     try:

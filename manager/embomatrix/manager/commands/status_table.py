@@ -41,7 +41,7 @@ def _worker_table(workers: tuple[WorkerInfo, ...]) -> Table:
 
 
 def _run_table(runs: tuple[RunInfo, ...]) -> Table:
-    table = Table("run", "name", "pending", "delivered", "failures", "again", "late", "prewarm hits")
+    table = Table("run", "name", "pending", "delivered", "failures", "re-dispatched", "late", "prewarm hits")
     for run in runs:
         stats = run.stats
         asked = stats.prewarm_hits + stats.prewarm_misses

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from embomatrix.rpc.wire.tokens import TokenInfo
 
 app = typer.Typer(
-    help="Hand out tokens, look them over, take them back.",
+    help="Issue, list and revoke tokens.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
@@ -26,24 +26,22 @@ Manager = Annotated[
 ]
 Token = Annotated[
     str,
-    typer.Option(
-        envvar="EMBOMATRIX_TOKEN", help="An admin's token, or @FILE that holds it.", show_default=False
-    ),
+    typer.Option(envvar="EMBOMATRIX_TOKEN", help="Token of an admin, or @FILE.", show_default=False),
 ]
 Ca = Annotated[
     Path | None,
     typer.Option(
-        envvar="EMBOMATRIX_CA", help="The ca.pem of a manager that serves by TLS.", show_default=False
+        envvar="EMBOMATRIX_CA", help="CA certificate (ca.pem) of a manager with TLS.", show_default=False
     ),
 ]
 
 
 @app.command()
 def issue(
-    role: Annotated[str, typer.Option(help="join, worker, trainer, viewer or admin.")],
-    label: Annotated[str, typer.Option(help="For people: whom it is for.")] = "",
+    role: Annotated[str, typer.Option(help="Role: join, worker, trainer, viewer or admin.")],
+    label: Annotated[str, typer.Option(help="Label for lists, such as the owner's name.")] = "",
     hours: Annotated[
-        float, typer.Option(min=0.0, help="How long it is valid; 0: until revoked, or a day for one to join.")
+        float, typer.Option(min=0.0, help="Validity in hours; 0: until revoked, or one day for a join token.")
     ] = 0.0,
     manager: Manager = "127.0.0.1:50070",
     token: Token = "",
@@ -61,7 +59,7 @@ def issue(
     )
     if wanted is not AccessRole.JOIN:
         print(new)
-        typer.echo(f"id {token_id}; it is not told again", err=True)
+        typer.echo(f"id {token_id}; the token is not shown again", err=True)
         return
     pem = read_ca(ca).decode("ascii")
     print(Invitation(manager, new, fingerprint_of(pem) if pem else ""))
@@ -82,7 +80,7 @@ def list_(manager: Manager = "127.0.0.1:50070", token: Token = "", ca: Ca = None
 
 @app.command()
 def revoke(
-    token_id: Annotated[str, typer.Argument(help="The id that `list` shows.")],
+    token_id: Annotated[str, typer.Argument(help="Token id, as `list` shows it.")],
     manager: Manager = "127.0.0.1:50070",
     token: Token = "",
     ca: Ca = None,

@@ -209,7 +209,7 @@ class RunArchive:
             for old in self._files()[self._kept :]:
                 old.unlink(missing_ok=True)
         except OSError as error:
-            logger.warning("history not kept run=%s: %s", summary.run.run_id, error)
+            logger.warning("run history not archived run=%s: %s", summary.run.run_id, error)
 
     def _files(self) -> list[Path]:
         """Return the files, newest first."""
@@ -229,5 +229,5 @@ class RunArchive:
         except FileNotFoundError:
             return None
         except (OSError, EOFError, zlib.error, DecodeError, ConvertError) as error:
-            logger.warning("history can't be read file=%s: %s", path.name, error)
+            logger.warning("run history can't be read file=%s: %s", path.name, error)
             return None

@@ -107,7 +107,7 @@ class BundleStore:
             found = PREFIX + sha.hexdigest()
             if found != digest:
                 raise InvalidRequestError(
-                    f"the bundle's content has digest {found}, expected {digest}: it was damaged on its way, or misnamed"
+                    f"the bundle's content has digest {found}, expected {digest}: it was damaged in transit, or misnamed"
                 )
             inflation.finish()
             await asyncio.to_thread(self._make_room, size, self._needed())
@@ -121,7 +121,7 @@ class BundleStore:
         """Yield the bundle in chunks. Raises NotFoundError for an absent bundle."""
         path = self._path(digest)
         if not self.has(digest):
-            raise NotFoundError(f"the manager has no bundle {digest}: put it first")
+            raise NotFoundError(f"the manager has no bundle {digest}: upload it first")
         with path.open("rb") as file:
             while chunk := await asyncio.to_thread(file.read, CHUNK_BYTES):
                 yield chunk
@@ -156,7 +156,7 @@ class BundleStore:
         if used > self._total_bytes:
             raise OverloadedError(
                 f"the bundle folder {self._folder} holds {used} of {self._total_bytes} bytes and has no room for {size} "
-                "more; all others are needed or were used lately: try again later, raise bundle_total_mb, or close runs"
+                "more; all others are needed or were used recently: try again later, raise bundle_total_mb, or close runs"
             )
 
     def _path(self, digest: str) -> Path:

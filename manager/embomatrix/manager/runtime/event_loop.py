@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-UNAUDITED: Final = "results are not audited: that takes a second worker"
+UNAUDITED: Final = "results are not audited: auditing needs a second worker"
 CLEANUP_S: Final = 5.0
 STOOD_STILL_S: Final = 1.0
 """A tick that is this late means that no worker was heard meanwhile."""
@@ -60,7 +60,7 @@ LET_GO_S: Final = 30.0
 """A manager without its store for this long disconnects its workers, which then turn to another manager. Equals the
 life of a lease."""
 STORE_AWAY: Final = (
-    "the manager is cut off from its store, and another one may lead: try again, or try the others"
+    "the manager cannot reach its store, and another one may lead: try again, or try the other managers"
 )
 _SUSPENSION: Final = {True: ("suspended", "is away"), False: ("goes on", "is back")}
 
@@ -309,7 +309,7 @@ class ManagerRuntime:
             self.load.lag.observe(late_s)
             if late_s >= STOOD_STILL_S:
                 logger.warning(
-                    "the manager stood still for %.1f s: is its machine paused, or short of memory?", late_s
+                    "the manager did not run for %.1f s: is its machine paused, or short of memory?", late_s
                 )
                 self.registry.stood_still(late_s, now_s=time.monotonic())
             self._watch_the_lead()

@@ -78,7 +78,7 @@ class Leadership:
                 raise
             except StateError as error:
                 self._problem = str(error)
-                logger.warning("the lead could not be renewed: %s", error)
+                logger.warning("leader lease not renewed: %s", error)
             else:
                 self._renewed_s, self._problem = asked_s, ""
 
@@ -96,8 +96,8 @@ async def warn_of_another_folder(store: StateStore, folder: Path) -> None:
     noted = {row.key: row.payload for row in await store.rows(Shelf.SWITCHES)}.get(_KEY)
     if noted is not None and noted != _mark_of(folder):
         logger.warning(
-            "the data folder %s is not that of the manager that led last on this state: bundles of its runs are missing "
-            "here, and their rollouts would fail. Give all managers of a state one --data-dir, such as a network share",
+            "the data folder %s differs from that of the last leader on this state: bundles of its runs are missing here, "
+            "and their rollouts would fail. Give all managers of a state the same --data-dir, such as a network share",
             folder,
         )
 

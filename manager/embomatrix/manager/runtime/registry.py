@@ -185,7 +185,7 @@ class Registry:
                 "this session is not known or was superseded by a newer one: register again"
             )
         if session.standing.is_gone:
-            raise SupersededError(f"worker {worker_id} was given up ({session.reason}): register again")
+            raise SupersededError(f"worker {worker_id} is lost ({session.reason}): register again")
         return session
 
     def holder(self, session_id: str) -> WorkerSession:
@@ -259,7 +259,7 @@ class Registry:
         for session in self._silent_for(suspect_s, now_s):
             silent_s = now_s - session.last_seen_s
             if silent_s >= max(self._limits.lost_after_s, suspect_s):
-                events.append(self._lose(session, f"not heard of for {silent_s:.1f} s"))
+                events.append(self._lose(session, f"silent for {silent_s:.1f} s"))
             elif session.standing is WorkerStanding.READY:
                 session.standing = WorkerStanding.SUSPECT
                 events.append(WorkerSuspected(session.worker_id))
@@ -268,7 +268,7 @@ class Registry:
                 if session.standing is WorkerStanding.DRAINING:
                     events.append(self._lose(session, "it drained and left", WorkerStanding.LEFT))
                 else:
-                    events.append(self._lose(session, "its connection broke and it did not come back"))
+                    events.append(self._lose(session, "its connection broke and it did not reconnect"))
         return events
 
     def _there(self, worker_id: str) -> WorkerSession:
@@ -276,9 +276,7 @@ class Registry:
         if session is None:
             raise NotFoundError(f"there is no worker {worker_id!r}: connected are {listed(self.present)}")
         if session.standing.is_gone:
-            raise NotFoundError(
-                f"worker {worker_id!r} is gone ({session.reason}): start it again at its machine"
-            )
+            raise NotFoundError(f"worker {worker_id!r} is gone ({session.reason}): restart it on its machine")
         return session
 
     def _note(self, session: WorkerSession, now_s: float) -> None:

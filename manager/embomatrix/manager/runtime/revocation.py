@@ -28,7 +28,7 @@ class Revocation:
         if not self._gate.knows_worker(worker_id) and worker_id not in registry.sessions:
             raise NotFoundError(
                 f"there is no worker {worker_id!r}, so none was revoked: connected are {listed(registry.present)}; "
-                "`embomatrix manager token list` shows whose credentials there are"
+                "`embomatrix manager token list` lists all credentials"
             )
         await self._gate.revoke_worker(worker_id, reason)
         self._end(worker_id, reason)

@@ -132,7 +132,7 @@ class Runs:
                 self._feed(BatchRestored(batch, delivered, failed_rows(log.rows)))
         self._feed(WorkersExpected(await self._store.workers()))
         if self._runs:
-            logger.info("took up %d runs of a former manager", len(self._runs))
+            logger.info("restored %d runs of a former manager", len(self._runs))
 
     async def serve(self) -> None:
         """Queue large batches in slices, until cancelled."""
@@ -213,7 +213,7 @@ class Runs:
         log = self._logs.get(run_id, batch_id)
         if log is None:
             raise NotFoundError(
-                f"batch {batch_id!r} of run {run_id!r} is not known (any more): submit it again"
+                f"batch {batch_id!r} of run {run_id!r} is unknown or forgotten: submit it again"
             )
         return log
 
@@ -263,12 +263,14 @@ class Runs:
             )
         queued = self._cluster.dispatcher.queued
         if queued + count > self.limits.queued_rollouts:
-            raise OverloadedError(f"{queued} rollouts wait already: submit again when some have come back")
+            raise OverloadedError(
+                f"{queued} rollouts are queued already: submit again after some have finished"
+            )
         missing = self._bundles.missing([rollout.bundle_digest for rollout in batch.rollouts])
         if missing:
             raise PreconditionError(
                 f"the manager lacks {len(missing)} bundles of batch {batch.batch_id!r}, first {missing[0]}: "
-                f"put them first"
+                f"upload them first"
             )
 
     def _feed(self, event: Event) -> None:

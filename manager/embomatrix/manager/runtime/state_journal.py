@@ -58,7 +58,7 @@ class StateJournal:
         except StateError as error:
             done = "paused" if paused else "resumed"
             raise UnavailableError(
-                f"dispatch is {done}, but another manager would not know ({error}): ask again when the store is back"
+                f"dispatch is {done}, but other managers were not told ({error}): repeat the command when the store is back"
             ) from error
 
     def hurry(self) -> None:

@@ -151,7 +151,7 @@ async def _results(log: BatchLog, cursor: int) -> AsyncIterator[list[ResultRow]]
     async for rows in log.messages(cursor):
         yield rows
     if log.dropped:
-        raise NotFoundError(f"batch {log.batch_id!r} is no longer kept: its run was closed")
+        raise NotFoundError(f"batch {log.batch_id!r} was discarded: its run was closed")
 
 
 def _tell(

@@ -27,7 +27,7 @@ class Standby:
 
     @property
     def sentence(self) -> str:
-        return f"this manager stands by, the one at {self.leader} leads: pass both to --manager, as in A:PORT,B:PORT"
+        return f"this manager stands by, the manager at {self.leader} leads: pass both to --manager, as in A:PORT,B:PORT"
 
     async def serve_calls(self, host: str, port: int) -> grpc.aio.Server:
         """Return a running server with health ``NOT_SERVING``. Raises PortInUseError."""

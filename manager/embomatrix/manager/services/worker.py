@@ -136,7 +136,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
         async with translate(context):
             session = self._runtime.registry.find(request.session_id, request.session_epoch)
             self._check_session(context, session)
-            left = SupersededError(f"worker {session.worker_id} said that it leaves: its session is over")
+            left = SupersededError(f"worker {session.worker_id} has left: its session is over")
             self._runtime.end_session(session, "it left", left, WorkerStanding.LEFT)
         return pb.DeregisterResponse()
 

@@ -260,7 +260,7 @@ class RedisStore:
                 f"them results that were delivered: set `maxmemory-policy noeviction`"
             )
         if not about.get("aof_enabled"):
-            logger.warning("Redis at %s keeps no AOF: what it holds is lost when it stops", self._shown)
+            logger.warning("Redis at %s has no AOF: its data is lost when it stops", self._shown)
         self._checked = True
 
     async def _batch_ids(self, run_id: str) -> list[str]:

@@ -56,18 +56,20 @@ class HttpRules:
             )
         changes = method not in READING
         if changes and _is_foreign(headers, host):
-            return HttpRefusal(403, "a page of another origin asks for a change: open the manager's own page")
+            return HttpRefusal(
+                403, "a page of another origin requested a change: open the manager's own dashboard"
+            )
         if (path in OPEN_PATHS or path.startswith(STATIC)) and not changes:
             return None
         try:
             role = self.gate.caller(token_of(headers.get("authorization"))).role
         except NotSignedInError as error:
-            return HttpRefusal(401, f"{error}; HTTP requests show it as `Authorization: Bearer TOKEN`")
+            return HttpRefusal(401, f"{error}; HTTP requests send it as `Authorization: Bearer TOKEN`")
         if role not in _allowed(path, changes=changes):
             needed = (
                 AccessRole.TRAINER if path == REWARDS else AccessRole.ADMIN if changes else AccessRole.VIEWER
             )
-            return HttpRefusal(403, f"a token of the role {role} may not do this: it takes {needed}")
+            return HttpRefusal(403, f"a token of the role {role} may not do this: it needs {needed}")
         return None
 
 

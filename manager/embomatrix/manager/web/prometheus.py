@@ -74,33 +74,31 @@ class _Cluster(Collector):
         runtime, chronicle = self._runtime, self._runtime.event_log
         dispatcher, totals = runtime.cluster.dispatcher, runtime.cluster.totals()
         yield _gauge("embo_runs", "Open runs.", len(runtime.runs.open))
-        yield _gauge("embo_queue_depth", "Rollouts that wait for a lease.", dispatcher.queued)
+        yield _gauge("embo_queue_depth", "Queued rollouts.", dispatcher.queued)
         yield _gauge("embo_leases", "Live leases.", len(dispatcher.live_leases))
         outcomes = {name: runtime.meter.outcomes[name] for name in OUTCOMES}
         yield _counters("embo_rollouts", "Rollouts by outcome.", "outcome", outcomes)
         phases = {phase.value: histogram for phase, histogram in chronicle.phases().items()}
         yield _histograms("embo_rollout_seconds", "Time of completed rollouts by phase.", "phase", phases)
         yield _attempts(chronicle.attempts)
-        yield _counter("embo_redispatched", "Leases that were given again.", totals.redispatched)
-        yield _counter("embo_lease_expired", "Leases that nobody renewed or answered.", dispatcher.expired)
-        yield _counter("embo_stale_results", "Late results that were fenced off.", totals.stale_results)
+        yield _counter("embo_redispatched", "Re-dispatched leases.", totals.redispatched)
+        yield _counter("embo_lease_expired", "Expired leases.", dispatcher.expired)
+        yield _counter("embo_stale_results", "Late results that were rejected.", totals.stale_results)
         won = chronicle.hedges_won
         hedges = {"true": won, "false": max(0, totals.hedged - won)}
-        yield _counters(
-            "embo_hedges", "Second leases of stragglers, by whether they came first.", "won", hedges
-        )
-        yield _counter("embo_groups_failed", "Groups that were given up.", totals.groups_failed)
+        yield _counters("embo_hedges", "Hedge leases, by whether they delivered first.", "won", hedges)
+        yield _counter("embo_groups_failed", "Failed groups.", totals.groups_failed)
 
     def _prewarming(self) -> Iterator[Metric]:
         totals = self._runtime.cluster.totals()
         hits, misses = totals.prewarm_hits, totals.prewarm_misses
-        yield _counter("embo_prewarm_hits", "Scenes that were warm when their batch came.", hits)
-        yield _counter("embo_prewarm_misses", "Scenes that were not warm when their batch came.", misses)
-        yield _counter(
-            "embo_prewarm_wasted", "Loads ahead of demand that nobody used.", totals.prewarm_wasted
-        )
+        yield _counter("embo_prewarm_hits", "Scenes that were warm when their batch arrived.", hits)
+        yield _counter("embo_prewarm_misses", "Scenes that were not warm when their batch arrived.", misses)
+        yield _counter("embo_prewarm_wasted", "Preloaded scenes that were not used.", totals.prewarm_wasted)
         leads = {"": self._runtime.cluster.scheduler.prewarm.leads}
-        yield _histograms("embo_prewarm_lead_seconds", "From a scene being warm to its demand.", "", leads)
+        yield _histograms(
+            "embo_prewarm_lead_seconds", "Time between a scene being warm and its demand.", "", leads
+        )
 
     def _manager(self) -> Iterator[Metric]:
         runtime = self._runtime
@@ -108,12 +106,12 @@ class _Cluster(Collector):
         text = "CPU time of the manager over that of the manager and the slots, in the last minute."
         yield _gauge("embo_manager_overhead_ratio", text, share)
         lag = {"": runtime.load.lag}
-        yield _histograms("embo_manager_lag_seconds", "How late the manager's clock ticked.", "", lag)
+        yield _histograms("embo_manager_lag_seconds", "Lag of the manager's clock ticks.", "", lag)
         operations = runtime.load.store
         yield _histograms("embo_store_op_seconds", "Time of the state store's operations.", "op", operations)
         dropped = sum(run.ring.dropped for run in runtime.event_log.runs.values())
         dropped += runtime.event_log.dropped + runtime.event_log.fleet.ring.dropped
-        yield _counter("embo_events_dropped", "Events of logs that made room for later ones.", dropped)
+        yield _counter("embo_events_dropped", "Events discarded from full logs.", dropped)
 
     def _slot_states(self) -> dict[str, int]:
         states = Counter[str]()
@@ -166,7 +164,7 @@ def _histograms(name: str, text: str, label: str, values: Mapping[str, Histogram
 
 
 def _attempts(attempts: Mapping[int, int]) -> Metric:
-    family = HistogramMetricFamily("embo_attempts", "Leases that a rollout took to its outcome.", labels=[])
+    family = HistogramMetricFamily("embo_attempts", "Attempts per rollout.", labels=[])
     bounds = (1, 2, 3, 5, 10)
     within = [sum(count for attempt, count in attempts.items() if attempt <= bound) for bound in bounds]
     buckets = [(str(bound), float(count)) for bound, count in zip(bounds, within, strict=True)]

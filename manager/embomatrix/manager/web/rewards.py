@@ -126,7 +126,7 @@ async def _executed(runs: Runs, batch: Batch) -> dict[str, Outcome]:
             return await _read(log)
     except TimeoutError as error:
         raise UnavailableError(
-            f"{len(batch.rollouts)} answers took more than {LONGEST_S:g} s: send fewer at once, or add workers"
+            f"{len(batch.rollouts)} answers took more than {LONGEST_S:g} s: send fewer per request, or add workers"
         ) from error
     finally:
         if not log.ended:
