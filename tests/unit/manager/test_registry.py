@@ -130,7 +130,7 @@ def test_a_worker_that_leaves_in_order_is_not_counted_as_lost(registry):
     assert {session.standing for session in registry.sessions.values()} == {WorkerStanding.LEFT}
     with pytest.raises(SupersededError, match="it left"):
         registry.find(said.session_id, said.epoch)
-    with pytest.raises(NotFoundError, match=r"'said' is gone .it left.: start it again"):
+    with pytest.raises(NotFoundError, match=r"'said' is gone .it left.: restart it"):
         registry.resume("said")
     with pytest.raises(NotFoundError, match="no worker 'nobody': connected are none"):
         registry.resume("nobody")
