@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from embomatrix.factory.floorplan.layout import FloorPlan, plan_floor
-from embomatrix.factory.floorplan.spec import DoorSpec, RoomSpec, WindowSpec
+from embomatrix.factory.floorplan.spec import OpeningSpec, RoomSpec
 from embomatrix.factory.floorplan.walls import PANE_M, WALL_HEIGHT_M
 from embomatrix.factory.floorplan.windows import GAP_M, HEAD_M, LEAST_SILL_M, sill_and_head
 from embomatrix.world.geometry import Aabb, Pose
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Window
 
 ORIGIN = Pose((0.0, 0.0, 0.0))
-CASEMENT = WindowSpec("casement", 0.8, 0.92)
+CASEMENT = OpeningSpec("casement", 0.8, 0.92)
 
 
-def house(*windows: WindowSpec, seed: int = 0) -> FloorPlan:
+def house(*windows: OpeningSpec, seed: int = 0) -> FloorPlan:
     """A living room with these windows and a bathroom beside it."""
     rooms = [
-        RoomSpec("living_room_0", "living_room", (4.0, 5.0), (DoorSpec("front", 0.9, 2.0),), windows),
+        RoomSpec("living_room_0", "living_room", (4.0, 5.0), (OpeningSpec("front", 0.9, 2.0),), windows),
         RoomSpec("bathroom_0", "bathroom", (2.0, 2.0)),
     ]
     return plan_floor(rooms, np.random.default_rng(seed), trials=6)
@@ -66,12 +66,12 @@ def test_every_window_fits_the_wall(height: float) -> None:
 
 
 def test_a_window_wider_than_its_wall_is_cut_to_it() -> None:
-    (window,) = house(WindowSpec("front", 30.0, 2.0)).windows
+    (window,) = house(OpeningSpec("front", 30.0, 2.0)).windows
     assert 3.0 < window.width_m < 5.0
 
 
 def test_windows_without_a_wall_are_told() -> None:
-    plan = house(*[WindowSpec("bay", 3.0, 1.5)] * 40)
+    plan = house(*[OpeningSpec("bay", 3.0, 1.5)] * 40)
     assert 0 < len(plan.windows) < 40
     told = [sentence for sentence in plan.left_out if "window-bay" in sentence]
     assert told == [f"{40 - len(plan.windows)} window-bay in living_room_0: no outer wall has room for it"]
@@ -91,7 +91,7 @@ def test_a_garden_is_outside_to_the_windows_of_the_house() -> None:
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.tuples(st.floats(0.3, 9.0), st.floats(0.3, 5.0)), max_size=12), st.integers(0, 2**32 - 1))
 def test_no_window_meets_a_doorway_or_another_window(sizes: list[tuple[float, float]], seed: int) -> None:
-    plan = house(*(WindowSpec(f"w{i}", *size) for i, size in enumerate(sizes)), seed=seed)
+    plan = house(*(OpeningSpec(f"w{i}", *size) for i, size in enumerate(sizes)), seed=seed)
     taken = [(w.along, w.center_m[w.along == "x"], *ends(w)) for w in plan.windows]
     for door in plan.doorways:
         middle, half = door.center_m[door.along == "y"], door.width_m / 2

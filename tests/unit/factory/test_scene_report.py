@@ -15,8 +15,7 @@ from embomatrix.factory.commands.scenes import app
 from embomatrix.factory.scenes.batch import SceneBuildJob, run_batch
 from embomatrix.factory.scenes.check import STABLE_SHARE, ProblemKind, check_scene, check_settled
 from embomatrix.factory.scenes.floor import ReachableFloor
-from embomatrix.factory.scenes.report import report_of, report_on, unaccounted
-from embomatrix.factory.scenes.tables import TABLE_COLUMNS, report_table
+from embomatrix.factory.scenes.report import TABLE_COLUMNS, report_of, report_on, report_table, unaccounted
 from embomatrix.host.cores import usable_cores
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.codec import scene_from_json

@@ -1,4 +1,4 @@
-"""Doorways of a floor plan: one between every room and the room it is entered from, more where the inventory lists them."""
+"""Doorways of a floor plan: one from each room to the room it is entered from, and more if the inventory lists them."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from embomatrix.factory.floorplan.spec import (
     OPEN_PLAN,
     PRIVATE,
     SLEEPING,
-    DoorSpec,
     FloorPlanError,
+    OpeningSpec,
 )
-from embomatrix.factory.floorplan.walls import DoorCut, Rect, shared_edge
+from embomatrix.factory.floorplan.walls import Rect, WallCut, shared_edge
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -24,22 +24,23 @@ if TYPE_CHECKING:
     import numpy as np
 
     from embomatrix.factory.floorplan.spec import RoomSpec
+    from embomatrix.world.scene import Doorway
 
 FRONT_YARD_M: Final = 3.0
-"""Open ground before the front door, if any wall has it: nobody enters a house through a crack between two rooms."""
+"""Preferred free ground before the front door, so that it does not open into a gap between two rooms."""
 
 
 def place_doorways(
     rooms: Sequence[RoomSpec], rects: Mapping[str, Rect], parents: Mapping[str, str], rng: np.random.Generator
-) -> tuple[list[DoorCut], list[str]]:
-    """Doorways that join all rooms, the one that leads outside last, and a sentence on listed doors that found no place."""
+) -> tuple[list[WallCut[Doorway]], list[str]]:
+    """Return doorways that join all rooms, the exterior one last, and a sentence on listed doors without a place."""
     left = {r.name: list(r.doors) for r in rooms}
     types = {r.name: r.type for r in rooms}
     front = _front_door(rooms, rects)
-    if front.doorway.model:
-        room = front.doorway.rooms[0]
-        left[room].remove(next(d for d in left[room] if d.model == front.doorway.model))
-    # Pairs that list the same door go first, or a third room could take it.
+    if front.opening.model:
+        room = front.opening.rooms[0]
+        left[room].remove(next(d for d in left[room] if d.model == front.opening.model))
+    # Pairs that list the same door come first: otherwise a third room could use it.
     pairs = sorted(
         parents.items(), key=lambda p: not {d.model for d in left[p[0]]} & {d.model for d in left[p[1]]}
     )
@@ -64,11 +65,11 @@ def _join(
     a: str,
     b: str,
     rects: Mapping[str, Rect],
-    left: Mapping[str, list[DoorSpec]],
+    left: Mapping[str, list[OpeningSpec]],
     types: Mapping[str, str],
     rng: np.random.Generator,
-) -> DoorCut:
-    """A doorway between two neighbours; takes the door out of the rooms' lists of doors that are left."""
+) -> WallCut[Doorway]:
+    """Return a doorway between two neighbours and remove its door from the rooms' lists in ``left``."""
     edge = shared_edge(rects[a], rects[b])
     if edge is None:
         raise FloorPlanError(f"rooms {a!r} and {b!r} share no wall: expected neighbours")
@@ -76,22 +77,22 @@ def _join(
     if door is not None:
         width, height = door.width_m, door.height_m
     elif types[a] in OPEN_PLAN and types[b] in OPEN_PLAN:
-        # Short walls keep a counter's depth on either side of the passage.
+        # Short walls keep the depth of a counter on either side of the passage.
         width, height = min(OPEN_PASSAGE_M, max(MIN_DOOR_M, edge.length - 1.4)), MAX_DOOR_HEIGHT_M
     else:
         width, height = 0.9, 2.05
     width = min(max(width, MIN_DOOR_M), edge.length)
     slack = edge.length - width
-    # Doors hang near a corner, which keeps the walls long; wide passages may sit in the middle too.
+    # Doors are near a corner, which leaves long walls; wide passages may also be in the middle.
     ends = (
         (slack / 2,) if slack < 0.5 else (0.2, slack - 0.2) if width <= 1.2 else (0.1, slack / 2, slack - 0.1)
     )
     start = edge.start + float(rng.choice(ends))
-    return edge.cut((a, b), start, width, min(height, MAX_DOOR_HEIGHT_M), door.model if door else "")
+    return edge.doorway((a, b), start, width, min(height, MAX_DOOR_HEIGHT_M), door.model if door else "")
 
 
-def _take_door(a: list[DoorSpec], b: list[DoorSpec]) -> DoorSpec | None:
-    """The door that both rooms list, else the first of either; removed from the lists."""
+def _take_door(a: list[OpeningSpec], b: list[OpeningSpec]) -> OpeningSpec | None:
+    """Remove and return the door that both rooms list, else the first door of either."""
     both = [d for d in a if d in b]
     if both:
         a.remove(both[0])
@@ -100,16 +101,16 @@ def _take_door(a: list[DoorSpec], b: list[DoorSpec]) -> DoorSpec | None:
     return a.pop(0) if a else b.pop(0) if b else None
 
 
-def _front_door(rooms: Sequence[RoomSpec], rects: Mapping[str, Rect]) -> DoorCut:
-    """The exterior door, in the most public room that has enough of an outer wall.
+def _front_door(rooms: Sequence[RoomSpec], rects: Mapping[str, Rect]) -> WallCut[Doorway]:
+    """Return the exterior door, in the most public room with enough outer wall.
 
-    A door that a single room lists is an exterior one, so a public room with such a door goes first. In a house without public
-    rooms, a hotel's suite, people enter the bedroom, not the bathroom.
+    A door listed by a single room is an exterior one: a public room with such a door comes first. A house without public
+    rooms, such as a hotel suite, is entered through the bedroom.
     """
     listed = Counter(model for r in rooms for model in {d.model for d in r.doors})
     public = [kind for kind in ENTRANCES if any(r.type == kind for r in rooms)] or list(SLEEPING)
 
-    def own_doors(room: RoomSpec) -> list[DoorSpec]:
+    def own_doors(room: RoomSpec) -> list[OpeningSpec]:
         return [d for d in room.doors if listed[d.model] == 1 and room.type in public]
 
     def order(room: RoomSpec) -> tuple[bool, int]:
@@ -118,7 +119,7 @@ def _front_door(rooms: Sequence[RoomSpec], rects: Mapping[str, Rect]) -> DoorCut
 
     for yard_m in (FRONT_YARD_M, 0.5):
         for room in sorted(rooms, key=order):
-            door = max(own_doors(room), key=lambda d: d.width_m, default=DoorSpec("", 0.9, 2.05))
+            door = max(own_doors(room), key=lambda d: d.width_m, default=OpeningSpec("", 0.9, 2.05))
             others = [r for n, r in rects.items() if n != room.name]
             outer = rects[room.name].outer_edges(others, yard_m)
             edge = max(outer, key=lambda e: e.length, default=None)
@@ -126,5 +127,5 @@ def _front_door(rooms: Sequence[RoomSpec], rects: Mapping[str, Rect]) -> DoorCut
                 width = min(max(door.width_m, MIN_DOOR_M), edge.length - 0.1)
                 start = edge.start + (edge.length - width) / 2
                 height = min(door.height_m, MAX_DOOR_HEIGHT_M)
-                return edge.cut((room.name, ""), start, width, height, door.model)
+                return edge.doorway((room.name, ""), start, width, height, door.model)
     raise FloorPlanError("no room has an outer wall wide enough for a front door")

@@ -1,7 +1,7 @@
-"""Floor plans: pack a house's true floor rectangles edge to edge and join them by doorways.
+"""Floor plans: the floor rectangles of a house, packed edge to edge and joined by doorways.
 
-Every room is packed as its floor grown by half a wall on each side, so neighbouring floors lie exactly one wall apart. Rooms
-attach one by one to a side of a room that is already placed (slot packing); the best of many seeded trials wins.
+Every room is packed as its floor grown by half a wall on each side, so neighbouring floors lie exactly one wall apart. The
+best of many seeded trials of slot packing wins.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ if TYPE_CHECKING:
 
 TRIALS: Final = 80
 FINALISTS: Final = 6
-"""Packings that get doors and windows before one is chosen."""
+"""Best packings that get doors and windows before one is chosen."""
 WINDOW_COST_M2: Final = 3.0
-"""What a window without a wall costs a plan, in square metres of extent."""
+"""Cost of a window without a wall, in square metres of extent."""
 
 
 @dataclass(frozen=True, slots=True)
 class FloorPlan:
-    """Rooms, walls, doorways and windows, and a sentence for every listed door or window without a place.
+    """Rooms, walls, doorways and windows, and a sentence for each listed door or window without a place.
 
-    The last doorway leads outside; it is filled by a closed leaf, part of ``walls``, as windows are by their panes.
+    The last doorway leads outside. Its closed panel, like the panes of windows, is part of ``walls``.
     """
 
     rooms: tuple[Room, ...]
@@ -46,14 +46,9 @@ class FloorPlan:
     windows: tuple[Window, ...] = ()
     left_out: tuple[str, ...] = ()
 
-    @property
-    def compactness(self) -> float:
-        """Share of the plan's bounding box that is room floor or wall, in (0, 1]."""
-        return compactness(self.rooms)
-
 
 def compactness(rooms: Sequence[Room]) -> float:
-    """Share of the rooms' bounding box that is floor or wall, in (0, 1]."""
+    """Return the share of the rooms' bounding box that is floor or wall, in (0, 1]."""
     low = np.min([r.low_m for r in rooms], axis=0) - WALL_M / 2
     high = np.max([r.high_m for r in rooms], axis=0) + WALL_M / 2
     used = sum((r.size_m[0] + WALL_M) * (r.size_m[1] + WALL_M) for r in rooms)
@@ -61,9 +56,9 @@ def compactness(rooms: Sequence[Room]) -> float:
 
 
 def plan_floor(rooms: Sequence[RoomSpec], rng: np.random.Generator, *, trials: int = TRIALS) -> FloorPlan:
-    """Pack the rooms, connect all of them by doorways and raise the walls.
+    """Pack the rooms, connect all of them by doorways, and build the walls.
 
-    Deterministic for a given generator state. Raises FloorPlanError when there are no rooms or they can't be joined by doors.
+    Equal generator states give equal plans. Raises FloorPlanError if there are no rooms or they can't be joined by doors.
     """
     if not rooms:
         raise FloorPlanError("no rooms to pack: expected at least one")
@@ -79,7 +74,7 @@ def plan_floor(rooms: Sequence[RoomSpec], rng: np.random.Generator, *, trials: i
 
 
 def _finish(rooms: Sequence[RoomSpec], packing: Packing, rng: np.random.Generator) -> tuple[float, FloorPlan]:
-    """Doorways, windows and walls for a packing, and its score with what every window without a wall costs."""
+    """Add doorways, windows and walls to a packing; return its score, windows without a wall included, and the plan."""
     low = np.min([r.low for r in packing.rects.values()], axis=0)
     rects = {name: rect.moved(-float(low[0]), -float(low[1])) for name, rect in packing.rects.items()}
     doors, unused = place_doorways(rooms, rects, packing.parents, rng)
@@ -87,8 +82,8 @@ def _finish(rooms: Sequence[RoomSpec], packing: Packing, rng: np.random.Generato
     plan = FloorPlan(
         rooms=tuple(Room(s.name, s.type, *rects[s.name].floor) for s in rooms),
         walls=build_walls(rects, doors, panes),
-        doorways=tuple(cut.doorway for cut in doors),
-        windows=tuple(cut.window for cut in panes),
+        doorways=tuple(cut.opening for cut in doors),
+        windows=tuple(cut.opening for cut in panes),
         left_out=(*unused, *walled_up),
     )
     listed = sum(len(room.windows) for room in rooms)

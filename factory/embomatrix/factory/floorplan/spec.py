@@ -1,4 +1,4 @@
-"""What a floor plan is made from: rooms with true floors, doors and windows, and what types of rooms want next to them."""
+"""Input of the floor planner: rooms with their floor sizes, doors and windows, and preferred neighbours by room type."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 MIN_DOOR_M: Final = 0.8
 MAX_DOOR_HEIGHT_M: Final = 2.1
 OPEN_PASSAGE_M: Final = 1.8
-"""Width of a passage between two rooms of an open plan, as far as their wall is long enough."""
+"""Width of a passage between two rooms of an open plan, if their wall is long enough."""
 
 ENTRANCES: Final = (
     "entryway",
@@ -59,7 +59,7 @@ PARENTS: Final[Mapping[str, tuple[str, ...]]] = {
     "garage": ("corridor", "utility_room", "entryway", "kitchen", "living_room"),
     "garden": ("living_room", "corridor", "dining_room", "kitchen", "entryway"),
 }
-"""Where the rooms of a type are entered from, the most natural first; any hub for a type that is not listed."""
+"""Room types from which rooms of a type are entered, most natural first; any hub for unlisted types."""
 PRIVATE: Final = frozenset(
     {
         "bathroom",
@@ -80,7 +80,7 @@ OPEN_PLAN: Final = frozenset(
 
 
 OUTDOORS: Final = frozenset({"garden"})
-"""Ground under the sky: windows of the house look onto it."""
+"""Outdoor types: windows of the house face them."""
 
 
 class FloorPlanError(ValueError):
@@ -88,17 +88,8 @@ class FloorPlanError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class DoorSpec:
-    """A door model of the inventory: leaf width and height in metres."""
-
-    model: str
-    width_m: float
-    height_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class WindowSpec:
-    """A window model of the inventory: width and height in metres."""
+class OpeningSpec:
+    """Door or window model of the inventory with its width and height in metres."""
 
     model: str
     width_m: float
@@ -107,10 +98,10 @@ class WindowSpec:
 
 @dataclass(frozen=True, slots=True)
 class RoomSpec:
-    """A room of the inventory before it has a place; ``floor_m`` may be turned by a quarter."""
+    """Room of the inventory before it is placed; ``floor_m`` may be turned by a quarter."""
 
     name: str
     type: str
     floor_m: Vec2
-    doors: tuple[DoorSpec, ...] = ()
-    windows: tuple[WindowSpec, ...] = ()
+    doors: tuple[OpeningSpec, ...] = ()
+    windows: tuple[OpeningSpec, ...] = ()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 from embomatrix.world.geometry import ConvexPart, Pose, Shape
 from embomatrix.world.scene import Doorway, Window
@@ -20,13 +20,14 @@ DOOR_LEAF_M: Final = 0.05
 PANE_M: Final = 0.02
 
 Interval = tuple[float, float]
+OpeningT = TypeVar("OpeningT", Doorway, Window)
 
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """Stretch of a wall's centre line that is free for a doorway: floor on one or both sides of all of it.
+    """Stretch of a wall's centre line in which a doorway or window can be cut.
 
-    ``along`` is the axis that it runs along, ``at`` its coordinate on the other axis.
+    It runs along the axis ``along``, at the coordinate ``at`` of the other axis.
     """
 
     along: str
@@ -38,45 +39,30 @@ class Edge:
     def length(self) -> float:
         return self.end - self.start
 
-    def cut(self, rooms: tuple[str, str], start: float, width: float, height: float, model: str) -> DoorCut:
-        """A doorway in this edge from ``start`` (a coordinate on the axis) over ``width`` metres."""
-        middle = start + width / 2
-        center = (middle, self.at) if self.along == "x" else (self.at, middle)
-        doorway = Doorway(rooms, center, width, height, self.along, model)
-        return DoorCut(doorway, self, (start, start + width))
+    def point(self, at: float) -> Vec2:
+        """Return the point of the centre line with this coordinate along the axis."""
+        return (at, self.at) if self.along == "x" else (self.at, at)
 
-    def glaze(
-        self, rooms: tuple[str, str], start: float, width: float, sill: float, head: float, model: str
-    ) -> WindowCut:
-        """A window in this edge from ``start`` (a coordinate on the axis) over ``width`` metres."""
-        middle = start + width / 2
-        center = (middle, self.at) if self.along == "x" else (self.at, middle)
-        return WindowCut(
-            Window(rooms, center, width, sill, head, self.along, model), self, (start, start + width)
-        )
+    def doorway(
+        self, rooms: tuple[str, str], start: float, width: float, height: float, model: str
+    ) -> WallCut[Doorway]:
+        """Cut a doorway that begins at the coordinate ``start``."""
+        center = self.point(start + width / 2)
+        return WallCut(Doorway(rooms, center, width, height, self.along, model), self, (start, start + width))
 
 
 @dataclass(frozen=True, slots=True)
-class DoorCut:
-    """A doorway and the interval that it takes out of its wall's centre line."""
+class WallCut(Generic[OpeningT]):
+    """Doorway or window, and the interval that it takes out of its wall's centre line."""
 
-    doorway: Doorway
-    edge: Edge
-    interval: Interval
-
-
-@dataclass(frozen=True, slots=True)
-class WindowCut:
-    """A window and the interval that it takes out of its wall's centre line."""
-
-    window: Window
+    opening: OpeningT
     edge: Edge
     interval: Interval
 
 
 @dataclass(frozen=True, slots=True)
 class Rect:
-    """A room grown by half a wall on each side."""
+    """Floor of a room grown by half a wall on each side."""
 
     x0: float
     y0: float
@@ -108,7 +94,7 @@ class Rect:
         )
 
     def outer_edges(self, others: Iterable[Rect], clear_m: float) -> list[Edge]:
-        """Stretches of this room's walls with no other room within ``clear_m`` behind them."""
+        """Return the stretches of this room's walls with no other room within ``clear_m`` behind them."""
         half = WALL_M / 2
         rects = list(others)
         found = []
@@ -126,7 +112,7 @@ class Rect:
 
 
 def shared_edge(a: Rect, b: Rect) -> Edge | None:
-    """The stretch of wall with floor of both rooms beside it, or None when they aren't neighbours."""
+    """Return the stretch of wall with floor of both rooms beside it; None if they are no neighbours."""
     half = WALL_M / 2
     for along, at_a, at_b, span_a, span_b in (
         ("y", (a.x0, a.x1), (b.x1, b.x0), (a.y0, a.y1), (b.y0, b.y1)),
@@ -140,9 +126,9 @@ def shared_edge(a: Rect, b: Rect) -> Edge | None:
 
 
 def build_walls(
-    rects: Mapping[str, Rect], doors: Sequence[DoorCut], windows: Sequence[WindowCut] = ()
+    rects: Mapping[str, Rect], doors: Sequence[WallCut[Doorway]], windows: Sequence[WallCut[Window]] = ()
 ) -> tuple[ConvexPart, ...]:
-    """Wall panels; lintels over the doorways and the closed leaf of every exterior door; sill, lintel and pane of windows."""
+    """Return wall panels, lintels of doorways, the closed panel of the exterior door, and sills, lintels and panes."""
     half = WALL_M / 2
     lines: dict[tuple[str, float], list[Interval]] = defaultdict(list)
     for rect in rects.values():
@@ -158,12 +144,12 @@ def build_walls(
         for piece in subtract(_merge(spans), holes[along, at])
     ]
     for door in doors:
-        height = door.doorway.height_m
+        height = door.opening.height_m
         walls.append(_panel(door.edge.along, door.edge.at, door.interval, height, WALL_HEIGHT_M))
-        if not door.doorway.rooms[1]:
+        if not door.opening.rooms[1]:
             walls.append(_panel(door.edge.along, door.edge.at, door.interval, 0.0, height, DOOR_LEAF_M))
     for glazed in windows:
-        along, at, span, window = glazed.edge.along, glazed.edge.at, glazed.interval, glazed.window
+        along, at, span, window = glazed.edge.along, glazed.edge.at, glazed.interval, glazed.opening
         walls += [
             _panel(along, at, span, 0.0, window.sill_m),
             _panel(along, at, span, window.head_m, WALL_HEIGHT_M),
@@ -193,7 +179,7 @@ def _merge(spans: Iterable[Interval]) -> list[Interval]:
 
 
 def subtract(spans: Iterable[Interval], holes: Iterable[Interval]) -> list[Interval]:
-    """What is left of intervals when others are taken out of them."""
+    """Return the parts of intervals outside all holes."""
     pieces = list(spans)
     for low, high in holes:
         pieces = [

@@ -1,4 +1,4 @@
-"""Windows of a floor plan: set into the outer walls of their rooms, between the doorways, spread over each wall."""
+"""Windows of a floor plan, set into the outer walls of their rooms between the doorways and spread over each wall."""
 
 from __future__ import annotations
 
@@ -6,56 +6,58 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.floorplan.spec import OUTDOORS, WindowSpec
-from embomatrix.factory.floorplan.walls import Edge, WindowCut, shared_edge, subtract
+from embomatrix.factory.floorplan.spec import OUTDOORS, OpeningSpec
+from embomatrix.factory.floorplan.walls import Edge, WallCut, shared_edge, subtract
+from embomatrix.world.scene import Window
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from embomatrix.factory.floorplan.spec import RoomSpec
-    from embomatrix.factory.floorplan.walls import DoorCut, Rect
+    from embomatrix.factory.floorplan.walls import Rect
+    from embomatrix.world.scene import Doorway
 
 SILL_M: Final = 0.9
 HEAD_M: Final = 2.15
-"""Windows end no higher: the lintel above carries the wall."""
+"""Upper edge of windows; the lintel above carries the wall."""
 LEAST_SILL_M: Final = 0.1
 TRANSOM_M: Final = 0.6
-"""Lower windows sit under the lintel, above people's heads."""
+"""Windows less high than this sit right under the lintel."""
 LEAST_SHARE: Final = 0.5
 LEAST_WIDTH_M: Final = 2.0
-"""Windows are cut to the wall that they go into, but not below half their width or these metres, whichever is less."""
+"""A window is narrowed to fit its wall, but not below half its width or 2 m, whichever is less."""
 GAP_M: Final = 0.25
-"""Wall between two windows, and between a window and a doorway or a corner."""
+"""Width of the wall between two windows, and between a window and a doorway or corner."""
 VIEW_M: Final = 0.8
-"""Open air behind a window."""
+"""Depth of free space behind a window."""
 SKYLIGHT_M: Final = 6.0
-"""What is listed as higher than this, in a house with walls of 2.4 m, is part of a roof or a facade."""
+"""Higher windows belong to a roof or facade: walls are 2.4 m high."""
 
 
 @dataclass(slots=True)
 class _Stretch:
-    """A piece of outer wall, ``beyond`` the room behind it, and the windows that go into it."""
+    """Stretch of outer wall, the name of the garden ``beyond`` it, and the windows assigned to it."""
 
     edge: Edge
     beyond: str
-    windows: list[WindowSpec] = field(default_factory=list)
+    windows: list[OpeningSpec] = field(default_factory=list)
 
     @property
     def free_m(self) -> float:
-        """Width that one more window may have."""
+        """Greatest width of one more window."""
         return self.edge.length - sum(w.width_m + GAP_M for w in self.windows) - 2 * GAP_M
 
 
 def place_windows(
-    rooms: Sequence[RoomSpec], rects: Mapping[str, Rect], doors: Sequence[DoorCut]
-) -> tuple[list[WindowCut], list[str]]:
-    """Openings for the windows of all rooms, and a sentence on those that found no wall.
+    rooms: Sequence[RoomSpec], rects: Mapping[str, Rect], doors: Sequence[WallCut[Doorway]]
+) -> tuple[list[WallCut[Window]], list[str]]:
+    """Return the windows of all rooms, and a sentence on windows without a wall.
 
-    A window goes into the longest free stretch of its room's outer walls; a garden behind the wall counts as outside, so what a
-    garden lists are the windows of the rooms around it. One that is wider than the wall allows is cut to it.
+    A window goes into the longest free stretch of its room's outer walls and is narrowed to fit. A garden counts as outside:
+    the windows that a garden lists are those of the rooms around it.
     """
     outdoors = {r.name for r in rooms if r.type in OUTDOORS}
-    cuts: list[WindowCut] = []
+    cuts: list[WallCut[Window]] = []
     left_out: list[str] = []
     for room in rooms:
         if room.name in outdoors:
@@ -78,9 +80,9 @@ def place_windows(
 
 
 def _stretches(
-    room: RoomSpec, rects: Mapping[str, Rect], doors: Sequence[DoorCut], outdoors: set[str]
+    room: RoomSpec, rects: Mapping[str, Rect], doors: Sequence[WallCut[Doorway]], outdoors: set[str]
 ) -> list[_Stretch]:
-    """Outer walls of the room without the doorways in them."""
+    """Return the outer walls of the room, interrupted by doorways."""
     mine = rects[room.name]
     others = [r for n, r in rects.items() if n != room.name]
     found = [_Stretch(edge, "") for edge in mine.outer_edges(others, VIEW_M)]
@@ -101,8 +103,8 @@ def _stretches(
     return pieces
 
 
-def _assign(window: WindowSpec, stretches: Sequence[_Stretch]) -> bool:
-    """Give the window to the stretch with most room, narrower than listed where need be; False when none has any."""
+def _assign(window: OpeningSpec, stretches: Sequence[_Stretch]) -> bool:
+    """Assign the window to the stretch with most space, narrowed if necessary; False if none has enough."""
     best = max(stretches, key=lambda s: s.free_m, default=None)
     if best is None or best.free_m < min(LEAST_SHARE * window.width_m, LEAST_WIDTH_M):
         return False
@@ -110,8 +112,8 @@ def _assign(window: WindowSpec, stretches: Sequence[_Stretch]) -> bool:
     return True
 
 
-def _spread(stretch: _Stretch, room: str) -> list[WindowCut]:
-    """The windows of a stretch in a row, with equal gaps."""
+def _spread(stretch: _Stretch, room: str) -> list[WallCut[Window]]:
+    """Return the windows of a stretch in a row with equal gaps."""
     if not stretch.windows:
         return []
     free = stretch.edge.length - sum(w.width_m for w in stretch.windows)
@@ -119,15 +121,16 @@ def _spread(stretch: _Stretch, room: str) -> list[WindowCut]:
     cuts, start = [], stretch.edge.start + gap
     for window in stretch.windows:
         sill, head = sill_and_head(window.height_m)
-        cuts.append(
-            stretch.edge.glaze((room, stretch.beyond), start, window.width_m, sill, head, window.model)
-        )
-        start += window.width_m + gap
+        edge, width = stretch.edge, window.width_m
+        center = edge.point(start + width / 2)
+        opening = Window((room, stretch.beyond), center, width, sill, head, edge.along, window.model)
+        cuts.append(WallCut(opening, edge, (start, start + width)))
+        start += width + gap
     return cuts
 
 
 def sill_and_head(height_m: float) -> tuple[float, float]:
-    """Heights above the floor between which a window of this height opens the wall."""
+    """Return the heights of the lower and upper edge of a window of this height."""
     if height_m < TRANSOM_M:
         return HEAD_M - height_m, HEAD_M
     sill = max(LEAST_SILL_M, min(SILL_M, HEAD_M - height_m))

@@ -1,7 +1,7 @@
-"""From a model file to an asset: turned, scaled to the catalog's size, cut into convex parts, with the catalog's mass.
+"""Import of model files: turned, scaled to the catalog's size, cut into convex parts, with the catalog's mass.
 
-A model takes the place of one of the catalog's: it bears that one's id, size, mass and abilities, so that a scene in which the
-catalog's model stands can be built with the imported one.
+An imported model replaces one model of the catalog. It has that model's id, size, mass and abilities, so any scene that
+lists the catalog's model can be built with it.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import ConvexPart, FloatArray, Vec3
 
 THIN_M: Final = 0.002
-"""Parts are grown to this thickness: a sheet without any is no body for an engine."""
+"""Least thickness of a part, in metres: the engine can't handle flat sheets."""
 BOX_SHARE: Final = 0.97
-"""A hull that fills this much of its box becomes that box: the engine is quickest with those."""
-BARRING_SHARE: Final = 0.25
-"""A link that covers this share of a cavity's mouth bars the way in."""
+"""A hull that fills this share of its bounding box is replaced by the box, which the engine tests fastest."""
+CLOSING_SHARE: Final = 0.25
+"""A link that covers this share of a cavity's opening closes it."""
 TURN: Final = {
-    # asset x, y, z in terms of the file's axes: its front is +z there, its width x, its height y
+    # Rows: the asset's x, y, z axes in the file's frame, with its front at +z, its width along x and its height along y.
     AxisConvention.Y_UP: np.array(((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))),
     AxisConvention.Z_UP: np.eye(3),
 }
@@ -50,9 +50,9 @@ TURN: Final = {
 
 @dataclass(frozen=True, slots=True)
 class ImportedAsset:
-    """An imported asset; ``stretch`` is the ratio of its largest to its smallest scale: 1 keeps the proportions.
+    """Imported asset. ``stretch`` is the ratio of its largest to its smallest scale; 1 keeps the proportions.
 
-    ``lacks`` says what the category's things can do and this model can't.
+    ``lacks`` has a sentence for each ability of the category that the model lacks.
     """
 
     asset: Asset
@@ -61,9 +61,9 @@ class ImportedAsset:
 
 
 def read_model(path: Path, frame: AxisConvention | None = None) -> RawModel:
-    """The model of an OBJ, STL, GLB or URDF file. ``frame`` overrules what its kind says of its axes.
+    """Read an OBJ, STL, GLB or URDF file. ``frame`` overrides the axis convention of the file's type.
 
-    Raises ModelFileError for a file that is of another kind, damaged or too large.
+    Raises ModelFileError for another type of file, and for one that is damaged or too large.
     """
     suffix = path.suffix.lower()
     if suffix == ".urdf":
@@ -81,9 +81,9 @@ def read_model(path: Path, frame: AxisConvention | None = None) -> RawModel:
 def import_model(
     catalog: Catalog, raw: RawModel, category: str, model_id: str, credit: Credit, decompose: Decomposer
 ) -> ImportedAsset:
-    """The asset of a model file in the place of one of the catalog's models; without a ``model_id``, of the one most like it.
+    """Make an asset that replaces a model of the catalog; without ``model_id``, the model with the most similar proportions.
 
-    Raises CatalogError for an unknown category or model, ModelFileError when the model can't be made an asset.
+    Raises CatalogError for an unknown category or model, ModelFileError if no asset can be made of the file.
     """
     turn = TURN[raw.frame]
     clouds = [mesh.vertices @ turn.T for link in raw.links for mesh in link.meshes]
@@ -116,19 +116,19 @@ def import_model(
 
 def _lacks(asset: Asset, wanted: Mapping[str, Mapping[str, float]]) -> Iterator[str]:
     if "openable" in wanted and not asset.joints:
-        yield f"things of the category {asset.category} can be opened: this model has no group that moves"
+        yield f"the category {asset.category} is openable: this model has no group that moves"
     if not {"openable", "fillable"}.isdisjoint(wanted) and not asset.interiors:
-        yield f"things are put inside a {asset.category}: this model has no cavity that is large enough"
+        yield f"the category {asset.category} has an inside: this model has no cavity that is large enough"
 
 
 def _abilities(known: Mapping[str, Mapping[str, float]], *, moves: bool) -> Mapping[str, Mapping[str, float]]:
-    """The category's abilities, but openable is what this model has a joint for."""
+    """Return the category's abilities; openable only if the model has a joint."""
     others = {name: values for name, values in known.items() if name != "openable"}
     return {"openable": known.get("openable", {}), **others} if moves else others
 
 
 def _likest(catalog: Catalog, category: str, extents: FloatArray) -> Model:
-    """The category's model whose proportions are nearest."""
+    """Return the category's model with the most similar proportions."""
 
     def unlike(model: Model) -> float:
         ratios = np.log(np.asarray(model.size_m) / extents)
@@ -139,7 +139,7 @@ def _likest(catalog: Catalog, category: str, extents: FloatArray) -> Model:
 
 @dataclass(frozen=True, slots=True)
 class _Transform:
-    """From the file's frame to the asset's: turn, centre, scale along each axis."""
+    """Transform from the file's frame to the asset's: rotation, translation, scale along each axis."""
 
     turn: FloatArray
     middle: FloatArray
@@ -174,21 +174,21 @@ def _link(number: int, raw: RawModel, transform: _Transform, decompose: Decompos
 
 
 def _together(meshes: Sequence[Mesh]) -> Mesh:
-    """One mesh of several: cut together, they share the hulls that a link may have."""
+    """Combine meshes into one, so that they share the hulls that a link may have."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
     return Mesh(np.vstack([mesh.vertices for mesh in meshes]), np.vstack(faces))
 
 
 def convex_part(points: FloatArray) -> ConvexPart:
-    """The convex hull of points as a box, where it nearly is one, or as a hull of at most 64 corners."""
+    """Return the convex hull of points: a box if it nearly is one, else a hull with at most 64 corners."""
     low, high = points.min(axis=0), points.max(axis=0)
     thin = np.maximum(0.0, THIN_M - (high - low)) / 2
     if thin.any():
         return box(low - thin, high + thin)
     try:
         shape = ConvexHull(points)
-    except QhullError:  # flat or a needle, though not along an axis
+    except QhullError:  # flat or a line, but not along an axis
         return box(low, high)
     if shape.volume >= BOX_SHARE * float(np.prod(high - low)):
         return box(low, high)
@@ -196,7 +196,7 @@ def convex_part(points: FloatArray) -> ConvexPart:
 
 
 def _extremes(corners: FloatArray) -> FloatArray:
-    """At most 64 of a hull's corners: those furthest out along directions that are spread evenly."""
+    """Return at most 64 corners of a hull: the extreme ones along evenly spread directions."""
     if len(corners) <= MAX_VERTICES:
         return corners
     far = corners[np.unique((corners @ _directions().T).argmax(axis=0))]
@@ -205,7 +205,7 @@ def _extremes(corners: FloatArray) -> FloatArray:
 
 @functools.cache
 def _directions() -> FloatArray:
-    """Directions over the sphere (Fibonacci's spiral), the six axes first, shape (64, 3)."""
+    """Return directions over the sphere (Fibonacci spiral), the six axes first, shape (64, 3)."""
     axes = np.vstack((np.eye(3), -np.eye(3)))
     k = np.arange(MAX_VERTICES - len(axes)) + 0.5
     z = 1 - 2 * k / len(k)
@@ -215,44 +215,41 @@ def _directions() -> FloatArray:
 
 
 def _exactly(links: Sequence[Link], entry: Model) -> tuple[Link, ...]:
-    """The links with their common box drawn to the catalog's: cutting and thickening may have moved it a little."""
+    """Scale the links to the catalog's box exactly: cutting and thickening change it a little."""
     boxes = [_box_of(part) for link in links for part in link.parts]
     whole = Aabb.around(boxes)
     scale = np.asarray(entry.size_m) / np.asarray(whole.size_m)
     middle = np.asarray(whole.center_m)
 
     def drawn(part: ConvexPart) -> ConvexPart:
-        points = (
-            part.pose.apply_all(np.asarray(part.vertices_m)) if part.vertices_m else _corners(part)
-        ) - middle
-        points = points * scale
+        points = (_points(part) - middle) * scale
         return hull(points) if part.shape is Shape.HULL else box(points.min(axis=0), points.max(axis=0))
 
     return tuple(Link(link.name, tuple(drawn(part) for part in link.parts), link.joint) for link in links)
 
 
-def _corners(part: ConvexPart) -> FloatArray:
-    found = _box_of(part)
-    return np.array([found.low_m, found.high_m])
+def _points(part: ConvexPart) -> FloatArray:
+    """Return the corners of a hull, or two opposite corners of an upright box."""
+    if part.vertices_m:
+        return part.pose.apply_all(np.asarray(part.vertices_m))
+    half = np.asarray(part.size_m) / 2
+    return np.asarray(part.pose.position_m) + np.array([-half, half])
 
 
 def _box_of(part: ConvexPart) -> Aabb:
-    points = part.pose.apply_all(np.asarray(part.vertices_m)) if part.vertices_m else None
-    if points is None:
-        half = np.asarray(part.size_m) / 2
-        points = np.array([np.asarray(part.pose.position_m) - half, np.asarray(part.pose.position_m) + half])
+    points = _points(part)
     (a, b, c), (d, e, f) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
     return Aabb((a, b, c), (d, e, f))
 
 
 def _places(links: Sequence[Link], size_m: Vec3) -> Body:
-    """Where things can be put on and in: the largest open surface of the base, and its cavities."""
+    """Find the places for objects: the largest open surface of the base, and its cavities."""
     solid = solid_cells([_planes(part) for part in links[0].parts], size_m)
     body = Body()
     surface = top_surface(solid, size_m)
     found = cavities(solid, size_m)
     for number, space in enumerate(found, start=1):
-        doors = tuple(link.name for link in links[1:] if _bars(link, space.box))
+        doors = tuple(link.name for link in links[1:] if _closes(link, space.box))
         name = f"shelf{number}" if len(found) > 1 else "inside"
         body.add_interior(name, space.box, doors, 0.0 if doors or space.roofed else OPEN_ABOVE_M)
     if surface is not None and all(surface.low_m[2] > space.box.center_m[2] for space in found):
@@ -260,8 +257,8 @@ def _places(links: Sequence[Link], size_m: Vec3) -> Body:
     return body
 
 
-def _bars(link: Link, inside: Aabb) -> bool:
-    """Whether a moving link covers a good part of the front or of the top of a cavity."""
+def _closes(link: Link, inside: Aabb) -> bool:
+    """True if a moving link covers at least CLOSING_SHARE of the front or the top of a cavity."""
     box = Aabb.around(_box_of(part) for part in link.parts)
     shared = [
         max(0.0, min(b, d) - max(a, c))
@@ -269,12 +266,12 @@ def _bars(link: Link, inside: Aabb) -> bool:
     ]
     width, depth, height = inside.size_m[1], inside.size_m[0], inside.size_m[2]
     front, top = shared[1] * shared[2] / (width * height), shared[0] * shared[1] / (depth * width)
-    return (front if box.center_m[0] > inside.center_m[0] else 0.0) >= BARRING_SHARE or (
+    return (front if box.center_m[0] > inside.center_m[0] else 0.0) >= CLOSING_SHARE or (
         top if box.center_m[2] > inside.high_m[2] else 0.0
-    ) >= BARRING_SHARE
+    ) >= CLOSING_SHARE
 
 
 def _planes(part: ConvexPart) -> tuple[FloatArray, FloatArray]:
-    """Outer half spaces of a part: normals (n, 3) and offsets (n,)."""
+    """Return the half spaces of a part: normals (n, 3) and offsets (n,)."""
     mesh = mesh_of(part)
     return mesh.face_normals, np.einsum("ij,ij->i", mesh.face_normals, mesh.triangles[:, 0])

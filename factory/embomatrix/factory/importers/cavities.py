@@ -1,4 +1,4 @@
-"""Surfaces and cavities of imported models, found in a grid of cells about their convex parts."""
+"""Surfaces and cavities of imported models, found in a grid of cells over their convex parts."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ if TYPE_CHECKING:
     Cells = NDArray[np.int64]
 
 CELLS: Final = 40
-"""Cells along each side of the box: what is thinner than a fortieth of it may be missed."""
+"""Cells along each side of the box: a thinner part than 1/40 of it may be missed."""
 LEAST_SHARE: Final = 0.12
-"""A surface or a cavity that takes less than this share of the box along x or y is none to put things on or in."""
+"""Least share of the box along x and y for a surface or cavity."""
 MAX_CAVITIES: Final = 12
 REMNANT_SHARE: Final = 0.25
-"""What a box leaves of a hollow that is no box is a cavity of its own from this share of that box's volume."""
+"""The rest of a hollow beside a cavity counts as a separate cavity from this share of the cavity's volume."""
 FLOOR_SHARE: Final = 0.6
-"""The share of a cavity's floor that is solid, at least: boards may have slots."""
+"""Least solid share of a cavity's floor: boards may have slots."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cavity:
-    """A box of free space; ``roofed`` when something solid is above it, so that nothing sticks out at its top."""
+    """Box of free space. ``roofed`` means that something solid is above it, so nothing can stick out of its top."""
 
     box: Aabb
     roofed: bool
 
 
 def solid_cells(planes: Sequence[tuple[FloatArray, FloatArray]], size_m: Vec3) -> Grid:
-    """Cells whose middle is in a part, shape (40, 40, 40). ``planes`` are (normals (n, 3), offsets (n,)) of each part."""
+    """Mark the cells with their centre in a part, shape (40, 40, 40). planes: (normals (n, 3), offsets (n,)) of each part."""
     ticks = [(np.arange(CELLS) + 0.5) / CELLS * extent - extent / 2 for extent in size_m]
     points = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
     inside = np.zeros(len(points), dtype=np.bool_)
-    # Half a cell of margin: a board thinner than a cell must not fall between two middles.
+    # Half a cell of margin: a board thinner than a cell must not fall between two centres.
     margin = min(size_m) / CELLS / 2
     for normals, offsets in planes:
         inside |= (points @ normals.T <= offsets + margin).all(axis=1)
@@ -52,7 +52,7 @@ def solid_cells(planes: Sequence[tuple[FloatArray, FloatArray]], size_m: Vec3) -
 
 
 def top_surface(solid: Grid, size_m: Vec3) -> Aabb | None:
-    """The largest level rectangle that lies open to above, as a box without height; None when all are small."""
+    """Return the largest level rectangle that is open above, as a box of zero height; None if all are too small."""
     heights = np.where(solid.any(axis=2), CELLS - np.argmax(solid[:, :, ::-1], axis=2), 0)  # (x, y)
     best: tuple[int, tuple[int, int, int, int], int] = (0, (0, 0, 0, 0), 0)
     for level in np.unique(heights[heights > 0]):
@@ -65,10 +65,9 @@ def top_surface(solid: Grid, size_m: Vec3) -> Aabb | None:
 
 
 def cavities(solid: Grid, size_m: Vec3) -> tuple[Cavity, ...]:
-    """The largest boxes of free cells with a floor and three walls about them, from the bottom up: shelves, drawers' bays.
+    """Return the largest boxes of free cells with a floor and three walls, from the bottom up: shelves, bays of drawers.
 
-    Free means that something solid lies below, behind, and to both sides: in front or above the way is open, or barred by a
-    door, whose cells are not in ``solid``.
+    A free cell has something solid below, behind, and on both sides. Doors are not in ``solid``: the front or the top is open.
     """
     free = ~solid
     for axis, ahead in ((0, False), (1, False), (1, True), (2, False)):
@@ -93,7 +92,7 @@ def cavities(solid: Grid, size_m: Vec3) -> tuple[Cavity, ...]:
 
 
 def _largest_box(free: Grid) -> tuple[Cells, Cells] | None:
-    """A box of free cells about the one that is furthest from any other cell, grown on all sides in turn."""
+    """Grow a box of free cells, side by side, from the cell that is farthest from all others."""
     room = ndimage.distance_transform_cdt(np.pad(free, 1), metric="chessboard")[1:-1, 1:-1, 1:-1]
     if room.max() < 2:
         return None
@@ -113,19 +112,19 @@ def _is_roomy(low: Cells, high: Cells) -> bool:
 
 
 def _is_remnant(low: Cells, high: Cells, other_low: Cells, other_high: Cells) -> bool:
-    """Whether a box is what a much larger one beside it, nothing solid between them, left of a round or bevelled hollow."""
+    """True if the box is the rest of a round or bevelled hollow beside a much larger box."""
     is_beside = bool((low <= other_high).all() and (other_low <= high).all())
     return is_beside and bool(np.prod(high - low) < REMNANT_SHARE * np.prod(other_high - other_low))
 
 
 def _has_floor(solid: Grid, low: Cells, high: Cells) -> bool:
-    """Whether most of what lies right below a box is solid: a cavity above another's mouth has no floor of its own."""
+    """True if most cells right below a box are solid."""
     below = solid[low[0] : high[0], low[1] : high[1], low[2] - 1] if low[2] > 0 else np.zeros(1)
     return bool(below.mean() >= FLOOR_SHARE)
 
 
 def _grow(free: Grid, low: Cells, high: Cells, axis: int, end: int) -> bool:
-    """Move one face of the box out by a cell, when all cells of that layer are free."""
+    """Move one face of the box outwards by a cell if all cells of that layer are free."""
     at = low[axis] - 1 if end == 0 else high[axis]
     if not 0 <= at < CELLS:
         return False
@@ -141,14 +140,14 @@ def _grow(free: Grid, low: Cells, high: Cells, axis: int, end: int) -> bool:
 
 
 def _behind(solid: Grid, axis: int, *, ahead: bool) -> Grid:
-    """Cells that have something solid further along an axis, ahead of them or behind."""
+    """Mark the cells with something solid farther along an axis: ahead of them or behind."""
     flipped = np.flip(solid, axis) if ahead else solid
     seen = np.maximum.accumulate(flipped, axis=axis)
     return np.flip(seen, axis) if ahead else seen
 
 
 def largest_rectangle(mask: NDArray[np.bool_]) -> tuple[int, tuple[int, int, int, int]]:
-    """Area and corners (x0, y0, x1, y1) of the largest rectangle of True cells, by histograms row by row."""
+    """Return area and corners (x0, y0, x1, y1) of the largest rectangle of True cells, by row-wise histograms."""
     best, corners = 0, (0, 0, 0, 0)
     runs = np.zeros(mask.shape[1], dtype=np.int64)
     for row, cells in enumerate(mask):
@@ -167,7 +166,7 @@ def largest_rectangle(mask: NDArray[np.bool_]) -> tuple[int, tuple[int, int, int
 
 
 def _box(low: tuple[int, ...], high: tuple[int, ...], size_m: Vec3) -> Aabb:
-    """Box in metres between two corners in cells."""
+    """Return the box in metres between two corners in cells."""
     (a, b, c), (d, e, f) = (
         tuple(float(v) / CELLS * extent - extent / 2 for v, extent in zip(corner, size_m, strict=True))
         for corner in (low, high)

@@ -1,4 +1,4 @@
-"""Convex pieces of meshes: by CoACD (Wei et al., SIGGRAPH 2022), kept by the content of the mesh, or one per component."""
+"""Convex decomposition of meshes: by CoACD (Wei et al., SIGGRAPH 2022) with a disk cache, or one hull per component."""
 
 from __future__ import annotations
 
@@ -23,30 +23,31 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import FloatArray
 
 MAX_HULLS: Final = 16
-"""Hulls of a link: Bullet drops further parts of one without a word."""
+"""Upper limit for the hulls of a link: Bullet silently drops further ones."""
 MAX_VERTICES: Final = 64
-"""Corners of a hull. An asset may have 512; 64 keep a contact test quick and lose less than the margin of the engine."""
+"""Upper limit for the corners of a hull. The engine takes 512; with 64, contact tests stay fast and the error is below its
+margin."""
 
 
 class Decomposer(Protocol):
-    """Cuts a mesh into convex pieces: points (n, 3) of each, at most ``most`` of them."""
+    """Function that cuts a mesh into at most ``most`` convex pieces, each given by points (n, 3)."""
 
     def __call__(self, mesh: Mesh, most: int) -> list[FloatArray]: ...
 
 
 def by_components(mesh: Mesh, most: int) -> list[FloatArray]:
-    """The hull of each connected component; where there are too many, the smallest join their neighbours.
+    """Return the points of each connected component; if there are too many, the smallest join their neighbours.
 
-    Exact for models that are assembled from convex pieces, and quick.
+    Fast, and exact for models assembled from convex pieces.
     """
-    # Not processed: it would weld boards that only touch.
+    # Processing would weld boards that only touch.
     whole = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     pieces = [np.asarray(part.vertices) for part in whole.split(only_watertight=False)]
     return merged(pieces or [mesh.vertices], most)
 
 
 def merged(pieces: Sequence[FloatArray], most: int) -> list[FloatArray]:
-    """At most ``most`` pieces: the smallest joins the one whose middle is nearest, again and again."""
+    """Join the smallest piece with the one whose centre is nearest until at most ``most`` pieces are left."""
     left = sorted(pieces, key=_extent)
     while len(left) > most:
         smallest = left.pop(0)
@@ -59,7 +60,7 @@ def merged(pieces: Sequence[FloatArray], most: int) -> list[FloatArray]:
 
 @dataclass(frozen=True, slots=True)
 class CoacdSettings:
-    """What CoACD is asked: its own names. A higher threshold (of concavity) gives fewer pieces."""
+    """Parameters of CoACD under its own names. A higher threshold (of concavity) gives fewer pieces."""
 
     threshold: float = 0.08
     resolution: int = 1000
@@ -69,14 +70,14 @@ class CoacdSettings:
 
 
 class Coacd:
-    """CoACD with a cache on disk: a mesh that was once cut is not cut again (0.1 to 30 s each)."""
+    """CoACD with a cache on disk: cutting a mesh takes 0.1 to 30 s."""
 
     def __init__(self, folder: Path | None = None, settings: CoacdSettings | None = None) -> None:
         self._folder = folder or default_cache()
         self._settings = settings or CoacdSettings()
 
     def __call__(self, mesh: Mesh, most: int) -> list[FloatArray]:
-        """Pieces of the mesh, from the cache where it has them. Raises ModelFileError where coacd is not installed."""
+        """Return the pieces of the mesh, cached if possible. Raises ModelFileError if coacd is not installed."""
         path = self._folder / f"{self.key(mesh, most)}.json"
         kept = _kept(path)
         if kept is not None:
@@ -87,7 +88,7 @@ class Coacd:
         return pieces
 
     def key(self, mesh: Mesh, most: int) -> str:
-        """Digest of all that the pieces depend on."""
+        """Return the digest of everything that the pieces depend on."""
         digest = hashlib.sha256()
         for array in (mesh.vertices.astype("<f8"), mesh.faces.astype("<i8")):
             digest.update(str(array.shape).encode() + array.tobytes())
@@ -102,7 +103,7 @@ class Coacd:
                 "coacd is not installed: `pip install embomatrix[importers]`, or cut by components (--cut components)"
             ) from None
         coacd.set_log_level("error")
-        # Cut in the unit cube: its thresholds are shares of the size, and a model's units are its own.
+        # CoACD's thresholds are shares of the size, so the mesh is scaled to the unit cube.
         low = mesh.vertices.min(axis=0)
         scale = float((mesh.vertices.max(axis=0) - low).max()) or 1.0
         pieces = coacd.run_coacd(
@@ -115,13 +116,13 @@ class Coacd:
 
 
 def default_cache() -> Path:
-    """Folder of the user's cache for cut meshes."""
+    """Return the user's cache folder for cut meshes."""
     root = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     return Path(root) / "embomatrix" / "convex"
 
 
 def _kept(path: Path) -> list[FloatArray] | None:
-    """Pieces of a file of the cache; None when it is missing or damaged: then they are made again."""
+    """Return the pieces of a cache file; None if it is missing or damaged."""
     try:
         pieces = [np.asarray(piece, dtype=np.float64) for piece in json.loads(path.read_bytes())]
     except (OSError, ValueError):

@@ -1,8 +1,8 @@
-"""Moving parts of Sweet Home 3D's models, told by the names of their groups.
+"""Moving parts of Sweet Home 3D models, marked by group names.
 
-``sweethome3d_hinge_N`` is a rod along the axis about which ``sweethome3d_opening_on_hinge_N`` turns,
-``sweethome3d_unique_rail`` (or ``sweethome3d_rail_N``) one along which ``sweethome3d_opening_on_rail_N`` slides. Groups may
-have anything appended to their names. The rods are no part of the asset: an opening goes through its own.
+``sweethome3d_opening_on_hinge_N`` turns about the rod ``sweethome3d_hinge_N``. ``sweethome3d_opening_on_rail_N`` slides along
+the rod ``sweethome3d_rail_N`` or ``sweethome3d_unique_rail``. Names may have any suffix. Rods are not part of the asset,
+because an opening passes through its own rod.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ _HINGE: Final = re.compile(r"sweethome3d_hinge_(\d+)")
 _RAIL: Final = re.compile(r"sweethome3d_(?:unique_rail|rail_(\d+))")
 TRAVEL_SHARE: Final = 0.8
 FORWARD: Final = {AxisConvention.Y_UP: 2, AxisConvention.Z_UP: 0}
-"""The axis along which a model's front lies, at its positive end."""
+"""Axis whose positive end is the model's front."""
 
 
 def linked(groups: Mapping[str, Mesh], frame: AxisConvention) -> RawModel:
-    """A model whose named openings move, and all else is its base. Raises ModelFileError when nothing else is left."""
+    """Return a model with named openings that move on a base of all other groups. Raises ModelFileError without a base."""
     openings: dict[tuple[str, str], list[Mesh]] = {}
     hinges: dict[str, Mesh] = {}
     rails: dict[str, Mesh] = {}
@@ -46,7 +46,7 @@ def linked(groups: Mapping[str, Mesh], frame: AxisConvention) -> RawModel:
         else:
             base.append(mesh)
     if not base:
-        raise ModelFileError("all groups are openings: expected a group that stands still")
+        raise ModelFileError("all groups are openings: expected at least one group that does not move")
     links = [RawLink("base", tuple(base))]
     for (kind, number), meshes in sorted(openings.items()):
         name = f"{'door' if kind == 'hinge' else 'drawer'}{number}"
@@ -61,17 +61,17 @@ def linked(groups: Mapping[str, Mesh], frame: AxisConvention) -> RawModel:
 
 
 def _turn(rod: Mesh, meshes: Iterable[Mesh], frame: AxisConvention) -> Motion:
-    """A quarter turn about the rod's middle line, towards the front."""
+    """Return a quarter turn about the rod's centre line, towards the front."""
     origin, axis = _line(rod)
     low, high = _box(meshes)
     arm = (low + high) / 2 - origin
-    swung = np.cross(axis, arm)  # where a positive turn takes the opening first
+    swung = np.cross(axis, arm)  # initial direction of a positive turn
     sign = 1.0 if swung[FORWARD[frame]] >= 0 else -1.0
     return Motion(JointKind.REVOLUTE, _triple(origin), _triple(sign * axis), math.pi / 2)
 
 
 def _slide(rod: Mesh, meshes: Iterable[Mesh], frame: AxisConvention) -> Motion:
-    """Along the rod: towards the front, or to the side on which there is more of it."""
+    """Return a slide along the rod: towards the front, or to the side with more of the rod."""
     origin, axis = _line(rod)
     low, high = _box(meshes)
     along = int(np.argmax(np.abs(axis)))
@@ -81,7 +81,7 @@ def _slide(rod: Mesh, meshes: Iterable[Mesh], frame: AxisConvention) -> Motion:
 
 
 def _line(rod: Mesh) -> tuple[FloatArray, FloatArray]:
-    """Middle and direction of a rod: the longest side of its box."""
+    """Return centre and direction of a rod: the longest side of its box."""
     low, high = _box((rod,))
     axis = np.zeros(3)
     axis[int(np.argmax(high - low))] = 1.0

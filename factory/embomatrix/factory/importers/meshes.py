@@ -1,4 +1,4 @@
-"""Triangle meshes from OBJ, STL and GLB files, group by group, with nothing else of the file: no materials, no textures."""
+"""Triangle meshes of OBJ, STL and GLB files by group, without materials and textures."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ GROUPED: Final = frozenset({".obj", ".glb", ".stl"})
 
 
 def read_groups(path: Path) -> Mapping[str, Mesh]:
-    """Meshes of a file by the name of their group or node, all in the file's frame.
+    """Return the meshes of a file by the name of their group or node, all in the file's frame.
 
-    Raises ModelFileError for a file of another kind, or one that is damaged.
+    Raises ModelFileError for another type of file, or one that is damaged.
     """
     data = read_bytes(path)
     match path.suffix.lower():
@@ -37,7 +37,7 @@ def read_groups(path: Path) -> Mapping[str, Mesh]:
 
 
 def _obj(data: bytes, path: Path) -> Mapping[str, Mesh]:
-    """Wavefront OBJ. Read here and not by a library: its names of groups say what moves, and a line can be named."""
+    """Read Wavefront OBJ. Libraries drop the group names, which mark moving parts, and the line numbers of errors."""
     vertices: list[tuple[float, ...]] = []
     groups: dict[str, list[tuple[int, int, int]]] = {}
     group = "base"
@@ -65,7 +65,7 @@ def _obj(data: bytes, path: Path) -> Mapping[str, Mesh]:
 
 
 def _corner(word: str, count: int) -> int:
-    """Index of a vertex; OBJ counts from 1, and from the end with a minus sign."""
+    """Return the index of a vertex; OBJ counts from 1, or from the end if negative."""
     index = int(word.split("/", 1)[0])
     found = index - 1 if index > 0 else count + index
     if not 0 <= found < count:
@@ -74,7 +74,7 @@ def _corner(word: str, count: int) -> int:
 
 
 def _binary(data: bytes, kind: str, path: Path) -> Mapping[str, Mesh]:
-    """GLB and STL by trimesh, from memory: nothing that the file names is opened."""
+    """Read GLB or STL with trimesh from memory: files that it references are never opened."""
     try:
         scene = trimesh.load_scene(io.BytesIO(data), file_type=kind)
         found = {
@@ -82,7 +82,7 @@ def _binary(data: bytes, kind: str, path: Path) -> Mapping[str, Mesh]:
             for name in scene.graph.nodes_geometry
         }
     except Exception as error:  # noqa: BLE001 - a damaged file fails anywhere in the reader, with any exception
-        raise ModelFileError(f"{path} is no {kind} that can be read: {error}") from None
+        raise ModelFileError(f"{path} can't be read as {kind}: {error}") from None
     meshes = {
         name: _cut(np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64), path)
         for name, mesh in found.items()
@@ -94,7 +94,7 @@ def _binary(data: bytes, kind: str, path: Path) -> Mapping[str, Mesh]:
 
 
 def _cut(points: FloatArray, faces: IntArray, path: Path) -> Mesh:
-    """The mesh of some faces with the vertices that they use."""
+    """Return the mesh of some faces with only the vertices that they use."""
     try:
         used, index = np.unique(faces, return_inverse=True)
         return Mesh(points[used], index.reshape(faces.shape))

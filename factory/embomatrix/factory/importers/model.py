@@ -1,4 +1,4 @@
-"""What a model file holds, before it becomes an asset: links of triangle meshes in the file's own frame and units."""
+"""Content of a model file: links of triangle meshes and their motions, in the file's own frame and units."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ MAX_FACES: Final = 400_000
 
 
 class ModelFileError(Exception):
-    """A model file that can't be imported: the message names the file, what was found, and what was expected."""
+    """Model file that can't be imported. The message names the file, what was found and what was expected."""
 
 
 class AxisConvention(StrEnum):
-    """Which way a file's axes point."""
+    """Directions of a file's axes."""
 
     Y_UP = "y"  # x width, y up, z towards the viewer of its front: OBJ of Sweet Home 3D, glTF
     Z_UP = "z"  # x forward, y to the left, z up: URDF
@@ -35,7 +35,7 @@ class AxisConvention(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
-    """Triangles: vertices (n, 3), faces (m, 3). ``convex`` tells that its hull is the whole of it."""
+    """Triangle mesh: vertices (n, 3), faces (m, 3). ``convex`` means that the mesh equals its convex hull."""
 
     vertices: FloatArray
     faces: IntArray
@@ -52,13 +52,13 @@ class Mesh:
             raise ModelFileError(f"a face names a vertex outside 0 .. {len(self.vertices) - 1}")
         if len(self.faces) > MAX_FACES:
             raise ModelFileError(
-                f"a mesh has {len(self.faces)} faces: expected at most {MAX_FACES}; thin it out first"
+                f"a mesh has {len(self.faces)} faces: expected at most {MAX_FACES}; simplify it first"
             )
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """How a link moves, in the file's frame: ``upper`` in radians or in the file's units."""
+    """Joint of a link in the file's frame; ``upper`` is the travel in radians or in the file's units of length."""
 
     kind: JointKind
     origin: tuple[float, float, float]
@@ -68,7 +68,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class RawLink:
-    """Meshes that move together. The first link of a model is its base and has no motion."""
+    """Meshes that move together. The first link of a model is its base, without a motion."""
 
     name: str
     meshes: tuple[Mesh, ...]
@@ -77,14 +77,14 @@ class RawLink:
 
 @dataclass(frozen=True, slots=True)
 class RawModel:
-    """A model as its file has it."""
+    """Links of a model file and the convention of its axes."""
 
     links: tuple[RawLink, ...]
     frame: AxisConvention
 
 
 def read_bytes(path: Path) -> bytes:
-    """The file's content. Raises ModelFileError when it is missing, unreadable, empty or larger than 64 MiB."""
+    """Return the file's content. Raises ModelFileError if it is missing, unreadable, empty or larger than 64 MiB."""
     try:
         size = path.stat().st_size
         if not 0 < size <= MAX_BYTES:

@@ -1,7 +1,7 @@
-"""Models from URDF: links, joints, boxes, cylinders, spheres and mesh files beside the URDF. Nothing of it is trusted.
+"""Models of untrusted URDF files: links, joints, boxes, cylinders, spheres, and mesh files beside the URDF.
 
-Entities and document types are refused before the text is parsed; mesh paths stay within the URDF's folder; links form one
-tree; masses are not negative (they are not used: the catalog has them).
+Entities and document types are rejected before parsing, and mesh paths must stay within the URDF's folder. Links must form
+one tree. Masses must not be negative; they are unused, because the catalog has its own.
 """
 
 from __future__ import annotations
@@ -56,11 +56,10 @@ class _Joint:
 
 
 def read_urdf(path: Path) -> RawModel:
-    """The model of a URDF file. Raises ModelFileError naming the element that is wrong."""
+    """Read a URDF file. Raises ModelFileError with the name of the wrong element."""
     try:
-        text = read_bytes(path).decode(
-            "utf-8"
-        )  # in another encoding a declaration could hide from the next lines
+        # Another encoding could hide a declaration from the check below.
+        text = read_bytes(path).decode("utf-8")
     except UnicodeDecodeError:
         raise ModelFileError(f"{path} is not UTF-8: expected a plain URDF") from None
     if len(text) > MAX_TEXT or _FORBIDDEN.search(text):
@@ -92,7 +91,7 @@ def _model(root: ET.Element, folder: Path) -> RawModel:
 
 
 def _tree(links: list[str], joints: list[_Joint]) -> list[str]:
-    """Links from the root downwards. Raises ModelFileError when they are not one tree."""
+    """Return the links from the root downwards. Raises ModelFileError if they are not one tree."""
     parents: dict[str, str] = {}
     for joint in joints:
         if joint.child in parents:
@@ -105,18 +104,20 @@ def _tree(links: list[str], joints: list[_Joint]) -> list[str]:
         found = ", ".join(map(repr, roots)) or "none: its joints form a cycle"
         raise ModelFileError(f"expected one link without a parent, found {found}")
     order = roots
-    for name in order:  # grows while it is read
+    for name in order:  # grows during the iteration
         order.extend(joint.child for joint in joints if joint.parent == name)
     if len(order) != len(links):
         lost = sorted(set(links) - set(order))
-        raise ModelFileError(f"the links {', '.join(map(repr, lost))} form a cycle that hangs on nothing")
+        raise ModelFileError(
+            f"the links {', '.join(map(repr, lost))} form a cycle without a connection to the root"
+        )
     return order
 
 
 def _gathered(
     elements: dict[str, ET.Element], joints: list[_Joint], order: list[str], folder: Path
 ) -> RawModel:
-    """Links with their fixed children merged into them, in the root's frame with every joint at zero."""
+    """Merge fixed children into their links, in the root's frame with every joint at zero."""
     into = {joint.child: joint for joint in joints}
     frames: dict[str, FloatArray] = {order[0]: np.eye(4)}
     owner: dict[str, str] = {order[0]: order[0]}
@@ -131,7 +132,7 @@ def _gathered(
                 if owner[joint.parent] != order[0]:
                     raise ModelFileError(
                         f"the joint {joint.name!r} moves on the moving link {owner[joint.parent]!r}: "
-                        "an asset has one joint between its base and a link; make one of the two fixed"
+                        "an asset has one joint between its base and a link; make one of the two joints fixed"
                     )
                 meshes[name] = []
                 axis = frames[name][:3, :3] @ joint.axis
@@ -172,7 +173,7 @@ def _joint(element: ET.Element, links: dict[str, ET.Element]) -> _Joint:
 
 
 def _shapes(link: ET.Element, frame: FloatArray, folder: Path) -> list[Mesh]:
-    """Collision shapes of a link, its visual ones where it has none, in the root's frame."""
+    """Return the collision shapes of a link, or its visual shapes if it has none, in the root's frame."""
     name = _name(link)
     inertial = link.find("inertial/mass")
     if inertial is not None and _number(inertial, "value", 0.0, name) < 0:
@@ -219,7 +220,7 @@ def _mesh_path(filename: str, name: str, folder: Path) -> Path:
 
 
 def _origin(element: ET.Element, name: str) -> FloatArray:
-    """(4, 4) transform of an ``origin`` child: translation, and roll, pitch, yaw about fixed axes."""
+    """Return the (4, 4) transform of an ``origin`` child: translation, and roll, pitch, yaw about fixed axes."""
     origin = element.find("origin")
     roll, pitch, yaw = _numbers(origin, "rpy", (0.0, 0.0, 0.0), name)
     (cr, cp, cy), (sr, sp, sy) = (tuple(map(f, (roll, pitch, yaw))) for f in (math.cos, math.sin))
@@ -263,7 +264,7 @@ def _numbers(
 
 
 def _extents(shape: ET.Element, key: str, name: str, *, count: int = 1) -> tuple[float, ...]:
-    """Lengths of a shape in metres, none of them longer than any piece of furniture."""
+    """Return lengths of a shape in metres, checked against MAX_EXTENT_M."""
     values = _numbers(shape, key, None, name, count)
     if not all(0 < value <= MAX_EXTENT_M for value in values):
         raise ModelFileError(

@@ -1,4 +1,4 @@
-"""What the robot can get at: furniture that opens, works or carries things needs a place to stand before or beside it."""
+"""Access to furniture: the robot needs floor before or beside furniture that opens, works or carries objects."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 _NO_FRONT: Final = "nobody could stand before its front"
 _NO_HOST: Final = "it lay in a cabinet that nobody could stand before"
 _AT_TABLE_M: Final = 1.0
-"""A seat further away leaves the robot room beside the table."""
+"""Distance within which a seat can block the floor beside a table."""
 
 
 def unserved(scene: Scene, floor: ReachableFloor) -> Iterator[tuple[SceneObject, Access]]:
-    """Furniture without a reachable place to stand, and which access it needs."""
+    """Yield furniture without a reachable place for the robot, and the access that it needs."""
     for item in scene.objects:
         access = _access(scene, item)
         if access is Access.NONE:
@@ -33,10 +33,10 @@ def unserved(scene: Scene, floor: ReachableFloor) -> Iterator[tuple[SceneObject,
 
 
 def with_all_served(scene: Scene) -> Scene:
-    """The scene without what leaves the robot no place to stand, each told in ``left_out``.
+    """Remove furniture so that the robot can use all that is left; ``left_out`` names each removed object.
 
-    Furnishing asks for floor near a cabinet on a wall, which may lie round a corner: the cabinet goes, with what lies in
-    it. It sees to floor beside a table before the chairs of other tables stand there: a chair goes.
+    Furnishing requires floor near a wall cabinet, but that floor may be round a corner: the cabinet and its contents are
+    removed. It requires floor beside a table before the chairs of other tables are placed: one blocking chair is removed.
     """
     lost: dict[str, str] = {}
     for item, access in unserved(scene, ReachableFloor(scene)):
@@ -46,7 +46,7 @@ def with_all_served(scene: Scene) -> Scene:
             lost[seat] = f"it stood where one gets at {item.name}"
     if not lost:
         return scene
-    # hosts stand before what they bear: one pass finds what lies in what lies in them
+    # A host precedes its contents in the scene, so one pass finds nested contents.
     for item in scene.objects:
         if item.host in lost:
             lost[item.name] = _NO_HOST
@@ -58,7 +58,7 @@ def with_all_served(scene: Scene) -> Scene:
 
 
 def _seat_in_the_way(scene: Scene, table: SceneObject) -> str:
-    """The nearest empty seat without which the robot could stand beside the table; "" when no single one is in the way."""
+    """Return the nearest empty seat whose removal gives the robot a place beside the table; "" if there is none."""
     box = box_of(scene, table)
     near = box.grown(_AT_TABLE_M)
     hosts = {item.host for item in scene.objects}

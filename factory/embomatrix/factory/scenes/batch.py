@@ -1,4 +1,4 @@
-"""Many scenes at once: each is built and checked in a process of its own, the largest inventories first."""
+"""Parallel building and checking of scenes, largest inventories first."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class SceneBuildJob:
-    """One scene to build and check; ``path`` is the file to write it to, ``assets`` a folder of imported ones.
+    """Scene to build and check. ``path`` is the output file, ``assets`` a folder of imported assets.
 
-    One with a ``source``, a file that an earlier build wrote, is only checked.
+    A job with a ``source``, the file of an earlier build, only checks that file.
     """
 
     scene_id: str
@@ -32,11 +32,10 @@ class SceneBuildJob:
 
 
 def run_batch(jobs: Sequence[SceneBuildJob], *, processes: int) -> Iterator[SceneReport]:
-    """Reports in the order in which they are finished; a single scene is built here.
+    """Yield reports as they finish; a single job runs in this process.
 
-    Raises CatalogError for an unknown scene before anything is built, ModelFileError for a damaged asset, OSError when a file
-    can't be written. A process that dies
-    is told in the reports of all that it leaves undone.
+    Raises CatalogError for an unknown scene before anything is built, ModelFileError for a damaged asset, OSError if a file
+    can't be written. If a worker process dies, the reports of its unfinished jobs say so.
     """
     catalog = Catalog.load()
     things = {job: _things(catalog, job) for job in jobs}
@@ -51,7 +50,7 @@ def run_batch(jobs: Sequence[SceneBuildJob], *, processes: int) -> Iterator[Scen
             try:
                 yield done.result()
             except BrokenExecutor:
-                yield SceneReport(job.scene_id, job.seed, error="its process died: is memory short?")
+                yield SceneReport(job.scene_id, job.seed, error="its process died, perhaps out of memory")
 
 
 def _run(job: SceneBuildJob) -> SceneReport:
@@ -63,13 +62,13 @@ def _run(job: SceneBuildJob) -> SceneReport:
         try:
             write_scene(job.path, scene)
         except OSError as error:
-            # a full disk doesn't say which file it is about
+            # The error of a full disk does not name the file.
             raise OSError(error.errno, error.strerror, str(job.path)) from error
     return report
 
 
 def _things(catalog: Catalog, job: SceneBuildJob) -> int:
-    """How much there is to place: the time that a scene takes follows it."""
+    """Return the number of objects to place, which predicts the time that the job takes."""
     if job.source is not None:
         return 0
     return sum(count for room in catalog.inventory(job.scene_id).rooms for _, _, count in room.items)

@@ -1,4 +1,4 @@
-"""Base scenes: an inventory becomes rooms, walls, doorways and furniture."""
+"""Base scenes: rooms, walls, doorways and furniture made from an inventory."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.floorplan.layout import FloorPlan, plan_floor
-from embomatrix.factory.floorplan.spec import DoorSpec, RoomSpec, WindowSpec
+from embomatrix.factory.floorplan.spec import OpeningSpec, RoomSpec
 from embomatrix.factory.furnish.pieces import FurniturePiece
 from embomatrix.factory.furnish.roles import FurnitureRole, is_portable, role_of
 from embomatrix.factory.furnish.rooms import Furnishing, furnish
@@ -34,9 +34,9 @@ PLANS: Final = 4
 SMALL_HOUSE: Final = 250
 PLANS_FOR_ESSENTIALS: Final = 12
 LOSS_TAKEN: Final = 4.0
-"""Plans are drawn again while more than this is left out: a cabinet, a bed; not for a trash can."""
+"""Loss of importance up to which a plan is accepted: a trash can may be left out, a cabinet or a bed may not."""
 ESSENTIAL: Final = 15.0
-"""What is worth as much is worth more plans: a bed, a toilet, the sink of a kitchen that is hardly wider than it."""
+"""Loss of importance up to which a plan is accepted after PLANS attempts: essential pieces get more attempts."""
 _FLAT_NAMES: Final = (
     "picture painting portrait information_bulletin periodic_table map projection_screen hanging_banners hanging "
     "architectural_plan"
@@ -47,10 +47,10 @@ _FLAT_ON_WALL: Final = frozenset(_FLAT_NAMES.split())
 def build_base_scene(
     scene_id: str, *, seed: int = 0, imported: Mapping[str, Asset] = MappingProxyType({})
 ) -> Scene:
-    """Lay out and furnish one of the catalog's inventories.
+    """Lay out and furnish one of the catalog's inventories. Equal arguments give equal scenes.
 
-    ``imported`` assets, by their id, stand in place of the generated ones. Equal arguments give equal scenes.
-    Raises CatalogError for an unknown id, FloorPlanError when its rooms can't be joined.
+    ``imported`` assets replace generated ones with the same id. Raises CatalogError for an unknown scene, FloorPlanError if
+    its rooms can't be joined.
     """
     catalog = Catalog.load()
     inventory = catalog.inventory(scene_id)
@@ -86,7 +86,7 @@ def build_base_scene(
 def _best_plan(
     specs: Sequence[RoomSpec], pieces: dict[str, list[FurniturePiece]], rng: np.random.Generator
 ) -> tuple[FloorPlan, Furnishing]:
-    """Furnish a few plans until one loses nothing of importance; houses with much to place get one."""
+    """Furnish plans until one loses nothing important; houses with many pieces get a single plan."""
     best: tuple[FloorPlan, Furnishing] | None = None
     small_house = sum(len(mine) for mine in pieces.values()) < SMALL_HOUSE
     for attempt in range(PLANS_FOR_ESSENTIALS if small_house else 1):
@@ -102,29 +102,29 @@ def _best_plan(
 
 
 def room_spec(catalog: Catalog, room: RoomInventory) -> RoomSpec:
-    """Floor, doors and windows of an inventory's room, each as often as it is listed."""
+    """Return floor, doors and windows of an inventory's room, each as often as it is listed."""
     doors = []
     for category, model, count in room.doors:
         _, width, height = catalog.model(category, model).size_m
-        doors += [DoorSpec(model, width, height)] * count
+        doors += [OpeningSpec(model, width, height)] * count
     windows = []
     for category, model, count in room.windows:
         depth, width, height = catalog.model(category, model).size_m
-        # A flat model's face is at its top: it is listed as it lies, not as it stands.
+        # The catalog lists flat models lying on their back: the face is at the top.
         face = (depth, width) if height < 0.1 else (max(depth, width), height)
-        windows += [WindowSpec(model, *face)] * count
+        windows += [OpeningSpec(model, *face)] * count
     return RoomSpec(room.name, room.type, room.floor_m, tuple(doors), tuple(windows))
 
 
 def _pieces(
     catalog: Catalog, inventory: SceneInventory, imported: Mapping[str, Asset]
 ) -> tuple[dict[str, list[FurniturePiece]], list[str]]:
-    """The items of every room as pieces, and sentences on what is listed twice or not modelled."""
+    """Return the items of every room as pieces, and sentences on items listed twice and on floors not modelled."""
     notes = [note for room in inventory.rooms for note in _floor_notes(room)]
     pieces: dict[str, list[FurniturePiece]] = {}
     seen: set[str] = set()
     number = 0
-    # Large rooms first: what spans two rooms, a bar, is listed in both and stands where it fits.
+    # Large rooms first: a piece that spans two rooms, like a bar, is listed in both and stands in the larger one.
     for room in sorted(inventory.rooms, key=lambda r: -r.floor_m[0] * r.floor_m[1]):
         mine = pieces.setdefault(room.name, [])
         for category, model, count in room.items:
@@ -146,7 +146,7 @@ def _pieces(
 
 
 def _floor_notes(room: RoomInventory) -> list[str]:
-    """Where the floor is not the inventory's own, or not all of it."""
+    """Return sentences on floors that are estimated or only partly used."""
     notes = []
     if room.floor_estimated:
         notes.append(f"floor of {room.name}: none is listed; the median of its room type stands for it")
@@ -181,7 +181,7 @@ def _objects(placed: Sequence[Placed]) -> tuple[tuple[SceneObject, ...], dict[st
 
 
 def _robot_start(plan: FloorPlan, placed: Sequence[Placed]) -> RobotStart:
-    """The free spot nearest to the middle of the largest public room, looking along x."""
+    """Return the free place nearest to the centre of the largest public room, facing +x."""
     public = ("living_room", "corridor", "lobby", "entryway", "dining_room", "kitchen")
     rooms = sorted(plan.rooms, key=lambda r: (r.type not in public, -r.size_m[0] * r.size_m[1]))
     for room in rooms:

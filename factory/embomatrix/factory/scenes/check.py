@@ -1,6 +1,6 @@
-"""What a scene must keep: nothing interpenetrates, everything rests or hangs, the robot gets to all that it may use.
+"""Rules of a valid scene: no penetration, everything rests or hangs, and the robot reaches everything it may use.
 
-Geometry tells most of it; the engine finds penetrations once more, and lets go of everything that can move.
+Most rules are checked by geometry. The engine tests penetration a second time and lets all movable objects settle.
 """
 
 from __future__ import annotations
@@ -32,13 +32,15 @@ HANG_M: Final = 0.03
 CEILING_M: Final = 2.4
 CUT_OFF_M2: Final = 1.0
 CUT_OFF_SHARE: Final = 0.01
-"""Floor that the robot fits on but can't get to: more of it in a room, by both counts, is an aisle that is barred."""
+"""Limits for unreachable floor on which the robot fits, per room: exceeding both means a blocked aisle."""
 STABLE_SHARE: Final = 0.96
-"""Share of the movable objects that must stay within 1 cm and 10 degrees when all are let go at once."""
+"""Share of the movable objects that must stay within 1 cm and 10 degrees when all settle at once."""
 _EDGE_M: Final = 0.005
 
 
 class ProblemKind(StrEnum):
+    """Broken rule of a scene."""
+
     NAME = "name"
     PENETRATION = "penetration"
     FLOATING = "floating"
@@ -55,7 +57,7 @@ class ProblemKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class SceneProblem:
-    """One broken rule: which objects (or rooms) break it and by how much, in words."""
+    """Broken rule with the objects or rooms concerned and a sentence on the extent."""
 
     kind: ProblemKind
     names: tuple[str, ...]
@@ -63,7 +65,7 @@ class SceneProblem:
 
 
 def check_scene(scene: Scene) -> tuple[SceneProblem, ...]:
-    """All broken rules by geometry alone; empty for a good scene."""
+    """Return all rules broken by geometry; empty for a valid scene."""
     return (
         *_names(scene),
         *_penetrations(scene),
@@ -75,7 +77,7 @@ def check_scene(scene: Scene) -> tuple[SceneProblem, ...]:
 
 
 def check_in_engine(scene: Scene) -> tuple[SceneProblem, ...]:
-    """Penetrations of more than 1 mm that Bullet finds. Raises EngineError where the engine is missing."""
+    """Return penetrations of more than 1 mm found by Bullet. Raises EngineError if the engine is missing."""
     engine = BulletEngine(scene)
     try:
         found = []
@@ -90,7 +92,7 @@ def check_in_engine(scene: Scene) -> tuple[SceneProblem, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Settlement:
-    """What became of a scene that was let go: how many objects can move, which did, and who sank into whom."""
+    """Result of settling a scene: the number of movable objects, those that moved, and objects that sank into others."""
 
     movable: int
     unstable: tuple[str, ...]
@@ -98,12 +100,12 @@ class Settlement:
 
     @property
     def stable_share(self) -> float:
-        """Share of the movable objects that stayed; 1 where nothing can move."""
+        """Share of the movable objects that stayed in place; 1 if nothing can move."""
         return 1.0 - len(self.unstable) / self.movable if self.movable else 1.0
 
 
 def check_settled(scene: Scene) -> Settlement:
-    """Let go of everything that can move, at once. Raises EngineError where the engine is missing."""
+    """Let all movable objects settle at once. Raises EngineError if the engine is missing."""
     settled = settle_scene(scene)
     problems = [
         SceneProblem(ProblemKind.SUNKEN, pair, f"{depth * 1000:.1f} mm into one another after settling")
@@ -113,7 +115,7 @@ def check_settled(scene: Scene) -> Settlement:
     if found.stable_share < STABLE_SHARE:
         moved = max(settled.objects[name].moved_m for name in found.unstable)
         detail = (
-            f"{found.stable_share:.1%} of {found.movable} movable objects stay, one moves {moved:.2f} m: "
+            f"{found.stable_share:.1%} of {found.movable} movable objects stay in place, one moves {moved:.2f} m: "
             f"expected {STABLE_SHARE:.0%}"
         )
         problems.append(SceneProblem(ProblemKind.UNSTABLE, found.unstable, detail))
@@ -124,7 +126,7 @@ def _names(scene: Scene) -> Iterator[SceneProblem]:
     for name, count in Counter(item.name for item in scene.objects).items():
         if count > 1:
             yield SceneProblem(
-                ProblemKind.NAME, (name,), f"the name stands {count} times: expected unique names"
+                ProblemKind.NAME, (name,), f"{count} objects have this name: expected unique names"
             )
     known = {item.name for item in scene.objects}
     for item in scene.objects:
@@ -160,7 +162,7 @@ def _supports(scene: Scene) -> Iterator[SceneProblem]:
 
 
 def _rests(scene: Scene, item: SceneObject, box: Aabb) -> bool:
-    """Whether the underside lies on a surface of the host with the box's middle above it."""
+    """True if the underside lies on a surface of the host, with the box's centre above it."""
     host = scene.by_name[item.host]
     for support in scene.assets[host.asset_id].supports:
         if bool(support.interior) < (item.relation is Relation.INSIDE):
@@ -198,7 +200,7 @@ def _rooms(scene: Scene) -> Iterator[SceneProblem]:
 
 
 def reach_problems(scene: Scene) -> Iterator[SceneProblem]:
-    """Rooms that no free floor leads into, and furniture that the robot can't get at."""
+    """Yield rooms and furniture that the robot can't reach, and rooms with a blocked aisle."""
     floor = ReachableFloor(scene)
     if not floor.has_start:
         yield SceneProblem(

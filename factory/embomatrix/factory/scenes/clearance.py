@@ -1,4 +1,4 @@
-"""What must stay free: the floor before doorways and the space before windows, by the parts of objects with joints shut."""
+"""Clearance: the floor before doorways and the space before windows must stay free of objects with shut joints."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     BoolArray = NDArray[np.bool_]
 
 SHALLOW: Final = 0.7
-"""Share of a room's shorter side that is kept free before a door or window where the full clearance is deeper than that."""
+"""Upper limit of the clearance as a share of the room's shorter side."""
 _TOUCH_M: Final = 1e-3
 
 
 class Clearance:
-    """Boxes of everything that stands or hangs in a scene on its own; what rests on furniture is left out."""
+    """Test of a scene's objects against the clear zones. Objects that rest on furniture are ignored."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -49,24 +49,24 @@ class Clearance:
         self._names = names
 
     def before_doorways(self) -> Iterator[tuple[Doorway, str, tuple[str, ...]]]:
-        """Every side of every doorway: the doorway, the room on this side, and what stands in its clear floor."""
+        """Yield for each side of each doorway: the doorway, the room, and the objects on its clear floor."""
         for doorway, room, zone in self._door_zones:
             yield doorway, room, self._within(zone)
 
     def bars_a_doorway(self, box: Aabb) -> bool:
-        """Whether a box reaches into the clear floor before any doorway."""
+        """True if a box reaches into the clear floor before any doorway."""
         corners = np.array((*box.low_m, *box.high_m))
         return any(_overlap(corners[None], zone)[0] for _, _, zone in self._door_zones)
 
     def doorway_floor(self, room: str) -> Iterator[tuple[float, float, float, float]]:
-        """Rectangles (x0, y0, x1, y1) of a room's floor that stay clear before its doorways."""
+        """Yield the rectangles (x0, y0, x1, y1) of a room's floor that stay clear before its doorways."""
         for _, side, zone in self._door_zones:
             if side == room:
                 x0, y0, _, x1, y1, _ = zone.tolist()
                 yield (x0, y0, x1, y1)
 
     def before_windows(self) -> Iterator[tuple[Window, str, tuple[str, ...]]]:
-        """Every side of every window, and what takes its light."""
+        """Yield for each side of each window: the window, the room, and the objects that block its light."""
         for window in self._scene.windows:
             low = max(window.sill_m, WINDOW_FROM_M)
             for room in self._sides(window):
@@ -88,7 +88,7 @@ class Clearance:
     def _zone(
         opening: Doorway | Window, room: Room, depth_m: float, low_m: float, high_m: float
     ) -> FloatArray:
-        """Corners (6,) of the space before an opening, from the room's wall inwards."""
+        """Return the corners (6,) of the clear space before an opening, from the room's wall inwards."""
         depth = min(depth_m, SHALLOW * min(room.size_m))
         across = 1 if opening.along == "x" else 0
         half = opening.width_m / 2
@@ -105,6 +105,6 @@ class Clearance:
 
 
 def _overlap(boxes: FloatArray, zone: FloatArray) -> BoolArray:
-    """Which of the boxes, shape (n, 6), share more than a millimetre with a zone (6,)."""
+    """Mark the boxes (n, 6) that overlap a zone (6,) by more than 1 mm."""
     over = np.minimum(boxes[:, 3:], zone[3:]) - np.maximum(boxes[:, :3], zone[:3])
     return np.asarray((over > _TOUCH_M).all(axis=1))

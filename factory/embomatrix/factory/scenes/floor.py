@@ -1,4 +1,4 @@
-"""The floor that the robot can reach in a scene, and where on it the robot could stand to work."""
+"""Floor of a scene that the robot can reach, and the places on it from which the arm reaches an object."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _FRONT_COSINE: Final = math.cos(math.radians(65.0))
 
 
 class ReachableFloor:
-    """Free floor connected to the robot's start, with doors and drawers as they stand: open ones take floor."""
+    """Free floor connected to the robot's start. Open doors and drawers occupy floor."""
 
     def __init__(self, scene: Scene) -> None:
         self._rooms = scene.rooms
@@ -43,18 +43,18 @@ class ReachableFloor:
 
     @property
     def has_start(self) -> bool:
-        """Whether the robot's start is free floor."""
+        """True if the robot's start is on free floor."""
         return self._label > 0
 
     @property
     def reachable_share(self) -> float:
-        """Share of the places where the robot fits that it can drive to from its start; 0 when there are none."""
+        """Share of the cells where the robot fits that it can reach from its start; 0 if there are none."""
         free = int(self._grid.free.sum())
         return float((self._grid.labels == self._label).sum() / free) if free and self.has_start else 0.0
 
     @property
     def free_share(self) -> float:
-        """Share of the rooms' floor over which nothing stands up to the robot's height."""
+        """Share of the rooms' floor without objects up to the robot's height."""
         free = total = 0
         for room in self._rooms:
             floor = np.ones(np.ceil(np.array(room.size_m) / CELL_M).astype(int), dtype=bool)
@@ -65,24 +65,24 @@ class ReachableFloor:
         return free / total
 
     def cells(self, low: tuple[float, float], high: tuple[float, float]) -> FloatArray:
-        """Centres of the reachable cells in a rectangle, shape (n, 2)."""
+        """Return the centres of the reachable cells in a rectangle, shape (n, 2)."""
         if not self.has_start:
             return np.empty((0, 2))
         return self._grid.free_centers(low, high, self._label)
 
     def enters(self, room: Room) -> bool:
-        """Whether any floor of the room is reachable."""
+        """True if any floor of the room is reachable."""
         return len(self.cells(room.low_m, room.high_m)) > 0
 
     def cut_off_m2(self, room: Room) -> float:
-        """Area of the places in the room where the robot fits but can't drive to; none of it lies within an object's box."""
+        """Return the area of the room's floor on which the robot fits but which it can't reach, outside of objects' boxes."""
         islands = set(np.unique(self._grid.labels).tolist()) - {0, self._label}
         centers = [self._grid.free_centers(room.low_m, room.high_m, label) for label in sorted(islands)]
         spots = np.concatenate([np.empty((0, 2)), *centers])
         return int((~_within(spots, self._footprints)).sum()) * CELL_M**2
 
     def spots(self, box: Aabb, *, front_of: Pose | None = None) -> FloatArray:
-        """Cells from which the arm reaches a box, shape (n, 2); with ``front_of`` only those before that pose's front."""
+        """Return the cells from which the arm reaches a box, shape (n, 2); only those before the front of ``front_of``."""
         low, high = np.asarray(box.low_m[:2]), np.asarray(box.high_m[:2])
         reach = ROBOT.reach_m - _REACH_SLACK_M
         cells = self.cells(_pair(low - reach), _pair(high + reach))
@@ -96,33 +96,21 @@ class ReachableFloor:
 
 
 def _within(spots: FloatArray, boxes: FloatArray) -> BoolArray:
-    """Which middles of cells, (n, 2), lie within any of some rectangles, (m, 4): marked on a grid, as both are many."""
-    if not len(spots):
-        return np.zeros(0, dtype=np.bool_)
-    low, high = spots.min(axis=0), spots.max(axis=0)
-    cells = np.rint((spots - low) / CELL_M).astype(int)
-    shape = cells.max(axis=0) + 1
-    axes = [low[axis] + CELL_M * np.arange(shape[axis]) for axis in (0, 1)]
-    for axis in (0, 1):
-        axes[axis][cells[:, axis]] = spots[:, axis]  # to the bit, where there is a spot
-    taken = np.zeros(shape, dtype=np.bool_)
-    for box in boxes[((boxes[:, :2] < high) & (boxes[:, 2:] > low)).all(axis=1)]:
-        rows, columns = (
-            slice(np.searchsorted(line, box[axis], "right"), np.searchsorted(line, box[axis + 2], "left"))
-            for axis, line in enumerate(axes)
-        )
-        taken[rows, columns] = True
-    return np.asarray(taken[cells[:, 0], cells[:, 1]])
+    """Mark the points (n, 2) that lie within any of the rectangles (m, 4)."""
+    taken = np.zeros(len(spots), dtype=np.bool_)
+    for box in boxes:
+        taken |= ((spots > box[:2]) & (spots < box[2:])).all(axis=1)
+    return taken
 
 
 def box_of(scene: Scene, item: SceneObject) -> Aabb:
-    """Bounding box of an object in the world, joints shut."""
+    """Return the bounding box of an object in the world with its joints shut."""
     asset = scene.assets[item.asset_id]
     return Aabb.around(part.aabb(item.pose_world_asset) for link in asset.links for part in link.parts)
 
 
 def _part_boxes(scene: Scene, item: SceneObject) -> Iterator[Aabb]:
-    """Boxes in the world of an object's parts, joints as they stand."""
+    """Yield the boxes in the world of an object's parts with their current joint positions."""
     shares = iter(item.joints)
     for link in scene.assets[item.asset_id].links:
         frame = item.pose_world_asset
@@ -133,7 +121,7 @@ def _part_boxes(scene: Scene, item: SceneObject) -> Iterator[Aabb]:
 
 
 def _barring(boxes: Iterable[Aabb]) -> FloatArray:
-    """Rows (x0, y0, x1, y1, z0, z1) of the boxes that stand in the robot's way: no rugs, nothing above its head."""
+    """Return rows (x0, y0, x1, y1, z0, z1) of the boxes that block the robot: no rugs, nothing above its head."""
     rows = [(*box.low_m[:2], *box.high_m[:2], box.low_m[2], box.high_m[2]) for box in boxes]
     table = np.array(rows, dtype=np.float64).reshape(-1, 6)
     return np.asarray(table[(table[:, 4] < ROBOT.height_m) & (table[:, 5] > _FLAT_M)])

@@ -1,4 +1,4 @@
-"""Opening and shutting a scene's furniture: what lies in a drawer comes along with it."""
+"""Opening and closing a scene's furniture together with the objects carried by its moving links."""
 
 from __future__ import annotations
 

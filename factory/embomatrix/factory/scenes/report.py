@@ -1,4 +1,4 @@
-"""What became of an inventory: how long it took, what stands in the scene, what was left out and why, what is wrong."""
+"""Reports of built scenes: time, contents, objects left out with the reason, and broken rules."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from collections import Counter
 from dataclasses import asdict, dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
+
+from rich.table import Table
 
 from embomatrix.factory.floorplan.layout import compactness
 from embomatrix.factory.floorplan.spec import FloorPlanError
@@ -25,7 +27,7 @@ from embomatrix.sim.engine import EngineError
 from embomatrix.world.catalog import Catalog, CatalogError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from embomatrix.world.asset import Asset
@@ -38,7 +40,7 @@ _COUNT: Final = re.compile(r"(\d+) (?:of (?:\d+|the) )?(\S+)")
 
 @dataclass(frozen=True, slots=True)
 class SceneReport:
-    """Figures of one scene. Times are CPU seconds; shares lie in [0, 1]; ``error`` is a sentence when nothing was built."""
+    """Figures of one scene. Times are CPU seconds, shares lie in [0, 1]. ``error`` says why nothing was built."""
 
     scene_id: str
     seed: int
@@ -47,7 +49,7 @@ class SceneReport:
     doorways: int = 0
     windows: int = 0
     listed: int = 0
-    """Items of the inventory without its doors, windows and floors."""
+    """Items of the inventory, except doors, windows and floors."""
     placed: int = 0
     movable: int = 0
     build_s: float = 0.0
@@ -55,11 +57,11 @@ class SceneReport:
     compactness: float = 0.0
     """Share of the plan's bounding box that is floor or wall."""
     free_floor: float = 0.0
-    """Share of the floor on which nothing stands."""
+    """Share of the floor without objects."""
     reachable: float = 0.0
-    """Share of the places where the robot fits that it can drive to."""
+    """Share of the cells where the robot fits that it can reach."""
     stable: float = 0.0
-    """Share of the movable objects that stay when all are let go."""
+    """Share of the movable objects that stay in place when all settle."""
     unstable: tuple[str, ...] = ()
     placed_by_room: tuple[tuple[str, int], ...] = ()
     left_out: tuple[str, ...] = ()
@@ -70,7 +72,7 @@ class SceneReport:
         return not self.error and not self.problems
 
     def to_json(self) -> Json:
-        """Plain values, rounded."""
+        """Return a JSON-serialisable dict with rounded numbers."""
         value = asdict(self)
         value["placed_by_room"] = dict(self.placed_by_room)
         value["problems"] = [[p.kind.value, list(p.names), p.detail] for p in self.problems]
@@ -82,7 +84,7 @@ class SceneReport:
 def report_on(
     scene_id: str, seed: int, imported: Mapping[str, Asset] = MappingProxyType({})
 ) -> tuple[SceneReport, Scene | None]:
-    """Build one scene, perhaps with imported assets, and check it; what fails is told in the report."""
+    """Build one scene, perhaps with imported assets, and check it; the report contains failures."""
     started = time.process_time()
     try:
         scene = build_base_scene(scene_id, seed=seed, imported=imported)
@@ -97,7 +99,7 @@ def report_on(
 
 
 def report_on_file(scene_id: str, seed: int, path: Path) -> SceneReport:
-    """Check the scene in a file, of this name and seed; what fails is told in the report."""
+    """Check the scene in a file; the report contains failures."""
     try:
         return report_of(read_scene(path))
     except (SceneFileError, EngineError) as error:
@@ -105,7 +107,7 @@ def report_on_file(scene_id: str, seed: int, path: Path) -> SceneReport:
 
 
 def report_of(scene: Scene, *, build_s: float = 0.0) -> SceneReport:
-    """Check a scene and count what is in it. Raises EngineError where the engine is missing."""
+    """Check a scene and count its contents. Raises EngineError if the engine is missing."""
     started = time.process_time()
     settlement = check_settled(scene)
     problems = (
@@ -138,9 +140,9 @@ def report_of(scene: Scene, *, build_s: float = 0.0) -> SceneReport:
 
 
 def unaccounted(scene: Scene) -> tuple[SceneProblem, ...]:
-    """Models of the base inventory of which fewer stand in the scene or among the left-out than are listed.
+    """Return a problem for each model listed more often than it is placed or reported as left out.
 
-    A scene that is no base scene of the catalog has no inventory to compare with: nothing is unaccounted for.
+    A scene without an inventory in the catalog has nothing unaccounted for.
     """
     placed = Counter(item.asset_id for item in scene.objects)
     told: Counter[str] = Counter()
@@ -152,8 +154,7 @@ def unaccounted(scene: Scene) -> tuple[SceneProblem, ...]:
         SceneProblem(
             ProblemKind.UNACCOUNTED,
             (asset_id,),
-            f"{count} are listed, {placed[asset_id]} stand in the scene, "
-            f"{told[asset_id]} are told to be left out",
+            f"{count} are listed, {placed[asset_id]} are placed, {told[asset_id]} are reported as left out",
         )
         for asset_id, count in _listed(scene.base).items()
         if placed[asset_id] + told[asset_id] < count
@@ -161,7 +162,7 @@ def unaccounted(scene: Scene) -> tuple[SceneProblem, ...]:
 
 
 def _listed(scene_id: str) -> Mapping[str, int]:
-    """How many of each model an inventory lists, empty for a scene that the catalog doesn't know."""
+    """Return the number of each model in an inventory; empty for a scene that is not in the catalog."""
     catalog = Catalog.load()
     if scene_id not in catalog.scene_ids:
         return {}
@@ -170,3 +171,43 @@ def _listed(scene_id: str) -> Mapping[str, int]:
         for category, model, count in room.items:
             listed[f"{category}-{model}"] += count
     return listed
+
+
+TABLE_COLUMNS: Final = 100
+"""Width of ``report_table`` in characters, also used for files and narrow terminals, which would cut figures off."""
+
+
+def report_table(reports: Sequence[SceneReport]) -> Table:
+    """Return a table with a row for each scene and a row of sums. Times are CPU seconds."""
+    table = Table(box=None, pad_edge=False)
+    table.add_column("scene", no_wrap=True)
+    for name in ("build s", "rooms", "placed", "listed", "movable", "stable", "wrong"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for report in reports:
+        if report.error:
+            table.add_row(_name(report), "not built")
+            continue
+        table.add_row(*_row(_name(report), [report]), f"{report.stable:.1%}", str(len(report.problems)))
+    if len(reports) > 1:
+        sums = _row(f"{len(reports)} scenes", reports)
+        table.add_row(*sums, "", str(sum(len(report.problems) for report in reports)), style="bold")
+    return table
+
+
+def problem_lines(reports: Sequence[SceneReport]) -> Iterator[str]:
+    """Yield a line for each problem and for each scene that could not be built."""
+    for report in reports:
+        if report.error:
+            yield f"{_name(report)}: {report.error}"
+        for problem in report.problems:
+            yield f"{_name(report)}: {problem.kind}: {', '.join(problem.names)}: {problem.detail}"
+
+
+def _name(report: SceneReport) -> str:
+    return f"{report.scene_id} #{report.seed}" if report.seed else report.scene_id
+
+
+def _row(name: str, reports: Sequence[SceneReport]) -> tuple[str, ...]:
+    counts = ((r.rooms, r.placed, r.listed, r.movable) for r in reports)
+    sums = (str(sum(column)) for column in zip(*counts, strict=True))
+    return (name, f"{sum(r.build_s for r in reports):.1f}", *sums)

@@ -1,4 +1,4 @@
-"""Scenes in files: what ``scene build`` writes, read again to be shown, drawn and checked. A file is trusted in nothing."""
+"""Scene files, as written by ``scene build``. Files are untrusted and checked in every part when read."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ if TYPE_CHECKING:
 
 SUFFIX: Final = ".json"
 MAX_BYTES: Final = 64 * 1024 * 1024
-"""More than ten times what the largest base scene takes."""
+"""Upper limit for a scene file, more than ten times the largest base scene."""
 
 
 class SceneFileError(ValueError):
-    """A file can't be used as a scene. The message names it, and tells what was found and what was expected."""
+    """File that can't be used as a scene. The message names the file, what was found and what was expected."""
 
 
 def write_scene(path: Path, scene: Scene) -> None:
-    """Raises OSError."""
+    """Write a scene as JSON. Raises OSError."""
     write_whole(path, json.dumps(scene_to_json(scene)).encode("utf-8"))
 
 
 def read_scene(path: Path) -> Scene:
-    """The scene in a file, checked in every part, and never more of the file than a scene may have. Raises SceneFileError."""
+    """Read and check the scene in a file of at most MAX_BYTES. Raises SceneFileError."""
     if not path.is_file():
         raise SceneFileError(f"{path} is no file: expected one that `embomatrix scene build` wrote")
     try:
@@ -42,5 +42,5 @@ def read_scene(path: Path) -> Scene:
         raise SceneFileError(f"{path}: {error}") from error
     except (ValueError, RecursionError) as error:
         raise SceneFileError(
-            f"{path} is no JSON ({error}): expected what `embomatrix scene build` wrote"
+            f"{path} is not JSON ({error}): expected what `embomatrix scene build` wrote"
         ) from error
