@@ -13,13 +13,11 @@ from typer.testing import CliRunner
 
 from embomatrix.factory.commands.app import app
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
-from embomatrix.factory.evaluate.aesthetics import Calibration, auc, features_of, fit, score_room
-from embomatrix.factory.evaluate.drafts import DraftFeatures, asked_in
-from embomatrix.factory.evaluate.judge import DiversityScores
+from embomatrix.factory.evaluate.aesthetics import SPOILERS, Calibration, auc, features_of, fit, score_room
+from embomatrix.factory.evaluate.judges import DiversityScores
 from embomatrix.factory.evaluate.page import BEGIN, END, with_factory
-from embomatrix.factory.evaluate.rooms import FLOOR, RoomBox, RoomPlan, plan_of, read_rooms
-from embomatrix.factory.evaluate.spoiling import SPOILERS
-from embomatrix.factory.evaluate.tasks import evenness, panel, people_of
+from embomatrix.factory.evaluate.room_plans import FLOOR, RoomBox, RoomPlan, plan_of, read_rooms
+from embomatrix.factory.evaluate.tasks import DraftFeatures, asked_in, evenness, panel, people_of
 from embomatrix.factory.metrics.figures import (
     EvaluationError,
     EvaluationFigures,

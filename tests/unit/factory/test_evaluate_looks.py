@@ -11,7 +11,7 @@ from tests.fakes.chat_server import ChatServer
 from typer.testing import CliRunner
 
 from embomatrix.factory.commands.app import app
-from embomatrix.factory.evaluate.looks import Impression, evaluate_looks, impression_of
+from embomatrix.factory.evaluate.judges import Impression, evaluate_looks, impression_of
 from embomatrix.factory.evaluate.page import with_factory
 from embomatrix.factory.evaluate.scenes import LIST, LayoutMethod, SceneTask
 from embomatrix.factory.evaluate.side_by_side import LEAST_PX, draw_side_by_side, named

@@ -9,12 +9,13 @@ import pytest
 
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.evaluate.scene_geometry import Flaw, flaws_of
-from embomatrix.factory.evaluate.scene_runs import OutcomeLog, evaluate_scenes
 from embomatrix.factory.evaluate.scenes import (
     LIST,
     LayoutMethod,
     LayoutOutcome,
+    OutcomeLog,
     SceneTask,
+    evaluate_scenes,
     evaluation_of,
     fixed_tasks,
 )

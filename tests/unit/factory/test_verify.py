@@ -9,14 +9,13 @@ from tests.fakes.datasets import write_kitchen_dataset
 from typer.testing import CliRunner
 
 from embomatrix.factory.commands.app import app
-from embomatrix.factory.verification.again import Look, sampled, verdict_of
-from embomatrix.factory.verification.figures import evaluation_of, objections
+from embomatrix.factory.verification import Judgement, compared, evaluation_of, objections, sampled
 from embomatrix.world.dataset import Dataset, write_dataset
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-FINE = Look("fetch", "", "sha256:1", same_plan=True)
+FINE = Judgement("fetch", "", "sha256:1", same_plan=True)
 
 
 @pytest.fixture(scope="module")
@@ -25,24 +24,24 @@ def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 def test_two_looks_that_agree_with_the_dataset_are_equal() -> None:
-    assert verdict_of(FINE, FINE).equal
-    assert not verdict_of(FINE, dataclasses.replace(FINE, digest="sha256:2")).equal
-    assert not verdict_of(FINE, dataclasses.replace(FINE, same_plan=False)).equal
+    assert compared(FINE, FINE).equal
+    assert not compared(FINE, dataclasses.replace(FINE, digest="sha256:2")).equal
+    assert not compared(FINE, dataclasses.replace(FINE, same_plan=False)).equal
     refused = dataclasses.replace(FINE, cached="no_plan: none", digest="")
-    assert verdict_of(FINE, refused).cached == "no_plan: none"
+    assert compared(FINE, refused).cached == "no_plan: none"
 
 
 def test_shares_are_of_what_was_asked_and_objections_name_the_task() -> None:
     verdicts = [
-        verdict_of(FINE, dataclasses.replace(FINE, physical="")),
-        verdict_of(FINE, dataclasses.replace(FINE, physical="grasp_slipped: step 2, pick_up: it fell")),
+        compared(FINE, dataclasses.replace(FINE, physical="")),
+        compared(FINE, dataclasses.replace(FINE, physical="grasp_slipped: step 2, pick_up: it fell")),
     ]
     evaluation = evaluation_of(verdicts, {})
     assert evaluation.figure("oracle_cached").value == 100
     assert (evaluation.figure("oracle_physical").value, evaluation.figure("oracle_physical").n) == (50, 2)
     assert evaluation.notes == ("Against plans in physics: grasp_slipped 1.",)
     assert list(objections(verdicts)) == ["fetch, in physics: grasp_slipped: step 2, pick_up: it fell"]
-    without = evaluation_of([verdict_of(FINE, FINE)], {})
+    without = evaluation_of([compared(FINE, FINE)], {})
     assert [figure.name for figure in without.figures] == ["oracle_cached", "reverified_bit_equal"]
 
 

@@ -1,4 +1,4 @@
-"""``embomatrix factory evaluate``: measure tasks and scenes, write figures, put them on the page of benchmarks."""
+"""``embomatrix factory evaluate``: measure tasks and scenes, write the figures, render the benchmark page."""
 
 from __future__ import annotations
 
@@ -15,15 +15,12 @@ from rich.console import Console
 from embomatrix.factory.commands.language_model import Key, Tape, chat_model
 from embomatrix.factory.commands.terminal import progress, report_evaluation, user_errors
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
-from embomatrix.factory.evaluate.drafts import asked_of
-from embomatrix.factory.evaluate.judge import judged
-from embomatrix.factory.evaluate.looks import evaluate_looks
-from embomatrix.factory.evaluate.measure import evaluate_aesthetics, evaluate_tasks, written_for
+from embomatrix.factory.evaluate.aesthetics import evaluate_aesthetics
+from embomatrix.factory.evaluate.judges import evaluate_looks, judged
 from embomatrix.factory.evaluate.page import with_factory
-from embomatrix.factory.evaluate.scene_runs import OutcomeLog, evaluate_scenes
-from embomatrix.factory.evaluate.scenes import LayoutMethod, fixed_tasks
+from embomatrix.factory.evaluate.scenes import LayoutMethod, OutcomeLog, evaluate_scenes, fixed_tasks
 from embomatrix.factory.evaluate.side_by_side import draw_side_by_side, named
-from embomatrix.factory.evaluate.tasks import panel, people_of
+from embomatrix.factory.evaluate.tasks import asked_of, evaluate_tasks, panel, people_of
 from embomatrix.factory.metrics.figures import (
     EvaluationError,
     EvaluationFigures,
@@ -38,23 +35,23 @@ from embomatrix.world.whole_file import write_whole
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping, Sequence
 
-    from embomatrix.factory.evaluate.drafts import DraftFeatures
+    from embomatrix.factory.evaluate.tasks import DraftFeatures
     from embomatrix.llm.values import ChatModel
 
 app = typer.Typer(
-    help="Measure tasks and scenes; figures go to JSON and to the page of benchmarks.",
+    help="Measure tasks and scenes; write the figures as JSON and to the benchmark page.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
 PAGE = Path("docs/benchmarks.md")
 JsonFile = Annotated[Path | None, typer.Option("--json", help="File for the figures.")]
-Seed = Annotated[int, typer.Option(min=0, help="Equal seeds give equal figures.")]
+Seed = Annotated[int, typer.Option(min=0, help="Random seed.")]
 Methods = Annotated[
     list[LayoutMethod] | None,
-    typer.Option("--method", help="One of them; give it again for more. Default: all."),
+    typer.Option("--method", help="Layout method; repeatable. Default: all."),
 ]
-Only = Annotated[int, typer.Option(min=1, help="Every so manieth task of the 140, for a quick look.")]
+Only = Annotated[int, typer.Option(min=1, help="Use only every n-th of the 140 tasks.")]
 T = TypeVar("T")
 
 
@@ -62,21 +59,21 @@ T = TypeVar("T")
 def tasks(
     dataset: Annotated[
         Path | None,
-        typer.Option(help="Measure the tasks of this dataset; without it both writers draft some."),
+        typer.Option(help="Measure the tasks of this dataset. Default: draft tasks with both writers."),
     ] = None,
     scenes: Annotated[
         list[str] | None,
-        typer.Option(help="Base scene; give it again for more. Default: the 45 to train on."),
+        typer.Option(help="Base scene; repeatable. Default: the 45 training scenes."),
     ] = None,
-    each: Annotated[int, typer.Option(min=2, help="Tasks of a scene; the paper takes 10.")] = 10,
+    each: Annotated[int, typer.Option(min=2, help="Tasks per scene (10 in the paper).")] = 10,
     seed: Seed = 0,
     json_file: JsonFile = None,
-    llm: Annotated[str, typer.Option(help="Endpoint whose model scores each scene's tasks as well.")] = "",
-    model: Annotated[str, typer.Option(help="Name of the model there.")] = "",
+    llm: Annotated[str, typer.Option(help="URL of an endpoint; its model also scores the tasks.")] = "",
+    model: Annotated[str, typer.Option(help="Name of the model at the endpoint.")] = "",
     key: Key = "",
     cassette: Tape = None,
 ) -> None:
-    """Diversity of instructions and goals, with and without social simulation."""
+    """Measure the diversity of instructions and goals, with and without social simulation."""
     with user_errors():
         if llm and not model:
             raise EvaluationError("--llm needs the name of a model there: give --model")
@@ -86,8 +83,9 @@ def tasks(
             chosen = tuple(dict.fromkeys(scenes or training_scenes()))
             with progress(Console(stderr=True)) as bars:
                 bar = bars.add_task("scenes", total=len(chosen))
-                written = written_for(chosen, each, seed, lambda done: bars.update(bar, completed=done))
-            groups, evaluation = written.social, evaluate_tasks(written, each, seed)
+                groups, evaluation = evaluate_tasks(
+                    chosen, each, seed, lambda done: bars.update(bar, completed=done)
+                )
         if llm or cassette is not None:
             verdicts = asyncio.run(
                 _asked(lambda judge: _judged(judge, groups, seed), llm, model, key, cassette)
@@ -100,22 +98,22 @@ def tasks(
 def scenes(
     sample: Annotated[
         Path,
-        typer.Option(help="The sample of the paper's tasks, JSON lines: half of the fixed tasks are in it."),
+        typer.Option(help="JSON lines file with the paper's sample of tasks, half of the fixed tasks."),
     ],
     methods: Methods = None,
     only: Only = 1,
     seed: Seed = 0,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
     json_file: JsonFile = None,
     outcomes: Annotated[
         Path | None,
         typer.Option(
-            help="File for what came of each task, JSON lines, written as it comes: with it a run that was stopped goes on."
+            help="JSON lines file for the outcome of each task; an interrupted run resumes from it."
         ),
     ] = None,
 ) -> None:
-    """Generation rate, verification pass rate and time of 140 fixed tasks, by layout tree and by two simpler ways."""
-    kept = "; what was found is kept, and the same command goes on from there" if outcomes is not None else ""
+    """Measure generation rate, verification pass rate and time of 140 fixed tasks, by layout tree and two baselines."""
+    kept = "; outcomes so far are saved: run the same command to resume" if outcomes is not None else ""
     with user_errors(outcomes, kept):
         chosen = fixed_tasks(sample)[::only]
         told = methods or list(LayoutMethod)
@@ -134,11 +132,11 @@ def scenes(
 @app.command()
 def picture(
     task: Annotated[str, typer.Argument(help="Name of one of the 140 fixed tasks.")],
-    sample: Annotated[Path, typer.Option(help="The paper's sample of tasks, JSON lines.")],
+    sample: Annotated[Path, typer.Option(help="JSON lines file with the paper's sample of tasks.")],
     seed: Seed = 0,
     out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("side_by_side.png"),
 ) -> None:
-    """Draw one fixed task as the three methods lay it out, side by side."""
+    """Draw the layouts of one fixed task by the three methods, side by side."""
     with user_errors(out):
         drawn = draw_side_by_side(named(fixed_tasks(sample), task), seed)
         drawn.save(out)
@@ -147,17 +145,17 @@ def picture(
 
 @app.command()
 def looks(
-    sample: Annotated[Path, typer.Option(help="The paper's sample of tasks, JSON lines.")],
+    sample: Annotated[Path, typer.Option(help="JSON lines file with the paper's sample of tasks.")],
     methods: Methods = None,
     only: Only = 1,
     seed: Seed = 0,
     json_file: JsonFile = None,
-    llm: Annotated[str, typer.Option(help="Endpoint with a model that sees.")] = "",
-    model: Annotated[str, typer.Option(help="Name of the model there.")] = "",
+    llm: Annotated[str, typer.Option(help="URL of an endpoint with a vision-language model.")] = "",
+    model: Annotated[str, typer.Option(help="Name of the model at the endpoint.")] = "",
     key: Key = "",
     cassette: Tape = None,
 ) -> None:
-    """The paper's judge of aesthetics: a language model that is shown the plan of each laid out room, with its tree."""
+    """Score layouts with the paper's judge: a vision-language model sees the plan of each room and its layout tree."""
     with user_errors():
         chosen, told = fixed_tasks(sample)[::only], methods or list(LayoutMethod)
 
@@ -174,10 +172,10 @@ def looks(
 
 @app.command()
 def admissions(
-    folder: Annotated[Path, typer.Argument(help="Folder that `build`, `generate` or `corpus` wrote.")],
+    folder: Annotated[Path, typer.Argument(help="Folder written by `build`, `generate` or `corpus`.")],
     json_file: JsonFile = None,
 ) -> None:
-    """How many drafts of a build were admitted, how many in an hour of two cores, and why the rest was not."""
+    """Count the admitted drafts of a build, in total and per hour on two cores, and the reasons against the others."""
     with user_errors():
         evaluation = evaluate_admissions(folder)
     report_evaluation(evaluation, json_file)
@@ -185,14 +183,14 @@ def admissions(
 
 @app.command()
 def aesthetics(
-    rooms: Annotated[Path, typer.Option(help="Table of hand-made rooms, gzipped JSON.")],
+    rooms: Annotated[Path, typer.Option(help="Gzipped JSON file with hand-made rooms.")],
     seed: Seed = 0,
     json_file: JsonFile = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="File for weights that are fitted to all of the rooms.")
+        Path | None, typer.Option(help="File for the weights fitted to all rooms.")
     ] = None,
 ) -> None:
-    """How well the geometric score tells hand-made rooms from spoilt ones that its fit did not see."""
+    """Measure how well the geometric score separates held-out hand-made rooms from corrupted ones."""
     with user_errors():
         evaluation, fitted = evaluate_aesthetics(rooms, seed)
         if calibration is not None:
@@ -202,10 +200,10 @@ def aesthetics(
 
 @app.command()
 def page(
-    files: Annotated[list[Path], typer.Argument(help="Files that `evaluate PART --json` wrote.")],
-    out: Annotated[Path, typer.Option(help="Page whose part on the factory is replaced.")] = PAGE,
+    files: Annotated[list[Path], typer.Argument(help="Files written by `evaluate PART --json`.")],
+    out: Annotated[Path, typer.Option(help="Page with the factory's section to replace.")] = PAGE,
 ) -> None:
-    """Write the factory's part of the page of benchmarks."""
+    """Write the factory's section of the benchmark page."""
     with user_errors(out):
         evaluations = [read_evaluation(file) for file in files]
         before = out.read_text(encoding="utf-8") if out.exists() else ""
@@ -225,7 +223,7 @@ def _of_dataset(folder: Path, each: int) -> tuple[Mapping[str, Sequence[DraftFea
 async def _asked(
     question: Callable[[ChatModel], Awaitable[T]], url: str, model: str, key: str, cassette: Path | None
 ) -> T:
-    """What comes of a question to an endpoint, to a recording, or to both."""
+    """Run a question against an endpoint, a recording, or both."""
     async with chat_model(url, model, key, cassette) as judge:
         return await question(judge)
 
@@ -233,7 +231,7 @@ async def _asked(
 async def _judged(
     judge: ChatModel, groups: Mapping[str, Sequence[DraftFeatures]], seed: int
 ) -> tuple[Figure, ...]:
-    """Mean scores of a language model over the scenes."""
+    """Return the mean scores of a language model over the scenes."""
     verdicts = [
         await judged(judge, [asked.instruction for asked in group], seed) for group in groups.values()
     ]

@@ -44,44 +44,34 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-SceneIds = Annotated[list[str] | None, typer.Argument(help="Names of scenes, or none with --all.")]
+SceneIds = Annotated[list[str] | None, typer.Argument(help="Names of scenes; none with --all.")]
 SceneSource = Annotated[
     str,
-    typer.Argument(
-        help="Name of a scene, as `embomatrix scene list` shows it, or a .json file that `scene build` wrote."
-    ),
+    typer.Argument(help="Name of a scene (see `embomatrix scene list`), or a .json file of `scene build`."),
 ]
 SceneSources = Annotated[
     list[str] | None,
-    typer.Argument(
-        help="Names of scenes, or .json files that `scene build` wrote, which have their seed; none with --all."
-    ),
+    typer.Argument(help="Names of scenes, or .json files of `scene build`; none with --all."),
 ]
 All = Annotated[bool, typer.Option("--all", help="All 51 scenes.")]
-Seed = Annotated[
-    int, typer.Option(min=0, help="Another seed gives another arrangement of the same inventory.")
-]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the arrangement. Files have their own seed.")]
 Seeds = Annotated[
-    list[int] | None,
-    typer.Option("--seed", min=0, help="Arrangement of the inventory; give it again for more. Default: 0."),
+    list[int] | None, typer.Option("--seed", min=0, help="Seed of the arrangement; repeatable. Default: 0.")
 ]
-Out = Annotated[Path, typer.Option(help="Folder for the files.")]
+Out = Annotated[Path, typer.Option(help="Output folder.")]
 Picture = Annotated[Path, typer.Option(help="PNG file to write.")]
-Jobs = Annotated[int, typer.Option(min=1, help="Processes at a time.")]
+Jobs = Annotated[int, typer.Option(min=1, help="Number of processes.")]
 Report = Annotated[
-    Path | None, typer.Option(help="JSON file for all figures, problems and what was left out.")
+    Path | None, typer.Option(help="JSON file for all figures, problems and objects left out.")
 ]
-Assets = Annotated[
-    Path | None,
-    typer.Option(help="Folder of imported assets, which take the place of the generated ones."),
-]
+Assets = Annotated[Path | None, typer.Option(help="Folder of imported assets that replace generated ones.")]
 CORES = usable_cores()
-LEFT_OUT = "what is listed and not placed, and why: `embomatrix scene show NAME`, or --report FILE"
+LEFT_OUT = "for objects that were left out, and why: `embomatrix scene show NAME`, or --report FILE"
 
 
 @app.command("list")
 def list_scenes() -> None:
-    """Name the scenes whose inventories are known."""
+    """List the scenes of the catalog."""
     catalog = Catalog.load()
     for scene_id in catalog.scene_ids:
         Console().print(catalog.inventory(scene_id).description, highlight=False)
@@ -97,21 +87,25 @@ def build(
     jobs: Jobs = CORES,
     assets: Assets = None,
 ) -> None:
-    """Lay out and furnish scenes, check them, and write them as JSON; exit status 1 when one has a problem."""
+    """Lay out and furnish scenes, check them, and write them as JSON; exit status 1 if one has a problem."""
     chosen = _chosen(scene_ids, every)
-    _known(chosen)
-    _check_assets(assets)
+    # Bad input is reported before anything is written or hours of work begin.
+    with _user_errors():
+        for name in chosen:
+            Catalog.load().inventory(name)
+        if assets is not None:
+            read_assets(assets)
     _check_writable(report)
-    folder = _folder(out)
+    _make_folder(out)
     several = len(set(seeds or ())) > 1
     orders = [
-        SceneBuildJob(name, seed, folder / (f"{name}-{seed}.json" if several else f"{name}.json"), assets)
+        SceneBuildJob(name, seed, out / (f"{name}-{seed}.json" if several else f"{name}.json"), assets)
         for name in chosen
         for seed in dict.fromkeys(seeds or (0,))
     ]
     reports = _run(orders, jobs)
-    Console().print(str(orders[0].path if len(orders) == 1 else folder), highlight=False)
-    _tell(reports, report)
+    Console().print(str(orders[0].path if len(orders) == 1 else out), highlight=False)
+    _print_reports(reports, report)
 
 
 @app.command()
@@ -122,44 +116,63 @@ def check(
     report: Report = None,
     jobs: Jobs = CORES,
 ) -> None:
-    """Test scenes for penetration, unstable and floating things and blocked ways; exit status 1 when something is wrong."""
-    orders = _to_check(_chosen(scenes, every), tuple(dict.fromkeys(seeds or (0,))))
+    """Check scenes for penetration, instability, floating objects and blocked ways; exit status 1 on a problem."""
+    orders = []
+    with _user_errors():
+        for name in _chosen(scenes, every):
+            if name.endswith(SUFFIX):
+                scene = read_scene(Path(name))
+                orders.append(SceneBuildJob(scene.scene_id, scene.seed, source=Path(name)))
+            else:
+                Catalog.load().inventory(name)
+                orders += [SceneBuildJob(name, seed) for seed in dict.fromkeys(seeds or (0,))]
     _check_writable(report)
-    _tell(_run(orders, jobs), report)
+    _print_reports(_run(orders, jobs), report)
 
 
 @app.command()
 def show(scene: SceneSource, seed: Seed = 0) -> None:
-    """Print rooms, doorways, objects and what was left out."""
-    _print_scene(_built(scene, seed))
+    """Print rooms, doorways, objects, and what was left out."""
+    with _user_errors():
+        built = _built(scene, seed)
+    console = Console()
+    table = Table("room", "size (m)", "doors to", "windows", "objects")
+    for room in built.rooms:
+        doors = [d for d in built.doorways if room.name in d.rooms]
+        beyond = [next((r or "outside" for r in d.rooms if r != room.name), "outside") for d in doors]
+        windows = sum(room.name in window.rooms for window in built.windows)
+        counts = Counter(built.assets[o.asset_id].category for o in built.objects if o.room == room.name)
+        listed = ", ".join(f"{n} {c}" if n > 1 else c for c, n in sorted(counts.items()))
+        size = f"{room.size_m[0]:.2f} x {room.size_m[1]:.2f}"
+        table.add_row(room.name, size, ", ".join(beyond), str(windows), listed)
+    console.print(table)
+    for sentence in built.left_out:
+        console.print(f"left out: {sentence}", highlight=False, markup=False)
 
 
 @app.command()
 def render(scene: SceneSource, seed: Seed = 0, out: Out = Path()) -> None:
-    """Draw a plan from above, an oblique view, and what the robot sees around it where it starts, as PNG files."""
-    _there([scene])
-    folder = _folder(out)
-    built = _built(scene, seed)
-    with _engine_refusals():
+    """Draw a plan, an oblique view, and the robot's view at its start, as PNG files."""
+    _check_sources([scene])
+    _make_folder(out)
+    with _user_errors():
+        built = _built(scene, seed)
         pictures = {
             "plan": draw_plan(built),
             "view": Image.fromarray(np.asarray(render_oblique(built))),
             "eyes": draw_eyes(built),
         }
     for kind, picture in pictures.items():
-        path = folder / f"{built.scene_id}_{kind}.png"
-        _write(path, _png(picture))
-        Console().print(str(path), highlight=False)
+        _write_png(out / f"{built.scene_id}_{kind}.png", picture)
 
 
 @app.command()
 def relations(out: Out = Path()) -> None:
-    """Draw what every relation means: cases in which it holds, and in which it does not, as a PNG file."""
-    path = _folder(out) / "relations.png"
-    with _engine_refusals():
+    """Draw examples and counterexamples of every relation as a PNG file."""
+    _make_folder(out)
+    with _user_errors():
         picture = draw_relations()
-    _write(path, _png(picture.quantize(64)))
-    Console().print(str(path), highlight=False)
+    _write_png(out / "relations.png", picture.quantize(64))
 
 
 @app.command()
@@ -169,47 +182,26 @@ def sheet(
     seed: Seed = 0,
     out: Picture = Path("scenes.png"),
 ) -> None:
-    """Draw the plans of many scenes on one sheet, as a PNG file."""
-    chosen = _chosen(scenes, every)
-    _there(chosen)
-    _check_writable(out)
-    _write(out, _png(draw_sheet(_built_all(chosen, seed)).quantize(64)))
-    Console().print(str(out), highlight=False)
+    """Draw the plans of many scenes on one sheet as a PNG file."""
+    built = _built_all(_chosen(scenes, every), seed, out)
+    _write_png(out, draw_sheet(built).quantize(64))
 
 
 @app.command()
 def views(scenes: SceneSources = None, seed: Seed = 0, out: Picture = Path("views.png")) -> None:
-    """Draw oblique views of some scenes side by side, as a PNG file."""
-    chosen = _chosen(scenes, every=False)
-    _there(chosen)
-    _check_writable(out)
-    built = _built_all(chosen, seed)
-    with _engine_refusals():
+    """Draw oblique views of some scenes side by side as a PNG file."""
+    built = _built_all(_chosen(scenes, every=False), seed, out)
+    with _user_errors():
         picture = draw_views(built)
-    _write(out, _png(picture.quantize(128)))
-    Console().print(str(out), highlight=False)
+    _write_png(out, picture.quantize(128))
 
 
-def _print_scene(scene: Scene) -> None:
-    console = Console()
-    table = Table("room", "size (m)", "doors to", "windows", "objects")
-    for room in scene.rooms:
-        doors = [d for d in scene.doorways if room.name in d.rooms]
-        beyond = [next((r or "outside" for r in d.rooms if r != room.name), "outside") for d in doors]
-        windows = sum(room.name in window.rooms for window in scene.windows)
-        counts = Counter(scene.assets[o.asset_id].category for o in scene.objects if o.room == room.name)
-        listed = ", ".join(f"{n} {c}" if n > 1 else c for c, n in sorted(counts.items()))
-        size = f"{room.size_m[0]:.2f} x {room.size_m[1]:.2f}"
-        table.add_row(room.name, size, ", ".join(beyond), str(windows), listed)
-    console.print(table)
-    for sentence in scene.left_out:
-        console.print(f"left out: {sentence}", highlight=False, markup=False)
-
-
-def _built_all(names: Sequence[str], seed: int) -> list[Scene]:
-    """The scenes, one after another, with a bar that tells how far it is."""
+def _built_all(names: Sequence[str], seed: int, out: Path) -> list[Scene]:
+    """Build the scenes with a progress bar, after checking all names and the output file."""
+    _check_sources(names)
+    _check_writable(out)
     scenes = []
-    with _progress(len(names)) as bar:
+    with _user_errors(), _progress(len(names)) as bar:
         for name in names:
             bar.update(bar.task_ids[0], description=name)
             scenes.append(_built(name, seed))
@@ -217,38 +209,16 @@ def _built_all(names: Sequence[str], seed: int) -> list[Scene]:
     return scenes
 
 
-def _check_assets(folder: Path | None) -> None:
-    """Before anything is made: a damaged asset shall leave no folder behind."""
-    try:
-        if folder is not None:
-            read_assets(folder)
-    except ModelFileError as error:
-        raise _refused(str(error)) from None
-
-
-def _check_writable(path: Path | None) -> None:
-    """Before anything is made: minutes of work shall not end at a file that can't be written."""
-    if path is None:
-        return
-    try:
-        check_writable(path)
-    except OSError as error:
-        raise _unwritable(path, error) from None
-
-
 def _run(orders: Sequence[SceneBuildJob], jobs: int) -> list[SceneReport]:
     reports = []
-    with _progress(len(orders)) as bar:
-        try:
-            for report in run_batch(orders, processes=jobs):
-                reports.append(report)
-                bar.update(bar.task_ids[0], advance=1, description=report.scene_id)
-        except OSError as error:
-            raise _unwritable(Path(error.filename or "."), error) from None
+    with _user_errors(), _progress(len(orders)) as bar:
+        for report in run_batch(orders, processes=jobs):
+            reports.append(report)
+            bar.update(bar.task_ids[0], advance=1, description=report.scene_id)
     return sorted(reports, key=lambda r: (r.scene_id, r.seed))
 
 
-def _tell(reports: Sequence[SceneReport], path: Path | None) -> None:
+def _print_reports(reports: Sequence[SceneReport], path: Path | None) -> None:
     console = Console()
     Console(width=max(console.width, TABLE_COLUMNS)).print(report_table(reports))
     for line in problem_lines(reports):
@@ -256,7 +226,8 @@ def _tell(reports: Sequence[SceneReport], path: Path | None) -> None:
     if any(report.left_out for report in reports):
         console.print(LEFT_OUT, highlight=False, soft_wrap=True)
     if path is not None:
-        _write(path, (json.dumps([r.to_json() for r in reports], indent=1) + "\n").encode("utf-8"))
+        with _user_errors(path):
+            write_whole(path, (json.dumps([r.to_json() for r in reports], indent=1) + "\n").encode("utf-8"))
         console.print(str(path), highlight=False)
     wrong = sum(not report.sound for report in reports)
     if wrong:
@@ -275,55 +246,18 @@ def _chosen(names: Sequence[str] | None, every: bool) -> tuple[str, ...]:
     return Catalog.load().scene_ids if every else tuple(dict.fromkeys(names or ()))
 
 
-def _to_check(names: Sequence[str], seeds: Sequence[int]) -> list[SceneBuildJob]:
-    """Each file once, as it has its own seed, and each inventory with all seeds."""
-    orders = []
-    for name in names:
-        if _is_file(name):
-            scene = _read(name)
-            orders.append(SceneBuildJob(scene.scene_id, scene.seed, source=Path(name)))
-        else:
-            _known([name])
-            orders += [SceneBuildJob(name, seed) for seed in seeds]
-    return orders
-
-
-def _there(names: Sequence[str]) -> None:
-    """Before anything is made: a wrong name or a damaged file shall leave no folder behind."""
-    for name in names:
-        if _is_file(name):
-            _read(name)
-        else:
-            _known([name])
-
-
-def _known(names: Sequence[str]) -> None:
-    """Before anything is made: a wrong name shall leave no folder behind."""
-    try:
+def _check_sources(names: Sequence[str]) -> None:
+    """Reject unknown names and damaged files before anything is written."""
+    with _user_errors():
         for name in names:
-            Catalog.load().inventory(name)
-    except CatalogError as error:
-        raise _refused(str(error)) from None
-
-
-def _is_file(name: str) -> bool:
-    return name.endswith(SUFFIX)
-
-
-def _read(name: str) -> Scene:
-    try:
-        return read_scene(Path(name))
-    except SceneFileError as error:
-        raise _refused(str(error)) from None
+            if name.endswith(SUFFIX):
+                read_scene(Path(name))
+            else:
+                Catalog.load().inventory(name)
 
 
 def _built(name: str, seed: int) -> Scene:
-    if _is_file(name):
-        return _read(name)
-    try:
-        return build_base_scene(name, seed=seed)
-    except (CatalogError, FloorPlanError) as error:
-        raise _refused(str(error)) from None
+    return read_scene(Path(name)) if name.endswith(SUFFIX) else build_base_scene(name, seed=seed)
 
 
 def _progress(total: int) -> Progress:
@@ -333,40 +267,38 @@ def _progress(total: int) -> Progress:
     return progress
 
 
-@contextlib.contextmanager
-def _engine_refusals() -> Iterator[None]:
-    """A machine without pybullet gets a sentence."""
-    try:
-        yield
-    except EngineError as error:
-        raise _refused(str(error)) from None
+def _check_writable(path: Path | None) -> None:
+    """Reject an output file that can't be written before minutes of work begin."""
+    if path is not None:
+        with _user_errors(path):
+            check_writable(path)
 
 
-def _folder(out: Path) -> Path:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _unwritable(out, error) from None
-    return out
+def _make_folder(path: Path) -> None:
+    with _user_errors(path):
+        path.mkdir(parents=True, exist_ok=True)
 
 
-def _write(path: Path, data: bytes) -> None:
-    try:
-        write_whole(path, data)
-    except OSError as error:
-        raise _unwritable(path, error) from None
-
-
-def _png(image: Image.Image) -> bytes:
+def _write_png(path: Path, image: Image.Image) -> None:
     buffer = io.BytesIO()
     image.save(buffer, format="PNG", optimize=True)
-    return buffer.getvalue()
+    with _user_errors(path):
+        write_whole(path, buffer.getvalue())
+    Console().print(str(path), highlight=False)
 
 
-def _unwritable(path: Path, error: OSError) -> typer.Exit:
-    return _refused(
-        f"{path} can't be written ({error.strerror}): make room, or name another folder with --out"
-    )
+@contextlib.contextmanager
+def _user_errors(path: Path | None = None) -> Iterator[None]:
+    """Print errors that the user can fix as one sentence and exit with status 2. ``path`` is the output path."""
+    try:
+        yield
+    except (CatalogError, EngineError, FloorPlanError, ModelFileError, SceneFileError) as error:
+        raise _refused(str(error)) from None
+    except OSError as error:
+        raise _refused(
+            f"{path or error.filename or '.'} can't be written ({error.strerror}): free disk space, or name another "
+            "folder with --out"
+        ) from None
 
 
 def _refused(sentence: str) -> typer.Exit:

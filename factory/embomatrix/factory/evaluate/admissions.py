@@ -1,4 +1,4 @@
-"""What a build's ledger tells: how many drafts were admitted, why the others were not, and how many an hour gives."""
+"""Admission figures from a build's ledger: share of admitted drafts, reasons against the others, tasks per hour."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 GOAL_PERCENT: Final = 90.0
 GOAL_PER_HOUR: Final = 1000.0
 CORES: Final = 2
-"""On so many cores that do nothing else, the goal is counted."""
+"""Number of otherwise idle cores that the goal refers to."""
 ADMITTED: Final = "admitted"
 
 
 def admitted_share(folder: Path, label: str = "") -> tuple[Figure, ...]:
-    """The one figure, in percent of drafts; none for a dataset without ledger. Raises EvaluationError for a damaged one."""
+    """Return the admitted share in percent of drafts; empty without a ledger. Raises EvaluationError for a damaged one."""
     attempts = _attempts(folder)
     if not attempts:
         return ()
@@ -33,7 +33,7 @@ def admitted_share(folder: Path, label: str = "") -> tuple[Figure, ...]:
 
 
 def evaluate_admissions(folder: Path) -> EvaluationFigures:
-    """Share and pace of what a build admitted, with the reasons against the rest. Raises EvaluationError."""
+    """Return share and rate of a build's admitted drafts, and the reasons against the others. Raises EvaluationError."""
     attempts = _attempts(folder)
     if not attempts:
         raise EvaluationError(
@@ -56,7 +56,7 @@ def evaluate_admissions(folder: Path) -> EvaluationFigures:
 
 
 def _per_hour(folder: Path, attempts: Sequence[dict[str, Any]], label: str) -> tuple[Figure, ...]:
-    """Admitted tasks in an hour of two cores, by processor time; of variants of which it is known, with all base scenes."""
+    """Return the admitted tasks per hour on two cores, by CPU time. Variants without a recorded time are left out."""
     lines = list(_times(folder / TIMES_FILE))
     timed = {(line["split"], line["variant"]) for line in lines if "variant" in line}
     spent_s = sum(line["cpu_s"] for line in lines)
@@ -71,7 +71,7 @@ def _per_hour(folder: Path, attempts: Sequence[dict[str, Any]], label: str) -> t
 
 
 def _times(path: Path) -> Iterator[dict[str, Any]]:
-    """Lines of the file of times. One that was cut short is left out: what it told of was made again."""
+    """Yield the records of CPU time. A truncated line is skipped: its work was repeated."""
     if not path.is_file():
         return
     for line in path.read_text(encoding="utf-8").splitlines():
@@ -92,7 +92,7 @@ def _attempts(folder: Path) -> list[dict[str, Any]]:
         return [{**line, "outcome": line["outcome"]} for line in lines]
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise EvaluationError(
-            f"{path} can't be read as a ledger ({error}): call the build again, which writes it anew"
+            f"{path} can't be read as a ledger ({error}): run the build again to rewrite it"
         ) from error
 
 
@@ -104,8 +104,8 @@ def _settings(folder: Path) -> dict[str, Any]:
         return {name: value[name] for name in ("writer", "look_ahead", "physical")}
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise EvaluationError(
-            f"{path} does not tell the settings of a build ({error}): name a folder that `factory build`, `generate` or "
-            "`corpus` wrote"
+            f"{path} does not hold the settings of a build ({error}): name a folder written by `factory build`, "
+            "`generate` or `corpus`"
         ) from error
 
 

@@ -1,8 +1,8 @@
-"""How well a room is laid out, by its geometry: 0 to 10 in the parts of the paper's rubric, weights fitted to hand-made rooms.
+"""Geometric score of a room's layout, from 0 to 10, with weights fitted to hand-made rooms.
 
-Correspondence gives 2 points: the share of what a task asks for that is there, as whoever laid the scene out is told. Clutter
-and placement give 4 each: features in [0, 1], weighted. The weights come of a logistic regression that tells hand-made
-rooms from the same rooms spoilt (see ``spoiling``); a weight below 0 is none.
+The score follows the paper's rubric. Correspondence gives up to 2 points: the share of a task's objects that are present.
+Clutter and placement give up to 4 points each: weighted means of features in [0, 1]. A logistic regression, with weights
+bounded below by 0, fits the weights so that hand-made rooms score higher than corrupted copies of them.
 """
 
 from __future__ import annotations
@@ -10,14 +10,16 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter, defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from scipy import ndimage
 
-from embomatrix.factory.evaluate.rooms import FLOOR, RoomBox, RoomPlan
+from embomatrix.factory.evaluate.room_plans import FLOOR, RoomBox, RoomPlan, read_rooms
+from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures
+from embomatrix.pages.figures import Better, Figure
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -25,15 +27,18 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     FloatArray = NDArray[np.float64]
+    from pathlib import Path
+
+    from embomatrix.factory.evaluate.room_plans import RoomBox, RoomPlan
 
 CELL_M: Final = 0.1
 ROBOT_M: Final = 0.2
-"""Radius with which free floor is walked through: SceneEval's, after PhyScene."""
+"""Radius of the robot in the test of free floor, as in SceneEval and PhyScene."""
 WALL_M: Final = 0.15
-"""As in the counts of how often furniture of a kind stands at the edge of a room."""
+"""Greatest distance to the edge of the room for furniture at a wall."""
 STRAIGHT_RAD: Final = math.radians(2)
 SEAT_M: Final = 0.5
-"""Between the edge of a seat and that of its table."""
+"""Greatest distance between a seat and its table."""
 SLACK_M: Final = 0.02
 AT_WALL: Final = frozenset(
     {"bed", "desk", "tv_stand", "fridge", "counter_top", "floor_lamp", "dresser", "toilet", "side_table", "shelving_unit",
@@ -44,22 +49,22 @@ TABLES: Final = frozenset({"dining_table", "desk", "counter_top", "bar", "coffee
 CLUTTER: Final = ("apart", "things_apart", "walkable", "within")
 PLACEMENT: Final = ("at_wall", "straight", "seated", "hosted", "in_reach")
 RAREST: Final = 0.02
-"""Share of a host, of the commonest one's, that counts as none."""
+"""Share of a host, relative to the commonest host, below which it counts as unused."""
 REACH_M: Final = (0.2, 1.5)
-"""Heights at which the robot's arm works."""
+"""Heights that the robot's arm reaches."""
 FILE: Final = "aesthetics.json"
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """``weights`` by feature, none below 0; ``hosts`` are shares of hosts by kind of thing, counted in hand-made rooms."""
+    """Fitted parameters: ``weights`` by feature, none below 0, and ``hosts``, shares of hosts by kind of object."""
 
     weights: Mapping[str, float]
     hosts: Mapping[str, Mapping[str, float]]
 
     @staticmethod
     def load() -> Calibration:
-        """The one that was fitted to the rooms that the data's notice names."""
+        """Return the packaged calibration; NOTICE.md names the rooms that it was fitted to."""
         path = resources.files("embomatrix.factory.evaluate") / FILE
         value = json.loads(path.read_text(encoding="utf-8"))
         return Calibration(value["weights"], value["hosts"])
@@ -67,7 +72,7 @@ class Calibration:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Points: of 2, of 4 and of 4. ``features`` are those that the room has anything to tell about."""
+    """Points out of 2, 4 and 4, and the features that apply to the room."""
 
     correspondence: float
     clutter: float
@@ -80,7 +85,7 @@ class Score:
 
 
 def score_room(plan: RoomPlan, calibration: Calibration, correspondence: float = 1.0) -> Score:
-    """``correspondence`` is the share of what was asked for that is there and holds, 1 where nothing was asked for."""
+    """Score a room. ``correspondence`` is the share of requested objects that are present, 1 if none were requested."""
     features = features_of(plan, calibration.hosts)
     return Score(
         2 * correspondence,
@@ -91,14 +96,14 @@ def score_room(plan: RoomPlan, calibration: Calibration, correspondence: float =
 
 
 def _weighted(features: Mapping[str, float], names: Sequence[str], weights: Mapping[str, float]) -> float:
-    """Weighted mean of the named features that the room has; full marks where it has none."""
+    """Return the weighted mean of the named features that apply to the room; 1 if none applies."""
     known = [name for name in names if name in features]
     whole = sum(weights[name] for name in known)
     return sum(weights[name] * features[name] for name in known) / whole if whole else 1.0
 
 
 def features_of(plan: RoomPlan, hosts: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
-    """Features in [0, 1], 1 the best; those are left out that the room has nothing for."""
+    """Return the features that apply to the room, in [0, 1]; 1 is best."""
     walled = [item for item in plan.pieces if item.kind in AT_WALL]
     seats = [item for item in plan.pieces if item.kind in SEATS]
     tables = [item for item in plan.pieces if item.kind in TABLES]
@@ -122,12 +127,12 @@ def features_of(plan: RoomPlan, hosts: Mapping[str, Mapping[str, float]]) -> dic
 
 
 def _fitness(share: float) -> float:
-    """Of a host: 1 for the commonest one, 0 for one that people never use, the logarithm of its share between."""
+    """Return the fitness of a host: 1 for the commonest, 0 for an unused one, logarithmic in its share between."""
     return 1 - math.log(max(share, RAREST)) / math.log(RAREST)
 
 
 def walkable_share(plan: RoomPlan) -> float:
-    """The largest part of the free floor that the robot can drive through, over all of the free floor."""
+    """Return the largest connected part of the floor that the robot can drive through, as a share of the free floor."""
     low, high = np.array(plan.low_m), np.array(plan.high_m)
     counts = np.maximum(1, np.ceil((high - low) / CELL_M)).astype(int)
     x = low[0] + (np.arange(counts[0]) + 0.5) * CELL_M
@@ -147,7 +152,7 @@ def walkable_share(plan: RoomPlan) -> float:
 
 
 def hosts_in(rooms: Sequence[RoomPlan]) -> dict[str, dict[str, float]]:
-    """How things of a kind are shared among kinds of hosts, by kind: each host's count over that of the commonest one."""
+    """Return for each kind of object its hosts, with their counts as shares of the commonest host's count."""
     counts: defaultdict[str, Counter[str]] = defaultdict(Counter)
     for room in rooms:
         for thing in room.things:
@@ -159,9 +164,9 @@ def hosts_in(rooms: Sequence[RoomPlan]) -> dict[str, dict[str, float]]:
 
 
 def fit(good: Sequence[RoomPlan], spoilt: Sequence[RoomPlan], *, steps: int = 4_000) -> Calibration:
-    """Weights that tell good rooms from spoilt ones: logistic regression by projected gradient descent, no weight below 0.
+    """Fit weights that separate good rooms from corrupted ones: logistic regression by projected gradient descent.
 
-    A feature that a room has nothing for counts as the mean over all rooms.
+    Weights are bounded below by 0. A feature that does not apply to a room is replaced by the mean over all rooms.
     """
     hosts = hosts_in(good)
     names = (*CLUTTER, *PLACEMENT)
@@ -182,13 +187,13 @@ def fit(good: Sequence[RoomPlan], spoilt: Sequence[RoomPlan], *, steps: int = 4_
 
 
 def auc(good: FloatArray, spoilt: FloatArray) -> float:
-    """Chance that a good room scores above a spoilt one, a draw counting half: Mann and Whitney 1947."""
+    """Return the probability that a good room scores above a corrupted one; ties count half (Mann and Whitney 1947)."""
     above = (good[:, None] > spoilt[None, :]).mean()
     return float(above + (good[:, None] == spoilt[None, :]).mean() / 2)
 
 
 def _bumps(items: Sequence[RoomBox], at: int) -> bool:
-    """Whether the item is in another one; what is drawn up to a table, or stands on a carpet, is not."""
+    """True if the item overlaps another one. Seats at tables and furniture on carpets do not count."""
     return any(_overlap(items[at], other) for number, other in enumerate(items) if number != at)
 
 
@@ -201,7 +206,7 @@ def _overlap(one: RoomBox, other: RoomBox) -> bool:
 
 
 def _gap_m(one: RoomBox, other: RoomBox) -> float:
-    """Distance of the two boxes' shadows on the room's axes; below 0 how deep one is in the other."""
+    """Return the horizontal distance of two boxes along the room's axes; negative for the depth of an overlap."""
     gaps = [
         abs(a - b) - c - d
         for a, b, c, d in zip(one.center_m, other.center_m, one.reach_m, other.reach_m, strict=True)
@@ -210,10 +215,127 @@ def _gap_m(one: RoomBox, other: RoomBox) -> float:
 
 
 def _wall_gap_m(item: RoomBox, plan: RoomPlan) -> float:
-    """From the box to the nearest edge of the room."""
+    """Return the distance from the box to the nearest edge of the room."""
     (x, y), (a, b) = item.center_m, item.reach_m
     return min(x - a - plan.low_m[0], plan.high_m[0] - x - a, y - b - plan.low_m[1], plan.high_m[1] - y - b)
 
 
 def _is_within(item: RoomBox, plan: RoomPlan) -> bool:
     return _wall_gap_m(item, plan) >= -5 * SLACK_M
+
+
+SHIFT_M: Final = 0.4
+TURN_RAD: Final = math.radians(15)
+SWAPPED: Final = 0.7
+"""Share of a room's small objects that change places."""
+
+
+def shifted(room: RoomPlan, rng: np.random.Generator) -> RoomPlan:
+    """Move and turn each piece a little at random, together with its small objects."""
+    moves = [tuple(float(step) for step in rng.normal(0.0, SHIFT_M, 2)) for _ in room.pieces]
+    turned = [
+        replace(_moved(item, move), tilt_rad=item.tilt_rad + float(rng.normal(0.0, TURN_RAD)))
+        for item, move in zip(room.pieces, moves, strict=True)
+    ]
+    return replace(room, pieces=tuple(turned), things=_carried(room, moves))
+
+
+def swapped(room: RoomPlan, rng: np.random.Generator) -> RoomPlan:
+    """Swap the places of small objects, whatever their hosts."""
+    chosen = [at for at in range(len(room.things)) if rng.random() < SWAPPED]
+    things, carried = list(room.things), list(room.carried)
+    for at, other in zip(chosen, rng.permutation(chosen) if chosen else (), strict=True):
+        place, thing = room.things[int(other)], room.things[at]
+        things[at] = replace(
+            thing,
+            center_m=place.center_m,
+            low_m=place.low_m,
+            high_m=place.low_m + thing.high_m - thing.low_m,
+            host=place.host,
+        )
+        carried[at] = room.carried[int(other)]
+    return replace(room, things=tuple(things), carried=tuple(carried))
+
+
+def dropped(room: RoomPlan, rng: np.random.Generator) -> RoomPlan:
+    """Put each piece anywhere in the room, perhaps turned by a quarter, together with its small objects."""
+    moves = []
+    for item in room.pieces:
+        x, y = (float(rng.uniform(low, high)) for low, high in zip(room.low_m, room.high_m, strict=True))
+        moves.append((x - item.center_m[0], y - item.center_m[1]))
+    pieces = [
+        replace(_moved(item, move), half_m=item.half_m[::-1] if rng.random() < 0.5 else item.half_m)
+        for item, move in zip(room.pieces, moves, strict=True)
+    ]
+    return replace(room, pieces=tuple(pieces), things=_carried(room, moves))
+
+
+SPOILERS: Final = {"shifted": shifted, "swapped": swapped, "dropped": dropped}
+
+
+def _carried(room: RoomPlan, moves: Sequence[tuple[float, ...]]) -> tuple[RoomBox, ...]:
+    return tuple(
+        _moved(thing, moves[bearer]) if bearer >= 0 else thing
+        for thing, bearer in zip(room.things, room.carried, strict=True)
+    )
+
+
+def _moved(item: RoomBox, move: tuple[float, ...]) -> RoomBox:
+    return replace(item, center_m=(item.center_m[0] + move[0], item.center_m[1] + move[1]))
+
+
+FEWEST_PIECES: Final = 3
+"""Least number of pieces of furniture in a hand-made room that is used."""
+AUC_GOAL: Final = 0.8
+SPLITS: Final = 10
+"""Random halvings of the rooms that the held-out AUC is averaged over: a single one depends on luck."""
+
+
+def evaluate_aesthetics(rooms_file: Path, seed: int) -> tuple[EvaluationFigures, Calibration]:
+    """Measure how well fitted scores separate held-out rooms; return also the calibration fitted to all rooms.
+
+    Raises EvaluationError.
+    """
+    rooms = [room for room in read_rooms(rooms_file) if len(room.pieces) >= FEWEST_PIECES]
+    if len(rooms) < 4:
+        raise EvaluationError(f"{rooms_file} holds {len(rooms)} rooms with furniture: expected 4 or more")
+    rng = np.random.default_rng(seed)
+    found: dict[str, list[float]] = {name: [] for name in ("auc", *SPOILERS)}
+    good, bad = [], []
+    for _ in range(SPLITS):
+        order = [rooms[int(at)] for at in rng.permutation(len(rooms))]
+        half = len(order) // 2
+        calibration = fit(order[:half], _spoilt(order[:half], rng))
+        real = _totals(order[half:], calibration)
+        spoilt = {
+            name: _totals([spoil(room, rng) for room in order[half:]], calibration)
+            for name, spoil in SPOILERS.items()
+        }
+        for name, totals in spoilt.items():
+            found[name].append(auc(real, totals))
+        everything = np.concatenate([*spoilt.values()])
+        found["auc"].append(auc(real, everything))
+        good.append(real.mean())
+        bad.append(everything.mean())
+    n = SPLITS * (len(rooms) - len(rooms) // 2)
+    figures = (
+        Figure("aesthetics_auc", float(np.mean(found["auc"])), "", Better.HIGHER, n, AUC_GOAL),
+        *(
+            Figure(f"aesthetics_auc {name}", float(np.mean(found[name])), "", Better.NEITHER, n)
+            for name in SPOILERS
+        ),
+        Figure("aesthetics hand-made", float(np.mean(good)), "of 10", Better.NEITHER, n),
+        Figure("aesthetics spoilt", float(np.mean(bad)), "of 10", Better.NEITHER, 3 * n),
+    )
+    conditions = {"rooms": len(rooms), "halvings": SPLITS, "seed": seed}
+    return EvaluationFigures("aesthetics", conditions, figures), fit(rooms, _spoilt(rooms, rng))
+
+
+def _spoilt(rooms: Sequence[RoomPlan], rng: np.random.Generator) -> list[RoomPlan]:
+    return [spoil(room, rng) for spoil in SPOILERS.values() for room in rooms]
+
+
+def _totals(
+    rooms: Sequence[RoomPlan], calibration: Calibration
+) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    return np.array([score_room(room, calibration).total for room in rooms])

@@ -1,7 +1,7 @@
-"""The paper's verification of a scene: the robot is sent to each thing that the task is about, and picks up what it can.
+"""The paper's verification of a scene: the robot moves to each object of the task and picks up what it can carry.
 
-What bears something is not picked up.
-Executed in the simulator, each thing from the start; what lies behind a door is opened first.
+Each object is tried in the simulator from the start state. Doors in front of it are opened first. Objects that carry others
+are not picked up.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ SEED: Final = 0
 
 
 def out_of_hand(stage: Simulator, task: Task, view: SceneView, names: Sequence[str]) -> tuple[str, ...]:
-    """Those of some objects that the robot can't get at, or not pick up though it could carry them; with why, in words.
+    """Return the objects that the robot can't reach, or can't pick up although they are portable, each with the reason.
 
-    Objects that are absent at the start, or hang higher than the arm reaches, are left out.
+    Objects that are absent at the start, or hang higher than the arm reaches, are skipped.
     """
     found = []
     for name in names:
@@ -47,7 +47,7 @@ def out_of_hand(stage: Simulator, task: Task, view: SceneView, names: Sequence[s
 
 
 def _plans(task: Task, view: SceneView, name: str) -> Iterator[Plan]:
-    """Ways to get at an object: to its place, or with what shuts it in opened first, from there or from another place."""
+    """Yield plans to reach an object: after opening what encloses it, with and without moving to the object itself."""
     shut = [
         host
         for guest, host in itertools.pairwise((name, *view.hosts(name)))

@@ -1,6 +1,6 @@
-"""The factory's part of the page of benchmarks: tables of evaluations between two marks, all else left as it is.
+"""Factory section of the benchmark page: tables of evaluations between two markers. The rest of the page stays as it is.
 
-What was measured anew takes the place of what stood under the same heading; the other headings stay.
+New figures replace the text under their heading; other headings stay.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 WIDTH: Final = 128
 BEGIN: Final = "<!-- by hand: factory -->"
-"""The page of benches keeps what stands between its marks, whoever wrote it."""
+"""Start marker. The renderer of the benchmark page keeps the text between such markers."""
 END: Final = "<!-- end by hand -->"
 _HEADING: Final = "\n### "
 PARTS: Final[Mapping[str, tuple[str, str]]] = {
@@ -72,9 +72,9 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
 
 
 def with_factory(page: str, evaluations: Sequence[EvaluationFigures]) -> str:
-    """The page with these evaluations in the factory's part, which is added at the end where it is not there yet.
+    """Return the page with these evaluations in the factory's section, which is appended if missing.
 
-    Raises EvaluationError where a mark lacks its other, for an unknown part, or a figure that two files of a part give.
+    Raises EvaluationError for a missing end marker, an unknown part, or a figure that two files contain.
     """
     there = _there(page.partition(BEGIN)[2].partition(END)[0])
     text = f"{BEGIN}\n{_render({**there, **_measured(evaluations)})}\n{END}"
@@ -84,13 +84,13 @@ def with_factory(page: str, evaluations: Sequence[EvaluationFigures]) -> str:
     _, mark, after = rest.partition(END)
     if not mark:
         raise EvaluationError(
-            f"the page has {BEGIN!r} without {END!r} after it: put it back where the part ends, so that nothing is lost"
+            f"the page has {BEGIN!r} without {END!r} after it: insert it at the end of the factory's section"
         )
     return f"{before}{text}{after}"
 
 
 def _there(text: str) -> dict[str, str]:
-    """What stands under the heading of each part."""
+    """Return the text under the heading of each part."""
     headings = {heading: part for part, (heading, _) in PARTS.items()}
     found = {}
     for section in text.split(_HEADING)[1:]:
@@ -101,7 +101,7 @@ def _there(text: str) -> dict[str, str]:
 
 
 def _render(sections: Mapping[str, str]) -> str:
-    """The whole of it in Markdown, in the order of `PARTS`."""
+    """Return the section as Markdown, in the order of `PARTS`."""
     lines = ["## Factory", "", "Written by `embomatrix factory evaluate page FILE...`."]
     for part, (heading, _) in PARTS.items():
         if part in sections:
@@ -110,7 +110,7 @@ def _render(sections: Mapping[str, str]) -> str:
 
 
 def _measured(evaluations: Sequence[EvaluationFigures]) -> dict[str, str]:
-    """What stands under the headings of these evaluations; files of one part are put together."""
+    """Return the text of each part; files of one part are combined."""
     sections = {}
     for part, mine in _by_part(evaluations).items():
         lines = [_paragraph(PARTS[part][1]), ""]
@@ -127,7 +127,7 @@ def _measured(evaluations: Sequence[EvaluationFigures]) -> dict[str, str]:
 
 
 def _by_part(evaluations: Sequence[EvaluationFigures]) -> dict[str, list[EvaluationFigures]]:
-    """Evaluations by part, in the order of the page. Raises EvaluationError."""
+    """Group evaluations by part, in the order of the page. Raises EvaluationError."""
     for evaluation in evaluations:
         if evaluation.part not in PARTS:
             raise EvaluationError(f"there is no part {evaluation.part!r}: expected {', '.join(PARTS)}")

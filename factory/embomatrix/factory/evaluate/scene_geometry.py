@@ -1,7 +1,7 @@
-"""Whether what was added to a scene is where it may be: told by code of its own, which no method of layout calls.
+"""Geometric verification of objects added to a scene, independent of the code of all layout methods.
 
-Bullet finds what is in one another; supports, rooms and doorways are judged by boxes of parts; where the robot gets to by a
-flood over a grid of its own.
+Bullet finds penetrations. Boxes of parts decide on supports, rooms and doorways. A flood fill over a grid finds the floor
+that the robot reaches.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ if TYPE_CHECKING:
 
 CELL_M: Final = 0.05
 REST_M: Final = 0.012
-"""An underside this near to a top rests on it: a centimetre as in the relations, and what things sink in physics."""
+"""Greatest gap between an underside and its support: 1 cm as in the relations, plus the sinking in physics."""
 WALL_M: Final = 0.03
-"""Things may touch walls, and reach this far into a room's edge by their boxes."""
+"""Depth by which boxes may overlap the edge of a room: objects may touch walls."""
 DOOR_M: Final = 0.6
-"""What must be free before a doorway at least: the robot's width and a hand on either side."""
+"""Free depth before a doorway: the robot's width and some clearance."""
 RUG_M: Final = 0.03
 HUNG_M: Final = 2.0
-"""Of what hangs higher nobody asks the robot."""
+"""Objects that hang higher need not be reached."""
 _HERE: Final = Pose((0.0, 0.0, 0.0))
 
 
 class Flaw(StrEnum):
-    """What can be wrong with an added thing."""
+    """Flaw of an added object."""
 
     PENETRATES = "penetrates"
     FLOATS = "floats"
@@ -61,7 +61,7 @@ def flaws_of(scene: Scene, added: Sequence[str]) -> tuple[tuple[str, Flaw], ...]
             found.append((name, Flaw.FLOATS))
         if not _is_within(scene, name, boxes[name]):
             found.append((name, Flaw.OUTSIDE))
-        if _bars_doorway(scene, boxes[name]):
+        if _blocks_doorway(scene, boxes[name]):
             found.append((name, Flaw.BARS_DOORWAY))
         hung = scene.by_name[name].fixed and boxes[name][:, 2].min() > HUNG_M
         if not hung and not _is_reached(boxes[name], reached):
@@ -70,7 +70,7 @@ def flaws_of(scene: Scene, added: Sequence[str]) -> tuple[tuple[str, Flaw], ...]
 
 
 def _parts(scene: Scene, item: SceneObject) -> FloatArray:
-    """Boxes of an object's parts with shut joints, rows (x0, y0, z0, x1, y1, z1)."""
+    """Return the boxes of an object's parts with shut joints, rows (x0, y0, z0, x1, y1, z1)."""
     rows = [
         (*box.low_m, *box.high_m)
         for link in scene.assets[item.asset_id].links
@@ -88,7 +88,7 @@ def _penetrating(scene: Scene, names: Sequence[str]) -> Iterator[str]:
 
 
 def _is_borne(scene: Scene, name: str, boxes: dict[str, FloatArray]) -> bool:
-    """Whether something bears a thing: the floor, the top of a part below it, a wall behind it, or the ceiling."""
+    """True if something supports the object: the floor, a part below it, a wall behind it, or the ceiling."""
     mine = boxes[name]
     low = mine[:, 2].min()
     if low <= REST_M:
@@ -102,7 +102,7 @@ def _is_borne(scene: Scene, name: str, boxes: dict[str, FloatArray]) -> bool:
                 return True
     item = scene.by_name[name]
     if not item.fixed:
-        # Round bottoms rest in hollows: the named host's own cavity bears what lies in it.
+        # A round bottom may rest in a hollow: the box of its host then reaches above its underside.
         host = boxes.get(item.host)
         return host is not None and bool(np.any((host[:, 2] <= low) & (host[:, 5] >= low - REST_M)))
     walls = np.array([(*box.low_m, *box.high_m) for wall in scene.walls for box in (wall.aabb(_HERE),)])
@@ -124,19 +124,19 @@ def _is_within(scene: Scene, name: str, parts: FloatArray) -> bool:
     )
 
 
-def _bars_doorway(scene: Scene, parts: FloatArray) -> bool:
-    """Whether a thing that the robot has to go around stands in a doorway or right before it."""
-    barring = parts[(parts[:, 2] < ROBOT.height_m) & (parts[:, 5] > RUG_M)]
+def _blocks_doorway(scene: Scene, parts: FloatArray) -> bool:
+    """True if an obstacle to the robot stands in a doorway or right before it."""
+    blocking = parts[(parts[:, 2] < ROBOT.height_m) & (parts[:, 5] > RUG_M)]
     for door in scene.doorways:
         half = np.array((door.width_m / 2, DOOR_M) if door.along == "x" else (DOOR_M, door.width_m / 2))
         low, high = np.array(door.center_m) - half, np.array(door.center_m) + half
-        if np.any(np.all((barring[:, :2] < high) & (barring[:, 3:5] > low), axis=1)):
+        if np.any(np.all((blocking[:, :2] < high) & (blocking[:, 3:5] > low), axis=1)):
             return True
     return False
 
 
 def _reached(scene: Scene, boxes: dict[str, FloatArray]) -> FloatArray:
-    """Middles of the cells that the robot's base gets to from its start, shape (n, 2)."""
+    """Return the centres of the cells that the robot's base reaches from its start, shape (n, 2)."""
     low = np.min([room.low_m for room in scene.rooms], axis=0) - 0.5
     high = np.max([room.high_m for room in scene.rooms], axis=0) + 0.5
     shape = np.ceil((high - low) / CELL_M).astype(int)
@@ -159,7 +159,7 @@ def _reached(scene: Scene, boxes: dict[str, FloatArray]) -> FloatArray:
     solid = np.concatenate([walls.reshape(-1, 6), *boxes.values()])
     for row in solid[(solid[:, 2] < ROBOT.height_m) & (solid[:, 5] > RUG_M)]:
         floor[window(row[:2], row[3:5])] = False
-    # Cells are counted as taken whole: half a cell is given back.
+    # A partly occupied cell counts as full, which takes half a cell on average: the threshold gives it back.
     free = ndimage.distance_transform_edt(floor) * CELL_M >= ROBOT.radius_m - CELL_M / 2
     labels, _ = ndimage.label(free, structure=np.ones((3, 3)))
     cells = np.argwhere(free)
@@ -172,7 +172,7 @@ def _reached(scene: Scene, boxes: dict[str, FloatArray]) -> FloatArray:
 
 
 def _is_reached(parts: FloatArray, cells: FloatArray) -> bool:
-    """Whether the robot can stand within an arm's length of a thing, and the thing is no higher than its arm gets."""
+    """True if the robot can stand within arm's length of the object, and the object is not too high."""
     low, high = parts[:, :2].min(axis=0), parts[:, 3:5].max(axis=0)
     away = np.hypot(*(cells - np.clip(cells, low, high)).T)
     return bool(np.any(away <= ROBOT.reach_m)) and bool(parts[:, 2].min() <= ROBOT.reach_high_m)

@@ -1,9 +1,8 @@
-"""Scene quality: the same tasks laid out by three methods, each scene judged by code that no method calls.
+"""Scene quality: the same tasks laid out by three methods, each scene judged by code that no method uses.
 
-A task counts as generated when every object has a place and its start holds in the simulator. A generated one counts as
-verified, as in the paper, when the robot can manipulate what the task is about, executed in the simulator, and the geometry
-of what was added is sound. Whether the oracle also finds a plan to the goal is a figure of its own: that depends on the
-skills as well.
+A task is generated if every object has a place and its start state holds in the simulator. A generated task is verified, as
+in the paper, if the robot can manipulate its objects in the simulator and the geometry of the added objects is valid. The
+share of tasks that the oracle solves is a separate figure, because it also depends on the skills.
 """
 
 from __future__ import annotations
@@ -23,35 +22,39 @@ import numpy as np
 from embomatrix.factory.admission import Admitted, RefusalReason, TaskRefusal, admit
 from embomatrix.factory.evaluate.aesthetics import Calibration, score_room
 from embomatrix.factory.evaluate.manipulation import out_of_hand
-from embomatrix.factory.evaluate.rooms import plan_of
+from embomatrix.factory.evaluate.room_plans import plan_of
 from embomatrix.factory.evaluate.scene_geometry import flaws_of
 from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures
+from embomatrix.factory.pipeline.store import ResumableLog
+from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.batch import poses_for
 from embomatrix.factory.task_import.sources import SourceText, read_activity
 from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
 from embomatrix.pages.figures import Better, Figure
+from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.planner.oracle import find_plan
+from embomatrix.sim.process_pool import process_pool
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from embomatrix.factory.layout.request import Layout, RequestedObject
     from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.factory.task_import.task import Lay
-    from embomatrix.sim.placing.pose_cache import PlacementLibrary
     from embomatrix.world.scene import Scene
+
 
 LIST: Final = "scene_tasks.json"
 
 
 class LayoutMethod(StrEnum):
-    """How a task is laid out."""
+    """Layout method of a task."""
 
     TREE = "tree"
     RANDOM = "random"
@@ -67,7 +70,7 @@ METHODS: Final[Mapping[LayoutMethod, Lay]] = {
 
 @dataclass(frozen=True, slots=True)
 class SceneTask:
-    """A task of the fixed list, and the base scene that it is laid out in."""
+    """Task of the fixed list and its base scene."""
 
     source: SourceText
     scene: str
@@ -75,7 +78,7 @@ class SceneTask:
 
 @dataclass(frozen=True, slots=True)
 class LayoutOutcome:
-    """What came of one task by one method; ``solved`` tells that the oracle's plan reaches the goal.
+    """Outcome of one task with one method; ``solved`` means that the oracle's plan reaches the goal.
 
     ``scene_s`` and ``planar_s`` are CPU seconds, the latter by room.
     """
@@ -93,7 +96,7 @@ class LayoutOutcome:
 
 
 def fixed_tasks(sample: Path) -> list[SceneTask]:
-    """70 tasks of the paper's sample, whose file is given, and 70 of BEHAVIOR-1K. Raises EvaluationError, SourceError."""
+    """Return 70 tasks of the paper's sample file and 70 tasks of BEHAVIOR-1K. Raises EvaluationError, SourceError."""
     text = (resources.files("embomatrix.factory.evaluate") / LIST).read_text(encoding="utf-8")
     names = json.loads(text)
     known = _sample(sample)
@@ -116,8 +119,8 @@ def _sample(path: Path) -> dict[str, SourceText]:
         ) from error
 
 
-class _Timed:
-    """A method with a watch: ``planar_s`` are the seconds of its planar solver, by room, ``names`` what it added."""
+class RecordedMethod:
+    """Layout method that records its planar solver's CPU seconds by room and the names of the objects it added."""
 
     def __init__(self, method: Lay) -> None:
         self._method = method
@@ -134,8 +137,8 @@ class _Timed:
 def judge(
     task: SceneTask, method: LayoutMethod, base: Scene, library: PlacementLibrary, *, seed: int = 0
 ) -> LayoutOutcome:
-    """Lay a task out by a method, look at the scene, and execute the oracle's plan in it."""
-    timed = _Timed(METHODS[method])
+    """Lay a task out with a method, check the scene, and execute the oracle's plan in it."""
+    timed = RecordedMethod(METHODS[method])
     began = time.process_time()
     imported = import_problem(task.source, base, seed=seed, options=ImportOptions(timed))
     spent = time.process_time() - began
@@ -171,7 +174,7 @@ def judge(
 def _executed(
     imported: ImportedTask, library: PlacementLibrary, seed: int
 ) -> tuple[TaskRefusal | None, tuple[str, ...]]:
-    """What speaks against a task when its oracle's plan is executed, None: nothing; and what the robot can't get at."""
+    """Execute the oracle's plan; return the refusal, None if the task is solved, and the objects out of reach."""
     view = SceneView(imported.scene)
     poses = poses_for(imported, view, library, None, seed)
     with contextlib.closing(load_simulator(Bundle(imported.scene, {}, poses))) as stage:
@@ -181,13 +184,13 @@ def _executed(
 
 
 def _beauty(imported: ImportedTask) -> float:
-    """Mean geometric score of the rooms that the task is about."""
+    """Return the mean geometric score of the task's rooms."""
     calibration = Calibration.load()
     return float(np.mean([score_room(plan_of(imported.scene, r), calibration).total for r in imported.rooms]))
 
 
 def evaluation_of(outcomes: Sequence[LayoutOutcome], conditions: Mapping[str, Any]) -> EvaluationFigures:
-    """Figures of all methods that were measured, the tree's with its goals, and the commonest reasons."""
+    """Return the figures of all measured methods, with goals for the tree method, and the commonest reasons."""
     figures: list[Figure] = []
     notes: list[str] = []
     for method in LayoutMethod:
@@ -202,7 +205,7 @@ def evaluation_of(outcomes: Sequence[LayoutOutcome], conditions: Mapping[str, An
 
 
 def _shared_aesthetics(outcomes: Sequence[LayoutOutcome], method: LayoutMethod) -> Iterable[Figure]:
-    """Over the tasks that every measured method laid out: what a method fails at is what is hard to lay out well."""
+    """Yield the score over tasks that every method laid out: tasks on which a method fails are hard to lay out well."""
     scores: defaultdict[tuple[str, str], dict[LayoutMethod, float]] = defaultdict(dict)
     for each in outcomes:
         if each.aesthetics is not None:
@@ -248,3 +251,83 @@ def _figures(outcomes: Sequence[LayoutOutcome], method: LayoutMethod) -> Iterabl
     scores = [outcome.aesthetics for outcome in outcomes if outcome.aesthetics is not None]
     if scores and math.isfinite(sum(scores)):
         yield Figure(f"aesthetics{label}", float(np.mean(scores)), "of 10", Better.HIGHER, len(scores))
+
+
+Trial = tuple[SceneTask, LayoutMethod]
+
+
+class OutcomeLog(ResumableLog[LayoutOutcome]):
+    """Outcomes of trials with one seed."""
+
+    @staticmethod
+    def open(path: Path, seed: int) -> OutcomeLog:
+        """Start or resume a log; a truncated last line is dropped. Raises EvaluationError, OSError."""
+        log = OutcomeLog(path)
+        log.resume({"seed": seed}, _outcome)
+        return log
+
+
+def _outcome(value: dict[str, Any]) -> LayoutOutcome:
+    told = {**value, "method": LayoutMethod(value["method"]), "planar_s": tuple(value["planar_s"])}
+    return LayoutOutcome(**told)
+
+
+def evaluate_scenes(
+    tasks: Sequence[SceneTask],
+    methods: Sequence[LayoutMethod],
+    seed: int,
+    jobs: int,
+    progress: Callable[[int], None] = lambda _done: None,
+    log: OutcomeLog | None = None,
+) -> tuple[EvaluationFigures, list[LayoutOutcome]]:
+    """Run every task with every method and call ``progress`` with the number of finished trials.
+
+    Trials in the ``log`` are skipped, new ones are appended to it. Equal arguments give equal outcomes.
+    """
+    log = log if log is not None else OutcomeLog()
+    trials = [(task, method) for task in tasks for method in methods]
+    known = {(each.task, each.scene, each.method) for each in log.outcomes}
+    by_scene: defaultdict[str, list[Trial]] = defaultdict(list)
+    for task, method in trials:
+        if (task.source.name, task.scene, method) not in known:
+            by_scene[task.scene].append((task, method))
+    progress(len(trials) - sum(map(len, by_scene.values())))
+    with contextlib.ExitStack() as stack:
+        for outcome in _made([(group, seed) for group in by_scene.values()], jobs, stack):
+            log.add(outcome)
+            progress(len(log.outcomes))
+    found = {(each.task, each.scene, each.method): each for each in log.outcomes}
+    outcomes = [found[task.source.name, task.scene, method] for task, method in trials]
+    conditions = {
+        "tasks": len(tasks),
+        "base scenes": len({task.scene for task in tasks}),
+        "seed": seed,
+        "methods": ", ".join(methods),
+        "time": "CPU seconds of one task from BDDL text to scene, base scene built before, execution after",
+    }
+    return evaluation_of(outcomes, conditions), outcomes
+
+
+def _made(
+    orders: Sequence[tuple[Sequence[Trial], int]], jobs: int, stack: contextlib.ExitStack
+) -> Iterator[LayoutOutcome]:
+    """Yield outcomes: trial by trial in this process, scene by scene with several processes."""
+    if jobs == 1:
+        for order in orders:
+            yield from _judged(order)
+        return
+    pool = stack.enter_context(process_pool(jobs))
+    for group in pool.map(_all_judged, orders):
+        yield from group
+
+
+def _all_judged(order: tuple[Sequence[Trial], int]) -> list[LayoutOutcome]:
+    return list(_judged(order))
+
+
+def _judged(order: tuple[Sequence[Trial], int]) -> Iterator[LayoutOutcome]:
+    trials, seed = order
+    base = build_base_scene(trials[0][0].scene)
+    with contextlib.closing(PlacementLibrary()) as library:
+        for task, method in trials:
+            yield judge(task, method, base, library, seed=seed)

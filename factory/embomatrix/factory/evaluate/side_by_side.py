@@ -1,4 +1,4 @@
-"""One fixed task laid out by every method, side by side in a picture: what the figures of the scene evaluation are about."""
+"""Picture of one fixed task, laid out by every method of the scene evaluation, side by side."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
 CAPTION_PX: Final = 26
 LEAST_PX: Final = 420
-"""Width of the panel of a method that laid nothing out."""
+"""Width of a panel for a method without a layout."""
 WIDTH: Final = 48
-"""Letters of a reason in one line there."""
+"""Characters per line of the reason in such a panel."""
 
 
 def named(tasks: Sequence[SceneTask], name: str) -> SceneTask:
-    """The fixed task of this name. Raises EvaluationError."""
+    """Return the fixed task of this name. Raises EvaluationError."""
     for task in tasks:
         if task.source.name == name:
             return task
@@ -38,7 +38,7 @@ def named(tasks: Sequence[SceneTask], name: str) -> SceneTask:
 
 
 def draw_side_by_side(task: SceneTask, seed: int) -> Image.Image:
-    """Plans of the first room that the goal is about, a panel for each method, or why one laid nothing out. An RGB image."""
+    """Return an RGB image with a panel for each method: the plan of the goal's first room, or the reason against a layout."""
     base = build_base_scene(task.scene)
     panels = []
     for method, lay in METHODS.items():

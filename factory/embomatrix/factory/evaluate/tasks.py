@@ -1,20 +1,34 @@
-"""The panel of diversity: what tasks of a scene have in common in words and goals, with and without social simulation."""
+"""Diversity of tasks in words and goals, with and without social simulation."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 import re
+import zlib
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from embomatrix.factory.metrics.diversity import diversity, normalised_entropy
+from embomatrix.factory.metrics.figures import EvaluationFigures
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.view import SceneView
+from embomatrix.factory.social.casting import NAMES
+from embomatrix.factory.social.writer import SocialWriter
+from embomatrix.factory.writer.tasks import Draft, PlainWriter
+from embomatrix.factory.writer.variant import build_variant
 from embomatrix.pages.figures import Better, Figure
+from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from embomatrix.factory.evaluate.drafts import DraftFeatures
+    from embomatrix.factory.writer.tasks import TaskWriter
+    from embomatrix.world.dataset import TaskRecord
+    from embomatrix.world.scene import Scene
 
 GOALS: Final[Mapping[str, tuple[Better, float]]] = {
     "self_bleu4": (Better.LOWER, 0.35),
@@ -22,7 +36,7 @@ GOALS: Final[Mapping[str, tuple[Better, float]]] = {
     "named_share": (Better.HIGHER, 0.9),
     "signature_entropy": (Better.HIGHER, 0.9),
 }
-"""For tasks with social simulation."""
+"""Goals of the figures for tasks with social simulation."""
 _SIGN: Final = re.compile(r"([\w ]+)\(([^()]*)\)")
 _PERSON: Final = re.compile(r"^\* \*\*(.+?)\*\*, \d+,", re.MULTILINE)
 
@@ -30,7 +44,10 @@ _PERSON: Final = re.compile(r"^\* \*\*(.+?)\*\*, \d+,", re.MULTILINE)
 def panel(
     groups: Mapping[str, Sequence[DraftFeatures]], names: Collection[str], label: str = ""
 ) -> tuple[Figure, ...]:
-    """Figures of tasks by base scene. ``names`` are those of the people; ``label`` tells writers apart, and has no goals."""
+    """Return the figures of tasks, grouped by base scene.
+
+    ``names`` are people's names. A ``label`` distinguishes the figures of another writer, which have no goals.
+    """
     tasks = [asked for group in groups.values() for asked in group]
     measured = diversity(
         {base: [asked.instruction for asked in group] for base, group in groups.items()},
@@ -53,16 +70,16 @@ def panel(
 
 
 def evenness(values: Sequence[str]) -> float:
-    """Shannon entropy over that of a uniform choice among the values that come up; 0 for fewer than two."""
+    """Return the Shannon entropy as a share of that of a uniform choice among the distinct values; 0 for fewer than two."""
     kinds = len(set(values))
     if kinds < 2:
         return 0.0
-    # Words come up many times over: their number, not that of all uses, bounds the entropy.
+    # Values repeat: the number of distinct values bounds the entropy, not the number of uses.
     return normalised_entropy(values) * math.log(len(values)) / math.log(kinds)
 
 
 def people_of(folder: Path) -> frozenset[str]:
-    """Names of everybody in a dataset's transcripts; none where it has no transcripts."""
+    """Return the names of all people in a dataset's transcripts; empty without transcripts."""
     return frozenset(
         name
         for path in sorted(folder.glob("*.md"))
@@ -79,3 +96,89 @@ def _figure(name: str, value: float, n: int, label: str) -> Figure:
 
 def _share(held: Sequence[bool]) -> float:
     return sum(held) / len(held) if held else 0.0
+
+
+ROOMS: Final = 3
+"""Rooms of a variant that get small objects, as in a build."""
+EACH_VARIANT: Final = 5
+TRIES: Final = 6
+"""Attempts for each task that a variant should give."""
+MOST_VARIANTS: Final = 12
+"""Upper limit for the variants of a scene: some rooms offer no tasks."""
+
+
+@dataclass(frozen=True, slots=True)
+class DraftFeatures:
+    """Measured features of a task: instruction, kind of goal, rooms, and whether the goal quantifies over objects."""
+
+    instruction: str
+    signature: str
+    rooms: tuple[str, ...]
+    quantified: bool
+
+
+def asked_in(base: Scene, writer: TaskWriter, count: int, seed: int) -> list[DraftFeatures]:
+    """Return up to ``count`` different tasks over variants of a base scene, cycling through the task categories."""
+    found: dict[str, DraftFeatures] = {}
+    for number in range(MOST_VARIANTS):
+        for draft in _drafts(base, writer, number, seed):
+            found.setdefault(f"{draft.signature}|{draft.task.instruction}", _asked(draft))
+            if len(found) == count:
+                return list(found.values())
+    return list(found.values())
+
+
+def _drafts(base: Scene, writer: TaskWriter, number: int, seed: int) -> Iterator[Draft]:
+    sequence = np.random.SeedSequence((seed, zlib.crc32(base.base.encode()), number))
+    rng = np.random.default_rng(sequence)
+    rooms = [str(name) for name in rng.permutation([room.name for room in base.rooms])[:ROOMS]]
+    variant = build_variant(base, rooms, f"{base.base}-drafts-{number:02d}", rng)
+    view, categories, given = SceneView(variant.scene), [*TaskCategory], 0
+    for attempt in range(TRIES * EACH_VARIANT):
+        category = categories[(number + attempt) % len(categories)]
+        draft = writer.write(variant, view, category, f"{variant.scene.scene_id}-{attempt:02d}", rng)
+        if isinstance(draft, Draft):
+            yield draft
+            given += 1
+        if given == EACH_VARIANT:
+            return
+
+
+def _asked(draft: Draft) -> DraftFeatures:
+    return DraftFeatures(draft.task.instruction, draft.signature, draft.rooms, bool(draft.task.types))
+
+
+def asked_of(records: Sequence[TaskRecord], count: int) -> dict[str, list[DraftFeatures]]:
+    """Return the first ``count`` tasks of each base scene in a dataset; scenes with fewer tasks are left out."""
+    groups: dict[str, list[DraftFeatures]] = {}
+    for record in records:
+        base = record.task.scene_id.split("-")[0]
+        asked = DraftFeatures(
+            record.task.instruction, record.signature, record.rooms, bool(record.task.types)
+        )
+        groups.setdefault(base, []).append(asked)
+    return {base: group[:count] for base, group in groups.items() if len(group) >= count}
+
+
+PLAIN: Final = "plain"
+
+
+def evaluate_tasks(
+    scene_ids: Sequence[str], each: int, seed: int, progress: Callable[[int], None] = lambda _done: None
+) -> tuple[Mapping[str, Sequence[DraftFeatures]], EvaluationFigures]:
+    """Draft ``each`` tasks per base scene with both writers; return those of the social writer, and the figures of both.
+
+    Scenes with fewer tasks are named in a note. Raises CatalogError for an unknown scene.
+    """
+    writers: tuple[TaskWriter, ...] = (SocialWriter(seed), PlainWriter())
+    social: dict[str, list[DraftFeatures]] = {}
+    plain: dict[str, list[DraftFeatures]] = {}
+    for done, scene_id in enumerate(scene_ids, start=1):
+        base = build_base_scene(scene_id, seed=seed)
+        social[base.base], plain[base.base] = (asked_in(base, writer, each, seed) for writer in writers)
+        progress(done)
+    short = [base for base, group in social.items() if len(group) < each]
+    figures = (*panel(social, NAMES), *panel(plain, NAMES, PLAIN))
+    notes = (f"Fewer than {each} tasks were found in {', '.join(short)}.",) if short else ()
+    conditions = {"scenes": len(social), "tasks a scene": each, "seed": seed}
+    return social, EvaluationFigures("tasks", conditions, figures, notes)

@@ -1,4 +1,4 @@
-"""A room as an aesthetics score sees it: furniture as boxes on a rectangle, and small things on the furniture."""
+"""Simplified rooms for the aesthetics score: furniture as boxes on a rectangle, and small objects on the furniture."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
 
 FLOOR: Final = "floor"
 MIN_PIECE_M: Final = 0.25
-"""Larger extent of what counts as furniture, of things that stand on the floor."""
+"""Least horizontal extent of furniture among objects on the floor."""
 STANDS_M: Final = 0.2
-"""Lower than this begins what stands on the floor where the source names nothing that bears it: RoboTHOR's furniture."""
+"""Greatest height of the underside of objects on the floor, for sources that name no host: RoboTHOR's furniture."""
 _PARTS: Final = frozenset(
     {"floor", "drawer", "cabinet", "shelf", "stove_burner", "stove_knob", "faucet", "sink_basin", "bathtub_basin", "blinds",
      "curtains", "window", "light_switch", "painting", "mirror", "poster", "shower_door", "shower_glass", "shower_curtain",
      "shower_head", "towel_holder", "hand_towel_holder", "toilet_paper_hanger", "room_decor", "sink"}
 )  # fmt: skip
-"""What iTHOR lists beside furniture: its parts, and what hangs on walls."""
+"""Kinds that iTHOR lists besides furniture: parts of it, and objects on walls."""
 _ALIASES: Final[Mapping[str, str]] = {
     "breakfast_table": "dining_table", "conference_table": "dining_table", "gaming_table": "dining_table",
     "countertop": "counter_top", "bottom_cabinet": "dresser", "bottom_cabinet_no_top": "counter_top",
@@ -42,14 +42,14 @@ _ALIASES: Final[Mapping[str, str]] = {
     "pillar_candle": "candle", "bottle_of_wine": "wine_bottle", "sponge": "dish_sponge",
     "box_of_tissues": "tissue_box", "table_lamp": "desk_lamp", "pot_plant": "house_plant",
 }  # fmt: skip
-"""Categories of the catalog, and what iTHOR calls such things."""
+"""iTHOR's kind for categories of the catalog."""
 
 
 @dataclass(frozen=True, slots=True)
 class RoomBox:
-    """A box. ``half_m`` are half its extents in its own frame, ``tilt_rad`` its angle off the room's axes, in ±π/4.
+    """Box of an object. ``half_m`` are half extents in its own frame, ``tilt_rad`` its angle to the room's axes, in ±π/4.
 
-    ``host`` is the kind of thing that it rests on or in; `FLOOR` for furniture.
+    ``host`` is the kind of its support; `FLOOR` for furniture.
     """
 
     kind: str
@@ -62,14 +62,17 @@ class RoomBox:
 
     @property
     def reach_m(self) -> tuple[float, float]:
-        """Half the extents of the box's shadow on the room's axes."""
+        """Half extents of the box's projection on the room's axes."""
         c, s = abs(math.cos(self.tilt_rad)), abs(math.sin(self.tilt_rad))
         return self.half_m[0] * c + self.half_m[1] * s, self.half_m[0] * s + self.half_m[1] * c
 
 
 @dataclass(frozen=True, slots=True)
 class RoomPlan:
-    """``pieces`` stand on the floor, ``things`` on or in pieces; ``carried`` gives the index of the piece, -1 for none."""
+    """Room with ``pieces`` on the floor and small ``things`` on or in them.
+
+    ``carried`` is the index of each thing's piece, -1 for none.
+    """
 
     name: str
     low_m: tuple[float, float]
@@ -80,12 +83,12 @@ class RoomPlan:
 
 
 def kind_of(category: str) -> str:
-    """What iTHOR calls things of a category, in lower case; the category itself where it has no word for them."""
+    """Return iTHOR's kind for a category in lower case; the category itself if iTHOR has none."""
     return _ALIASES.get(category, category)
 
 
 def plan_of(scene: Scene, room_name: str) -> RoomPlan:
-    """One room of a scene. Raises KeyError for a room that is not there."""
+    """Return one room of a scene. Raises KeyError for an unknown room."""
     room = {item.name: item for item in scene.rooms}[room_name]
     pieces: list[RoomBox] = []
     things: list[tuple[RoomBox, str]] = []
@@ -116,19 +119,19 @@ def plan_of(scene: Scene, room_name: str) -> RoomPlan:
 
 
 def read_rooms(path: Path) -> list[RoomPlan]:
-    """The hand-made rooms of iTHOR and RoboTHOR, from the table that `docs/tasks.md` describes. Raises EvaluationError."""
+    """Read the hand-made rooms of iTHOR and RoboTHOR from the table described in `docs/tasks.md`. Raises EvaluationError."""
     try:
         with gzip.open(path, "rt", encoding="utf-8") as file:
             value = json.load(file)
         return [_room_from(room, number) for number, room in enumerate(value["rooms"])]
     except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
         raise EvaluationError(
-            f"{path} is no table of hand-made rooms ({error}): expected gzipped JSON with 'rooms' and their 'objects'"
+            f"{path} is not a table of hand-made rooms ({error}): expected gzipped JSON with 'rooms' and their 'objects'"
         ) from error
 
 
 def _room_from(value: Mapping[str, Any], number: int) -> RoomPlan:
-    """Axes: x and z of the source are the floor. The rectangle is the box around all that stands or hangs in the room."""
+    """Convert a room. The source's x and z axes span the floor; the rectangle is the box around all objects."""
     rows = [(_snake(row[0]), *row[2:]) for row in value["objects"] if row[0] != "Floor"]
     boxes = np.array([[row[3][0], row[3][2], row[4][0], row[4][2]] for row in rows])  # (n, 4)
     low, high = boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2  # (n, 2) each
@@ -145,7 +148,7 @@ def _room_from(value: Mapping[str, Any], number: int) -> RoomPlan:
         if host != FLOOR:
             things.append(replace(item, tilt_rad=0.0))
         elif 2 * max(half) >= MIN_PIECE_M:
-            # The source's boxes lie along the axes; furniture that stands askew by a degree is meant to be straight.
+            # The source's boxes lie along the axes, so furniture that is off by a degree still has a straight box.
             pieces.append(item)
     low_m, high_m = low.min(axis=0), high.max(axis=0)
     return RoomPlan(
@@ -159,7 +162,7 @@ def _room_from(value: Mapping[str, Any], number: int) -> RoomPlan:
 
 
 def _bearer(thing: RoomBox, pieces: Sequence[RoomBox]) -> int:
-    """The piece of the host's kind above whose floor the thing is, -1 where none is."""
+    """Return the index of the piece of the host's kind below the thing, -1 if there is none."""
     for index, piece in enumerate(pieces):
         inside = all(
             abs(a - b) <= reach + 0.05
@@ -171,7 +174,7 @@ def _bearer(thing: RoomBox, pieces: Sequence[RoomBox]) -> int:
 
 
 def _quarter(yaw_rad: float) -> tuple[bool, float]:
-    """Whether the yaw is nearest to an odd quarter turn, and what is left, in ±π/4."""
+    """Return True if the yaw is nearest to an odd quarter turn, and the remaining angle in ±π/4."""
     turns = round(yaw_rad / (math.pi / 2))
     return bool(turns % 2), yaw_rad - turns * math.pi / 2
 

@@ -1,0 +1,181 @@
+"""Second verification of admitted tasks by processes that took no part in admitting them.
+
+Two processes without shared state judge each task. Both find and execute a plan; their traces must be equal to the bit.
+Optionally a robot also executes the dataset's plan in stepped physics.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from embomatrix.factory.admission import SEED, Admitted, admit, plan_failure
+from embomatrix.factory.metrics.figures import EvaluationFigures
+from embomatrix.factory.task_import.batch import max_held_share
+from embomatrix.pages.figures import Better, Figure
+from embomatrix.sim.physical.actor import physical_simulator
+from embomatrix.sim.planner.oracle import find_plan
+from embomatrix.sim.process_pool import process_pool
+from embomatrix.sim.simulation import load_simulator
+from embomatrix.skills.parse import plan_from_json, plan_to_json
+from embomatrix.world.dataset import Dataset, DatasetError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from embomatrix.sim.executor import Simulator
+    from embomatrix.world.bundle import Bundle
+    from embomatrix.world.dataset import TaskRecord
+
+SUCCESS: Final = ""
+"""Empty sentence of a task without an objection."""
+GOAL_PERCENT: Final = 100.0
+PHYSICAL_GOAL_PERCENT: Final = 97.0
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """Result of one process. ``cached`` and ``physical`` are objections to the task; ``physical`` is None if not tested.
+
+    ``digest`` covers every pose and state after every step of the plan. ``same_plan`` means that the plan is the dataset's.
+    """
+
+    task: str
+    cached: str
+    digest: str
+    same_plan: bool
+    physical: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class VerificationOutcome:
+    """Objections to a task in both modes, and whether two processes agree with each other and the dataset."""
+
+    task: str
+    cached: str
+    equal: bool
+    physical: str | None
+
+
+def sampled(records: Sequence[TaskRecord], most: int | None, seed: int) -> list[TaskRecord]:
+    """Draw up to ``most`` records with a seed and return them in the order of the dataset; None returns all."""
+    if most is None or most >= len(records):
+        return list(records)
+    chosen = np.random.default_rng((seed, len(records))).permutation(len(records))[:most]
+    return [records[int(at)] for at in sorted(chosen)]
+
+
+def verify_again(
+    folder: Path,
+    records: Sequence[TaskRecord],
+    *,
+    physical: bool,
+    jobs: int,
+    progress: Callable[[int], None] = lambda _done: None,
+) -> list[VerificationOutcome]:
+    """Judge records of a dataset twice and call ``progress`` with the number of judgements so far.
+
+    Raises DatasetError if a bundle can't be read or a process dies.
+    """
+    by_bundle: dict[str, list[str]] = {}
+    for record in records:
+        by_bundle.setdefault(record.bundle_digest, []).append(record.task.task_id)
+    found: list[dict[str, Judgement]] = []
+    done = 0
+    # A new pool for each round: no process of the second round shares state with the first.
+    for in_physics in (False, physical):
+        judgements: dict[str, Judgement] = {}
+        judge = partial(_judge_bundle, folder, physical=in_physics)
+        try:
+            with process_pool(jobs) as pool:
+                for group in pool.map(judge, by_bundle.items()):
+                    judgements |= {each.task: each for each in group}
+                    done += len(group)
+                    progress(done)
+        except BrokenProcessPool as error:
+            raise DatasetError(
+                "a process that verifies tasks died, perhaps out of memory: run the command again with fewer --jobs"
+            ) from error
+        found.append(judgements)
+    first, second = found
+    return [compared(first[task], second[task]) for task in (record.task.task_id for record in records)]
+
+
+def compared(first: Judgement, second: Judgement) -> VerificationOutcome:
+    """Combine two judgements of one task."""
+    same = (first.cached, first.digest) == (second.cached, second.digest)
+    equal = same and first.same_plan and second.same_plan
+    return VerificationOutcome(first.task, first.cached or second.cached, equal, second.physical)
+
+
+def _judge_bundle(folder: Path, tasks: tuple[str, list[str]], *, physical: bool) -> list[Judgement]:
+    """Judge tasks of one bundle. tasks: (digest of the bundle, task ids)."""
+    dataset = Dataset.load(folder)
+    bundle = dataset.read_bundle(tasks[0])
+    records = [dataset.find(task) for task in tasks[1]]
+    with contextlib.closing(load_simulator(bundle)) as stage:
+        judgements = [_cached(stage, record) for record in records]
+    if not physical:
+        return judgements
+    return [
+        replace(each, physical=_physical(bundle, record))
+        for each, record in zip(judgements, records, strict=True)
+    ]
+
+
+def _cached(stage: Simulator, record: TaskRecord) -> Judgement:
+    """Judge a task as admission does and execute the plan found."""
+    verdict = admit(stage, record.task, find_plan, most_held=max_held_share(record.task))
+    if not isinstance(verdict, Admitted):
+        return Judgement(record.task.task_id, f"{verdict.reason}: {verdict.sentence}", "", same_plan=False)
+    trace = stage.execute(record.task, verdict.plan, SEED)
+    same = plan_to_json(verdict.plan) == [dict(call) for call in record.oracle]
+    return Judgement(record.task.task_id, SUCCESS, trace.digest, same)
+
+
+def _physical(bundle: Bundle, record: TaskRecord) -> str:
+    """Execute the dataset's plan with a robot in physics; return the objection, empty if it reaches the goal."""
+    plan = plan_from_json(list(record.oracle), record.task.profile)
+    with contextlib.closing(physical_simulator(bundle)) as stage:
+        return plan_failure(stage, record.task, plan)
+
+
+def evaluation_of(
+    verdicts: Sequence[VerificationOutcome], conditions: Mapping[str, Any]
+) -> EvaluationFigures:
+    """Return shares in percent of the tasks, and the objections to plans in physics, commonest first."""
+    physical = [verdict.physical for verdict in verdicts if verdict.physical is not None]
+    figures = [
+        _figure("oracle_cached", [not verdict.cached for verdict in verdicts], GOAL_PERCENT),
+        _figure("reverified_bit_equal", [verdict.equal for verdict in verdicts], GOAL_PERCENT),
+    ]
+    if physical:
+        figures.append(
+            _figure("oracle_physical", [not sentence for sentence in physical], PHYSICAL_GOAL_PERCENT)
+        )
+    reasons = Counter(sentence.split(":")[0] for sentence in physical if sentence)
+    told = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
+    notes = (f"Against plans in physics: {told}.",) if told else ()
+    return EvaluationFigures("verification", conditions, tuple(figures), notes)
+
+
+def objections(verdicts: Sequence[VerificationOutcome]) -> Iterator[str]:
+    """Yield a line for each objection to a task."""
+    for verdict in verdicts:
+        if verdict.cached:
+            yield f"{verdict.task}: {verdict.cached}"
+        elif not verdict.equal:
+            yield f"{verdict.task}: two processes, or one of them and the dataset, differ in plan or trace"
+        if verdict.physical:
+            yield f"{verdict.task}, in physics: {verdict.physical}"
+
+
+def _figure(name: str, held: Sequence[bool], goal: float) -> Figure:
+    return Figure(name, 100 * sum(held) / len(held), "%", Better.HIGHER, len(held), goal)
