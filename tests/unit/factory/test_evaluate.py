@@ -138,7 +138,7 @@ def test_hand_made_rooms_are_read_with_their_furniture_and_what_it_bears(tmp_pat
 
 
 def test_a_file_that_holds_no_rooms_is_told_in_a_sentence(tmp_path):
-    with pytest.raises(EvaluationError, match="no table of hand-made rooms"):
+    with pytest.raises(EvaluationError, match="not a table of hand-made rooms"):
         read_rooms(_rooms_file(tmp_path / "rooms.json.gz", [{"kind": "bedrooms", "objects": [["Bed"]]}]))
 
 
@@ -315,4 +315,4 @@ def test_the_command_tells_in_a_sentence_what_is_wrong(tmp_path):
     assert "none" in found.output
     found = CliRunner().invoke(app, ["evaluate", "aesthetics", "--rooms", str(tmp_path)])
     assert found.exit_code == 2
-    assert "no table of hand-made rooms" in found.output.replace("\n", " ")
+    assert "not a table of hand-made rooms" in found.output.replace("\n", " ")

@@ -36,32 +36,31 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 WORTH_TELLING: Final = 1.25
-"""A model that is stretched more than this along one side against another no longer looks like itself."""
+"""Ratio of the largest to the smallest scale from which a distorted model is reported."""
 
 
 class Cut(StrEnum):
-    """Ways to cut a mesh into convex parts."""
+    """Convex decomposition method."""
 
     COACD = "coacd"
     COMPONENTS = "components"
 
 
-Categories = Annotated[
-    list[str] | None, typer.Option("--category", help="Only this category; give it again for more.")
-]
+Categories = Annotated[list[str] | None, typer.Option("--category", help="Only this category; repeatable.")]
 
 
 @app.command()
 def check(
     category: Categories = None,
     every_model: Annotated[
-        bool, typer.Option("--every-model", help="All models of a category, not its first alone.")
+        bool, typer.Option("--every-model", help="All models of a category instead of the first.")
     ] = False,
     glance: Annotated[
-        bool, typer.Option("--glance", help="Watch things only until they are slow, not for two seconds.")
+        bool,
+        typer.Option("--glance", help="End each drop test once the asset is slow, not after two seconds."),
     ] = False,
 ) -> None:
-    """Test size, cavities, doors and standing of all that scenes or activities use; exit status 1 when something is wrong."""
+    """Check size, cavities, doors and stability of all assets in use; exit status 1 if one breaks a rule."""
     catalog = Catalog.load()
     assets = _assets(catalog, category, every_model=every_model)
     try:
@@ -87,7 +86,7 @@ def check(
 
 @app.command()
 def families() -> None:
-    """Count the categories of each family, of those that scenes or activities use."""
+    """Count the categories in use by family."""
     catalog = Catalog.load()
     counts = Counter(family_of(catalog, name) for name in catalog.used_categories)
     table = Table("family", "categories", title=f"{len(catalog.used_categories)} categories")
@@ -102,7 +101,7 @@ def draw(
     category: Categories = None,
     every_model: Annotated[bool, typer.Option("--every-model", help="All models of a category.")] = False,
 ) -> None:
-    """Draw assets side by side, those with doors or drawers also open. Without a category: all that open, heat or cool."""
+    """Draw assets side by side, closed and open. Default: all categories that open, heat or cool."""
     catalog = Catalog.load()
     chosen = category or [name for name in catalog.used_categories if _is_worth_a_look(catalog, name)]
     picture = draw_sheet(_assets(catalog, chosen, every_model=every_model))
@@ -116,21 +115,23 @@ def draw(
 @app.command("import")
 def import_(
     file: Annotated[Path, typer.Argument(help="OBJ, STL, GLB or URDF.")],
-    category: Annotated[str, typer.Option(help="Category of the catalog that the model is one of.")],
-    creator: Annotated[str, typer.Option(help="Whose work it is.")],
-    licence: Annotated[str, typer.Option(help="On which terms it may be used, e.g. CC0-1.0.")],
+    category: Annotated[str, typer.Option(help="Category of the model in the catalog.")],
+    creator: Annotated[str, typer.Option(help="Author of the model.")],
+    licence: Annotated[str, typer.Option(help="Licence of the model, e.g. CC0-1.0.")],
     out: Annotated[Path, typer.Option(help="Folder of imported assets.")],
     model: Annotated[
         str,
-        typer.Option(help="The catalog's model to replace; by default the one of the likest proportions."),
+        typer.Option(
+            help="Model of the catalog to replace. Default: the one with the most similar proportions."
+        ),
     ] = "",
-    source: Annotated[str, typer.Option(help="Where it comes from; by default the file's name.")] = "",
+    source: Annotated[str, typer.Option(help="Source of the model. Default: the file's name.")] = "",
     up: Annotated[
         AxisConvention | None, typer.Option(help="Axis that points up: y (OBJ, GLB) or z (STL, URDF).")
     ] = None,
-    cut: Annotated[Cut, typer.Option(help="How meshes are cut into convex parts.")] = Cut.COACD,
+    cut: Annotated[Cut, typer.Option(help="Convex decomposition of meshes.")] = Cut.COACD,
 ) -> None:
-    """Make an asset of a model file, in the place of one of the catalog's models: `scene build --assets` then uses it."""
+    """Import a model file as an asset that replaces one of the catalog's models in `scene build --assets`."""
     credit = Credit(creator, licence, source or file.name)
     try:
         raw = read_model(file, up)
@@ -146,7 +147,7 @@ def import_(
 
 
 def _tell(imported: ImportedAsset, path: Path) -> None:
-    """What the asset has, what it lacks of what its category's things do, and which rule of `assets check` it breaks."""
+    """Print contents, missing abilities, and broken rules of the imported asset."""
     asset, console = imported.asset, Console(soft_wrap=True)
     parts = sum(len(link.parts) for link in asset.links)
     console.print(
@@ -157,19 +158,19 @@ def _tell(imported: ImportedAsset, path: Path) -> None:
     for lack in imported.lacks:
         console.print(lack, highlight=False)
     for finding in check_asset(Catalog.load(), asset):
-        # What is not there at all was told above.
+        # Missing parts were already reported above.
         if not finding.excused and not imported.lacks:
             console.print(f"{finding.rule.value}: {finding.detail}", highlight=False)
     if imported.stretch > WORTH_TELLING:
         console.print(
             f"its proportions are changed by a factor of {imported.stretch:.2f} to fit {asset.size_m} m: "
-            "another --model may be more like it",
+            "another --model may be more similar",
             highlight=False,
         )
 
 
 def _stands_in(asset_id: str) -> str:
-    """In which base scenes `scene build --assets` makes a difference."""
+    """Return a sentence on the base scenes that use the asset."""
     catalog = Catalog.load()
     listing = [
         scene_id
@@ -181,9 +182,9 @@ def _stands_in(asset_id: str) -> str:
         )
     ]
     return (
-        f"it stands in {', '.join(listing)}"
+        f"it is used in {', '.join(listing)}"
         if listing
-        else "it stands in no base scene: give a --model that one lists"
+        else "no base scene uses it: give a --model that a scene lists"
     )
 
 

@@ -1,4 +1,4 @@
-"""``embomatrix factory verify``: judge the tasks of a dataset again, in other processes, and in stepped physics."""
+"""``embomatrix factory verify``: verify the tasks of a dataset again, in other processes and in stepped physics."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 Physical = Annotated[
     bool,
-    typer.Option("--physical", help="Let a robot carry the oracle's plans out in stepped physics as well."),
+    typer.Option("--physical", help="Also execute the oracle's plans with a robot in stepped physics."),
 ]
-Sample = Annotated[int | None, typer.Option(min=1, help="So many tasks, drawn by the seed. Default: all.")]
+Sample = Annotated[int | None, typer.Option(min=1, help="Number of tasks to sample. Default: all.")]
 Figures = Annotated[Path | None, typer.Option("--json", help="File for the figures, for `evaluate page`.")]
 
 
@@ -30,13 +30,13 @@ def verify(
     folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")] = Path("build/dataset"),
     physical: Physical = False,
     sample: Sample = None,
-    seed: Annotated[int, typer.Option(min=0, help="Equal seeds draw equal tasks.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the sample.")] = 0,
     jobs: Jobs = None,
     json_file: Figures = None,
 ) -> None:
     """Judge admitted tasks again, each in two other processes, which must agree to the bit.
 
-    Exit status: 1 when a task is not admitted again, or two processes disagree.
+    Exit status 1 if a task is not admitted again or two processes disagree.
     """
     with user_errors(json_file):
         if json_file is not None:

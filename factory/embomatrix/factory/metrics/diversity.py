@@ -1,6 +1,6 @@
-"""How diverse instructions and goals are, without a judge: n-grams, entropies, near-duplicates, who is named.
+"""Diversity of instructions and goals without a judge: n-grams, entropies, near-duplicates, named people.
 
-Every figure depends on how many instructions it is taken of: self-BLEU grows with them. Compare sets of equal size.
+All figures depend on the number of instructions (self-BLEU grows with it): compare sets of equal size.
 """
 
 from __future__ import annotations
@@ -15,27 +15,27 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 
 NEAR: Final = 0.9
-"""Cosine of two instructions above which one counts as a copy of the other."""
+"""Cosine similarity above which two instructions are near-duplicates."""
 SMOOTHING: Final = 0.1
-"""Stands for a count of 0 among n-grams: method 1 of Chen and Cherry (2014)."""
+"""Replacement for n-gram counts of 0: method 1 of Chen and Cherry (2014)."""
 _WORD: Final = re.compile(r"[a-z0-9]+(?:'[a-z]+)?")
 
 Words = tuple[str, ...]
 
 
 def words_of(text: str) -> Words:
-    """Lower-case words; an underscore parts them."""
+    """Return lower-case words; underscores separate words."""
     return tuple(_WORD.findall(text.lower().replace("_", " ")))
 
 
 def distinct(texts: Sequence[Words], n: int) -> float:
-    """Different n-grams over all n-grams (Li et al. 2016); 0 where there are none."""
+    """Return the share of distinct n-grams (Li et al. 2016); 0 without n-grams."""
     grams = [gram for words in texts for gram in _grams(words, n)]
     return len(set(grams)) / len(grams) if grams else 0.0
 
 
 def self_bleu(texts: Sequence[Words], n: int = 4) -> float:
-    """Mean BLEU of each text against all others (Zhu et al. 2018): 1 for copies, towards 0 for texts with nothing in common."""
+    """Return the mean BLEU of each text against all others (Zhu et al. 2018): 1 for copies, near 0 for unrelated texts."""
     if len(texts) < 2:
         return 0.0
     scores = [
@@ -46,7 +46,7 @@ def self_bleu(texts: Sequence[Words], n: int = 4) -> float:
 
 
 def bleu(words: Words, references: Sequence[Words], n: int = 4) -> float:
-    """Geometric mean of the clipped precisions of 1- to n-grams, with the brevity penalty (Papineni et al. 2002)."""
+    """Return the geometric mean of clipped 1- to n-gram precisions with the brevity penalty (Papineni et al. 2002)."""
     logs = []
     for size in range(1, n + 1):
         counts = Counter(_grams(words, size))
@@ -67,7 +67,7 @@ def bleu(words: Words, references: Sequence[Words], n: int = 4) -> float:
 
 
 def normalised_entropy(values: Collection[Hashable]) -> float:
-    """Shannon entropy of how often each value comes up, over the largest possible: the logarithm of how many there are."""
+    """Return the Shannon entropy of the values' frequencies as a share of its maximum, the log of their number."""
     if len(values) < 2:
         return 0.0
     shares = [count / len(values) for count in Counter(values).values()]
@@ -75,7 +75,7 @@ def normalised_entropy(values: Collection[Hashable]) -> float:
 
 
 def near_duplicates(texts: Sequence[Words], near: float = NEAR) -> float:
-    """Share of texts that an earlier one resembles, by the cosine of TF-IDF weights of words and pairs of words."""
+    """Return the share of texts similar to an earlier one, by the cosine of TF-IDF weights of words and word pairs."""
     vectors = _weighted(texts)
     copies = sum(
         any(_cosine(vector, earlier) > near for earlier in vectors[:number])
@@ -85,7 +85,7 @@ def near_duplicates(texts: Sequence[Words], near: float = NEAR) -> float:
 
 
 def named_share(texts: Iterable[str], names: Collection[str]) -> float:
-    """Share of texts that name somebody."""
+    """Return the share of texts that contain one of the names."""
     known = re.compile(rf"\b(?:{'|'.join(map(re.escape, names))})\b") if names else None
     found = [bool(known and known.search(text)) for text in texts]
     return sum(found) / len(found) if found else 0.0
@@ -93,9 +93,9 @@ def named_share(texts: Iterable[str], names: Collection[str]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Diversity:
-    """Figures over groups of instructions, a base scene's each; means over the groups but for what concerns all of them.
+    """Figures of instructions grouped by base scene: means over the groups.
 
-    ``signature_entropy`` and ``verb_entropy`` are over all tasks; ``group`` is the number of instructions of a group.
+    ``signature_entropy`` and ``verb_entropy`` are over all tasks; ``group`` is the mean size of a group.
     """
 
     groups: int
@@ -113,7 +113,7 @@ class Diversity:
 def diversity(
     instructions: Mapping[str, Sequence[str]], signatures: Sequence[str], names: Collection[str]
 ) -> Diversity:
-    """Measure instructions by base scene; ``signatures`` are the goals' kinds, ``names`` those of everybody."""
+    """Measure instructions by base scene. ``signatures`` are the goals' kinds, ``names`` are people's names."""
     groups = [[words_of(text) for text in texts] for texts in instructions.values() if texts]
     texts = [text for found in instructions.values() for text in found]
     every = [words for group in groups for words in group]

@@ -1,4 +1,4 @@
-"""What an evaluation hands in: figures with their goals, in the form of the benches' files, and how they were measured."""
+"""Result of an evaluation: figures with their goals in the format of the benchmarks, and the conditions of measurement."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 
 class EvaluationError(Exception):
-    """An evaluation can't be made or read. One sentence that names the remedy."""
+    """Evaluation that can't be made or read. The message is one sentence with the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class EvaluationFigures:
-    """Figures of one part. ``conditions`` say what was measured, as plain JSON values; ``notes`` are sentences for the page."""
+    """Figures of one part with JSON-serialisable ``conditions`` of measurement, and ``notes`` for the page."""
 
     part: str
     conditions: Mapping[str, Any]
@@ -29,12 +29,12 @@ class EvaluationFigures:
     notes: tuple[str, ...] = ()
 
     def figure(self, name: str) -> Figure:
-        """The figure of that name. Raises KeyError."""
+        """Return the figure of this name. Raises KeyError."""
         return {figure.name: figure for figure in self.figures}[name]
 
 
 def evaluation_to_json(evaluation: EvaluationFigures) -> dict[str, Any]:
-    """Plain JSON values; numbers with six digits."""
+    """Return a JSON-serialisable dict with numbers of six digits."""
     return {
         "part": evaluation.part,
         "conditions": dict(evaluation.conditions),
@@ -44,7 +44,7 @@ def evaluation_to_json(evaluation: EvaluationFigures) -> dict[str, Any]:
 
 
 def read_evaluation(path: Path) -> EvaluationFigures:
-    """What `evaluation_to_json` made, from a file. Raises EvaluationError when it is none."""
+    """Read a file written with `evaluation_to_json`. Raises EvaluationError for any other content."""
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
         return EvaluationFigures(
@@ -55,6 +55,6 @@ def read_evaluation(path: Path) -> EvaluationFigures:
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise EvaluationError(
-            f"{path} holds no figures of an evaluation ({error}): expected a file that 'embomatrix factory evaluate' "
-            "wrote with --json"
+            f"{path} holds no figures of an evaluation ({error}): expected a file written by 'embomatrix factory "
+            "evaluate' with --json"
         ) from error

@@ -1,4 +1,4 @@
-"""Draw films: the room that the robot is in, what it sees, and its plan beside that, in processes of their own."""
+"""Films of a plan: the robot's room, its camera view, and the plan as text, drawn in separate processes."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ ROOM_PX: Final = (640, 480)
 EYE_PX: Final = (256, 192)
 LINE_PX: Final = 17
 LINES: Final = 15
-"""Lines of the plan that fit beside the picture."""
+"""Lines of the plan beside the picture."""
 LINE_CHARACTERS: Final = 38
 COLORS: Final = 128
-"""Of a frame's palette: flat shading needs no more."""
+"""Size of a frame's palette: flat shading needs no more."""
 CHUNK: Final = 6
-"""Frames that a process draws for one request."""
+"""Frames that a process draws per request."""
 HOLD_MS: Final = 1500
-"""How long the last frame stays."""
+"""Duration of the last frame."""
 SUFFIXES: Final = (".gif", ".webp", ".png")
 
 
 class FilmError(ValueError):
-    """A film can't be drawn. The message tells what was found and what was expected."""
+    """Film that can't be drawn. The message says what was found and what was expected."""
 
 
 @dataclass(frozen=True, slots=True)
 class Caption:
-    """One line of the plan: the call in words, and whether it succeeded; None for a call that was not executed."""
+    """Line of the plan: the call in words, and its success; None for a call that was not executed."""
 
     text: str
     ok: bool | None
@@ -73,7 +73,7 @@ def draw_film(
 
 
 def write_film(path: Path, pictures: Sequence[Image.Image]) -> None:
-    """Write an animation, its kind chosen by the suffix: GIF, WebP or animated PNG. Raises FilmError for another suffix."""
+    """Write an animation as GIF, WebP or PNG, by the file's suffix. Raises FilmError for another suffix."""
     check_suffix(path)
     frames = [picture.quantize(COLORS) for picture in pictures] if path.suffix == ".gif" else [*pictures]
     durations = [round(1000 / FRAMES_PER_S)] * (len(frames) - 1) + [HOLD_MS]
@@ -81,15 +81,15 @@ def write_film(path: Path, pictures: Sequence[Image.Image]) -> None:
 
 
 def check_suffix(path: Path) -> None:
-    """Raise FilmError when no film can be written to a file of this name."""
+    """Raise FilmError if the file's suffix is not that of a film."""
     if path.suffix not in SUFFIXES:
         raise FilmError(
             f"a film can't be written as {path.name!r}: expected a name that ends in {', '.join(SUFFIXES)}"
         )
 
 
-class _Cutter:
-    """One process's stages, brought from frame to frame: one with low walls to look into, one as the robot sees it."""
+class _FrameRenderer:
+    """Stages of one process, updated from frame to frame: one with low walls to look into, one with full walls."""
 
     def __init__(self, scene: Scene, rooms: Mapping[int, tuple[Room, ...]]) -> None:
         self._scene = scene
@@ -101,7 +101,7 @@ class _Cutter:
         self._changed: set[str] = set()
 
     def shoot(self, frame: FilmFrame) -> tuple[Image.Image, Image.Image]:
-        """The rooms of the frame's step from above and aside, and what the robot sees."""
+        """Return an oblique view of the rooms of the frame's step, and the robot's camera view."""
         changed = {*frame.poses, *frame.joints, *frame.hidden}
         for name in sorted(changed | self._changed):
             self._show(frame, name)
@@ -122,21 +122,21 @@ class _Cutter:
                 stage.put(name, pose, frame.joints.get(name, item.joints))
 
 
-_cutter: _Cutter | None = None
+_renderer: _FrameRenderer | None = None
 
 
 def _open_stage(scene: Scene, rooms: Mapping[int, tuple[Room, ...]]) -> None:
-    global _cutter  # a pool's initializer has no other way to leave something for its tasks
-    _cutter = _Cutter(scene, rooms)
+    global _renderer  # a pool's initializer has no other way to pass state to its tasks
+    _renderer = _FrameRenderer(scene, rooms)
 
 
 def _draw(frames: Sequence[FilmFrame]) -> list[tuple[Image.Image, Image.Image]]:
-    assert _cutter is not None
-    return [_cutter.shoot(frame) for frame in frames]
+    assert _renderer is not None
+    return [_renderer.shoot(frame) for frame in frames]
 
 
 def _rooms_seen(film: Film) -> dict[int, tuple[Room, ...]]:
-    """Of each step the rooms that the robot is in while it lasts; all of them where it is in none."""
+    """Return for each step the rooms that the robot visits; all rooms if it is in none."""
     names: dict[int, set[str]] = {}
     for frame in film.frames:
         names.setdefault(frame.step, set()).add(film.scene.room_at((frame.robot.x_m, frame.robot.y_m)))
@@ -145,7 +145,7 @@ def _rooms_seen(film: Film) -> dict[int, tuple[Room, ...]]:
 
 
 def _page(room: Image.Image, eye: Image.Image, captions: Sequence[Caption], step: int) -> Image.Image:
-    """One frame: the room, the robot's view, and the plan with the step that is under way."""
+    """Compose one frame: the room, the robot's view, and the plan with the current step."""
     whole = Image.new("RGB", (ROOM_PX[0] + EYE_PX[0], ROOM_PX[1]), "white")
     whole.paste(room, (0, 0))
     whole.paste(eye, (ROOM_PX[0], 0))
@@ -162,7 +162,7 @@ def _page(room: Image.Image, eye: Image.Image, captions: Sequence[Caption], step
 
 
 def _color(caption: Caption, number: int, step: int) -> str:
-    """Calls to come are grey, the present one is dark, those behind it green, and what failed red."""
+    """Return the colour of a call: grey for later, dark for current, green for finished, red for failed calls."""
     if number > step or caption.ok is None:
         return "#a0a7b0"
     if not caption.ok:

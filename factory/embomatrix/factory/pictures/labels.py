@@ -1,4 +1,4 @@
-"""Words on a picture: each where it is legible and hides no other."""
+"""Placement of text on a picture: legible and without overlaps."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ Boxes = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 """Boxes in rows, (n, 4)."""
 
 SIZES: Final = (13, 12, 11, 10)
-"""Sizes of letters that are tried, in pixels: smaller ones can't be read."""
+"""Font sizes in pixels, in the order tried; smaller ones are illegible."""
 _HALO_PX: Final = 1
 _INSET_PX: Final = 2
 _PLACES: Final = (0.5, 0.25, 0.75, 0.0, 1.0)
-"""Where in a box words may stand, as shares of the room that they leave: the middle first."""
+"""Positions of text in a box, as shares of the free space; the centre first."""
 _NUMBER_SIZE: Final = 11
 _GAPS_PX: Final = (4, 10, 18)
-"""How far from a point its number may stand: near, unless others are there."""
+"""Distances of a number from its point, in the order tried."""
 _LINES: Final = 3
 GAP: Final = "  "
-"""Between a name and what is told of it."""
+"""Separator between a name and its details."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Setting:
-    """One way to set words: broken into lines, at a size, upright or not, with the pixels that they take."""
+class _TextLayout:
+    """Text broken into lines, with font size, orientation, and extent in pixels."""
 
     words: str
     size: int
@@ -44,16 +44,16 @@ class _Setting:
 
 
 class Labels:
-    """What is written on one picture so far, and where it must not be written over."""
+    """Text on one picture. New text never covers earlier text."""
 
     def __init__(self, image: Image.Image) -> None:
         self._image = image
         self._kept = boxes(())
 
     def inside(self, name: str, box: Box, color: str, clear_of: Boxes) -> bool:
-        """Write a name within a box, broken at its underscores if need be, off ``clear_of`` if it can be.
+        """Write a name within a box, broken at underscores if necessary, and outside ``clear_of`` if possible.
 
-        False where no size that can be read has room.
+        Return False if no legible size fits.
         """
         for marks in (np.vstack([self._kept, clear_of]), self._kept):
             for setting in _settings(name, box):
@@ -64,9 +64,9 @@ class Labels:
         return False
 
     def beside(self, words: str, at: tuple[int, int], color: str, clear_of: Boxes) -> None:
-        """Write a few letters next to a point, on the first free side of it; above to the right where none is."""
+        """Write a few characters next to a point, on its first free side; above it to the right if none is free."""
         width, height = _measured(words, _NUMBER_SIZE)
-        setting = _Setting(words, _NUMBER_SIZE, False, width, height)
+        setting = _TextLayout(words, _NUMBER_SIZE, False, width, height)
         corners = [
             (at[0] + dx, at[1] + dy)
             for gap in _GAPS_PX
@@ -81,7 +81,7 @@ class Labels:
         )
         self._write(setting, next(free, corners[0]), color)
 
-    def _write(self, setting: _Setting, at: tuple[int, int], color: str) -> None:
+    def _write(self, setting: _TextLayout, at: tuple[int, int], color: str) -> None:
         font = ImageFont.load_default(setting.size)
         flat = (setting.height, setting.width) if setting.upright else (setting.width, setting.height)
         for tint, halo in (("white", _HALO_PX), (color, 0)):
@@ -96,16 +96,16 @@ class Labels:
 
 
 def boxes(rows: Iterable[Box]) -> Boxes:
-    """Boxes in rows, (n, 4), of which there may be none."""
+    """Return boxes as rows, (n, 4)."""
     return np.array([*rows], dtype=np.int64).reshape(-1, 4)
 
 
-def _taken(setting: _Setting, at: tuple[int, int]) -> Box:
+def _taken(setting: _TextLayout, at: tuple[int, int]) -> Box:
     return (*at, at[0] + setting.width, at[1] + setting.height)
 
 
-def _settings(name: str, box: Box) -> Iterator[_Setting]:
-    """Ways to set a name that the box has room for: large before small, on one line before several, level before upright."""
+def _settings(name: str, box: Box) -> Iterator[_TextLayout]:
+    """Yield layouts of a name that fit the box: large first, then on one line first, then horizontal first."""
     width, height = box[2] - box[0] - 2 * _INSET_PX, box[3] - box[1] - 2 * _INSET_PX
     one, *more = _broken(name)
     for size in SIZES:
@@ -114,11 +114,11 @@ def _settings(name: str, box: Box) -> Iterator[_Setting]:
                 long, high = _measured(words, size)
                 w, h = (high, long) if upright else (long, high)
                 if w <= width and h <= height:
-                    yield _Setting(words, size, upright, w, h)
+                    yield _TextLayout(words, size, upright, w, h)
 
 
-def _places(setting: _Setting, box: Box) -> Iterator[tuple[int, int]]:
-    """Left upper corners at which the words lie within the box."""
+def _places(setting: _TextLayout, box: Box) -> Iterator[tuple[int, int]]:
+    """Yield upper left corners for which the text lies within the box."""
     left, top = box[0] + _INSET_PX, box[1] + _INSET_PX
     spare_x = box[2] - _INSET_PX - left - setting.width
     spare_y = box[3] - _INSET_PX - top - setting.height
@@ -128,10 +128,10 @@ def _places(setting: _Setting, box: Box) -> Iterator[tuple[int, int]]:
 
 @lru_cache(maxsize=4096)
 def _broken(words: str) -> tuple[str, ...]:
-    """Words on one line, and on two and three as even as their underscores allow; what follows a gap has a line of its own."""
+    """Return the text on one line, and broken at underscores into two and three even lines; details get a separate line."""
     name, gap, rest = words.partition(GAP)
     if gap:
-        return (words, *(f"{way}\n{rest}" for way in _broken(name)))
+        return (words, *(f"{lines}\n{rest}" for lines in _broken(name)))
     parts = [f"{part}_" for part in name.split("_")]
     parts[-1] = parts[-1][:-1]
     ways = [name]
@@ -146,7 +146,7 @@ def _broken(words: str) -> tuple[str, ...]:
 
 @lru_cache(maxsize=4096)
 def _measured(words: str, size: int) -> tuple[int, int]:
-    """Width and height in pixels of lines with their halo."""
+    """Return width and height of lines with their halo in pixels."""
     font = ImageFont.load_default(size)
     pen = ImageDraw.Draw(Image.new("L", (1, 1)))
     left, top, right, bottom = pen.multiline_textbbox((0, 0), words, font, spacing=1, stroke_width=_HALO_PX)
@@ -154,7 +154,7 @@ def _measured(words: str, size: int) -> tuple[int, int]:
 
 
 def _meets(box: Box, others: Boxes) -> bool:
-    """Whether a box overlaps one of the others."""
+    """True if a box overlaps one of the others."""
     left, top, right, bottom = box
     return bool(
         np.any(

@@ -1,4 +1,4 @@
-"""The column of words beside a plan: what colours mean, what has which number, and what stands where."""
+"""Legend beside a plan: meaning of colours, numbers of objects, and contents of furniture."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MARGIN_PX: Final = 16
 
 
 def draw_legend(colors: Sequence[tuple[str, str]], lines: Iterable[str], height_px: int) -> Image.Image:
-    """Colours with their meaning, then ``lines``, broken where they are long, in as many columns as the height asks for."""
+    """Draw colours with their meaning, then wrapped ``lines``, in as many columns as the height requires."""
     rows = [
         row
         for line in lines
@@ -45,7 +45,7 @@ def draw_legend(colors: Sequence[tuple[str, str]], lines: Iterable[str], height_
 
 
 def counted(names: Iterable[str]) -> str:
-    """Names of things in few words: ``book_1, book_2, book_3, cup_1`` is ``book_1-3, cup_1``."""
+    """Abbreviate names of objects: ``book_1, book_2, book_3, cup_1`` becomes ``book_1-3, cup_1``."""
     numbers: Mapping[str, list[int]] = defaultdict(list)
     for name in names:
         kind, number = in_order(name)
@@ -54,13 +54,13 @@ def counted(names: Iterable[str]) -> str:
 
 
 def in_order(name: str) -> tuple[str, int]:
-    """A name's kind and number, by which names are sorted as people count; -1 for a name without a number."""
+    """Return a name's kind and number as a sort key; -1 for a name without a number."""
     kind, _, number = name.rpartition("_")
     return (kind, int(number)) if number.isdecimal() else (name, -1)
 
 
 def _runs(kind: str, numbers: Sequence[int]) -> str:
-    """``book_1-3, 7`` of 1, 2, 3 and 7; the kind alone where it has no numbers."""
+    """Return ``book_1-3, 7`` for 1, 2, 3 and 7; only the kind if it has no numbers."""
     if numbers[0] < 0:
         return kind
     runs = [

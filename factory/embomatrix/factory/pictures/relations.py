@@ -1,4 +1,4 @@
-"""A picture of every relation: small scenes, photographed, each with what the simulator says of it."""
+"""Pictures of every relation: small rendered scenes, each with the simulator's verdict."""
 
 from __future__ import annotations
 
@@ -43,16 +43,16 @@ COLUMNS: Final = 4
 PANEL_PX: Final = (300, 240)
 LABEL_PX: Final = 40
 LEAST_SPAN_M: Final = 0.3
-"""The camera comes no nearer than for things of this size."""
+"""Least object size that the camera's distance is computed for."""
 
 
 @dataclass(frozen=True, slots=True)
 class RelationPicture:
-    """One case. ``at_m`` is the middle of the first object's underside, from the second's middle and from ``on``.
+    """Case of a relation between object ``a`` and object ``b``, which stands upright with its front at +x.
 
-    The second may be one of `ROOMS`: then ``at_m`` is in the world. ``on`` names a surface of the second, "top" its top;
-    empty: the floor. The second stands upright with its front at +x, its joints at ``open``. A relation of one object has
-    no first.
+    ``at_m`` is the centre of the underside of ``a``, relative to the centre of ``b`` and the surface ``on`` of ``b``. "top" is
+    the top of ``b``, "" the floor. If ``b`` is one of `ROOMS`, ``at_m`` is in the world frame. ``open`` is the joints' share
+    of travel. A relation of one object has no ``a``.
     """
 
     predicate: str
@@ -63,9 +63,9 @@ class RelationPicture:
     on: str = ""
     open: float = 0.0
     side: float = -1.3
-    """How far to the right of the second's front the camera stands, in spans: positive looks past its open door."""
+    """Sideways offset of the camera in spans; positive looks past an open door."""
     above: float = 1.1
-    """How far above what it looks at the camera stands, in spans: low to see what is between a thing and a surface."""
+    """Height of the camera above its target in spans; small values show the gap between an object and a surface."""
 
 
 PANELS: Final = (
@@ -108,7 +108,7 @@ PANELS: Final = (
 
 
 def draw_relations() -> Image.Image:
-    """All panels in rows of four. Raises EngineError where pybullet is missing."""
+    """Return all panels in rows of four. Raises EngineError if pybullet is missing."""
     width, height = PANEL_PX[0], PANEL_PX[1] + LABEL_PX
     sheet = Image.new("RGB", (COLUMNS * width, -(-len(PANELS) // COLUMNS) * height), "white")
     for number, panel in enumerate(PANELS):
@@ -118,7 +118,7 @@ def draw_relations() -> Image.Image:
 
 
 def verdict(panel: RelationPicture) -> bool:
-    """What the simulator says of a panel's scene."""
+    """Return the simulator's verdict on a panel's relation."""
     scene = panel_scene(panel)
     engine = BulletEngine(scene)
     try:
@@ -131,7 +131,7 @@ def verdict(panel: RelationPicture) -> bool:
 
 
 def panel_scene(panel: RelationPicture) -> Scene:
-    """The objects of a panel on an empty floor."""
+    """Return a scene with the panel's objects on an empty floor."""
     catalog = Catalog.load()
     assets = {name: build_asset(catalog, *MODELS[name]) for name in (panel.b, panel.a) if name in MODELS}
     stands = {panel.b: (0.0, 0.0, 0.0), **({panel.a: _at(panel, assets)} if panel.a else {})}
@@ -152,7 +152,7 @@ def panel_scene(panel: RelationPicture) -> Scene:
 
 
 def _at(panel: RelationPicture, assets: Mapping[str, Asset]) -> Vec3:
-    """Where the first object's underside is in the world; the second one's lies on the floor."""
+    """Return the centre of the underside of ``a`` in the world; ``b`` stands on the floor."""
     x, y, z = panel.at_m
     if not panel.on:
         return panel.at_m
@@ -188,7 +188,7 @@ def _drawn(panel: RelationPicture) -> Image.Image:
 
 
 def _framed(scene: Scene, panel: RelationPicture) -> Aabb:
-    """What the camera looks at: all of the second object where it counts or hides the first, the first, or both."""
+    """Return the box that the camera looks at: both objects, all of ``b`` if it hides ``a`` or is alone, else ``a``."""
     boxes = {
         item.name: AssetBounds(scene.asset_of(item.name)).box(item.pose_world_asset) for item in scene.objects
     }

@@ -1,4 +1,4 @@
-"""Top-down picture of a scene: rooms, walls, doorways, furniture with its front, small things as dots."""
+"""Plan of a scene from above: rooms, walls, doorways, furniture with its front, small objects as dots."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _MARGIN_PX: Final = 15
 _FINEST_PX_PER_M: Final = 110.0
 _LONG_SIDE_PX: Final = 1500
 _COARSEST_PX_PER_M: Final = 60.0
-"""Below this, names of rooms and furniture don't fit where they are: large scenes get a larger picture instead ..."""
+"""Least scale at which names fit into rooms and furniture: large scenes get a larger picture."""
 _LONGEST_SIDE_PX: Final = 3000
-"""... up to this size."""
+"""Upper limit for the picture's long side."""
 _LEAST_HEIGHT_PX: Final = 700
 _EACH_BY_NUMBER: Final = 3
-"""So many things on one host have numbers; more are told in one line of the legend."""
+"""Up to this many small objects on a host get numbers; more share one line of the legend."""
 _PANE_M: Final = 0.03
-"""Half the thickness at which windows are drawn."""
+"""Half the drawn thickness of windows."""
 _SMALL_M: Final = 0.3
 _HUNG_M: Final = 1.2
 _CEILING_M: Final = 2.3
@@ -50,13 +50,13 @@ _LEGEND: Final = (
     ("opens", "opens (cabinet, fridge, oven ...)"),
     ("works", "switches on, gives water or heat"),
     ("rests", "other furniture"),
-    ("hung", "on the wall above the robot's way"),
+    ("hung", "on the wall, above the robot"),
     ("rug", "rug"),
     ("plant", "plant"),
 )
 _SIGNS: Final = (
     "triangle: front · red: doorway · blue: window",
-    "ring: light or fan · dot: small thing, green if it can move",
+    "ring: light or fan · dot: small object, green if it can move",
 )
 _ROOM_COLOR: Final = "#b03030"
 _PLANTS: Final = frozenset({"tree", "low_resolution_tree", "bush", "pot_plant"})
@@ -64,7 +64,7 @@ _WORKS: Final = ("toggleable", "heatSource", "coldSource", "particleSource")
 
 
 def draw_plan(scene: Scene) -> Image.Image:
-    """The scene from above, north up; on the right a legend of all that has no room for its name. Returns an RGB image."""
+    """Return an RGB image of the scene from above, north up, with a legend for names that do not fit."""
     plan = _Plan(scene)
     plan.rooms()
     plan.walls()
@@ -87,12 +87,12 @@ def footprint(scene: Scene, item: SceneObject) -> Aabb:
 
 
 def is_overhead(box: Aabb) -> bool:
-    """Whether an object with this box hangs under the ceiling, out of the plan's way."""
+    """True if an object with this box hangs under the ceiling."""
     return box.high_m[2] > _CEILING_M and box.low_m[2] > 0.85
 
 
 def kind_of(scene: Scene, item: SceneObject, box: Aabb) -> str:
-    """Key of ``FILL``: what an object is to the robot."""
+    """Return the key of ``FILL`` for an object."""
     asset = scene.assets[item.asset_id]
     if box.low_m[2] >= _HUNG_M:
         return "hung"
@@ -122,9 +122,9 @@ class _Plan:
         self._draw = ImageDraw.Draw(self.image)
         self._small = [o for o in scene.objects if self._is_small(o)]
         self._named: list[tuple[SceneObject, Box, str]] = []
-        """Furniture with the box that its name may stand in, and its colour."""
+        """Furniture with the box for its name and the text colour."""
         self._marks: list[Box] = []
-        """What words had better not cover: dots, fronts, lights, the robot."""
+        """Boxes that text avoids if possible: dots, fronts, lights, the robot."""
 
     def rooms(self) -> None:
         for number, room in enumerate(self._scene.rooms):
@@ -137,7 +137,7 @@ class _Plan:
             thin = min(part.size_m[:2]) < 0.1
             if box.low_m[2] > 0.1:
                 continue
-            # of one room alone, walls are drawn no further than the room goes
+            # In the plan of a single room, walls are clipped to the room.
             low, high = (
                 np.clip(each[:2], self._low, self._high).tolist() for each in (box.low_m, box.high_m)
             )
@@ -188,12 +188,12 @@ class _Plan:
         self._draw.line((x, y, *tip), fill="#d02020", width=2)
 
     def label(self) -> list[str]:
-        """Write names where they fit, numbers where they don't. Returns the legend's lines."""
+        """Write names if they fit, else numbers; return the legend's lines."""
         labels = Labels(self.image)
         self._label_rooms(labels)
         marks = boxes(self._marks)
         numbered: list[tuple[SceneObject, Box, str]] = []
-        # what lies on something first, for it hides that; then the small, for a large box has more places
+        # Objects on furniture come first because they cover it; then small boxes, which have fewer places for text.
         for item, box, color in sorted(self._named, key=lambda named: (not named[0].host, _area(named[1]))):
             if not labels.inside(item.name, box, color, marks):
                 numbered.append((item, box, color))
@@ -225,7 +225,7 @@ class _Plan:
         labels.beside("robot", (x, y + int(ROBOT.radius_m * self._scale)), "#d02020", standing)
 
     def _told_by_host(self) -> Mapping[str, Sequence[str]]:
-        """Names of small things by the host that they crowd, as ``inside shelf_1``."""
+        """Group small objects by place, as ``inside shelf_1``, if there are too many for numbers."""
         told = defaultdict(list)
         for item in self._small:
             if item.relation and item.host:
@@ -242,7 +242,7 @@ class _Plan:
         return (max(x, y) < _SMALL_M or bool(item.host and not item.fixed)) and not is_overhead(box)
 
     def _layer(self, item: SceneObject) -> tuple[int, float]:
-        """Rugs lie under everything, and a crown would hide what stands under its tree; then the lower before the higher."""
+        """Return the drawing order: rugs, then plants, whose crowns would hide furniture, then by height."""
         box = footprint(self._scene, item)
         kind = kind_of(self._scene, item, box)
         rank = 2 if item.host else {"rug": 0, "plant": 1}.get(kind, 2)
@@ -255,7 +255,7 @@ class _Plan:
         self._marks.append(around)
 
     def _front(self, item: SceneObject, color: str) -> None:
-        """A triangle at the middle of the front edge, pointing to the room."""
+        """Draw a triangle at the centre of the front edge, pointing to the room."""
         size = self._scene.assets[item.asset_id].size_m
         pose = item.pose_world_asset
         if abs(pose.rotation[2, 2]) < 0.9:

@@ -1,4 +1,4 @@
-"""Many scenes in one picture, without labels: plans on a sheet, to see at a glance what became of each, and views."""
+"""Many scenes in one picture without labels: a sheet of plans, and oblique views side by side."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _DIRECTIONS: Final = ("ahead", "to its left", "behind", "to its right")
 
 
 def draw_sheet(scenes: Sequence[Scene], *, columns: int = 9, cell_px: int = 200) -> Image.Image:
-    """Plans side by side, row by row, each fitted into a square cell with its name below. Returns an RGB image."""
+    """Return an RGB image of plans in rows, each fitted into a square cell with its name below."""
     rows = math.ceil(len(scenes) / columns)
     sheet = Image.new("RGB", (columns * cell_px, rows * (cell_px + _CAPTION_PX)), "white")
     draw = ImageDraw.Draw(sheet)
@@ -38,11 +38,11 @@ def draw_sheet(scenes: Sequence[Scene], *, columns: int = 9, cell_px: int = 200)
 
 
 def draw_views(scenes: Sequence[Scene], *, width_px: int = 560) -> Image.Image:
-    """Oblique views side by side, each ``width_px`` wide and three quarters as high. Raises EngineError without pybullet."""
+    """Return oblique views side by side, each ``width_px`` wide with aspect ratio 4:3. Raises EngineError without pybullet."""
     height_px = width_px * 3 // 4
     row = Image.new("RGB", (len(scenes) * width_px, height_px), "white")
     for number, scene in enumerate(scenes):
-        # drawn at twice the size: Bullet's renderer leaves edges jagged
+        # Rendered at twice the size: Bullet's renderer does no antialiasing.
         view = render_oblique(scene, width_px=2 * width_px, height_px=2 * height_px)
         smooth = Image.fromarray(np.asarray(view)).resize((width_px, height_px), Image.Resampling.LANCZOS)
         row.paste(smooth, (number * width_px, 0))
@@ -50,7 +50,7 @@ def draw_views(scenes: Sequence[Scene], *, width_px: int = 560) -> Image.Image:
 
 
 def draw_eyes(scene: Scene, *, width_px: int = 480) -> Image.Image:
-    """What the robot sees where it starts, in four directions, each ``width_px`` wide and three quarters as high.
+    """Return the robot's view at its start in four directions, each ``width_px`` wide with aspect ratio 4:3.
 
     Raises EngineError without pybullet.
     """
@@ -66,7 +66,7 @@ def draw_eyes(scene: Scene, *, width_px: int = 480) -> Image.Image:
 
 
 def draw_thumbnail(scene: Scene, side_px: int) -> Image.Image:
-    """One plan, north up, in the middle of a square: rooms, walls, windows, doorways and furniture by kind."""
+    """Return a plan, north up, centred in a square: rooms, walls, windows, doorways and furniture by kind."""
     low = np.min([room.low_m for room in scene.rooms], axis=0) - _MARGIN_M
     high = np.max([room.high_m for room in scene.rooms], axis=0) + _MARGIN_M
     scale = side_px / float(max(high - low))
@@ -92,7 +92,7 @@ def draw_thumbnail(scene: Scene, side_px: int) -> Image.Image:
         draw.rectangle(box(x - a, y - b, x + a, y + b), fill="#6fc3e8")
     boxes = {item.name: footprint(scene, item) for item in scene.objects}
     kinds = {item.name: kind_of(scene, item, boxes[item.name]) for item in scene.objects}
-    # Plants first: a tree's crown would hide what stands under it.
+    # Plants first: a tree's crown would hide furniture below it.
     for item in sorted(scene.objects, key=lambda o: kinds[o.name] != "plant"):
         around = boxes[item.name]
         if not is_overhead(around) and kinds[item.name] != "hung":

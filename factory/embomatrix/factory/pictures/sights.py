@@ -1,4 +1,4 @@
-"""Pictures for language models that see: a scene from above and by the robot's eyes, and one of its rooms, as PNG files."""
+"""PNG pictures for vision-language models: a scene from above, the robot's view, and single rooms."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Room, Scene
 
 WALL_M: Final = 0.3
-"""What begins this near to a room is its wall, or an opening in it."""
+"""Walls and openings within this distance of a room belong to it."""
 _ORIGIN: Final = Pose((0.0, 0.0, 0.0))
 
 
 def sights_of(scene: Scene) -> tuple[bytes, bytes]:
-    """The labelled plan, and what the robot sees in four directions where it starts. Raises EngineError without pybullet."""
+    """Return the labelled plan and the robot's view at its start in four directions. Raises EngineError without pybullet."""
     return _png(draw_plan(scene)), _png(draw_eyes(scene))
 
 
 def sight_of_room(scene: Scene, room: str) -> bytes:
-    """The labelled plan of one room alone. Raises KeyError for an unknown room."""
+    """Return the labelled plan of one room. Raises KeyError for an unknown room."""
     return _png(draw_plan(alone(scene, room)))
 
 
 def alone(scene: Scene, name: str) -> Scene:
-    """The scene without its other rooms and what belongs to them. Raises KeyError for an unknown room."""
+    """Return the scene reduced to one room. Raises KeyError for an unknown room."""
     room = {each.name: each for each in scene.rooms}[name]
     return replace(
         scene,
