@@ -1,4 +1,4 @@
-"""Every asset is true: its size, its cavities, its surfaces and the swing of its doors are what they claim to be."""
+"""Geometry of assets: size, cavities, surfaces and swing of doors."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ CATALOG = Catalog.load()
 
 
 def chosen_models() -> Iterator[tuple[str, str]]:
-    """Every model that four scenes hold, two of each small category, and two of each openable one."""
+    """All models of four scenes, and two models of each small and each openable category."""
     found = {
         (category, model)
         for scene_id in SCENES
@@ -58,7 +58,7 @@ WITH_JOINTS = [asset for asset in ASSETS if asset.joints]
 
 
 def planes_of(part: ConvexPart) -> tuple[FloatArray, FloatArray]:
-    """Outer half spaces of a part: normals (n, 3) and offsets, in the asset's frame."""
+    """Half spaces of a part: normals (n, 3) and offsets, in the asset's frame."""
     mesh = mesh_of(part)
     return mesh.face_normals, np.einsum("ij,ij->i", mesh.face_normals, mesh.triangles[:, 0])
 
@@ -112,7 +112,7 @@ def corners_at(link: Link, fraction: float) -> FloatArray:
 
 
 def parts_of(asset: Asset, link: str) -> tuple[ConvexPart, ...]:
-    """Parts of a link by its name, of the base for ""."""
+    """Parts of a link; of the base for an empty name."""
     return next(item.parts for item in asset.links if item.name == (link or "base"))
 
 
@@ -249,7 +249,7 @@ def assert_clear(asset: Asset, fractions: tuple[float, ...]) -> None:
                     assert depth <= 1e-5, (asset.asset_id, link.name, fraction, depth)
 
 
-def test_an_open_door_leaves_the_mouth_of_its_cavity_free() -> None:
+def test_open_door_leaves_the_opening_of_its_cavity_free() -> None:
     for asset in WITH_JOINTS:
         for interior in asset.interiors:
             mouth = interior_box(interior.center_m, interior.size_m)
@@ -284,7 +284,7 @@ def test_open_doors_stay_within_the_width_of_their_cabinet() -> None:
                 assert np.abs(corners[:, 1]).max() <= half + 1e-5, (asset.asset_id, link.name)
 
 
-def test_loose_things_have_a_flat_base_under_their_middle() -> None:
+def test_loose_objects_have_a_flat_base_under_their_centre() -> None:
     for asset in ASSETS:
         if asset.mass_kg > 5.0 or family_of(CATALOG, asset.category) in HUNG:
             continue
@@ -324,7 +324,7 @@ def test_doors_of_the_same_bay_close_the_same_cavity() -> None:
     }  # fmt: skip
 
 
-def test_a_drawer_carries_its_floor_and_its_cavity_four_fifths_of_its_depth_out() -> None:
+def test_drawer_slides_out_by_four_fifths_with_its_floor_and_cavity() -> None:
     drawers = [(asset, link) for asset in WITH_JOINTS for link in asset.links[1:] if "drawer" in link.name]
     assert len({asset.category for asset, _ in drawers}) >= 5
     for asset, link in drawers:
@@ -341,7 +341,7 @@ def test_a_drawer_carries_its_floor_and_its_cavity_four_fifths_of_its_depth_out(
         assert len(walls) == 4, asset.asset_id
 
 
-def test_drawers_are_where_the_records_tell_of_a_joint() -> None:
+def test_models_listed_with_a_joint_have_drawers() -> None:
     for category in ("desk", "nightstand", "coffee_table", "console_table"):
         for model in CATALOG.models_of(category):
             asset = build_asset(CATALOG, category, model.model_id)
@@ -392,7 +392,7 @@ def test_building_takes_less_than_five_milliseconds() -> None:
     assert (time.process_time() - started) / len(ASSETS) < 0.005
 
 
-def test_a_stall_has_its_counter_where_people_work_and_a_roof_over_it() -> None:
+def test_stall_has_a_counter_at_working_height_below_a_roof() -> None:
     stand = build_asset(CATALOG, "farm_stand", CATALOG.models_of("farm_stand")[0].model_id)
     (counter,) = stand.supports
     assert counter.center_m[2] + stand.size_m[2] / 2 == pytest.approx(0.9)

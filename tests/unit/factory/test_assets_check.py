@@ -1,4 +1,4 @@
-"""The sanity test of all assets that scenes or activities use, and that it finds what is wrong."""
+"""Checks of all assets in use, and of assets with a known flaw."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from embomatrix.world.geometry import ConvexPart, Pose, Shape
 
 CATALOG = Catalog.load()
 PLAIN_BOXES = 160
-"""Of the categories in use, at most so many are a plain box: sheets, thin rods, flat fittings, dice."""
+"""Upper limit for categories in use that are a plain box: sheets, thin rods, flat fittings, dice."""
 
 
 def first_of(category: str) -> Asset:
@@ -33,7 +33,7 @@ def wrong(findings: tuple[AssetFinding, ...]) -> list[Rule]:
     return [finding.rule for finding in findings if not finding.excused]
 
 
-def test_what_scenes_and_activities_use_is_known() -> None:
+def test_categories_in_use_are_those_of_scenes_and_activities() -> None:
     used = CATALOG.used_categories
     assert len(used) == 1428
     assert {"fridge", "apple", "door", "bath_towel"} <= set(used)
@@ -49,7 +49,7 @@ def test_every_model_of_every_category_in_use_passes() -> None:
 
 
 def wrong_ones(most: int | None) -> list[str]:
-    """Models in use that break a rule of geometry, of so many of each category."""
+    """Return the violations among the first ``most`` models of each category in use."""
     return [
         f"{category}-{model.model_id}"
         for category in CATALOG.used_categories
@@ -58,7 +58,7 @@ def wrong_ones(most: int | None) -> list[str]:
     ]
 
 
-def test_what_slicing_makes_has_the_shape_of_a_part_of_the_whole() -> None:
+def test_sliced_food_has_the_shape_of_a_part_of_the_whole() -> None:
     kinds = {
         name: family_of(CATALOG, name)
         for name in (
@@ -85,7 +85,7 @@ def test_few_categories_are_plain_boxes() -> None:
     assert len(plain) <= PLAIN_BOXES
 
 
-def test_every_excuse_from_the_probe_is_needed_and_has_a_reason() -> None:
+def test_every_exemption_from_the_probe_is_needed_and_has_a_reason() -> None:
     excused = {
         family_of(CATALOG, name)
         for name in CATALOG.used_categories
@@ -95,14 +95,14 @@ def test_every_excuse_from_the_probe_is_needed_and_has_a_reason() -> None:
     assert set(EXCUSED_FROM_PROBE) <= excused
 
 
-def test_a_model_of_another_size_is_found() -> None:
+def test_model_of_wrong_size_is_reported() -> None:
     apple = first_of("apple")
     taller = replace(apple, size_m=(*apple.size_m[:2], apple.size_m[2] * 1.06))
     assert wrong(check_asset(CATALOG, taller)) == [Rule.SIZE]
     assert not check_asset(CATALOG, replace(apple, size_m=(*apple.size_m[:2], apple.size_m[2] * 1.04)))
 
 
-def test_a_cavity_that_is_too_narrow_is_found() -> None:
+def test_too_narrow_cavity_is_reported() -> None:
     bucket = first_of("bucket")
     slit = Interior("inside", (0.0, 0.0, 0.0), (0.1, PROBE_M - 1e-3, 0.1))
     (finding,) = check_asset(CATALOG, replace(bucket, interiors=(slit,)))
@@ -110,7 +110,7 @@ def test_a_cavity_that_is_too_narrow_is_found() -> None:
     assert "0.029 m wide" in finding.detail
 
 
-def test_a_door_that_cuts_its_frame_is_found() -> None:
+def test_door_that_penetrates_its_frame_is_reported() -> None:
     fridge = first_of("fridge")
     base, door = fridge.links
     assert door.joint is not None
@@ -120,7 +120,7 @@ def test_a_door_that_cuts_its_frame_is_found() -> None:
     assert finding.detail.startswith("door at 5% of its travel")
 
 
-def test_two_drawers_that_cut_each_other_are_found() -> None:
+def test_overlapping_drawers_are_reported() -> None:
     fridge = first_of("fridge")
     out, side = Joint(JointKind.PRISMATIC, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.4), (0.0, 1.0, 0.0)
     one = Link("one", (box_at((0.0, 0.0, 0.0), (0.1, 0.1, 0.1)),), out)
@@ -130,12 +130,12 @@ def test_two_drawers_that_cut_each_other_are_found() -> None:
     assert Rule.OPENABLE in wrong(findings)
 
 
-def test_an_openable_thing_without_a_joint_is_found() -> None:
+def test_openable_asset_without_a_joint_is_reported() -> None:
     fridge = first_of("fridge")
     assert Rule.OPENABLE in wrong(check_asset(CATALOG, replace(fridge, links=fridge.links[:1])))
 
 
-def test_a_sheet_has_a_tile_for_the_closed_and_one_for_the_open_thing() -> None:
+def test_sheet_shows_an_asset_closed_and_open() -> None:
     picture = draw_sheet([first_of("apple"), first_of("fridge")], columns=3)
     assert picture.width == 3 * TILE_PX
     grey = picture.convert("L")
@@ -144,7 +144,7 @@ def test_a_sheet_has_a_tile_for_the_closed_and_one_for_the_open_thing() -> None:
         assert dark.getbbox() is not None
 
 
-def test_check_tells_the_rules_and_an_unknown_category_by_name() -> None:
+def test_check_prints_the_rules_and_names_an_unknown_category() -> None:
     pytest.importorskip("pybullet", reason="PyBullet has wheels up to Python 3.11 on x86-64")
     told = CliRunner().invoke(app, ["check", "--category", "bowl", "--category", "fridge", "--glance"])
     assert told.exit_code == 0, told.output

@@ -1,4 +1,4 @@
-"""docs/assets.md counts the families as the code does, and names every rule of the sanity test."""
+"""docs/assets.md counts the families and names every rule of the asset check."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def rows(first_heading: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in found[1].splitlines()]
 
 
-def test_the_table_of_families_counts_every_category_in_use_once() -> None:
+def test_table_of_families_counts_every_category_in_use_once() -> None:
     catalog = Catalog.load()
     counts = Counter(family_of(catalog, name) for name in catalog.used_categories)
     listed: list[Family] = []
@@ -41,6 +41,6 @@ def test_every_rule_has_its_row() -> None:
     assert [name.strip("` ") for name, _ in rows("rule")] == list(Rule)
 
 
-def test_the_fields_of_the_page_are_those_of_an_asset() -> None:
+def test_fields_of_the_page_are_those_of_an_asset() -> None:
     named = {name.strip("` ") for name, _ in rows("field")} - {"link` of both"}
     assert named <= {field.name for field in fields(Asset)}

@@ -1,4 +1,4 @@
-"""Small things rest where they are put: the engine's own bodies, stepped for a second and a half."""
+"""Small objects stay in place in the engine."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def client() -> Iterator[int]:
 
 
 @pytest.mark.parametrize("category", THINGS.split())
-def test_thing_stays_upright_where_it_is_put(client: int, category: str) -> None:
+def test_dropped_object_stays_upright_in_place(client: int, category: str) -> None:
     catalog = Catalog.load()
     asset = build_asset(catalog, category, catalog.models_of(category)[0].model_id)
     half = asset.size_m[2] / 2
@@ -56,11 +56,11 @@ def test_thing_stays_upright_where_it_is_put(client: int, category: str) -> None
     assert math.degrees(math.acos(1 - 2 * (qx * qx + qy * qy))) < 1.5
 
 
-def test_nearly_every_category_in_use_stands_at_a_glance() -> None:
+def test_nearly_every_category_in_use_stands_in_a_short_run() -> None:
     assert not fallen(CATALOG.used_categories[::6], GLANCE_STEPS)
 
 
-def test_whatever_slicing_makes_lies_still() -> None:
+def test_sliced_food_comes_to_rest() -> None:
     pieces = [name for name in CATALOG.category_names if name.startswith(("half_", "sliced_"))]
     assert len(pieces) > 200
     assert not fallen(pieces, GLANCE_STEPS)
@@ -71,7 +71,7 @@ def test_every_category_stands_for_two_seconds() -> None:
     assert not fallen(CATALOG.category_names, STEPS_OF_TWO_SECONDS)
 
 
-def test_a_thing_on_its_edge_is_found() -> None:
+def test_object_on_its_edge_is_reported() -> None:
     book = build_asset(CATALOG, "hardback", CATALOG.models_of("hardback")[0].model_id)
     lean = Link("base", tuple(replace(part, pose=LEANING @ part.pose) for part in book.links[0].parts))
     (finding,) = check_standing(CATALOG, [replace(book, links=(lean,), size_m=(0.2, 0.2, 0.2))])
@@ -80,6 +80,6 @@ def test_a_thing_on_its_edge_is_found() -> None:
 
 
 def fallen(categories: Sequence[str], least_steps: int) -> list[AssetFinding]:
-    """What does not stand, of the first model of each category, and is not excused."""
+    """Return the unexcused findings for the first model of each category."""
     assets = [build_asset(CATALOG, name, CATALOG.models_of(name)[0].model_id) for name in categories]
     return [f for f in check_standing(CATALOG, assets, least_steps) if not f.excused]

@@ -1,4 +1,4 @@
-"""The shipped tables are what the script derives from the bddl package."""
+"""Shipped tables equal those derived from the bddl package."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cavities of imported models: every compartment is one, and what a round wall leaves over is none."""
+"""Cavities of imported models: every compartment is one; the rest beside a round wall is none."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from embomatrix.factory.importers.cavities import CELLS, cavities
 
 
-def test_a_round_hollow_is_one_cavity() -> None:
+def test_round_hollow_is_one_cavity() -> None:
     x, y = np.meshgrid(np.arange(CELLS) - 19.5, np.arange(CELLS) - 19.5, indexing="ij")
     solid = np.repeat((np.hypot(x, y) > 17)[:, :, None], CELLS, axis=2)
     solid[:, :, :2] = True
@@ -16,7 +16,7 @@ def test_a_round_hollow_is_one_cavity() -> None:
     assert min(inside.box.size_m[:2]) > 0.2
 
 
-def test_a_small_bay_beside_a_large_one_is_a_cavity_of_its_own() -> None:
+def test_small_bay_beside_a_large_one_is_a_separate_cavity() -> None:
     solid = np.zeros((CELLS,) * 3, dtype=np.bool_)
     for axis in (0, 1, 2):
         solid[(slice(None),) * axis + ((0, 1, -2, -1),)] = True

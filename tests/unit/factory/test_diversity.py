@@ -1,4 +1,4 @@
-"""Figures of diversity against values worked out by hand, and in the order that a reader would give."""
+"""Diversity figures against values calculated by hand."""
 
 import math
 
@@ -22,7 +22,7 @@ TEXTS = st.lists(
 )
 
 
-def test_words_are_lower_case_and_parted_at_underscores():
+def test_words_are_lower_case_and_split_at_underscores():
     assert words_of("Put Mia's apple in the top_cabinet_0, please!") == (
         "put", "mia's", "apple", "in", "the", "top", "cabinet", "0", "please",
     )  # fmt: skip
@@ -35,30 +35,30 @@ def test_distinct_counts_each_gram_once():
     assert distinct([], 1) == 0
 
 
-def test_bleu_is_the_formula_written_out():
+def test_bleu_equals_the_formula_written_out():
     words, reference = tuple("abcd"), tuple("abce")
     precisions = [3 / 4, 2 / 3, 1 / 2, 0.1 / 1]
     assert bleu(words, [reference]) == pytest.approx(math.prod(precisions) ** 0.25)
 
 
-def test_a_short_text_pays_for_its_brevity():
+def test_short_text_gets_a_brevity_penalty():
     assert bleu(tuple("ab"), [tuple("abcd")], n=1) == pytest.approx(math.exp(1 - 4 / 2))
 
 
 @given(TEXTS)
-def test_self_bleu_lies_between_nothing_and_copies(texts):
+def test_self_bleu_lies_between_unrelated_texts_and_copies(texts):
     assert 0 <= self_bleu(texts) <= 1 + 1e-9
     assert self_bleu([texts[0]] * 3) == pytest.approx(1)
 
 
 @given(st.lists(st.sampled_from("abcd"), min_size=2, max_size=20))
-def test_entropy_is_greatest_where_all_differ(values):
+def test_entropy_is_greatest_if_all_values_differ(values):
     assert -1e-9 <= normalised_entropy(values) <= 1 + 1e-9
     assert normalised_entropy(range(len(values))) == pytest.approx(1)
     assert normalised_entropy([1] * len(values)) == 0
 
 
-def test_a_copy_counts_and_what_it_copies_does_not():
+def test_only_the_later_text_counts_as_near_duplicate():
     texts = [("put", "the", "apple", "away")] * 2 + [("open", "a", "window")]
     assert near_duplicates(texts) == pytest.approx(1 / 3)
 
@@ -70,7 +70,7 @@ def test_names_are_whole_words():
     assert named_share(["Mia asks."], []) == 0
 
 
-def test_templates_are_less_diverse_than_talk():
+def test_templates_are_less_diverse_than_free_text():
     templates = [
         f"Put the {thing} in the fridge." for thing in ("apple", "pear", "plate", "mug", "plum", "bowl")
     ]

@@ -1,4 +1,4 @@
-"""Evaluations: diversity of tasks, a score of layouts that tells good rooms from spoilt ones, and the page of figures."""
+"""Evaluations: diversity of tasks, aesthetics score of layouts, admission figures, and the page of figures."""
 
 import dataclasses
 import gzip
@@ -39,7 +39,7 @@ ROOM = RoomPlan("bedroom_0", (0.0, 0.0), (4.0, 4.0), (BED, DESK, CHAIR), (BOOK, 
 HOSTS = {"book": {"desk": 1.0, "bed": 0.2}, "pillow": {"bed": 1.0}}
 
 
-def test_a_room_as_people_have_it_has_every_feature_but_the_free_floor_at_its_best():
+def test_well_arranged_room_has_full_marks_except_for_free_floor():
     features = features_of(ROOM, HOSTS)
     assert {name for name, value in features.items() if value < 1} == {"walkable"}
     assert features["walkable"] > 0.7
@@ -58,19 +58,19 @@ def test_a_room_as_people_have_it_has_every_feature_but_the_free_floor_at_its_be
         ("in_reach", {"things": (dataclasses.replace(BOOK, low_m=1.9, high_m=2.0),), "carried": (1,)}),
     ],
 )  # fmt: skip
-def test_each_feature_falls_with_what_it_is_about(feature, change):
+def test_each_feature_falls_with_its_flaw(feature, change):
     spoilt = dataclasses.replace(ROOM, **change)
     assert features_of(spoilt, HOSTS)[feature] < features_of(ROOM, HOSTS)[feature]
 
 
-def test_a_feature_that_a_room_has_nothing_for_does_not_count():
+def test_feature_that_does_not_apply_is_left_out():
     empty = RoomPlan("hall_0", (0.0, 0.0), (3.0, 3.0), (), (), ())
     assert features_of(empty, HOSTS) == {"walkable": 1.0}
     assert score_room(empty, Calibration.load()).total == pytest.approx(10)
 
 
 @given(st.floats(0, 1), st.integers(0, 1000))
-def test_scores_lie_between_0_and_10_and_rise_with_what_is_there(share, seed):
+def test_scores_lie_between_0_and_10_and_rise_with_correspondence(share, seed):
     spoilt = SPOILERS["dropped"](ROOM, np.random.default_rng(seed))
     score = score_room(spoilt, Calibration.load(), share)
     assert 0 <= score.total <= 10
@@ -78,7 +78,7 @@ def test_scores_lie_between_0_and_10_and_rise_with_what_is_there(share, seed):
 
 
 @given(st.sampled_from(sorted(SPOILERS)), st.integers(0, 1000))
-def test_a_spoilt_room_has_the_same_things_elsewhere(name, seed):
+def test_corrupted_room_has_the_same_objects_elsewhere(name, seed):
     spoilt = SPOILERS[name](ROOM, np.random.default_rng(seed))
     assert [item.kind for item in (*spoilt.pieces, *spoilt.things)] == [
         "bed",
@@ -93,11 +93,11 @@ def test_a_spoilt_room_has_the_same_things_elsewhere(name, seed):
             assert np.allclose(np.subtract(thing.center_m, before.center_m), moved)
 
 
-def test_auc_counts_pairs_in_the_right_order_and_draws_by_half():
+def test_auc_counts_ordered_pairs_and_half_of_ties():
     assert auc(np.array([3.0, 2.0]), np.array([1.0, 2.0])) == pytest.approx((2 + 1 + 0.5) / 4)
 
 
-def test_a_fit_tells_rooms_from_spoilt_ones_and_uses_no_weight_below_0():
+def test_fit_separates_corrupted_rooms_with_nonnegative_weights():
     rng = np.random.default_rng(0)
     spoilt = [spoil(ROOM, rng) for spoil in SPOILERS.values() for _ in range(4)]
     calibration = fit([ROOM] * 4, spoilt, steps=400)
@@ -106,7 +106,7 @@ def test_a_fit_tells_rooms_from_spoilt_ones_and_uses_no_weight_below_0():
     assert score_room(ROOM, calibration).total > np.mean(worst)
 
 
-def test_a_room_of_a_scene_stands_within_its_walls_and_scores_like_a_hand_made_one(flat):
+def test_generated_room_scores_like_a_hand_made_one(flat):
     plans = [plan_of(flat, room.name) for room in flat.rooms]
     assert sum(len(plan.pieces) for plan in plans) > 20
     calibration = Calibration.load()
@@ -120,7 +120,7 @@ def _rooms_file(path, rooms):
     return path
 
 
-def test_hand_made_rooms_are_read_with_their_furniture_and_what_it_bears(tmp_path):
+def test_hand_made_rooms_are_read_with_furniture_and_small_objects(tmp_path):
     objects = [
         ["Floor", "", [0, 0, 0], 0.0, [0, -0.2, 0], [9, 0.4, 9], [], 1.0],
         ["TVStand", "a", [1, 0, 0], 91.0, [1, 0.3, 0], [0.4, 0.6, 1.2], ["Floor"], 9.0],
@@ -137,18 +137,18 @@ def test_hand_made_rooms_are_read_with_their_furniture_and_what_it_bears(tmp_pat
     assert room.high_m == (1.2, 2.05)
 
 
-def test_a_file_that_holds_no_rooms_is_told_in_a_sentence(tmp_path):
+def test_file_without_rooms_is_reported_in_a_sentence(tmp_path):
     with pytest.raises(EvaluationError, match="not a table of hand-made rooms"):
         read_rooms(_rooms_file(tmp_path / "rooms.json.gz", [{"kind": "bedrooms", "objects": [["Bed"]]}]))
 
 
 @given(st.lists(st.sampled_from("abc"), min_size=1, max_size=12))
-def test_evenness_is_1_where_all_kinds_come_up_equally_often(values):
+def test_evenness_is_1_for_equal_frequencies(values):
     assert 0 <= evenness(values) <= 1 + 1e-9
     assert evenness(list("abc") * 4) == pytest.approx(1)
 
 
-def test_the_panel_measures_each_writer_and_sets_goals_for_one():
+def test_both_writers_are_measured_and_one_has_goals():
     tasks = [
         DraftFeatures("Mia is cooking: put the mug in the oven.", "inside(mug,oven)", ("kitchen_0",), False),
         DraftFeatures("For Hugo, open a fridge.", "open(fridge)", ("kitchen_0", "bar_0"), True),
@@ -171,13 +171,13 @@ def test_people_are_read_from_transcripts(tmp_path):
     assert people_of(tmp_path) == {"Mia", "Hugo"}
 
 
-def test_drafts_of_a_scene_are_different_and_the_same_for_a_seed(flat):
+def test_drafts_of_a_scene_differ_and_depend_only_on_the_seed(flat):
     first = asked_in(flat, SocialWriter(0), 6, 0)
     assert len({asked.instruction for asked in first}) == 6
     assert first == asked_in(flat, SocialWriter(0), 6, 0)
 
 
-def test_scenes_to_train_in_and_held_out_ones_are_all_scenes_and_share_none():
+def test_training_and_held_out_scenes_partition_all_scenes():
     assert len(training_scenes()) == 45
     assert {*training_scenes(), *HELDOUT_SCENES} == {*Catalog.load().scene_ids}
     stems = {scene.rsplit("_", 1)[0] for scene in training_scenes()}
@@ -197,7 +197,7 @@ EVALUATION = EvaluationFigures(
 )
 
 
-def test_figures_survive_their_file(tmp_path):
+def test_figures_are_read_back_equal(tmp_path):
     path = tmp_path / "tasks.json"
     path.write_text(json.dumps(evaluation_to_json(EVALUATION)))
     assert read_evaluation(path) == EVALUATION
@@ -206,7 +206,7 @@ def test_figures_survive_their_file(tmp_path):
         read_evaluation(path)
 
 
-def test_the_page_keeps_all_but_the_factorys_part():
+def test_page_keeps_everything_outside_the_factory_section():
     page = with_factory("# Benchmarks\n\nBy others.\n", [EVALUATION])
     assert page.startswith("# Benchmarks\n\nBy others.\n")
     assert "| self_bleu4 | 0.3 | ≤ 0.35 | reached | 450 |" in page
@@ -218,7 +218,7 @@ def test_the_page_keeps_all_but_the_factorys_part():
     assert again.count(BEGIN) == again.count(END) == 1
 
 
-def test_what_was_not_measured_anew_stays_on_the_page():
+def test_unmeasured_parts_stay_on_the_page():
     rooms = dataclasses.replace(EVALUATION, part="aesthetics", notes=("Of rooms.",))
     page = with_factory("# Benchmarks\n", [EVALUATION, rooms])
     assert page.index("### Diversity of tasks") < page.index("### Aesthetics")
@@ -228,7 +228,7 @@ def test_what_was_not_measured_anew_stays_on_the_page():
     assert with_factory(page, [rooms]) == page
 
 
-def test_files_of_one_part_are_put_together_on_the_page():
+def test_files_of_one_part_are_combined_on_the_page():
     other = dataclasses.replace(
         EVALUATION, figures=(dataclasses.replace(EVALUATION.figures[0], name="distinct1"),)
     )
@@ -237,7 +237,7 @@ def test_files_of_one_part_are_put_together_on_the_page():
     assert "| distinct1 | 0.3 | ≤ 0.35 | reached | 450 |" in page
 
 
-def test_a_page_with_half_a_part_is_left_alone():
+def test_page_without_an_end_marker_is_rejected():
     with pytest.raises(EvaluationError, match="put it back"):
         with_factory(f"# Benchmarks\n{BEGIN}\ntext\n", [EVALUATION])
     with pytest.raises(EvaluationError, match="given twice"):
@@ -246,7 +246,7 @@ def test_a_page_with_half_a_part_is_left_alone():
         with_factory("", [dataclasses.replace(EVALUATION, part="x")])
 
 
-def test_the_ledger_tells_how_many_drafts_were_admitted(tmp_path):
+def test_ledger_gives_the_admitted_share(tmp_path):
     assert admitted_share(tmp_path) == ()
     ledger = tmp_path / "attempts.jsonl"
     ledger.write_text("".join(json.dumps({"outcome": told}) + "\n" for told in ("admitted", "no_plan") * 2))
@@ -258,7 +258,7 @@ def test_the_ledger_tells_how_many_drafts_were_admitted(tmp_path):
 
 
 def a_build(folder, writer, times):
-    """A build of two variants with three admitted tasks and one refused, and what its file of times holds."""
+    """Write a build of two variants with three admitted tasks and one refused task, and its file of times."""
     settings = {"settings": {"writer": writer, "look_ahead": True}}
     drafts = [(0, "admitted"), (0, "admitted"), (0, "no_plan"), (1, "admitted")]
     lines = [
@@ -270,7 +270,7 @@ def a_build(folder, writer, times):
     (folder / "times.jsonl").write_text("".join(json.dumps(line) + "\n" for line in times))
 
 
-def test_the_pace_of_admission_is_by_the_time_of_variants_that_is_known_and_of_all_base_scenes(tmp_path):
+def test_admission_rate_uses_recorded_times_of_variants_and_base_scenes(tmp_path):
     known = [
         {"base_scenes": 1, "cpu_s": 2.0},
         {"split": "train", "variant": 0, "cpu_s": 5.0},
@@ -288,13 +288,13 @@ def test_the_pace_of_admission_is_by_the_time_of_variants_that_is_known_and_of_a
     assert "| admitted_per_hour |" in with_factory("", [found])
 
 
-def test_the_plain_writer_s_admissions_have_its_name_and_no_goals_and_an_untimed_build_no_pace(tmp_path):
+def test_plain_writer_figures_have_no_goals_and_untimed_builds_no_rate(tmp_path):
     a_build(tmp_path, "plain", [])
     found = evaluate_admissions(tmp_path)
     assert [(figure.name, figure.goal) for figure in found.figures] == [("admitted_share plain", None)]
 
 
-def test_what_is_no_build_is_told_in_a_sentence(tmp_path):
+def test_folder_that_is_no_build_is_reported_in_a_sentence(tmp_path):
     answer = CliRunner().invoke(app, ["evaluate", "admissions", str(tmp_path)])
     assert answer.exit_code == 2
     assert "has no ledger of drafts" in answer.output
@@ -304,12 +304,12 @@ def test_what_is_no_build_is_told_in_a_sentence(tmp_path):
         evaluate_admissions(tmp_path)
 
 
-def test_a_judge_gives_points_of_ten():
+def test_judge_scores_from_0_to_10():
     with pytest.raises(ValueError, match="less than or equal to 10"):
         DiversityScores.model_validate({"variety": 8, "characters": 9, "overall": 11, "explanation": "x"})
 
 
-def test_the_command_tells_in_a_sentence_what_is_wrong(tmp_path):
+def test_command_reports_user_errors_in_a_sentence(tmp_path):
     found = CliRunner().invoke(app, ["evaluate", "tasks", "--dataset", str(tmp_path / "none")])
     assert found.exit_code == 2
     assert "none" in found.output

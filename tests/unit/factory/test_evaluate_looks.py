@@ -1,4 +1,4 @@
-"""The paper's judge of scenes: a model sees a labelled plan of each room that something was added to, with the tree."""
+"""The paper's judge of scenes: a model gets a labelled plan of each changed room and the layout tree."""
 
 import base64
 import io
@@ -52,7 +52,7 @@ async def asked(laid: tuple[Scene, tuple[str, ...]], *script: str) -> tuple[Impr
             return await impression_of(endpoint, *laid, seed=0), server
 
 
-async def test_the_judge_sees_the_room_and_reads_the_tree(laid) -> None:
+async def test_judge_gets_the_plan_of_the_room_and_the_tree(laid) -> None:
     impression, server = await asked(laid, json.dumps(POINTS))
     assert impression.score == 8.5
     words, picture = server.requests[0]["messages"][0]["content"]
@@ -62,7 +62,7 @@ async def test_the_judge_sees_the_room_and_reads_the_tree(laid) -> None:
     assert Image.open(io.BytesIO(data)).format == "PNG"
 
 
-async def test_points_beyond_the_rubric_are_sent_back_and_a_judge_that_insists_gives_none(laid) -> None:
+async def test_points_beyond_the_rubric_are_rejected_and_retried(laid) -> None:
     wrong = json.dumps({**POINTS, "clutter": 5})
     _, server = await asked(laid, wrong, json.dumps(POINTS))
     assert "clutter: input should be less than or equal to 4" in server.requests[1]["messages"][-1]["content"]
@@ -70,7 +70,7 @@ async def test_points_beyond_the_rubric_are_sent_back_and_a_judge_that_insists_g
         await asked(laid, wrong)
 
 
-def test_a_room_alone_keeps_its_own_things_and_walls(flat: Scene) -> None:
+def test_single_room_keeps_its_objects_and_walls(flat: Scene) -> None:
     room = alone(flat, "living_room_0")
     assert [each.name for each in room.rooms] == ["living_room_0"]
     assert {item.room for item in room.objects} == {"living_room_0"}
@@ -94,7 +94,7 @@ async def test_every_method_has_its_mean_and_unusable_answers_are_counted() -> N
     assert "| judge tree | 8.5 of 10 |" in with_factory("", [found])
 
 
-def test_a_task_is_drawn_by_every_method_side_by_side_with_the_reason_where_one_fails() -> None:
+def test_picture_has_a_panel_for_each_method_or_the_reason_of_its_failure() -> None:
     huge = APPLE.replace("breakfast_table", "unicorn")
     one, none = (
         draw_side_by_side(SceneTask(SourceText("apple", text, "embomatrix"), "Rs_int"), 0)
@@ -112,7 +112,7 @@ def _fixed() -> list[tuple[str, str]]:
     return list(json.loads(text)["sample"])
 
 
-def test_without_a_model_nobody_looks(tmp_path) -> None:
+def test_judging_layouts_without_a_model_is_an_error(tmp_path) -> None:
     sample = tmp_path / "sample.jsonl"
     lines = [json.dumps({"name": name, "bddl": APPLE}) for name, _ in _fixed()]
     sample.write_text("\n".join(lines))

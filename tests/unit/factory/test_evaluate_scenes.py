@@ -1,4 +1,4 @@
-"""Scenes are judged by eyes of their own: each flaw is seen, sound scenes have none, and rates are what they say."""
+"""Scene evaluation: every flaw is detected, valid scenes have none, and rates are correct."""
 
 import json
 from dataclasses import replace
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 
-def test_seventy_tasks_of_each_source_are_fixed_in_scenes_that_there_are() -> None:
+def test_seventy_tasks_of_each_source_are_fixed_in_known_scenes() -> None:
     text = (resources.files("embomatrix.factory.evaluate") / LIST).read_text(encoding="utf-8")
     names = json.loads(text)
     assert [len(names["sample"]), len(names["behavior"])] == [70, 70]
@@ -43,21 +43,21 @@ def test_seventy_tasks_of_each_source_are_fixed_in_scenes_that_there_are() -> No
         assert {scene for _, scene in source} <= set(Catalog.load().scene_ids)
 
 
-def test_a_sample_that_lacks_the_fixed_tasks_is_told(tmp_path: "Path") -> None:
+def test_sample_without_the_fixed_tasks_is_rejected(tmp_path: "Path") -> None:
     file = tmp_path / "sample.jsonl"
     file.write_text('{"name": "other", "bddl": "()"}\n', encoding="utf-8")
     with pytest.raises(EvaluationError, match="lacks 70 of the fixed tasks"):
         fixed_tasks(file)
 
 
-def test_what_the_generator_lays_has_no_flaw(flat: "Scene") -> None:
+def test_generated_layouts_have_no_flaw(flat: "Scene") -> None:
     editor = SceneEditor(flat)
     layout = lay(editor, [RequestedObject("mug", (("mug", Catalog.load().models_of("mug")[0].model_id),))], 0)
     assert flaws_of(editor.freeze("sound"), tuple(layout.names.values())) == ()
 
 
 def placed(flat: "Scene", x: float, y: float, low_m: float, host: str = "") -> set[Flaw]:
-    """Flaws of a basket put somewhere, looked at by nobody."""
+    """Return the flaws of a basket at a place chosen without any check."""
     editor = SceneEditor(flat)
     asset = build_asset(
         Catalog.load(), "wicker_basket", Catalog.load().models_of("wicker_basket")[0].model_id
@@ -68,7 +68,7 @@ def placed(flat: "Scene", x: float, y: float, low_m: float, host: str = "") -> s
     return {flaw for found, flaw in flaws_of(editor.freeze("odd"), (name,)) if found == name}
 
 
-def test_each_flaw_of_a_thing_is_seen(flat: "Scene") -> None:
+def test_each_flaw_of_an_object_is_detected(flat: "Scene") -> None:
     room = next(room for room in flat.rooms if room.name == "living_room_0")
     table = next(
         item for item in flat.objects if item.name.startswith("breakfast_table") and item.room == room.name
@@ -89,7 +89,7 @@ def outcome(
     return LayoutOutcome("task", "Rs_int", method, generated, verified, verified, reason, 1.0, (0.01,), 8.0)
 
 
-def test_rates_are_shares_and_only_the_tree_has_goals() -> None:
+def test_rates_are_shares_and_only_the_tree_method_has_goals() -> None:
     found = [
         outcome(LayoutMethod.TREE),
         outcome(LayoutMethod.TREE, "geometry: a floats", verified=False),
@@ -128,7 +128,7 @@ UNICORN = """(define (problem unicorn)
 )"""
 
 
-def test_a_run_that_was_stopped_makes_only_what_is_missing_and_keeps_it(tmp_path: "Path") -> None:
+def test_resumed_run_makes_only_the_missing_trials(tmp_path: "Path") -> None:
     path = tmp_path / "outcomes.jsonl"
     log = OutcomeLog.open(path, 0)
     for outcome in KNOWN:
@@ -143,7 +143,7 @@ def test_a_run_that_was_stopped_makes_only_what_is_missing_and_keeps_it(tmp_path
     assert OutcomeLog.open(path, 0).outcomes == outcomes
 
 
-def test_a_last_line_that_was_cut_short_is_made_anew(tmp_path: "Path") -> None:
+def test_truncated_last_line_is_repeated(tmp_path: "Path") -> None:
     path = tmp_path / "outcomes.jsonl"
     log = OutcomeLog.open(path, 0)
     for outcome in KNOWN[:2]:
@@ -164,7 +164,7 @@ def test_a_last_line_that_was_cut_short_is_made_anew(tmp_path: "Path") -> None:
         ('{"seed": 0}\n{"task": 3}\n{}\n', "line 2, is no outcome"),
     ],
 )
-def test_outcomes_of_another_run_are_left_alone(tmp_path: "Path", content: str, message: str) -> None:
+def test_outcomes_of_another_seed_are_rejected(tmp_path: "Path", content: str, message: str) -> None:
     path = tmp_path / "outcomes.jsonl"
     path.write_text(content, encoding="utf-8")
     with pytest.raises(EvaluationError, match=message):

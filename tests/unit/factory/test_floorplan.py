@@ -46,7 +46,7 @@ def apart_m(a: object, b: object) -> float:
 
 
 @pytest.mark.parametrize("scene_id", BASE_SCENES)
-def test_rooms_keep_their_true_size_and_lie_a_wall_apart(scene_id: str) -> None:
+def test_rooms_keep_their_size_and_lie_a_wall_apart(scene_id: str) -> None:
     plan = plan_of(scene_id)
     floors = {room.name: room.floor_m for room in Catalog.load().inventory(scene_id).rooms}
     for room in plan.rooms:
@@ -79,7 +79,7 @@ def test_walls_stand_on_no_floor_and_leave_inner_doorways_open(scene_id: str) ->
 
 @pytest.fixture(scope="module")
 def true_rooms() -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Corners of the rooms of Beechwood_0_int as they were measured."""
+    """Measured corners of the rooms of Beechwood_0_int."""
     path = DATA / "beechwood_0_int_layout.json"
     if not path.exists():
         pytest.skip("the measured layout of Beechwood_0_int lies beside the repository, in ../shared/data")
@@ -104,7 +104,7 @@ def test_plans_are_about_as_compact_as_the_real_one(
     assert compactness(plan.rooms) > 0.8
 
 
-def test_doorways_join_rooms_that_truly_touch_more_often_than_chance(
+def test_doorways_join_rooms_adjacent_in_the_real_house_more_often_than_chance(
     true_rooms: dict[str, tuple[np.ndarray, np.ndarray]],
 ) -> None:
     def touch(a: str, b: str) -> bool:
@@ -119,12 +119,12 @@ def test_doorways_join_rooms_that_truly_touch_more_often_than_chance(
     assert sum(touch(*rooms) for rooms in inner) / len(inner) > 1.2 * chance
 
 
-def test_a_seed_decides_the_plan() -> None:
+def test_equal_seeds_give_equal_plans() -> None:
     assert plan_of("Rs_int", 3) == plan_of("Rs_int", 3)
     assert any(plan_of("Rs_int", 3) != plan_of("Rs_int", other) for other in (4, 5, 6))
 
 
-def test_an_inner_door_is_taken_from_both_rooms_that_list_it() -> None:
+def test_inner_door_is_removed_from_both_rooms_that_list_it() -> None:
     wide = OpeningSpec("wide", 1.5, 2.0)
     rooms = [
         RoomSpec("kitchen_0", "kitchen", (3, 3), (wide,)),
@@ -135,7 +135,7 @@ def test_an_inner_door_is_taken_from_both_rooms_that_list_it() -> None:
     assert [(door.model, door.width_m) for door in inner] == [("wide", pytest.approx(1.5))]
 
 
-def test_a_suite_is_entered_by_its_bedroom() -> None:
+def test_suite_is_entered_by_its_bedroom() -> None:
     front, cabin = OpeningSpec("front", 0.9, 2.0), OpeningSpec("cabin", 0.9, 2.0)
     rooms = [
         RoomSpec("bathroom_0", "bathroom", (3, 3), (cabin,)),
@@ -145,7 +145,7 @@ def test_a_suite_is_entered_by_its_bedroom() -> None:
     assert (plan.doorways[-1].rooms, plan.doorways[-1].model) == (("bedroom_0", ""), "front")
 
 
-def test_no_rooms_are_refused() -> None:
+def test_plan_without_rooms_is_rejected() -> None:
     with pytest.raises(FloorPlanError, match="at least one"):
         plan_floor([], np.random.default_rng(0))
 
@@ -155,7 +155,7 @@ def test_no_rooms_are_refused() -> None:
     st.lists(st.tuples(st.floats(1.0, 9.0), st.floats(1.0, 9.0)), min_size=1, max_size=7),
     st.integers(0, 2**32 - 1),
 )
-def test_any_rooms_are_packed_without_overlap_and_all_reached(
+def test_any_rooms_are_packed_without_overlap_and_connected(
     floors: list[tuple[float, float]], seed: int
 ) -> None:
     types = ("corridor", "bedroom", "kitchen", "bathroom", "living_room", "storage_room", "garage")

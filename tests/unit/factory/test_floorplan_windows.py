@@ -39,7 +39,7 @@ def ends(window: Window) -> tuple[float, float]:
     return middle - window.width_m / 2, middle + window.width_m / 2
 
 
-def test_a_window_is_a_pane_between_sill_and_lintel() -> None:
+def test_window_is_a_pane_between_sill_and_lintel() -> None:
     plan = house(CASEMENT)
     (window,) = plan.windows
     x, y = window.center_m
@@ -54,7 +54,7 @@ def test_a_window_is_a_pane_between_sill_and_lintel() -> None:
 @pytest.mark.parametrize(
     ("height", "sill", "head"), [(0.92, 0.9, 1.82), (0.44, 1.71, 2.15), (4.0, 0.1, 2.15)]
 )
-def test_heights_of_windows_follow_what_they_are(height: float, sill: float, head: float) -> None:
+def test_sill_and_head_follow_the_window_height(height: float, sill: float, head: float) -> None:
     assert sill_and_head(height) == pytest.approx((sill, head))
 
 
@@ -65,19 +65,19 @@ def test_every_window_fits_the_wall(height: float) -> None:
     assert head - sill <= height + 1e-9
 
 
-def test_a_window_wider_than_its_wall_is_cut_to_it() -> None:
+def test_window_wider_than_its_wall_is_narrowed() -> None:
     (window,) = house(OpeningSpec("front", 30.0, 2.0)).windows
     assert 3.0 < window.width_m < 5.0
 
 
-def test_windows_without_a_wall_are_told() -> None:
+def test_windows_without_a_wall_are_reported() -> None:
     plan = house(*[OpeningSpec("bay", 3.0, 1.5)] * 40)
     assert 0 < len(plan.windows) < 40
     told = [sentence for sentence in plan.left_out if "window-bay" in sentence]
     assert told == [f"{40 - len(plan.windows)} window-bay in living_room_0: no outer wall has room for it"]
 
 
-def test_a_garden_is_outside_to_the_windows_of_the_house() -> None:
+def test_windows_may_face_a_garden() -> None:
     rooms = [
         RoomSpec("living_room_0", "living_room", (3.0, 3.0), (), (CASEMENT,) * 3),
         RoomSpec("garden_0", "garden", (30.0, 30.0), (), (CASEMENT,) * 3),

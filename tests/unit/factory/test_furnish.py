@@ -38,7 +38,7 @@ DOOR = Doorway(("kitchen_0", "hall_0"), (2.0, -0.06), 0.9, 2.0, "x")
 
 
 def block(category: str, size: Vec3, *, door: bool = False) -> Asset:
-    """A solid box with a top to put things on, and a hinged front if it opens."""
+    """A solid box with a surface on top, and a hinged front if ``door``."""
     links = [Link("base", (ConvexPart(Shape.BOX, Pose((0.0, 0.0, 0.0)), size),))]
     if door:
         leaf = ConvexPart(Shape.BOX, Pose((size[0] / 2 - 0.01, 0.0, 0.0)), (0.02, size[1], size[2]))
@@ -75,7 +75,7 @@ def test_chairs_face_the_table_from_outside_it() -> None:
         assert abs(member.x) >= 0.4 + 0.225 or abs(member.y) >= 0.7 + 0.225
 
 
-def test_a_counter_slab_lies_on_its_tallest_cabinet() -> None:
+def test_worktop_lies_on_its_tallest_cabinet() -> None:
     cabinet, lower = (
         block("bottom_cabinet", (0.5, 0.5, 0.55), door=True),
         block("bottom_cabinet", (0.5, 0.45, 0.53), door=True),
@@ -91,7 +91,7 @@ def test_a_counter_slab_lies_on_its_tallest_cabinet() -> None:
 
 
 @pytest.mark.parametrize("depth_m", [0.6, 0.7, 0.9, 1.2])
-def test_no_slab_reaches_far_over_the_drawers_below_it(depth_m) -> None:
+def test_worktop_overhangs_the_drawers_below_it_only_a_little(depth_m) -> None:
     cabinet = block("bottom_cabinet", (0.5, 0.9, 0.55), door=True)
     (counter,), _ = room_groups(pieces(block("countertop", (depth_m, 1.0, 0.03)), cabinet))
     under, slab = counter.members
@@ -100,7 +100,7 @@ def test_no_slab_reaches_far_over_the_drawers_below_it(depth_m) -> None:
     assert front - under.piece.size_m[0] >= slab.x - slab.piece.size_m[0] / 2 - 1e-9
 
 
-def test_a_slab_without_cabinets_is_left_out_with_a_sentence() -> None:
+def test_worktop_without_cabinets_is_left_out_with_a_reason() -> None:
     groups, left_out = room_groups(pieces(block("countertop", (0.6, 1.0, 0.03))), "kitchen")
     assert groups == []
     assert [(piece.category, reason) for piece, reason in left_out] == [
@@ -108,12 +108,12 @@ def test_a_slab_without_cabinets_is_left_out_with_a_sentence() -> None:
     ]
 
 
-def test_a_door_leaf_needs_its_own_width_before_it() -> None:
+def test_door_panel_needs_its_width_of_free_floor() -> None:
     assert front_depth_m(block("fridge", (0.7, 0.9, 1.8), door=True)) == pytest.approx(0.9, abs=0.05)
     assert front_depth_m(block("stove", (0.6, 0.9, 0.9))) == pytest.approx(0.6)
 
 
-def test_a_room_cut_in_two_is_not_passable() -> None:
+def test_room_cut_in_two_is_not_passable() -> None:
     space = RoomSpace(ROOM, [DOOR])
     beyond = Target((1.0, 2.4, 3.0, 3.0))
     assert space.reachable(targets=[beyond])
@@ -124,13 +124,13 @@ def test_a_room_cut_in_two_is_not_passable() -> None:
     )
 
 
-def test_the_floor_before_a_doorway_stays_free() -> None:
+def test_floor_before_a_doorway_stays_free() -> None:
     space = RoomSpace(ROOM, [DOOR])
     before, aside = (1.9, 0.1, 0.0, 2.1, 0.5, 0.8), (0.1, 0.1, 0.0, 0.5, 0.5, 0.8)
     assert space.blocks_zone(np.array([before, aside])).tolist() == [True, False]
 
 
-def test_backed_furniture_looks_away_from_its_wall() -> None:
+def test_backed_furniture_faces_away_from_its_wall() -> None:
     result = furnished(block("bookcase", (0.3, 1.0, 2.0)), block("sofa", (0.9, 1.8, 0.8)))
     assert len(result.placed) == 2
     for item in result.placed:
@@ -140,14 +140,14 @@ def test_backed_furniture_looks_away_from_its_wall() -> None:
         assert after < before or before < 1.2
 
 
-def test_what_does_not_fit_is_named_and_nothing_else_is_lost() -> None:
+def test_only_pieces_that_do_not_fit_are_left_out_and_named() -> None:
     result = furnished(*[block("fridge", (0.8, 0.9, 1.8), door=True)] * 9, floor=(2.5, 2.5))
     kept = len(result.placed)
     assert 0 < kept < 9
     assert result.left_out == (f"{9 - kept} fridge-box in kitchen_0: no free place keeps the room passable",)
 
 
-def test_small_things_of_one_model_are_capped() -> None:
+def test_small_objects_of_one_model_are_capped() -> None:
     result = furnished(block("breakfast_table", (0.9, 1.6, 0.75)), *[block("mug", (0.08, 0.1, 0.1))] * 40)
     mugs = [item for item in result.placed if item.piece.category == "mug"]
     assert len(mugs) == MAX_EQUAL
@@ -159,13 +159,13 @@ def test_small_things_of_one_model_are_capped() -> None:
     )
 
 
-def test_an_unknown_category_gets_a_role_by_its_size() -> None:
+def test_unknown_category_gets_a_role_by_its_size() -> None:
     assert role_of("gadget", (0.1, 0.1, 0.1), 0.2) is FurnitureRole.SURFACE
     assert role_of("contraption", (0.6, 1.4, 1.0), 40.0) is FurnitureRole.BACKED
     assert role_of("obelisk", (5.0, 5.0, 9.0), 4000.0) is FurnitureRole.STRUCTURE
 
 
-def test_the_same_seed_builds_the_same_scene() -> None:
+def test_same_seed_builds_the_same_scene() -> None:
     first, again, other = (build_base_scene("hotel_suite_small", seed=seed) for seed in (0, 0, 1))
     assert (again.rooms, again.walls, again.objects) == (first.rooms, first.walls, first.objects)
     assert other.objects != first.objects
@@ -177,7 +177,7 @@ def test_names_count_from_one_within_a_category(flat: Scene) -> None:
         assert names == [f"{category}_{i + 1}" for i in range(len(names))]
 
 
-def test_wall_cabinets_hang_above_the_robots_way_and_everything_is_shut(flat: Scene) -> None:
+def test_wall_cabinets_hang_above_the_robot_and_all_joints_are_shut(flat: Scene) -> None:
     cabinets = [item for item in flat.objects if item.name.startswith("top_cabinet")]
     assert cabinets
     assert all(box_of(flat, item).low_m[2] == pytest.approx(HUNG_BOTTOM_M, abs=0.01) for item in cabinets)
@@ -192,7 +192,7 @@ def test_every_inventory_item_is_placed_or_accounted_for(flat: Scene) -> None:
             assert asset_id in placed or any(asset_id in sentence for sentence in flat.left_out), asset_id
 
 
-def test_a_dishwasher_stays_in_the_run() -> None:
+def test_dishwasher_stays_in_the_run() -> None:
     result = furnished(
         block("fridge", (0.7, 0.65, 1.7), door=True),
         block("furniture_sink", (0.64, 1.3, 1.0)),
@@ -211,7 +211,7 @@ def test_a_dishwasher_stays_in_the_run() -> None:
     assert y0 - 0.05 <= b0 < b1 <= y1 + 0.05
 
 
-def test_units_of_a_kitchen_stand_in_one_line_or_round_a_corner() -> None:
+def test_kitchen_units_stand_in_one_line_or_round_a_corner() -> None:
     units = [block(c, (0.6, 0.6, 0.9)) for c in ("fridge", "stove", "oven", "dishwasher", "washer")]
     placed = furnished(*units).placed
     assert len(placed) == len(units)
@@ -223,7 +223,7 @@ def test_units_of_a_kitchen_stand_in_one_line_or_round_a_corner() -> None:
         assert min(gaps) < 1.0
 
 
-def test_a_basin_is_let_into_the_counter() -> None:
+def test_basin_is_set_into_the_counter() -> None:
     result = furnished(
         block("countertop", (0.56, 1.02, 0.03)),
         *[block("bottom_cabinet", (0.45, 0.48, 0.62), door=True)] * 2,
@@ -235,7 +235,7 @@ def test_a_basin_is_let_into_the_counter() -> None:
     assert basin.bottom == pytest.approx(slab.box[5] + REST_GAP_M)
 
 
-def test_a_basin_without_a_counter_hangs_on_the_wall() -> None:
+def test_basin_without_a_counter_hangs_on_the_wall() -> None:
     (basin,) = furnished(block("drop_in_sink", (0.5, 0.7, 0.3))).placed
     assert basin.host == -1
     assert basin.bottom > 0.4
@@ -261,7 +261,7 @@ def test_nothing_stands_in_a_doorways_clearance_and_every_chair_is_at_the_table(
         assert board.box[1] <= y <= board.box[4]
 
 
-def test_a_class_looks_one_way() -> None:
+def test_seats_of_a_class_face_one_way() -> None:
     desk, chair = block("desk", (0.6, 0.75, 0.76)), block("straight_chair", (0.5, 0.5, 0.85))
     rng = np.random.default_rng(0)
     plan = plan_floor([RoomSpec("classroom_0", "classroom", (8.0, 7.0))], rng)
@@ -270,7 +270,7 @@ def test_a_class_looks_one_way() -> None:
     assert len({round(p.yaw, 3) for p in result.placed if p.piece.category == "straight_chair"}) == 1
 
 
-def test_a_piece_before_a_window_is_no_higher_than_its_sill() -> None:
+def test_piece_before_a_window_is_no_higher_than_its_sill() -> None:
     window = Window(("kitchen_0", ""), (2.0, 3.06), 1.2, 0.9, 2.0, "x")
     space = RoomSpace(ROOM, [DOOR], [window])
     low, tall = (1.8, 2.6, 0.0, 2.2, 2.9, 0.8), (1.8, 2.6, 0.0, 2.2, 2.9, 1.8)
@@ -283,7 +283,7 @@ def test_a_piece_before_a_window_is_no_higher_than_its_sill() -> None:
         max_size=5,
     )
 )
-def test_floor_kept_up_to_date_box_by_box_is_the_floor_of_all_boxes_at_once(
+def test_incremental_floor_equals_floor_computed_at_once(
     corners: list[tuple[float, float, float, float]],
 ) -> None:
     boxes = [(x, y, 0.0, x + w, y + d, 0.9) for x, y, w, d in corners]

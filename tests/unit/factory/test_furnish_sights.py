@@ -1,4 +1,4 @@
-"""Rooms as a person who looks at them would have them."""
+"""Furnished rooms look plausible to a person."""
 
 import pytest
 
@@ -17,14 +17,14 @@ def called(scene, *words):
 
 
 def over(one, other):
-    """Area in which one box covers another, seen from above, m^2."""
+    """Horizontal overlap of two boxes in m²."""
     sides = [
         min(one.high_m[axis], other.high_m[axis]) - max(one.low_m[axis], other.low_m[axis]) for axis in (0, 1)
     ]
     return max(0.0, sides[0]) * max(0.0, sides[1])
 
 
-def test_a_narrow_kitchen_keeps_its_sink(flat):
+def test_narrow_kitchen_keeps_its_sink(flat):
     assert any("sink" in item.name and item.room.startswith("kitchen") for item in flat.objects)
 
 

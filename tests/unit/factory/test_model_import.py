@@ -58,7 +58,7 @@ def imported(path: Path, category: str, model: str = "") -> ImportedAsset:
     return import_model(CATALOG, read_model(path), category, model, CREDIT, by_components)
 
 
-def test_an_obj_takes_the_place_and_the_size_and_the_mass_of_a_catalog_model(tmp_path: Path) -> None:
+def test_obj_gets_id_size_and_mass_of_a_catalog_model(tmp_path: Path) -> None:
     path = tmp_path / "cupboard.obj"
     path.write_text(obj_text(CUPBOARD))
     result = imported(path, "bottom_cabinet", "songes")
@@ -73,7 +73,7 @@ def test_an_obj_takes_the_place_and_the_size_and_the_mass_of_a_catalog_model(tmp
     assert not check_asset(CATALOG, asset)
 
 
-def test_a_hinge_of_sweet_home_3d_opens_towards_the_front(tmp_path: Path) -> None:
+def test_hinge_of_sweet_home_3d_opens_towards_the_front(tmp_path: Path) -> None:
     path = tmp_path / "cupboard.obj"
     path.write_text(obj_text(CUPBOARD))
     asset = imported(path, "bottom_cabinet", "songes").asset
@@ -104,7 +104,7 @@ def test_every_compartment_of_a_shelf_is_a_cavity_with_its_own_floor(tmp_path: P
     )
 
 
-def test_a_box_without_a_lid_holds_what_sticks_out_of_it(tmp_path: Path) -> None:
+def test_open_box_holds_objects_that_stick_out(tmp_path: Path) -> None:
     path = tmp_path / "crate.obj"
     front = ("front", (0, 0, 48), (60, 80, 50))
     path.write_text(obj_text((*(board for board in CUPBOARD[:5] if board[0] != "roof"), front)))
@@ -114,7 +114,7 @@ def test_a_box_without_a_lid_holds_what_sticks_out_of_it(tmp_path: Path) -> None
     assert floor.clearance_m > 1.0
 
 
-def test_a_rail_of_sweet_home_3d_is_a_drawer(tmp_path: Path) -> None:
+def test_rail_of_sweet_home_3d_is_a_drawer(tmp_path: Path) -> None:
     path = tmp_path / "drawer.obj"
     rail = ("sweethome3d_unique_rail", (29, 1, 2), (31, 2, 48))
     drawer = ("sweethome3d_opening_on_rail_1", (3, 10, 4), (57, 30, 50))
@@ -125,14 +125,14 @@ def test_a_rail_of_sweet_home_3d_is_a_drawer(tmp_path: Path) -> None:
     assert slide.upper == pytest.approx(0.8 * depth, rel=0.01)
 
 
-def test_an_opening_without_its_hinge_is_named(tmp_path: Path) -> None:
+def test_opening_without_a_hinge_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "cupboard.obj"
     path.write_text(obj_text((*CUPBOARD[:5], CUPBOARD[6])))
     with pytest.raises(ModelFileError, match="has no sweethome3d_hinge_1"):
         read_model(path)
 
 
-def test_a_model_that_lacks_what_its_category_does_is_told(tmp_path: Path) -> None:
+def test_missing_abilities_of_a_model_are_reported(tmp_path: Path) -> None:
     path = tmp_path / "block.obj"
     path.write_text(obj_text((("base", (0, 0, 0), (70, 170, 70)),)))
     result = imported(path, "fridge")
@@ -142,7 +142,7 @@ def test_a_model_that_lacks_what_its_category_does_is_told(tmp_path: Path) -> No
     ]  # fmt: skip
 
 
-def test_a_glb_is_read_with_the_poses_of_its_nodes(tmp_path: Path) -> None:
+def test_glb_is_read_with_the_poses_of_its_nodes(tmp_path: Path) -> None:
     scene: Any = trimesh.Scene()
     for size, height in (((1.0, 0.1, 0.6), 1.0), ((0.1, 1.0, 0.1), 0.45)):
         lifted = np.eye(4)
@@ -170,7 +170,7 @@ def test_a_glb_is_read_with_the_poses_of_its_nodes(tmp_path: Path) -> None:
         ("a.blend", b"BLENDER", "ends in '.blend': expected one of .glb, .obj, .stl, .urdf"),
     ],
 )
-def test_a_damaged_mesh_file_is_named(tmp_path: Path, name: str, data: bytes, message: str) -> None:
+def test_damaged_mesh_file_is_named(tmp_path: Path, name: str, data: bytes, message: str) -> None:
     path = tmp_path / name
     path.write_bytes(data)
     with pytest.raises(ModelFileError, match=message):
@@ -178,7 +178,7 @@ def test_a_damaged_mesh_file_is_named(tmp_path: Path, name: str, data: bytes, me
 
 
 @given(st.lists(st.tuples(*[st.floats(-2, 2)] * 3), min_size=1, max_size=120))
-def test_a_convex_part_holds_its_points_within_a_millimetre_or_few(points: list[tuple[float, ...]]) -> None:
+def test_convex_part_contains_its_points_within_a_few_millimetres(points: list[tuple[float, ...]]) -> None:
     cloud = np.array(points)
     part = convex_part(cloud)
     box = part.aabb(HERE)
@@ -201,7 +201,7 @@ def test_too_many_components_are_joined_to_sixteen() -> None:
     assert np.vstack(pieces).min(axis=0) == pytest.approx(vertices.min(axis=0))
 
 
-def test_a_cut_mesh_is_kept_by_its_content_and_a_damaged_copy_is_not_used(tmp_path: Path) -> None:
+def test_decomposition_is_cached_by_content_and_damaged_files_are_ignored(tmp_path: Path) -> None:
     cube = trimesh.creation.box((1.0, 1.0, 1.0))
     mesh = Mesh(np.asarray(cube.vertices), np.asarray(cube.faces))
     moved = Mesh(mesh.vertices + 1e-9, mesh.faces)
@@ -213,7 +213,7 @@ def test_a_cut_mesh_is_kept_by_its_content_and_a_damaged_copy_is_not_used(tmp_pa
     assert np.asarray(cutter(mesh, 16)).tolist() == kept
 
 
-def test_a_folder_of_assets_reads_back_equal_and_names_what_is_damaged(tmp_path: Path) -> None:
+def test_folder_of_assets_is_read_back_equal_and_damaged_files_are_named(tmp_path: Path) -> None:
     path = tmp_path / "box.obj"
     path.write_text(obj_text((("base", (0, 0, 0), (7, 7, 7)),)))
     asset = imported(path, "apple").asset
@@ -233,7 +233,7 @@ def test_a_folder_of_assets_reads_back_equal_and_names_what_is_damaged(tmp_path:
         read_assets(tmp_path / "nowhere")
 
 
-def test_the_command_writes_an_asset_or_one_line_that_says_why_not(tmp_path: Path) -> None:
+def test_command_writes_an_asset_or_one_line_with_the_reason(tmp_path: Path) -> None:
     path = tmp_path / "cupboard.obj"
     path.write_text(obj_text(CUPBOARD))
     said = [
@@ -258,7 +258,7 @@ def test_the_command_writes_an_asset_or_one_line_that_says_why_not(tmp_path: Pat
         assert "Traceback" not in refused.output
 
 
-def test_the_command_tells_of_a_mug_that_is_too_narrow_for_a_probe(tmp_path: Path) -> None:
+def test_command_reports_a_mug_that_is_too_narrow(tmp_path: Path) -> None:
     sides = (("left", (0, 10, 0), (36, 100, 100)), ("right", (64, 10, 0), (100, 100, 100)))
     ends = (("back", (36, 10, 0), (64, 100, 36)), ("front", (36, 10, 64), (64, 100, 100)))
     path = tmp_path / "mug.obj"
@@ -271,7 +271,7 @@ def test_the_command_tells_of_a_mug_that_is_too_narrow_for_a_probe(tmp_path: Pat
 
 
 @pytest.mark.parametrize(("model", "words"), [("bamfsz", " Rs_int,"), ("songes", "in no base scene")])
-def test_the_command_tells_which_scenes_the_model_stands_in(tmp_path: Path, model: str, words: str) -> None:
+def test_command_names_the_scenes_that_use_the_model(tmp_path: Path, model: str, words: str) -> None:
     path = tmp_path / "cupboard.obj"
     path.write_text(obj_text(CUPBOARD))
     said = ["--creator", "A. Maker", "--licence", "CC0-1.0", "--out", str(tmp_path), "--cut", "components"]
@@ -303,7 +303,7 @@ def test_models_of_sweet_home_3d_become_assets(tmp_path: Path, name: str, catego
 
 
 @pytest.mark.slow
-def test_a_cup_is_cut_by_coacd_once_holds_a_probe_and_keeps_its_maker(tmp_path: Path) -> None:
+def test_cup_is_decomposed_once_holds_a_probe_and_keeps_its_credit(tmp_path: Path) -> None:
     pytest.importorskip("coacd", reason="needs embomatrix[importers]")
     wall = [(0.0, 0.0), (4.0, 0.0), (4.0, 9.0), (3.5, 9.0), (3.5, 0.5), (0.0, 0.5)]
     cup: Any = trimesh.creation.revolve(wall, sections=24)
@@ -320,7 +320,7 @@ def test_a_cup_is_cut_by_coacd_once_holds_a_probe_and_keeps_its_maker(tmp_path: 
     assert kept.stat().st_mtime_ns == written
 
 
-def test_a_scene_is_built_with_the_imported_asset_in_place_of_the_generated_one(tmp_path: Path) -> None:
+def test_scene_is_built_with_the_imported_asset_in_place_of_the_generated_one(tmp_path: Path) -> None:
     path = tmp_path / "cupboard.obj"
     path.write_text(obj_text(CUPBOARD))
     save_asset(tmp_path / "shelf", imported(path, "stand", "oyenza").asset)
@@ -329,7 +329,7 @@ def test_a_scene_is_built_with_the_imported_asset_in_place_of_the_generated_one(
     assert {asset.credit for asset in scene.assets.values()} == {CREDIT, None}
 
 
-def test_a_folder_without_assets_is_refused_before_anything_is_built(tmp_path: Path) -> None:
+def test_folder_without_assets_is_refused_before_anything_is_built(tmp_path: Path) -> None:
     said = ["build", "Rs_int", "--out", str(tmp_path / "out"), "--assets", str(tmp_path / "nowhere")]
     refused = CliRunner().invoke(scene_app, said)
     assert refused.exit_code == 2

@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 HERE = Pose((0.0, 0.0, 0.0))
 
 
-def test_the_plan_shows_more_than_walls(flat: Scene) -> None:
+def test_plan_shows_more_than_walls(flat: Scene) -> None:
     pixels = np.asarray(draw_plan(flat))
     assert pixels.ndim == 3
     assert min(pixels.shape[:2]) > 500
     assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 12
 
 
-def test_the_oblique_view_holds_the_whole_scene(flat: Scene) -> None:
+def test_oblique_view_holds_the_whole_scene(flat: Scene) -> None:
     pixels = render_oblique(flat, width_px=320, height_px=240)
     assert pixels.shape == (240, 320, 3)
     background = (pixels == pixels[0, 0]).all(axis=2)
@@ -38,14 +38,14 @@ def test_the_oblique_view_holds_the_whole_scene(flat: Scene) -> None:
     assert edge.mean() > 0.95, "nothing is cut off at the edge of the picture"
 
 
-def test_a_plan_shows_its_windows(flat: Scene) -> None:
+def test_plan_shows_its_windows(flat: Scene) -> None:
     lit, walled = (np.asarray(draw_plan(scene)) for scene in (flat, replace(flat, windows=())))
     blue = (0x6F, 0xC3, 0xE8)
     assert (lit == blue).all(axis=2).any()
     assert not (walled == blue).all(axis=2).any()
 
 
-def test_a_crown_hides_nothing_that_stands_under_it(home: Scene) -> None:
+def test_crown_of_a_tree_hides_nothing_below_it(home: Scene) -> None:
     fridge = next(item for item in home.objects if home.assets[item.asset_id].category == "fridge")
     box = home.box_of(fridge.name)
     size = tuple(2 * extent for extent in box.size_m)
@@ -63,7 +63,7 @@ def test_a_crown_hides_nothing_that_stands_under_it(home: Scene) -> None:
     assert (shown == orange).all(axis=2).sum() > 0.8 * (alone == orange).all(axis=2).sum()
 
 
-def test_a_sheet_holds_a_plan_in_every_cell(flat: Scene) -> None:
+def test_sheet_holds_a_plan_in_every_cell(flat: Scene) -> None:
     pixels = np.asarray(draw_sheet([flat] * 5, columns=3, cell_px=120))
     assert pixels.shape == (2 * (120 + 16), 3 * 120, 3)
     for row, column in ((0, 0), (0, 2), (1, 1)):
@@ -73,7 +73,7 @@ def test_a_sheet_holds_a_plan_in_every_cell(flat: Scene) -> None:
     assert (empty == 255).all()
 
 
-def test_an_unknown_scene_gets_one_sentence_with_close_names() -> None:
+def test_unknown_scene_gets_one_sentence_with_close_names() -> None:
     result = CliRunner().invoke(app, ["show", "Rs_itn"])
     assert result.exit_code == 2
     assert "Rs_int" in result.output
@@ -90,7 +90,7 @@ def test_render_writes_plan_view_and_what_the_robot_sees(tmp_path: Path) -> None
     ]
 
 
-def test_check_finds_a_base_scene_in_order() -> None:
+def test_check_accepts_a_base_scene() -> None:
     result = CliRunner().invoke(app, ["check", "hotel_suite_small"])
     assert result.exit_code == 0, result.output
     assert "nothing wrong" in result.output
@@ -102,7 +102,7 @@ def test_relations_are_drawn_by_a_command(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["relations.png"]
 
 
-def test_a_report_that_can_not_be_written_is_told_before_the_work(tmp_path: Path) -> None:
+def test_unwritable_report_is_rejected_before_the_work(tmp_path: Path) -> None:
     report = tmp_path / "nowhere" / "report.json"
     for arguments in (["check", "--all"], ["build", "--all", "--out", str(tmp_path / "out")]):
         result = CliRunner().invoke(app, [*arguments, "--report", str(report)])

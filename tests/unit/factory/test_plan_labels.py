@@ -1,4 +1,4 @@
-"""Words on plans: names where they can be read, numbers and a legend for the others."""
+"""Text on plans: legible names, and numbers with a legend for the others."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NOTHING = boxes(())
 
 
 def written(image: Image.Image) -> np.ndarray:
-    """Where the picture is not grey any more: (height, width)."""
+    """Mask of the pixels that are no longer grey, (height, width)."""
     return np.asarray(np.any(np.asarray(image) != 128, axis=2))
 
 
@@ -34,7 +34,7 @@ def grey() -> Image.Image:
     [(20, 20, 180, 50), (20, 20, 90, 70), (20, 10, 40, 115), (20, 10, 56, 110)],
     ids=["long", "in lines", "upright", "narrow"],
 )
-def test_a_name_stays_within_its_box(box: tuple[int, int, int, int]) -> None:
+def test_name_stays_within_its_box(box: tuple[int, int, int, int]) -> None:
     image = grey()
     assert Labels(image).inside("straight_chair_1", box, "black", NOTHING)
     rows, columns = np.nonzero(written(image))
@@ -44,7 +44,7 @@ def test_a_name_stays_within_its_box(box: tuple[int, int, int, int]) -> None:
     assert rows.max() < box[3]
 
 
-def test_the_size_of_a_room_stands_below_its_name_where_one_line_is_too_long() -> None:
+def test_size_of_a_room_moves_below_its_name_if_one_line_is_too_long() -> None:
     def one_line_of(words: str) -> np.ndarray:
         image = grey()
         assert Labels(image).inside(words, (5, 5, 195, 115), "black", NOTHING)
@@ -59,13 +59,13 @@ def test_the_size_of_a_room_stands_below_its_name_where_one_line_is_too_long() -
     assert np.ptp(rows) + 1 > 1.5 * name[0]
 
 
-def test_a_name_that_could_not_be_read_is_not_written() -> None:
+def test_illegible_name_is_not_written() -> None:
     image = grey()
     assert not Labels(image).inside("straight_chair_1", (20, 20, 50, 50), "black", NOTHING)
     assert not written(image).any()
 
 
-def test_names_of_one_box_stand_apart_until_it_is_full() -> None:
+def test_names_in_one_box_do_not_overlap_until_it_is_full() -> None:
     image = grey()
     labels = Labels(image)
     inks = []
@@ -76,13 +76,13 @@ def test_names_of_one_box_stand_apart_until_it_is_full() -> None:
 
 
 @pytest.mark.parametrize(("mark", "must"), [((40, 20, 160, 70), False), ((0, 0, 200, 120), True)])
-def test_a_name_covers_marks_only_where_it_must(mark: tuple[int, int, int, int], must: bool) -> None:
+def test_name_covers_marks_only_if_necessary(mark: tuple[int, int, int, int], must: bool) -> None:
     image = grey()
     assert Labels(image).inside("bed_1", (20, 20, 180, 100), "black", boxes([mark]))
     assert written(image)[mark[1] : mark[3], mark[0] : mark[2]].any() == must
 
 
-def test_numbers_of_one_point_stand_around_it() -> None:
+def test_numbers_of_one_point_are_placed_around_it() -> None:
     image = grey()
     labels = Labels(image)
     inks = []
@@ -100,11 +100,11 @@ def test_numbers_of_one_point_stand_around_it() -> None:
         (["floors", "cup_4"], "floors, cup_4"),
     ],
 )
-def test_names_are_told_in_few_words(names: list[str], words: str) -> None:
+def test_names_are_abbreviated(names: list[str], words: str) -> None:
     assert counted(names) == words
 
 
-def test_a_legend_grows_by_columns_and_not_in_height() -> None:
+def test_legend_grows_by_columns_and_not_in_height() -> None:
     one, two = (draw_legend([("red", "opens")], ["bed_1"] * count, 320) for count in (5, 25))
     assert one.height == two.height == 320
     assert two.width == 2 * one.width

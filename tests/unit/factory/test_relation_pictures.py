@@ -1,4 +1,4 @@
-"""The picture of the relations says of each case what the simulator does, and what a person expects."""
+"""Pictures of relations: the simulator's verdicts are those that a person expects."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ HOLDING = {
 
 
 @pytest.mark.parametrize("panel", PANELS, ids=lambda panel: f"{panel.predicate}: {panel.note}")
-def test_each_case_is_judged_as_a_person_reads_it(panel) -> None:
+def test_simulator_verdict_of_each_case_is_as_expected(panel) -> None:
     assert verdict(panel) == (panel.note in HOLDING)
 
 
@@ -33,7 +33,7 @@ def test_every_relation_is_shown_holding_and_not_holding() -> None:
     }
 
 
-def test_the_sheet_has_a_photograph_in_every_panel() -> None:
+def test_sheet_has_a_picture_in_every_panel() -> None:
     sheet = np.asarray(draw_relations())
     rows = -(-len(PANELS) // COLUMNS)
     panels = (

@@ -1,4 +1,4 @@
-"""What leaves the robot no place to stand is left out, with what lies in it, and said to be."""
+"""Furniture that the robot can't use is removed with its contents and reported."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CABINET = "top_cabinet_1"
 
 
 def turned_to_the_wall(scene: Scene) -> Scene:
-    """The scene with a cabinet's front to the wall, and a thing of the living room in it."""
+    """The scene with a cabinet that faces the wall and contains an object of the living room."""
     x, y, z = scene.by_name[CABINET].pose_world_asset.position_m
     changed = {
         CABINET: {
@@ -33,11 +33,11 @@ def turned_to_the_wall(scene: Scene) -> Scene:
     )
 
 
-def test_a_furnished_flat_loses_nothing(flat: Scene) -> None:
+def test_furnished_flat_keeps_all_furniture(flat: Scene) -> None:
     assert with_all_served(flat) is flat
 
 
-def test_a_cabinet_that_faces_the_wall_goes_with_what_lies_in_it(flat: Scene) -> None:
+def test_cabinet_facing_the_wall_is_removed_with_its_contents(flat: Scene) -> None:
     scene = turned_to_the_wall(flat)
     assert [item.name for item, _ in unserved(scene, ReachableFloor(scene))] == [CABINET]
     left = with_all_served(scene)
@@ -53,7 +53,7 @@ def test_a_cabinet_that_faces_the_wall_goes_with_what_lies_in_it(flat: Scene) ->
     assert {item.asset_id for item in left.objects} == set(left.assets)
 
 
-def test_a_chair_that_stands_where_one_gets_at_another_table_is_left_out() -> None:
+def test_chair_that_blocks_another_table_is_removed() -> None:
     scene = build_base_scene(
         "grocery_store_cafe", seed=1
     )  # four small tables with twelve chairs in one small room

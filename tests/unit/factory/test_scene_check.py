@@ -32,35 +32,35 @@ def kinds(scene: Scene) -> set[ProblemKind]:
     return {problem.kind for problem in check_scene(scene)}
 
 
-def test_a_base_scene_breaks_no_rule(flat: Scene) -> None:
+def test_base_scene_breaks_no_rule(flat: Scene) -> None:
     assert check_scene(flat) == ()
 
 
-def test_the_engine_finds_no_penetration_in_a_base_scene(flat: Scene) -> None:
+def test_engine_finds_no_penetration_in_a_base_scene(flat: Scene) -> None:
     assert check_in_engine(flat) == ()
 
 
-def test_a_sunken_object_penetrates_what_carries_it(flat: Scene) -> None:
+def test_sunken_object_penetrates_its_support(flat: Scene) -> None:
     item = next(o for o in flat.objects if o.host and not o.fixed)
     problems = check_scene(moved(flat, item.name, dz=-0.01))
     assert any(p.kind is ProblemKind.PENETRATION and item.name in p.names for p in problems)
 
 
-def test_a_lifted_object_floats(flat: Scene) -> None:
+def test_lifted_object_floats(flat: Scene) -> None:
     item = next(o for o in flat.objects if o.host and not o.fixed)
     assert ProblemKind.FLOATING in kinds(moved(flat, item.name, dz=0.05))
 
 
-def test_an_object_in_another_room_is_reported(flat: Scene) -> None:
+def test_object_in_another_room_is_reported(flat: Scene) -> None:
     assert ProblemKind.ROOM in kinds(moved(flat, "bed_1", dx=50.0))
 
 
-def test_a_name_used_twice_is_reported(flat: Scene) -> None:
+def test_name_used_twice_is_reported(flat: Scene) -> None:
     twice = replace(flat, objects=(*flat.objects, flat.objects[0]))
     assert ProblemKind.NAME in kinds(twice)
 
 
-def test_a_robot_shut_in_a_cupboard_reaches_nothing(flat: Scene) -> None:
+def test_enclosed_robot_reaches_nothing(flat: Scene) -> None:
     bed = next(o for o in flat.objects if o.name == "bed_1").pose_world_asset.position_m
     stuck = replace(flat, robot=replace(flat.robot, x_m=bed[0], y_m=bed[1]))
     assert ProblemKind.UNREACHABLE_ROOM in kinds(stuck)
@@ -75,7 +75,7 @@ def test_boxes_side_by_side_do_not_overlap_and_shifted_ones_do() -> None:
 
 
 @given(st.floats(0.05, 0.5), st.floats(0.05, 0.5), st.floats(0.0, 6.28), st.floats(-0.2, 0.2))
-def test_round_things_overlap_by_the_sum_of_their_radii_less_their_distance(
+def test_overlap_of_round_objects_is_sum_of_radii_minus_distance(
     r1: float, r2: float, angle: float, gap: float
 ) -> None:
     away = r1 + r2 + gap

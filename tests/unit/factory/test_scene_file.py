@@ -1,4 +1,4 @@
-"""Scenes in files: what was built is shown, drawn and checked again; anything else is refused in a sentence."""
+"""Scene files: built scenes are shown, drawn and checked again; other files are rejected in a sentence."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def path(flat: Scene, tmp_path: Path) -> Path:
     return path
 
 
-def test_a_scene_is_read_back_equal_and_its_file_is_far_below_the_limit(flat: Scene, path: Path) -> None:
+def test_scene_is_read_back_equal_and_its_file_is_far_below_the_limit(flat: Scene, path: Path) -> None:
     assert read_scene(path) == flat
     assert path.stat().st_size * 40 < MAX_BYTES
 
 
-def test_a_file_is_shown_and_drawn_as_the_scene_that_it_holds(flat: Scene, path: Path) -> None:
+def test_scene_in_a_file_is_shown_and_drawn(flat: Scene, path: Path) -> None:
     shown = CliRunner().invoke(app, ["show", str(path)])
     assert shown.exit_code == 0, shown.output
     assert all(room.name in shown.output for room in flat.rooms)
@@ -41,7 +41,7 @@ def test_a_file_is_shown_and_drawn_as_the_scene_that_it_holds(flat: Scene, path:
     assert (path.parent / "sheet.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_file_is_checked_once_with_the_seed_that_it_has(flat: Scene, path: Path) -> None:
+def test_file_is_checked_once_with_its_own_seed(flat: Scene, path: Path) -> None:
     borne = next(item for item in flat.objects if item.host and not item.fixed)
     x, y, z = borne.pose_world_asset.position_m
     hanging = replace(borne, pose_world_asset=Pose((x, y, z + 0.2), borne.pose_world_asset.quat_xyzw))
@@ -67,7 +67,7 @@ def test_a_file_is_checked_once_with_the_seed_that_it_has(flat: Scene, path: Pat
         (b'{"objects": []}', "scene"),
     ],
 )
-def test_a_file_that_holds_no_scene_is_refused_in_a_sentence(tmp_path: Path, data: bytes, words: str) -> None:
+def test_file_without_a_scene_is_rejected_in_a_sentence(tmp_path: Path, data: bytes, words: str) -> None:
     path = tmp_path / "bad.json"
     path.write_bytes(data)
     with pytest.raises(SceneFileError, match=words):
@@ -75,7 +75,7 @@ def test_a_file_that_holds_no_scene_is_refused_in_a_sentence(tmp_path: Path, dat
 
 
 @pytest.mark.parametrize("name", ["../../etc/passwd", "/dev/zero", "a/b"])
-def test_a_path_in_the_place_of_a_name_never_becomes_one(flat: Scene, tmp_path: Path, name: str) -> None:
+def test_path_is_never_used_as_a_scene_name(flat: Scene, tmp_path: Path, name: str) -> None:
     path = tmp_path / "bad.json"
     path.write_text(json.dumps({**scene_to_json(flat), "scene_id": name}))
     result = CliRunner().invoke(app, ["render", str(path), "--out", str(tmp_path / "pictures")])
@@ -84,7 +84,7 @@ def test_a_path_in_the_place_of_a_name_never_becomes_one(flat: Scene, tmp_path: 
     assert not (tmp_path / "pictures").exists()
 
 
-def test_a_file_of_a_gigabyte_is_refused_before_it_is_read(tmp_path: Path) -> None:
+def test_oversized_file_is_rejected_before_reading(tmp_path: Path) -> None:
     path = tmp_path / "big.json"
     with path.open("wb") as file:
         file.truncate(1 << 30)
@@ -95,14 +95,14 @@ def test_a_file_of_a_gigabyte_is_refused_before_it_is_read(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("name", ["nowhere.json", "folder.json"])
-def test_a_file_that_is_none_is_named(tmp_path: Path, name: str) -> None:
+def test_missing_file_is_named(tmp_path: Path, name: str) -> None:
     (tmp_path / "folder.json").mkdir()
     result = CliRunner().invoke(app, ["check", str(tmp_path / name)])
     assert result.exit_code == 2
     assert f"{name} is no file" in result.output
 
 
-def test_building_takes_names_alone(path: Path) -> None:
+def test_build_accepts_only_names(path: Path) -> None:
     result = CliRunner().invoke(app, ["build", str(path), "--out", str(path.parent / "out")])
     assert result.exit_code == 2
     assert "unknown scene" in result.output

@@ -1,4 +1,4 @@
-"""Furniture that stands open at a scene's start holds what it held when it was shut."""
+"""Furniture that is open at a scene's start keeps its contents."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import SceneObject
 
 TRAVEL_M = 0.36
-"""The fake cabinet's drawers come out by this much; it faces north."""
+"""Travel of the fake cabinet's drawers in metres; it faces north."""
 
 
 def cabinet_with_a_bowl_in_its_lower_drawer() -> tuple[dict[str, SceneObject], dict[str, Asset]]:
@@ -42,7 +42,7 @@ def cabinet_with_a_bowl_in_its_lower_drawer() -> tuple[dict[str, SceneObject], d
     return objects, {asset.asset_id: asset for _, asset, *_ in rows}
 
 
-def test_what_lies_in_a_drawer_comes_out_with_it_and_what_lies_in_that_too() -> None:
+def test_contents_move_with_a_drawer_recursively() -> None:
     objects, assets = cabinet_with_a_bowl_in_its_lower_drawer()
     changed = with_joints(objects, assets, "cabinet_1", (0.0, 0.5))
     assert set(changed) == {"cabinet_1", "bowl_1", "mug_1", "book_1"}
@@ -52,7 +52,7 @@ def test_what_lies_in_a_drawer_comes_out_with_it_and_what_lies_in_that_too() -> 
         assert moved.position_m == pytest.approx((0.0, out_m, 0.0))
 
 
-def test_a_drawer_bumps_into_what_stands_before_it_unless_it_stands_off() -> None:
+def test_drawer_hits_an_obstacle_unless_it_is_far_enough() -> None:
     objects, assets = cabinet_with_a_bowl_in_its_lower_drawer()
     for off_m, expected in ((0.2, {"book_9"}), (0.6, set())):
         block = make.block("book", "book.n.02", (0.2, 0.15, 0.4), {})
@@ -65,7 +65,7 @@ def test_a_drawer_bumps_into_what_stands_before_it_unless_it_stands_off() -> Non
         assert bumped_into(scene, solids, "cabinet_1", (1.0, 1.0)) == expected
 
 
-def test_a_drawer_that_is_shut_again_brings_its_things_back() -> None:
+def test_closing_a_drawer_restores_its_contents() -> None:
     objects, assets = cabinet_with_a_bowl_in_its_lower_drawer()
     opened = objects | with_joints(objects, assets, "cabinet_1", (1.0, 1.0))
     shut = opened | with_joints(opened, assets, "cabinet_1", (0.0, 0.0))

@@ -28,7 +28,7 @@ SMALL = "hotel_suite_small"
 
 
 def put(scene: Scene, name: str, x: float, y: float, z: float | None = None) -> Scene:
-    """The scene with one object at another place, as it is turned."""
+    """The scene with one object at another place with the same heading."""
     item = scene.by_name[name]
     pose = item.pose_world_asset
     there = Pose((x, y, pose.position_m[2] if z is None else z), pose.quat_xyzw)
@@ -42,7 +42,7 @@ def problems(scene: Scene, kind: ProblemKind) -> list[tuple[str, ...]]:
 
 
 def standing(scene: Scene) -> str:
-    """Something higher than a window's sill that stands on the floor."""
+    """An object on the floor that is higher than a window's sill."""
     return next(
         o.name
         for o in scene.objects
@@ -52,14 +52,14 @@ def standing(scene: Scene) -> str:
     )
 
 
-def test_what_stands_in_a_doorway_is_reported(flat: Scene) -> None:
+def test_object_in_a_doorway_is_reported(flat: Scene) -> None:
     door = next(d for d in flat.doorways if d.rooms[1])
     name = standing(flat)
     assert not problems(flat, ProblemKind.DOORWAY)
     assert (name,) in problems(put(flat, name, *door.center_m), ProblemKind.DOORWAY)
 
 
-def test_what_stands_before_a_window_is_reported_unless_it_is_low(flat: Scene) -> None:
+def test_high_object_before_a_window_is_reported(flat: Scene) -> None:
     window = next(w for w in flat.windows if not w.rooms[1])
     room = next(r for r in flat.rooms if r.name == window.rooms[0])
     inward = np.sign(np.subtract(room.center_m, window.center_m)) * (
@@ -74,7 +74,7 @@ def test_what_stands_before_a_window_is_reported_unless_it_is_low(flat: Scene) -
     assert not any(name in names for names in problems(sunk, ProblemKind.WINDOW))
 
 
-def test_a_barred_aisle_is_reported(flat: Scene) -> None:
+def test_blocked_aisle_is_reported(flat: Scene) -> None:
     room = max(flat.rooms, key=lambda r: min(r.size_m))
     middle = room.center_m[1]
     x0, x1 = room.low_m[0] - 0.1, room.high_m[0] + 0.1
@@ -84,19 +84,19 @@ def test_a_barred_aisle_is_reported(flat: Scene) -> None:
     assert (room.name,) in problems(replace(barred, robot=start), ProblemKind.AISLE)
 
 
-def test_a_narrow_doorway_is_reported(flat: Scene) -> None:
+def test_narrow_doorway_is_reported(flat: Scene) -> None:
     narrow = replace(flat, doorways=tuple(replace(d, width_m=0.6) for d in flat.doorways))
     assert problems(narrow, ProblemKind.DOORWAY)
 
 
-def test_a_base_scene_stays_where_it_is_when_all_is_let_go(flat: Scene) -> None:
+def test_base_scene_is_stable(flat: Scene) -> None:
     settlement = check_settled(flat)
     assert settlement.movable == sum(not item.fixed for item in flat.objects) > 0
     assert settlement.stable_share >= STABLE_SHARE
     assert settlement.problems == ()
 
 
-def test_things_hung_in_the_air_fall_and_are_reported(flat: Scene) -> None:
+def test_unsupported_objects_fall_and_are_reported(flat: Scene) -> None:
     scene = flat
     for item in flat.objects:
         if not item.fixed:
@@ -107,14 +107,14 @@ def test_things_hung_in_the_air_fall_and_are_reported(flat: Scene) -> None:
     assert [problem.kind for problem in settlement.problems] == [ProblemKind.UNSTABLE]
 
 
-def test_an_item_that_vanishes_is_unaccounted_for(flat: Scene) -> None:
+def test_vanished_item_is_unaccounted_for(flat: Scene) -> None:
     assert unaccounted(flat) == ()
     gone = flat.objects[-1]
     (problem,) = unaccounted(replace(flat, objects=flat.objects[:-1]))
     assert problem.names == (gone.asset_id,)
 
 
-def test_a_report_counts_what_is_in_the_scene(flat: Scene) -> None:
+def test_report_counts_the_objects_of_the_scene(flat: Scene) -> None:
     report = report_of(flat)
     listed = sum(n for room in Catalog.load().inventory("Rs_int").rooms for *_, n in room.items)
     assert report.sound
@@ -124,7 +124,7 @@ def test_a_report_counts_what_is_in_the_scene(flat: Scene) -> None:
     assert 0.8 < report.compactness <= 1.0
 
 
-def test_an_empty_house_is_all_free_floor(flat: Scene) -> None:
+def test_empty_house_is_all_free_floor(flat: Scene) -> None:
     bare = ReachableFloor(replace(flat, objects=()))
     full = ReachableFloor(flat)
     assert bare.free_share == 1.0
@@ -132,14 +132,14 @@ def test_an_empty_house_is_all_free_floor(flat: Scene) -> None:
     assert 0.3 < full.free_share < 0.95
 
 
-def test_an_unknown_scene_is_a_report_not_a_crash() -> None:
+def test_unknown_scene_gives_a_report_with_an_error() -> None:
     report, scene = report_on("Rs_itn", 0)
     assert scene is None
     assert "Rs_int" in report.error
     assert not report.sound
 
 
-def test_scenes_are_built_side_by_side_and_written(tmp_path: Path) -> None:
+def test_scenes_are_built_in_parallel_and_written(tmp_path: Path) -> None:
     jobs = [SceneBuildJob(SMALL, seed, tmp_path / f"{seed}.json") for seed in (0, 1)]
     reports = sorted(run_batch(jobs, processes=2), key=lambda report: report.seed)
     assert [report.seed for report in reports] == [0, 1]
@@ -150,12 +150,12 @@ def test_scenes_are_built_side_by_side_and_written(tmp_path: Path) -> None:
     assert {room.name for room in first.rooms} == {room.name for room in second.rooms}
 
 
-def test_a_wrong_name_stops_a_batch_before_anything_is_built() -> None:
+def test_unknown_name_stops_a_batch_before_anything_is_built() -> None:
     with pytest.raises(CatalogError, match="Rs_int"):
         list(run_batch([SceneBuildJob("Rs_itn", 0), SceneBuildJob(SMALL, 0)], processes=1))
 
 
-def test_check_writes_a_report_and_names_what_is_missing(tmp_path: Path) -> None:
+def test_check_writes_a_report_and_names_missing_objects(tmp_path: Path) -> None:
     path = tmp_path / "report.json"
     result = CliRunner().invoke(app, ["check", SMALL, "--report", str(path)])
     assert result.exit_code == 0, result.output
@@ -174,14 +174,14 @@ def test_check_writes_a_report_and_names_what_is_missing(tmp_path: Path) -> None
         (["sheet", "Rs_itn"], "Rs_int"),
     ],
 )
-def test_what_to_build_must_be_said_once(arguments: list[str], words: str) -> None:
+def test_names_and_all_exclude_one_another(arguments: list[str], words: str) -> None:
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 2
     assert words in result.output
     assert "Traceback" not in result.output
 
 
-def test_the_page_names_every_rule() -> None:
+def test_page_names_every_rule() -> None:
     page = (Path(__file__).parents[3] / "docs" / "scenes.md").read_text(encoding="utf-8")
     assert [kind.value for kind in ProblemKind if f"`{kind.value}`" not in page] == []
 
@@ -198,7 +198,7 @@ def test_all_51_scenes_are_built_and_keep_every_rule(seed: int) -> None:
     assert not wrong
 
 
-def test_a_table_of_scenes_with_seeds_fits_the_width_it_is_printed_with(flat: Scene) -> None:
+def test_table_of_scenes_with_seeds_fits_the_width_it_is_printed_with(flat: Scene) -> None:
     report = replace(report_of(flat), scene_id="school_computer_lab_and_infirmary", seed=100)
     out = io.StringIO()
     Console(file=out, width=TABLE_COLUMNS).print(report_table([report, report]))

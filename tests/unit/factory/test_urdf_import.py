@@ -1,4 +1,4 @@
-"""Models from URDF files keep their joints, or are refused in a sentence that names what is wrong with the tree."""
+"""URDF import: models keep their joints; invalid files are rejected with the wrong element."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def joint(name: str, parent: str, child: str, kind: str = "fixed", extra: str = 
     return f'<joint name="{name}" type="{kind}">{ends}{extra}</joint>'
 
 
-def test_a_urdf_keeps_its_joint_and_merges_what_is_fixed(tmp_path: Path) -> None:
+def test_urdf_keeps_its_joint_and_merges_fixed_links(tmp_path: Path) -> None:
     limits = '<limit lower="0" upper="1.2"/><axis xyz="0 0 1"/><origin xyz="0.5 -0.5 0" rpy="0 0 0"/>'
     path = urdf(
         tmp_path,
@@ -77,14 +77,14 @@ def test_a_urdf_keeps_its_joint_and_merges_what_is_fixed(tmp_path: Path) -> None
         ('<link name="a"><visual><geometry><mesh filename="x.obj"/></geometry></visual></link>', "can't be read"),
     ],
 )  # fmt: skip
-def test_a_urdf_that_is_no_tree_or_leaves_its_folder_is_refused(
+def test_urdf_that_is_no_tree_or_leaves_its_folder_is_rejected(
     tmp_path: Path, body: str, message: str
 ) -> None:
     with pytest.raises(ModelFileError, match=message):
         read_urdf(urdf(tmp_path, body))
 
 
-def test_a_moving_link_on_a_moving_link_is_refused(tmp_path: Path) -> None:
+def test_moving_link_on_a_moving_link_is_refused(tmp_path: Path) -> None:
     limit = '<limit lower="0" upper="1"/>'
     joints = joint("j", "a", "b", "revolute", limit) + joint("k", "b", "c", "prismatic", limit)
     with pytest.raises(ModelFileError, match="the joint 'k' moves on the moving link 'b'"):
@@ -92,7 +92,7 @@ def test_a_moving_link_on_a_moving_link_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
-def test_entities_are_refused_in_any_encoding(tmp_path: Path, encoding: str) -> None:
+def test_entities_are_rejected_in_any_encoding(tmp_path: Path, encoding: str) -> None:
     path = tmp_path / "bomb.urdf"
     bomb = '<!DOCTYPE r [<!ENTITY a "aaaa">]><robot name="&a;"/>'
     path.write_bytes(f'<?xml version="1.0" encoding="{encoding}"?>{bomb}'.encode(encoding))

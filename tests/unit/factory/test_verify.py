@@ -1,4 +1,4 @@
-"""Admitted tasks are judged again by other processes: what differs, is refused or fails in physics is told."""
+"""Second verification of admitted tasks: differences, refusals and failures in physics are reported."""
 
 import dataclasses
 import json
@@ -23,7 +23,7 @@ def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return Dataset.load(write_kitchen_dataset(tmp_path_factory.mktemp("kitchen")))
 
 
-def test_two_looks_that_agree_with_the_dataset_are_equal() -> None:
+def test_equal_judgements_agree_with_the_dataset() -> None:
     assert compared(FINE, FINE).equal
     assert not compared(FINE, dataclasses.replace(FINE, digest="sha256:2")).equal
     assert not compared(FINE, dataclasses.replace(FINE, same_plan=False)).equal
@@ -31,7 +31,7 @@ def test_two_looks_that_agree_with_the_dataset_are_equal() -> None:
     assert compared(FINE, refused).cached == "no_plan: none"
 
 
-def test_shares_are_of_what_was_asked_and_objections_name_the_task() -> None:
+def test_shares_count_tested_modes_and_objections_name_the_task() -> None:
     verdicts = [
         compared(FINE, dataclasses.replace(FINE, physical="")),
         compared(FINE, dataclasses.replace(FINE, physical="grasp_slipped: step 2, pick_up: it fell")),
@@ -45,7 +45,7 @@ def test_shares_are_of_what_was_asked_and_objections_name_the_task() -> None:
     assert [figure.name for figure in without.figures] == ["oracle_cached", "reverified_bit_equal"]
 
 
-def test_a_sample_is_drawn_by_its_seed_in_the_order_of_the_dataset(kitchen: Dataset) -> None:
+def test_sample_depends_on_the_seed_and_keeps_the_order(kitchen: Dataset) -> None:
     chosen = sampled(kitchen.records, 2, 3)
     assert chosen == sampled(kitchen.records, 2, 3)
     places = [kitchen.records.index(record) for record in chosen]
@@ -53,10 +53,8 @@ def test_a_sample_is_drawn_by_its_seed_in_the_order_of_the_dataset(kitchen: Data
     assert sampled(kitchen.records, None, 0) == list(kitchen.records)
 
 
-def test_the_command_judges_tasks_in_other_processes_and_in_physics(
-    tmp_path: "Path", kitchen: Dataset
-) -> None:
-    """The first task is as it was admitted; the other holds a plan that the oracle does not find."""
+def test_command_judges_tasks_in_other_processes_and_in_physics(tmp_path: "Path", kitchen: Dataset) -> None:
+    """The first task is unchanged; the other has a plan that the oracle does not find."""
     first, other = kitchen.records[0], kitchen.records[1]
     other = dataclasses.replace(other, oracle=first.oracle)
     folder = tmp_path / "tasks"
@@ -72,7 +70,7 @@ def test_the_command_judges_tasks_in_other_processes_and_in_physics(
     assert figures == {"oracle_cached": 100, "reverified_bit_equal": 50, "oracle_physical": 50}
 
 
-def test_a_dataset_without_tasks_is_told(tmp_path: "Path") -> None:
+def test_dataset_without_tasks_is_reported(tmp_path: "Path") -> None:
     write_dataset(tmp_path, [], {})
     result = CliRunner().invoke(app, ["verify", str(tmp_path)])
     assert result.exit_code == 2
