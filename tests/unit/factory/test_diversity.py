@@ -85,7 +85,7 @@ def test_templates_are_less_diverse_than_free_text():
     social = diversity(
         {"home": talk}, ["frozen(pear)", "not open(window)", "ontop(mug,sink)", "off(lamp)"], names
     )
-    assert social.self_bleu4 < 0.1 < 0.2 < plain.self_bleu4
-    assert social.distinct_2 > plain.distinct_2
-    assert (social.named_share, plain.named_share) == (1, 0)
-    assert social.signature_entropy > plain.signature_entropy
+    assert social["self_bleu4"] < 0.1 < 0.2 < plain["self_bleu4"]
+    assert social["distinct_2"] > plain["distinct_2"]
+    assert (social["named_share"], plain["named_share"]) == (1, 0)
+    assert social["signature_entropy"] > plain["signature_entropy"]

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from embomatrix.llm.values import ChatModel
     from embomatrix.world.scene import Scene
 
-JUDGE: Final = "diversity judge"
-PROMPT: Final = """\
+DIVERSITY_JUDGE: Final = "diversity judge"
+DIVERSITY_PROMPT: Final = """\
 Please analyze the diversity of the following generated commands and provide a score out of 10 based on the following criteria:
 
 1. Variety: Do the commands include a diverse range of actions, objects, and scenarios? Do the commands cover different types \
@@ -65,15 +65,18 @@ async def judged(model: ChatModel, commands: Sequence[str], seed: int, attempts:
     """Return the model's scores for the commands of one scene. Raises LlmError."""
     listed = "\n".join(f"{number}. {command}" for number, command in enumerate(commands, start=1))
     request = ChatRequest(
-        JUDGE, (Message(Speaker.USER, PROMPT.format(commands=f"\n{listed}\n")),), temperature=0.0, seed=seed
+        DIVERSITY_JUDGE,
+        (Message(Speaker.USER, DIVERSITY_PROMPT.format(commands=f"\n{listed}\n")),),
+        temperature=0.0,
+        seed=seed,
     )
     return (await ask(model, request, DiversityScores, attempts=attempts)).value
 
 
-JUDGE: Final = "scene judge"
+SCENE_JUDGE: Final = "scene judge"
 MOST_ROOMS: Final = 4
 """Upper limit for the pictures in one request."""
-PROMPT: Final = """\
+SCENE_PROMPT: Final = """\
 You are a professional scene arrangement evaluator, capable of providing objective assessments of the reasonableness \
 and aesthetics of each scene. Now, to complete a task, the user needs to place some new objects in an initial room, \
 and these objects must satisfy certain spatial relationships, such as "A inside B" meaning B must be placed inside A, \
@@ -133,8 +136,8 @@ async def impression_of(
     for room in rooms:
         trees |= tree_in(scene.objects, room, added).nested()
     pictures = tuple(sight_of_room(scene, room) for room in rooms)
-    message = Message(Speaker.USER, PROMPT.format(tree=json.dumps(trees)), pictures)
-    request = ChatRequest(JUDGE, (message,), temperature=0.0, seed=seed)
+    message = Message(Speaker.USER, SCENE_PROMPT.format(tree=json.dumps(trees)), pictures)
+    request = ChatRequest(SCENE_JUDGE, (message,), temperature=0.0, seed=seed)
     return (await ask(model, request, Impression, attempts=attempts)).value
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 import zlib
@@ -49,14 +48,12 @@ def panel(
     ``names`` are people's names. A ``label`` distinguishes the figures of another writer, which have no goals.
     """
     tasks = [asked for group in groups.values() for asked in group]
-    measured = diversity(
+    values = diversity(
         {base: [asked.instruction for asked in group] for base, group in groups.items()},
         [asked.signature for asked in tasks],
         names,
     )
-    values = dataclasses.asdict(measured)
     n = len(tasks)
-    del values["groups"], values["group"]
     signs = [sign for asked in tasks for sign in _SIGN.findall(asked.signature)]
     things = [arguments.split(",") for _, arguments in signs]
     values |= {

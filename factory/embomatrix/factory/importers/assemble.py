@@ -233,7 +233,7 @@ def _points(part: ConvexPart) -> FloatArray:
     if part.vertices_m:
         return part.pose.apply_all(np.asarray(part.vertices_m))
     half = np.asarray(part.size_m) / 2
-    return np.asarray(part.pose.position_m) + np.array([-half, half])
+    return np.asarray(np.asarray(part.pose.position_m) + np.array([-half, half]))
 
 
 def _box_of(part: ConvexPart) -> Aabb:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
@@ -91,44 +90,26 @@ def named_share(texts: Iterable[str], names: Collection[str]) -> float:
     return sum(found) / len(found) if found else 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Diversity:
-    """Figures of instructions grouped by base scene: means over the groups.
-
-    ``signature_entropy`` and ``verb_entropy`` are over all tasks; ``group`` is the mean size of a group.
-    """
-
-    groups: int
-    group: float
-    self_bleu4: float
-    distinct_1: float
-    distinct_2: float
-    near_duplicate_rate: float
-    named_share: float
-    signature_entropy: float
-    verb_entropy: float
-    words: float
-
-
 def diversity(
     instructions: Mapping[str, Sequence[str]], signatures: Sequence[str], names: Collection[str]
-) -> Diversity:
-    """Measure instructions by base scene. ``signatures`` are the goals' kinds, ``names`` are people's names."""
+) -> dict[str, float]:
+    """Measure instructions by base scene. ``signatures`` are the goals' kinds, ``names`` are people's names.
+
+    Figures are means over the scenes, except those of names, signatures, verbs and words, which are over all tasks.
+    """
     groups = [[words_of(text) for text in texts] for texts in instructions.values() if texts]
     texts = [text for found in instructions.values() for text in found]
     every = [words for group in groups for words in group]
-    return Diversity(
-        groups=len(groups),
-        group=_mean([len(group) for group in groups]),
-        self_bleu4=_mean([self_bleu(group) for group in groups]),
-        distinct_1=_mean([distinct(group, 1) for group in groups]),
-        distinct_2=_mean([distinct(group, 2) for group in groups]),
-        near_duplicate_rate=_mean([near_duplicates(group) for group in groups]),
-        named_share=named_share(texts, names),
-        signature_entropy=normalised_entropy(signatures),
-        verb_entropy=normalised_entropy([words[0] for words in every if words]),
-        words=_mean([len(words) for words in every]),
-    )
+    return {
+        "self_bleu4": _mean([self_bleu(group) for group in groups]),
+        "distinct_1": _mean([distinct(group, 1) for group in groups]),
+        "distinct_2": _mean([distinct(group, 2) for group in groups]),
+        "near_duplicate_rate": _mean([near_duplicates(group) for group in groups]),
+        "named_share": named_share(texts, names),
+        "signature_entropy": normalised_entropy(signatures),
+        "verb_entropy": normalised_entropy([words[0] for words in every if words]),
+        "words": _mean([len(words) for words in every]),
+    }
 
 
 def _grams(words: Words, n: int) -> list[Words]:

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 def with_joints(
     objects: Mapping[str, SceneObject], assets: Mapping[str, Asset], name: str, fractions: Sequence[float]
 ) -> dict[str, SceneObject]:
-    """What changes when an object's joints are set: the object, and all that rides on its links, by name.
+    """Set an object's joints; return the object and all carried objects at their new poses, by name.
 
-    ``fractions`` are shares of the joints' travel, one for each; ``assets`` are given by their ids. Things ride that the
-    objects' hosts and relations say lie there, with whatever lies on or in them. Raises KeyError for an unknown name.
+    ``fractions`` are shares of the joints' travel, one for each joint; ``assets`` are keyed by id. Hosts and relations decide
+    which objects a link carries, contents of contents included. Raises KeyError for an unknown name.
     """
     item = objects[name]
     asset, base = assets[item.asset_id], item.pose_world_asset
@@ -32,14 +32,14 @@ def with_joints(
     for link in sorted(links_with_surfaces(asset) - {""}):
         before = link_frame(asset, base, item.joints, link)
         motion = link_frame(asset, base, changed[name].joints, link) @ before.inverse()
-        for rider in _riders(objects, assets, name, before, link):
-            for guest in _with_guests(objects, rider):
-                changed[guest.name] = replace(guest, pose_world_asset=motion @ guest.pose_world_asset)
+        for carried in _carried_by_link(objects, assets, name, before, link):
+            for each in _with_contents(objects, carried):
+                changed[each.name] = replace(each, pose_world_asset=motion @ each.pose_world_asset)
     return changed
 
 
 def bumped_into(scene: Scene, solids: Solids, name: str, fractions: Sequence[float]) -> frozenset[str]:
-    """Owners of solids that an object, or what rides on it, would be in with its joints set, and is not in as it stands."""
+    """Return the owners of solids that the object or its carried objects would newly penetrate with its joints set."""
     before = scene.by_name
     found: set[str] = set()
     changed = with_joints(before, scene.assets, name, fractions)
@@ -51,20 +51,20 @@ def bumped_into(scene: Scene, solids: Solids, name: str, fractions: Sequence[flo
     return frozenset(found - changed.keys())
 
 
-def _riders(
+def _carried_by_link(
     objects: Mapping[str, SceneObject], assets: Mapping[str, Asset], host: str, frame: Pose, link: str
 ) -> Iterator[SceneObject]:
-    """Guests of an object that lie on or in one of its links, whose frame is given."""
+    """Yield the objects that lie on or in a link of the host. ``frame`` is the link's frame."""
     asset = assets[objects[host].asset_id]
-    for guest in objects.values():
-        if guest.host == host and guest.relation is not None:
-            box = bounds_of(assets[guest.asset_id]).box(frame.inverse() @ guest.pose_world_asset)
-            if link_under(box, asset, guest.relation) == link:
-                yield guest
+    for item in objects.values():
+        if item.host == host and item.relation is not None:
+            box = bounds_of(assets[item.asset_id]).box(frame.inverse() @ item.pose_world_asset)
+            if link_under(box, asset, item.relation) == link:
+                yield item
 
 
-def _with_guests(objects: Mapping[str, SceneObject], item: SceneObject) -> Iterator[SceneObject]:
+def _with_contents(objects: Mapping[str, SceneObject], item: SceneObject) -> Iterator[SceneObject]:
     yield item
-    for guest in objects.values():
-        if guest.host == item.name:
-            yield from _with_guests(objects, guest)
+    for other in objects.values():
+        if other.host == item.name:
+            yield from _with_contents(objects, other)
