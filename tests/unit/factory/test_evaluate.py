@@ -238,7 +238,7 @@ def test_files_of_one_part_are_combined_on_the_page():
 
 
 def test_page_without_an_end_marker_is_rejected():
-    with pytest.raises(EvaluationError, match="put it back"):
+    with pytest.raises(EvaluationError, match="insert it at the end"):
         with_factory(f"# Benchmarks\n{BEGIN}\ntext\n", [EVALUATION])
     with pytest.raises(EvaluationError, match="given twice"):
         with_factory("", [EVALUATION, EVALUATION])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from html import escape
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.pictures.scene import footprint, is_overhead
+from embomatrix.factory.pictures.scene import is_overhead
 from embomatrix.world.geometry import Pose
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def inspection_view(scene: Scene, view: PlanView, about: Collection[str], things
         if box.low_m[2] < 0.1 and view.is_visible(box.low_m, box.high_m):
             parts.append(view.box(box.low_m, box.high_m, "wall"))
     for item in scene.objects:
-        box = footprint(scene, item)
+        box = scene.box_of(item.name)
         if item.room in names and item.name not in things and not is_overhead(box) and not item.absent:
             kind = "piece goal" if item.name in about else "piece"
             parts.append(view.box(box.low_m, box.high_m, kind, item.name))

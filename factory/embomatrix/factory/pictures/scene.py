@@ -16,7 +16,7 @@ from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Aabb, Pose
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from embomatrix.factory.pictures.labels import Box
     from embomatrix.world.scene import Scene, SceneObject
@@ -66,8 +66,7 @@ _WORKS: Final = ("toggleable", "heatSource", "coldSource", "particleSource")
 def draw_plan(scene: Scene) -> Image.Image:
     """Return an RGB image of the scene from above, north up, with a legend for names that do not fit."""
     plan = _Plan(scene)
-    plan.rooms()
-    plan.walls()
+    plan.building()
     plan.furniture()
     plan.small_things()
     plan.robot()
@@ -81,9 +80,21 @@ def draw_plan(scene: Scene) -> Image.Image:
     return whole
 
 
-def footprint(scene: Scene, item: SceneObject) -> Aabb:
-    """Bounding box of an object in the world, closed."""
-    return scene.box_of(item.name)
+def draw_building(
+    draw: ImageDraw.ImageDraw, scene: Scene, box: Callable[[float, float, float, float], Box]
+) -> None:
+    """Draw rooms, walls and windows. ``box`` converts a rectangle (x0, y0, x1, y1) in metres to pixels."""
+    for number, room in enumerate(scene.rooms):
+        draw.rectangle(box(*room.low_m, *room.high_m), fill=PALE[number % len(PALE)])
+    for wall in scene.walls:
+        around = wall.aabb(_ORIGIN)
+        if around.low_m[2] <= 0.1:
+            panel = min(wall.size_m[:2]) < 0.1
+            draw.rectangle(box(*around.low_m[:2], *around.high_m[:2]), fill="#b5522b" if panel else "#3a3a3a")
+    for window in scene.windows:
+        a, b = (window.width_m / 2, _PANE_M) if window.along == "x" else (_PANE_M, window.width_m / 2)
+        x, y = window.center_m
+        draw.rectangle(box(x - a, y - b, x + a, y + b), fill="#6fc3e8")
 
 
 def is_overhead(box: Aabb) -> bool:
@@ -126,39 +137,23 @@ class _Plan:
         self._marks: list[Box] = []
         """Boxes that text avoids if possible: dots, fronts, lights, the robot."""
 
-    def rooms(self) -> None:
-        for number, room in enumerate(self._scene.rooms):
-            corners = [self._px(*room.low_m), self._px(*room.high_m)]
-            self._draw.rectangle(_ordered(corners), fill=PALE[number % len(PALE)])
-
-    def walls(self) -> None:
-        for part in self._scene.walls:
-            box = part.aabb(_ORIGIN)
-            thin = min(part.size_m[:2]) < 0.1
-            if box.low_m[2] > 0.1:
-                continue
+    def building(self) -> None:
+        def box(x0: float, y0: float, x1: float, y1: float) -> Box:
             # In the plan of a single room, walls are clipped to the room.
-            low, high = (
-                np.clip(each[:2], self._low, self._high).tolist() for each in (box.low_m, box.high_m)
-            )
-            self._draw.rectangle(
-                _ordered([self._px(*low), self._px(*high)]), fill="#b5522b" if thin else "#3a3a3a"
-            )
+            low, high = (np.clip(each, self._low, self._high).tolist() for each in ((x0, y0), (x1, y1)))
+            return _ordered([self._px(*low), self._px(*high)])
+
+        draw_building(self._draw, self._scene, box)
         for door in self._scene.doorways:
             a, b = (door.width_m / 2, 0.0) if door.along == "x" else (0.0, door.width_m / 2)
             x, y = door.center_m
             ends = [self._px(x - a, y - b), self._px(x + a, y + b)]
             self._draw.line(ends, fill="#b5522b", width=2)
-        for window in self._scene.windows:
-            a, b = (window.width_m / 2, _PANE_M) if window.along == "x" else (_PANE_M, window.width_m / 2)
-            x, y = window.center_m
-            corners = [self._px(x - a, y - b), self._px(x + a, y + b)]
-            self._draw.rectangle(_ordered(corners), fill="#6fc3e8")
 
     def furniture(self) -> None:
         shown = [o for o in self._scene.objects if not self._is_small(o)]
         for item in sorted(shown, key=self._layer):
-            box = footprint(self._scene, item)
+            box = self._scene.box_of(item.name)
             if is_overhead(box):
                 self._ceiling(box)
                 continue
@@ -237,13 +232,13 @@ class _Plan:
         return self._view.whereabouts(item.name) if is_told else ""
 
     def _is_small(self, item: SceneObject) -> bool:
-        box = footprint(self._scene, item)
+        box = self._scene.box_of(item.name)
         x, y, _ = box.size_m
         return (max(x, y) < _SMALL_M or bool(item.host and not item.fixed)) and not is_overhead(box)
 
     def _layer(self, item: SceneObject) -> tuple[int, float]:
         """Return the drawing order: rugs, then plants, whose crowns would hide furniture, then by height."""
-        box = footprint(self._scene, item)
+        box = self._scene.box_of(item.name)
         kind = kind_of(self._scene, item, box)
         rank = 2 if item.host else {"rug": 0, "plant": 1}.get(kind, 2)
         return rank, box.low_m[2]

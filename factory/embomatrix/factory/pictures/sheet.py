@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from embomatrix.factory.pictures.scene import FILL, PALE, footprint, is_overhead, kind_of
+from embomatrix.factory.pictures.scene import FILL, draw_building, is_overhead, kind_of
 from embomatrix.sim.bullet.camera import render_egocentric, render_oblique
-from embomatrix.world.geometry import Pose
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from embomatrix.factory.pictures.labels import Box
     from embomatrix.world.scene import Scene
 
-_ORIGIN: Final = Pose((0.0, 0.0, 0.0))
+
 _MARGIN_M: Final = 0.3
 _CAPTION_PX: Final = 16
-_PANE_M: Final = 0.03
+
 _DIRECTIONS: Final = ("ahead", "to its left", "behind", "to its right")
 
 
@@ -74,23 +74,13 @@ def draw_thumbnail(scene: Scene, side_px: int) -> Image.Image:
     image = Image.new("RGB", (side_px, side_px), "white")
     draw = ImageDraw.Draw(image)
 
-    def box(x0: float, y0: float, x1: float, y1: float) -> tuple[float, float, float, float]:
+    def box(x0: float, y0: float, x1: float, y1: float) -> Box:
         left, right = shift[0] + (x0 - low[0]) * scale, shift[0] + (x1 - low[0]) * scale
         top, bottom = shift[1] + (high[1] - y1) * scale, shift[1] + (high[1] - y0) * scale
         return (round(left), round(top), max(round(left), round(right)), max(round(top), round(bottom)))
 
-    for number, room in enumerate(scene.rooms):
-        draw.rectangle(box(*room.low_m, *room.high_m), fill=PALE[number % len(PALE)])
-    for wall in scene.walls:
-        around = wall.aabb(_ORIGIN)
-        if around.low_m[2] < 0.1:
-            leaf = min(wall.size_m[:2]) < 0.1
-            draw.rectangle(box(*around.low_m[:2], *around.high_m[:2]), fill="#b5522b" if leaf else "#3a3a3a")
-    for window in scene.windows:
-        a, b = (window.width_m / 2, _PANE_M) if window.along == "x" else (_PANE_M, window.width_m / 2)
-        x, y = window.center_m
-        draw.rectangle(box(x - a, y - b, x + a, y + b), fill="#6fc3e8")
-    boxes = {item.name: footprint(scene, item) for item in scene.objects}
+    draw_building(draw, scene, box)
+    boxes = {item.name: scene.box_of(item.name) for item in scene.objects}
     kinds = {item.name: kind_of(scene, item, boxes[item.name]) for item in scene.objects}
     # Plants first: a tree's crown would hide furniture below it.
     for item in sorted(scene.objects, key=lambda o: kinds[o.name] != "plant"):
