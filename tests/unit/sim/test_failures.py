@@ -1,4 +1,4 @@
-"""Every reason of failure, each met by the shortest plan that leads to it."""
+"""Every failure reason, produced by the shortest plan."""
 
 from dataclasses import replace
 
@@ -100,14 +100,14 @@ ELSEWHERE = {
 
 
 @pytest.mark.parametrize("reason", list(REACHED))
-def test_a_plan_meets_the_reason(awkward, reason):
+def test_plan_fails_with_the_reason(awkward, reason):
     trace = executed(awkward, REACHED[reason])
     assert trace.failure is reason, trace.steps[-1].message
     assert trace.steps[-1].failure in reasons_of(trace.steps[-1].call.skill)
 
 
 @pytest.mark.parametrize("reason", list(AT_HOME))
-def test_a_household_plan_meets_the_reason(home, reason):
+def test_household_plan_fails_with_the_reason(home, reason):
     trace = executed(home, AT_HOME[reason])
     assert trace.failure is reason, trace.steps[-1].message
     assert trace.steps[-1].failure in reasons_of(trace.steps[-1].call.skill)
@@ -129,12 +129,12 @@ def test_a_household_plan_meets_the_reason(home, reason):
         ),
     ],
 )
-def test_a_tool_or_a_tap_that_is_not_ready_is_told(home, text, reason):
+def test_unready_tool_or_tap_is_named(home, text, reason):
     trace = executed(home, text)
     assert trace.failure is reason, trace.steps[-1].message
 
 
-def test_every_reason_is_met_by_some_test():
+def test_every_failure_reason_is_covered():
     mishaps = frozenset().union(*MISHAPS.values())
     assert {*REACHED, *AT_HOME} | ELSEWHERE | mishaps == set(FailureReason)
     assert not mishaps & {*REACHED, *AT_HOME, *ELSEWHERE}
@@ -147,12 +147,12 @@ def test_no_path_leads_into_a_room_without_a_door():
     assert trace.steps[0].message == "the robot can't get to apple_2: a wall blocks the way"
 
 
-def test_a_room_without_a_door_can_not_be_entered():
+def test_room_without_a_door_can_not_be_entered():
     trace = executed_alone(replace(kitchen_scene(), doorways=()), "go_to_room living_room_0")
     assert trace.failure is FailureReason.NO_PATH
 
 
-def test_what_lies_in_the_middle_of_a_huge_table_can_not_be_reached():
+def test_object_in_the_middle_of_a_huge_table_can_not_be_reached():
     island, apple = make.block("island", "island.n.01", (2.6, 2.6, 0.5), {}), make.apple()
     scene = scene_of(
         "island",
@@ -167,7 +167,7 @@ def test_what_lies_in_the_middle_of_a_huge_table_can_not_be_reached():
 
 
 @pytest.mark.parametrize("text", ["move apple_2", "go_to_room living_room_0"])
-def test_who_stands_in_the_doorway_is_told(text):
+def test_blocker_in_the_doorway_is_named(text):
     chest = make.block("chest", "chest.n.02", (0.5, 0.9, 0.6), {})
     scene = with_objects(
         kitchen_scene(),
@@ -178,7 +178,7 @@ def test_who_stands_in_the_doorway_is_told(text):
     assert trace.steps[0].message.endswith(": chest_1 blocks the way")
 
 
-def test_the_arm_does_not_reach_through_a_wall():
+def test_arm_does_not_reach_through_a_wall():
     low, apple = make.coffee_table(), make.apple()
     scene = scene_of(
         "wall",
@@ -191,7 +191,7 @@ def test_the_arm_does_not_reach_through_a_wall():
     assert trace.failure is FailureReason.NO_LINE_OF_APPROACH
 
 
-def test_a_chest_is_too_large_for_the_gripper():
+def test_chest_is_too_large_for_the_gripper():
     chest = replace(make.block("chest", "chest.n.01", (0.5, 0.5, 0.5), {}), mass_kg=3.0)
     scene = scene_of("chest", [(placed("chest_1", chest, "kitchen_0", upright(1.5, 1.5, 0, chest)), chest)])
     trace = executed_alone(scene, "move chest_1; pick_up chest_1")
@@ -224,20 +224,20 @@ def in_front_of_the_microwave():
     )
 
 
-def test_a_mug_in_front_of_the_microwave_keeps_its_door_shut():
+def test_mug_in_front_of_the_microwave_blocks_its_door():
     trace = executed_alone(in_front_of_the_microwave(), "move microwave_1; open microwave_1")
     assert trace.failure is FailureReason.DOOR_BLOCKED
     assert trace.steps[-1].message == "mug_1 is in the way of the door of microwave_1"
 
 
-def test_a_door_that_is_blocked_stays_as_it_was():
+def test_blocked_door_keeps_its_position():
     simulator = load_simulator(Bundle(in_front_of_the_microwave(), {}))
     executed(simulator, "move microwave_1; open microwave_1")
     assert not simulator.facts.holds("open", ("microwave_1",))
     simulator.close()
 
 
-def test_a_full_bowl_takes_nothing_more(flat):
+def test_full_bowl_takes_nothing_more(flat):
     trace = executed(
         flat,
         "move apple_1; pick_up apple_1; move bowl_1; place bowl_1 inside; move mug_1; pick_up mug_1; "
