@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from embomatrix.sim.engine import FLOOR, WALL, EngineError
 from embomatrix.world.geometry import Shape
-from embomatrix.world.records import MAX_VERTICES
+from embomatrix.world.records import (
+    MAX_COORDINATE_M,
+    MAX_LINKS,
+    MAX_PARTS,
+    MAX_VERTICES,
+    MIN_EXTENT_M,
+    UNIT_TOLERANCE,
+)
 from embomatrix.world.tables import has_volume
 
 if TYPE_CHECKING:
@@ -18,12 +25,6 @@ if TYPE_CHECKING:
     from embomatrix.world.asset import Asset, Joint, Link
     from embomatrix.world.geometry import ConvexPart, Pose
     from embomatrix.world.scene import Scene, SceneObject
-
-PART_LIMIT: Final = 16
-LINK_LIMIT: Final = 100
-MIN_EXTENT_M: Final = 0.001
-WORLD_LIMIT_M: Final = 1e4
-UNIT_TOLERANCE: Final = 1e-4
 
 
 def check_scene(scene: Scene) -> None:
@@ -52,9 +53,9 @@ def check_asset(asset: Asset) -> None:
     pieces = sum(1 + sum(part.shape is Shape.HULL for part in link.parts) for link in asset.links)
     if not asset.links or not asset.links[0].parts or asset.links[0].joint is not None:
         raise EngineError(f"{what} has no base: expected a first link with parts and without a joint")
-    if pieces > LINK_LIMIT:
+    if pieces > MAX_LINKS:
         raise EngineError(
-            f"{what} makes {pieces} bodies: expected at most {LINK_LIMIT}; use fewer hulls or links"
+            f"{what} makes {pieces} bodies: expected at most {MAX_LINKS}; use fewer hulls or links"
         )
     if not (math.isfinite(asset.mass_kg) and asset.mass_kg > 0):
         raise EngineError(f"{what} weighs {asset.mass_kg} kg: expected a positive, finite mass")
@@ -65,10 +66,10 @@ def check_asset(asset: Asset) -> None:
 def check_pose(pose: Pose, what: str) -> None:
     """Raise EngineError unless the position is finite and within the world, and the quaternion has length 1."""
     x, y, z = pose.position_m
-    limit = WORLD_LIMIT_M
+    limit = MAX_COORDINATE_M
     if not (-limit <= x <= limit and -limit <= y <= limit and -limit <= z <= limit):
         raise EngineError(
-            f"{what!r} is at {pose.position_m} m: expected finite coordinates within {WORLD_LIMIT_M:.0f} m"
+            f"{what!r} is at {pose.position_m} m: expected finite coordinates within {MAX_COORDINATE_M:.0f} m"
         )
     length = math.hypot(*pose.quat_xyzw)
     if not abs(length - 1.0) <= UNIT_TOLERANCE:
@@ -93,9 +94,9 @@ def check_fractions(item: SceneObject, asset: Asset, fractions: Sequence[float])
 
 def _check_link(link: Link, what: str, *, moves: bool) -> None:
     plain = sum(part.shape is not Shape.HULL for part in link.parts)
-    if plain > PART_LIMIT:
+    if plain > MAX_PARTS:
         raise EngineError(
-            f"link {link.name!r} of {what} has {plain} parts: expected at most {PART_LIMIT}; merge some or split the link"
+            f"link {link.name!r} of {what} has {plain} parts: expected at most {MAX_PARTS}; merge some or split the link"
         )
     if moves and link.joint is None:
         raise EngineError(
@@ -118,7 +119,7 @@ def _check_joint(joint: Joint, what: str) -> None:
 
 def _check_part(part: ConvexPart, what: str) -> None:
     check_pose(part.pose, what)
-    if not all(MIN_EXTENT_M <= extent <= WORLD_LIMIT_M for extent in part.size_m):
+    if not all(MIN_EXTENT_M <= extent <= MAX_COORDINATE_M for extent in part.size_m):
         raise EngineError(
             f"{what} measures {part.size_m} m: expected extents of {MIN_EXTENT_M} m or more; make it thicker or leave it out"
         )

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.fakes.pose_caches import build_pose_cache
 from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.placing.placement import Placer
-from embomatrix.sim.placing.pose_cache import build_pose_cache
 from embomatrix.sim.placing.trial import in_reach
 from embomatrix.sim.state.relations import Relations
 from embomatrix.skills.failure import FailureReason

@@ -5,6 +5,7 @@ import time
 
 import pytest
 from tests.fakes import furniture as make
+from tests.fakes.pose_caches import build_pose_cache
 from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.bullet.client import ClientPool
@@ -12,7 +13,7 @@ from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.mini_world import MiniWorld, StaticObject
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.candidates import beside, candidates, stands_in
-from embomatrix.sim.placing.pose_cache import POSES, PlacementLibrary, build_pose_cache
+from embomatrix.sim.placing.pose_cache import POSES, PlacementLibrary
 from embomatrix.sim.state.relations import Relations
 from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.poses import PlacementKey

@@ -16,11 +16,20 @@ from hypothesis import strategies as st
 
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.codec import asset_from_json, asset_to_json, scene_from_json, scene_to_json
-from embomatrix.world.codec_task import poses_from_json, poses_to_json, task_from_json, task_to_json
-from embomatrix.world.records import SceneInvalidError
+from embomatrix.world.codec_task import poses_of, poses_to_json, task_of, task_to_json
+from embomatrix.world.poses import PoseCache
+from embomatrix.world.records import PosesJson, SceneInvalidError, TaskJson, convert
 from embomatrix.world.scene import Scene, Window
 from embomatrix.world.tables import Tables, TableWriter
 from embomatrix.world.task import Task
+
+
+def task_from_json(value: object) -> Task:
+    return task_of(convert(value, TaskJson, "task"), "task")
+
+
+def poses_from_json(value: object, tables: Tables) -> PoseCache:
+    return poses_of(convert(value, PosesJson, "poses"), tables)
 
 
 def through_text(value: Any) -> Any:
