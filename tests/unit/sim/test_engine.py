@@ -249,7 +249,10 @@ def test_apple_has_the_same_box_however_it_is_turned() -> None:
     ("call", "words"),
     [
         (lambda e: e.pose("unicorn_1"), "no object 'unicorn_1'"),
-        (lambda e: e.set_pose("apple_1", Pose((math.nan, 0, 0))), "finite coordinates"),
+        (
+            lambda e: e.set_pose("apple_1", Pose((math.nan, 0, 0))),
+            "finite coordinates",
+        ),
         (lambda e: e.set_pose("apple_1", Pose((0, 0, 0), (0, 0, 0, 0))), "quaternion of length"),
         (lambda e: e.set_joints("fridge_1", ()), "expected 1, one for each joint"),
         (lambda e: e.set_joints("fridge_1", (math.nan,)), "from 0 to 1"),
@@ -276,12 +279,18 @@ def _base(*parts: ConvexPart) -> dict[str, object]:
 @pytest.mark.parametrize(
     ("scene", "words"),
     [
-        (_with_asset(**_base(*[make.box((0, 0, 0), (0.1, 0.1, 0.1))] * 17)), "17 parts: expected at most 16"),
-        (_with_asset(**_base(make.box((0, 0, 0), (0.1, 0.0, 0.1)))), "expected extents"),
-        (_with_asset(**_base(make.box((0, 0, math.inf), (0.1, 0.1, 0.1)))), "finite coordinates"),
-        (_with_asset(**_base()), "no base"),
-        (_with_asset(mass_kg=math.nan), "positive, finite mass"),
-        (_with_asset(links=(*make.apple().links, *make.apple().links)), "has no joint"),
+        (_with_asset(**_base(*[make.box((0, 0, 0), (0.1, 0.1, 0.1))] * 17)), "parts: .*length <= 16"),
+        (
+            _with_asset(**_base(make.box((0, 0, 0), (0.1, 0.0, 0.1)))),
+            r"size_m\[1\]: found 0.0: expected `float` > 0.001",
+        ),
+        (
+            _with_asset(**_base(make.box((0, 0, math.inf), (0.1, 0.1, 0.1)))),
+            r"pose\[2\]: found inf: expected `float`",
+        ),
+        (_with_asset(**_base()), "parts: .*length >= 1"),
+        (_with_asset(mass_kg=math.nan), "mass_kg: found nan: expected `float` > 0.0"),
+        (_with_asset(links=(*make.apple().links, *make.apple().links)), "a joint for every other link"),
         (
             _with_asset(
                 links=(

@@ -6,10 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from embomatrix.world.geometry import Pose
-from embomatrix.world.placements import Placements, Stands, flattened
+from embomatrix.world.placements import Placements, flattened
 from embomatrix.world.poses import PlacementKey, StandPose
 from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.state import Relation
+from embomatrix.world.tables import Tables, TableWriter
 
 NAME = st.sampled_from(("apple-aa", "table-bb", "footprint-9x9x12cm", "level-floor"))
 KEY = st.builds(PlacementKey, NAME, NAME, st.sampled_from(Relation))
@@ -62,8 +63,9 @@ def test_duplicate_set_or_asset_is_refused() -> None:
 
 
 def test_standing_poses_come_from_the_rows_of_their_name() -> None:
-    rows = np.array([[1.0, 2.0, 0.5], [3.0, 4.0, -0.5], [5.0, 6.0, 0.0]])
-    stands = Stands({"apple_1": (0, 2), "table_1": (2, 1), "sky_1": (3, 0)}, rows)
+    writer = TableWriter()
+    writer.stands([(1.0, 2.0, 0.5), (3.0, 4.0, -0.5), (5.0, 6.0, 0.0)])
+    stands = Tables(writer.arrays()).stands({"apple_1": (0, 2), "table_1": (2, 1), "sky_1": (3, 0)})
     assert stands == {
         "apple_1": (StandPose(1.0, 2.0, 0.5), StandPose(3.0, 4.0, -0.5)),
         "table_1": (StandPose(5.0, 6.0, 0.0),),
