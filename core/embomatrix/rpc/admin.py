@@ -9,11 +9,11 @@ from embomatrix.rpc.fleet_client import FleetClient
 from embomatrix.rpc.managers import of_the_leader
 from embomatrix.rpc.status import cluster_errors
 from embomatrix.rpc.wire.rollout import each, inside
-from embomatrix.rpc.wire.run_log import event_page_from_proto, run_summary_from_proto
+from embomatrix.rpc.wire.run_log import event_page_from_proto, explanation_from_proto, run_summary_from_proto
 from embomatrix.rpc.wire.session import plan_cell_from_proto
 
 if TYPE_CHECKING:
-    from embomatrix.rpc.run_log import EventPage, RunEvent, RunSummary
+    from embomatrix.rpc.run_log import EventPage, RolloutExplanation, RunEvent, RunSummary
     from embomatrix.rpc.wire.values import PlanCell
 
 
@@ -34,6 +34,14 @@ class AdminClient(FleetClient):
         with cluster_errors(self._address):
             answer = await self._admin.ReadEvents(request, timeout=self._call_s)
             return inside("page", event_page_from_proto, answer)
+
+    @of_the_leader
+    async def explain(self, rollout_id: str) -> RolloutExplanation:
+        """Return the recent history of a rollout. Raises NotFoundError."""
+        request = pb.ExplainRolloutRequest(rollout_id=rollout_id)
+        with cluster_errors(self._address):
+            answer = await self._admin.ExplainRollout(request, timeout=self._call_s)
+            return inside("explanation", explanation_from_proto, answer)
 
     async def all_events(self, run_id: str = "") -> tuple[RunEvent, ...]:
         """The whole log, as it is by now."""

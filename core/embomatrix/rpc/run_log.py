@@ -110,6 +110,40 @@ class RunSummary:
     version: str
 
 
+class RolloutStepKind(StrEnum):
+    """Kinds of steps in the history of a rollout."""
+
+    SUBMITTED = "submitted"
+    QUEUED = "queued"
+    LEASED = "leased"
+    HEDGED = "hedged"
+    REVOKED = "revoked"
+    EXPIRED = "expired"
+    RETURNED = "returned"
+    HELD = "held"
+    DELIVERED = "delivered"
+
+
+class RolloutStep(NamedTuple):
+    """One step in the history of a rollout. ``cause`` names the event that led to it."""
+
+    at_s: float
+    kind: RolloutStepKind
+    run_id: str
+    batch_id: str
+    worker_id: str
+    reason: str
+    cause: str
+
+
+@dataclass(frozen=True, slots=True)
+class RolloutExplanation:
+    """Recent history of a rollout. ``place`` is empty once it has its outcome."""
+
+    steps: tuple[RolloutStep, ...]
+    place: str
+
+
 @dataclass(frozen=True, slots=True)
 class EventPage:
     """Events in order. ``dropped`` of the log so far made room for later ones."""

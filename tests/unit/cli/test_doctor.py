@@ -5,13 +5,22 @@ import asyncio
 import pytest
 from tests.integration.test_manager_service import manager as a_manager
 
-from embomatrix.cli.doctor.findings import Finding, Level, verdict
-from embomatrix.cli.doctor.machine import NEEDED, disk, machine, memory, parts, port, python
+from embomatrix.cli.doctor.machine import (
+    NEEDED,
+    Finding,
+    Level,
+    disk,
+    machine,
+    memory,
+    parts,
+    port,
+    python,
+    verdict,
+)
 from embomatrix.cli.doctor.manager import (
     Visit,
     certificate,
     clock,
-    cluster,
     manager,
     mistrust,
     ports_held,
@@ -21,7 +30,6 @@ from embomatrix.manager.access.folder import prepare
 from embomatrix.rpc.admin import AdminClient
 from embomatrix.rpc.capabilities import Capabilities
 from embomatrix.rpc.versions import PROTOCOL_VERSION, VersionRange
-from embomatrix.rpc.wire.values import FleetStatus
 
 
 def levels(findings):
@@ -120,7 +128,6 @@ async def test_a_cluster_that_stands_still_is_worth_a_look_and_no_fault_of_this_
         found = await manager(Visit(endpoints.address, page_port=1))
     assert levels(found)["cluster"] is Level.NOTE
     assert "Dispatch is paused" in next(f.found for f in found if f.thing == "cluster")
-    assert cluster(FleetStatus(())) == [], "a manager of an earlier release says nothing of it"
 
 
 async def test_a_port_of_another_kind_is_told_once(tmp_path):

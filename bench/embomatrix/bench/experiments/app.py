@@ -29,7 +29,7 @@ from embomatrix.bench.experiments.design import (
 from embomatrix.bench.experiments.findings import Run, figures_of, findings_of
 from embomatrix.bench.experiments.section import add_section, learning_section
 from embomatrix.cli.failure import fail
-from embomatrix.cli.foreground import no_problem, run_command
+from embomatrix.cli.local_cluster import no_problem, run_command
 from embomatrix.host.cores import usable_cores
 from embomatrix.pages.figures import figure_to_json, shown
 from embomatrix.trainer.logging.recorder import read_metrics

@@ -9,7 +9,10 @@ from embomatrix.rpc.run_log import (
     EventKind,
     EventPage,
     PhaseSummary,
+    RolloutExplanation,
     RolloutPhase,
+    RolloutStep,
+    RolloutStepKind,
     RunEvent,
     RunSeries,
     RunSummary,
@@ -52,6 +55,25 @@ def event_page_to_proto(page: EventPage) -> pb.ReadEventsResponse:
 
 def event_page_from_proto(message: pb.ReadEventsResponse) -> EventPage:
     return EventPage(each("events", run_event_from_proto, message.events), message.dropped)
+
+
+def explanation_to_proto(found: RolloutExplanation) -> pb.ExplainRolloutResponse:
+    steps = (pb.RolloutStep(**step._asdict()) for step in found.steps)
+    return pb.ExplainRolloutResponse(steps=steps, place=found.place)
+
+
+def explanation_from_proto(message: pb.ExplainRolloutResponse) -> RolloutExplanation:
+    return RolloutExplanation(each("steps", _rollout_step_from_proto, message.steps), message.place)
+
+
+def _rollout_step_from_proto(message: pb.RolloutStep) -> RolloutStep:
+    finite("at_s", message.at_s)
+    try:
+        kind = RolloutStepKind(message.kind)
+    except ValueError as error:
+        raise ConvertError("kind", f"{message.kind!r} is no known step: upgrade this side") from error
+    texts = (message.run_id, message.batch_id, message.worker_id, message.reason, message.cause)
+    return RolloutStep(message.at_s, kind, *texts)
 
 
 def run_summary_to_proto(summary: RunSummary) -> pb.GetRunResponse:

@@ -1,4 +1,4 @@
-"""`embomatrix manager`: serve a Simulation Manager, or ask one how it does."""
+"""`embomatrix manager`: serve a Simulation Manager, and manage its tokens."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from embomatrix.rpc.roles import AccessRole
 
 app = typer.Typer(
-    help="Serve a Simulation Manager, or ask one how the cluster does.",
+    help="Serve a Simulation Manager, and manage its tokens.",
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -27,16 +27,6 @@ app.add_typer(token_app, name="token")
 
 Token = Annotated[
     str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="A token, or @FILE that holds it.", show_default=False)
-]
-Manager = Annotated[
-    str,
-    typer.Option("--manager", "--address", help="HOST:PORT of the manager.", envvar="EMBOMATRIX_MANAGER"),
-]
-Ca = Annotated[
-    Path | None,
-    typer.Option(
-        envvar="EMBOMATRIX_CA", help="The ca.pem of a manager that serves by TLS.", show_default=False
-    ),
 ]
 DataDir = Annotated[Path | None, typer.Option(help="Folder of bundles and state.", show_default=False)]
 ShownDataset = Annotated[
@@ -94,7 +84,10 @@ def serve(
     tls_ca: TlsCa = None,
     insecure_bind: InsecureBind = False,
     audit: Audit = None,
-    log_level: Annotated[str, typer.Option(help="debug, info, warning or error.")] = "info",
+    log_level: Annotated[
+        str,
+        typer.Option(help="debug, info, warning or error; debug also checks invariants."),
+    ] = "info",
     log_format: LogLines = LogFormat.HUMAN,
 ) -> None:
     """Serve until interrupted."""
@@ -118,21 +111,6 @@ def serve(
     settings = _settings(options)
     hide(settings.token)
     _serve(settings)
-
-
-@app.command()
-def status(manager: Manager = "127.0.0.1:50070", token: Token = "", ca: Ca = None) -> None:
-    """Show workers and runs of a manager."""
-    import asyncio
-
-    from embomatrix.manager.services.status_table import show_status
-    from embomatrix.rpc.status import ClusterError
-    from embomatrix.rpc.trust import read_ca
-
-    try:
-        asyncio.run(show_status(manager, _token(token), read_ca(ca)))
-    except ClusterError as error:
-        _refuse(str(error))
 
 
 @app.command()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from embomatrix.manager.observe.chronicle import PAGE
 from embomatrix.manager.observe.run_figures import summary_of
-from embomatrix.rpc.run_log import EventPage, RunSummary
+from embomatrix.rpc.run_log import EventPage, RolloutExplanation, RunSummary
 from embomatrix.rpc.status import NotFoundError
 from embomatrix.rpc.wire.values import RunInfo
 
@@ -89,6 +89,17 @@ class RunHistory:
         summary, events = kept
         beyond = [event for event in events if event.sequence > after]
         return EventPage(tuple(beyond[:limit]), summary.events_dropped)
+
+    def explain(self, rollout_id: str) -> RolloutExplanation:
+        """Return the recent decisions about a rollout. Raises ``NotFoundError``."""
+        steps, place = self._cluster.explain(rollout_id)
+        if not steps and not place:
+            raise NotFoundError(
+                f"there is no trace of rollout {rollout_id!r}: this manager never had it, or its history made room for "
+                "later ones; `embomatrix cluster events RUN` may still have its events"
+            )
+        epoch_s = self._chronicle.epoch_s
+        return RolloutExplanation(tuple(s._replace(at_s=epoch_s + s.at_s) for s in steps), place)
 
     async def latest(self, run_id: str, seconds: float) -> EventPage:
         """The last of a run's log: events of so many seconds before its last. Raises ``NotFoundError``."""

@@ -10,7 +10,7 @@ from embomatrix.manager.web.health import health
 from embomatrix.manager.web.views import overview, plan, run_infos, worker_infos
 from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.rpc.status import translate
-from embomatrix.rpc.wire.run_log import event_page_to_proto, run_summary_to_proto
+from embomatrix.rpc.wire.run_log import event_page_to_proto, explanation_to_proto, run_summary_to_proto
 from embomatrix.rpc.wire.session import plan_cell_to_proto, run_info_to_proto, worker_info_to_proto
 
 if TYPE_CHECKING:
@@ -53,6 +53,13 @@ class AdminServicer(TokenMethods):
         async with translate(context):
             page = await self._runtime.history.events(request.run_id, request.after, request.limit)
         return event_page_to_proto(page)
+
+    async def ExplainRollout(
+        self, request: pb.ExplainRolloutRequest, context: grpc.aio.ServicerContext
+    ) -> pb.ExplainRolloutResponse:
+        async with translate(context):
+            found = self._runtime.history.explain(request.rollout_id)
+        return explanation_to_proto(found)
 
     async def DrainWorker(
         self, request: pb.DrainWorkerRequest, context: grpc.aio.ServicerContext
