@@ -1,37 +1,21 @@
-"""`embomatrix bench`: measure this machine, write figures as JSON, show them as a table, render the page."""
+"""`embomatrix bench`: measure this machine, print the figures, write them as JSON and render the page of benchmarks."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from embomatrix.bench.cluster.cli import (
-    DATASET,
-    ENGINE_DATASET,
-    LIMIT_S,
-    NAIVE,
-    DataSet,
-    EngineDataSet,
-    Json,
-    LimitS,
-    Naive,
-    Parts,
-    Work,
-    cluster,
-    cluster_job,
-    measure_cluster,
-)
-from embomatrix.bench.cluster.overhead import ClusterLoad
-from embomatrix.bench.engine.engine import bench_engine, check_scenes
-from embomatrix.bench.engine.rollout import bench_rollout
-from embomatrix.bench.engine.scenes import scenes_of
-from embomatrix.bench.engine.workload import PINNED, SIZES, read_workload, workload_to_text, write_workload
-from embomatrix.bench.fidelity.page import figures_of, read_disagreement, skill_table
-from embomatrix.bench.fidelity.page import replay as replayed
+from embomatrix.bench.cluster.ablation import AblationSizes, bench_ablation
+from embomatrix.bench.cluster.flow import FlowSizes, bench_flow
+from embomatrix.bench.cluster.prewarm import PrewarmSizes, bench_prewarm
+from embomatrix.bench.engine.engine import bench_engine
+from embomatrix.bench.engine.plan_writer import save_workload, write_workload
+from embomatrix.bench.engine.workload import PINNED, SIZES, load_workload
+from embomatrix.bench.fidelity.page import figures_of, read_disagreement, replay_trial
 from embomatrix.bench.fidelity.pool import Modes
 from embomatrix.bench.fidelity.suite import (
     DISAGREEMENTS_FILE,
@@ -40,233 +24,351 @@ from embomatrix.bench.fidelity.suite import (
     SuiteProgress,
     run_fidelity,
 )
-from embomatrix.bench.operations.cli import operations
+from embomatrix.bench.peers.contest import PeerSizes, PeerSystem, bench_peers
 from embomatrix.bench.report.figures import (
     BenchResult,
     commit_here,
     describe_machine,
-    figure_in,
-    put_together,
+    merge_parts,
     read_result,
 )
 from embomatrix.bench.report.output import console, errors, hand_in, refusals, write
-from embomatrix.bench.report.page import hand_parts, render_page
-from embomatrix.bench.trainer.cli import trainer
-from embomatrix.sim.fidelity.report import report_on
+from embomatrix.bench.report.page import check_page, render_page
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.dataset import Dataset
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
+
+    from embomatrix.bench.engine.workload import Workload
+    from embomatrix.pages.figures import Figure
+
+    OnStep = Callable[[str], None]
 
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Measure the engine, rollouts and the cluster on this machine.",
+    help="Measure the engine, the cluster, the trainer and operations on this machine.",
 )
-Scenes = Annotated[int, typer.Option(min=1, help="Scenes to measure in.")]
-Repeats = Annotated[int, typer.Option(min=1, help="Executions of each plan.")]
-Page = Annotated[Path, typer.Option(help="Page to write; parts written by hand are kept.")]
-Cycles = Annotated[int, typer.Option(min=80, help="Cycles of loading and resetting, to see growth.")]
 
-FIDELITY_DATASET = Path("build/scenes")
-FIDELITY_OUT = Path("build/fidelity")
+
+class ClusterPart(StrEnum):
+    """Parts of the cluster's benchmark, in the order of the page."""
+
+    ABLATION = "ablation"
+    FLOW = "flow"
+    PREWARM = "prewarm"
+    PEERS = "peers"
+
+
+class TrainerPart(StrEnum):
+    """Parts of the trainer's benchmark."""
+
+    STEP = "step"
+    RUN = "run"
+    EVAL = "eval"
+
+
+class OperationsPart(StrEnum):
+    """Parts of the benchmark of operations."""
+
+    IMAGES = "images"
+    COMPOSE = "compose"
+    JOIN = "join"
+    DASHBOARD = "dashboard"
+
+
+PINNED_HELP = "Dataset with a workload; by default the small one that the package ships."
+DataSet = Annotated[Path, typer.Option("--dataset", help=PINNED_HELP, show_default=False)]
+Json = Annotated[Path | None, typer.Option("--json", help="File for the figures.")]
+PageFile = Annotated[Path, typer.Option(help="Page to update; text between its tables is kept.")]
+Cycles = Annotated[int, typer.Option(min=80, help="Cycles of loading and resetting that show memory growth.")]
+LimitS = Annotated[
+    float, typer.Option(min=5.0, help="Seconds for one cluster, from its first process to its last result.")
+]
+Parts = Annotated[
+    list[ClusterPart] | None, typer.Option("--part", help="Part to measure; repeatable. [default: all]")
+]
+Naive = Annotated[int, typer.Option(min=1, help="Rollouts of the ablation's first row; each takes seconds.")]
 PAGE = Path("docs/benchmarks.md")
-SPEEDUP = "skill_speedup_min"
+FULL_SUITE = Path("build/scenes")
 MODES = Modes(cached=load_simulator, physical=physical_simulator)
-
-app.command()(cluster)
-app.command()(operations)
-app.command()(trainer)
+QUICK = FidelitySettings(plans=24, calls=0, seed=0)
 
 
 @app.command()
-def rollout(
-    dataset: DataSet = DATASET, json_file: Json = None, scenes: Scenes = 24, repeats: Repeats = 3
-) -> None:
-    """Measure loading, skills, rollouts, reset and reward in one process."""
+def engine(dataset: DataSet = PINNED, json_file: Json = None, cycles: Cycles = 2000) -> None:
+    """Measure loading, executing and resetting on one core."""
     with refusals():
-        hand_in(_rollout(dataset, scenes, repeats), json_file)
+        hand_in(_engine(load_workload(dataset), cycles), json_file)
 
 
 @app.command()
-def engine(
-    dataset: DataSet = ENGINE_DATASET,
-    workload: Work = PINNED,
+def cluster(
+    dataset: DataSet = PINNED,
     json_file: Json = None,
-    cycles: Cycles = 2000,
-    fidelity: Annotated[
+    part: Parts = None,
+    naive: Naive = 16,
+    peer: Annotated[
+        list[PeerSystem] | None, typer.Option("--peer", help="Peer to measure; repeatable. [default: all]")
+    ] = None,
+    limit_s: LimitS = 120.0,
+) -> None:
+    """Measure the paper's ablation, the manager under load, look-ahead, and other libraries on the same work."""
+    with refusals():
+        peers = PeerSizes(peers=tuple(peer or PeerSystem))
+        hand_in(_cluster(load_workload(dataset), part, naive, limit_s, peers), json_file)
+
+
+@app.command()
+def simulation(
+    json_file: Json = None,
+    most_workers: Annotated[
+        int, typer.Option(min=10, max=100_000, help="Workers of the largest simulated cluster.")
+    ] = 10_000,
+) -> None:
+    """Measure the manager's decisions in simulated clusters; needs no dataset and starts no process."""
+    from embomatrix.bench.cluster.simulated import SimulationBench
+
+    def measure(on_step: OnStep) -> Sequence[Figure]:
+        return list(SimulationBench(on_step).figures(most_workers))
+
+    with refusals():
+        hand_in(_measured("simulation", measure, most_workers=most_workers), json_file)
+
+
+@app.command()
+def trainer(
+    dataset: DataSet = PINNED,
+    json_file: Json = None,
+    trl: Annotated[
         Path | None,
-        typer.Option(help="Figures that `bench fidelity` wrote: skill_speedup_min is taken from there."),
+        typer.Option(
+            help="Python of an environment with TRL, to compare with: `python3.11 -m venv trl && trl/bin/pip install "
+            "trl==1.16.0`.",
+            envvar="EMBOMATRIX_TRL",
+        ),
+    ] = None,
+    part: Annotated[
+        list[TrainerPart] | None, typer.Option("--part", help="Part to measure; repeatable. [default: all]")
     ] = None,
 ) -> None:
-    """Measure the engine on one core with a pinned workload in furnished scenes."""
+    """Measure a GRPO step, the time shares of a short run, and an evaluation of stored answers."""
+    from embomatrix.bench.trainer.measure import bench_trainer
+
+    parts = tuple(part or TrainerPart)
     with refusals():
-        speedup = (figure_in(fidelity, SPEEDUP),) if fidelity is not None else ()
-        result = _engine(dataset, workload, cycles)
-        hand_in(replace(result, figures=(*result.figures, *speedup)), json_file)
+        hand_in(_measured("trainer", lambda step: bench_trainer(dataset, trl, parts, step)), json_file)
+
+
+@app.command()
+def operations(
+    dataset: DataSet = PINNED,
+    json_file: Json = None,
+    part: Annotated[
+        list[OperationsPart] | None,
+        typer.Option("--part", help="Part to measure; repeatable. [default: all]"),
+    ] = None,
+    checkout: Annotated[Path, typer.Option(help="Folder of the compose file.")] = Path(),
+) -> None:
+    """Measure image sizes, `docker compose up` to its first rollout, joining, and the dashboard.
+
+    Parts that need Docker or Chromium are left out with a note if these are missing.
+    """
+    parts = tuple(part or OperationsPart)
+    with refusals():
+        workload = load_workload(dataset)
+        result = _measured("operations", lambda step: _operations(workload, checkout, parts, step))
+        hand_in(result, json_file)
 
 
 @app.command()
 def fidelity(
-    dataset: DataSet = FIDELITY_DATASET,
+    dataset: Annotated[
+        Path | None,
+        typer.Option(help=f"Dataset. [default: {FULL_SUITE}; with --quick the one that the package ships]"),
+    ] = None,
     json_file: Json = None,
-    out: Annotated[Path, typer.Option(help="Folder for plans, results and disagreements.")] = FIDELITY_OUT,
-    jobs: Annotated[
-        int, typer.Option(min=0, max=64, help="Processes; with 0 the results so far are summed up.")
-    ] = 2,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder for plans, results and disagreements. [default: build/fidelity]"),
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=0, max=64, help="Processes; 0 sums up the results so far.")] = 2,
     plans: Annotated[int, typer.Option(min=1, help="Plans at least.")] = 1_000,
     calls: Annotated[int, typer.Option(min=0, help="Calls of every skill at least.")] = 200,
     seed: Annotated[int, typer.Option(min=0, help="Equal seeds and datasets give equal plans.")] = 0,
+    quick: Annotated[
+        bool,
+        typer.Option("--quick", help=f"Run {QUICK.plans} plans: a check that takes minutes, not a result."),
+    ] = False,
     replay: Annotated[
-        str, typer.Option(help="FILE:N, a line of the disagreements, to see step by step.")
+        str, typer.Option(help="FILE:N, a line of the disagreements, to be shown step by step.")
     ] = "",
 ) -> None:
-    """Run the same plans in both execution modes and tell how far they agree; goes on where it was cut short."""
+    """Run the same plans in cached and in physical mode and compare; resumes an interrupted suite."""
     with refusals():
+        found = Dataset.load(dataset or (PINNED if quick else FULL_SUITE))
         if replay:
-            for line in replayed(Dataset.load(dataset), read_disagreement(replay), MODES):
+            for line in replay_trial(found, read_disagreement(replay), MODES):
                 console.print(line, highlight=False, markup=False, soft_wrap=True)
             return
-        settings = FidelitySettings(plans, calls, seed)
-        hand_in(_fidelity(Dataset.load(dataset), settings, out, jobs), json_file)
+        settings = QUICK if quick else FidelitySettings(plans, calls, seed)
+        folder = out or Path("build/fidelity-quick" if quick else "build/fidelity")
+        hand_in(_fidelity(found, settings, folder, jobs), json_file)
 
 
 @app.command()
 def workload(
-    dataset: DataSet = ENGINE_DATASET,
-    out: Annotated[Path, typer.Option(help="File to write.")] = PINNED,
+    dataset: Annotated[Path, typer.Option(help="Folder that `embomatrix factory build` wrote.")],
+    out: Annotated[Path | None, typer.Option(help="Folder to write to. [default: the dataset's]")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Equal seeds and datasets give equal files.")] = 0,
     bodies: Annotated[
         int, typer.Option(help=f"Main size of scenes: one of {', '.join(map(str, SIZES))}.")
     ] = 300,
-    scenes: Annotated[int, typer.Option(min=1, help="Scenes of the main size.")] = 8,
+    scenes: Annotated[int, typer.Option(min=1, help="Scenes of the main size.")] = 4,
     plans: Annotated[int, typer.Option(min=1, help="Plans for each scene, all different.")] = 50,
 ) -> None:
-    """Write the plans that `bench engine` executes: after a change of scenes, their digests are no longer the same."""
+    """Write the plans that benchmarks execute in a dataset's scenes."""
     if bodies not in SIZES:
         raise typer.BadParameter(f"found {bodies}: expected one of {', '.join(map(str, SIZES))}")
     with refusals(), errors.status("reading the dataset") as status:
+        found = Dataset.load(dataset)
+
+        def on_scene(scene_id: str) -> None:
+            status.update(f"writing plans for {scene_id}")
+
         written = write_workload(
-            Dataset.load(dataset),
-            seed=seed,
-            bodies=bodies,
-            scenes=scenes,
-            plans=plans,
-            on_scene=lambda scene_id: status.update(f"writing plans for {scene_id}"),
+            found, seed=seed, bodies=bodies, scenes=scenes, plans=plans, on_scene=on_scene
         )
-        write(out, workload_to_text(written))
-    count = sum(len(scene.executions) for scene in written.scenes)
-    console.print(f"wrote {count} plans in {len(written.scenes)} scenes to {out}", highlight=False)
+        save_workload(found, written, out or dataset)
+    count = len(written.rollouts)
+    console.print(f"wrote {count} plans in {len(written.scenes)} scenes to {out or dataset}", highlight=False)
 
 
 @app.command(name="all")
 def everything(
-    dataset: DataSet = DATASET,
-    out: Page = PAGE,
-    json_dir: Annotated[Path | None, typer.Option(help="Folder for one JSON file for each bench.")] = None,
-    limit_s: LimitS = LIMIT_S,
+    dataset: DataSet = PINNED,
+    out: PageFile = PAGE,
+    json_dir: Annotated[Path | None, typer.Option(help="Folder for one JSON file of each benchmark.")] = None,
+    limit_s: LimitS = 120.0,
     part: Parts = None,
-    naive: Naive = NAIVE,
-    engine_dataset: EngineDataSet = ENGINE_DATASET,
-    workload: Work = PINNED,
+    naive: Naive = 16,
     cycles: Cycles = 2000,
-    fidelity: Annotated[
-        Path | None, typer.Option(help="Figures that `bench fidelity` wrote, to go on the page.")
-    ] = None,
 ) -> None:
-    """Run every bench but that of fidelity, which takes its time, and render the page."""
+    """Measure engine and cluster, and render the page."""
     with refusals():
-        # What can't be read or replaced is refused before minutes are spent.
-        hand_parts(_present(out))
-        check_scenes(Dataset.load(engine_dataset), read_workload(workload))
-        job = cluster_job(dataset, engine_dataset, workload, part, naive, ClusterLoad(limit_s=limit_s))
-        agreement = [read_result(fidelity)] if fidelity is not None else []
-        results = [
-            _engine(engine_dataset, workload, cycles),
-            _rollout(dataset, scenes=24, repeats=3),
-            measure_cluster(job),
-        ]
-        results = _with_speedup([*results, *agreement])
+        # A page that can't be updated is refused before minutes are spent.
+        check_page(_text_of(out))
+        found = load_workload(dataset)
+        results = [_engine(found, cycles), _cluster(found, part, naive, limit_s, PeerSizes())]
         for result in results:
             hand_in(result, json_dir / f"{result.bench}.json" if json_dir is not None else None)
-        write(out, render_page(results, _present(out)))
+        write(out, render_page(results, _text_of(out)))
         console.print(f"wrote {out}", highlight=False)
 
 
 @app.command()
 def page(
-    files: Annotated[list[Path], typer.Argument(help="Figures that benches wrote with --json.")],
-    out: Page = PAGE,
+    files: Annotated[list[Path], typer.Argument(help="Files that benchmarks wrote with --json.")],
+    out: PageFile = PAGE,
 ) -> None:
-    """Render the page of figures that were measured before."""
+    """Render the page from figures that were measured before."""
     with refusals():
-        results = _with_speedup(put_together([read_result(file) for file in files]))
-        write(out, render_page(results, _present(out)))
+        results = merge_parts([read_result(file) for file in files])
+        write(out, render_page(results, _text_of(out)))
         console.print(f"wrote {out}", highlight=False)
 
 
-def _with_speedup(results: Sequence[BenchResult]) -> list[BenchResult]:
-    """The engine's result with the least speed-up of a skill, where fidelity was measured."""
-    speedup = tuple(
-        figure
-        for result in results
-        if result.bench == "fidelity"
-        for figure in result.figures
-        if figure.name == SPEEDUP
+def _measured(bench: str, measure: Callable[[OnStep], Sequence[Figure]], **machine: Any) -> BenchResult:
+    """Measure with progress on the terminal."""
+    found = describe_machine() | machine
+    with errors.status(bench) as status:
+        figures = measure(lambda step: status.update(f"{bench}: {step}"))
+    return BenchResult(bench, commit_here(), found, tuple(figures))
+
+
+def _engine(found: Workload, cycles: int) -> BenchResult:
+    return _measured("engine", lambda on_step: bench_engine(found, cycles, on_step))
+
+
+def _cluster(
+    found: Workload, parts: list[ClusterPart] | None, naive: int, limit_s: float, peers: PeerSizes
+) -> BenchResult:
+    def measure(on_step: OnStep) -> list[Figure]:
+        measures: dict[ClusterPart, Callable[[], Sequence[Figure]]] = {
+            ClusterPart.ABLATION: lambda: bench_ablation(
+                found.main, AblationSizes(naive=naive, limit_s=limit_s), on_step
+            ),
+            ClusterPart.FLOW: lambda: bench_flow(found.main, FlowSizes(limit_s=limit_s), on_step),
+            ClusterPart.PREWARM: lambda: bench_prewarm(found, PrewarmSizes(limit_s=limit_s), on_step),
+            ClusterPart.PEERS: lambda: bench_peers(found.main, peers, on_step),
+        }
+        return [
+            figure for part in ClusterPart if part in (parts or ClusterPart) for figure in measures[part]()
+        ]
+
+    return _measured("cluster", measure)
+
+
+def _operations(
+    found: Workload, checkout: Path, parts: Sequence[OperationsPart], on_step: OnStep
+) -> list[Figure]:
+    from embomatrix.bench.operations.compose import (
+        compose_at,
+        image_sizes,
+        measure_first_rollout,
+        missing_images,
     )
-    return [
-        replace(result, figures=(*(f for f in result.figures if f.name != SPEEDUP), *speedup))
-        if result.bench == "engine" and speedup
-        else result
-        for result in results
-    ]
+    from embomatrix.bench.operations.dashboard import browser_path, measure_dashboard
+    from embomatrix.bench.operations.joining import measure_joining
 
-
-def _engine(dataset: Path, workload: Path, cycles: int) -> BenchResult:
-    machine = describe_machine()
-    found, work = Dataset.load(dataset), read_workload(workload)
-    with errors.status("engine") as status:
-
-        def on_step(what: str) -> None:
-            status.update(f"engine: {what}")
-
-        return BenchResult("engine", commit_here(), machine, bench_engine(found, work, cycles, on_step))
-
-
-def _rollout(dataset: Path, scenes: int, repeats: int) -> BenchResult:
-    machine = describe_machine()
-    chosen = scenes_of(Dataset.load(dataset), scenes)
-    with errors.status("one process") as status:
-
-        def on_scene(number: int) -> None:
-            status.update(f"one process: {number} of {len(chosen)} scenes")
-
-        return BenchResult("rollout", commit_here(), machine, bench_rollout(chosen, repeats, on_scene))
+    figures: list[Figure] = []
+    if {OperationsPart.IMAGES, OperationsPart.COMPOSE} & set(parts):
+        compose = compose_at(checkout)
+        if compose is None:
+            _note("images and compose are left out: they need a Docker engine and a checkout (--checkout)")
+        elif missing := missing_images():
+            _note(
+                f"images and compose are left out: build {' and '.join(missing)} with `docker compose build`"
+            )
+        else:
+            figures += image_sizes() if OperationsPart.IMAGES in parts else ()
+            if OperationsPart.COMPOSE in parts:
+                figures += measure_first_rollout(compose, found, on_step)
+    if OperationsPart.JOIN in parts:
+        figures += measure_joining(on_step)
+    if OperationsPart.DASHBOARD in parts:
+        if browser_path() is None:
+            _note("dashboard_paint_s is left out: it needs Chromium and `pip install 'embomatrix[bench]'`")
+        figures += measure_dashboard(on_step)
+    return figures
 
 
 def _fidelity(dataset: Dataset, settings: FidelitySettings, out: Path, jobs: int) -> BenchResult:
-    machine = describe_machine() | {"jobs": jobs, "plans_asked": settings.plans, "seed": settings.seed}
     started_s = time.monotonic()
     fresh = not (out / RESULTS_FILE).exists()
-    with errors.status("fidelity") as status:
+
+    def measure(on_step: OnStep) -> tuple[Figure, ...]:
         progress = SuiteProgress(
-            written=lambda done, of: status.update(f"fidelity: plans for {done} of {of} scenes"),
-            executed=lambda done, of: status.update(f"fidelity: {done} of {of} plans in both modes"),
+            written=lambda done, of: on_step(f"plans for {done} of {of} scenes"),
+            executed=lambda done, of: on_step(f"{done} of {of} plans in both modes"),
         )
         outcome = run_fidelity(dataset, settings, out, jobs, MODES, progress)
-    minutes = (time.monotonic() - started_s) / 60 if fresh else None
-    console.print(skill_table(report_on(outcome.comparisons)))
-    for sentence in outcome.lost:
-        errors.print(f"lost: {sentence}", highlight=False, markup=False)
-    console.print(
-        f"disagreements: {out / DISAGREEMENTS_FILE}; see one with --replay {out / DISAGREEMENTS_FILE}:1",
-        highlight=False,
-    )
-    return BenchResult("fidelity", commit_here(), machine, figures_of(outcome, minutes))
+        for sentence in outcome.lost:
+            _note(f"lost: {sentence}")
+        return figures_of(outcome, (time.monotonic() - started_s) / 60 if fresh else None)
+
+    result = _measured("fidelity", measure, jobs=jobs, plans_asked=settings.plans, seed=settings.seed)
+    path = out / DISAGREEMENTS_FILE
+    console.print(f"disagreements: {path}; show the first with --replay {path}:1", highlight=False)
+    return result
 
 
-def _present(page: Path) -> str:
+def _note(text: str) -> None:
+    errors.print(text, highlight=False, markup=False)
+
+
+def _text_of(page: Path) -> str:
     return page.read_text(encoding="utf-8") if page.exists() else ""

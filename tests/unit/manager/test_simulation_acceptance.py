@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from embomatrix.bench.cluster.simulated_sweeps import in_flight
+from embomatrix.bench.cluster.simulated import in_flight
 from embomatrix.manager.simulation.run import ClusterSimulation, simulate
 from embomatrix.manager.simulation.scenario import (
     LOCAL,

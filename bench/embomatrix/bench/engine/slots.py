@@ -1,4 +1,4 @@
-"""What a scene costs in the worker's own processes: loading it in a fork of the root, forking slots, their memory."""
+"""Cost of a scene in the worker's own processes: loading it in a fork of the root, forking slots, private memory."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ if TYPE_CHECKING:
     from embomatrix.worker.slots.processes import Child, Root
 
 LOADS: Final = 3
-"""Loads of each scene, in a new process each."""
+"""Loads of each scene, each in a new process."""
 RESPAWNS: Final = 8
 WAIT_S: Final = 0.3
-"""A scene that is announced waits for its first rollout, and makes meanwhile what that will need."""
+"""Time for a scene to complete its deferred work, as an announced scene has before its first rollout."""
 ANSWER_S: Final = 60.0
 
 
 @dataclass(frozen=True, slots=True)
 class SlotSample:
-    """Single measurements in processes: seconds of CPU, seconds on the clock for respawns, MB."""
+    """Single measurements in processes: CPU seconds of loads and rollouts, wall seconds of respawns, memory in MB."""
 
     load_s: list[float] = field(default_factory=list)
     execute_s: list[float] = field(default_factory=list)
     respawn_s: list[float] = field(default_factory=list)
-    """From the order to kill a slot to the first answer of the next one, which executed an empty plan."""
+    """Time from the order to kill a slot to the first answer of the next slot, which executed an empty plan."""
     private_mb: list[float] = field(default_factory=list)
-    """What a slot holds for itself when it waits, after it has executed every plan of its scene."""
+    """Private memory of an idle slot that has executed every plan of its scene."""
 
 
 def measure_slots(scenes: Sequence[tuple[SceneWork, bytes]]) -> SlotSample:
-    """Load the scenes and execute their plans as a worker does. Raises BenchError when a process fails."""
+    """Load the scenes and execute their plans as a worker does. Raises BenchError if a process fails."""
     sample = SlotSample()
     with tempfile.TemporaryDirectory(prefix="embomatrix-bench-") as folder:
         try:
@@ -70,11 +70,8 @@ async def _measure(scenes: Sequence[tuple[SceneWork, bytes]], folder: Path, samp
 
 async def _load(root: Root, scene: SceneWork, path: Path, sample: SlotSample) -> Child:
     child = await root.fork()
-    request = {
-        "path": str(path),
-        "digest": scene.bundle_digest,
-        "slot_memory_mb": SlotLimits(1, 0).slot_memory_mb,
-    }
+    memory_mb = SlotLimits(1, 0).slot_memory_mb
+    request = {"path": str(path), "digest": scene.bundle_digest, "slot_memory_mb": memory_mb}
     answer = await _ask(child, PipeMessage(request))
     sample.load_s.append(float(answer.header["cpu_s"]))
     return child
@@ -83,22 +80,18 @@ async def _load(root: Root, scene: SceneWork, path: Path, sample: SlotSample) ->
 async def _execute(child: Child, scene: SceneWork, sample: SlotSample) -> None:
     await asyncio.sleep(WAIT_S)
     slot = await child.fork()
-    rollouts = [
-        Rollout(str(number), "bench", scene.bundle_digest, item.task_id, item.plan, item.seed)
-        for number, item in enumerate(scene.executions)
-    ]
-    for rollout in rollouts:
+    for rollout in scene.rollouts:
         answer = await _ask(slot, _frame(rollout))
         sample.execute_s.append(float(answer.header["cpu_s"]))
     await asyncio.sleep(WAIT_S)
     sample.private_mb.append(private_mb(slot.pid))
-    nothing = _frame(Rollout("empty", "bench", scene.bundle_digest, rollouts[0].task_id, (), 0))
+    empty = _frame(Rollout("empty", "empty", scene.bundle_digest, scene.executions[0].task_id, (), 0))
     for _ in range(RESPAWNS):
         killed = slot
         started_s = time.perf_counter()
         killed.kill()
         slot = await child.fork()
-        await _ask(slot, nothing)
+        await _ask(slot, empty)
         sample.respawn_s.append(time.perf_counter() - started_s)
         await killed.end()
     await slot.end()

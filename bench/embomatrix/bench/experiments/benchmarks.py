@@ -1,4 +1,4 @@
-"""The paper's table: success of a policy on benchmarks before and after GRPO, as `embomatrix eval` measured it."""
+"""Paper's table of success on benchmarks before and after GRPO, from reports of `embomatrix eval`."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.bench.report.page import table
 from embomatrix.pages.figures import Better, Figure
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.evaluation.table import ScoreRow, head
 from embomatrix.trainer.evaluation.table import table as table_rows
-from embomatrix.trainer.run.errors import TrainerError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,24 +19,24 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _FIGURE_NAMES: Final = {"eai": "eai_world"}
-"""Of benchmarks whose own name could be mistaken for another's: EAI's tasks in our world are not EAI's own."""
+"""Figure names of benchmarks with ambiguous names: EAI's tasks in our world are not EAI's own benchmark."""
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyStage:
-    """A policy of a run, by what it has been through."""
+    """Policy of a run after one stage of training."""
 
     label: str
     policy: Path
 
     def report(self, run: Path, bench: str) -> Path:
-        """Where `embomatrix eval` puts its report on a benchmark."""
+        """Path of the report of `embomatrix eval` on a benchmark."""
         return run / "benchmarks" / file_name(bench) / file_name(self.label) / "report.json"
 
 
 @dataclass(frozen=True, slots=True)
 class BenchRows:
-    """One benchmark's part of the table: titles of its columns, a line for each stage, and the figures."""
+    """Part of the table for one benchmark: column titles, one line for each stage, and the figures."""
 
     bench: str
     head: tuple[str, ...]
@@ -44,7 +45,7 @@ class BenchRows:
 
 
 def bench_rows(run: Path, bench: str, stages: Sequence[PolicyStage]) -> BenchRows:
-    """Read the reports of a benchmark. Raises TrainerError where one is missing or damaged."""
+    """Read the reports of a benchmark. Raise TrainerError if one is missing or damaged."""
     reports = []
     for stage in stages:
         path = stage.report(run, bench)
@@ -70,7 +71,7 @@ def bench_rows(run: Path, bench: str, stages: Sequence[PolicyStage]) -> BenchRow
 
 
 def benchmark_section(run: Path, found: Sequence[BenchRows], commit: str, today: date) -> str:
-    """The section in Markdown."""
+    """Section in Markdown."""
     lines = [f"## {today.isoformat()}: benchmarks before and after GRPO", ""]
     lines += [
         f"The run `{run.name}`, evaluated at commit `{commit}`. Success in percent, 95 % intervals over tasks.",
@@ -78,11 +79,11 @@ def benchmark_section(run: Path, found: Sequence[BenchRows], commit: str, today:
     ]
     for each in found:
         lines += [f"`{each.bench}`", ""]
-        lines += ["| " + " | ".join(row) + " |" for row in (each.head, ["---"] * len(each.head), *each.lines)]
+        lines += table(each.head, each.lines)
         lines.append("")
     return "\n".join(lines)
 
 
 def file_name(text: str) -> str:
-    """The last part of a benchmark's name or path, fit for a file's name."""
+    """Last part of a benchmark's name or path, with characters that a file name may hold."""
     return re.sub(r"[^A-Za-z0-9._-]+", "-", text.rstrip("/").rpartition("/")[2]).strip("-.") or "bench"

@@ -1,4 +1,4 @@
-"""An experiment's runs, one after the other, each by the command that a person would use. What is done is not done again."""
+"""Runs of an experiment, one after the other, by the user's own commands. Finished runs are not repeated."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 
 from embomatrix.bench.experiments.design import toml_of
 from embomatrix.cli.local_cluster import cluster_problem, local_cluster, no_problem, run_command
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.outcome import OUTCOME
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.logging.outcome import OUTCOME
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
+    from contextlib import AbstractContextManager
     from pathlib import Path
 
     from embomatrix.bench.experiments.design import Arm, Budget, Design
@@ -24,7 +25,7 @@ IMITATED = "imitated"
 
 @dataclass(frozen=True, slots=True)
 class Venue:
-    """Where rollouts are executed: what a command is told of it, and why it can't go on (a sentence, or nothing)."""
+    """Place of execution: options that name it, and a function that returns a problem, or an empty string."""
 
     arguments: tuple[str, ...]
     problem: Callable[[], str]
@@ -32,7 +33,7 @@ class Venue:
 
 @contextlib.contextmanager
 def own_venue(folder: Path, workers: int, slots: int) -> Iterator[Venue]:
-    """A cluster of this machine's own, which ends with the experiment."""
+    """Run a cluster on this machine for the duration of the experiment."""
     cluster = local_cluster(folder / "cluster", workers=workers, slots=slots)
     with cluster.supervisor:
         yield Venue((f"--manager={cluster.address}",), lambda: cluster_problem(cluster))
@@ -40,19 +41,28 @@ def own_venue(folder: Path, workers: int, slots: int) -> Iterator[Venue]:
 
 @dataclass(frozen=True, slots=True)
 class Conductor:
-    """Conducts a design in a folder; ``tell`` gets the heading of each run. Raises TrainerError, OSError, SystemExit."""
+    """Runs a design in a folder; ``announce`` gets the heading of each run. Raises TrainerError, OSError, SystemExit."""
 
     design: Design
     dataset: Path
     folder: Path
-    tell: Callable[[str], None]
+    announce: Callable[[str], None]
+
+    def conduct(self, place: AbstractContextManager[Venue]) -> None:
+        """Run all imitations, then all arms."""
+        for seed in self.design.seeds:
+            self.imitate(seed)
+        with place as venue:
+            for seed in self.design.seeds:
+                for arm in self.design.arms:
+                    self.train(seed, arm, venue)
 
     def imitate(self, seed: int) -> None:
-        """The policy that this seed's arms start from."""
+        """Train the policy that this seed's arms start from."""
         out = self.folder_of(seed, IMITATED)
         if (out / "reference").is_dir():
             return
-        self.tell(f"seed {seed}: imitation")
+        self.announce(f"seed {seed}: imitation")
         design = self.design
         self._run(
             out,
@@ -60,17 +70,17 @@ class Conductor:
             no_problem,
             "imitate",
             f"--model={design.model}",
-            _told("seconds", design.imitation.seconds, design.imitation),
+            _budget("seconds", design.imitation.seconds, design.imitation),
             f"--patience={design.patience}",
             f"--seed={seed}",
         )
 
     def train(self, seed: int, arm: Arm, place: Venue) -> None:
-        """One arm of one seed."""
+        """Train one arm of one seed."""
         out = self.folder_of(seed, arm.name)
         if (out / OUTCOME).is_file():
             return
-        self.tell(f"seed {seed}: {arm.name}")
+        self.announce(f"seed {seed}: {arm.name}")
         self._run(
             out,
             {**self.design.shared, **arm.settings},
@@ -78,17 +88,17 @@ class Conductor:
             "train",
             f"--model={self.folder_of(seed, IMITATED) / 'reference'}",
             "--imitate-seconds=0",
-            _told("minutes", self.design.grpo.seconds / 60, self.design.grpo),
+            _budget("minutes", self.design.grpo.seconds / 60, self.design.grpo),
             f"--seed={seed}",
             *place.arguments,
         )
         if not (out / OUTCOME).is_file():
             raise TrainerError(
-                f"the run in {out} ended without an outcome: give the same command again to finish it"
+                f"the run in {out} ended without an outcome: give the same command again to resume it"
             )
 
     def folder_of(self, seed: int, name: str) -> Path:
-        """A run's folder."""
+        """Folder of a run."""
         return self.folder / f"seed-{seed}" / name
 
     def _run(
@@ -97,9 +107,9 @@ class Conductor:
         out.mkdir(parents=True, exist_ok=True)
         written = out / "settings.toml"
         write_whole(written, toml_of(settings).encode("utf-8"))
-        goes_on = any((out / "checkpoints").glob("[!.]*"))
-        # On resuming, the checkpoint has the settings.
-        rest = ("--resume",) if goes_on else (f"--settings={written}",)
+        resumes = any((out / "checkpoints").glob("[!.]*"))
+        # A checkpoint holds the settings already.
+        rest = ("--resume",) if resumes else (f"--settings={written}",)
         run_command(
             "experiment",
             problem,
@@ -111,6 +121,6 @@ class Conductor:
         )
 
 
-def _told(unit: str, amount: float, budget: Budget) -> str:
-    """The option that gives a command its budget."""
+def _budget(unit: str, amount: float, budget: Budget) -> str:
+    """Option that gives a command its budget."""
     return f"--{unit}={amount}" if budget.steps is None else f"--steps={budget.steps}"

@@ -1,14 +1,15 @@
-"""What an experiment is: seeds, an imitation that its arms share, and the settings in which the arms differ."""
+"""Design of an experiment: seeds, a shared imitation, and the settings in which the arms differ."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import tomllib
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ _FILE: Final = "design.json"
 
 @dataclass(frozen=True, slots=True)
 class Arm:
-    """One way to train. ``settings`` by dotted key, the values as TOML."""
+    """Settings of one arm by dotted key, the values as TOML."""
 
     name: str
     settings: Mapping[str, str]
@@ -31,7 +32,7 @@ class Arm:
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """Seconds on the clock, or in their place a number of steps: what is found then does not depend on what else runs."""
+    """Wall time in seconds, or a number of steps, which makes results independent of other load."""
 
     seconds: float
     steps: int | None = None
@@ -42,10 +43,10 @@ class Budget:
 
 @dataclass(frozen=True, slots=True)
 class Design:
-    """Everything that decides an experiment but the machine. ``shared`` settings hold for imitation and for all arms.
+    """Everything that determines an experiment except the machine. ``shared`` settings hold for imitation and all arms.
 
-    For each seed a policy imitates for its budget at most, and ends earlier after ``patience`` measurements without a lower
-    loss; each arm then starts from it. ``dataset`` is the folder's name and the digest of its tasks.
+    For each seed one policy imitates within its budget and stops early after ``patience`` measurements without a lower loss.
+    Each arm starts from that policy. ``dataset`` is the folder's name and the digest of its tasks.
     """
 
     name: str
@@ -64,13 +65,23 @@ RELEVANCE_ARMS: Final = (
     Arm(WITH_RELEVANCE, {}),
     Arm(WITHOUT_RELEVANCE, {"grpo.relevance": "0.0"}),
 )
-"""The paper's ablation."""
+"""Arms of the paper's ablation."""
 
 
-def parse_settings(told: Iterable[str]) -> dict[str, str]:
-    """Settings of ``KEY=VALUE`` texts; a value that is no TOML is a string. Raises TrainerError."""
+def dataset_digest(dataset: Path) -> str:
+    """First digits of the digest of a dataset's tasks. Raise TrainerError if there is no dataset."""
+    tasks = dataset / "tasks.jsonl"
+    if not tasks.is_file():
+        raise TrainerError(
+            f"no dataset at {dataset}: build one with `embomatrix factory build --out={dataset}`"
+        )
+    return hashlib.sha256(tasks.read_bytes()).hexdigest()[:12]
+
+
+def parse_settings(texts: Iterable[str]) -> dict[str, str]:
+    """Parse ``KEY=VALUE`` texts; a value that is no TOML is a string. Raise TrainerError."""
     found: dict[str, str] = {}
-    for text in told:
+    for text in texts:
         key, equals, value = (part.strip() for part in text.partition("="))
         if not (key and equals and value):
             raise TrainerError(f"{text!r}: expected KEY=VALUE, for example grpo.learning_rate=4e-4")
@@ -78,19 +89,19 @@ def parse_settings(told: Iterable[str]) -> dict[str, str]:
     return found
 
 
-def parse_arm(told: str) -> Arm:
-    """An arm of ``NAME`` or ``NAME:KEY=VALUE,KEY=VALUE``. Raises TrainerError."""
-    name, _, settings = told.partition(":")
+def parse_arm(text: str) -> Arm:
+    """Parse ``NAME`` or ``NAME:KEY=VALUE,KEY=VALUE``. Raise TrainerError."""
+    name, _, settings = text.partition(":")
     if not _NAME.fullmatch(name):
         raise TrainerError(
-            f"the arm {told!r} has the name {name!r}: expected small letters, digits, points and hyphens, then a colon and "
+            f"the arm {text!r} has the name {name!r}: expected small letters, digits, points and hyphens, then a colon and "
             "settings, for example fast:grpo.learning_rate=4e-4"
         )
     return Arm(name, parse_settings(settings.split(",") if settings else ()))
 
 
 def checked_arms(arms: Sequence[Arm]) -> tuple[Arm, ...]:
-    """The arms, if they can be told apart. Raises TrainerError."""
+    """Return the arms if their names differ. Raise TrainerError."""
     names = [arm.name for arm in arms]
     if len(set(names)) < len(names) or not names:
         raise TrainerError(f"the arms are called {', '.join(names) or 'nothing'}: expected one name for each")
@@ -98,12 +109,12 @@ def checked_arms(arms: Sequence[Arm]) -> tuple[Arm, ...]:
 
 
 def toml_of(settings: Mapping[str, str]) -> str:
-    """A settings file for `embomatrix train --settings`."""
+    """Settings file for `embomatrix train --settings`."""
     return "".join(f"{key} = {value}\n" for key, value in settings.items())
 
 
 def keep_design(folder: Path, design: Design) -> None:
-    """Write what the experiment in the folder is, or see that it is this one. Raises TrainerError, OSError."""
+    """Write the design into the folder, or check that the folder holds this one. Raise TrainerError, OSError."""
     path = folder / _FILE
     value = json.loads(json.dumps(asdict(design)))
     if path.exists():
@@ -114,7 +125,7 @@ def keep_design(folder: Path, design: Design) -> None:
         other = sorted(name for name in value if before.get(name) != value[name])
         if other:
             raise TrainerError(
-                f"{folder} holds another experiment: {', '.join(other)} differ; repeat its options to go on with it, or pass "
+                f"{folder} holds another experiment: {', '.join(other)} differ; repeat its options to resume it, or pass "
                 "another --out"
             )
         return

@@ -1,4 +1,4 @@
-"""What the runs of an experiment found: success of each arm over all seeds, curves, and where the time went."""
+"""Findings of an experiment: success of each arm over all seeds, learning curves, and time shares."""
 
 from __future__ import annotations
 
@@ -11,14 +11,18 @@ import numpy as np
 from embomatrix.bench.experiments.design import WITHOUT_RELEVANCE
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.trainer.evaluation.intervals import Interval, bootstrap
+from embomatrix.trainer.logging.outcome import OUTCOME, read_outcome
+from embomatrix.trainer.logging.recorder import read_metrics
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
 
-    from embomatrix.trainer.run.outcome import RunOutcome, TaskRate
+    from embomatrix.bench.experiments.design import Design
+    from embomatrix.trainer.logging.outcome import RunOutcome, TaskRate
 
 BINS: Final = 10
-"""A curve is told by the means over so many stretches of a run, each of as many steps."""
+"""Number of equal stretches of a run that a curve has means of."""
 MOST_WAIT: Final = 0.05
 MOST_OVERHEAD: Final = 0.10
 SUCCESS_AFTER: Final = 0.70
@@ -27,7 +31,7 @@ LEAST_GAIN: Final = 0.15
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One finished run: its numbers, and a record for each of its steps."""
+    """Finished run: its outcome and one metrics record for each step."""
 
     seed: int
     arm: str
@@ -54,8 +58,19 @@ class ArmFindings:
         return _mean([run.outcome.overhead for run in self.runs])
 
 
+def read_runs(design: Design, folder_of: Callable[[int, str], Path]) -> dict[str, list[Run]]:
+    """Read the finished runs by arm. Raise TrainerError for a damaged one."""
+    runs: dict[str, list[Run]] = {arm.name: [] for arm in design.arms}
+    for name, found in runs.items():
+        for seed in design.seeds:
+            folder = folder_of(seed, name)
+            if (folder / OUTCOME).is_file():
+                found.append(Run(seed, name, read_outcome(folder), read_metrics(folder)))
+    return runs
+
+
 def findings_of(name: str, runs: Sequence[Run]) -> ArmFindings:
-    """Sum up an arm's runs. Tasks are the unit of chance: each counts once, with its mean over the seeds."""
+    """Summarise an arm's runs. Tasks are the sampling unit: each counts once, with its mean over the seeds."""
     before = [by_task(run.outcome.before) for run in runs]
     after = [by_task(run.outcome.after) for run in runs]
     gains = [
@@ -68,7 +83,7 @@ def findings_of(name: str, runs: Sequence[Run]) -> ArmFindings:
 
 
 def by_task(rates: Sequence[TaskRate]) -> dict[str, float]:
-    """Success by task, of those of which something is known."""
+    """Success by task, without tasks of unknown success."""
     return {each.task_id: each.rate for each in rates if each.rate is not None}
 
 
@@ -81,14 +96,14 @@ def _over_seeds(rates: Sequence[Mapping[str, float]]) -> list[float]:
 
 
 def curve(run: Run, key: str) -> tuple[float, ...]:
-    """Means of a metric over ``BINS`` stretches of a run; fewer where it has fewer steps. NaN where no step has the metric."""
+    """Means of a metric over ``BINS`` stretches of a run, fewer if it has fewer steps; NaN if no step has the metric."""
     values = np.array([math.nan if row[key] is None else float(row[key]) for row in run.metrics])
     parts = np.array_split(values, max(1, min(BINS, len(values))))
     return tuple(_mean(list(part[~np.isnan(part)])) for part in parts if part.size)
 
 
 def figures_of(arms: Sequence[ArmFindings]) -> tuple[Figure, ...]:
-    """The figures of an experiment; those of the first arm carry the plain names."""
+    """Figures of an experiment; those of the first arm have the plain names."""
     first = arms[0]
     tasks = len(_over_seeds([by_task(run.outcome.after) for run in first.runs]))
     count = tasks * len(first.runs)

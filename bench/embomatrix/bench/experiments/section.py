@@ -1,4 +1,4 @@
-"""An experiment as a section in Markdown: configuration, success, curves, times. Sections are added, none is replaced."""
+"""Markdown section of an experiment: configuration, success, curves, times. Sections are appended, never replaced."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import textwrap
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.bench.experiments.findings import BINS, by_task, curve
+from embomatrix.bench.report.page import table
 from embomatrix.trainer.evaluation.intervals import bootstrap
 from embomatrix.world.whole_file import write_whole
 
@@ -25,38 +26,38 @@ HEAD: Final = (
     "its tables are by hand.\nSections are added, none is taken away: what did not work stays.\n"
 )
 NOTHING: Final = "–"
-"""Where no task was held out, or no step has the metric."""
+"""Cell without a value: no task was held out, or no step has the metric."""
 CURVES: Final = (
     ("success", "success of training plans"),
-    ("dead_groups", "groups without signal"),
+    ("zero_variance_groups", "groups without signal"),
     ("entropy", "entropy of a token, nats"),
     ("plan_steps", "executed steps of a plan"),
 )
-"""Metrics that are told along a run."""
+"""Metrics that the section shows along a run."""
 
 
 def learning_section(
     design: Design, arms: Sequence[ArmFindings], machine: Mapping[str, Any], commit: str, today: date
 ) -> str:
-    """The section of an experiment with arms."""
+    """Section of an experiment with arms."""
     return "\n".join(
         [
             f"## {today.isoformat()}: {design.name}",
             "",
             _paragraph(_configuration(design, machine, commit)),
             "",
-            *_table(("arm", "settings"), ((arm.name, _told(arm.settings)) for arm in design.arms)),
+            *table(("arm", "settings"), ((arm.name, _settings(arm.settings)) for arm in design.arms)),
             "",
             "Success on held-out tasks, 95 % bootstrap over tasks; *all* gives each task its mean over the seeds.",
             "",
-            *_table(
+            *table(
                 ("arm", "seed", "steps", "rollouts", "lost", "after imitation", "after GRPO", "gain"),
                 [row for arm in arms for row in _success_rows(arm)],
             ),
             "",
             f"Means over {BINS} stretches of each run, first to last.",
             "",
-            *_table(
+            *table(
                 ("arm", "seed", "metric", *(str(number) for number in range(1, BINS + 1))),
                 [row for arm in arms for run in arm.runs for row in _curve_rows(run)],
             ),
@@ -64,7 +65,7 @@ def learning_section(
             "Where the time of GRPO's steps went; *overhead* is all but sampling and update. *memory* is the most that the",
             "trainer's process held.",
             "",
-            *_table(
+            *table(
                 ("arm", "seed", "seconds a step", "sampling", "update", "waiting", "overhead", "memory"),
                 [_time_row(run) for arm in arms for run in arm.runs],
             ),
@@ -74,14 +75,14 @@ def learning_section(
 
 
 def add_section(page: Path, section: str) -> None:
-    """Add a section below what a page holds; a page that is not there yet gets its head. Raises OSError."""
+    """Append a section to a page; a missing page is created with its head. Raise OSError."""
     before = page.read_text(encoding="utf-8") if page.exists() else HEAD
     page.parent.mkdir(parents=True, exist_ok=True)
     write_whole(page, f"{before.rstrip()}\n\n{section.rstrip()}\n".encode())
 
 
 def _configuration(design: Design, machine: Mapping[str, Any], commit: str) -> str:
-    shared = f", all with {_told(design.shared)}" if design.shared else ""
+    shared = f", all with {_settings(design.shared)}" if design.shared else ""
     return (
         f"Dataset {design.dataset}; model `{design.model}`; seeds {', '.join(map(str, design.seeds))}; at most "
         f"{design.imitation} of imitation{_stop(design.patience)}; {design.grpo} of GRPO an "
@@ -98,15 +99,15 @@ def _stop(patience: int) -> str:
 
 def _success_rows(arm: ArmFindings) -> Iterable[tuple[str, ...]]:
     for run in arm.runs:
-        told = run.outcome
-        then, now = by_task(told.before), by_task(told.after)
+        outcome = run.outcome
+        then, now = by_task(outcome.before), by_task(outcome.after)
         gain = bootstrap([now[task] - then[task] for task in now if task in then])
         yield (
             arm.name,
             str(run.seed),
-            str(told.steps),
-            f"{told.rollouts:,}",
-            str(told.lost),
+            str(outcome.steps),
+            f"{outcome.rollouts:,}",
+            str(outcome.lost),
             *(f"{bootstrap(list(rates.values())).value:.1%}" if rates else NOTHING for rates in (then, now)),
             gain.as_percent() if now else NOTHING,
         )
@@ -128,28 +129,23 @@ def _curve_rows(run: Run) -> Iterable[tuple[str, ...]]:
 
 
 def _time_row(run: Run) -> tuple[str, ...]:
-    told = run.outcome
-    total = told.grpo_s or 1.0
+    outcome = run.outcome
+    total = outcome.grpo_s or 1.0
     shares = [
-        told.spent_s.get(name, 0.0) / total for name in ("sampling", "update", "waiting for simulation")
+        outcome.spent_s.get(name, 0.0) / total for name in ("sampling", "update", "waiting for simulation")
     ]
     return (
         run.arm,
         str(run.seed),
-        f"{total / max(1, told.steps):.2f}",
+        f"{total / max(1, outcome.steps):.2f}",
         *(f"{share:.1%}" for share in shares),
-        f"{told.overhead:.1%}",
-        f"{told.peak_mb:,.0f} MB" if told.peak_mb else "–",
+        f"{outcome.overhead:.1%}",
+        f"{outcome.peak_mb:,.0f} MB" if outcome.peak_mb else "–",
     )
 
 
-def _told(settings: Mapping[str, str]) -> str:
+def _settings(settings: Mapping[str, str]) -> str:
     return ", ".join(f"`{key} = {value}`" for key, value in settings.items()) or "defaults"
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    lines = [head, ["---"] * len(head), *rows]
-    return ["| " + " | ".join(line) + " |" for line in lines]
 
 
 def _paragraph(text: str) -> str:

@@ -6,8 +6,6 @@ import contextlib
 import json
 from typing import TYPE_CHECKING, Final
 
-from rich.table import Table
-
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.sim.fidelity.compare import objects_in, true_atoms
@@ -94,36 +92,6 @@ def _skill_figures(report: FidelityReport) -> Iterator[Figure]:
             yield Figure(f"speed-up {item.skill.value}", item.speedup, "×", Better.HIGHER, item.compared)
 
 
-def skill_table(report: FidelityReport) -> Table:
-    """One row a skill: calls, disagreements and times."""
-    table = Table(title="skills", title_justify="left")
-    table.add_column("skill")
-    for heading in (
-        "calls",
-        "succeeded",
-        "compared",
-        "unequal",
-        "other reason",
-        "cached ms",
-        "physical ms",
-        "×",
-    ):
-        table.add_column(heading, justify="right")
-    for item in report.skills:
-        if item.calls:
-            table.add_row(
-                item.skill.value,
-                *(
-                    f"{n:,}"
-                    for n in (item.calls, item.succeeded, item.compared, item.unequal, item.other_reason)
-                ),
-                f"{item.cached_s * 1e3:.2f}",
-                f"{item.physical_s * 1e3:.1f}",
-                f"{item.speedup:,.0f}",
-            )
-    return table
-
-
 def read_disagreement(spot: str) -> FidelityTrial:
     """The trial of a line, given as FILE:N with N from 1. Raises BenchError."""
     name, _, number = spot.rpartition(":")
@@ -141,7 +109,7 @@ def read_disagreement(spot: str) -> FidelityTrial:
     raise BenchError(f"{name} has fewer than {number} lines: name one that is there")
 
 
-def replay(dataset: Dataset, trial: FidelityTrial, modes: Modes) -> Iterator[str]:
+def replay_trial(dataset: Dataset, trial: FidelityTrial, modes: Modes) -> Iterator[str]:
     """Lines about the trial, executed again in both modes. Raises DatasetError, BenchError and EngineError."""
     bundle = dataset.bundle(trial.bundle_digest)
     task = bundle.tasks.get(trial.task_id)

@@ -1,14 +1,12 @@
-"""Our cluster against what one would pick instead, on the same engine, the same plans and the same cores, in one run.
+"""Contest of our cluster with its peers: one engine, one workload and the same cores in one run.
 
-Each peer runs as its tutorial shows and tuned in two ways: see ``LibraryMode``. Tuned, its processes hold the scenes
-and
-have loaded them before the clock starts. No plan is executed twice in a process before throughput has been measured.
+Tuned processes have loaded the scenes before the clock starts. No plan is executed twice in a process before throughput has
+been measured.
 """
 
 from __future__ import annotations
 
 import contextlib
-import importlib
 import importlib.util
 import logging
 import os
@@ -18,47 +16,55 @@ import time
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import psutil
 
 from embomatrix.bench.cluster.cpu import descendants_cpu_s
-from embomatrix.bench.engine.apart import apart
-from embomatrix.bench.peers.contender import ContenderSetup, LibraryMode, Pass, RolloutChunk, execute, greet
-from embomatrix.bench.peers.engine_pool import executed_twice, forget_executions, write_bundles
-from embomatrix.bench.peers.own_cluster import own_cluster
+from embomatrix.bench.peers.contenders import (
+    ContenderSetup,
+    Done,
+    Lost,
+    celery_on_redis,
+    own_cluster,
+    process_pool,
+    ray_tasks,
+)
+from embomatrix.bench.peers.scene_process import executed_twice, forget_executions, write_bundles
+from embomatrix.bench.report.figures import BenchError, quantile
+from embomatrix.bench.report.page import CONTEST
+from embomatrix.pages.figures import Better, Figure
+from embomatrix.sim.process_pool import process_pool as own_processes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from embomatrix.bench.cluster.work import ClusterWorkload
-    from embomatrix.bench.peers.contender import Bring, Contender
+    from embomatrix.bench.engine.workload import Workload
+    from embomatrix.bench.peers.contenders import Contender, RolloutChunk, StartContender
     from embomatrix.rpc.wire.values import Rollout
-
 
 logger = logging.getLogger(__name__)
 
+LEAD_GOAL: Final = 1.0
+GREETINGS: Final = 4
+"""Empty requests for each process at a time, until every process has answered one."""
+
 
 class PeerSystem(StrEnum):
-    """What one would pick instead."""
+    """Libraries that could do the work of the cluster."""
 
     POOL = "process_pool"
     RAY = "ray"
     CELERY = "celery"
 
 
-@dataclass(frozen=True, slots=True)
-class Library:
-    """Where a peer's adapter is, and what must be installed for it."""
-
-    module: str
-    function: str
-    needs: str
-
-
-LIBRARIES: Final[Mapping[PeerSystem, Library]] = {
-    PeerSystem.POOL: Library("embomatrix.bench.peers.process_pool", "process_pool", "concurrent"),
-    PeerSystem.RAY: Library("embomatrix.bench.peers.ray_peer", "ray_cluster", "ray"),
-    PeerSystem.CELERY: Library("embomatrix.bench.peers.celery_peer", "celery_on_redis", "celery"),
+LIBRARIES: Final[Mapping[PeerSystem, tuple[StartContender, str]]] = {
+    PeerSystem.POOL: (process_pool, "concurrent"),
+    PeerSystem.RAY: (ray_tasks, "ray"),
+    PeerSystem.CELERY: (celery_on_redis, "celery"),
 }
+"""Start function of each peer, and the module that must be installed for it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,138 +74,211 @@ class PeerSizes:
     peers: tuple[PeerSystem, ...] = tuple(PeerSystem)
     slots: int = 2
     chunk: int = 10
-    """Rollouts of one scene that are sent together when a peer is tuned: some 25 ms of work."""
+    """Rollouts of one scene in a chunk: some 25 ms of work."""
     warm: int = 10
-    """Plans of each scene that the tuned processes execute before the others are measured: they have worked before."""
+    """Plans of each scene that tuned processes execute before the others are measured."""
     plain: int = 40
     alone: int = 40
-    """Rollouts with nothing else under way."""
+    """Rollouts with no other rollout in flight."""
     waves: int = 10
     wave: int = 8
-    """So many times so many rollouts are submitted at once, each for itself: latency under load."""
+    """Single rollouts that are submitted at once, ``waves`` times: latency under load."""
     kill_at: float = 0.25
     """Share of the results after which a process is killed."""
     limit_s: float = 45.0
-    """For each measurement: what was not heard of by then is counted as hung."""
+    """Limit for each measurement; rollouts without news by then count as hung."""
     start_s: float = 60.0
-    """For processes to start and to load their scenes."""
+    """Limit for processes to start and load their scenes."""
     peer_s: float = 180.0
-    """For all of one peer, which is given up then."""
+    """Limit for one peer."""
+
+
+@dataclass(slots=True)
+class ContestPass:
+    """Outcome of chunks that were submitted at once. Latency is from the submission of all."""
+
+    wall_s: float = 0.0
+    latency_s: list[float] = field(default_factory=list)
+    lost: int = 0
+    hung: int = 0
+    repeated: int = 0
+    reasons: dict[str, int] = field(default_factory=dict)
+    pids: list[int] = field(default_factory=list)
+
+    @property
+    def rate(self) -> float:
+        """Results per second. Raise BenchError if there are none."""
+        if not self.latency_s:
+            reasons = "; ".join(self.reasons) or f"{self.hung} were never answered"
+            raise BenchError(f"no rollout of the contest had a result: {reasons}")
+        return len(self.latency_s) / self.wall_s
 
 
 @dataclass(frozen=True, slots=True)
-class Tuned:
-    """What was measured of one contender that holds its scenes."""
+class TunedMeasurement:
+    """Measurements of a contender that holds its scenes. ``cpu_s`` is of all its processes and of this one."""
 
-    all_at_once: Pass
+    all_at_once: ContestPass
     cpu_s: float
-    """Processor time of all its processes meanwhile, and of the one that submits."""
-    alone: Pass
-    waves: tuple[Pass, ...]
-    killed: Pass
+    alone_s: tuple[float, ...]
+    wave_s: tuple[float, ...]
+    killed: ContestPass
     repeated: int
     """Executions beyond the first of each rollout, after the kill."""
 
 
-@dataclass(frozen=True, slots=True)
-class PeerOutcome:
-    """What was measured of one peer."""
-
-    plain: Pass
-    shared: Tuned
-    affine_cold: Pass
-    """Half of the plans in scenes that nobody loaded before: what a step with new scenes costs without look-ahead."""
-    affine: Pass
-    """The other half, now that the scenes are there."""
-
-    @property
-    def best_rate(self) -> float:
-        """Results per second of the better of both ways to tune it."""
-        return max(self.shared.all_at_once.rate, self.affine.rate)
-
-
-@dataclass(frozen=True, slots=True)
-class Contest:
-    """Ours, the peers that could be measured, and why the others could not."""
-
-    ours: Tuned
-    peers: Mapping[PeerSystem, PeerOutcome] = field(default_factory=dict)
-    skipped: Mapping[PeerSystem, str] = field(default_factory=dict)
-
-
-def hold_contest(work: ClusterWorkload, sizes: PeerSizes, on_step: Callable[[str], None]) -> Contest:
-    """Measure ours and every peer that is installed. Raises BenchError when a contender does not come up."""
-    on_step("the contest: ours")
-    with _folder(work) as folder:
-        setup = ContenderSetup(LibraryMode.SHARED, folder, sizes.slots, tuple(work.bundles))
-        with own_cluster(setup, work) as contender:
-            ours = _tuned(contender, setup, work, sizes)
-    peers: dict[PeerSystem, PeerOutcome] = {}
-    skipped: dict[PeerSystem, str] = {}
+def bench_peers(workload: Workload, sizes: PeerSizes, on_step: Callable[[str], None]) -> tuple[Figure, ...]:
+    """Measure our cluster and every installed peer. Raise BenchError if our cluster does not start."""
+    on_step("contest: ours")
+    with _folder(workload) as folder:
+        setup = ContenderSetup(folder, sizes.slots, tuple(workload.bundles))
+        with own_cluster(setup, workload) as contender:
+            ours = _tuned(contender, setup, workload, sizes)
+    rate = ours.all_at_once.rate
+    leads: list[Figure] = []
+    figures = [*_tuned_figures("ours", ours)]
     for peer in sizes.peers:
-        on_step(f"the contest: {peer.value}")
-        outcome = missing(peer) or apart(measure_peer, (peer, work, sizes), sizes.peer_s)
-        if isinstance(outcome, PeerOutcome):
-            peers[peer] = outcome
-        else:
-            skipped[peer] = str(outcome)
-            logger.warning("the contest goes without %s: %s", peer.value, outcome)
-    return Contest(ours, peers, skipped)
+        on_step(f"contest: {peer.value}")
+        found = missing(peer) or run_apart(measure_peer, (peer, workload, sizes), sizes.peer_s)
+        if isinstance(found, str):
+            logger.warning("the contest goes without %s: %s", peer.value, found)
+            continue
+        plain, tuned = found
+        lead = rate / tuned.all_at_once.rate
+        leads.append(_figure(f"vs_{peer.value}", lead, "×", ours.all_at_once, LEAD_GOAL))
+        figures.append(_figure(f"{CONTEST}{peer.value}: plain, 1/s", plain.rate, "1/s", plain))
+        figures += _tuned_figures(peer.value, tuned)
+    return (*leads, *figures)
 
 
 def missing(peer: PeerSystem) -> str:
-    """Why a peer can't be measured here; "" when it can."""
-    needs = LIBRARIES[peer].needs
-    if importlib.util.find_spec(needs) is None:
-        return f"{needs} is not installed: `pip install 'embomatrix[bench]'`"
+    """Reason for leaving a peer out; empty if it can be measured here."""
+    module = LIBRARIES[peer][1]
+    if importlib.util.find_spec(module) is None:
+        return f"{module} is not installed: `pip install 'embomatrix[bench]'`"
     return ""
 
 
-def measure_peer(peer: PeerSystem, work: ClusterWorkload, sizes: PeerSizes) -> PeerOutcome:
-    """Bring the peer up in each mode and measure it. Raises what the library raises."""
-    library = LIBRARIES[peer]
-    bring: Bring = getattr(importlib.import_module(library.module), library.function)
-    with _brought(bring, LibraryMode.PLAIN, work, sizes) as (contender, _):
+def run_apart(measure: Callable[..., Any], arguments: tuple[Any, ...], limit_s: float) -> Any:
+    """Return the result of a picklable call in a new process; a sentence if it fails or takes too long.
+
+    The process and its descendants are killed at the end.
+    """
+    with own_processes(1) as pool:
+        pid = pool.submit(os.getpid).result()
+        try:
+            return pool.submit(measure, *arguments).result(limit_s)
+        except TimeoutError:
+            return f"it was not done within {limit_s:g} s"
+        except Exception as error:  # noqa: BLE001  # a library may raise anything: the contest goes without it
+            return f"{type(error).__name__}: {error}"[:300]
+        finally:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                process = psutil.Process(pid)
+                for each in (*process.children(recursive=True), process):
+                    with contextlib.suppress(psutil.NoSuchProcess):
+                        each.kill()
+
+
+def measure_peer(
+    peer: PeerSystem, workload: Workload, sizes: PeerSizes
+) -> tuple[ContestPass, TunedMeasurement]:
+    """Measure the peer, plain and tuned. Raises what the library raises."""
+    start = LIBRARIES[peer][0]
+    with _folder(workload) as folder, start(ContenderSetup(folder, sizes.slots)) as contender:
         # The first calls start the processes.
-        execute(contender, singles(work.sample(2 * sizes.slots)), sizes.limit_s)
-        plain = execute(contender, singles(work.sample(sizes.plain)), sizes.limit_s)
-    with _brought(bring, LibraryMode.SHARED, work, sizes, preload=tuple(work.bundles)) as (contender, setup):
-        greet(contender, setup, sizes.start_s)
-        shared = _tuned(contender, setup, work, sizes)
-    with _brought(bring, LibraryMode.AFFINE, work, sizes) as (contender, setup):
-        greet(contender, setup, sizes.start_s)
-        first, second = (
-            chunks_of(part, sizes.chunk, setup.lanes) for part in (work.rollouts[0::2], work.rollouts[1::2])
-        )
-        cold = execute(contender, first, sizes.limit_s)
-        affine = execute(contender, second, sizes.limit_s)
-    return PeerOutcome(plain, shared, cold, affine)
+        execute(contender, singles(workload.sample(2 * sizes.slots)), sizes.limit_s)
+        plain = execute(contender, singles(workload.sample(sizes.plain)), sizes.limit_s)
+    with _folder(workload) as folder:
+        setup = ContenderSetup(folder, sizes.slots, tuple(workload.bundles))
+        with start(setup) as contender:
+            await_processes(contender, sizes.slots, sizes.start_s)
+            return plain, _tuned(contender, setup, workload, sizes)
 
 
-def _tuned(contender: Contender, setup: ContenderSetup, work: ClusterWorkload, sizes: PeerSizes) -> Tuned:
-    execute(contender, chunks_of(work.first(sizes.warm).rollouts, sizes.chunk, setup.lanes), sizes.limit_s)
-    chunks = chunks_of(work.after(sizes.warm).rollouts, sizes.chunk, setup.lanes)
+def execute(
+    contender: Contender,
+    chunks: Sequence[RolloutChunk],
+    limit_s: float,
+    on_done: Callable[[ContestPass], None] = lambda _: None,
+) -> ContestPass:
+    """Submit the chunks and wait for all; ``on_done`` sees the state after each result."""
+    outcome = ContestPass()
+    started_s = time.perf_counter()
+
+    def take(news: Done | Lost) -> None:
+        outcome.wall_s = time.perf_counter() - started_s
+        if isinstance(news, Lost):
+            outcome.lost += news.count
+            outcome.reasons[news.reason] = outcome.reasons.get(news.reason, 0) + news.count
+            return
+        outcome.latency_s += [outcome.wall_s] * len(news.results)
+        outcome.repeated += news.repeated
+        outcome.pids.append(news.pid)
+        on_done(outcome)
+
+    contender.run(chunks, take, limit_s)
+    outcome.hung = sum(map(len, chunks)) - len(outcome.latency_s) - outcome.lost
+    return outcome
+
+
+def await_processes(contender: Contender, count: int, limit_s: float) -> None:
+    """Wait until every process has loaded its scenes. Raise BenchError if one does not."""
+    deadline_s = time.monotonic() + limit_s
+    seen: set[int] = set()
+    while len(seen) < count:
+        left_s = deadline_s - time.monotonic()
+        outcome = execute(contender, [()] * (GREETINGS * count), max(0.1, left_s))
+        seen.update(outcome.pids)
+        if left_s <= 0 or outcome.reasons:
+            reason = "; ".join(outcome.reasons) or f"{len(seen)} of {count} processes answered"
+            raise BenchError(f"the peer's processes did not start within {limit_s:g} s: {reason}")
+
+
+def chunks_of(rollouts: Sequence[Rollout], size: int) -> list[RolloutChunk]:
+    """Chunks of one scene each."""
+    by_scene: dict[str, list[Rollout]] = {}
+    for rollout in rollouts:
+        by_scene.setdefault(rollout.bundle_digest, []).append(rollout)
+    return [
+        tuple(scene[start : start + size])
+        for scene in by_scene.values()
+        for start in range(0, len(scene), size)
+    ]
+
+
+def singles(rollouts: Sequence[Rollout]) -> list[RolloutChunk]:
+    """Chunks of one rollout each."""
+    return [(rollout,) for rollout in rollouts]
+
+
+def _tuned(
+    contender: Contender, setup: ContenderSetup, workload: Workload, sizes: PeerSizes
+) -> TunedMeasurement:
+    execute(contender, chunks_of(workload.first(sizes.warm).rollouts, sizes.chunk), sizes.limit_s)
+    chunks = chunks_of(workload.after(sizes.warm).rollouts, sizes.chunk)
     before_s, own_s = descendants_cpu_s(), time.process_time()
     all_at_once = execute(contender, chunks, sizes.limit_s)
     own_s = time.process_time() - own_s
     cpu_s = own_s + descendants_cpu_s() - before_s
-    alone = Pass()
-    for rollout in work.sample(sizes.alone):
-        alone.latency_s += execute(contender, singles((rollout,)), sizes.limit_s).latency_s
-    sample = work.sample(sizes.wave)
-    waves = tuple(execute(contender, singles(sample), sizes.limit_s) for _ in range(sizes.waves))
+
+    def latencies(rollouts: Sequence[Rollout]) -> list[float]:
+        return execute(contender, singles(rollouts), sizes.limit_s).latency_s
+
+    alone_s = tuple(s for rollout in workload.sample(sizes.alone) for s in latencies((rollout,)))
+    wave_s = tuple(s for _ in range(sizes.waves) for s in latencies(workload.sample(sizes.wave)))
     forget_executions(setup.folder)
     killed = _killed(contender, chunks, sizes)
     repeated = max(killed.repeated, executed_twice(setup.folder))
-    return Tuned(all_at_once, cpu_s, alone, waves, killed, repeated)
+    return TunedMeasurement(all_at_once, cpu_s, alone_s, wave_s, killed, repeated)
 
 
-def _killed(contender: Contender, chunks: Sequence[RolloutChunk], sizes: PeerSizes) -> Pass:
-    """Once more everything at once; a process that executes is killed in the middle."""
-    due = sizes.kill_at * sum(len(chunk.rollouts) for chunk in chunks)
+def _killed(contender: Contender, chunks: Sequence[RolloutChunk], sizes: PeerSizes) -> ContestPass:
+    """Submit everything once more and kill an executing process on the way."""
+    due = sizes.kill_at * sum(map(len, chunks))
     victims: list[int] = []
 
-    def kill(outcome: Pass) -> None:
+    def kill(outcome: ContestPass) -> None:
         if not victims and len(outcome.latency_s) >= due:
             victims.append(contender.victim(outcome.pids))
             os.kill(victims[0], signal.SIGKILL)
@@ -207,41 +286,27 @@ def _killed(contender: Contender, chunks: Sequence[RolloutChunk], sizes: PeerSiz
     return execute(contender, chunks, sizes.limit_s, kill)
 
 
-def chunks_of(rollouts: Sequence[Rollout], size: int, lanes: int) -> list[RolloutChunk]:
-    """Chunks of one scene each. The scenes are shared out over the lanes, and the lanes' chunks take turns."""
-    by_scene: dict[str, list[Rollout]] = {}
-    for rollout in rollouts:
-        by_scene.setdefault(rollout.bundle_digest, []).append(rollout)
-    queues: list[list[RolloutChunk]] = [[] for _ in range(lanes)]
-    for number, scene in enumerate(by_scene.values()):
-        lane = number % lanes
-        queues[lane] += [
-            RolloutChunk(lane, tuple(scene[start : start + size])) for start in range(0, len(scene), size)
-        ]
-    longest = max(map(len, queues), default=0)
-    return [queue[turn] for turn in range(longest) for queue in queues if turn < len(queue)]
-
-
-def singles(rollouts: Sequence[Rollout]) -> list[RolloutChunk]:
-    """Every rollout for itself, in the first queue."""
-    return [RolloutChunk(0, (rollout,)) for rollout in rollouts]
-
-
 @contextlib.contextmanager
-def _brought(
-    bring: Bring, mode: LibraryMode, work: ClusterWorkload, sizes: PeerSizes, preload: tuple[str, ...] = ()
-) -> Iterator[tuple[Contender, ContenderSetup]]:
-    """A contender in a folder of its own with the bundles."""
-    with _folder(work) as folder:
-        setup = ContenderSetup(mode, folder, sizes.slots, preload)
-        with bring(setup) as contender:
-            yield contender, setup
-
-
-@contextlib.contextmanager
-def _folder(work: ClusterWorkload) -> Iterator[Path]:
-    # What is killed may still write when the folder is removed.
+def _folder(workload: Workload) -> Iterator[Path]:
+    # A killed process may still write when the folder is removed.
     with tempfile.TemporaryDirectory(prefix="embo-", ignore_cleanup_errors=True) as name:
-        folder = Path(name)
-        write_bundles(folder, work.bundles)
-        yield folder
+        write_bundles(Path(name), workload.bundles)
+        yield Path(name)
+
+
+def _tuned_figures(system: str, found: TunedMeasurement) -> Iterator[Figure]:
+    prefix, lower = f"{CONTEST}{system}: ", Better.LOWER
+    everything, killed = found.all_at_once, found.killed
+    count, waves = len(everything.latency_s), len(found.wave_s)
+    submitted = len(killed.latency_s) + killed.lost + killed.hung
+    yield _figure(f"{prefix}tuned, 1/s", everything.rate, "1/s", everything)
+    yield Figure(f"{prefix}CPU, ms", found.cpu_s / count * 1e3, "ms", lower, count)
+    yield Figure(f"{prefix}alone, ms", quantile(found.alone_s, 0.5) * 1e3, "ms", lower, len(found.alone_s))
+    yield Figure(f"{prefix}under load, ms", float(np.mean(found.wave_s)) * 1e3, "ms", lower, waves)
+    yield Figure(f"{prefix}killed: lost", killed.lost, "count", lower, submitted)
+    yield Figure(f"{prefix}killed: never answered", killed.hung, "count", lower, submitted)
+    yield Figure(f"{prefix}killed: executed again", found.repeated, "count", lower, submitted)
+
+
+def _figure(name: str, value: float, unit: str, measured: ContestPass, goal: float | None = None) -> Figure:
+    return Figure(name, value, unit, Better.HIGHER, len(measured.latency_s), goal)

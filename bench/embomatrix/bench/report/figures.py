@@ -1,4 +1,4 @@
-"""What every bench hands in: figures with their goals, the machine and the commit they were measured on."""
+"""Result of a benchmark: figures with their goals, the machine and the commit they were measured on."""
 
 from __future__ import annotations
 
@@ -23,30 +23,26 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 BUSY_SHARE: Final = 0.25
-"""A machine whose cores are busier than this before a bench begins is shared: its figures are worse than they need be."""
+"""Load of a core above which a machine counts as shared before a benchmark begins."""
 GIT_S: Final = 10.0
 
 
 class BenchError(Exception):
-    """A bench can't be run or has no result. One sentence that names the remedy."""
+    """Benchmark that can't be run or has no result. The message names the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class BenchResult:
-    """Outcome of one bench. ``machine`` says where it ran, as plain JSON values."""
+    """Result of one benchmark. ``machine`` describes the machine as JSON-serialisable values."""
 
     bench: str
     commit: str
     machine: Mapping[str, Any]
     figures: tuple[Figure, ...]
 
-    def figure(self, name: str) -> Figure:
-        """The figure of that name. Raises KeyError."""
-        return {figure.name: figure for figure in self.figures}[name]
-
 
 def result_to_json(result: BenchResult) -> dict[str, Any]:
-    """Plain JSON values; numbers with six digits."""
+    """JSON-serialisable dict; numbers have six digits."""
     return {
         "bench": result.bench,
         "commit": result.commit,
@@ -56,7 +52,7 @@ def result_to_json(result: BenchResult) -> dict[str, Any]:
 
 
 def read_result(path: Path) -> BenchResult:
-    """What `result_to_json` made of a result, from a file. Raises BenchError when it is none."""
+    """Read a file that `embomatrix bench NAME --json` wrote. Raise BenchError if it is none."""
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
         machine = dict(value["machine"])
@@ -65,22 +61,22 @@ def read_result(path: Path) -> BenchResult:
         return BenchResult(str(value["bench"]), str(value["commit"]), machine, figures)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise BenchError(
-            f"{path} holds no figures of a bench ({error}): expected a file that 'embomatrix bench NAME --json' wrote"
+            f"{path} holds no figures of a benchmark ({error}): expected a file that 'embomatrix bench NAME --json' wrote"
         ) from error
 
 
-def put_together(results: Sequence[BenchResult]) -> list[BenchResult]:
-    """Results of one bench, measured in parts, as one; the later figure of a name counts.
+def merge_parts(results: Sequence[BenchResult]) -> list[BenchResult]:
+    """Merge results of one benchmark that was measured in parts; the later figure of a name counts.
 
-    Raises BenchError when parts of a bench were measured at different commits.
+    Raise BenchError if parts of a benchmark were measured at different commits.
     """
     whole: dict[str, BenchResult] = {}
     for result in results:
         before = whole.get(result.bench, result)
         if before.commit != result.commit:
             raise BenchError(
-                f"files of bench {result.bench!r} are of the commits {before.commit} and {result.commit}: "
-                "expected parts of one commit; measure again"
+                f"the files of benchmark {result.bench!r} are of the commits {before.commit} and {result.commit}: "
+                "expected one commit; measure again"
             )
         figures = {figure.name: figure for figure in (*before.figures, *result.figures)}
         busiest = max((before.machine, result.machine), key=lambda machine: float(machine["load_before"]))
@@ -88,33 +84,23 @@ def put_together(results: Sequence[BenchResult]) -> list[BenchResult]:
     return list(whole.values())
 
 
-def figure_in(path: Path, name: str) -> Figure:
-    """A figure of a file that `bench fidelity` wrote. Raises BenchError when it has none of that name."""
-    try:
-        return read_result(path).figure(name)
-    except (BenchError, KeyError) as error:
-        raise BenchError(
-            f"{path} has no figure {name!r}: expected a file that 'embomatrix bench fidelity --json' wrote"
-        ) from error
-
-
 def quantile(values: Sequence[float], share: float) -> float:
-    """The value below which ``share`` of the measurements lie. Raises BenchError when there are none."""
+    """Value below which ``share`` of the measurements lie. Raise BenchError if there are none."""
     if not values:
-        raise BenchError("nothing was measured: expected a dataset with at least one task")
+        raise BenchError("nothing was measured: expected a workload with at least one plan")
     return float(np.quantile(np.asarray(values), share))
 
 
 def quantile_figure(
     name: str, seconds: Sequence[float], share: float, unit: str, goal: float | None = None
 ) -> Figure:
-    """A quantile of durations, told in ``unit``: "ms" or "µs"."""
+    """Quantile of durations in ``unit``: "ms" or "µs"."""
     value = quantile(seconds, share) * {"ms": 1e3, "µs": 1e6}[unit]
     return Figure(f"{name}, p{share * 100:.0f}", value, unit, Better.LOWER, len(seconds), goal)
 
 
 def describe_machine() -> dict[str, Any]:
-    """Where the bench runs, and how busy that machine is before it begins."""
+    """Describe this machine and its load before the benchmark begins."""
     gpu = find_gpu().name
     return {
         "cpu": _cpu_model(),
@@ -129,15 +115,15 @@ def describe_machine() -> dict[str, Any]:
 
 
 def is_shared(machine: Mapping[str, Any]) -> bool:
-    """Whether others kept the machine busy before the bench began."""
+    """Return whether the machine was busy before the benchmark began."""
     return bool(machine["load_before"] > BUSY_SHARE * machine["cores"])
 
 
 def commit_here() -> str:
-    """Commit of the checkout that this code runs from, with ``-dirty`` for changes; else the package's version."""
+    """Commit of the checkout that this code runs from, ``-dirty`` if changed; else the package's version."""
     here = Path(__file__).resolve()
     try:
-        # Without this an install inside another repository's folder would name that repository's commit.
+        # An install inside another repository's folder must not name that repository's commit.
         _git(here.parent, "ls-files", "--error-unmatch", here.name)
         return _git(here.parent, "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*")
     except (OSError, subprocess.SubprocessError):

@@ -1,9 +1,9 @@
-"""TRL's steps of GRPO on a load, as a program for an environment that has TRL and nothing of ours.
+"""TRL's GRPO steps on a load, as a program for an environment that has TRL and none of our packages.
 
     PYTHON trl_steps.py LOAD
 
-Writes processor seconds of each step, as JSON, on the last line of standard output. Groups, lengths, loss, batch and model
-are those of our own steps; the reward is the text's length there too.
+It writes the CPU seconds of each step as JSON on the last line of standard output. Groups, lengths, loss, batch, model and
+reward are those of our own steps.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
 
 def measure(load: dict[str, Any]) -> list[float]:
-    """Processor seconds of each measured step."""
+    """CPU seconds of each measured step."""
     import torch
     from datasets import Dataset
     from transformers import TrainerCallback
     from trl import GRPOTrainer
 
     class Clock(TrainerCallback):
-        """Reads the processor's clock around each step."""
+        """Reads the CPU clock around each step."""
 
         def __init__(self) -> None:
             self.began_s = 0.0

@@ -1,0 +1,191 @@
+"""GRPO steps on one load for two trainers: the same prompts, the same model shape, the same groups, one thread.
+
+Our steps run in this process; TRL's run in an environment with its own pins, as the program ``trl_steps``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import time
+from concurrent.futures import Future
+from dataclasses import asdict, dataclass
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import torch
+
+from embomatrix.bench.report.figures import BenchError
+from embomatrix.cli.local_cluster import without_membership
+from embomatrix.reward.breakdown import RewardBreakdown
+from embomatrix.skills.prompt import Codec, limited, prompt_for
+from embomatrix.skills.syntax import PROFILES, PlaceRelation
+from embomatrix.trainer.cluster.gateway import PlanOutcome
+from embomatrix.trainer.config.settings import GrpoSettings
+from embomatrix.trainer.data.variation import Variation
+from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers
+from embomatrix.trainer.grpo.learner import Learner
+from embomatrix.trainer.grpo.update import StepPlan, Updater
+from embomatrix.trainer.lifecycle.stopwatch import Stopwatch
+from embomatrix.trainer.policy.hf import HfPolicy
+from embomatrix.trainer.policy.prompts import PromptBuilder
+from embomatrix.world.task import Profile
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from embomatrix.skills.prompt import Situation
+    from embomatrix.trainer.data.tasks import TrainingTask
+
+END: Final = "<end>"
+UNKNOWN: Final = "<unknown>"
+ROWS: Final = 16
+LIMIT_S: Final = 3600.0
+"""Limit for one command. A few steps take minutes, and many times as long on a shared machine."""
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """A step samples ``group`` plans of ``new`` tokens for each of ``tasks`` prompts and learns from all of them.
+
+    ``words`` are the vocabulary. ``steps`` are measured after ``unmeasured`` ones, in which libraries warm up.
+    """
+
+    prompts: tuple[str, ...]
+    words: tuple[str, ...]
+    tasks: int = 4
+    group: int = 8
+    new: int = 48
+    steps: int = 5
+    unmeasured: int = 1
+    layers: int = 4
+    width: int = 256
+    heads: int = 4
+    inner: int = 672
+    seed: int = 0
+
+
+def load_of(tasks: Sequence[TrainingTask]) -> Load:
+    """The load of these tasks' prompts in lines."""
+    prompts = [prompt_for(limited(task.situation, ROWS), Codec.LINES) for task in tasks]
+    texts = tuple(f"{prompt.system}\n\n{prompt.user}\nPlan:\n" for prompt in prompts)
+    skills = [skill.value for skill in PROFILES[Profile.PAPER]]
+    words = dict.fromkeys(word for text in texts for word in text.split())
+    words |= dict.fromkeys([*skills, *(relation.value for relation in PlaceRelation)])
+    return Load(texts, (UNKNOWN, END, *words))
+
+
+class LengthScore:
+    """Stand-in for the cluster: an immediate reward by the text's length, so that groups carry a signal."""
+
+    def submit(
+        self,
+        batch_id: str,
+        step: int,
+        task: TrainingTask,
+        situation: Situation,
+        texts: Sequence[str],
+        codec: Codec,
+    ) -> Future[tuple[PlanOutcome, ...]]:
+        done: Future[tuple[PlanOutcome, ...]] = Future()
+        done.set_result(
+            tuple(PlanOutcome(text, RewardBreakdown(float(len(text)), 0.0, 0.0, (), False)) for text in texts)
+        )
+        return done
+
+
+def own_step_s(load: Load, tasks: Sequence[TrainingTask]) -> list[float]:
+    """CPU seconds of each of our measured steps."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    torch.manual_seed(load.seed)
+    policy = policy_of(load)
+    settings = GrpoSettings(
+        tasks_per_step=load.tasks, group=load.group, chunk=load.tasks, max_new=load.new, kl_coef=0.0
+    )
+    prompt_builder = PromptBuilder(policy, ROWS, Variation({}, rename=0.0, drop=0.0))
+    workers = DataParallelWorkers(Learner(policy, policy, settings))
+    updater = Updater(policy, workers, prompt_builder, LengthScore(), settings, Stopwatch())
+    generator = torch.Generator().manual_seed(load.seed)
+    spent_s = []
+    for step in range(load.unmeasured + load.steps):
+        chosen = [tasks[(step * load.tasks + at) % len(tasks)] for at in range(load.tasks)]
+        began_s = time.process_time()
+        updater.take_step(StepPlan(step, chosen, (), (), np.random.default_rng, generator, rate_factor=1.0))
+        spent_s.append(time.process_time() - began_s)
+    torch.set_num_threads(threads)
+    return spent_s[load.unmeasured :]
+
+
+def policy_of(load: Load) -> HfPolicy:
+    """A random Llama of the load's shape over its words."""
+    from tokenizers import Tokenizer, models, pre_tokenizers
+    from transformers import LlamaConfig, LlamaForCausalLM, PreTrainedTokenizerFast
+
+    model = models.WordLevel({word: at for at, word in enumerate(load.words)}, unk_token=UNKNOWN)
+    inner = Tokenizer(model)
+    inner.pre_tokenizer = pre_tokenizers.WhitespaceSplit()
+    words: Any = PreTrainedTokenizerFast  # transformers leaves it untyped
+    tokenizer = words(tokenizer_object=inner, unk_token=UNKNOWN, eos_token=END)
+    config = LlamaConfig(
+        vocab_size=len(load.words),
+        hidden_size=load.width,
+        intermediate_size=load.inner,
+        num_hidden_layers=load.layers,
+        num_attention_heads=load.heads,
+        num_key_value_heads=load.heads,
+        max_position_embeddings=2048,
+        tie_word_embeddings=True,
+        eos_token_id=load.words.index(END),
+    )
+    return HfPolicy(LlamaForCausalLM(config), tokenizer, Codec.LINES, "a random Llama")
+
+
+def trl_step_s(load: Load, python: Path, folder: Path) -> list[float]:
+    """CPU seconds of each of TRL's measured steps; ``python`` is the interpreter of its environment. Raise BenchError."""
+    path = folder / "load.json"
+    path.write_text(json.dumps(asdict(load)), encoding="utf-8")
+    spec = find_spec("embomatrix.bench.trainer.trl_steps")
+    # An environment with its own pins must not import our packages.
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    return parse_step_s(
+        run_command(str(python), str(spec.origin if spec else ""), str(path), environment=environment)
+    )
+
+
+def parse_step_s(output: str) -> list[float]:
+    """CPU seconds of the steps, from the last line of a program's output. Raise BenchError."""
+    last = (output.strip().splitlines() or [""])[-1]
+    try:
+        value: Any = json.loads(last)
+        return [float(each) for each in value["step_s"]]
+    except (ValueError, KeyError, TypeError) as error:
+        raise BenchError(
+            f"a program printed no step times ({last[:100]!r}): expected JSON with step_s"
+        ) from error
+
+
+def run_command(*command: str, environment: Mapping[str, str] | None = None) -> str:
+    """Return the standard output of a program. Raise BenchError with its last line if it fails."""
+    try:
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            timeout=LIMIT_S,
+            check=False,
+            env=without_membership(environment or os.environ),
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise BenchError(
+            f"{command[0]} can't be run ({error}): name another interpreter, or measure on an idle machine"
+        ) from error
+    if done.returncode:
+        words = (done.stderr.strip() or done.stdout.strip()).splitlines()[-1:] or ["no output"]
+        raise BenchError(
+            f"`{' '.join(command[:4])} …` failed ({words[0][:300]}): mend that and measure again"
+        )
+    return done.stdout

@@ -1,0 +1,205 @@
+"""`bench fidelity`: a process that dies costs one trial, a suite goes on where it was cut short, disagreements are replayed."""
+
+import json
+
+import pytest
+from tests.fakes.datasets import write_kitchen_dataset
+from tests.fakes.fidelity import clumsy, dying, hanging, raising
+from typer.testing import CliRunner
+
+from embomatrix.bench.cli import app
+from embomatrix.bench.fidelity.page import figures_of, read_disagreement, replay_trial
+from embomatrix.bench.fidelity.pool import LOST, FidelityPool, Modes, TrialJob
+from embomatrix.bench.fidelity.suite import (
+    DISAGREEMENTS_FILE,
+    PLANS_FILE,
+    RESULTS_FILE,
+    FidelitySettings,
+    SuiteProgress,
+    run_fidelity,
+    write_all_trials,
+)
+from embomatrix.bench.report.figures import BenchError
+from embomatrix.sim.fidelity.compare import FidelityTrial, PlanKind
+from embomatrix.sim.fidelity.records import trial_from_json, trial_to_json
+from embomatrix.sim.fidelity.sampler import SKILLS
+from embomatrix.sim.simulation import load_simulator
+from embomatrix.skills.parse import parse_plan
+from embomatrix.world.dataset import Dataset
+
+QUIET = SuiteProgress(written=lambda done, of: None, executed=lambda done, of: None)
+SMALL = FidelitySettings(plans=20, calls=0, seed=0)
+LIMIT_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return Dataset.load(write_kitchen_dataset(tmp_path_factory.mktemp("dataset")))
+
+
+@pytest.fixture(scope="module")
+def suite(dataset, tmp_path_factory):
+    """A suite against a mode that can't press switches: its folder and its outcome."""
+    folder = tmp_path_factory.mktemp("suite")
+    return folder, run_fidelity(dataset, SMALL, folder, 2, Modes(load_simulator, clumsy), QUIET)
+
+
+def test_a_suite_compares_every_plan_and_writes_the_disagreements(suite):
+    folder, outcome = suite
+    plans = (folder / PLANS_FILE).read_text().splitlines()
+    assert len(plans) == len(outcome.comparisons) >= SMALL.plans
+    assert not outcome.lost
+    differing = [item for item in outcome.comparisons if item.first_difference is not None]
+    assert differing
+    assert {item.pairs[item.first_difference][0].skill.value for item in differing} == {"toggle_on"}
+    told = [json.loads(line) for line in (folder / DISAGREEMENTS_FILE).read_text().splitlines()]
+    assert {value["trial"] for value in told} >= {item.trial.trial_id for item in differing}
+
+
+def test_figures_bear_the_names_that_others_read(suite):
+    figures = {figure.name: figure for figure in figures_of(suite[1], minutes=None)}
+    assert {"final_atoms_equal", "step_outcomes_equal", "plans", "scenes", "skill_speedup_min"} <= set(
+        figures
+    )
+    assert figures["step_outcomes_equal"].value < 1.0
+    assert figures["scenes"].value == 1.0
+
+
+def test_a_suite_that_was_cut_short_goes_on_where_it_was(suite, dataset, tmp_path):
+    folder, outcome = suite
+    for name in (PLANS_FILE, "settings.json"):
+        (tmp_path / name).write_text((folder / name).read_text())
+    lines = (folder / RESULTS_FILE).read_text().splitlines()
+    (tmp_path / RESULTS_FILE).write_text("\n".join(lines[:-2]) + "\n" + lines[-2][:40])
+    executed = []
+    progress = SuiteProgress(written=QUIET.written, executed=lambda done, of: executed.append(done))
+    again = run_fidelity(dataset, SMALL, tmp_path, 1, Modes(load_simulator, clumsy), progress)
+    assert executed == [len(lines) - 1, len(lines)]
+    assert [item.cached.atoms for item in again.comparisons] == [
+        item.cached.atoms for item in outcome.comparisons
+    ]
+
+
+def test_a_trial_that_was_lost_is_tried_again_when_the_suite_goes_on(suite, dataset, tmp_path):
+    folder, outcome = suite
+    for name in (PLANS_FILE, "settings.json"):
+        (tmp_path / name).write_text((folder / name).read_text())
+    *lines, last = (folder / RESULTS_FILE).read_text().splitlines()
+    gone = {**trial_to_json(trial_from_json(json.loads(last))), LOST: "no answer in 180 s"}
+    (tmp_path / RESULTS_FILE).write_text("\n".join([*lines, json.dumps(gone)]) + "\n")
+    modes = Modes(load_simulator, clumsy)
+    assert len(run_fidelity(dataset, SMALL, tmp_path, 0, modes, QUIET).lost) == 1
+    again = run_fidelity(dataset, SMALL, tmp_path, 1, modes, QUIET)
+    assert (len(again.comparisons), again.lost) == (len(outcome.comparisons), ())
+
+
+def test_without_processes_the_results_so_far_are_summed_up(suite, dataset, tmp_path):
+    folder, _ = suite
+    for name in (PLANS_FILE, "settings.json"):
+        (tmp_path / name).write_text((folder / name).read_text())
+    modes = Modes(load_simulator, clumsy)
+    with pytest.raises(BenchError, match="no result to sum up"):
+        run_fidelity(dataset, SMALL, tmp_path, 0, modes, QUIET)
+    lines = (folder / RESULTS_FILE).read_text().splitlines()
+    (tmp_path / RESULTS_FILE).write_text("\n".join(lines[:3]) + "\n" + lines[3][:40])
+    with (tmp_path / RESULTS_FILE).open("a") as running:  # of a suite that goes on meanwhile
+        assert len(run_fidelity(dataset, SMALL, tmp_path, 0, modes, QUIET).comparisons) == 3
+        running.write(lines[3][40:] + "\n")
+    assert (tmp_path / RESULTS_FILE).read_text().splitlines() == lines[:4]
+
+
+def test_a_folder_of_other_settings_is_refused(suite, dataset):
+    with pytest.raises(BenchError, match="other settings"):
+        run_fidelity(dataset, FidelitySettings(21, 0, 0), suite[0], 1, Modes(load_simulator, clumsy), QUIET)
+
+
+def test_plans_reach_the_quota_of_every_skill(dataset):
+    settings = FidelitySettings(plans=20, calls=8, seed=1)
+    trials = write_all_trials(dataset, settings, Modes(load_simulator, clumsy), QUIET)
+    calls = [
+        call.skill
+        for trial in trials
+        if trial.kind in (PlanKind.ORACLE, PlanKind.VALID)
+        for call in trial.plan
+    ]
+    assert all(calls.count(skill) >= settings.calls for skill in SKILLS)
+    assert trials == write_all_trials(dataset, settings, Modes(load_simulator, clumsy), QUIET)
+
+
+def trials_of(dataset, *texts):
+    record = dataset.records[0]
+    fridge = record.task.index_of["fridge_1"]
+    return tuple(
+        FidelityTrial(
+            f"t-{number}",
+            record.bundle_digest,
+            "flat",
+            record.task.task_id,
+            PlanKind.VALID,
+            0,
+            parse_plan(text.replace("fridge", str(fridge))),
+        )
+        for number, text in enumerate(texts)
+    )
+
+
+@pytest.mark.parametrize(
+    ("physical", "reason", "limit_s"),
+    [
+        (dying, "the process died", LIMIT_S),
+        (raising, "the door is not a number", LIMIT_S),
+        pytest.param(hanging, "no answer in 10 s", 10.0, marks=pytest.mark.slow),
+    ],
+)
+def test_a_process_that_fails_costs_only_the_trial_that_it_was_at(dataset, physical, reason, limit_s):
+    trials = trials_of(dataset, "move fridge", "move fridge\nopen fridge", "turn 1.0")
+    values = []
+    pool = FidelityPool(dataset.folder, Modes(load_simulator, physical), 1, limit_s)
+    pool.run([TrialJob(trials[0].bundle_digest, trials)], values.append)
+    assert [value["trial"] for value in values] == ["t-0", "t-1", "t-2"]
+    assert [LOST in value for value in values] == [False, True, False]
+    assert reason in values[1][LOST]
+
+
+def test_a_disagreement_is_shown_again_step_by_step(suite, dataset):
+    folder, _ = suite
+    path = folder / DISAGREEMENTS_FILE
+    number = next(
+        n
+        for n, line in enumerate(path.read_text().splitlines(), 1)
+        if "toggle_on" in line and '"step"' in line
+    )
+    lines = list(replay_trial(dataset, read_disagreement(f"{path}:{number}"), Modes(load_simulator, clumsy)))
+    assert any(line.startswith("≠") and "toggle_on" in line for line in lines)
+    assert any("blocks it" in line for line in lines)
+    assert any(line.strip().startswith("cached only:") for line in lines)
+
+
+@pytest.mark.parametrize("spot", ["nowhere", "file:0", "file:x"])
+def test_a_line_that_is_not_named_right_is_refused(spot):
+    with pytest.raises(BenchError, match="FILE:N"):
+        read_disagreement(spot)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--dataset", "nowhere"], "there is no dataset in nowhere"),
+        (["--replay", "nowhere"], "expected FILE:N"),
+        (["--replay", "nowhere:3"], "nowhere"),
+    ],
+)
+def test_what_a_person_gets_wrong_is_one_sentence(dataset, options, sentence):
+    given = options if "--dataset" in options else ["--dataset", str(dataset.folder), *options]
+    answer = CliRunner().invoke(app, ["fidelity", *given])
+    assert answer.exit_code == 2
+    assert sentence in answer.output
+    assert "Traceback" not in answer.output
+
+
+def test_a_damaged_suite_is_refused_with_its_folder(dataset, suite, tmp_path):
+    for name in (PLANS_FILE, "settings.json"):
+        (tmp_path / name).write_text((suite[0] / name).read_text())
+    (tmp_path / RESULTS_FILE).write_text("not JSON\n{}\n")
+    with pytest.raises(BenchError, match="damaged"):
+        run_fidelity(dataset, SMALL, tmp_path, 1, Modes(load_simulator, clumsy), QUIET)

@@ -1,0 +1,71 @@
+"""`embomatrix bench trainer`: one load for two trainers, and one sentence for each refusal."""
+
+import sys
+from dataclasses import replace
+
+import pytest
+from tests.fakes.datasets import write_kitchen_dataset
+from tests.fakes.symbolic_household import make_tasks
+from typer.testing import CliRunner
+
+from embomatrix.bench.cli import app
+from embomatrix.bench.report.figures import BenchError
+from embomatrix.bench.trainer.measure import StepShares, bench_trainer
+from embomatrix.bench.trainer.steps import load_of, own_step_s, parse_step_s, policy_of
+
+TASKS = make_tasks(3, 0, objects=6).train
+SMALL = {"tasks": 2, "group": 3, "new": 4, "steps": 2, "layers": 1, "width": 32, "heads": 2, "inner": 32}
+
+
+def test_load_knows_every_word_of_its_prompts():
+    load = load_of(TASKS)
+    assert {word for prompt in load.prompts for word in prompt.split()} <= set(load.words)
+
+
+def test_our_steps_use_the_prompts_of_the_load():
+    pytest.importorskip("transformers")
+    load = replace(load_of(TASKS), **SMALL)
+    assert len(own_step_s(load, TASKS)) == 2
+    policy = policy_of(load)
+    words = [load.words[token] for token in policy.encode_plan(load.prompts[0])[:-1]]
+    assert words == load.prompts[0].split()
+
+
+@pytest.mark.parametrize("output", ["", "no json", "[]", '{"step_s": null}'])
+def test_program_without_step_times_is_one_sentence(output):
+    with pytest.raises(BenchError, match="printed no step times"):
+        parse_step_s(output)
+
+
+def test_step_times_are_read_from_the_last_line():
+    assert parse_step_s('a warning\n{"step_s": [1.5, 2]}\n') == [1.5, 2.0]
+
+
+def test_shares_are_of_the_given_steps_and_the_time_since_earlier_ones():
+    def record(seconds, sampling, update, waiting):
+        spent_s = {"sampling": sampling, "update": update, "waiting for simulation": waiting}
+        return {"seconds": seconds, "rollouts": 6, "spent_s": spent_s}
+
+    steps = [record(4.0, 1.0, 1.0, 2.0), record(2.0, 2.0, 1.5, 2.2), record(2.0, 3.0, 2.0, 2.4)]
+    first, later = StepShares.of(steps[:1], {}), StepShares.of(steps[1:], steps[0]["spent_s"])
+    assert (first.steps, first.waiting, first.overhead, first.rollouts_per_s) == (1, 0.5, 0.5, 1.5)
+    assert (later.steps, later.rollouts_per_s) == (2, 3.0)
+    assert (later.waiting, later.overhead) == pytest.approx((0.1, 0.25))
+
+
+def test_missing_dataset_is_one_sentence():
+    result = CliRunner().invoke(app, ["trainer", "--dataset=nowhere", "--part=step"])
+    assert result.exit_code == 2
+    assert "no dataset at nowhere" in " ".join(result.output.split())
+
+
+@pytest.mark.slow
+def test_steps_are_compared_with_those_of_the_named_interpreter(tmp_path):
+    pytest.importorskip("transformers")
+    folder = write_kitchen_dataset(tmp_path / "kitchen")
+    stand_in = tmp_path / "python"
+    stand_in.write_text(f"#!{sys.executable}\nprint('{{\"step_s\": [1000.0]}}')\n")
+    stand_in.chmod(0o755)
+    figures = bench_trainer(folder, stand_in, ["step"], lambda _: None)
+    found = {figure.name: figure for figure in figures}
+    assert found["grpo_step_vs_trl"].value == pytest.approx(1000.0 / found["grpo_step_cpu_s"].value)
