@@ -12,12 +12,12 @@ import httpx
 import pytest
 from tests.fakes.worker import FakeWorker, completed
 
-from embomatrix.manager.runtime.app import running
+from embomatrix.manager.services.app import running
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.manager.store.protocol import Candidate, FencedError
 from embomatrix.manager.store.sqlite import SqliteStore
 from embomatrix.proto.v1 import scene_service_pb2, scene_service_pb2_grpc
-from embomatrix.rpc.admin import AdminClient
+from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import (
@@ -165,8 +165,8 @@ async def test_history_of_a_rollout_names_its_leases_and_an_unknown_one_is_refus
             found = await admin.explain("b1-0")
             with pytest.raises(NotFoundError, match="no trace of rollout 'nothing'"):
                 await admin.explain("nothing")
-    leased = [step.worker_id for step in found.steps if step.kind.value == "leased"]
-    assert (leased, found.steps[-1].kind.value, found.place) == (["victim", "other"], "delivered", "")
+    leased = [step.worker_id for step in found.steps if step.kind == "leased"]
+    assert (leased, found.steps[-1].kind, found.place) == (["victim", "other"], "delivered", "")
     assert abs(found.steps[0].at_s - time.time()) < 60
 
 

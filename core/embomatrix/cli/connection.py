@@ -11,16 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from embomatrix.cli.failure import fail
-from embomatrix.rpc.admin import AdminClient
+from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
-from embomatrix.rpc.managers import PATIENCE_S
+from embomatrix.rpc.managers import FAILOVER_S
 from embomatrix.rpc.status import ClusterError
 from embomatrix.rpc.trust import read_ca, read_token
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
 
-    from embomatrix.rpc.fleet_client import FleetClient
 
 Manager = Annotated[str, typer.Option(help="HOST:PORT of the manager.", envvar="EMBOMATRIX_MANAGER")]
 Token = Annotated[
@@ -37,8 +36,7 @@ _OPTIONS: Final = (("manager", Manager, DEFAULT_ADDRESS), ("token", Token, ""), 
 def manager_command(
     name: str,
     *,
-    client: type[FleetClient] = AdminClient,
-    timeout_s: float = PATIENCE_S,
+    timeout_s: float = FAILOVER_S,
     until_interrupted: bool = False,
 ) -> Callable[[Callable[..., Coroutine[None, None, None]]], Callable[..., None]]:
     """Make a typer command of an async function whose first parameter is an open client.
@@ -53,7 +51,7 @@ def manager_command(
         def run(*, manager: str, token: str = "", ca: Path | None = None, **arguments: object) -> None:
             async def ask() -> None:
                 secret, trusted = read_token(token), read_ca(ca)
-                async with client(manager, secret, ca=trusted, patience_s=timeout_s) as connected:
+                async with AdminClient(manager, secret, ca=trusted, failover_s=timeout_s) as connected:
                     await function(connected, **arguments)
 
             try:
@@ -69,7 +67,7 @@ def manager_command(
             for option, kind, default in _OPTIONS
         ]
         parameters = [*(one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in own), *options]
-        del run.__wrapped__  # type: ignore[attr-defined]
+        del run.__wrapped__
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {one.name: one.annotation for one in parameters}
         return run

@@ -10,7 +10,7 @@ from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import manager
 
 from embomatrix.cli.cluster.status import Glance, earliest, rate, screen, sentences, status, top
-from embomatrix.rpc.admin import AdminClient
+from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.wire.values import (
     FleetStatus,
     PlanCell,

@@ -19,7 +19,7 @@ from embomatrix.manager.control.events import (
     WorkerRecovered,
     WorkerSuspected,
 )
-from embomatrix.rpc.leases import LeaseRef
+from embomatrix.rpc.wire.leases import LeaseRef
 from embomatrix.rpc.wire.values import (
     Batch,
     Cancelled,
@@ -371,7 +371,7 @@ def test_history_of_a_redispatched_rollout_names_workers_reasons_and_causes(tabl
     (again, _) = leases(table.tell(WorkerLost("w1", "killed"), after_s=1.0))
     table.finish(again)
     steps = state.explain("b1-0")
-    assert [(step.kind.value, step.worker_id, step.cause) for step in steps] == [
+    assert [(step.kind, step.worker_id, step.cause) for step in steps] == [
         ("submitted", "", "BatchSubmitted"),
         ("leased", "w1", "BatchSubmitted"),
         ("returned", "w1", "WorkerLost"),

@@ -23,8 +23,7 @@ from embomatrix.cli.cluster.tables import (
 from embomatrix.cli.cluster.trace import chrome_trace
 from embomatrix.cli.connection import AsJson, manager_command
 from embomatrix.cli.failure import fail
-from embomatrix.rpc.admin import AdminClient  # noqa: TC001  typer reads the annotations when a command runs
-from embomatrix.rpc.token_client import TokenClient
+from embomatrix.rpc.admin_client import AdminClient  # noqa: TC001  typer reads the annotations when a command runs
 
 FOLLOW_S: Final = 0.5
 """Pause between two requests of `events --follow`."""
@@ -101,7 +100,7 @@ async def events(
     """Print the log of a run, or of the workers, one event per line."""
     console, after = Console(soft_wrap=True, highlight=False), 0
     while True:
-        page = await client.events(run, after=after)
+        page = await client.read_events(run, after=after)
         for event in page.events:
             if as_json:
                 show_json(event_plain(event))
@@ -194,9 +193,9 @@ async def pause(client: AdminClient, as_json: AsJson = False) -> None:
 
 
 @app.command()
-@manager_command("cluster", client=TokenClient)
+@manager_command("cluster")
 async def revoke(
-    client: TokenClient,
+    client: AdminClient,
     name: Worker,
     reason: Annotated[str, typer.Option(help="Reason shown to the worker's owner.")],
     as_json: AsJson = False,

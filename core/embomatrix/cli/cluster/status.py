@@ -16,7 +16,7 @@ from rich.text import Text
 
 from embomatrix.cli.cluster.tables import run_table, show_json, worker_table
 from embomatrix.cli.connection import AsJson, manager_command
-from embomatrix.rpc.admin import AdminClient  # noqa: TC001  typer reads the annotations when a command runs
+from embomatrix.rpc.admin_client import AdminClient  # noqa: TC001  typer reads the annotations when a command runs
 from embomatrix.rpc.status import UnavailableError
 from embomatrix.rpc.wire.values import Warmth
 

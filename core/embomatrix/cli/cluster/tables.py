@@ -12,7 +12,7 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from embomatrix.rpc.run_log import EventKind, RolloutStep, RunEvent
+from embomatrix.rpc.wire.run_log import EventKind, RolloutStep, RunEvent
 from embomatrix.rpc.wire.values import ResidentState, Warmth
 
 if TYPE_CHECKING:
@@ -152,7 +152,7 @@ def step_line(step: RolloutStep, begin_s: float) -> Text:
     """Format a step of a rollout's history as one line, with seconds since the first step."""
     at = time.strftime("%H:%M:%S", time.localtime(step.at_s))
     line = Text(f"{at} +{step.at_s - begin_s:.3f} s ", style="dim", no_wrap=True)
-    line.append(f"{step.kind.value:<10}", style="default")
+    line.append(f"{step.kind:<10}", style="default")
     line.append(f" {step.worker_id}:" if step.worker_id else "", style="default")
     line.append(f" {step.reason}" if step.reason else "", style="default")
     return line.append(f"  ({step.cause})", style="dim")

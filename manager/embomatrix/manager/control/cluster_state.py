@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from embomatrix.manager.control.commands import Command
     from embomatrix.manager.control.events import Event
-    from embomatrix.rpc.run_log import RolloutStep
+    from embomatrix.rpc.wire.run_log import RolloutStep
 
 UNIT_COST_S: Final = 1e-5
 """Assumed CPU time of a placement for each need and worker that it examines."""

@@ -21,7 +21,7 @@ from embomatrix.manager.control.dispatch.outcomes import close_case, deliver, re
 from embomatrix.manager.control.dispatch.records import RolloutRecord
 from embomatrix.manager.control.dispatch.state import AuditCase
 from embomatrix.manager.control.reputation import Ruling, judge, opinion_of
-from embomatrix.rpc.run_log import RolloutStepKind
+from embomatrix.rpc.wire.run_log import RolloutStepKind
 from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure
 
 if TYPE_CHECKING:

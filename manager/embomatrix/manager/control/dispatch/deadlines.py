@@ -8,7 +8,7 @@ from embomatrix.manager.control.dispatch.audits import finish, tick_audits
 from embomatrix.manager.control.dispatch.lease_ends import judge_scene, take_away
 from embomatrix.manager.control.dispatch.leasing import fill_workers, hedge_late
 from embomatrix.manager.control.dispatch.membership import release_awaited
-from embomatrix.rpc.run_log import RolloutStepKind
+from embomatrix.rpc.wire.run_log import RolloutStepKind
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from embomatrix.manager.control.dispatch.audits import finish, hold_for_audit
 from embomatrix.manager.control.dispatch.batches import attempts_allowed
 from embomatrix.manager.control.dispatch.leasing import offer_scene
 from embomatrix.manager.control.dispatch.outcomes import requeue
-from embomatrix.rpc.run_log import RolloutStepKind
+from embomatrix.rpc.wire.run_log import RolloutStepKind
 from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure
 
 if TYPE_CHECKING:

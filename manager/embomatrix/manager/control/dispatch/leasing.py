@@ -6,8 +6,8 @@ from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.control.commands import CancelLease, GiveLease
-from embomatrix.rpc.leases import LeaseOrigin
-from embomatrix.rpc.run_log import RolloutStepKind
+from embomatrix.rpc.wire.leases import LeaseOrigin
+from embomatrix.rpc.wire.run_log import RolloutStepKind
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence

@@ -15,7 +15,7 @@ from embomatrix.manager.control.dispatch.leasing import fill_workers, offer_scen
 from embomatrix.manager.control.dispatch.outcomes import open_batch
 from embomatrix.manager.control.dispatch.records import DispatchPhase
 from embomatrix.manager.control.events import WorkerJoined, WorkerLost, WorkerReported, WorkerResumed
-from embomatrix.rpc.run_log import RolloutStepKind
+from embomatrix.rpc.wire.run_log import RolloutStepKind
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure, ResidentState
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.control.dispatch.state import DispatchState
     from embomatrix.manager.control.events import BatchRestored
     from embomatrix.manager.control.workers import Standing, WorkerRecord
-    from embomatrix.rpc.leases import LeaseOrigin, LeaseRef
+    from embomatrix.rpc.wire.leases import LeaseOrigin, LeaseRef
 
 
 def worker_joined(state: DispatchState, event: WorkerJoined) -> None:

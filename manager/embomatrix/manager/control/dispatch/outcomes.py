@@ -8,7 +8,7 @@ from embomatrix.manager.control.commands import DeliverResult, FinishBatch
 from embomatrix.manager.control.dispatch.batches import failed_with
 from embomatrix.manager.control.dispatch.leasing import enqueue, queue_rollouts, revoke
 from embomatrix.manager.control.dispatch.records import DispatchPhase, RolloutKey
-from embomatrix.rpc.run_log import RolloutStepKind
+from embomatrix.rpc.wire.run_log import RolloutStepKind
 from embomatrix.rpc.wire.values import Cancelled, InfraFailure, RolloutResult
 
 if TYPE_CHECKING:

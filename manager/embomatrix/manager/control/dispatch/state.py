@@ -13,7 +13,7 @@ from embomatrix.manager.control.dispatch.queues import PendingQueues
 from embomatrix.manager.control.dispatch.records import DispatchPhase, LeaseRecord, RolloutKey, RolloutRecord
 from embomatrix.manager.control.reputation import Auditor, AuditRules, Opinion
 from embomatrix.manager.control.workers import WorkerPool
-from embomatrix.rpc.run_log import RolloutStep, RolloutStepKind
+from embomatrix.rpc.wire.run_log import RolloutStep, RolloutStepKind
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure
 
 if TYPE_CHECKING:
