@@ -244,7 +244,9 @@ async def test_a_page_without_its_manager_says_from_when_it_is_and_goes_on_with_
             await at_work()
             await opened.open("overview")
             await opened.until("#health", "No worker has joined yet")
-        assert "the manager has not answered since" in await opened.until("#health", "This page shows the state of")
+        assert "the manager has not answered since" in await opened.until(
+            "#health", "This page shows the state of"
+        )
         with contextlib.ExitStack() as stack:
             await at_work()
             await opened.until("#health", "No worker has joined yet")
