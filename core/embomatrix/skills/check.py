@@ -7,7 +7,7 @@ distances, go to the view.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from embomatrix.skills.appliances import (
     cold_source,
@@ -45,8 +45,7 @@ if TYPE_CHECKING:
     Check = Callable[["BoundCall"], SkillRefusal | None]
 
 
-@dataclass(frozen=True, slots=True)
-class BoundCall:
+class BoundCall(NamedTuple):
     """A call whose indices are resolved to object names in one world; "" for an absent or unknown index."""
 
     world: WorldView
@@ -77,13 +76,9 @@ class BoundCall:
     def refuse(self, reason: FailureReason, **values: str) -> SkillRefusal:
         """Return the refusal for this call. Target, source, held object and relation fill in the sentence by default."""
         carried, relation = self.world.carried, self.call.relation
-        known = {
-            "target": self.target,
-            "source": self.source,
-            "held": carried[0] if carried else "",
-            "relation": preposition(relation) if relation is not None else "",
-        }
-        return refuse(reason, **(known | values))
+        values.setdefault("relation", preposition(relation) if relation is not None else "")
+        held = carried[0] if carried else ""
+        return refuse(reason, target=self.target, source=self.source, held=held, **values)
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,12 +16,16 @@ if TYPE_CHECKING:
     from embomatrix.world.asset import Asset
     from embomatrix.world.state import SubstanceFact
 
-_BLOCKERS: Final = ("other", "container", "source", "target")
-"""Fields of a sentence, from the most to the least specific, that name the object at fault."""
-_FIELDS: Final = {
-    reason: {field for _, field, _, _ in Formatter().parse(sentence)}
-    for reason, sentence in SENTENCES.items()
-}
+_FIELDS_AT_FAULT: Final = ("other", "container", "source", "target")
+"""Fields of a sentence that name the object at fault, the most specific one first."""
+
+
+def _blocker_field(sentence: str) -> str:
+    fields = {field for _, field, _, _ in Formatter().parse(sentence)}
+    return next((name for name in _FIELDS_AT_FAULT if name in fields), "")
+
+
+_BLOCKER_FIELD: Final = {reason: _blocker_field(sentence) for reason, sentence in SENTENCES.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,8 +108,7 @@ def refuse(reason: FailureReason, **values: str) -> SkillRefusal:
 
     Raises KeyError if the sentence needs a value that is not given.
     """
-    blocker = next((values[name] for name in _BLOCKERS if name in _FIELDS[reason]), "")
-    return SkillRefusal(reason, SENTENCES[reason].format(**values), blocker)
+    return SkillRefusal(reason, SENTENCES[reason].format(**values), values.get(_BLOCKER_FIELD[reason], ""))
 
 
 def target_of(world: WorldView, call: SkillCall) -> str:

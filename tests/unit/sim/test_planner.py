@@ -385,7 +385,7 @@ def test_food_that_must_end_cooked_and_not_hot_is_cooled_down_after_it_is_cooked
         (Not(atom("inroom", "sink_1", "kitchen_0")), "sink_1 is fixed and can't be picked up"),
         (
             atom("nextto", "apple_1", "cabinet_1"),
-            "(nextto apple_1 cabinet_1) is a matter of luck: no skill aims at it",
+            "(nextto apple_1 cabinet_1) depends on luck: no skill aims at it",
         ),
     ],
 )

@@ -1,4 +1,4 @@
-"""Calls of a plan that is being written: each is executed, from a place where it can be, and kept when it succeeds."""
+"""Calls of a plan under construction: each call is executed, and kept if it succeeds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from embomatrix.world.task import Task
 
 NEIGHBOURS: Final = 6
-"""Things beside another from which that is tried to be reached, when no place to stand serves it itself."""
+"""Neighbours of an object to try as standing places when the object's own standing poses do not serve."""
 OUT_OF_ARM: Final = frozenset(
     {
         FailureReason.NO_STANDING_POSE,
@@ -24,22 +24,22 @@ OUT_OF_ARM: Final = frozenset(
         FailureReason.NO_LINE_OF_APPROACH,
     }
 )
-"""Failures that standing elsewhere may mend."""
+"""Failures that another standing place may avoid."""
 
 
 class StuckError(Exception):
-    """A routine can't go on. The sentence names the call and why it failed."""
+    """Raised when a routine can't go on. The message names the call and the reason."""
 
 
 class TooLongError(StuckError):
-    """The plan has more steps than are executed."""
+    """Raised when the plan has more steps than a simulator executes."""
 
 
 class PlanCalls:
-    """The calls of one attempt at a task, from its start. A call that fails is told, and left out of the plan.
+    """Calls of one attempt at a task. A failed call is reported to the caller and left out of the plan.
 
-    Every method raises StuckError when a call names an object outside the table, or the plan grows too long. A ``thrifty``
-    plan goes nowhere for what is in reach already.
+    Every method raises StuckError if a call names an object outside the table, or if the plan grows too long. A ``thrifty``
+    plan contains no move to an object that is already in reach.
     """
 
     def __init__(self, simulator: Simulator, task: Task, seed: int, *, thrifty: bool = False) -> None:
@@ -53,7 +53,7 @@ class PlanCalls:
 
     @property
     def plan(self) -> Plan:
-        """The calls so far. Of several moves in a row the last is kept, and none at the end."""
+        """Calls so far. Of consecutive moves only the last is kept, and none at the end."""
         pairs = zip(self._calls, [*self._calls[1:], None], strict=True)
         return tuple(
             call
@@ -62,9 +62,9 @@ class PlanCalls:
         )
 
     def place(self, target: str, relation: PlaceRelation, near: str = "") -> Step:
-        """Place what the hand holds, from beside ``near`` where that does.
+        """Place the held object, from beside ``near`` if possible.
 
-        When nothing is free within reach, from beside other things on the target too.
+        If there is no free pose within reach, try from beside neighbours of the target too.
         """
         call = self._call(Skill.PLACE, target, relation)
         found = self._from_beside(near, call, target) if near else None
@@ -72,14 +72,14 @@ class PlanCalls:
             return found
         step = self.use(Skill.PLACE, target, relation)
         if step.failure is FailureReason.NO_FREE_POSE:
-            for other in self._around(target):
+            for other in self._neighbours(target):
                 again = self._from_beside(other, call, target)
                 if again is not None and again.ok:
                     return again
         return step
 
     def use(self, skill: Skill, name: str, relation: PlaceRelation | None = None) -> Step:
-        """Go to the object unless the robot is there, then do it, from beside a neighbour if need be."""
+        """Use the object from its own standing pose, else from beside a neighbour."""
         return self._attempt(self._call(skill, name, relation), name)
 
     def use_on(self, skill: Skill, name: str, source: str, at: str) -> Step:
@@ -92,29 +92,28 @@ class PlanCalls:
         step = self._go_to(name)
         step = self._run(call) if step.ok else step
         if step.failure in OUT_OF_ARM:
-            for other in self._around(name):
+            for other in self._neighbours(name):
                 again = self._from_beside(other, call, name)
                 if again is not None:
                     return again
         return step
 
     def _from_beside(self, other: str, call: SkillCall, name: str) -> Step | None:
-        """A call about an object from beside another; None where the robot can't stand there, or not reach it from there."""
+        """Run a call about ``name`` from beside another object; None if the robot can't stand there or reach from there."""
         if self._go_to(other).ok and within_reach(self._world, name) is None:
             return self._run(call)
         return None
 
-    def _around(self, name: str) -> list[str]:
-        """Rows near an object, the nearest first: who stands at one of them may reach it."""
-        box = self._world.relations.body(name)
-        x, y, _ = box.center_m
+    def _neighbours(self, name: str) -> list[str]:
+        """Return the rows nearest to an object."""
+        x, y, _ = self._world.relations.body(name).center_m
 
-        def away(other: str) -> float:
+        def squared_distance(other: str) -> float:
             ox, oy, _ = self._world.relations.body(other).center_m
             return (ox - x) ** 2 + (oy - y) ** 2
 
         others = [item for item in self._task.table if item != name and item not in self._world.carried]
-        return sorted(others, key=away)[:NEIGHBOURS]
+        return sorted(others, key=squared_distance)[:NEIGHBOURS]
 
     def _go_to(self, name: str) -> Step:
         step = self._run(self._call(Skill.MOVE, name))
@@ -123,6 +122,7 @@ class PlanCalls:
         return step
 
     def _stands_at(self, name: str) -> bool:
+        """True if the object is in reach and the plan need not move: thrifty, or just sent to it or to its container."""
         inside = self._world.relations.inside
         sent = (
             self._thrifty
@@ -148,7 +148,7 @@ class PlanCalls:
         return row
 
     def _run(self, call: SkillCall) -> Step:
-        """Execute a call; one that succeeds is part of the plan."""
+        """Execute a call and add it to the plan if it succeeds."""
         step = self._simulator.run_step(call)
         if step.ok:
             self._calls.append(call)

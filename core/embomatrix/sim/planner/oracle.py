@@ -1,26 +1,24 @@
-"""The oracle: a plan for a task, found by working back from its goal and proven by executing it.
+"""Oracle planner: finds a plan by working back from a task's goal and proves it by execution.
 
-It sees what no policy sees, the goal and the whole state, so it tells which tasks can be done and teaches imitation.
-A goal is first turned into conjunctions of literals; an attempt makes one of them true, errand by errand, in the simulator,
-and looks again: what an errand undid is done in the next round.
+It sees the goal and the whole state, which no policy sees. It decides which tasks can be done, and its plans teach imitation.
+The goal is first turned into conjunctions of literals. An attempt makes one conjunction true in the simulator, subgoal by
+subgoal, and repeats for literals that a later subgoal undid.
 """
 
 from __future__ import annotations
 
 import functools
 import itertools
+import re
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.planner.calls import StuckError, TooLongError
 from embomatrix.sim.planner.choices import choices
-from embomatrix.sim.planner.chores import chores_for, chosen, is_about_chores
-from embomatrix.sim.planner.errands import Errands, Warming
-from embomatrix.sim.planner.limits import is_hot_work, portables, sources_for, why_impossible
+from embomatrix.sim.planner.feasibility import needs_heat, portables, sources_for, why_impossible
 from embomatrix.sim.planner.script import PlanScript
-from embomatrix.sim.planner.ways import PlacementGoal
-from embomatrix.sim.planner.wishes import GoalLiterals
-from embomatrix.sim.planner.wording import Wording
+from embomatrix.sim.planner.subgoals import Exposure, PlacementGoal, Subgoals
+from embomatrix.sim.planner.tool_work import chosen_methods, needs_tools, subgoals_for
 from embomatrix.world.evaluate import evaluate, render
 from embomatrix.world.goal import Not
 from embomatrix.world.state import Relation, State
@@ -31,65 +29,69 @@ if TYPE_CHECKING:
     from embomatrix.sim.executor import Simulator
     from embomatrix.sim.planner.choices import Choice, GroundLiteral
     from embomatrix.skills.syntax import Plan
+    from embomatrix.world.scene import Scene
     from embomatrix.world.task import Task
 
 PROOF_SEEDS: Final = (0, 1, 2)
-"""A plan must succeed with each of these: one that needs luck is none."""
+"""A plan must succeed with each of these seeds, so that it does not depend on luck."""
 SOURCES_TRIED: Final = 3
-"""Heat or cold sources that are tried for an object."""
-WAYS_TRIED: Final = 4
-UNAIMED_WAYS_TRIED: Final = 8
-"""Ways in which a relation is brought about, and one that no skill aims at."""
+"""Heat or cold sources, or tools, to try for an object."""
+VARIANTS_TRIED: Final = 4
+UNAIMED_VARIANTS_TRIED: Final = 8
+"""Variants to try for a relation, and for the relation that no skill aims at."""
 ATTEMPTS: Final = 36
-"""Plans that are written at most for a task."""
+"""Most plans that are written for a task."""
 ROUNDS: Final = 4
-"""Times that an attempt looks for what is missing, and does it."""
+"""Most times that one attempt looks for missing literals and acts on them."""
 UNAIMED: Final = Relation.NEXTTO
-"""The relation that comes about by luck alone, unless two things share a small surface."""
+"""Relation that no skill aims at: it comes about by luck, unless two objects share a small surface."""
+NAMED: Final = 2
+NAMED_IN_ROOM: Final = 3
+"""Preference of an object whose category the instruction names, and of one that it names with the right room."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanNotFound:
-    """No plan was found. ``reason`` is a sentence: what stopped the most promising attempt."""
+    """Result without a plan. ``reason`` is a sentence about the most promising attempt."""
 
     reason: str
 
 
 @dataclass(frozen=True, slots=True)
 class Strategy:
-    """How an attempt differs from the others.
+    """Parameters of one attempt.
 
-    ``source_rank`` and ``way`` choose among sources and tools, and among ways to bring relations about; ``reverse`` turns
-    the order of the placements; ``singly`` lets a source work on one thing at a time; ``seed`` decides where things come to
-    stand while the plan is written. A ``thrifty`` attempt goes nowhere for what is in reach already.
+    ``source_rank`` selects among sources and tools, ``variant`` among the ways to bring relations about. ``reverse`` turns the
+    order of the placements. ``singly`` lets a source work on one object at a time. ``seed`` decides about poses while the
+    plan is written. ``thrifty`` leaves out moves to objects in reach.
     """
 
     source_rank: int = 0
     reverse: bool = False
-    way: int = 0
+    variant: int = 0
     singly: bool = False
     seed: int = PROOF_SEEDS[0]
     thrifty: bool = False
 
 
 def find_plan(simulator: Simulator, task: Task) -> Plan | PlanNotFound:
-    """A plan whose execution reaches the goal with several seeds, or why there is none. Leaves the simulator anywhere."""
+    """Return a plan that reaches the goal with several seeds, or the reason why none was found. Leaves the state anywhere."""
     simulator.reset(task, PROOF_SEEDS[0])
     if evaluate(task.goal, simulator.facts, task.types):
         return PlanNotFound("the goal holds at the start: there is nothing to do")
-    limit = functools.cache(functools.partial(_limit, simulator, task))
-    names = Wording(task, simulator.world.scene).names
-    options = choices(task.goal, task.types, simulator.facts, names, lambda item: bool(limit(item)))
+    obstacle = functools.cache(functools.partial(_obstacle, simulator, task))
+    preference = functools.partial(naming_rank, task, simulator.world.scene)
+    options = choices(task.goal, task.types, simulator.facts, preference, lambda item: bool(obstacle(item)))
     if not options:
         return PlanNotFound("the goal contradicts itself")
-    hopeful = [choice for choice in options if not any(map(limit, choice))]
-    if not hopeful:
-        return PlanNotFound(next(filter(None, map(limit, options[0]))))
-    return _first_proven(simulator, task, hopeful)
+    possible = [choice for choice in options if not any(map(obstacle, choice))]
+    if not possible:
+        return PlanNotFound(next(filter(None, map(obstacle, options[0]))))
+    return _first_proven(simulator, task, possible)
 
 
-def _limit(simulator: Simulator, task: Task, item: GroundLiteral) -> str:
-    """Why the literal, which does not hold yet, never will; "" otherwise."""
+def _obstacle(simulator: Simulator, task: Task, item: GroundLiteral) -> str:
+    """Return why a literal that does not hold yet is impossible, else ""."""
     missing = simulator.facts.holds(item.atom.predicate, item.atom.args) != item.positive
     return why_impossible(simulator.world, task, item) if missing else ""
 
@@ -114,7 +116,7 @@ def _first_proven(simulator: Simulator, task: Task, options: Sequence[Choice]) -
 
 
 def _attempts(options: Sequence[Choice]) -> list[tuple[Choice, Strategy]]:
-    """Choices with strategies that make a difference to them, the first of both first: in diagonals."""
+    """Pair choices with the strategies that matter to them, in diagonal order: the first of both first."""
     ranked = [
         (rank + place, place, choice, strategy)
         for place, choice in enumerate(options)
@@ -127,20 +129,20 @@ def _attempts(options: Sequence[Choice]) -> list[tuple[Choice, Strategy]]:
 def _strategies(choice: Choice) -> list[Strategy]:
     predicates = [item.atom.predicate for item in choice]
     warm = bool({State.HOT, State.COOKED, State.FROZEN} & set(predicates))
-    choosy = warm or any(map(is_about_chores, predicates))
+    choosy = warm or any(map(needs_tools, predicates))
     carried = sum(predicate in set(Relation) for predicate in predicates)
     found = itertools.product(
         PROOF_SEEDS,
         (False, True) if warm else (False,),
-        range(UNAIMED_WAYS_TRIED if UNAIMED in predicates else WAYS_TRIED if carried else 1),
+        range(UNAIMED_VARIANTS_TRIED if UNAIMED in predicates else VARIANTS_TRIED if carried else 1),
         range(SOURCES_TRIED) if choosy else (0,),
         (False, True) if carried > 1 else (False,),
     )
-    return [Strategy(rank, reverse, way, singly, seed) for seed, singly, way, rank, reverse in found]
+    return [Strategy(rank, reverse, variant, singly, seed) for seed, singly, variant, rank, reverse in found]
 
 
 def _flaw(simulator: Simulator, task: Task, plan: Plan, choice: Choice) -> str:
-    """Why the plan is no proof that the task can be done, "" when it is one."""
+    """Return why a plan does not prove the task, "" if it does."""
     for seed in PROOF_SEEDS:
         trace = simulator.execute(task, plan, seed)
         if trace.failure is not None:
@@ -149,14 +151,14 @@ def _flaw(simulator: Simulator, task: Task, plan: Plan, choice: Choice) -> str:
             missing = _missing(simulator, choice)
             lucky = next((item for item in missing if item.atom.predicate == UNAIMED), None)
             if lucky is not None:
-                return f"{_in_words(lucky)} is a matter of luck: no skill aims at it"
+                return f"{_in_words(lucky)} depends on luck: no skill aims at it"
             unmet = " ".join(map(_in_words, missing))
             return f"with seed {seed} the plan runs to its end and the goal does not hold: {unmet} is missing"
     return ""
 
 
 def _short_enough(simulator: Simulator, task: Task, choice: Choice, strategy: Strategy) -> Plan:
-    """A plan, a thrifty one where another would have too many steps. Raises StuckError."""
+    """Write a plan, a thrifty one if the usual plan has too many steps. Raises StuckError."""
     try:
         return _write(simulator, task, choice, strategy)
     except TooLongError:
@@ -164,13 +166,13 @@ def _short_enough(simulator: Simulator, task: Task, choice: Choice, strategy: St
 
 
 def _write(simulator: Simulator, task: Task, choice: Choice, strategy: Strategy) -> Plan:
-    """Execute what the literals ask for, and return the calls that it took. Raises StuckError."""
-    script = PlanScript(simulator, task, strategy.seed, GoalLiterals(choice), thrifty=strategy.thrifty)
+    """Make the literals true and return the calls. Raises StuckError."""
+    script = PlanScript(simulator, task, strategy.seed, choice, thrifty=strategy.thrifty)
     for _ in range(ROUNDS):
         missing = _missing(simulator, choice)
         if not missing:
             break
-        _errands(simulator, task, choice, missing, strategy).run(script, simulator)
+        _subgoals(simulator, task, choice, missing, strategy).run(script, simulator)
     return script.plan
 
 
@@ -180,25 +182,21 @@ def _missing(simulator: Simulator, choice: Choice) -> list[GroundLiteral]:
     ]
 
 
-def _errands(
+def _subgoals(
     simulator: Simulator, task: Task, choice: Choice, missing: list[GroundLiteral], strategy: Strategy
-) -> Errands:
-    return Errands(
+) -> Subgoals:
+    world = simulator.world
+    work = subgoals_for(world, missing)
+    return Subgoals(
         placements=_placements(choice, strategy),
-        chores=tuple(
-            chosen(
-                simulator.world,
-                task.table,
-                chores_for(simulator.world, missing),
-                portables(simulator.world, task),
-                strategy.source_rank,
-            )
+        tool_work=tuple(
+            chosen_methods(world, task.table, work, portables(world, task), strategy.source_rank)
         ),
-        warmings=_warmings(simulator, task, choice, missing, strategy),
+        exposures=_exposures(simulator, task, choice, missing, strategy),
         open={item.atom.args[0]: item.positive for item in choice if item.atom.predicate == State.OPEN},
         on={item.atom.args[0]: item.positive for item in choice if item.atom.predicate == State.TOGGLED_ON},
         leave=tuple(_relation_of(item) for item in choice if not item.positive and _is_relation(item)),
-        way=strategy.way,
+        variant=strategy.variant,
         singly=strategy.singly,
     )
 
@@ -216,7 +214,7 @@ def _in_words(item: GroundLiteral) -> str:
 
 
 def _placements(choice: Choice, strategy: Strategy) -> tuple[PlacementGoal, ...]:
-    """Where things must be, what others go on or in before those; what is there and stays there is not carried."""
+    """Return final placements in an order that places the hosts of other objects first."""
     wanted = [_relation_of(item) for item in choice if item.positive and _is_relation(item)]
     if strategy.reverse:
         wanted.reverse()
@@ -229,10 +227,10 @@ def _placements(choice: Choice, strategy: Strategy) -> tuple[PlacementGoal, ...]
     return tuple(ordered)
 
 
-def _warmings(
+def _exposures(
     simulator: Simulator, task: Task, choice: Choice, missing: list[GroundLiteral], strategy: Strategy
-) -> tuple[Warming, ...]:
-    """Sources that objects are taken to, hot ones before cold ones. Raises StuckError for what no source does."""
+) -> tuple[Exposure, ...]:
+    """Return exposures to sources, hot ones first. Raises StuckError if no source brings a state about."""
     homes = {
         item.atom.args[0]: item.atom.args[1]
         for item in choice
@@ -241,10 +239,10 @@ def _warmings(
     needs: dict[tuple[str, bool], set[State]] = {}
     for item in missing:
         if item.atom.predicate in (State.HOT, State.COOKED, State.FROZEN):
-            key = (item.atom.args[0], is_hot_work(item))
+            key = (item.atom.args[0], needs_heat(item))
             needs.setdefault(key, set()).add(State(item.atom.predicate))
     return tuple(
-        Warming(
+        Exposure(
             name,
             _source_for(simulator, task, name, hot, frozenset(states), homes.get(name, ""), strategy),
             hot,
@@ -262,9 +260,9 @@ def _source_for(
     home: str,
     strategy: Strategy,
 ) -> str:
-    """A source in the object table that brings the states about.
+    """Return a source in the object table that brings the states about.
 
-    The one that the instruction names goes first, then where the object must end, then those in its room.
+    The source that the instruction names ranks first, then the object's final host, then sources in its room.
     """
     world = simulator.world
     able = list(sources_for(world, task, name, states, hot=hot))
@@ -273,13 +271,33 @@ def _source_for(
             f"no object in the table makes {name} {' and '.join(sorted(states))}: expected a heat or cold source"
         )
     room = world.room_of(name)
-    wording = Wording(task, world.scene)
     able.sort(
         key=lambda other: (
-            -wording.names(other),
+            -naming_rank(task, world.scene, other),
             other != home,
             not world.is_fixed(other),
             world.room_of(other) != room,
         )
     )
     return able[strategy.source_rank % len(able)]
+
+
+def naming_rank(task: Task, scene: Scene, name: str) -> int:
+    """Rank how well the instruction names an object: 0 for not at all, highest for its category in its room.
+
+    Plans for imitation should follow the instruction where the goal leaves a choice.
+    """
+    item = scene.by_name.get(name)
+    if item is None:
+        return 0
+    text = f" {_plain(task.instruction)} "
+    category = _plain(scene.assets[item.asset_id].category)
+    room = _plain(next((room.type for room in scene.rooms if room.name == item.room), ""))
+    if room and f" {category} in the {room} " in text:
+        return NAMED_IN_ROOM
+    return NAMED if f" {category} " in text else 0
+
+
+def _plain(text: str) -> str:
+    """Return lower-case words with single spaces."""
+    return " ".join(re.findall(r"[a-z0-9]+", text.lower()))

@@ -1,9 +1,8 @@
-"""Plans written while they are executed: household routines that emit the skill calls which the present state needs.
+"""Household routines that write a plan while they execute it: they emit the calls that the present state needs.
 
-A routine goes to a thing before it uses it, unless the robot was just sent to that thing or to the container that it
-lies in. So whether a plan has a move follows from what the plan says, not from distances that no planner is told: but for
-plans that would be too long otherwise.
-A call that fails changes nothing and is left out of the plan: where there is a remedy, the routine takes it and tries again.
+A routine moves to an object before it uses it, unless the robot was just sent to that object or to its container. Moves thus
+follow from the plan's own text, not from distances that a policy never sees. Thrifty plans are the exception.
+A failed call changes nothing and is left out of the plan. If there is a remedy, the routine applies it and tries again.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.planner.calls import PlanCalls, StuckError
+from embomatrix.sim.planner.choices import belongs_at, may_lie_on
 from embomatrix.skills.appliances import cold_source, heat_source, starts_closed
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import PlaceRelation, Skill
@@ -20,122 +20,122 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from embomatrix.sim.executor import Simulator
-    from embomatrix.sim.planner.wishes import GoalLiterals
+    from embomatrix.sim.planner.choices import Choice
     from embomatrix.skills.syntax import Plan
     from embomatrix.skills.trace import Step
     from embomatrix.world.task import Task
 
 DEPTH: Final = 8
-"""Things that are taken off, out of or from before one another at most before the last of them is moved."""
+"""Longest chain of objects that must be cleared away, each before the next."""
 SURFACES_TRIED: Final = 8
-"""Surfaces that are tried for a thing that is in the way."""
+"""Surfaces to try for an object that must be put away."""
 BLOCKERS: Final = 3
-"""Things that are taken from before a door at most."""
+"""Objects that are cleared from one door at most."""
 
 
 class PlanScript:
-    """One attempt at a task, from its start. Every routine raises StuckError when a call of it fails for good."""
+    """One attempt at a task. Every routine raises StuckError if one of its calls fails without a remedy."""
 
     def __init__(
-        self, simulator: Simulator, task: Task, seed: int, wishes: GoalLiterals, *, thrifty: bool = False
+        self, simulator: Simulator, task: Task, seed: int, choice: Choice = (), *, thrifty: bool = False
     ) -> None:
-        """A ``thrifty`` attempt goes nowhere for what is in reach already."""
+        """Start an attempt to make the literals of ``choice`` true. ``thrifty``: no moves to objects in reach."""
         self._calls = PlanCalls(simulator, task, seed, thrifty=thrifty)
         self._world = simulator.world
         self._task = task
-        self._wishes = wishes
+        self._choice = choice
 
     @property
     def plan(self) -> Plan:
-        """The calls so far. Of several moves in a row the last is kept, and none at the end."""
+        """Calls so far, as `PlanCalls.plan` gives them."""
         return self._calls.plan
 
     @property
     def rows(self) -> tuple[str, ...]:
-        """The task's object table."""
+        """Object table of the task."""
         return self._task.table
 
     def transfer(
         self, name: str, target: str, relation: PlaceRelation, depth: int = 0, *, near: str = ""
     ) -> None:
-        """Carry an object to its place, beside ``near`` if can be. What must be open is opened while the hand is empty.
+        """Carry an object to its place, from beside ``near`` if possible. Containers are opened while the hand is empty.
 
-        When there is no room, other things are taken from the place first, as long as there are any.
+        If there is no room, other portable objects at that place are put away first.
         """
         while True:
             self._prepare(target, relation)
             self._take(name, depth)
             step = self._calls.place(target, relation, near)
             if step.ok or (
-                step.failure is FailureReason.NO_FREE_POSE and self._piled(name, target, relation)
+                step.failure is FailureReason.NO_FREE_POSE and self._place_on_contents(name, target, relation)
             ):
                 return
-            burden = self._in_the_way_at(target, relation, name)
+            burden = self._removable_at(target, relation, name)
             if step.failure is not FailureReason.NO_FREE_POSE or not burden or depth == DEPTH:
                 raise StuckError(_sentence(step))
             self._set_down(name, frozenset((name, target)))
             self.put_away(burden, frozenset((burden, name, target)), depth + 1)
 
-    def _piled(self, name: str, target: str, relation: PlaceRelation) -> bool:
-        """Whether what the hand holds could be put on something that lies in the target, and so lies in it as well."""
+    def _place_on_contents(self, name: str, target: str, relation: PlaceRelation) -> bool:
+        """Place the held object on an object inside the target. True if it is then inside the target too."""
         if relation is not PlaceRelation.INSIDE:
             return False
         for other in self._task.table:
-            lies_there = other != name and self._world.relations.inside(other, target)
-            if lies_there and self._calls.use(Skill.PLACE, other, PlaceRelation.ONTOP).ok:
+            is_inside = other != name and self._world.relations.inside(other, target)
+            if is_inside and self._calls.use(Skill.PLACE, other, PlaceRelation.ONTOP).ok:
                 if self.holds(Relation.INSIDE, name, target):
                     return True
                 self._take(name, DEPTH)
         return False
 
     def open(self, name: str, depth: int = 0) -> None:
-        """Open it, unless it is open. An appliance that must be closed while it runs is switched off first."""
+        """Open an object unless it is open. An appliance that runs only when closed is switched off first."""
         if self._world.is_open(name):
             return
-        self.clear_way_to(name)
+        self.open_containers_of(name)
         if self._world.is_on(name) and starts_closed(self._world.asset(name)):
             self.switch_off(name)
         self._swing(Skill.OPEN, name, depth)
 
     def close(self, name: str, depth: int = 0) -> None:
-        """Close it, unless it is closed."""
+        """Close an object unless it is closed."""
         if self._world.is_open(name):
-            self.clear_way_to(name)
+            self.open_containers_of(name)
             self._swing(Skill.CLOSE, name, depth)
 
     def switch_on(self, name: str) -> None:
-        """Switch it on, unless it is on, closed if it must be."""
+        """Switch an object on unless it is on. Close it first if it runs only when closed."""
         if self._world.is_on(name):
             return
-        self.clear_way_to(name)
+        self.open_containers_of(name)
         if starts_closed(self._world.asset(name)):
             self.close(name)
         self._use(Skill.TOGGLE_ON, name)
 
     def switch_off(self, name: str) -> None:
-        """Switch it off, unless it is off."""
+        """Switch an object off unless it is off."""
         if self._world.is_on(name):
-            self.clear_way_to(name)
+            self.open_containers_of(name)
             self._use(Skill.TOGGLE_OFF, name)
 
     def put_away(self, name: str, avoid: frozenset[str], depth: int = 0) -> None:
-        """Carry an object to the first surface with room that is none of ``avoid``; those of its own room come first."""
+        """Carry an object to the first surface with room outside ``avoid``, preferably in its present room."""
         if not any(self._surfaces(name, avoid)):
             raise StuckError(f"there is no free surface in the object table to put {name} on")
         self._take(name, depth)
         self._set_down(name, avoid)
 
     def holds(self, relation: Relation, a: str, b: str) -> bool:
-        """Whether the relation holds in the state reached."""
+        """True if the relation holds now."""
         return self._world.relations.holds(relation, a, b)
 
     def take(self, name: str) -> None:
-        """Take an object into the hand, unless it is there."""
+        """Pick an object up unless it is in the hand."""
         if name not in self._world.carried[:1]:
             self._take(name, 0)
 
-    def lay_down(self, avoid: frozenset[str]) -> None:
-        """Leave what the hand holds on the first surface with room that is none of ``avoid``."""
+    def put_down(self, avoid: frozenset[str]) -> None:
+        """Place the held object on the first surface with room outside ``avoid``."""
         held = self._world.carried[0]
         self._set_down(held, avoid | {held})
 
@@ -146,18 +146,18 @@ class PlanScript:
             raise StuckError(_sentence(step))
 
     def unload(self, name: str) -> None:
-        """Take off what rests on an object."""
+        """Put away the objects that rest on an object."""
         while burden := self._world.burden(name):
             self._unload(burden, name, 0)
 
-    def clear_way_to(self, name: str) -> None:
+    def open_containers_of(self, name: str) -> None:
         """Open the closed containers around an object, the outermost first."""
         around = [item.name for item in self._world.relations.enclosing(name) if item.closed]
         for container in reversed(around):
             self.open(container)
 
     def _set_down(self, name: str, avoid: frozenset[str]) -> None:
-        """Place what the hand holds on the first surface with room."""
+        """Place the held object on the first surface with room."""
         reason = ""
         for _, surface in zip(range(SURFACES_TRIED), self._surfaces(name, avoid), strict=False):
             step = self._calls.use(Skill.PLACE, surface, PlaceRelation.ONTOP)
@@ -167,7 +167,7 @@ class PlanScript:
         raise StuckError(reason or f"there is no free surface in the object table to put {name} on")
 
     def _surfaces(self, name: str, avoid: frozenset[str]) -> Iterator[str]:
-        """Where a thing may be left: plain furniture before what has doors, works or can be carried itself."""
+        """Yield surfaces for an object: plain furniture first, then furniture with doors, portable objects, and sources."""
         room = self._world.room_of(name)
 
         def rank(surface: str) -> tuple[bool, ...]:
@@ -184,19 +184,19 @@ class PlanScript:
                     if item not in avoid
                     and item not in self._world.carried
                     and self._world.asset(item).supports
-                    and self._wishes.may_lie_on(name, item, self._world.room_of(item))
+                    and may_lie_on(self._choice, name, item, self._world.room_of(item))
                 ),
                 key=rank,
             )
         )
 
     def _prepare(self, target: str, relation: PlaceRelation) -> None:
-        self.clear_way_to(target)
+        self.open_containers_of(target)
         if relation is PlaceRelation.INSIDE and self._world.asset(target).joints:
             self.open(target)
 
-    def _in_the_way_at(self, target: str, relation: PlaceRelation, name: str) -> str:
-        """A thing that can be carried and takes room on or in the target, "" when there is none."""
+    def _removable_at(self, target: str, relation: PlaceRelation, name: str) -> str:
+        """Return an object that takes up room at the target and may go elsewhere, "" for none."""
         wanted = Relation(relation.value)
         return next(
             (
@@ -205,13 +205,13 @@ class PlanScript:
                 if other != name
                 and not self._world.is_fixed(other)
                 and self._world.relations.holds(wanted, other, target)
-                and not self._wishes.belongs_at(other, target)
+                and not belongs_at(self._choice, other, target)
             ),
             "",
         )
 
     def _take(self, name: str, depth: int) -> None:
-        self.clear_way_to(name)
+        self.open_containers_of(name)
         while burden := self._world.burden(name):
             self._unload(burden, name, depth)
         step = self._calls.use(Skill.PICK_UP, name)
@@ -223,12 +223,12 @@ class PlanScript:
 
     def _unload(self, burden: str, name: str, depth: int) -> None:
         if depth == DEPTH:
-            raise StuckError(f"too many things are stacked on {name}")
+            raise StuckError(f"too many objects are stacked on {name}")
         self.put_away(burden, frozenset((name, burden)), depth + 1)
-        self.clear_way_to(name)
+        self.open_containers_of(name)
 
     def _swing(self, skill: Skill, name: str, depth: int) -> None:
-        """Move a door or a lid; what can be carried away from before it is, or else the thing itself to where it opens."""
+        """Open or close a door. A portable object that blocks it is put away, else the object itself if it is portable."""
         for _ in range(BLOCKERS):
             step = self._calls.use(skill, name)
             if step.ok:

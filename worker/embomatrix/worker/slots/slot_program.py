@@ -22,10 +22,10 @@ import weakref
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
+from embomatrix.host.anonymous_memory import nameless_file
 from embomatrix.host.parent import die_with_parent
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.settings import PAPER, RewardSettings
-from embomatrix.rpc.nameless import nameless_file
 from embomatrix.rpc.wire.outcome import completed_to_proto
 from embomatrix.rpc.wire.rollout import rollout_from_proto
 from embomatrix.rpc.wire.values import InfraCode
