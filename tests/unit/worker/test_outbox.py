@@ -9,7 +9,6 @@ from embomatrix.rpc.wire.leases import LeaseRef, LeaseResult
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure
 from embomatrix.worker.link import outbox as module
 from embomatrix.worker.link.outbox import ResultOutbox
-from embomatrix.worker.link.reconnecting import Backoff
 
 
 def _result(number):

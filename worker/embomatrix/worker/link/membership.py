@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import os
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
@@ -16,8 +15,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from embomatrix.worker.host.settings import WorkerSettings
-
-logger = logging.getLogger(__name__)
 
 CONFLICTS_ALLOWED: Final = 3
 """More session conflicts than this within the window mean that another worker has the same name."""
