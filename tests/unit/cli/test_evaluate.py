@@ -46,7 +46,7 @@ def told(*arguments):
             "expected one of --model, --endpoint, --baseline and --answers",
         ),
         (("--baseline=oracle", "--bench=nowhere"), "no benchmark at nowhere: pass a dataset folder"),
-        (("--baseline=oracle", "--bench=eai"), "make it with `embomatrix factory import`"),
+        (("--baseline=oracle", "--bench=eai"), "create it with `embomatrix factory import`"),
         (
             ("--endpoint=http://127.0.0.1:1/v1", "--bench=DATASET"),
             "pass --model-name as the endpoint calls it",
@@ -56,6 +56,7 @@ def told(*arguments):
             "is measured as a whole: leave out --split",
         ),
         (("--answers=OUT/none",), "none can't be read (No such file or directory)"),
+        (("--baseline=oracle", "--settings=OUT/none"), "none can't be read (No such file or directory)"),
     ],
 )
 def test_evaluation_that_can_not_be_made_is_told_why(kitchen, tmp_path, arguments, words):
@@ -67,8 +68,9 @@ def test_evaluation_that_can_not_be_made_is_told_why(kitchen, tmp_path, argument
 
 
 def test_endpoint_that_can_not_be_reached_is_named(kitchen, tmp_path):
-    asked = ("--endpoint=http://127.0.0.1:1/v1", "--model-name=m", "--attempts=1", f"--bench={kitchen}")
-    status, text = told(*asked, "--samples=2", f"--out={tmp_path}")
+    (tmp_path / "settings.toml").write_text("attempts = 1\nsamples = 3\n")
+    asked = ("--endpoint=http://127.0.0.1:1/v1", "--model-name=m", f"--settings={tmp_path / 'settings.toml'}")
+    status, text = told(*asked, f"--bench={kitchen}", "--samples=2", f"--out={tmp_path}")
     assert status == 2
     assert "can't be reached" in text
     assert "0 of 2 answers are kept in" in text
@@ -86,7 +88,7 @@ def test_answers_that_are_missing_are_told(measured, tmp_path):
     (tmp_path / "answers.jsonl").write_text("".join(lines[:5]))
     status, text = told(f"--answers={tmp_path / 'answers.jsonl'}", "--jobs=1")
     assert status == 0
-    assert "8 of 12 answers are missing: figures are over the others" in text
+    assert "8 of 12 answers are missing: the figures leave them out" in text
     assert json.loads((tmp_path / "report.json").read_text())["samples"] == 4
 
 
@@ -108,7 +110,8 @@ def test_an_answer_that_was_never_asked_for_is_named(measured, tmp_path, field, 
     status, text = told(f"--answers={tmp_path / 'answers.jsonl'}")
     assert status == 2
     assert (
-        f"answer to sample {stranger['sample']} of the task '{stranger['task_id']}', which was never" in text
+        f"answer to sample {stranger['sample']} of the task '{stranger['task_id']}', which is not part"
+        in text
     )
 
 
