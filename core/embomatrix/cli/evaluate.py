@@ -219,8 +219,14 @@ def evaluate(
                 "expected one of --model, --endpoint, --baseline and --answers: give one of them"
             )
         options = {
-            **{"samples": samples, "temperature": temperature, "max_tokens": max_tokens, "codec": codec},
-            **{"profile": profile, "tasks": tasks, "jobs": jobs, "threads": threads},
+            "samples": samples,
+            "temperature": temperature,
+            "max_tokens": max_tokens,
+            "codec": codec,
+            "profile": profile,
+            "tasks": tasks,
+            "jobs": jobs,
+            "threads": threads,
         }
         settings = read_eval_settings(settings_file, options)
         open_executor = functools.partial(_executor, manager, token, ca, settings.jobs)
