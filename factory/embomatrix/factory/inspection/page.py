@@ -42,9 +42,7 @@ def task_page(
     tree: object = None,
     picture: str = "",
 ) -> str:
-    """Return the page. ``transcript`` is Markdown, ``tree`` a nested layout tree, ``picture`` the HTML of
-    `scene_picture`.
-    """
+    """Return the page. ``transcript`` is Markdown, ``tree`` a nested layout tree, ``picture`` the HTML of `scene_picture`."""
     task = record.task
     about = objects_of(task.goal, task.types)
     things = list(show.moments[0].things_m)

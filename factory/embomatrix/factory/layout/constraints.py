@@ -183,9 +183,7 @@ def next_to_m(size_m: Size3, other: PlaneFootprint) -> float:
 
 
 def _beside(spots: SpotCandidates, size_m: Size3, other: PlaneFootprint) -> BoolArray:
-    """Mask of spots side by side with a footprint: overlapping heights, a shared span along one axis, and a small
-    gap.
-    """
+    """Mask of spots side by side with a footprint: overlapping heights, a shared span along one axis, and a small gap."""
     if other.low_m >= size_m[2] or other.high_m <= 0.0:
         return np.zeros(len(spots), dtype=bool)
     apart = np.abs(spots.center - np.asarray(other.center_m)) - spots.half - _half(other)  # (n, 2)

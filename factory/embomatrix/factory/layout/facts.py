@@ -39,8 +39,7 @@ def rooms_of(editor: SceneEditor) -> tuple[LayoutRoomFacts, ...]:
 
 
 def hosts_in(editor: SceneEditor, room: str, named: Container[str] = ()) -> tuple[HostFacts, ...]:
-    """Return the possible hosts in a room: furniture that people put objects on or in, and objects that the task
-    names.
+    """Return the possible hosts in a room: furniture that people put objects on or in, and objects that the task names.
 
     Furniture that the robot can't reach is left out.
     """

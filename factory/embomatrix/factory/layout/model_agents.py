@@ -78,8 +78,7 @@ class ConstraintsAnswer(_Answer):
 
 
 class ModelLayoutAgents(OnOneLoop):
-    """Layout agents on one language model. The rules replace unusable answers, and missing ones up to
-    ``failure_limit``.
+    """Layout agents on one language model. The rules replace unusable answers, and missing ones up to ``failure_limit``.
 
     Without a limit, the first missing answer raises EndpointError.
     """
@@ -207,9 +206,7 @@ class ModelLayoutAgents(OnOneLoop):
         seed: int,
         history: str = "",
     ) -> T | None:
-        """Return a checked answer, or None if it is unusable or missing. Raise EndpointError beyond the failure
-        limit.
-        """
+        """Return a checked answer, or None if it is unusable or missing. Raise EndpointError beyond the failure limit."""
         text = USER.format(brief=LAYOUT_AGENTS[name].brief.dump_json(brief).decode())
         if history:
             text += f"\nEarlier failures:\n{history}"

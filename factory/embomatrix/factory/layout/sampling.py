@@ -1,5 +1,6 @@
-"""Object-level Sampling Agent: continuous poses on, in, under and beside objects. Each pose is free, reachable and
-blocks no path.
+"""Object-level Sampling Agent: continuous poses on, in, under and beside objects.
+
+Each pose is free, reachable and blocks no path.
 """
 
 from __future__ import annotations

@@ -156,8 +156,7 @@ def build_dataset(
     check: VariantCheck | None = None,
     layout: LayoutAgents | None = None,
 ) -> BuildSummary:
-    """Build a dataset, or resume an interrupted build. ``progress`` is called with each split's number of admitted
-    tasks.
+    """Build a dataset, or resume an interrupted build. ``progress`` is called with each split's number of admitted tasks.
 
     ``check`` is a second check of each variant, such as a cluster. ``writer`` and ``layout`` replace the writer of
     the settings and the rule-based layout agents; they run in this process. Otherwise ``jobs`` processes are used.
@@ -212,8 +211,7 @@ class _SplitOrders:
         return len(self._store.records_of(self._split))
 
     def next_round(self) -> list[VariantOrder]:
-        """Return the next variants to make, without those that the store already holds. Empty if the split is
-        complete.
+        """Return the next variants to make, without those that the store already holds. Empty if the split is complete.
 
         An incomplete round is repeated with the orders of its first start, which know no task of their own round.
         """
@@ -306,8 +304,9 @@ def _summary(store: BuildStore, rooms: Mapping[str, Mapping[str, tuple[str, ...]
 def variant_makers(
     settings: BuildSettings, writer: TaskWriter | None, layout: LayoutAgents | None, jobs: int
 ) -> Iterator[MakeVariants]:
-    """Yield a function that makes variants. ``writer`` and ``layout`` stay in this process, since they may hold a
-    connection.
+    """Yield a function that makes variants.
+
+    ``writer`` and ``layout`` stay in this process, since they may hold a connection.
     """
     if writer is not None or layout is not None:
         with contextlib.closing(VariantMaker(settings, writer, layout)) as maker:

@@ -47,8 +47,9 @@ class ClusterCheck:
             self._runner.close()
 
     def check(self, made: VariantYield) -> VariantYield:
-        """Return the variant with the tasks that the cluster admits. Raise ClusterError, or DatasetError if a slot
-        can't execute a plan.
+        """Return the variant with the tasks that the cluster admits.
+
+        Raise ClusterError, or DatasetError if a slot can't execute a plan.
         """
         if not made.result.records:
             return made

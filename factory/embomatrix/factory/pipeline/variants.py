@@ -55,9 +55,7 @@ FOCUS_ROOMS: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class VariantOrder:
-    """Order for one variant of a base scene. ``rooms`` are those of its split; ``known`` holds keys of existing
-    tasks.
-    """
+    """Order for one variant of a base scene. ``rooms`` are those of its split; ``known`` holds keys of existing tasks."""
 
     split: str
     number: int
@@ -213,7 +211,10 @@ class _VariantJob:
         """Write the next draft, or several at once if the writer waits for answers. Empty after the last turn."""
         if not isinstance(self._writer, BatchTaskWriter):
             return [
-                (category, self._writer.write(self._variant, view, category, self._task_id(known), rng))
+                (
+                    category,
+                    self._writer.write(self._variant, view, DraftOrder(category, self._task_id(known), rng)),
+                )
                 for category in itertools.islice(turns, 1)
             ]
         categories = list(itertools.islice(turns, min(self._writer.at_once, MAX_DRAFTS - known)))

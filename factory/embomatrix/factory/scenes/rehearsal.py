@@ -41,8 +41,9 @@ class SimulatedRobot:
     """Feasibility checks in the simulator. Each check runs once. Close after use; not thread-safe."""
 
     def __init__(self, scene: Scene, blocks: ArmLimits = lambda _: False) -> None:
-        """Load the scene. ``blocks`` reports handlings that the arm can't do. Raise EngineError if the scene can't be
-        loaded.
+        """Load the scene.
+
+        ``blocks`` reports handlings that the arm can't do. Raise EngineError if the scene can't be loaded.
         """
         self._view = SceneView(scene)
         self._blocks = blocks
@@ -113,9 +114,7 @@ class SimulatedRobot:
         return not self._blocks(handled)
 
     def _task_about(self, names: tuple[str, ...]) -> Task:
-        """Return a task for the simulator with these objects and their supports in its table. Its goal is a
-        placeholder.
-        """
+        """Return a task for the simulator with these objects and their supports in its table. Its goal is a placeholder."""
         goal = Atom(State.OPEN.value, names[:1])
         rows = dict.fromkeys(row for name in names for row in (name, *self._view.hosts(name)))
         return Task(

@@ -195,9 +195,7 @@ NEVER_REQUESTED: Final = frozenset(
     }
 )
 _NEVER_REQUESTED_ENDINGS: Final = ("_shaker", "_atomizer", "_bottle", "_grinder", "_dispenser", "_can")
-"""Categories, and endings of categories, that nobody asks to open or switch. In the catalog, a salt shaker has a
-switch.
-"""
+"""Categories, and endings of categories, that nobody asks to open or switch. In the catalog, a salt shaker has a switch."""
 STORAGE_THEMES: Final[Mapping[str, frozenset[Theme]]] = {
     **dict.fromkeys(_KITCHEN, _themes("cooking meals tidying stock guests")),
     **dict.fromkeys(

@@ -1,6 +1,4 @@
-"""Import of problems over many scenes: each problem is bound to the first suitable scene and verified in the
-simulator.
-"""
+"""Import of problems over many scenes: each problem is bound to the first suitable scene and verified in the simulator."""
 
 from __future__ import annotations
 
@@ -84,8 +82,7 @@ def bind_first(
 def imports(
     source: SourceText, bases: Sequence[Scene], *, seed: int, options: ImportOptions, draws: int = 1
 ) -> Iterator[ImportedTask | TaskRefusal]:
-    """Yield imports of the problem into each scene as it is, and with missing furniture added if the options allow
-    it.
+    """Yield imports of the problem into each scene as it is, and with missing furniture added if the options allow it.
 
     The problem's own scene is tried ``draws`` times before all others. The last round renumbers rooms. Refusals that
     do not depend on the scene end the search.
@@ -127,8 +124,7 @@ def verify_first(
     seed: int = 0,
     options: ImportOptions | None = None,
 ) -> Verified | TaskRefusal:
-    """Import the problem into the first scene in which it is admitted. Otherwise return the refusal that came
-    furthest.
+    """Import the problem into the first scene in which it is admitted. Otherwise return the refusal that came furthest.
 
     The order of the scenes is that of `bind_first`. Raise BddlError.
     """

@@ -33,8 +33,9 @@ SOLVED_GOAL: Final = 0.95
 
 @dataclass(frozen=True, slots=True)
 class ProblemOutcome:
-    """Outcome of one problem. ``scene`` is its base scene; if the problem is refused, ``reason`` and ``sentence`` are
-    set instead.
+    """Outcome of one problem.
+
+    ``scene`` is its base scene; if the problem is refused, ``reason`` and ``sentence`` are set instead.
 
     ``unreachable`` lists the goal's literals that no skill achieves, by profile. ``notes`` lists changes made to the
     problem.

@@ -129,9 +129,7 @@ def floor_needed_m2(contents: tuple[str, ...]) -> float:
 
 
 def _fits(size_m: Vec3, floor: SupportSurface) -> bool:
-    """True if the footprint fits on the floor in either orientation and the height fits below the ceiling of the
-    cavity.
-    """
+    """True if the footprint fits on the floor in either orientation and the height fits below the ceiling of the cavity."""
     footprint = sorted(size_m[:2])
     return all(map(operator.le, footprint, sorted(floor.size_m))) and size_m[2] <= floor.clearance_m
 
