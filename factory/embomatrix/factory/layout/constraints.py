@@ -72,9 +72,7 @@ GRADED_SHARE: Final = 0.3
 
 @dataclass(frozen=True, slots=True)
 class SpotCandidates:
-    """Candidate spots of one object: centres (n, 2), yaws (n,), and half extents (n, 2) of the box around the rotated
-    footprint.
-    """
+    """Candidate spots of one object: centres (n, 2), yaws (n,), and half extents (n, 2) of the rotated footprint's box."""
 
     center: FloatArray
     yaw: FloatArray

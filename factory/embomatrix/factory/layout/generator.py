@@ -90,8 +90,8 @@ def lay(
     left: list[LayoutFailure] = []
     unreachable: list[LayoutFailure] = []
     for number, room in enumerate(dict.fromkeys(rooms.values())):
-        mine = [item for item in items if rooms[item.name] == room]
-        job = _RoomJob(editor, agents, editor.rooms[room], mine, seed * 1009 + number, record)
+        room_items = [item for item in items if rooms[item.name] == room]
+        job = _RoomJob(editor, agents, editor.rooms[room], room_items, seed * 1009 + number, record)
         left += job.run()
         names |= job.names
         unreachable += job.unreachable

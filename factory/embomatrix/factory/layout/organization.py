@@ -202,8 +202,8 @@ def organize(brief: RoomBrief) -> LayoutTree:
         options = list(choices(brief, thing, hung))
         if not options:
             continue
-        worths = [_branch_score(brief, thing, branch, contents) for branch in options]
-        best = options[int(np.argmax(np.asarray(worths) + RANDOM_SCORE * rng.random(len(options))))]
+        scores = [_branch_score(brief, thing, branch, contents) for branch in options]
+        best = options[int(np.argmax(np.asarray(scores) + RANDOM_SCORE * rng.random(len(options))))]
         hung[thing.name] = best
         contents.setdefault(best.parent, Counter())[thing.category] += 1
     return LayoutTree.of(brief.room.name, hung.values())
@@ -302,18 +302,18 @@ def host_score(category: str, host: HostFacts, relation: LayoutRelation) -> floa
         return UNSUITABLE_SCORE
     wanted = preferred_hosts(category)
     if relation is LayoutRelation.ONTOP and is_appliance_top(host.category):
-        worth = AVOIDED_SCORE
+        score = AVOIDED_SCORE
     elif host.category in wanted:
-        worth = PREFERRED_SCORE - RANK_PENALTY * wanted.index(host.category)
+        score = PREFERRED_SCORE - RANK_PENALTY * wanted.index(host.category)
     else:
-        worth = AVOIDED_SCORE if host.category in NO_HOSTS else UNKNOWN_SCORE
+        score = AVOIDED_SCORE if host.category in NO_HOSTS else UNKNOWN_SCORE
     if relation is LayoutRelation.INSIDE and not kept_behind_doors(category, host.category):
-        worth += (
+        score += (
             UNSUITABLE_SCORE
             if is_appliance_top(host.category) and host.category not in wanted
             else CLOSED_SCORE
         )
-    return worth
+    return score
 
 
 def describe_failures(failures: Sequence[LayoutFailure]) -> str:

@@ -154,7 +154,7 @@ class HostFacts:
     category: str
     offers: tuple[HostOffer, ...]
     contents: tuple[str, ...] = ()
-    shut: bool = False
+    closed: bool = False
 
 
 @_value

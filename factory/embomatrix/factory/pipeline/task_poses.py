@@ -178,13 +178,13 @@ class SceneSurvey:
 
     def blocks(self, handled: Sequence[tuple[Handling, str]]) -> bool:
         """True if the arm can't do one of the handlings in the initial scene."""
-        self._look_at(name for _, name in handled)
+        self._compute(name for _, name in handled)
         return any(name in self._blocked.get(handling, {}) for handling, name in handled)
 
     def poses(self, names: Iterable[str]) -> PoseCache:
         """Return standing poses and arm limits of these objects as a bundle carries them, without placements."""
         wanted = dict.fromkeys(names)
-        self._look_at(wanted)
+        self._compute(wanted)
         barred = {
             handling: {name: found[name] for name in wanted if name in found}
             for handling in Handling
@@ -196,7 +196,7 @@ class SceneSurvey:
         """Return the cache with the reachable poses of each placed object."""
         return poses if self._foresight is None else prospects(self._world, poses, placings)
 
-    def _look_at(self, names: Iterable[str]) -> None:
+    def _compute(self, names: Iterable[str]) -> None:
         fresh = [name for name in dict.fromkeys(names) if name not in self._stands]
         if not fresh:
             return

@@ -95,14 +95,14 @@ class VariantMaker:
         if writer is None:
             writer = SocialWriter(settings.seed) if settings.writer is WriterKind.SOCIAL else PlainWriter()
         foresight = Foresight() if settings.look_ahead else None
-        self._bench = _SharedTools(settings, writer, PlacementLibrary(), foresight)
+        self._tools = _SharedTools(settings, writer, PlacementLibrary(), foresight)
         self._layout = layout
         self._bases: dict[str, Scene] = {}
 
     def make(self, order: VariantOrder) -> VariantYield:
         """Write and judge the tasks of one variant."""
         began = time.process_time()
-        seed = self._bench.settings.seed
+        seed = self._tools.settings.seed
         if order.base not in self._bases:
             self._bases[order.base] = build_base_scene(order.base, seed=seed)
         base = self._bases[order.base]
@@ -113,11 +113,11 @@ class VariantMaker:
         variant = build_variant(
             base, focus, f"{base.base}-{order.split}-{order.number:03d}", rng, self._layout
         )
-        made = _VariantJob(variant, order, self._bench).run(rng)
-        return replace(made, cpu_s=time.process_time() - began)
+        result = _VariantJob(variant, order, self._tools).run(rng)
+        return replace(result, cpu_s=time.process_time() - began)
 
     def close(self) -> None:
-        self._bench.library.close()
+        self._tools.library.close()
 
 
 def uniqueness_key(signature: str, instruction: str) -> str:
@@ -149,14 +149,14 @@ def _focus(
 class _VariantJob:
     """Writing and judging of one variant's tasks."""
 
-    def __init__(self, variant: Variant, order: VariantOrder, bench: _SharedTools) -> None:
+    def __init__(self, variant: Variant, order: VariantOrder, tools: _SharedTools) -> None:
         self._variant = variant
         self._order = order
-        self._seed = bench.settings.seed
-        self._writer = bench.writer
-        self._library = bench.library
-        self._foresight = bench.foresight
-        self._physical = bench.settings.physical
+        self._seed = tools.settings.seed
+        self._writer = tools.writer
+        self._library = tools.library
+        self._foresight = tools.foresight
+        self._physical = tools.settings.physical
         self._known = set(order.known)
         self._admitted: list[tuple[Draft, Plan]] = []
         self._rejections: list[Rejection] = []
@@ -173,7 +173,7 @@ class _VariantJob:
         left = dict(missing)
         bundle = Bundle(scene, {}, poses)
         with contextlib.ExitStack() as stack:
-            stage = stack.enter_context(contextlib.closing(load_simulator(bundle)))
+            simulator = stack.enter_context(contextlib.closing(load_simulator(bundle)))
             robot = (
                 stack.enter_context(contextlib.closing(physical_simulator(bundle)))
                 if self._physical
@@ -182,10 +182,10 @@ class _VariantJob:
             for draft in drafts:
                 if len(self._admitted) == TASKS_PER_VARIANT:
                     break
-                if left[draft.task.category] > 0 and self._judge(stage, robot, draft):
+                if left[draft.task.category] > 0 and self._judge(simulator, robot, draft):
                     left[draft.task.category] -= 1
             tasks = {draft.task.task_id: draft.task for draft, _ in self._admitted}
-            data = encode_bundle(prepare(Bundle(scene, tasks, poses), stage.world))
+            data = encode_bundle(prepare(Bundle(scene, tasks, poses), simulator.world))
         return VariantYield(self._result(bundle_digest(data)), data, self._transcripts(), self._trees())
 
     def _write(
@@ -250,11 +250,11 @@ class _VariantJob:
     def _is_new(self, draft: Draft) -> bool:
         """True if the signature belongs to this split and the task is not known yet."""
         key = uniqueness_key(draft.signature, draft.task.instruction)
-        mine = is_heldout_signature(draft.signature, self._seed) is (self._order.split == "heldout")
-        return mine and key not in self._known
+        in_split = is_heldout_signature(draft.signature, self._seed) is (self._order.split == "heldout")
+        return in_split and key not in self._known
 
-    def _judge(self, stage: Simulator, robot: Simulator | None, draft: Draft) -> bool:
-        verdict = admit(stage, draft.task, find_plan, physics=robot)
+    def _judge(self, simulator: Simulator, robot: Simulator | None, draft: Draft) -> bool:
+        verdict = admit(simulator, draft.task, find_plan, physics=robot)
         if isinstance(verdict, Admitted):
             self._admitted.append((draft, verdict.plan))
             return True

@@ -266,8 +266,9 @@ def _person(
 def _day(
     people: Sequence[Person], rooms: Sequence[Room], milieu: Milieu, rng: np.random.Generator
 ) -> tuple[DaySlot, ...]:
-    """Return the schedule: activities in the people's own rooms, then every other activity of each room, then
-    unvisited rooms.
+    """Return the schedule.
+
+    It holds activities in the people's own rooms, then every other activity of each room, then unvisited rooms.
     """
     types = {room.name: _activities_in(room.type, milieu) for room in rooms}
     slots = []

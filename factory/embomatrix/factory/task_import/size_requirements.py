@@ -154,10 +154,10 @@ def smallest_m(type_name: str) -> Vec3 | None:
 def _holds_at_start(problem: BddlProblem, atom: Atom) -> bool:
     """True if the atom holds at the start for everything that its names stand for."""
     first, second = (problem.types.get(name.lstrip("?"), (name.lstrip("?"),)) for name in atom.args)
-    told = {
+    at_start = {
         item.atom.args for item in problem.init if item.positive and item.atom.predicate == atom.predicate
     }
-    return all(any((one, other) in told for other in second) for one in first)
+    return all(any((one, other) in at_start for other in second) for one in first)
 
 
 def _share(problem: BddlProblem, thing: str, host: str) -> list[str]:

@@ -68,15 +68,15 @@ class DoorOpener:
 
     def _in_the_way_of_doors(self, name: str, trial: Scene) -> bool:
         item = trial.by_name[name]
-        leaf = Solids()
-        leaf.add(name, placed_parts(trial.asset_of(name), item.pose_world_asset, item.joints))
+        panel = Solids()
+        panel.add(name, placed_parts(trial.asset_of(name), item.pose_world_asset, item.joints))
         for other in self._doors:
             swinging = trial.by_name[other]
             if other == name or any(swinging.joints):
                 continue
             asset = trial.asset_of(other)
             sweep = (placed_parts(asset, swinging.pose_world_asset, [s] * len(asset.joints)) for s in SWEEP)
-            if any(leaf.overlaps(parts) for parts in sweep):
+            if any(panel.overlaps(parts) for parts in sweep):
                 return True
         return False
 
