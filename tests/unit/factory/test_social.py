@@ -292,7 +292,7 @@ def test_tidying_person_does_not_ask_for_running_water():
     assert sinks
     for sink in sinks:
         sign = f"toggled_on({sink})"
-        piece = GoalConjunct(Atom("toggled_on", (sink,)), "", (sink,), (sign,), "switch", "it", options="tap")
+        piece = GoalConjunct(Atom("toggled_on", (sink,)), "", (sink,), (sign,), "switch", "it", manner="tap")
         assert Theme.TIDYING not in themes_of(piece, Flat()), sink
 
 
