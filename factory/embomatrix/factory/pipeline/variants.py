@@ -16,7 +16,7 @@ from embomatrix.factory.pipeline.settings import WriterKind
 from embomatrix.factory.pipeline.store import Rejection, VariantResult
 from embomatrix.factory.pipeline.task_poses import PoseNeeds, SceneSurvey, cache_poses
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.scenes.rehearsal import SimulatedRobot
+from embomatrix.factory.scenes.feasibility import SimulatedRobot
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.factory.writer.tasks import BatchTaskWriter, DraftOrder, PlainWriter, is_heldout_signature
@@ -166,15 +166,15 @@ class _VariantJob:
         missing = self._order.missing
         scene = self._variant.scene
         with SceneSurvey(scene, self._foresight) as survey:
-            with SimulatedRobot(scene, survey.blocks) as rehearsal:
-                drafts = self._write(missing, SceneView(scene, rehearsal), rng)
+            with SimulatedRobot(scene, survey.blocks) as robot:
+                drafts = self._write(missing, SceneView(scene, robot), rng)
             needs = [PoseNeeds(draft.about, draft.task.table) for draft in drafts]
             poses = cache_poses(SceneView(scene), needs, self._library, survey, self._seed)
         left = dict(missing)
         bundle = Bundle(scene, {}, poses)
         with contextlib.ExitStack() as stack:
             simulator = stack.enter_context(contextlib.closing(load_simulator(bundle)))
-            robot = (
+            physics = (
                 stack.enter_context(contextlib.closing(physical_simulator(bundle)))
                 if self._physical
                 else None
@@ -182,7 +182,7 @@ class _VariantJob:
             for draft in drafts:
                 if len(self._admitted) == TASKS_PER_VARIANT:
                     break
-                if left[draft.task.category] > 0 and self._judge(simulator, robot, draft):
+                if left[draft.task.category] > 0 and self._judge(simulator, physics, draft):
                     left[draft.task.category] -= 1
             tasks = {draft.task.task_id: draft.task for draft, _ in self._admitted}
             data = encode_bundle(prepare(Bundle(scene, tasks, poses), simulator.world))
@@ -253,8 +253,8 @@ class _VariantJob:
         in_split = is_heldout_signature(draft.signature, self._seed) is (self._order.split == "heldout")
         return in_split and key not in self._known
 
-    def _judge(self, simulator: Simulator, robot: Simulator | None, draft: Draft) -> bool:
-        verdict = admit(simulator, draft.task, find_plan, physics=robot)
+    def _judge(self, simulator: Simulator, physics: Simulator | None, draft: Draft) -> bool:
+        verdict = admit(simulator, draft.task, find_plan, physics=physics)
         if isinstance(verdict, Admitted):
             self._admitted.append((draft, verdict.plan))
             return True

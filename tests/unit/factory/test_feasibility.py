@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from embomatrix.factory.pipeline.task_poses import SceneSurvey
-from embomatrix.factory.scenes.rehearsal import SimulatedRobot
+from embomatrix.factory.scenes.feasibility import SimulatedRobot
 from embomatrix.factory.scenes.view import CapableRobot, SceneView
 from embomatrix.factory.social.requests import RequestedAtom, RequestPredicate, TaskRequest, check_request
 from embomatrix.factory.writer.tasks import DraftOrder, PlainWriter
