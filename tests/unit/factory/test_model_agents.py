@@ -120,7 +120,7 @@ def test_invalid_descriptions_are_rejected_and_the_inventory_is_used():
     short = {"rooms": {room: SIGHT["rooms"][room] for room in ROOMS[1:]}}
     draft, server = written(*map(json.dumps, (order, short, order)), CAST, TALK, GOOD, look=seen)
     assert "string should match pattern" in server.requests[1]["messages"][-1]["content"]
-    assert f"nothing is said of {ROOMS[0]}" in server.requests[2]["messages"][-1]["content"]
+    assert f"no sentence describes {ROOMS[0]}" in server.requests[2]["messages"][-1]["content"]
     assert draft is not None
     assert "fire" not in server.requests[3]["messages"][1]["content"]
 
