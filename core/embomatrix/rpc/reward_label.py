@@ -1,55 +1,51 @@
-"""What a trainer that asks for rewards over HTTP carries beside each prompt: all that makes a rollout of an answer."""
+"""Label that a trainer sends beside each prompt when it requests rewards over HTTP."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
-from typing import Self
+from dataclasses import asdict
+from typing import Annotated, Self
+
+from pydantic import Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
 
 from embomatrix.rpc.status import InvalidRequestError
-from embomatrix.world.task import Profile
+from embomatrix.world.task import Profile  # noqa: TC001  # pydantic evaluates the annotations
 
 LARGEST_SEED = 2**31 - 1
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class RewardLabel:
-    """A task in its scene, the skills that plans for it may use, and the seed that its rollouts share."""
+    """Task, bundle, skill profile and seed of a rollout."""
 
-    task_id: str
-    bundle_digest: str
+    task_id: Annotated[str, Field(min_length=1)]
+    bundle_digest: Annotated[str, Field(min_length=1)]
     profile: Profile
-    seed: int
+    seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)]
 
     def text(self) -> str:
-        """As JSON in one line, for the label column of a trainer's dataset."""
+        """Return the label as one line of JSON, for the label column of a dataset."""
         return json.dumps(asdict(self))
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """The inverse of ``text``. Raises InvalidRequestError."""
+        """Parse the JSON of ``text``. Raises InvalidRequestError."""
         try:
-            value = json.loads(text)
-            label = cls(
-                task_id=_string(value["task_id"]),
-                bundle_digest=_string(value["bundle_digest"]),
-                profile=Profile(value["profile"]),
-                seed=int(value["seed"]),
-            )
-        except (ValueError, TypeError, KeyError, RecursionError) as error:
+            return TypeAdapter(cls).validate_json(text)
+        except ValidationError as error:
+            first = error.errors(include_url=False, include_context=False)[0]
+            field = ".".join(map(str, first["loc"])) or "label"
             raise InvalidRequestError(
-                f"found the label {text[:80]!r} ({type(error).__name__}: {str(error)[:80]}): expected one that "
+                f"found the label {text[:80]!r} ({field}: {first['msg']}): expected one that "
                 "`trainer.adapters.openrlhf.rows` wrote"
             ) from error
-        if not 0 <= label.seed <= LARGEST_SEED:
-            raise InvalidRequestError(f"found the seed {label.seed} in a label: expected 0 to {LARGEST_SEED}")
-        return label
 
 
 def answer_in(query: str, prompt: str) -> str:
-    """What was written after the prompt; tokenizers may have put a mark before it. Raises InvalidRequestError.
+    """Return the text after the prompt; tokenizers may have inserted text before it. Raises InvalidRequestError.
 
-    The prompt shows a plan as an example, which must not be taken for an answer.
+    The prompt shows an example plan, which must not be parsed as the answer.
     """
     _, found, answer = query.partition(prompt)
     if not found:
@@ -57,9 +53,3 @@ def answer_in(query: str, prompt: str) -> str:
             f"the query {query[:80]!r} does not hold its prompt {prompt[:80]!r}: send both as they were"
         )
     return answer
-
-
-def _string(value: object) -> str:
-    if not isinstance(value, str) or not value:
-        raise ValueError(f"expected a text, found {value!r}")
-    return value

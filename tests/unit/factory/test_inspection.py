@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 
 from embomatrix.factory.commands.app import app
 from embomatrix.factory.inspection.page import task_page, transcript_html
-from embomatrix.factory.inspection.plan_view import PlanView
 from embomatrix.factory.inspection.playing import play_oracle
 from embomatrix.factory.pipeline.export import FIELDS, dataset_card, encode_rows, export_rows
+from embomatrix.pages.plan_view import PlanView
 from embomatrix.world.dataset import Dataset, DatasetError
 
 EVIL = '</script><script>alert(1)</script><b onclick="x">'

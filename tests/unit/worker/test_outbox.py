@@ -1,13 +1,13 @@
-"""Results are kept until they are acknowledged, and carried again by the next stream."""
+"""Outbox: results are kept until they are acknowledged, and sent again on the next stream."""
 
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.random import default_rng
 
-from embomatrix.rpc.leases import LeaseRef, LeaseResult
+from embomatrix.host.backoff import Backoff
+from embomatrix.rpc.wire.leases import LeaseRef, LeaseResult
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure
 from embomatrix.worker.link import outbox as module
-from embomatrix.worker.link.backoff import Backoff
 from embomatrix.worker.link.outbox import ResultOutbox
 
 
@@ -30,7 +30,7 @@ def test_a_result_is_sent_once_on_a_stream_and_kept():
     assert len(outbox) == 3
 
 
-def test_a_new_stream_carries_what_was_not_acknowledged():
+def test_new_stream_sends_unacknowledged_results():
     outbox = _filled(3)
     outbox.take_unsent(3)
     outbox.acknowledge(_result(1).ref)
@@ -44,7 +44,7 @@ def test_an_acknowledgement_of_something_unknown_is_ignored():
     assert len(outbox) == 1
 
 
-def test_the_oldest_result_goes_when_nobody_listens_for_very_long():
+def test_oldest_result_is_dropped_beyond_the_limit():
     outbox = _filled(module.LIMIT + 1)
     assert len(outbox) == module.LIMIT
     assert outbox.take_unsent(1) == (_result(1),)
@@ -72,7 +72,8 @@ def test_no_result_is_lost_before_it_is_acknowledged(actions):
 
 
 def test_waits_double_up_to_the_longest_and_start_over_after_a_success():
-    backoff = Backoff(default_rng(0), longest_s=3.0)
+    rng = default_rng(0)
+    backoff = Backoff(0.2, 3.0, jitter=lambda: rng.uniform(0.8, 1.2))
     waits = [backoff.next_s() for _ in range(12)]
     assert all(0.8 <= wait / min(3.0, 0.2 * 2**n) <= 1.2 for n, wait in enumerate(waits))
     backoff.reset()

@@ -36,10 +36,10 @@ from embomatrix.cli.failure import fail
 from embomatrix.cli.foreground import no_problem, run_command
 from embomatrix.host.cores import usable_cores
 from embomatrix.pages.figures import shown
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.outcome import read_outcome
-from embomatrix.trainer.run.settings import checked_settings
-from embomatrix.trainer.run.starting import usual_threads
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import checked_settings
+from embomatrix.trainer.logging.outcome import read_outcome
+from embomatrix.trainer.run.starting import default_threads
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -51,7 +51,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Run the paper's experiments over several seeds: figures, and a section for docs/experiments.md.",
+    help="Run the paper's experiments over several seeds: figures, and a section for docs/experiments/training.md.",
 )
 console = Console(highlight=False, markup=False, soft_wrap=True)
 
@@ -89,7 +89,7 @@ COMPARE: Final = Preset("settings compared")
 
 _Json = Annotated[Path | None, typer.Option("--json", help="File for the figures.")]
 _Page = Annotated[
-    Path | None, typer.Option(help="Page to append the section to, such as docs/experiments.md.")
+    Path | None, typer.Option(help="Page to append the section to, such as docs/experiments/training.md.")
 ]
 _Manager = Annotated[str, typer.Option(help="HOST:PORT of a manager; by default a cluster on this machine.")]
 _Arm = Annotated[
@@ -161,7 +161,7 @@ def _experiment(preset: Preset, summary: str) -> Callable[..., None]:
                 imitation=Budget(imitate_seconds, imitate_steps),
                 patience=patience,
                 grpo=Budget(60 * minutes, steps),
-                threads=threads or usual_threads(),
+                threads=threads or default_threads(),
                 shared=parse_settings(settings or ()),
                 arms=arms,
             )

@@ -174,7 +174,7 @@ def _lead_all(stage: PhysicalStage, name: str, goal: float) -> SkillRefusal | No
         if refusal is not None:
             break
     # Where the robot ends up does not undo what became of the door.
-    fold(stage, stage.world.navigator.aside(name, home), name)
+    fold(stage, stage.world.navigator.step_aside(name, home), name)
     return refusal
 
 

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.joints.panels import swing_leaves
+from embomatrix.sim.joints.panels import swing_panels
 from embomatrix.sim.joints.swings import SWING
 from embomatrix.sim.physical.hands import ways_to
 from embomatrix.sim.physical.place import PLACES
@@ -75,14 +75,14 @@ class Prospects:
     def _look(self, placing: Placing) -> tuple[int | None, str]:
         """Number of the first pose that the arm gets at, and what bars the way to all when it is sure that it gets at none."""
         stands = self._poses.stands.get(placing.target, ())
-        if not stands or not self._placer.knows(placing.held, placing.target, placing.relation):
+        if not stands or not self._placer.has_verified(placing.held, placing.target, placing.relation):
             return None, ""
         grip = self._grip(placing.held)
         if grip is None:
             return None, ""
         self._make_ready(placing)
         # Who opened the target has stepped aside from its leaves.
-        stand = self._world.navigator.aside(placing.target, stands[0])
+        stand = self._world.navigator.step_aside(placing.target, stands[0])
         poses = self._placer.verified(placing.held, placing.target, placing.relation, stand, LOOKS)
         if not poses:
             return None, ""
@@ -160,7 +160,7 @@ class Prospects:
         world.hand.take(world.cargo(placing.held))
         self._stage.open_around(placing.target)
         if placing.relation is Relation.INSIDE:
-            swing_leaves(world.engine, world.relations, placing.target, SWING)
+            swing_panels(world.engine, world.relations, placing.target, SWING)
         world.navigator.refresh()
 
 

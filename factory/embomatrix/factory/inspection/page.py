@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from PIL import Image
 
-from embomatrix.factory.inspection.plan_view import PlanView
+from embomatrix.factory.inspection.plan_view import inspection_view
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.pages.head import page_head
+from embomatrix.pages.plan_view import PlanView
 from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.world.evaluate import objects_of
 
@@ -59,7 +60,7 @@ def task_page(
         instruction=escape(task.instruction),
         facts=_facts(record),
         goal=escape(task.goal_bddl),
-        plan=view.svg(about, things),
+        plan=inspection_view(scene, view, about, things),
         moments=_script_json([_moment_json(moment, view) for moment in show.moments]),
         steps=_steps(show),
         verdict=escape(f"The plan {verdict} and earns {show.reward:.2f}."),
