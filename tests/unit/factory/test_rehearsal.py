@@ -11,7 +11,7 @@ from embomatrix.factory.scenes.view import AnyRobot, SceneView
 from embomatrix.factory.social.requests import RequestedAtom, TaskRequest, Wanted, check_request
 from embomatrix.factory.writer.tasks import PlainWriter
 from embomatrix.factory.writer.variant import Variant
-from embomatrix.sim.physical.survey import Foresight
+from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import Handling
 from embomatrix.world.scene import Scene
@@ -88,7 +88,7 @@ def test_nothing_is_asked_for_that_the_robot_cannot_do(home: Scene) -> None:
 
 def test_a_survey_answers_alike_whatever_was_asked_before(home: Scene) -> None:
     names = ("apple_1", "stove_1")
-    foresight = Foresight()
+    foresight = ReachabilitySurvey()
     with SceneSurvey(home, foresight) as at_once, SceneSurvey(home, foresight) as bit_by_bit:
         assert not bit_by_bit.bars([(Handling.PRESS, "stove_1")])
         assert not bit_by_bit.bars([(Handling.TAKE, "apple_1")])

@@ -15,11 +15,11 @@ from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.robot import tucked
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.physical import arm, body
-from embomatrix.sim.physical.doors import Leaf
+from embomatrix.sim.physical.doors import DoorPanel
 from embomatrix.sim.physical.floor import Floor
 from embomatrix.sim.physical.grasp import cross
 from embomatrix.sim.physical.motion import Mover
-from embomatrix.sim.physical.space import boxes_of, strikes, struck
+from embomatrix.sim.physical.space import boxes_of, deepest_box, struck
 from embomatrix.sim.state.relations import Relations
 from embomatrix.world.asset import Joint, JointKind, Link
 from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
@@ -77,7 +77,7 @@ def test_balls_strike_a_turned_box_where_they_are_in_it():
     quarter = Pose.from_xyz_yaw(1.0, 0.0, 0.0, np.pi / 4)
     boxes = boxes_of([(quarter, (0.2, 2.0, 0.2), "beam")])
     balls = np.array([[[0.5, 0.5, 0.0]], [[1.5, 0.5, 0.0]]])  # the beam runs along (-1, 1)
-    assert strikes(boxes, balls, np.array([0.05]), 0.0).tolist() == [0, -1]
+    assert [deepest_box(boxes, row, np.array([0.05]), 0.0) for row in balls] == [0, -1]
     np.testing.assert_allclose(boxes.gaps(balls[:, 0])[:, 0], (-0.1, 0.6071), atol=1e-3)
 
 
@@ -94,7 +94,7 @@ def test_who_strikes_nothing_is_told_sooner_and_is_the_same(seed):
     )
     balls = body.balls(postures)
     for margin_m in (-0.003, 0.0, 0.012):
-        expected = strikes(boxes, balls, body.RADII, margin_m) >= 0
+        expected = np.array([deepest_box(boxes, row, body.RADII, margin_m) >= 0 for row in balls])
         np.testing.assert_array_equal(struck(boxes, balls, body.RADII, margin_m), expected)
 
 
@@ -104,8 +104,8 @@ def test_a_door_is_at_its_front_when_it_is_shut_and_before_it_when_it_is_open():
     link = Link("door", (front,), hinge)
     fridge = make.asset("fridge", "electric_refrigerator.n.01", (0.6, 0.6, 1.0), [], links=[link])
     around = Aabb.around([front.aabb(Pose((0.0, 0.0, 0.0)))])
-    leaf = Leaf("fridge_1", 0, link, hinge, fridge, Pose((1.0, 2.0, 0.5)), around)
-    shut, opened = leaf.at(0.0), leaf.at(1.0)
+    panel = DoorPanel("fridge_1", 0, link, hinge, fridge, Pose((1.0, 2.0, 0.5)), around)
+    shut, opened = panel.at(0.0), panel.at(1.0)
     np.testing.assert_allclose((shut.low_m[0], shut.high_m[0]), (1.3, 1.32), atol=1e-9)
     np.testing.assert_allclose((opened.low_m[0], opened.high_m[0]), (1.31, 1.91), atol=0.02)
 
@@ -114,20 +114,20 @@ def test_what_the_arm_touches_is_drawn_in_until_it_does_not_and_the_rest_stays()
     near, far = Pose((1.0, 0.0, 0.0)), Pose((0.0, 2.0, 0.0))
     boxes = boxes_of([(near, (0.2, 2.0, 0.2), "door"), (far, (0.2, 0.2, 0.2), "wall")])
     ball, radius = np.array([[0.88, 0.0, 0.0]]), np.array([0.05])  # 3 cm deep in the door
-    assert strikes(boxes, ball[None], radius, 0.0).tolist() == [0]
+    assert deepest_box(boxes, ball, radius, 0.0) == 0
     freed = boxes.drawn_in(ball, radius, 0.012)
     np.testing.assert_allclose(freed.gaps(ball).min(axis=1) - radius, [0.012], atol=1e-9)
     np.testing.assert_array_equal(freed.half[1], boxes.half[1])
 
 
-@pytest.mark.parametrize(("leaf_m", "order"), [(2.4, [3.3, 4.5]), (3.6, [4.5, 3.3])])
-def test_places_that_a_leaf_cuts_off_come_last(leaf_m, order):
+@pytest.mark.parametrize(("panel_m", "order"), [(2.4, [3.3, 4.5]), (3.6, [4.5, 3.3])])
+def test_places_that_a_leaf_cuts_off_come_last(panel_m, order):
     engine = BulletEngine(kitchen_scene())
     try:
         # From the south wall on: the long one reaches the furniture in the north, and more floor lies east of it.
-        leaf = boxes_of([(Pose((4.0, leaf_m / 2, 0.5)), (0.04, leaf_m, 1.0), "door")])
+        panel = boxes_of([(Pose((4.0, panel_m / 2, 0.5)), (0.04, panel_m, 1.0), "door")])
         east, west = np.array([[4.5, 0.5, 0.0]]), np.array([[3.3, 2.6, 0.0]])
-        found = Floor(Navigator(engine, Relations(engine))).cut_off_last([west, east], leaf)
+        found = Floor(Navigator(engine, Relations(engine))).with_cut_off_last([west, east], panel)
     finally:
         engine.close()
     assert [float(group[0, 0]) for group in found] == order

@@ -11,7 +11,7 @@ from tests.fakes.plans import executed, with_objects
 from tests.fakes.scenes import kitchen_scene, placed, upright
 
 from embomatrix.sim.physical.actor import physical_simulator
-from embomatrix.sim.physical.grasp import SHEET_M, grasp_tracks, surface_point
+from embomatrix.sim.physical.grasp import SHEET_M, grasp_tool_paths, surface_point
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.geometry import Pose
 
@@ -56,7 +56,7 @@ def test_a_ray_tells_where_it_enters_a_thing_and_how_thick_that_is():
 
 def test_the_hand_does_not_reach_through_a_sheet_into_what_it_lies_on():
     sheet = make.block("sheet", "sheet.n.01", (0.2, 0.15, 0.003), {})
-    tracks = grasp_tracks(sheet, Pose((0.0, 0.0, 0.7515)), (), 0.0, None)
+    tracks = grasp_tool_paths(sheet, Pose((0.0, 0.0, 0.7515)), (), 0.0, None)
     assert min(float(track.position[:, 2].min()) for track in tracks) >= 0.753 - SHEET_M - 1e-9
 
 

@@ -11,8 +11,8 @@ from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical import body
-from embomatrix.sim.physical.fold import WAYS
-from embomatrix.sim.physical.press import press, pressing
+from embomatrix.sim.physical.fold import PATHS_TRIED
+from embomatrix.sim.physical.press import press, press_paths
 from embomatrix.sim.physical.space import struck
 from embomatrix.sim.physical.stage import PhysicalStage
 from embomatrix.sim.placing.pose_cache import standing_poses
@@ -40,7 +40,7 @@ def test_no_way_to_press_a_thing_leads_the_arm_through_it(stage, name):
     own = boxes.only(name)
     for stand in stage.world.navigator.stands(name, stage.world.navigator.start)[:4]:
         stage.stand_at(stand)
-        ways = list(itertools.islice(pressing(stage, name)[1], WAYS))
+        ways = list(itertools.islice(press_paths(stage, name)[1], PATHS_TRIED))
         assert ways
         arms = body.balls(np.concatenate([way.postures for way in ways]))[:, ~body.HAND_BALLS]
         assert not struck(own, arms, body.RADII[~body.HAND_BALLS], 0.0).any()

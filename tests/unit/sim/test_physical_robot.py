@@ -9,8 +9,8 @@ from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.robot import TUCKED_ARM, Posture, RobotBody
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.grasp import facing
-from embomatrix.sim.physical.reach import ArmReach, HeldGeometry, Track
-from embomatrix.sim.physical.roadmap import way_between
+from embomatrix.sim.physical.reach import ArmReach, HeldGeometry, ToolPath
+from embomatrix.sim.physical.rrt import path_between
 from embomatrix.sim.physical.space import boxes_of
 from embomatrix.sim.physical.stage import TOOL
 from embomatrix.sim.robot_dimensions import LIFT_M, MAST_TOP_M, SHOULDER_LOW_M
@@ -73,12 +73,12 @@ def test_the_hand_gets_level_under_a_roof_at_any_height(height_m):
     boxes = boxes_of([FLOOR, *boards])
     positions = np.array([[-0.05, 0.0, height_m], [0.1, 0.0, height_m], [0.2, 0.0, height_m]])
     tracks = [
-        Track(np.tile(facing(course, roll, LEFT), (3, 1, 1)), positions, np.zeros(3, dtype=bool), 2)
+        ToolPath(np.tile(facing(course, roll, LEFT), (3, 1, 1)), positions, np.zeros(3, dtype=bool), 2)
         for course in (AHEAD, np.array([np.cos(0.3), 0.0, -np.sin(0.3)]))
         for roll in (0.0, np.pi / 2)
     ]
     bases = np.array([[-away, aside, 0.0] for away in (0.4, 0.5, 0.6, 0.7) for aside in (-0.2, 0.0, 0.2)])
-    way = next(ArmReach(boxes, boxes).ways(tracks, [bases]), None)
+    way = next(ArmReach(boxes, boxes).paths(tracks, [bases]), None)
     assert way is not None
     np.testing.assert_allclose(body.tools(way.postures)[1], positions, atol=1e-6)
 
@@ -96,7 +96,7 @@ def stops_at_a_wall(one, other):
 def test_two_trees_meet_through_a_door():
     start, goal = np.array([-1.0, 0.0]), np.array([1.0, 0.0])
     draws = np.random.default_rng(0).uniform(-2.0, 2.0, (200, 2))
-    way = way_between(start, goal, draws, np.full(2, 0.1), stops_at_a_wall)
+    way = path_between(start, goal, draws, np.full(2, 0.1), stops_at_a_wall)
     assert way is not None
     np.testing.assert_array_equal(way[[0, -1]], [start, goal])
     assert all(np.array_equal(stops_at_a_wall(*pair), pair[1]) for pair in itertools.pairwise(way))
@@ -105,7 +105,7 @@ def test_two_trees_meet_through_a_door():
 def test_where_nothing_leads_through_there_is_no_way():
     draws = np.random.default_rng(0).uniform((-2.0, -2.0), (2.0, 0.9), (50, 2))
     assert (
-        way_between(np.array([-1.0, 0.0]), np.array([1.0, 0.0]), draws, np.full(2, 0.1), stops_at_a_wall)
+        path_between(np.array([-1.0, 0.0]), np.array([1.0, 0.0]), draws, np.full(2, 0.1), stops_at_a_wall)
         is None
     )
 

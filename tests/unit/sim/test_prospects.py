@@ -11,8 +11,8 @@ from tests.fakes.scenes import kitchen_scene, placed, upright
 
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.live_world import LiveWorld
-from embomatrix.sim.physical.prospects import Placing
-from embomatrix.sim.physical.survey import prospects
+from embomatrix.sim.physical.placement_reachability import PlacementQuery
+from embomatrix.sim.physical.survey import placement_reachability
 from embomatrix.sim.placing.pose_cache import build_pose_cache
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
@@ -24,8 +24,8 @@ from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.state import Relation
 from embomatrix.world.tables import Tables, TableWriter
 
-ON_COUNTER = Placing("apple_1", "countertop_1", Relation.ONTOP)
-INTO_BOWL = Placing("apple_1", "bowl_1", Relation.INSIDE)
+ON_COUNTER = PlacementQuery("apple_1", "countertop_1", Relation.ONTOP)
+INTO_BOWL = PlacementQuery("apple_1", "bowl_1", Relation.INSIDE)
 
 
 def looked_ahead(scene, placings):
@@ -35,7 +35,7 @@ def looked_ahead(scene, placings):
         poses = build_pose_cache(scene, held, targets, seed=0, engine=engine)
         world = LiveWorld(Bundle(scene, {}, poses), engine)
         before = world.state_bytes()
-        found = prospects(world, poses, placings)
+        found = placement_reachability(world, poses, placings)
         assert world.state_bytes() == before
         return found
 
@@ -104,7 +104,7 @@ def boxed_in():
 
 
 def test_where_nothing_could_be_taken_from_nothing_is_placed():
-    placing = Placing("slice_1", "stand_1", Relation.ONTOP)
+    placing = PlacementQuery("slice_1", "stand_1", Relation.ONTOP)
     scene = boxed_in()
     poses = looked_ahead(scene, (placing,))
     other = poses.barred_places[Relation.ONTOP]["slice_1"]["stand_1"]

@@ -10,7 +10,7 @@ from tests.fakes.scenes import kitchen_scene, placed, upright
 
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.live_world import LiveWorld
-from embomatrix.sim.physical.survey import Foresight
+from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.sim.placing.pose_cache import standing_poses
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
@@ -48,7 +48,7 @@ def surveyed(scene, names, foresight=None):
         poses = PoseCache({}, standing_poses(engine, names))
         world = LiveWorld(Bundle(scene, {}, poses), engine)
         before = world.state_bytes()
-        found = (foresight or Foresight()).survey(world, poses, names)
+        found = (foresight or ReachabilitySurvey()).survey(world, poses, names)
         assert world.state_bytes() == before
         assert {name: set(stands) for name, stands in found.stands.items()} == {
             name: set(stands) for name, stands in poses.stands.items()
@@ -122,7 +122,7 @@ def test_the_lid_of_what_can_be_carried_is_barred():
 
 
 def test_what_a_look_ahead_knows_of_other_scenes_changes_no_answer(flat):
-    foresight = Foresight()
+    foresight = ReachabilitySurvey()
     surveyed(walled_in(), ("microwave_1",), foresight)
     assert surveyed(kitchen_scene(), NAMES, foresight) == flat
 
