@@ -14,17 +14,15 @@ from embomatrix.sim.fidelity.compare import (
     PlanKind,
     StepRun,
     compare,
-    objects_in,
-    run_trial,
-)
-from embomatrix.sim.fidelity.plans import Example, Request, write_trials
-from embomatrix.sim.fidelity.records import (
     comparison_from_json,
     comparison_to_json,
     disagreement_to_json,
+    objects_in,
+    run_trial,
     trial_from_json,
     trial_to_json,
 )
+from embomatrix.sim.fidelity.plans import SolvedTask, TrialRequest, write_trials
 from embomatrix.sim.fidelity.report import report_on
 from embomatrix.sim.fidelity.sampler import ROUTINES, SKILLS
 from embomatrix.sim.planner.oracle import find_plan
@@ -54,7 +52,7 @@ def cached(bundle):
 
 @pytest.fixture(scope="module")
 def examples(bundle, cached):
-    return [Example(task, find_plan(cached, task)) for task in bundle.tasks.values()]
+    return [SolvedTask(task, find_plan(cached, task)) for task in bundle.tasks.values()]
 
 
 def trial_of(task, words):
@@ -155,7 +153,7 @@ def test_every_skill_of_the_paper_has_a_way_to_be_sampled():
 
 def test_equal_seeds_write_equal_trials_and_other_seeds_others(cached, examples):
     first, again, other = (
-        write_trials(cached, DIGEST, examples, Request(KINDS, {}, seed)) for seed in (0, 0, 1)
+        write_trials(cached, DIGEST, examples, TrialRequest(KINDS, {}, seed)) for seed in (0, 0, 1)
     )
     assert first == again
     assert [trial.plan for trial in first] != [trial.plan for trial in other]
@@ -165,7 +163,9 @@ def test_equal_seeds_write_equal_trials_and_other_seeds_others(cached, examples)
 
 def test_trials_reach_the_quota_of_every_skill_and_behave_as_their_kind_says(cached, examples, bundle):
     quota = 6
-    trials = write_trials(cached, DIGEST, examples, Request(KINDS, dict.fromkeys(SKILLS, quota), 5, extra=60))
+    trials = write_trials(
+        cached, DIGEST, examples, TrialRequest(KINDS, dict.fromkeys(SKILLS, quota), 5, extra=60)
+    )
     calls = Counter()
     for trial in trials:
         run = run_trial(cached, bundle.tasks[trial.task_id], trial)
@@ -179,7 +179,7 @@ def test_trials_reach_the_quota_of_every_skill_and_behave_as_their_kind_says(cac
 
 
 def test_trials_and_comparisons_survive_their_files(cached, examples, bundle):
-    for trial in write_trials(cached, DIGEST, examples, Request(KINDS, {}, 2)):
+    for trial in write_trials(cached, DIGEST, examples, TrialRequest(KINDS, {}, 2)):
         assert trial_from_json(trial_to_json(trial)) == trial
         found = compare(cached, cached, bundle.tasks[trial.task_id], trial)
         back = comparison_from_json(comparison_to_json(found))
