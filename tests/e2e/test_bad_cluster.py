@@ -13,10 +13,10 @@ from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.rpc.wire.values import Batch, Completed, Rollout
 from embomatrix.skills.parse import plan_from_json
-from embomatrix.trainer.policy.choice import new_policy
-from embomatrix.trainer.run.checkpoint import CheckpointStore, TrainingProgress
-from embomatrix.trainer.run.data import load_tasks
-from embomatrix.trainer.run.settings import read_settings
+from embomatrix.trainer.config.settings import read_settings
+from embomatrix.trainer.data.tasks import load_tasks
+from embomatrix.trainer.lifecycle.checkpoint import CheckpointStore, TrainingProgress
+from embomatrix.trainer.policy.loading import new_policy
 from embomatrix.world.dataset import Dataset
 
 NOWHERE = "127.0.0.1:1"

@@ -37,7 +37,7 @@ def assert_told(told, status, *words):
         (("scene", "show", "Rs_imt"), "unknown scene 'Rs_imt' (the catalog holds 51): did you mean Rs_int"),
         (("factory", "build", "--scene=Rs_imt", "--out=OUT"), "unknown scene 'Rs_imt'"),
         (("factory", "import", "--activity=bringin_water"), "did you mean bringing_water"),
-        (("train", "--model=tinny", "--dataset=DATASET", "--out=OUT"), "the model 'tinny' is no folder here"),
+        (("train", "--model=tinny", "--dataset=DATASET", "--out=OUT"), "the model 'tinny' is not a folder"),
         (("trian",), "did you mean `train`?"),
     ],
 )
@@ -219,7 +219,7 @@ def test_unknown_setting_of_a_training_is_named(kitchen, tmp_path):
         f"--dataset={kitchen}",
         f"--out={tmp_path / 'out'}",
     )
-    assert_told(told, 2, "there is no setting 'speed': mend its name or leave it out")
+    assert_told(told, 2, "unknown setting 'speed': correct its name or remove it")
 
 
 @pytest.mark.parametrize(
@@ -232,7 +232,10 @@ def test_unknown_setting_of_a_training_is_named(kitchen, tmp_path):
         (("scene", "build", "Rs_int", "--out=OUT"), "can't be written (Not a directory)"),
         (("manager", "serve", "--port=0", "--data-dir=OUT"), "pass another --data-dir"),
         (("worker", "run", "--cache-dir=OUT"), "name another folder with --cache-dir"),
-        (("train", "--dataset=DATASET", "--out=OUT"), "can't be made (Not a directory): pass another --out"),
+        (
+            ("train", "--dataset=DATASET", "--out=OUT"),
+            "can't be created (Not a directory): pass another --out",
+        ),
         (("demo", "--dataset=DATASET", "--out=OUT"), "can't be made (Not a directory): pass another --out"),
     ],
 )
@@ -251,13 +254,13 @@ def test_full_disk_leaves_no_half_scene(tmp_path):
 
 def test_there_is_nothing_to_resume_without_a_checkpoint(kitchen, tmp_path):
     told = run("train", "--resume", f"--dataset={kitchen}", f"--out={tmp_path}")
-    assert_told(told, 2, f"there is no checkpoint in {tmp_path} to resume from: leave out --resume")
+    assert_told(told, 2, f"no checkpoint in {tmp_path} to resume from: leave out --resume")
 
 
 def test_folder_of_another_run_is_left_alone(kitchen, tmp_path):
     (tmp_path / "checkpoints" / "step-000001").mkdir(parents=True)
     told = run("train", f"--dataset={kitchen}", f"--out={tmp_path}")
-    assert_told(told, 2, f"{tmp_path} holds another run: pass --resume to go on with it, or another --out")
+    assert_told(told, 2, f"{tmp_path} holds another run: pass --resume to continue it, or another --out")
     assert_told(
         run("demo", f"--dataset={kitchen}", f"--out={tmp_path}"), 2, "holds another run: pass another --out"
     )

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.timeout(1200)
 
 @dataclass(frozen=True)
 class Run:
-    """What a training told and wrote whose first worker was killed in the middle, and who was started anew."""
+    """What a training told and wrote whose first worker was killed in the middle, and who was started varied."""
 
     told: str
     out: Path

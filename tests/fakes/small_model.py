@@ -13,7 +13,7 @@ from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.facts import facts_of
-from embomatrix.factory.social.model_agents import ModelAgents
+from embomatrix.factory.social.model_agents import SocialModelAgents
 from embomatrix.factory.social.values import ROBOT, Act, Cast, Conversation, DaySlot, DialogueTurn, Person
 from embomatrix.llm.cassette import Cassette, CassetteMode
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
@@ -49,7 +49,7 @@ async def ask_everything(model):
     """Each agent asked once with all of its attempts: what came of it by agent, a value or the error."""
     view = SceneView(kitchen_scene())
     facts = facts_of(view, ["kitchen_0"])
-    agents = ModelAgents(model, max_tokens=MAX_TOKENS)
+    agents = SocialModelAgents(model, max_tokens=MAX_TOKENS)
     asked = {
         "cast": lambda: agents.cast(facts, 0),
         "converse": lambda: agents.converse(facts, CAST, SLOT, TaskCategory.PICK_AND_PLACE, 0),

@@ -26,7 +26,7 @@ from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.prompt import PromptRow, Situation
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
 from embomatrix.skills.trace import Step
-from embomatrix.trainer.run.data import TaskSet, TrainingTask
+from embomatrix.trainer.data.tasks import TaskSet, TrainingTask
 from embomatrix.world.goal import And, Atom, Not
 from embomatrix.world.state import Relation
 from embomatrix.world.task import Task, TaskCategory

@@ -9,12 +9,10 @@ import itertools
 import pytest
 import torch
 
+from embomatrix.trainer.config.settings import GrpoSettings, LossKind, RatioLevel
 from embomatrix.trainer.grpo.objective import (
-    LossKind,
-    Objective,
-    RatioLevel,
-    Scale,
-    Terms,
+    LossInputs,
+    LossTotals,
     group_advantages,
     surrogate_loss,
 )
@@ -136,9 +134,9 @@ def their_loss(case, folder, kind, level, kl_coef):
 def test_loss_and_gradient_are_those_of_trl(case, tmp_path, kind, level, kl_coef):
     theirs = their_loss(case, tmp_path, kind, level, kl_coef)
     their_gradient = case.gradient(theirs)
-    terms = Terms(case.logprobs(), case.old, case.mask, case.advantages, case.reference)
-    objective = Objective(kind, level, clip_low=0.2, clip_high=0.28, kl_coef=kl_coef)
-    scale = Scale(TASKS * GROUP, int(case.mask.sum()), LENGTH)
-    ours, _ = surrogate_loss(terms, objective, scale)
+    terms = LossInputs(case.logprobs(), case.old, case.mask, case.advantages, case.reference)
+    settings = GrpoSettings(loss=kind, ratio=level, clip_low=0.2, clip_high=0.28, kl_coef=kl_coef)
+    scale = LossTotals(TASKS * GROUP, int(case.mask.sum()), LENGTH)
+    ours, _ = surrogate_loss(terms, settings, scale)
     assert ours.item() == pytest.approx(theirs.item(), rel=1e-5, abs=1e-7)
     assert float((case.gradient(ours) - their_gradient).norm() / their_gradient.norm()) < 1e-5

@@ -9,9 +9,9 @@ pytestmark = [pytest.mark.peers, pytest.mark.timeout(900)]
 TELL = """
 import sys
 from pathlib import Path
-from embomatrix.trainer.imitation.imitate import ImitationProgress
+from embomatrix.trainer.imitation.teacher_forcing import ImitationProgress
 from embomatrix.trainer.logging.recorder import Recorder
-from embomatrix.trainer.run.settings import read_settings
+from embomatrix.trainer.config.settings import read_settings
 from embomatrix.trainer.logging.trackers import trackers_of
 folder, step = Path(sys.argv[1]), int(sys.argv[2])
 with trackers_of(read_settings(None, {"track": ["wandb", "trackio"]}), folder) as trackers:

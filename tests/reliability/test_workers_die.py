@@ -42,7 +42,7 @@ async def test_where_nothing_dies_hardly_anything_is_executed_twice(tmp_path):
 
 
 async def kill_again_and_again(cluster, rng, kills):
-    """``kill -9`` a random worker every two seconds, and start it anew."""
+    """``kill -9`` a random worker every two seconds, and start it varied."""
     with contextlib.suppress(asyncio.CancelledError):
         while True:
             await asyncio.sleep(2.0)

@@ -23,26 +23,26 @@ from embomatrix.cli.examinee import Chosen, Questions, asked_of
 from embomatrix.cli.failure import INTERRUPTED, fail
 from embomatrix.host.cores import usable_cores
 from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.cluster.executor import ClusterExecutor
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.eai.exam import CODEC as EAI_CODEC
 from embomatrix.trainer.eai.exam import NAME as NATIVE
 from embomatrix.trainer.eai.exam import NativeExam
+from embomatrix.trainer.evaluation.answer_sources import questions_digest
 from embomatrix.trainer.evaluation.answers import (
     FILE,
     MOST_SAMPLES,
     AnswerSheet,
     EvaluationSetup,
-    check_asked_for,
+    check_expected,
     ordered,
     read_answers,
 )
-from embomatrix.trainer.evaluation.asking import questions_digest
 from embomatrix.trainer.evaluation.baselines import BaselineName
 from embomatrix.trainer.evaluation.benchmark import find_benchmark
-from embomatrix.trainer.evaluation.cluster import ClusterExecutor
 from embomatrix.trainer.evaluation.exam import WorldExam
 from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
-from embomatrix.trainer.run.errors import TrainerError
 from embomatrix.world.task import Profile
 from embomatrix.world.whole_file import write_whole
 
@@ -50,10 +50,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from embomatrix.cli.examinee import EvaluationSubject
+    from embomatrix.trainer.cluster.executor import Executor
     from embomatrix.trainer.evaluation.answers import Answer
     from embomatrix.trainer.evaluation.benchmark import Benchmark
     from embomatrix.trainer.evaluation.exam import Exam
-    from embomatrix.trainer.evaluation.judging import Executor
     from embomatrix.trainer.evaluation.table import ScoreRow
 
 DEFAULT_BENCH: Final = "build/dataset"
@@ -276,7 +276,7 @@ def _judge_stored(
                 f"{path} answers other tasks than {bench or setup.bench} holds now (digest {setup.bench_digest[:19]}…, now "
                 f"{exam.digest[:19]}…): pass the benchmark that was asked with --bench"
             )
-        check_asked_for(stored, exam.task_ids, setup, path)
+        check_expected(stored, exam.task_ids, setup, path)
         given = ordered(stored, exam.task_ids, setup.samples)
         asked_for = len(exam.task_ids) * setup.samples
         if len(given) < asked_for:

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.eai.exam import NAME as NATIVE
 from embomatrix.trainer.eai.exam import NativeExam
-from embomatrix.trainer.evaluation.asking import EndpointAsker, PolicyAsker, WriterAsker
+from embomatrix.trainer.evaluation.answer_sources import EndpointSource, PolicySource, ScriptSource
 from embomatrix.trainer.evaluation.baselines import BaselineName, baseline_for
 from embomatrix.trainer.evaluation.exam import WorldExam
-from embomatrix.trainer.run.errors import TrainerError
 from embomatrix.world.task import MAX_TABLE
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.trainer.evaluation.asking import Asker
+    from embomatrix.trainer.evaluation.answer_sources import AnswerSource
     from embomatrix.trainer.evaluation.exam import Exam
     from embomatrix.world.task import Profile
 
@@ -65,7 +65,7 @@ class Chosen:
 class EvaluationSubject:
     """Who is asked, and what its setup says of it."""
 
-    asker: Asker
+    asker: AnswerSource
     label: str
     codec: Codec
     rows: int
@@ -84,12 +84,12 @@ def asked_of(exam: Exam, chosen: Chosen, questions: Questions, folder: Path) -> 
             )
         tokens = questions.max_tokens or loaded.max_tokens
         return EvaluationSubject(
-            PolicyAsker(loaded.policy), chosen.model, loaded.policy.codec, loaded.rows, tokens
+            PolicySource(loaded.policy), chosen.model, loaded.policy.codec, loaded.rows, tokens
         )
     if chosen.endpoint:
         return _endpoint(chosen, questions, folder)
     name = chosen.baseline or BaselineName.ORACLE
-    return EvaluationSubject(WriterAsker(_writer(exam, name)), name.value, Codec.JSON, MAX_TABLE, 1)
+    return EvaluationSubject(ScriptSource(_writer(exam, name)), name.value, Codec.JSON, MAX_TABLE, 1)
 
 
 def _writer(exam: Exam, name: BaselineName) -> Callable[[str, np.random.Generator], str]:
@@ -118,5 +118,5 @@ def _endpoint(chosen: Chosen, questions: Questions, folder: Path) -> EvaluationS
         Endpoint, chosen.endpoint, chosen.model_name, api_key=chosen.key, limits=limits
     )
     tokens = questions.max_tokens or ENDPOINT_TOKENS
-    asker = EndpointAsker(opened, folder / "ledger.jsonl")
+    asker = EndpointSource(opened, folder / "ledger.jsonl")
     return EvaluationSubject(asker, chosen.model_name, questions.codec or Codec.JSON, MAX_TABLE, tokens)

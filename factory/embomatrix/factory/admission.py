@@ -1,8 +1,8 @@
-"""Admission: a task enters a data set only when the simulator says so.
+"""Admission: the simulator decides whether a task enters a dataset.
 
-Its goal must not hold at the start, at most half of its atoms may (in a benchmark of others, more), and the oracle planner must
-find a plan that earns full success when it is executed; where asked for, also by a robot in stepped physics. What is turned
-away is a value with a reason.
+The goal must not hold at the start, and at most half of its atoms may (published benchmarks have other limits). The
+oracle planner must find a plan that earns full success when it is executed, optionally also by a robot in stepped
+physics. A refusal is a value with a reason.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 
 
 SEED: Final = 0
-"""Seed of the verifying executions."""
-MOST_HELD: Final = 0.5
-"""Share of a goal's atoms that may hold at the start: "leave it closed" is asked beside other things, not in their place."""
+"""Seed of the executions that verify a task."""
+MAX_HELD_SHARE: Final = 0.5
+"""Share of a goal's atoms that may hold at the start. Atoms such as "leave it closed" may only accompany others."""
 
 
 class PlanExecutor(Protocol):
-    """What executes plans: ``sim.executor.Simulator``, or a table in a test."""
+    """Executor of plans: ``sim.executor.Simulator``, or a table in a test."""
 
     @property
     def facts(self) -> Facts: ...
@@ -46,70 +46,70 @@ S = TypeVar("S", bound=PlanExecutor)
 
 @dataclass(frozen=True, slots=True)
 class Admitted:
-    """A plan that reaches the goal, and the atoms that hold already at the start."""
+    """Plan that reaches the goal, and the atoms that already hold at the start."""
 
     plan: Plan
     held_at_start: tuple[str, ...]
 
 
 def admit(
-    stage: S,
+    executor: S,
     task: Task,
     find_plan: Callable[[S, Task], Plan | PlanNotFound],
     init: Sequence[InitLiteral] = (),
     *,
-    most_held: float = MOST_HELD,
+    most_held: float = MAX_HELD_SHARE,
     physics: PlanExecutor | None = None,
 ) -> Admitted | TaskRefusal:
-    """Judge a task by execution. ``init`` are atoms that must hold at the start, as the task's source says.
+    """Judge a task by execution. ``init`` lists atoms that must hold at the start according to the task's source.
 
-    No more than the share ``most_held`` of the goal's atoms may hold then; 1: all but one. In ``physics``, where there is one,
-    the plan found must reach the goal as well.
+    At most the share ``most_held`` of the goal's atoms may hold at the start; 1 means all but one. If ``physics`` is
+    given, the plan must also reach the goal there.
     """
-    stage.execute(task, (), SEED)
+    executor.execute(task, (), SEED)
     for literal in init:
-        if stage.facts.holds(literal.atom.predicate, literal.atom.args) is not literal.positive:
+        if executor.facts.holds(literal.atom.predicate, literal.atom.args) is not literal.positive:
             wanted = render(literal.atom if literal.positive else Not(literal.atom))
             return TaskRefusal(
                 RefusalReason.INIT_NOT_MET, f"{wanted} does not hold in the scene that was built"
             )
-    if evaluate(task.goal, stage.facts, task.types):
+    if evaluate(task.goal, executor.facts, task.types):
         return TaskRefusal(RefusalReason.GOAL_HOLDS, f"the goal holds at the start: {task.goal_bddl}")
     atoms = scored_atoms(task.goal, task.types)
-    held = tuple(render(atom) for atom in atoms if evaluate(atom, stage.facts, task.types))
+    held = tuple(render(atom) for atom in atoms if evaluate(atom, executor.facts, task.types))
     if len(held) > most_held * len(atoms):
         return TaskRefusal(
             RefusalReason.MOSTLY_DONE,
-            f"{len(held)} of {len(atoms)} atoms hold at the start, at most {most_held:.0%} may: {' '.join(held)}",
+            f"{len(held)} of {len(atoms)} atoms hold at the start, expected at most {most_held:.0%}: {' '.join(held)}",
         )
-    plan = find_plan(stage, task)
+    plan = find_plan(executor, task)
     if isinstance(plan, PlanNotFound):
         return TaskRefusal(RefusalReason.NO_PLAN, f"the oracle planner found no plan: {plan.reason}")
-    trace = stage.execute(task, plan, SEED)
-    reward = score(task, trace.touched, stage.facts)
+    trace = executor.execute(task, plan, SEED)
+    reward = score(task, trace.touched, executor.facts)
     if trace.failure is not None or not reward.success:
-        last = trace.steps[-1].message if trace.steps else "it is empty"
+        last = trace.steps[-1].message if trace.steps else "the plan is empty"
         return TaskRefusal(RefusalReason.ORACLE_FAILED, f"the oracle's plan earns {reward.total:.1f}: {last}")
-    against = objection(physics, task, plan) if physics is not None else ""
-    if against:
+    failure = plan_failure(physics, task, plan) if physics is not None else ""
+    if failure:
         return TaskRefusal(
-            RefusalReason.PHYSICS_FAILED, f"the oracle's plan fails in stepped physics: {against}"
+            RefusalReason.PHYSICS_FAILED, f"the oracle's plan fails in stepped physics: {failure}"
         )
     return Admitted(plan, held)
 
 
-def objection(stage: PlanExecutor, task: Task, plan: Plan) -> str:
-    """What speaks against a plan when it is executed on a stage; empty where it reaches the goal."""
-    trace = stage.execute(task, plan, SEED)
+def plan_failure(executor: PlanExecutor, task: Task, plan: Plan) -> str:
+    """Execute a plan and return the reason for its failure, or an empty string if it reaches the goal."""
+    trace = executor.execute(task, plan, SEED)
     if trace.failure is None:
-        reached = score(task, trace.touched, stage.facts).success
-        return "" if reached else "goal_missed: every step succeeds, and the goal does not hold in the end"
+        reached = score(task, trace.touched, executor.facts).success
+        return "" if reached else "goal_missed: every step succeeds, but the goal does not hold at the end"
     last = trace.steps[-1]
     return f"{last.failure}: step {len(trace.steps)}, {last.call.skill}: {last.message}"
 
 
 class RefusalReason(StrEnum):
-    """In the order in which they are looked for: the first two stop a draft, then ten a binding, the others an admission."""
+    """Reasons in the order of the checks: two for drafts, ten for bindings, the rest for admission."""
 
     NO_ANSWER = "no_answer"
     UNUSABLE_ANSWER = "unusable_answer"
@@ -133,14 +133,14 @@ class RefusalReason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class TaskRefusal:
-    """A task that is left out, and why."""
+    """Refused task: the reason, and a sentence about the case."""
 
     reason: RefusalReason
     sentence: str
 
 
 class RefusedError(Exception):
-    """Raised inside a binding; callers get the refusal as a value."""
+    """Refusal raised inside a binding. Callers of the import get the refusal as a value."""
 
     def __init__(self, reason: RefusalReason, sentence: str) -> None:
         super().__init__(sentence)

@@ -1,8 +1,9 @@
-"""Build the catalog's package data from the ``bddl`` package: ``python -m embomatrix.factory.catalog_tables --out FOLDER``.
+"""Build the catalog's package data from the ``bddl`` package: ``python -m embomatrix.factory.catalog_tables --out
+FOLDER``.
 
-BEHAVIOR-1K's knowledge base (``bddl`` 3.6.0, MIT) knows the box of every object model, the mass and the abilities of
-their categories, and the room-by-room inventories of 51 scenes. What the project needs of its 28 MB is written as three
-small tables, byte for byte the same on every run, beside the notice that the licence asks for.
+BEHAVIOR-1K's knowledge base (``bddl`` 3.6.0, MIT) holds the box of every object model, the mass and abilities of
+their categories, and the inventories of 51 scenes by room. This script reduces its 28 MB to three small tables, which
+are identical on every run, and adds the notice that the licence requires.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ NOTICE_FILE: Final = "NOTICE.md"
 DOORS: Final = frozenset({"door", "sliding_door", "garage_door", "elevator_door", "gate"})
 WINDOWS: Final = frozenset({"openable_window", "fixed_window"})
 STRUCTURE: Final = frozenset({"walls", "floors", "ceilings", "lawn", "driveway"})
-"""Categories of the building itself: its panels and its ground, which a scene lays out anew."""
+"""Categories of the building itself. A scene generates its own walls and floors."""
 LEAST_FLOOR_M: Final = 0.4
-"""A narrower floor model is a threshold or a strip between two others, where nobody can stand."""
+"""Narrower floor models are thresholds or strips that nobody can stand on."""
 
 _SYNSET: Final = re.compile(r"[a-z][\w'\-]*\.n\.\d\d")
-"""A name of the taxonomy in a problem file, ``apple.n.01``, without the number of an instance."""
+"""Synset in a problem file, such as ``apple.n.01``, without the number of an instance."""
 
 UNIVERSAL: Final = frozenset(
     {
@@ -47,15 +48,17 @@ UNIVERSAL: Final = frozenset(
         "stainable", "stickyable", "tarnishable", "wetable", "wrinkleable",
     }
 )  # fmt: skip
-"""Abilities that every solid thing has: they tell nothing apart and would double the table."""
+"""Abilities that every solid object has. They carry no information and would double the table."""
 
 
 class CatalogSourceError(Exception):
-    """The ``bddl`` package is missing or is not the version that the tables are derived from."""
+    """The ``bddl`` package is missing or has another version than the tables."""
 
 
 def source_folder() -> Path:
-    """Folder of the installed package's generated data. Raises SourceError when it is absent or another version."""
+    """Return the folder of the package's generated data. Raise CatalogSourceError if it is missing or has another
+    version.
+    """
     spec = importlib.util.find_spec("bddl")
     if spec is None or spec.origin is None:
         raise CatalogSourceError(f"the package bddl is not installed: try `pip install bddl=={BDDL_VERSION}`")
@@ -68,9 +71,9 @@ def source_folder() -> Path:
 
 
 def build_catalog(folder: Path) -> Json:
-    """Synsets (children, abilities), categories (synset, mass) and models (box in m, meta links).
+    """Return synsets (children, abilities), categories (synset, mass) and models (box in m, meta links).
 
-    Categories are solid things only: the 601 others are particle meshes of substances, which have no mass either.
+    Only solid categories are kept. The other 601 are particle meshes of substances, which have no mass.
     """
     inventory = _read_json(folder / "object_inventory.json")
     synsets = _taxonomy(_read_json(folder / "output_hierarchy.json"))
@@ -97,7 +100,7 @@ def build_catalog(folder: Path) -> Json:
 
 
 def _activity_synsets(folder: Path, known: Mapping[str, Json]) -> list[str]:
-    """Synsets that the activities' definitions name, of those in the taxonomy."""
+    """Return the synsets of the taxonomy that the activity definitions name."""
     found: set[str] = set()
     for path in folder.glob("*/problem*.bddl"):
         found.update(_SYNSET.findall(path.read_text(encoding="utf-8").lower()))
@@ -122,7 +125,7 @@ def _taxonomy(root: Json) -> dict[str, Json]:
 
 
 def _abilities(raw: Mapping[str, Mapping[str, Json]]) -> dict[str, dict[str, float]]:
-    """Keep what tells things apart, with the parameters that are numbers."""
+    """Keep the distinguishing abilities with their numeric parameters."""
     return {
         ability: {name: float(value) for name, value in parameters.items() if isinstance(value, (int, float))}
         for ability, parameters in raw.items()
@@ -138,7 +141,9 @@ def _masses(path: Path) -> dict[str, float]:
 
 
 def build_scenes(folder: Path) -> Json:
-    """Inventories of all scenes: per room its floor (m) and the models of doors, windows and objects with counts."""
+    """Return the inventories of all scenes: for each room its floor (m), and model counts of doors, windows and
+    objects.
+    """
     boxes = _read_json(folder / "object_inventory.json")["bounding_box_sizes"]
     scenes = _read_json(folder / "combined_room_object_list.json")["scenes"]
     typical = _typical_floors(scenes, boxes)
@@ -179,14 +184,14 @@ def _pick(models: Mapping[str, int], categories: frozenset[str]) -> dict[str, in
 
 
 def _floors(models: Iterable[str], boxes: Json) -> list[list[float]]:
-    """Depth and width of a room's floor models, the largest first, without thresholds."""
+    """Return depth and width of a room's floor models without thresholds, the largest first."""
     sizes = [boxes[key.rsplit("-", 1)[1]] for key in models if _category(key) == "floors"]
     floors = [[round(size[0], 3), round(size[1], 3)] for size in sizes if min(size[:2]) >= LEAST_FLOOR_M]
     return sorted(floors, key=lambda s: (-s[0] * s[1], s))
 
 
 def _typical_floors(scenes: Json, boxes: Json) -> dict[str, list[float]]:
-    """Median floor of each room type: the size of the twelve rooms whose inventory lists none to stand on."""
+    """Return the median floor of each room type, for the twelve rooms without a usable floor model."""
     seen: dict[str, list[list[float]]] = defaultdict(list)
     for rooms in scenes.values():
         for name, models in rooms.items():
@@ -211,13 +216,13 @@ def _read_json(path: Path) -> Json:
 
 
 def encode(table: Json) -> bytes:
-    """Compress a table so that equal tables give equal bytes: keys sorted, no time stamp, no file name."""
+    """Compress a table deterministically: sorted keys, no time stamp, no file name."""
     text = json.dumps(table, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
     return gzip.compress(text.encode(), compresslevel=9, mtime=0)
 
 
 def notice(licence: str) -> str:
-    """Text that goes beside the tables: where they come from, and the licence with its copyright line."""
+    """Return the notice for the tables: their source, and the licence with its copyright line."""
     return (
         "# NOTICE: data in this folder\n\n"
         f"`{CATALOG_FILE}`, `{SCENES_FILE}` and `{SUBSTANCES_FILE}` are derived from the Python package `bddl` {BDDL_VERSION}\n"
@@ -237,7 +242,7 @@ def _licence_text() -> str:
 
 
 def write_tables(out: Path) -> tuple[Path, ...]:
-    """Derive all files into ``out`` (made when absent) and return their paths."""
+    """Write all files to ``out``, which is created if missing, and return their paths."""
     folder = source_folder()
     contents = {
         CATALOG_FILE: encode(build_catalog(folder)),
@@ -252,7 +257,7 @@ def write_tables(out: Path) -> tuple[Path, ...]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Command line: write the tables and name the files."""
+    """Write the tables and print the files."""
     parser = argparse.ArgumentParser(
         description="Derive the catalog's tables from the installed bddl package."
     )
@@ -271,7 +276,7 @@ if __name__ == "__main__":
 
 
 ON: Final = "on"
-"""What stands in place of a substance in the needs of a remover that works when it is switched on."""
+"""Stands for a substance in the needs of a remover that works when it is switched on."""
 DEFAULTS: Final = {
     "default_visual_conditions": "visual",
     "default_fluid_conditions": "liquid",
@@ -280,12 +285,13 @@ DEFAULTS: Final = {
 
 
 def build_substances(folder: Path) -> Json:
-    """The table, from the package's generated data.
+    """Return the table of substances.
 
-    ``kinds``: each substance is "visual" (a film, such as dust), "liquid" or "solid" (grains and pieces). ``needs`` are the
-    lists that the other entries number: null for never, else the substances one of which must soak the tool (``on``: it
-    must run), empty for none. ``removers`` map a tool to substances, and to kinds for those not named; ``washer`` are
-    washing machines' rules; ``sources`` what flows out of things that are switched on; ``halves`` what slicing makes.
+    ``kinds`` maps each substance to "visual" (a film, such as dust), "liquid" or "solid" (grains and pieces).
+    ``needs`` are numbered lists: null means never; otherwise one of the substances must soak the tool (``on``: the
+    tool must run); empty means no need. ``removers`` map a tool to substances, and to kinds for all others.
+    ``washer`` holds the rules of washing machines, ``sources`` the liquids that switched-on objects give, and
+    ``halves`` the product of slicing.
     """
     knowledge = json.loads((folder / "propagated_annots_params.json").read_text(encoding="utf-8"))
     washer = json.loads((folder / "transition_map/tm_jsons/washer.json").read_text(encoding="utf-8"))
@@ -317,7 +323,7 @@ def build_substances(folder: Path) -> Json:
 
 
 def _able(knowledge: Mapping[str, Json], ability: str, parameter: str) -> Iterator[tuple[str, Json]]:
-    """Synsets whose ability has the parameter, in their order, with all parameters of the ability."""
+    """Yield the synsets whose ability has the parameter, in sorted order, with all parameters of the ability."""
     for name, entry in sorted(knowledge.items()):
         if entry.get(ability, {}).get(parameter):
             yield name, entry[ability]
@@ -338,7 +344,7 @@ def _removals(remover: Mapping[str, Json]) -> dict[str, list[str] | None]:
 
 
 def _options(conditions: list[list[Json]] | None) -> list[str] | None:
-    """Each condition is a state and its value: ``["saturated", SUBSTANCE]`` or ``["toggled_on", true]``."""
+    """Return the substances of conditions such as ``["saturated", SUBSTANCE]`` or ``["toggled_on", true]``."""
     if conditions is None:
         return None
     return [value if state == "saturated" else ON for state, value in conditions]

@@ -25,9 +25,9 @@ from embomatrix.bench.experiments.design import (
 from embomatrix.bench.experiments.findings import Run, curve, figures_of, findings_of
 from embomatrix.bench.experiments.section import add_section, learning_section
 from embomatrix.cli.foreground import no_problem
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.outcome import RunOutcome, TaskRate, read_outcome, write_outcome
-from embomatrix.trainer.run.settings import read_settings
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import read_settings
+from embomatrix.trainer.logging.outcome import RunOutcome, TaskRate, read_outcome, write_outcome
 
 DESIGN = Design(
     name="learning",
@@ -56,7 +56,8 @@ def outcome(before, after):
 
 def run(seed, arm, before, after):
     metrics = [
-        {"success": step / 20, "dead_groups": 0.5, "entropy": 0.2, "plan_steps": 4.0} for step in range(20)
+        {"success": step / 20, "zero_variance_groups": 0.5, "entropy": 0.2, "plan_steps": 4.0}
+        for step in range(20)
     ]
     return Run(seed, arm, outcome(before, after), metrics)
 
@@ -229,7 +230,7 @@ def test_an_outcome_is_read_as_it_was_written(tmp_path):
     [
         (("learning", "--dataset=nowhere"), "no dataset at nowhere: build one"),
         (("compare", "--arm=Fast:a=1", "--dataset=DS"), "has the name 'Fast': expected small letters"),
-        (("compare", "--arm=a:grpo.speed=1", "--dataset=DS"), "there is no setting 'grpo.speed'"),
+        (("compare", "--arm=a:grpo.speed=1", "--dataset=DS"), "unknown setting 'grpo.speed'"),
         (("learning", "--set=grpo.group=1", "--dataset=DS"), "setting 'grpo.group'"),
         (("table", "--run=nowhere", "--bench=DS"), "no outcome of a finished run"),
     ],

@@ -36,13 +36,16 @@ def told(*arguments):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--model=OUT", "--bench=DATASET"), "OUT is no model: expected runs/NAME/checkpoints/step-000050"),
+        (
+            ("--model=OUT", "--bench=DATASET"),
+            "OUT is not a model: expected runs/NAME/checkpoints/step-000050",
+        ),
         (("--bench=DATASET",), "expected one of --model, --endpoint, --baseline and --answers"),
         (
             ("--baseline=oracle", "--model=tiny"),
             "expected one of --model, --endpoint, --baseline and --answers",
         ),
-        (("--baseline=oracle", "--bench=nowhere"), "there is no benchmark at nowhere: pass a dataset folder"),
+        (("--baseline=oracle", "--bench=nowhere"), "no benchmark at nowhere: pass a dataset folder"),
         (("--baseline=oracle", "--bench=eai"), "make it with `embomatrix factory import`"),
         (
             ("--endpoint=http://127.0.0.1:1/v1", "--bench=DATASET"),

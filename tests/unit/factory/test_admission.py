@@ -1,4 +1,4 @@
-"""A task is admitted only when executing the oracle's plan shows that it can be done, and was not done already."""
+"""Admission requires that the oracle's plan reaches a goal that does not hold at the start."""
 
 import pytest
 
@@ -23,7 +23,7 @@ def task(goal: str) -> Task:
 
 
 class Boxes:
-    """A stage on which ``open`` works, and nothing else does."""
+    """Executor in which only ``open`` works."""
 
     def __init__(self, *opened: str) -> None:
         self._start = set(opened)
@@ -49,7 +49,7 @@ class Boxes:
 
 
 class Stuck(Boxes):
-    """Boxes that a robot can't get open; it may take them to be open all the same."""
+    """Boxes that a robot can't open, although it may believe that they are open."""
 
     def __init__(self, *, says_so: bool = True) -> None:
         super().__init__()
@@ -65,7 +65,7 @@ def oracle(*plan: SkillCall):
     return lambda _stage, _task: plan
 
 
-def test_task_that_the_oracle_solves_is_admitted_with_its_plan() -> None:
+def test_task_solved_by_the_oracle_is_admitted_with_its_plan() -> None:
     verdict = admit(Boxes(), task("(and (open box_1) (open box_2))"), oracle(OPEN_1, OPEN_2))
     assert verdict == Admitted((OPEN_1, OPEN_2), ())
 
@@ -96,16 +96,14 @@ def test_atoms_that_hold_at_the_start_are_listed() -> None:
         ),
     ],
 )
-def test_task_is_turned_away_for_one_reason(
-    stage: Boxes, goal: str, plan: Plan, reason: RefusalReason
-) -> None:
+def test_task_is_refused_with_one_reason(stage: Boxes, goal: str, plan: Plan, reason: RefusalReason) -> None:
     verdict = admit(stage, task(goal), oracle(*plan))
     assert isinstance(verdict, TaskRefusal)
     assert verdict.reason is reason
     assert len(verdict.sentence) > 20
 
 
-def test_plan_that_a_robot_can_not_carry_out_in_physics_is_turned_away_with_what_stopped_it() -> None:
+def test_plan_that_fails_in_physics_is_refused_with_the_failed_step() -> None:
     goal = task("(open box_1)")
     assert isinstance(admit(Boxes(), goal, oracle(OPEN_1), physics=Boxes()), Admitted)
     verdict = admit(Boxes(), goal, oracle(OPEN_1), physics=Stuck())
@@ -115,10 +113,10 @@ def test_plan_that_a_robot_can_not_carry_out_in_physics_is_turned_away_with_what
     )
     unmoved = admit(Boxes(), goal, oracle(OPEN_1), physics=Stuck(says_so=False))
     assert isinstance(unmoved, TaskRefusal)
-    assert "the goal does not hold in the end" in unmoved.sentence
+    assert "the goal does not hold at the end" in unmoved.sentence
 
 
-def test_planner_s_own_reason_is_passed_on() -> None:
+def test_planner_reason_is_passed_on() -> None:
     verdict = admit(
         Boxes(), task("(open box_1)"), lambda _stage, _task: PlanNotFound("box_1 is behind a wall")
     )
@@ -127,7 +125,7 @@ def test_planner_s_own_reason_is_passed_on() -> None:
     )
 
 
-def test_start_that_is_not_as_the_source_says_is_turned_away() -> None:
+def test_unmet_start_atom_is_refused() -> None:
     init = (InitLiteral(Atom("open", ("box_1",)), positive=False), InitLiteral(Atom("open", ("box_2",))))
     verdict = admit(Boxes("box_1"), task("(open box_3)"), oracle(OPEN_1), init)
     assert isinstance(verdict, TaskRefusal)
@@ -135,13 +133,13 @@ def test_start_that_is_not_as_the_source_says_is_turned_away() -> None:
     assert "(not (open box_1))" in verdict.sentence
 
 
-def test_of_a_benchmark_more_than_half_may_hold_at_the_start_and_never_all() -> None:
+def test_benchmark_may_hold_more_than_half_but_not_all_atoms_at_the_start() -> None:
     goal = task("(and (open box_1) (open box_2) (open box_3))")
     held = Boxes("box_1", "box_2")
     opened = oracle(SkillCall(Skill.OPEN, object_index=goal.index_of["box_3"]))
     usual = admit(held, goal, opened)
     assert isinstance(usual, TaskRefusal)
-    assert "2 of 3 atoms hold at the start, at most 50% may" in usual.sentence
+    assert "2 of 3 atoms hold at the start, expected at most 50%" in usual.sentence
     assert isinstance(admit(held, goal, opened, most_held=1.0), Admitted)
     done = admit(Boxes("box_1", "box_2", "box_3"), goal, opened, most_held=1.0)
     assert isinstance(done, TaskRefusal)

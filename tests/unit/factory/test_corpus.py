@@ -1,4 +1,4 @@
-"""A corpus keeps training and held-out tasks apart, and tells when what was frozen has changed."""
+"""A corpus separates training from held-out tasks and detects changes to the frozen set."""
 
 import dataclasses
 import json
@@ -27,7 +27,7 @@ def kitchen(tmp_path_factory):
 
 
 def _written(folder, kitchen, splits, scene, kinds):
-    """A dataset of kitchen tasks that claim to lie in a scene and to be of a kind."""
+    """Return a dataset of kitchen tasks with the given scenes and signatures."""
     records = [
         dataclasses.replace(
             record,
@@ -46,7 +46,7 @@ def _written(folder, kitchen, splits, scene, kinds):
 
 @pytest.fixture
 def corpus(tmp_path, kitchen):
-    """Two tasks to train on and one held out in one scene, two in another."""
+    """Two training tasks and one held-out task in one scene, two in another."""
     _written(tmp_path / TRAIN, kitchen, ("train", "train", "heldout"), "Rs_int", "abc")
     _written(tmp_path / UNSEEN, kitchen, ("heldout", "heldout"), "Ihlen_1_int", "de")
     return tmp_path
@@ -60,39 +60,39 @@ def test_held_out_tasks_of_both_builds_are_frozen_together(corpus):
     assert freeze(corpus) == frozen
 
 
-def test_a_changed_task_is_told(corpus):
+def test_changed_task_is_detected(corpus):
     freeze(corpus)
     path = corpus / VERIFIED / "tasks.jsonl"
     path.write_text(path.read_text().replace('"signature":"d"', '"signature":"z"'))
-    with pytest.raises(DatasetError, match="is not what was frozen"):
+    with pytest.raises(DatasetError, match="differs from the frozen corpus"):
         check_frozen(corpus)
 
 
-def test_a_damaged_bundle_is_told(corpus):
+def test_damaged_bundle_is_detected(corpus):
     freeze(corpus)
     next((corpus / VERIFIED / "bundles").iterdir()).write_bytes(b"other")
     with pytest.raises(DatasetError):
         check_frozen(corpus)
 
 
-def test_a_kind_of_goal_on_both_sides_is_refused(corpus, kitchen):
+def test_signature_on_both_sides_is_refused(corpus, kitchen):
     _written(corpus / UNSEEN, kitchen, ("heldout", "heldout"), "Ihlen_1_int", "ae")
     with pytest.raises(DatasetError, match="'a' are trained on and held out"):
         freeze(corpus)
 
 
-def test_more_than_half_in_scenes_of_training_is_refused(corpus, kitchen):
+def test_majority_in_training_scenes_is_refused(corpus, kitchen):
     _written(corpus / UNSEEN, kitchen, ("heldout",), "Rs_int", "d")
     with pytest.raises(DatasetError, match="2 of 2 held-out tasks lie in scenes of training"):
         freeze(corpus)
 
 
-def test_what_was_never_frozen_is_told(corpus):
-    with pytest.raises(DatasetError, match="does not tell what was frozen"):
+def test_missing_freeze_is_reported(corpus):
+    with pytest.raises(DatasetError, match="does not describe a frozen corpus"):
         check_frozen(corpus)
 
 
-def test_the_builds_share_a_seed_and_no_scene_and_most_is_held_out_elsewhere():
+def test_builds_share_the_seed_but_no_scene_and_most_held_out_tasks_are_unseen():
     builds = CorpusSettings(seed=3).builds()
     train, unseen = builds[TRAIN], builds[UNSEEN]
     assert (train.train, train.heldout, unseen.heldout) == (2_000, 40, 60)
@@ -102,7 +102,7 @@ def test_the_builds_share_a_seed_and_no_scene_and_most_is_held_out_elsewhere():
     assert unseen.scenes == HELDOUT_SCENES
 
 
-def test_the_command_checks_a_corpus(corpus):
+def test_corpus_check_prints_the_frozen_digest(corpus):
     freeze(corpus)
     done = CliRunner().invoke(app, ["corpus", "--out", str(corpus), "--check"])
     assert done.exit_code == 0, done.output

@@ -27,7 +27,7 @@ def a_host(scene: Scene, prefix: str) -> str:
     ("relation", "host"),
     [(Relation.ONTOP, "breakfast_table"), (Relation.INSIDE, "fridge"), (Relation.INSIDE, "bottom_cabinet")],
 )
-def test_added_things_rest_where_they_were_asked_for(flat: Scene, relation: Relation, host: str) -> None:
+def test_added_object_rests_on_its_host(flat: Scene, relation: Relation, host: str) -> None:
     edit = SceneEditor(flat)
     names = [sampler(edit, n).add("apple", None, relation, a_host(flat, host)) for n in range(2)]
     scene = edit.freeze("task-scene")
@@ -39,7 +39,7 @@ def test_added_things_rest_where_they_were_asked_for(flat: Scene, relation: Rela
     assert not any(scene.by_name[n].fixed for n in names)
 
 
-def test_a_thing_on_the_floor_of_a_room_is_in_that_room_and_in_reach(flat: Scene) -> None:
+def test_floor_object_is_in_its_room_and_reachable(flat: Scene) -> None:
     edit = SceneEditor(flat)
     name = sampler(edit).add("bucket", None, None, "living_room_0")
     scene = edit.freeze("task-scene")
@@ -58,7 +58,7 @@ def test_next_to_means_on_the_same_surface(flat: Scene) -> None:
     assert check_scene(edit.freeze("task-scene")) == ()
 
 
-def test_the_base_scene_is_left_alone_and_assets_in_use_travel(flat: Scene) -> None:
+def test_base_scene_is_unchanged_and_used_assets_are_included(flat: Scene) -> None:
     before = flat.objects
     edit = SceneEditor(flat)
     name = sampler(edit).add("apple", None, Relation.ONTOP, a_host(flat, "breakfast_table"))
@@ -70,7 +70,7 @@ def test_the_base_scene_is_left_alone_and_assets_in_use_travel(flat: Scene) -> N
     assert scene.by_name[name].asset_id in scene.assets
 
 
-def test_the_same_seed_puts_a_thing_in_the_same_place(flat: Scene) -> None:
+def test_equal_seeds_give_equal_poses(flat: Scene) -> None:
     def pose(seed: int) -> object:
         edit = SceneEditor(flat)
         return edit.objects[
@@ -102,7 +102,7 @@ def test_states_and_joints_are_set_by_name(flat: Scene) -> None:
         ("sofa", Relation.INSIDE, "fridge_1", LayoutReason.TOO_LARGE),
     ],
 )
-def test_what_can_not_be_placed_says_why(
+def test_unplaceable_object_raises_with_its_reason(
     flat: Scene, category: str, relation: Relation | None, host: str, reason: LayoutReason
 ) -> None:
     with pytest.raises(PlacementError) as caught:
@@ -110,7 +110,7 @@ def test_what_can_not_be_placed_says_why(
     assert caught.value.reason is reason
 
 
-def test_a_full_shelf_says_so(flat: Scene) -> None:
+def test_full_shelf_raises_no_free_spot(flat: Scene) -> None:
     edit = SceneEditor(flat)
 
     def fill() -> None:

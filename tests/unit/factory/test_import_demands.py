@@ -1,4 +1,4 @@
-"""Of several models a problem's things are given those that do what the problem is about."""
+"""Models are chosen by the requirements that a problem puts on its objects."""
 
 import numpy as np
 import pytest
@@ -12,14 +12,14 @@ from embomatrix.factory.task_import.binding import Addition
 from embomatrix.factory.task_import.models import models_for
 from embomatrix.factory.task_import.size_requirements import (
     CavityFit,
-    Demand,
-    demand_on,
-    demands_of,
+    Requirement,
+    requirement_on,
+    requirements_of,
     room_for,
     smallest_m,
 )
-from embomatrix.factory.task_import.sources import NAMESAKES, activity_names
-from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
+from embomatrix.factory.task_import.sources import EAI_NAMESAKES, activity_names
+from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
 from embomatrix.world.bddl import parse_problem
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.scene import Scene
@@ -35,7 +35,7 @@ BOXES = """(define (problem p) (:domain igibson)
 CARTON = Addition("carton", "carton.n.02", None, "", "kitchen_0")
 
 
-def model_of(demand: Demand, addition: Addition = CARTON):
+def model_of(demand: Requirement, addition: Addition = CARTON):
     return models_for(addition, np.random.default_rng(0), demand)[0]
 
 
@@ -43,38 +43,40 @@ def asset_of(model):
     return build_asset(Catalog.load(), model.category, model.model_id)
 
 
-def test_what_goes_in_is_shared_by_all_containers_and_what_stays_is_not_carried() -> None:
-    demands = demands_of(parse_problem(BOXES))
+def test_contents_are_shared_among_containers_and_static_objects_are_not_carried() -> None:
+    demands = requirements_of(parse_problem(BOXES))
     on_floor = (Relation.ONTOP, "floor.n.01_1")
-    assert demand_on(demands, "carton.n.02_1", "carton.n.02") == Demand(
+    assert requirement_on(demands, "carton.n.02_1", "carton.n.02") == Requirement(
         bears=True, contents=("book.n.02",) * 2, places=(on_floor,)
     )
-    assert demand_on(demands, "book.n.02_1", "book.n.02") == Demand(
+    assert requirement_on(demands, "book.n.02_1", "book.n.02") == Requirement(
         carried=True, places=((Relation.ONTOP, "table.n.02_1"), (Relation.INSIDE, "carton.n.02_1"))
     )
-    assert demand_on(demands, "table.n.02_1", "table.n.02") == Demand(bears=True, burden=("book.n.02",) * 3)
+    assert requirement_on(demands, "table.n.02_1", "table.n.02") == Requirement(
+        bears=True, burden=("book.n.02",) * 3
+    )
 
 
-def test_what_must_not_stay_is_carried_and_what_must_not_go_in_needs_no_room() -> None:
+def test_negated_places_require_carrying_but_no_space() -> None:
     text = """(define (problem p) (:domain igibson)
         (:objects book.n.02_1 - book.n.02 carton.n.02_1 - carton.n.02 table.n.02_1 - table.n.02)
         (:init (ontop book.n.02_1 table.n.02_1) (inroom table.n.02_1 kitchen))
         (:goal (and (not (ontop book.n.02_1 table.n.02_1)) (not (inside book.n.02_1 carton.n.02_1)))))"""
-    demands = demands_of(parse_problem(text))
-    assert demands["book.n.02_1"] == Demand(carried=True, places=((Relation.ONTOP, "table.n.02_1"),))
-    assert demands["carton.n.02_1"] == Demand()
+    demands = requirements_of(parse_problem(text))
+    assert demands["book.n.02_1"] == Requirement(carried=True, places=((Relation.ONTOP, "table.n.02_1"),))
+    assert demands["carton.n.02_1"] == Requirement()
 
 
-def test_a_container_has_floor_for_all_that_goes_in() -> None:
+def test_container_has_floor_for_all_contents() -> None:
     plates = ("plate.n.04",) * 4
-    model = model_of(Demand(bears=True, contents=plates))
+    model = model_of(Requirement(bears=True, contents=plates))
     assert room_for(asset_of(model), plates) is CavityFit.FOR_ALL
-    small = asset_of(model_of(Demand(bears=True)))
+    small = asset_of(model_of(Requirement(bears=True)))
     assert room_for(small, plates) > CavityFit.FOR_ALL
 
 
-def test_a_container_that_is_carried_can_be_lifted_whatever_goes_in() -> None:
-    model = model_of(Demand(bears=True, contents=("plate.n.04",) * 9, carried=True))
+def test_carried_container_is_liftable_whatever_its_contents() -> None:
+    model = model_of(Requirement(bears=True, contents=("plate.n.04",) * 9, carried=True))
     assert is_liftable(model.size_m, Catalog.load().category(model.category).mass_kg)
 
 
@@ -86,39 +88,39 @@ def test_a_container_that_is_carried_can_be_lifted_whatever_goes_in() -> None:
         (("apple.n.01",) * 30, CavityFit.FOR_EACH),
     ],
 )
-def test_room_is_told_by_footprints(contents: tuple[str, ...], room: CavityFit) -> None:
+def test_cavity_fit_depends_on_footprints(contents: tuple[str, ...], room: CavityFit) -> None:
     catalog = Catalog.load()
     bucket = min(catalog.models_of("bucket"), key=lambda model: model.size_m)
     assert room_for(build_asset(catalog, "bucket", bucket.model_id), contents) is room
 
 
-def test_of_a_type_without_models_nothing_is_known() -> None:
+def test_type_without_models_has_no_size() -> None:
     assert smallest_m("dust.n.01") is None
     assert smallest_m("no_such_thing.n.01") is None
 
 
-def test_the_scene_of_a_problem_comes_first_with_other_draws(home: Scene, flat: Scene) -> None:
+def test_own_scene_is_tried_first_with_several_draws(home: Scene, flat: Scene) -> None:
     item = source(PROBLEM)
     at_home = type(item)(item.name, item.text, item.source, item.request, scene=home.base)
-    asked = list(batch.imports(at_home, [flat, home], seed=0, manner=Manner(), draws=2))
+    asked = list(batch.imports(at_home, [flat, home], seed=0, options=ImportOptions(), draws=2))
     first = [found.scene.base for found in asked[:2] if isinstance(found, ImportedTask)]
     assert first == [home.base] * 2
     one, other = (found.scene for found in asked[:2])
     assert one.scene_id != other.scene_id
 
 
-def test_what_no_skill_reaches_is_tried_in_no_further_scene(home: Scene, flat: Scene) -> None:
+def test_scene_independent_refusal_ends_the_search(home: Scene, flat: Scene) -> None:
     text = PROBLEM.replace(
         "(not (open ?electric_refrigerator.n.01_1))", "(sliced ?electric_refrigerator.n.01_1)"
     )
     item = source(text)
     at_home = type(item)(item.name, item.text, item.source, item.request, scene=home.base)
-    (only,) = batch.imports(at_home, [flat, home], seed=0, manner=Manner(), draws=3)
+    (only,) = batch.imports(at_home, [flat, home], seed=0, options=ImportOptions(), draws=3)
     assert isinstance(only, TaskRefusal)
     assert only.reason is RefusalReason.INEXPRESSIBLE
 
 
-def test_a_tap_joins_the_table_where_something_must_be_wet(home: Scene) -> None:
+def test_tap_joins_the_table_when_the_goal_needs_water(home: Scene) -> None:
     text = PROBLEM.replace("(not (open ?electric_refrigerator.n.01_1))", "(soaked ?apple.n.01_1)")
     wet = import_problem(source(text.replace("apple.n.01", "rag.n.01")), home)
     dry = import_problem(source(PROBLEM.replace("apple.n.01", "rag.n.01")), home)
@@ -129,7 +131,7 @@ def test_a_tap_joins_the_table_where_something_must_be_wet(home: Scene) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "origin", "examines"),
+    ("name", "origin", "is_held_out"),
     [
         ("toys", "eai", True),
         ("re-shelving_library_books", "embomatrix", True),
@@ -137,13 +139,15 @@ def test_a_tap_joins_the_table_where_something_must_be_wet(home: Scene) -> None:
         ("cook_a_turkey", "behavior-1k", False),
     ],
 )
-def test_what_examines_is_not_trained_on(home: Scene, name: str, origin: str, examines: bool) -> None:
+def test_benchmark_tasks_are_never_training_tasks(
+    home: Scene, name: str, origin: str, is_held_out: bool
+) -> None:
     item = type(source())(name, PROBLEM, origin)
     imported = import_problem(item, home)
     assert isinstance(imported, ImportedTask)
-    assert imported.examines is examines
+    assert imported.is_held_out is is_held_out
 
 
-def test_the_namesakes_are_activities_of_the_package() -> None:
-    assert len(NAMESAKES) == 67
-    assert {name.replace("-", "_") for name in activity_names()} >= NAMESAKES
+def test_namesakes_are_activities_of_the_package() -> None:
+    assert len(EAI_NAMESAKES) == 67
+    assert {name.replace("-", "_") for name in activity_names()} >= EAI_NAMESAKES

@@ -1,4 +1,4 @@
-"""Problems of other worlds in the words of the catalog: renamed types, groups, what is left unsaid; EAI, and the report."""
+"""Problems of other datasets: renamed types, type groups, implied rooms, EAI's tasks, and the import report."""
 
 import dataclasses
 import json
@@ -13,9 +13,9 @@ from embomatrix.factory.task_import.dialects import (
     GROUPS,
     LAMPS,
     RENAMED,
-    in_catalog_words,
     read_problem,
-    said_whole,
+    translate_types,
+    with_implied_rooms,
 )
 from embomatrix.factory.task_import.reach import unreachable_atoms
 from embomatrix.factory.task_import.report import (
@@ -32,31 +32,31 @@ from embomatrix.factory.task_import.sources import (
     ProblemSourceError,
     read_eai,
 )
-from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
+from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
 from embomatrix.world.bddl import InitLiteral, parse_formula, parse_problem
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.goal import Atom
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import Profile
 
-EVALUABLE = Manner(reachable=False)
+EVALUABLE = ImportOptions(reachable=False)
 
 
-def test_renamed_types_are_read_as_what_the_catalog_calls_them() -> None:
-    text, notes = in_catalog_words(PROBLEM.replace("breakfast_table.n.01", "cupboard.n.01"), RENAMED)
+def test_renamed_types_are_translated() -> None:
+    text, notes = translate_types(PROBLEM.replace("breakfast_table.n.01", "cupboard.n.01"), RENAMED)
     assert "cupboard.n.01_1 - cabinet.n.01" in text
     assert notes == ("cupboard.n.01 is read as cabinet.n.01",)
 
 
-def test_a_group_stands_for_a_type_that_the_problem_does_not_name_already() -> None:
+def test_group_is_replaced_by_a_type_that_the_problem_does_not_name() -> None:
     text = "hardback.n.01_1 - hardback.n.01 book.n.02_1 - book.n.02"
     assert (
-        in_catalog_words(text, GROUPS)[0]
+        translate_types(text, GROUPS)[0]
         == "hardback.n.01_1 - hardback.n.01 book.n.02_1 - paperback_book.n.01"
     )
 
 
-def test_a_light_that_is_switched_is_read_as_a_lamp_and_one_that_hangs_is_not() -> None:
+def test_switched_light_becomes_a_lamp_but_ceiling_light_does_not() -> None:
     text = PROBLEM.replace("breakfast_table.n.01", "room_light.n.01")
     problem, notes = read_problem(source(text))
     assert problem.objects["room_light.n.01_1"] == "room_light.n.01"
@@ -66,7 +66,7 @@ def test_a_light_that_is_switched_is_read_as_a_lamp_and_one_that_hangs_is_not() 
     assert notes == ("room_light.n.01 is read as floor_lamp.n.01",)
 
 
-def test_a_driveway_is_ground_that_things_stand_on(home: Scene) -> None:
+def test_driveway_is_floor(home: Scene) -> None:
     text = PROBLEM.replace("floor.n.01_1 - floor.n.01", "driveway.n.01_1 - driveway.n.01").replace(
         "floor.n.01_1", "driveway.n.01_1"
     )
@@ -78,7 +78,7 @@ def test_a_driveway_is_ground_that_things_stand_on(home: Scene) -> None:
     assert (apple.room, apple.host) == ("kitchen_0", "")
 
 
-def test_every_word_is_read_as_types_that_have_models() -> None:
+def test_every_type_translates_to_types_with_models() -> None:
     catalog = Catalog.load()
     for options in (*GROUPS.values(), *LAMPS.values()):
         for name in options:
@@ -86,36 +86,38 @@ def test_every_word_is_read_as_types_that_have_models() -> None:
             assert catalog.categories_of(name), name
 
 
-def test_what_a_problem_leaves_unsaid_is_said() -> None:
+def test_implied_rooms_are_added() -> None:
     text = PROBLEM.replace("(ontop apple.n.01_2 breakfast_table.n.01_1)", "(inside apple.n.01_2 closet_1)")
-    problem, notes = said_whole(parse_problem(text))
+    problem, notes = with_implied_rooms(parse_problem(text))
     assert InitLiteral(Atom("inroom", ("apple.n.01_2", "closet_1"))) in problem.init
     assert notes == ("(inside apple.n.01_2 closet_1) is read as being in the room",)
-    assert said_whole(problem) == (problem, ())
+    assert with_implied_rooms(problem) == (problem, ())
 
 
-def test_a_floor_without_a_room_is_that_of_what_stands_on_it() -> None:
+def test_floor_without_a_room_gets_the_room_of_objects_on_it() -> None:
     text = PROBLEM.replace(
         "(inroom floor.n.01_1 kitchen)", "(inroom apple.n.01_1 kitchen) (ontop apple.n.01_1 floor.n.01_1)"
     )
-    problem, notes = said_whole(parse_problem(text))
+    problem, notes = with_implied_rooms(parse_problem(text))
     assert InitLiteral(Atom("inroom", ("floor.n.01_1", "kitchen"))) in problem.init
     assert len(notes) == 1
 
 
-def test_a_goal_that_no_skill_reaches_is_bound_where_it_need_only_be_told(home: Scene) -> None:
+def test_unreachable_goal_is_bound_when_only_evaluation_is_needed(home: Scene) -> None:
     item = source(
         PROBLEM.replace("(not (open ?electric_refrigerator.n.01_1))", "(sliced ?breakfast_table.n.01_1)")
     )
     refused = import_problem(item, home)
     assert isinstance(refused, TaskRefusal)
     assert refused.reason is RefusalReason.INEXPRESSIBLE
-    assert isinstance(import_problem(item, home, manner=EVALUABLE), ImportedTask)
-    folded = import_problem(source(PROBLEM.replace("(not (open ?", "(not (folded ?")), home, manner=EVALUABLE)
+    assert isinstance(import_problem(item, home, options=EVALUABLE), ImportedTask)
+    folded = import_problem(
+        source(PROBLEM.replace("(not (open ?", "(not (folded ?")), home, options=EVALUABLE
+    )
     assert isinstance(folded, TaskRefusal)
 
 
-def test_atoms_beyond_a_profile_are_listed_with_their_sign() -> None:
+def test_unreachable_atoms_are_listed_with_their_sign() -> None:
     problem = parse_problem(PROBLEM)
     goal = parse_formula(
         "(and (sliced apple.n.01_1) (forall (?a - apple.n.01) (not (folded ?a))) (ontop apple.n.01_2 breakfast_table.n.01_1))",
@@ -136,7 +138,7 @@ EAI_PROBLEM = """(define (problem toys_0) (:domain igibson)
 
 @pytest.fixture
 def eai(tmp_path: Path) -> Path:
-    """A folder like that of the unpacked wheel, with one task."""
+    """Folder like the unpacked wheel, with one task."""
     root = tmp_path / "behavior_eval"
     files = {
         "data/demo_stats.json": json.dumps(
@@ -151,11 +153,9 @@ def eai(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_eai_s_tasks_are_bound_to_the_scene_that_they_were_written_for(
-    eai: Path, flat: Scene, home: Scene
-) -> None:
+def test_eai_task_is_bound_to_its_own_scene(eai: Path, flat: Scene, home: Scene) -> None:
     (item,) = read_eai(eai)
-    imported = bind_first(item, [home, flat], manner=EVALUABLE)
+    imported = bind_first(item, [home, flat], options=EVALUABLE)
     assert isinstance(imported, ImportedTask)
     assert imported.scene.base == "Rs_int"
     assert imported.task.instruction == "Put the toys on the dusted table."
@@ -164,9 +164,9 @@ def test_eai_s_tasks_are_bound_to_the_scene_that_they_were_written_for(
     assert "plaything.n.01 is read as toy_figure.n.01" in outcome.notes
 
 
-def test_the_report_counts_refusals_and_lists_what_no_skill_reaches(eai: Path, flat: Scene) -> None:
+def test_report_counts_refusals_and_lists_unreachable_goals(eai: Path, flat: Scene) -> None:
     (item,) = read_eai(eai)
-    bound = outcome_of(item, bind_first(item, [flat], manner=EVALUABLE))
+    bound = outcome_of(item, bind_first(item, [flat], options=EVALUABLE))
     refused = outcome_of(item, TaskRefusal(RefusalReason.DOES_NOT_FIT, "no room"))
     told = report_to_json([bound, refused])
     assert (told["problems"], told["bound"], told["refused"]) == (2, 1, {"does_not_fit": 1})
@@ -177,7 +177,7 @@ def test_the_report_counts_refusals_and_lists_what_no_skill_reaches(eai: Path, f
     assert (rate.value, rate.goal, rate.n) == (0.5, 1.0, 2)
 
 
-def test_solved_are_counted_among_the_goals_that_a_profile_reaches() -> None:
+def test_solved_share_counts_reachable_goals_only() -> None:
     solved, stuck, beyond = (
         ProblemOutcome(name, "behavior-1k", "", reason, "", {"paper": atoms, "household": ()}, ())
         for name, reason, atoms in (("a", "", ()), ("b", "no_plan", ()), ("c", "", ("(cut apple)",)))
@@ -192,12 +192,12 @@ def test_solved_are_counted_among_the_goals_that_a_profile_reaches() -> None:
     ]
 
 
-def test_a_folder_without_eai_s_files_is_one_sentence(tmp_path: Path) -> None:
+def test_folder_without_eai_files_is_rejected_in_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(ProblemSourceError, match=r"can't be read|holds no tasks of EAI"):
         read_eai(tmp_path)
 
 
-def test_rooms_of_other_worlds_may_be_counted_otherwise(home: Scene) -> None:
+def test_renumbered_rooms_may_differ(home: Scene) -> None:
     other = source(PROBLEM.replace(" kitchen)", " kitchen_7)"))
     assert isinstance(import_problem(other, home), TaskRefusal)
     found = bind_first(other, [home])
@@ -205,7 +205,7 @@ def test_rooms_of_other_worlds_may_be_counted_otherwise(home: Scene) -> None:
     assert "kitchen_7 is read as kitchen_0" in found.notes
 
 
-def test_a_room_that_a_scene_lacks_is_one_like_it_at_the_last(home: Scene) -> None:
+def test_missing_room_type_is_replaced_by_a_similar_one_last(home: Scene) -> None:
     text = PROBLEM.replace(
         "(ontop apple.n.01_2 breakfast_table.n.01_1)", "(inroom apple.n.01_2 television_room_0)"
     )

@@ -1,4 +1,4 @@
-"""Substances, pieces, floors and what is reachable: problems of the household profile, bound and executed."""
+"""Problems of the household profile: substances, halves, floors and reachability, bound and executed."""
 
 import contextlib
 
@@ -7,7 +7,7 @@ from tests.fakes.plans import plan_of
 from tests.fakes.problems import PROBLEM, source
 
 from embomatrix.factory.task_import.batch import Verified, verify
-from embomatrix.factory.task_import.reach import Horizon
+from embomatrix.factory.task_import.reach import Reachability
 from embomatrix.factory.task_import.task import ImportedTask, import_problem
 from embomatrix.sim.engine import FLOOR
 from embomatrix.sim.physical.survey import ReachabilitySurvey
@@ -62,7 +62,7 @@ HOUSEHOLD = """(define (problem slice_an_apple_and_wipe_the_bowl)
 """
 
 
-def test_substances_and_halves_of_a_problem_are_in_the_scene_that_is_made(home: Scene) -> None:
+def test_substances_and_halves_are_in_the_imported_scene(home: Scene) -> None:
     imported = import_problem(source(HOUSEHOLD), home)
     assert isinstance(imported, ImportedTask), imported
     task, scene = imported.task, imported.scene
@@ -83,7 +83,7 @@ def test_substances_and_halves_of_a_problem_are_in_the_scene_that_is_made(home: 
     assert [scene.asset_of(item.name).synset for item in salted] == ["salt__shaker.n.01"]
 
 
-def test_a_household_task_is_read_back_and_can_be_done(home: Scene) -> None:
+def test_household_task_round_trips_and_is_solvable(home: Scene) -> None:
     imported = import_problem(source(HOUSEHOLD), home)
     assert isinstance(imported, ImportedTask)
     data = encode_bundle(Bundle(imported.scene, {imported.task.task_id: imported.task}))
@@ -107,7 +107,7 @@ def test_a_household_task_is_read_back_and_can_be_done(home: Scene) -> None:
         assert evaluate(task.goal, simulator.facts, task.types)
 
 
-def test_a_floor_that_the_goal_is_about_becomes_an_object_that_can_be_wiped_and_stood_on(home: Scene) -> None:
+def test_floor_in_the_goal_becomes_an_object_to_wipe_and_stand_on(home: Scene) -> None:
     text = HOUSEHOLD.replace("(covered plate.n.04_1 dust.n.01_1)", "(covered floor.n.01_1 dust.n.01_1)", 1)
     text = text.replace(
         "(not (covered ?plate.n.04_1 ?dust.n.01_1))",
@@ -125,7 +125,7 @@ def test_a_floor_that_the_goal_is_about_becomes_an_object_that_can_be_wiped_and_
     }
 
 
-def test_a_floor_is_no_obstacle_and_what_stands_in_its_room_is_on_it(home: Scene) -> None:
+def test_floor_is_no_obstacle_and_supports_objects_of_its_room(home: Scene) -> None:
     text = PROBLEM.replace(
         "(not (open ?electric_refrigerator.n.01_1))", "(not (ontop ?apple.n.01_1 ?floor.n.01_1))"
     )
@@ -175,7 +175,7 @@ REACHABLE: dict[str, bool] = {
 
 
 @pytest.mark.parametrize("goal", REACHABLE)
-def test_what_the_skills_can_bring_about_is_told_from_the_problem_alone(goal: str) -> None:
+def test_reachability_is_judged_from_the_problem_alone(goal: str) -> None:
     problem = parse_problem(HOUSEHOLD)
     formula = parse_formula(goal, problem.objects)
-    assert (Horizon(problem).obstacle(formula) is None) is REACHABLE[goal]
+    assert (Reachability(problem).obstacle(formula) is None) is REACHABLE[goal]

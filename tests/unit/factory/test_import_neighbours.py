@@ -1,4 +1,4 @@
-"""What a goal wants beside something gets places there, so that a plan can bring it about."""
+"""Pairs that a goal wants next to each other get suitable poses, so that a plan can succeed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 from tests.fakes.problems import source
 
-from embomatrix.factory.pipeline.task_poses import Beside
+from embomatrix.factory.pipeline.task_poses import NeighbourPair
 from embomatrix.factory.task_import.batch import Verified, verify_first
 from embomatrix.factory.task_import.neighbours import neighbours_of
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
@@ -32,26 +32,29 @@ PROBLEM = """(define (problem lay_the_money_down) (:domain omnigibson)
 @pytest.mark.parametrize(
     ("goal", "pairs"),
     [
-        ("(nextto cup_1 lamp_1)", (Beside("cup_1", "lamp_1"),)),
-        ("(nextto stove_1 cup_1)", (Beside("cup_1", "stove_1"),)),
+        ("(nextto cup_1 lamp_1)", (NeighbourPair("cup_1", "lamp_1"),)),
+        ("(nextto stove_1 cup_1)", (NeighbourPair("cup_1", "stove_1"),)),
         ("(not (nextto cup_1 lamp_1))", ()),
         (
             "(forall (?cup - cup) (nextto ?cup stove_1))",
-            (Beside("cup_1", "stove_1"), Beside("cup_2", "stove_1")),
+            (NeighbourPair("cup_1", "stove_1"), NeighbourPair("cup_2", "stove_1")),
         ),
         (
             "(and (nextto cup_1 lamp_1) (ontop cup_1 stove_1) (ontop lamp_1 stove_1))",
-            (Beside("cup_1", "lamp_1", "stove_1"),),
+            (NeighbourPair("cup_1", "lamp_1", "stove_1"),),
         ),
         ("(and (nextto cup_1 lamp_1) (ontop cup_1 stove_1) (ontop lamp_1 cup_2))", ()),
-        ("(and (nextto cup_1 lamp_1) (ontop lamp_1 stove_1))", (Beside("cup_1", "lamp_1", "stove_1"),)),
-        ("(and (nextto cup_1 lamp_1) (ontop cup_1 stove_1))", (Beside("lamp_1", "cup_1", "stove_1"),)),
-        ("(and (nextto cup_1 stove_1) (ontop cup_1 lamp_1))", (Beside("cup_1", "stove_1"),)),
+        (
+            "(and (nextto cup_1 lamp_1) (ontop lamp_1 stove_1))",
+            (NeighbourPair("cup_1", "lamp_1", "stove_1"),),
+        ),
+        ("(and (nextto cup_1 lamp_1) (ontop cup_1 stove_1))", (NeighbourPair("lamp_1", "cup_1", "stove_1"),)),
+        ("(and (nextto cup_1 stove_1) (ontop cup_1 lamp_1))", (NeighbourPair("cup_1", "stove_1"),)),
         ("(nextto stove_1 stove_1)", ()),
     ],
 )
-def test_what_is_carried_goes_beside_what_stays_or_goes_there_too(
-    goal: str, pairs: tuple[Beside, ...]
+def test_carried_object_goes_beside_a_static_or_carried_neighbour(
+    goal: str, pairs: tuple[NeighbourPair, ...]
 ) -> None:
     formula = parse_formula(goal, NAMES)
     assert neighbours_of(formula, TYPES, lambda name: not name.startswith("stove")) == pairs
@@ -69,7 +72,7 @@ def test_what_is_carried_goes_beside_what_stays_or_goes_there_too(
     ],
     ids=["on a table", "on the floor", "two alike that are carried", "two others that are carried"],
 )
-def test_a_plan_brings_things_next_to_one_another(home: Scene, goal: str) -> None:
+def test_plan_brings_objects_next_to_each_other(home: Scene, goal: str) -> None:
     outcome = verify_first(source(PROBLEM.format(goal=goal)), [home], PlacementLibrary(), None)
     assert isinstance(outcome, Verified), outcome
     assert "nextto" in outcome.record.signature

@@ -1,4 +1,4 @@
-"""Problems are read from files, from BEHAVIOR-1K and from the paper's sample; each is bound or refused."""
+"""Problems from files, BEHAVIOR-1K and the paper's sample are bound or refused."""
 
 import json
 import re
@@ -29,7 +29,7 @@ from embomatrix.world.bddl import parse_problem
 SAMPLE = Path(__file__).parents[4] / "shared" / "data" / "embomatrix_tasks_sample.jsonl"
 
 
-def test_as_many_goals_are_expressible_as_the_documentation_says() -> None:
+def test_number_of_expressible_goals_matches_the_documentation() -> None:
     pytest.importorskip("bddl", reason="the bddl package is not installed")
     page = " ".join((Path(__file__).parents[3] / "docs" / "tasks.md").read_text().split())
     said = re.search(r"1,016 activities (\d+) pass these checks, of the paper's 400 sample tasks (\d+)", page)
@@ -55,7 +55,7 @@ def test_unknown_activity_suggests_a_close_name() -> None:
     assert len(activity_names()) >= 1016
 
 
-def test_unreadable_sources_are_one_sentence(tmp_path: Path) -> None:
+def test_unreadable_source_is_rejected_in_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(ProblemSourceError, match="can't be read"):
         read_file(tmp_path / "missing.bddl")
     with pytest.raises(ProblemSourceError, match="can't be read"):
@@ -72,7 +72,7 @@ def test_unreadable_sources_are_one_sentence(tmp_path: Path) -> None:
 @pytest.mark.skipif(
     not SAMPLE.exists(), reason="the sample of the paper's tasks is not beside the repository"
 )
-def test_tasks_of_the_paper_s_factory_are_bound_or_refused() -> None:
+def test_paper_tasks_are_bound_or_refused() -> None:
     bases = [build_base_scene("Rs_int"), build_base_scene("Wainscott_0_int")]
     outcomes = [bind_first(item, bases) for item in list(read_jsonl(SAMPLE))[::8]]
     counts = Counter(item.reason if isinstance(item, TaskRefusal) else "bound" for item in outcomes)
@@ -80,7 +80,7 @@ def test_tasks_of_the_paper_s_factory_are_bound_or_refused() -> None:
     assert sum(counts.values()) == 50
 
 
-def test_activities_of_behavior_1k_are_bound_or_refused() -> None:
+def test_behavior_1k_activities_are_bound_or_refused() -> None:
     pytest.importorskip("bddl", reason="the bddl package is not installed")
     base = build_base_scene("Wainscott_0_int")
     names = activity_names()[::32]
@@ -92,7 +92,7 @@ def test_activities_of_behavior_1k_are_bound_or_refused() -> None:
         assert set(item.task.table) <= set(item.scene.by_name)
 
 
-def test_an_import_in_two_processes_tells_the_same(tmp_path: Path) -> None:
+def test_import_in_two_processes_gives_the_same_outcomes(tmp_path: Path) -> None:
     jsonl = tmp_path / "problems.jsonl"
     roomy = PROBLEM.replace(
         "(inroom breakfast_table.n.01_1 kitchen)", "(inroom breakfast_table.n.01_1 living_room)"
@@ -110,7 +110,7 @@ def test_an_import_in_two_processes_tells_the_same(tmp_path: Path) -> None:
     assert [json.loads(line)["reason"] for line in told[0].splitlines()[1:]] == ["", "unknown_type"]
 
 
-def test_problems_that_name_a_liquid_are_left_out_when_only_solids_are_wanted(tmp_path: Path) -> None:
+def test_solids_option_skips_problems_with_liquids(tmp_path: Path) -> None:
     jsonl, outcomes = tmp_path / "problems.jsonl", tmp_path / "outcomes.jsonl"
     wet = PROBLEM.replace(
         "floor.n.01_1 - floor.n.01\n", "floor.n.01_1 - floor.n.01\n        water.n.06_1 - water.n.06\n"
@@ -139,7 +139,7 @@ def test_problems_that_name_a_liquid_are_left_out_when_only_solids_are_wanted(tm
     assert "leave out --solids" in " ".join(refused.output.split())
 
 
-def test_an_import_that_was_stopped_goes_on_and_tells_the_same_in_the_end(tmp_path: Path) -> None:
+def test_interrupted_import_resumes_with_the_same_result(tmp_path: Path) -> None:
     unknown = PROBLEM.replace("apple.n.01", "unicorn.n.01")
     jsonl, outcomes = tmp_path / "problems.jsonl", tmp_path / "outcomes.jsonl"
     # two problems may have one name

@@ -1,4 +1,4 @@
-"""BDDL is bound to a scene, or refused for one reason of a closed set with a sentence about the case."""
+"""A BDDL problem is bound to a scene, or refused with one of a closed set of reasons."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from embomatrix.factory.admission import RefusalReason, RefusedError, TaskRefusa
 from embomatrix.factory.task_import.batch import Verified, verify
 from embomatrix.factory.task_import.binding import bind
 from embomatrix.factory.task_import.start_state import with_states
-from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
+from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
 from embomatrix.factory.task_import.task_fields import category_of, instruction_of
 from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
@@ -20,12 +20,12 @@ from embomatrix.world.task import TaskCategory
 
 
 def refusal(text: str, scene: Scene) -> TaskRefusal:
-    outcome = import_problem(source(text), scene, manner=Manner(furnishing=False))
+    outcome = import_problem(source(text), scene, options=ImportOptions(furnishing=False))
     assert isinstance(outcome, TaskRefusal)
     return outcome
 
 
-def test_problem_becomes_a_task_in_a_scene_of_its_own(home: Scene) -> None:
+def test_problem_becomes_a_task_in_its_own_scene(home: Scene) -> None:
     imported = import_problem(source(), home)
     assert isinstance(imported, ImportedTask)
     task, scene = imported.task, imported.scene
@@ -74,7 +74,7 @@ REFUSALS: dict[RefusalReason, tuple[str, str]] = {
 
 
 @pytest.mark.parametrize("reason", REFUSALS)
-def test_what_can_t_be_bound_is_refused_for_its_reason(home: Scene, reason: RefusalReason) -> None:
+def test_unbindable_problem_is_refused_with_its_reason(home: Scene, reason: RefusalReason) -> None:
     old, new = REFUSALS[reason]
     text = PROBLEM.replace(old, new)
     if reason is RefusalReason.AGENT_IN_GOAL:
@@ -87,7 +87,7 @@ def test_what_can_t_be_bound_is_refused_for_its_reason(home: Scene, reason: Refu
     assert len(outcome.sentence) > 25
 
 
-def test_furniture_of_which_no_model_can_do_what_is_asked_is_refused_with_what_that_is(home: Scene) -> None:
+def test_furniture_without_a_capable_model_is_refused_with_the_missing_ability(home: Scene) -> None:
     outcome = import_problem(source(PROBLEM.replace("electric_refrigerator", "sofa")), home)
     assert isinstance(outcome, TaskRefusal)
     assert outcome.reason is RefusalReason.DOES_NOT_FIT
@@ -101,25 +101,25 @@ def test_misspelt_type_suggests_the_right_one(home: Scene) -> None:
     assert "did you mean breakfast_table.n.01" in outcome.sentence
 
 
-def test_broken_text_is_an_error_with_its_line(home: Scene) -> None:
+def test_invalid_text_raises_with_its_line(home: Scene) -> None:
     with pytest.raises(BddlError, match="line"):
         import_problem(source(PROBLEM.replace("kitchen)", "kitchen", 1)), home)
 
 
-def test_two_objects_of_a_type_need_two_of_the_scene_s(home: Scene) -> None:
+def test_two_objects_of_a_type_need_two_scene_objects(home: Scene) -> None:
     text = PROBLEM.replace("breakfast_table.n.01_1 -", "breakfast_table.n.01_1 breakfast_table.n.01_2 -")
     text = text.replace("(open elec", "(inroom breakfast_table.n.01_2 kitchen)\n        (open elec")
     assert refusal(text, home).reason is RefusalReason.NO_SCENE_OBJECT
 
 
-def test_binding_is_by_ability_as_well_as_by_type(home: Scene) -> None:
+def test_binding_considers_abilities(home: Scene) -> None:
     on = "(toggled_on electric_refrigerator.n.01_1)"
     problem = parse_problem(PROBLEM.replace("(not (open ?electric_refrigerator.n.01_1))", on))
     with pytest.raises(RefusedError, match="electric_refrigerator"):
         bind(problem, home, np.random.default_rng(0), furnishing=False)
 
 
-def test_small_thing_of_the_room_that_the_scene_lacks_is_put_on_furniture_there(home: Scene) -> None:
+def test_missing_small_object_is_placed_on_furniture_of_the_room(home: Scene) -> None:
     text = PROBLEM.replace("(ontop apple.n.01_2 breakfast_table.n.01_1)", "(inroom apple.n.01_2 living_room)")
     text = text.replace("apple.n.01_2", "tennis_ball.n.01_1").replace(
         "tennis_ball.n.01_1 - apple.n.01", "- apple.n.01\n        tennis_ball.n.01_1 - tennis_ball.n.01"
@@ -131,7 +131,7 @@ def test_small_thing_of_the_room_that_the_scene_lacks_is_put_on_furniture_there(
     assert ball.host in imported.scene.by_name
 
 
-def test_what_the_start_places_nowhere_is_put_where_such_things_are(home: Scene) -> None:
+def test_object_without_a_place_goes_to_usual_furniture(home: Scene) -> None:
     imported = import_problem(
         source(PROBLEM.replace("(ontop apple.n.01_2 breakfast_table.n.01_1)\n", "\n")), home
     )
@@ -140,17 +140,19 @@ def test_what_the_start_places_nowhere_is_put_where_such_things_are(home: Scene)
     assert imported.scene.by_name["apple_4"].host
 
 
-def test_furniture_that_the_room_lacks_is_brought_in_where_that_is_allowed(home: Scene) -> None:
+def test_missing_furniture_is_added_if_allowed(home: Scene) -> None:
     text = PROBLEM.replace("breakfast_table.n.01", "armchair.n.01")
     imported = import_problem(source(text), home)
     assert isinstance(imported, ImportedTask)
     chair = imported.scene.by_name["armchair_1"]
     assert (chair.room, chair.fixed) == ("kitchen_0", True)
     assert imported.scene.by_name["apple_3"].host == "armchair_1"
-    assert isinstance(import_problem(source(text), home, manner=Manner(furnishing=False)), TaskRefusal)
+    assert isinstance(
+        import_problem(source(text), home, options=ImportOptions(furnishing=False)), TaskRefusal
+    )
 
 
-def test_states_of_the_start_are_set_and_taken_away(home: Scene) -> None:
+def test_start_states_are_set_and_cleared(home: Scene) -> None:
     literals = [
         InitLiteral(Atom("hot", ("apple_1",))),
         InitLiteral(Atom("open", ("fridge_1",))),
@@ -178,7 +180,7 @@ def test_states_of_the_start_are_set_and_taken_away(home: Scene) -> None:
         ("clean_all_4_frames", "Clean all 4 frames."),
     ],
 )
-def test_instruction_is_the_problem_s_name_in_words(name: str, expected: str) -> None:
+def test_instruction_is_the_problem_name_in_words(name: str, expected: str) -> None:
     problem = parse_problem(PROBLEM.replace("Put_the_apples_in_the_fridge_in_kitchen_0", name))
     assert instruction_of(source(), problem) == expected
 
@@ -194,7 +196,7 @@ def test_instruction_is_the_problem_s_name_in_words(name: str, expected: str) ->
         ("(and (open b_1) (ontop a_1 b_1))", TaskCategory.COMPOUND),
     ],
 )
-def test_goal_tells_which_of_the_four_kinds_a_task_is(goal: str, category: TaskCategory) -> None:
+def test_goal_determines_the_task_category(goal: str, category: TaskCategory) -> None:
     assert category_of(parse_formula(goal, {"a_1": "a", "b_1": "b"})) is category
 
 
@@ -210,7 +212,7 @@ def test_imported_task_is_verified_by_execution(home: Scene) -> None:
     assert [call["action"] for call in outcome.record.oracle][-1] == "close"
 
 
-def test_an_appliance_that_the_goal_wants_carried_is_loose_and_another_is_not(home: Scene) -> None:
+def test_carried_appliance_becomes_movable_and_others_stay_fixed(home: Scene) -> None:
     text = """(define (problem move_the_toaster) (:domain omnigibson)
         (:objects toaster.n.02_1 - toaster.n.02 breakfast_table.n.01_1 - breakfast_table.n.01
             stove.n.01_1 - stove.n.01 floor.n.01_1 - floor.n.01 agent.n.01_1 - agent.n.01)
@@ -225,7 +227,7 @@ def test_an_appliance_that_the_goal_wants_carried_is_loose_and_another_is_not(ho
     assert loose == {"breakfast_table.n.01_1": True, "stove.n.01_1": False}
 
 
-def test_a_wildcard_is_every_further_object_of_the_type_in_the_room(home: Scene) -> None:
+def test_wildcard_stands_for_all_further_objects_of_the_type_in_the_room(home: Scene) -> None:
     text = PROBLEM.replace("breakfast_table.n.01_1 -", "breakfast_table.n.01_1 breakfast_table.n.01_* -")
     text = text.replace("(open elec", "(inroom breakfast_table.n.01_* kitchen)\n        (open elec")
     binding = bind(parse_problem(text), home, np.random.default_rng(0))

@@ -1,4 +1,4 @@
-"""A task is shown on one page that needs nothing else, no text of a dataset becomes markup, and a dataset is exported whole."""
+"""The task page is self-contained and escapes all text of the dataset; exports are complete."""
 
 import dataclasses
 import json
@@ -12,16 +12,16 @@ from typer.testing import CliRunner
 
 from embomatrix.factory.commands.app import app
 from embomatrix.factory.inspection.page import task_page, transcript_html
-from embomatrix.factory.inspection.plan_view import PlanView
 from embomatrix.factory.inspection.playing import play_oracle
-from embomatrix.factory.pipeline.export import FIELDS, card, encoded, export_rows
+from embomatrix.factory.pipeline.export import FIELDS, dataset_card, encode_rows, export_rows
+from embomatrix.pages.plan_view import PlanView
 from embomatrix.world.dataset import Dataset, DatasetError
 
 EVIL = '</script><script>alert(1)</script><b onclick="x">'
 
 
 class _Tags(HTMLParser):
-    """What a browser would make of a page: its elements, and the scripts that would run."""
+    """Elements of a page and the scripts that a browser would run."""
 
     def __init__(self, page):
         super().__init__()
@@ -50,7 +50,7 @@ def shown(dataset):
     return record, bundle.scene, play_oracle(record, bundle)
 
 
-def test_the_oracle_is_played_from_the_start_to_the_goal(shown):
+def test_oracle_plan_is_played_from_start_to_goal(shown):
     record, _, show = shown
     assert len(show.moments) == len(record.oracle) + 1
     assert show.success
@@ -59,7 +59,7 @@ def test_the_oracle_is_played_from_the_start_to_the_goal(shown):
     assert len({moment.robot_m for moment in show.moments}) > 1
 
 
-def test_the_page_needs_nothing_else_and_shows_every_step_and_object(shown):
+def test_page_is_self_contained_and_shows_every_step_and_object(shown):
     record, scene, show = shown
     page = task_page(record, scene, show)
     tags = _Tags(page)
@@ -73,7 +73,7 @@ def test_the_page_needs_nothing_else_and_shows_every_step_and_object(shown):
         assert f"<td>{name}</td>" in page
 
 
-def test_no_text_of_a_dataset_becomes_markup(shown):
+def test_dataset_text_never_becomes_markup(shown):
     record, scene, show = shown
     task = dataclasses.replace(record.task, instruction=EVIL, goal_bddl=EVIL, task_id=EVIL)
     evil = dataclasses.replace(record, task=task, signature=EVIL, rooms=(EVIL,))
@@ -90,7 +90,7 @@ def test_no_text_of_a_dataset_becomes_markup(shown):
     assert "alert(1)</script>" not in page
 
 
-def test_a_transcript_keeps_its_headings_lists_and_strong_words():
+def test_transcript_keeps_headings_lists_and_bold_words():
     text = "# Instruction\n\n## The people\n\n* **Mia**, 40\n* **Hugo**, 9\n\n**Mia** (need): I can't.\n"
     assert transcript_html(text) == (
         "<h3>The people</h3><ul><li><strong>Mia</strong>, 40</li><li><strong>Hugo</strong>, 9</li></ul>"
@@ -98,7 +98,7 @@ def test_a_transcript_keeps_its_headings_lists_and_strong_words():
     )
 
 
-def test_the_plan_is_north_up_and_holds_all_of_its_rooms(shown):
+def test_plan_is_north_up_and_contains_its_rooms(shown):
     _, scene, _ = shown
     view = PlanView(scene, [room.name for room in scene.rooms])
     room = scene.rooms[0]
@@ -108,7 +108,7 @@ def test_the_plan_is_north_up_and_holds_all_of_its_rooms(shown):
     assert 0 < top < bottom < view.size[1]
 
 
-def test_the_command_writes_a_page_and_suggests_a_task_that_is_there(dataset, tmp_path):
+def test_inspect_writes_a_page_and_suggests_close_task_ids(dataset, tmp_path):
     task_id, out = dataset.records[0].task.task_id, tmp_path / "task.html"
     done = CliRunner().invoke(
         app, ["inspect", task_id, "--dataset", str(dataset.folder), "--out", str(out), "--no-picture"]
@@ -122,7 +122,7 @@ def test_the_command_writes_a_page_and_suggests_a_task_that_is_there(dataset, tm
     assert "did you mean" in wrong.output
 
 
-def test_pictures_of_scenes_are_drawn_once(dataset, tmp_path):
+def test_scene_pictures_are_rendered_once(dataset, tmp_path):
     folder = tmp_path / "data"
     shutil.copytree(dataset.folder, folder)
     done = [CliRunner().invoke(app, ["pictures", str(folder)]) for _ in range(2)]
@@ -137,7 +137,7 @@ def test_every_task_is_exported_with_every_field(dataset):
     rows = export_rows(dataset)
     assert [row["task_id"] for row in rows] == [record.task.task_id for record in dataset.records]
     assert all(list(row) == list(FIELDS) for row in rows)
-    assert [json.loads(line) for line in encoded(rows, ".jsonl").decode().splitlines()] == rows
+    assert [json.loads(line) for line in encode_rows(rows, ".jsonl").decode().splitlines()] == rows
 
 
 def test_parquet_holds_the_same_rows(dataset, tmp_path):
@@ -146,24 +146,24 @@ def test_parquet_holds_the_same_rows(dataset, tmp_path):
     )
     rows = export_rows(dataset)
     path = tmp_path / "tasks.parquet"
-    path.write_bytes(encoded(rows, ".parquet"))
+    path.write_bytes(encode_rows(rows, ".parquet"))
     assert parquet.read_table(path).to_pylist() == rows
 
 
-def test_other_forms_are_refused_with_the_known_ones(dataset):
+def test_unknown_export_suffix_is_refused(dataset):
     with pytest.raises(DatasetError, match=r"expected \.jsonl or \.parquet"):
-        encoded(export_rows(dataset), ".csv")
+        encode_rows(export_rows(dataset), ".csv")
 
 
-def test_the_card_counts_what_is_there_and_explains_every_field(dataset):
-    text = card(dataset, "tasks.jsonl", b"abc")
+def test_card_counts_tasks_and_explains_every_field(dataset):
+    text = dataset_card(dataset, "tasks.jsonl", b"abc")
     assert "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad" in text
     assert f"| all | {len(dataset.train)} | {len(dataset.heldout)} |" in text
     assert all(f"| `{name}` |" in text for name in FIELDS)
     assert "imported" in text
 
 
-def test_the_export_command_puts_the_card_beside_the_file(dataset, tmp_path):
+def test_export_writes_the_card_beside_the_file(dataset, tmp_path):
     done = CliRunner().invoke(app, ["export", str(dataset.folder), "--out", str(tmp_path / "tasks.jsonl")])
     assert done.exit_code == 0, done.output
     assert (tmp_path / "README.md").read_text().startswith("---\n")

@@ -1,4 +1,4 @@
-"""Rooms, trees and poses of a task's things: each level alone, and all of them in one flat."""
+"""Layout levels one by one: room distribution, layout trees and object poses; then complete layouts in one flat."""
 
 import json
 from typing import TYPE_CHECKING
@@ -9,7 +9,7 @@ from tests.fakes.chat_server import ChatServer
 
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.furnish.roles import wall_height_m
-from embomatrix.factory.layout.agent_interfaces import DOORS, AgentName, BriefError
+from embomatrix.factory.layout.agent_interfaces import LAYOUT_AGENTS, AgentName, BriefError
 from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.distribution import DistributionError, distribute
 from embomatrix.factory.layout.generator import lay
@@ -18,12 +18,12 @@ from embomatrix.factory.layout.model_agents import ModelLayoutAgents
 from embomatrix.factory.layout.organization import LayoutTree, TreeError, organize
 from embomatrix.factory.layout.request import RequestedObject
 from embomatrix.factory.layout.values import (
-    MEANS,
+    RELATION_METHODS,
     Branch,
     DistributionBrief,
-    Failure,
     HostFacts,
     HostOffer,
+    LayoutFailure,
     LayoutRelation,
     LayoutRoomFacts,
     ObjectBrief,
@@ -48,12 +48,16 @@ FRIDGE = HostFacts("fridge_1", "fridge", (HostOffer(IN, ((0.5, 0.5, 0.4),), 0.6)
 PLATE = ObjectBrief("plate_1", "plate", (0.24, 0.24, 0.02))
 
 
-def test_every_relation_of_a_tree_has_its_means():
-    assert set(MEANS) == set(LayoutRelation)
+def branch_to(name: str, tree: LayoutTree) -> Branch | None:
+    return next((branch for branch in tree.branches() if branch.child == name), None)
+
+
+def test_every_tree_relation_has_a_method():
+    assert set(RELATION_METHODS) == set(LayoutRelation)
     assert len(LayoutRelation) == 9
 
 
-def test_a_tree_is_read_back_from_its_branches_and_tells_parents_before_children():
+def test_tree_round_trips_through_its_branches_with_parents_first():
     branches = [
         Branch("kitchen_0", ON, "table_1"),
         Branch("table_1", ON, "bowl_1"),
@@ -71,49 +75,49 @@ def test_a_tree_is_read_back_from_its_branches_and_tells_parents_before_children
     ("branches", "problem"),
     [
         ([("a", "b"), ("a", "c"), ("root", "a"), ("c", "b")], "give every object one parent"),
-        ([("a", "b"), ("b", "a")], "does not lead to the root"),
-        ([("a", "root")], "being the root"),
+        ([("a", "b"), ("b", "a")], "is not connected to the root"),
+        ([("a", "root")], "as the root"),
     ],
 )
-def test_branches_that_make_no_tree_are_told(branches, problem):
+def test_invalid_branches_raise_tree_error(branches, problem):
     with pytest.raises(TreeError, match=problem):
         LayoutTree.of("root", [Branch(parent, ON, child) for parent, child in branches])
 
 
-def test_things_go_where_people_keep_them_and_with_what_they_belong_to():
-    things = (
+def test_objects_go_to_usual_rooms_and_stay_with_related_objects():
+    objects = (
         PLATE,
         ObjectBrief("alarm_clock_1", "alarm_clock", (0.05, 0.1, 0.1)),
         ObjectBrief("apple_1", "apple", (0.07, 0.07, 0.07), relation=ON, host="plate_1"),
     )
-    found = distribute(DistributionBrief((KITCHEN, BEDROOM), things)).rooms
+    found = distribute(DistributionBrief((KITCHEN, BEDROOM), objects)).rooms
     assert found == {"plate_1": "kitchen_0", "alarm_clock_1": "bedroom_0", "apple_1": "kitchen_0"}
 
 
-def test_what_belongs_together_and_is_wanted_apart_is_told():
-    things = (
+def test_contradicting_room_demands_raise_distribution_error():
+    objects = (
         ObjectBrief("plate_1", "plate", (0.24, 0.24, 0.02), rooms=("kitchen_0",)),
         ObjectBrief(
             "apple_1", "apple", (0.07, 0.07, 0.07), rooms=("bedroom_0",), relation=ON, host="plate_1"
         ),
     )
     with pytest.raises(DistributionError, match="belong together"):
-        distribute(DistributionBrief((KITCHEN, BEDROOM), things))
+        distribute(DistributionBrief((KITCHEN, BEDROOM), objects))
 
 
-def test_a_host_that_failed_is_not_asked_again_and_what_fits_nowhere_is_left_out():
+def test_failed_host_is_not_tried_again_and_unplaceable_object_is_left_out():
     brief = RoomBrief(KITCHEN, (TABLE,), (PLATE,))
-    assert organize(brief).parent_of("plate_1") == Branch("breakfast_table_1", ON, "plate_1")
-    failed = Failure("plate_1", ON, "breakfast_table_1", LayoutReason.NO_FREE_SPOT, "full")
+    assert branch_to("plate_1", organize(brief)) == Branch("breakfast_table_1", ON, "plate_1")
+    failed = LayoutFailure("plate_1", ON, "breakfast_table_1", LayoutReason.NO_FREE_SPOT, "full")
     floor = RoomBrief(KITCHEN, (TABLE,), (PLATE,), (failed,))
-    assert organize(floor).parent_of("plate_1") == Branch("kitchen_0", ON, "plate_1")
-    nowhere = Failure("plate_1", ON, "kitchen_0", LayoutReason.BARS_THE_WAY, "")
-    assert organize(RoomBrief(KITCHEN, (TABLE,), (PLATE,), (failed, nowhere))).parent_of("plate_1") is None
+    assert branch_to("plate_1", organize(floor)) == Branch("kitchen_0", ON, "plate_1")
+    nowhere = LayoutFailure("plate_1", ON, "kitchen_0", LayoutReason.BLOCKS_PATH, "")
+    assert branch_to("plate_1", organize(RoomBrief(KITCHEN, (TABLE,), (PLATE,), (failed, nowhere)))) is None
 
 
-def test_what_the_task_demands_is_no_choice():
+def test_task_demands_override_host_choice():
     milk = ObjectBrief("milk_1", "carton_of_milk", (0.1, 0.1, 0.2), relation=IN, host="fridge_1")
-    assert organize(RoomBrief(KITCHEN, (TABLE, FRIDGE), (milk,))).parent_of("milk_1") == Branch(
+    assert branch_to("milk_1", organize(RoomBrief(KITCHEN, (TABLE, FRIDGE), (milk,)))) == Branch(
         "fridge_1", IN, "milk_1"
     )
 
@@ -133,7 +137,7 @@ def items(flat: "Scene") -> list[RequestedObject]:
     ]
 
 
-def test_a_task_is_laid_out_soundly_and_equally_for_equal_seeds(flat: "Scene") -> None:
+def test_layout_is_collision_free_and_deterministic(flat: "Scene") -> None:
     editor = SceneEditor(flat)
     layout = lay(editor, items(flat), 3)
     scene = editor.freeze("laid")
@@ -148,7 +152,7 @@ def test_a_task_is_laid_out_soundly_and_equally_for_equal_seeds(flat: "Scene") -
     assert again.freeze("laid") == scene
 
 
-def test_what_fits_nowhere_is_left_out_with_its_reason_and_the_rest_is_laid(flat: "Scene") -> None:
+def test_unplaceable_object_is_reported_and_others_are_placed(flat: "Scene") -> None:
     fridge = next(item.name for item in flat.objects if item.name.startswith("fridge"))
     layout = lay(
         SceneEditor(flat),
@@ -156,27 +160,27 @@ def test_what_fits_nowhere_is_left_out_with_its_reason_and_the_rest_is_laid(flat
         0,
     )
     (failure,) = layout.failures
-    assert (failure.thing, failure.reason) == ("bed", LayoutReason.TOO_LARGE)
+    assert (failure.object_name, failure.reason) == ("bed", LayoutReason.TOO_LARGE)
     assert "mug" in layout.names
 
 
 @pytest.mark.parametrize("method", [lay_at_random, lay_by_poses])
-def test_the_ways_that_layouts_are_compared_with_take_the_same_items(flat: "Scene", method) -> None:
+def test_baseline_methods_accept_the_same_items(flat: "Scene", method) -> None:
     editor = SceneEditor(flat)
     layout = method(editor, items(flat), 0)
-    assert layout.names.keys() | {failure.thing for failure in layout.failures} == {
+    assert layout.names.keys() | {failure.object_name for failure in layout.failures} == {
         each.name for each in items(flat)
     }
 
 
 @pytest.mark.parametrize("name", AgentName)
-def test_every_agent_has_a_door_that_names_what_is_wrong_with_a_brief(name):
+def test_agent_interface_names_the_invalid_field_of_a_brief(name):
     with pytest.raises(BriefError, match="--schema"):
-        DOORS[name].read('{"nonsense": 1}')
-    assert DOORS[name].about
+        LAYOUT_AGENTS[name].read('{"nonsense": 1}')
+    assert LAYOUT_AGENTS[name].about
 
 
-def test_what_hangs_high_elsewhere_hangs_where_the_robot_gets_at_it(home):
+def test_wall_object_hangs_within_the_robots_reach(home):
     catalog = Catalog.load()
     camera = build_asset(catalog, "security_camera", catalog.models_of("security_camera")[0].model_id)
     editor = SceneEditor(home)
@@ -184,20 +188,20 @@ def test_what_hangs_high_elsewhere_hangs_where_the_robot_gets_at_it(home):
     assert pose.position_m[2] < ROBOT.reach_high_m < wall_height_m("security_camera")
 
 
-def test_a_brief_goes_through_its_door_unchanged():
-    door = DOORS[AgentName.ORGANIZER]
+def test_brief_round_trips_through_its_interface():
+    door = LAYOUT_AGENTS[AgentName.ORGANIZER]
     brief = RoomBrief(KITCHEN, (TABLE, FRIDGE), (PLATE,))
     assert door.read(door.brief.dump_json(brief).decode()) == brief
-    assert json.loads(door.written(door.rules(brief)))[-1]["child"] == "plate_1"
+    assert json.loads(door.to_json(door.rules(brief)))[-1]["child"] == "plate_1"
 
 
-def organized(*script: object, patience: FailureLimit | None = None) -> tuple[LayoutTree, ChatServer]:
+def organized(*script: object, failure_limit: FailureLimit | None = None) -> tuple[LayoutTree, ChatServer]:
     server = ChatServer(*script)
     with server.serving() as url:
         endpoint = Endpoint(
             url, "small-1", limits=EndpointLimits(attempts=2, first_wait_s=0.01, timeout_s=5.0)
         )
-        with ModelLayoutAgents(endpoint, endpoint, patience=patience) as agents:
+        with ModelLayoutAgents(endpoint, endpoint, failure_limit=failure_limit) as agents:
             return agents.organize(RoomBrief(KITCHEN, (TABLE, FRIDGE), (PLATE,))), server
 
 
@@ -205,33 +209,33 @@ def branch(parent: str, child: str = "plate_1") -> str:
     return json.dumps({"branches": [{"parent": parent, "relation": "ontop", "child": child}]})
 
 
-def test_a_model_organizes_a_room_and_hears_what_is_wrong():
+def test_model_organizes_a_room_after_feedback():
     tree, server = organized("I think", branch("unicorn_1"), branch("fridge_1"), branch("breakfast_table_1"))
-    assert tree.parent_of("plate_1") in (
+    assert branch_to("plate_1", tree) in (
         Branch("breakfast_table_1", ON, "plate_1"),
         Branch("kitchen_0", ON, "plate_1"),
     )
     told = [request["messages"][-1]["content"] for request in server.requests]
     assert "no complete JSON value" in told[1]
-    assert "does not lead to the root" in told[2]
+    assert "is not connected to the root" in told[2]
 
 
-def test_rules_stand_in_for_a_model_that_stays_wrong():
+def test_rules_replace_a_model_with_unusable_answers():
     tree, server = organized("no", "no", "no")
-    assert tree.parent_of("plate_1") == Branch("breakfast_table_1", ON, "plate_1")
+    assert branch_to("plate_1", tree) == Branch("breakfast_table_1", ON, "plate_1")
     assert len(server.requests) == 3
 
 
-def test_a_dead_endpoint_is_told_of_and_where_patience_is_had_rules_stand_in():
+def test_dead_endpoint_raises_or_falls_back_to_rules_within_the_failure_limit():
     broken = (500, {}, "broken", 0.0)
     with pytest.raises(EndpointError, match=r"room-organizer: the endpoint .* answered 500"):
         organized(broken)
-    tree, server = organized(broken, patience=FailureLimit(most=2))
-    assert tree.parent_of("plate_1") == Branch("breakfast_table_1", ON, "plate_1")
+    tree, server = organized(broken, failure_limit=FailureLimit(most=2))
+    assert branch_to("plate_1", tree) == Branch("breakfast_table_1", ON, "plate_1")
     assert len(server.requests) == 2
 
 
-def test_a_model_s_tree_is_taken_when_it_is_allowed():
+def test_valid_tree_of_a_model_is_accepted():
     tree, server = organized(branch("kitchen_0"))
-    assert tree.parent_of("plate_1") == Branch("kitchen_0", ON, "plate_1")
+    assert branch_to("plate_1", tree) == Branch("kitchen_0", ON, "plate_1")
     assert "<brief>" in server.requests[0]["messages"][1]["content"]

@@ -1,24 +1,24 @@
-"""What the robot has to get at is put where it does: by the runtime's own standing poses, not by a guess."""
+"""Placed objects are reachable, judged by the standing poses of the runtime."""
 
 from dataclasses import replace
 
 import pytest
 
 from embomatrix.factory.layout.generator import lay
-from embomatrix.factory.layout.pending import MOVES, Seat, Seating
+from embomatrix.factory.layout.pending import MAX_MOVES, PendingObjects, Support
 from embomatrix.factory.layout.request import RequestedObject
-from embomatrix.factory.layout.values import Failure, LayoutRelation
+from embomatrix.factory.layout.values import LayoutFailure, LayoutRelation
 from embomatrix.factory.scenes.editor import LayoutReason, SceneEditor
-from embomatrix.factory.scenes.rehearsal import Rehearsal
+from embomatrix.factory.scenes.rehearsal import SimulatedRobot
 from embomatrix.factory.task_import.sources import SourceText
-from embomatrix.factory.task_import.task import REDRAWN, ImportedTask, Manner, import_problem
+from embomatrix.factory.task_import.task import MAX_REDRAWN, ImportedTask, ImportOptions, import_problem
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import Pose
 from embomatrix.world.scene import Scene
 from embomatrix.world.state import Relation
 
 ON, IN, UNDER = LayoutRelation.ONTOP, LayoutRelation.INSIDE, LayoutRelation.UNDER
-FLOOR = Seat(None, "living_room_0")
+FLOOR = Support(None, "living_room_0")
 BASKET = (("wicker_basket", "jqfftz"),)
 
 
@@ -31,7 +31,7 @@ def named(scene: Scene, category: str) -> str:
 
 
 @pytest.fixture
-def seating(flat: Scene) -> Seating:
+def pending(flat: Scene) -> PendingObjects:
     bowls = sorted(models("bowl"), key=lambda each: -Catalog.load().model(*each).size_m[0])
     items = [
         RequestedObject("backpack", models("backpack")[:1]),
@@ -39,10 +39,10 @@ def seating(flat: Scene) -> Seating:
         RequestedObject("wide", (bowls[0], bowls[-1]), IN, "cabinet_1"),
         RequestedObject("other", bowls[:1], IN, "cabinet_1"),
     ]
-    return Seating(SceneEditor(flat), "living_room_0", items)
+    return PendingObjects(SceneEditor(flat), "living_room_0", items)
 
 
-def test_shoes_under_a_bed_and_food_in_a_box_with_a_lid_are_at_hand(flat: Scene) -> None:
+def test_shoes_under_a_bed_and_food_in_a_box_with_a_lid_are_reachable(flat: Scene) -> None:
     editor = SceneEditor(flat)
     layout = lay(
         editor,
@@ -53,59 +53,59 @@ def test_shoes_under_a_bed_and_food_in_a_box_with_a_lid_are_at_hand(flat: Scene)
         ],
         0,
     )
-    assert (layout.failures, layout.out_of_hand) == ((), ())
-    with Rehearsal(editor.freeze("laid")) as robot:
-        assert robot.fetches(layout.names["shoe"])
-        assert robot.fetches(layout.names["apple"])
+    assert (layout.failures, layout.unreachable) == ((), ())
+    with SimulatedRobot(editor.freeze("laid")) as robot:
+        assert robot.can_pick_up(layout.names["shoe"])
+        assert robot.can_pick_up(layout.names["apple"])
 
 
-def test_what_holds_a_thing_that_nobody_reaches_is_put_elsewhere_a_few_times(seating: Seating) -> None:
-    for _ in range(MOVES):
-        seating.seat("backpack", Pose((0.0, 0.0, 1.0)), (None, ""), FLOOR)
-        seating.refuse("book", IN, "backpack_1", LayoutReason.NOT_AT_HAND, "too deep")
-        assert seating.offer_another(seating.waiting["book"])
-        failure = seating.failures[-1]
-        assert (failure.thing, failure.host, failure.reason) == (
+def test_host_of_an_unreachable_object_is_moved_a_limited_number_of_times(pending: PendingObjects) -> None:
+    for _ in range(MAX_MOVES):
+        pending.place("backpack", Pose((0.0, 0.0, 1.0)), (None, ""), FLOOR)
+        pending.record_failure("book", IN, "backpack_1", LayoutReason.INACCESSIBLE, "too deep")
+        assert pending.replace_host(pending.waiting["book"])
+        failure = pending.failures[-1]
+        assert (failure.object_name, failure.host, failure.reason) == (
             "backpack",
             "living_room_0",
-            LayoutReason.NOT_AT_HAND,
+            LayoutReason.INACCESSIBLE,
         )
-        assert "backpack" in seating.waiting
-        assert "backpack" not in seating.names
-    seating.seat("backpack", Pose((0.0, 0.0, 1.0)), (None, ""), FLOOR)
-    seating.refuse("book", IN, "backpack_3", LayoutReason.NOT_AT_HAND, "too deep")
-    assert not seating.offer_another(seating.waiting["book"])
+        assert "backpack" in pending.waiting
+        assert "backpack" not in pending.names
+    pending.place("backpack", Pose((0.0, 0.0, 1.0)), (None, ""), FLOOR)
+    pending.record_failure("book", IN, "backpack_3", LayoutReason.INACCESSIBLE, "too deep")
+    assert not pending.replace_host(pending.waiting["book"])
 
 
-def test_a_wide_thing_makes_way_for_another_at_the_host_that_both_need(seating: Seating) -> None:
-    seating.seat("wide", Pose((0.0, 0.0, 1.0)), (None, ""), Seat(Relation.INSIDE, "cabinet_1"))
-    before = seating.placed["wide"].asset.size_m[0]
-    seating.refuse("other", IN, "cabinet_1", LayoutReason.NO_FREE_SPOT, "full")
-    seating.next_model("other")
-    assert seating.waiting["wide"].asset.size_m[0] < before
-    assert not seating.given_up
-    assert not seating.failures
-    seating.seat("wide", Pose((0.0, 0.0, 1.0)), (None, ""), Seat(Relation.INSIDE, "cabinet_1"))
-    seating.refuse("other", IN, "cabinet_1", LayoutReason.NO_FREE_SPOT, "full")
-    seating.next_model("other")
-    assert [failure.thing for failure in seating.given_up] == ["other"]
+def test_wide_object_is_replaced_to_fit_another_at_a_shared_host(pending: PendingObjects) -> None:
+    pending.place("wide", Pose((0.0, 0.0, 1.0)), (None, ""), Support(Relation.INSIDE, "cabinet_1"))
+    before = pending.placed["wide"].asset.size_m[0]
+    pending.record_failure("other", IN, "cabinet_1", LayoutReason.NO_FREE_SPOT, "full")
+    pending.next_model("other")
+    assert pending.waiting["wide"].asset.size_m[0] < before
+    assert not pending.abandoned
+    assert not pending.failures
+    pending.place("wide", Pose((0.0, 0.0, 1.0)), (None, ""), Support(Relation.INSIDE, "cabinet_1"))
+    pending.record_failure("other", IN, "cabinet_1", LayoutReason.NO_FREE_SPOT, "full")
+    pending.next_model("other")
+    assert [failure.object_name for failure in pending.abandoned] == ["other"]
 
 
-def test_what_a_task_puts_into_a_full_room_makes_furniture_of_the_room_go(flat: Scene) -> None:
+def test_object_in_a_full_room_replaces_spare_furniture(flat: Scene) -> None:
     editor = SceneEditor(flat)
-    seating = Seating(
+    pending = PendingObjects(
         editor, "living_room_0", [RequestedObject("bed", models("bed")[:1], rooms=("living_room_0",))]
     )
     before = [item for item in flat.objects if item.room == "living_room_0" and item.fixed]
-    seating.refuse("bed", ON, "living_room_0", LayoutReason.NO_FREE_SPOT, "full")
-    seating.next_model("bed")
+    pending.record_failure("bed", ON, "living_room_0", LayoutReason.NO_FREE_SPOT, "full")
+    pending.next_model("bed")
     gone = [item for item in before if item.name not in editor.objects]
     assert len([item for item in gone if not item.host]) == 1
-    assert seating.waiting["bed"].last is not None
-    assert not seating.failures
+    assert pending.waiting["bed"].last_failure is not None
+    assert not pending.failures
 
 
-def test_furniture_goes_for_what_the_robot_does_not_get_at_on_a_full_floor_but_not_for_what_stands_on_other(
+def test_spare_furniture_is_removed_for_unreachable_floor_objects_only(
     flat: Scene,
 ) -> None:
     editor = SceneEditor(flat)
@@ -114,34 +114,34 @@ def test_furniture_goes_for_what_the_robot_does_not_get_at_on_a_full_floor_but_n
         RequestedObject("bag", models("backpack")[:1], ON, "living_room_0"),
         RequestedObject("cup", models("mug")[:1], ON, table),
     ]
-    seating = Seating(editor, "living_room_0", items)
+    pending = PendingObjects(editor, "living_room_0", items)
     before = len(editor.objects)
-    seating.refuse("cup", ON, table, LayoutReason.NOT_AT_HAND, "too far")
-    assert not seating.make_way(seating.waiting["cup"])
+    pending.record_failure("cup", ON, table, LayoutReason.INACCESSIBLE, "too far")
+    assert not pending.clear_floor(pending.waiting["cup"])
     assert len(editor.objects) == before
-    seating.refuse("bag", ON, "living_room_0", LayoutReason.NOT_AT_HAND, "behind a sofa")
-    assert seating.make_way(seating.waiting["bag"])
+    pending.record_failure("bag", ON, "living_room_0", LayoutReason.INACCESSIBLE, "behind a sofa")
+    assert pending.clear_floor(pending.waiting["bag"])
     assert len(editor.objects) < before
-    assert [failure.thing for failure in seating.failures] == ["cup"]
+    assert [failure.object_name for failure in pending.failures] == ["cup"]
 
 
-def test_furniture_that_the_task_is_about_stays_reachable_when_the_rest_may_be_barred(flat: Scene) -> None:
+def test_named_furniture_stays_reachable_when_paths_to_other_furniture_may_be_blocked(flat: Scene) -> None:
     editor = SceneEditor(flat)
     editor.keep([named(flat, "fridge")])
     kitchen = editor.objects[named(flat, "fridge")].room
-    seating = Seating(editor, kitchen, [RequestedObject("booth", models("booth"), ON, kitchen)])
+    pending = PendingObjects(editor, kitchen, [RequestedObject("booth", models("booth"), ON, kitchen)])
     stove = next(
         name for name, item in editor.objects.items() if item.room == kitchen and editor.is_spare(name)
     )
-    seating.refuse("booth", ON, kitchen, LayoutReason.BARS_THE_WAY, "narrow")
-    seating.next_model("booth")
-    assert "booth" in seating.waiting
+    pending.record_failure("booth", ON, kitchen, LayoutReason.BLOCKS_PATH, "narrow")
+    pending.next_model("booth")
+    assert "booth" in pending.waiting
     assert stove in editor.given_up
     assert named(flat, "fridge") not in editor.given_up
 
 
-def test_many_things_for_one_basket_are_packed(flat: Scene) -> None:
-    """Four oranges of 8.5 cm in a basket whose floor is 20 cm wide: only beside one another they fit."""
+def test_many_objects_for_one_basket_are_packed(flat: Scene) -> None:
+    """Four oranges of 8.5 cm only fit side by side in a basket with a floor 20 cm wide."""
     oranges = [
         RequestedObject(f"orange_{number}", (("orange", "ucstpm"),), IN, "basket") for number in range(4)
     ]
@@ -163,33 +163,33 @@ SHOE_ON_FLOOR = (
 )
 
 
-def test_furniture_at_which_nobody_reaches_a_thing_is_left_for_other_and_kept_as_the_last_resort(
+def test_furniture_with_unreachable_contents_is_excluded_and_kept_as_fallback(
     flat: Scene,
 ) -> None:
     asked: list[str] = []
 
-    def out_of_hand_at(bad: int):
+    def unreachable_at(bad: int):
         def method(editor, items, seed):
             asked.append(next((item.host for item in items if item.name.startswith("sandal")), ""))
             layout = lay(editor, items, seed)
-            wrong = Failure("sandal.n.01_1", ON, asked[-1], LayoutReason.NOT_AT_HAND, "too far")
-            return replace(layout, out_of_hand=(wrong,)) if len(asked) <= bad else layout
+            wrong = LayoutFailure("sandal.n.01_1", ON, asked[-1], LayoutReason.INACCESSIBLE, "too far")
+            return replace(layout, unreachable=(wrong,)) if len(asked) <= bad else layout
 
         return method
 
     text = SourceText("shoes", SHOE, "embomatrix")
-    second = import_problem(text, flat, manner=Manner(out_of_hand_at(1), reachable=False))
+    second = import_problem(text, flat, options=ImportOptions(unreachable_at(1), reachable=False))
     assert isinstance(second, ImportedTask)
     assert len(asked) == 2
     assert asked[0] != asked[1]
     asked.clear()
     assert isinstance(
-        import_problem(text, flat, manner=Manner(out_of_hand_at(99), reachable=False)), ImportedTask
+        import_problem(text, flat, options=ImportOptions(unreachable_at(99), reachable=False)), ImportedTask
     )
     assert len(asked) > 1
 
 
-def test_a_layout_in_which_something_stays_out_of_hand_is_drawn_anew_and_the_best_is_taken(
+def test_layout_with_unreachable_objects_is_redrawn_and_the_best_is_used(
     flat: Scene,
 ) -> None:
     drawn: list[Pose] = []
@@ -197,13 +197,15 @@ def test_a_layout_in_which_something_stays_out_of_hand_is_drawn_anew_and_the_bes
     def worst_at_first(editor, items, seed):
         layout = lay(editor, items, seed)
         drawn.append(editor.objects[layout.names["sandal.n.01_1"]].pose_world_asset)
-        wrong = Failure("sandal.n.01_1", ON, "living_room_0", LayoutReason.NOT_AT_HAND, "behind a sofa")
-        return replace(layout, out_of_hand=(wrong,) * (2 if len(drawn) == 1 else 1))
+        wrong = LayoutFailure(
+            "sandal.n.01_1", ON, "living_room_0", LayoutReason.INACCESSIBLE, "behind a sofa"
+        )
+        return replace(layout, unreachable=(wrong,) * (2 if len(drawn) == 1 else 1))
 
     imported = import_problem(
-        SourceText("shoes", SHOE_ON_FLOOR, "embomatrix"), flat, manner=Manner(worst_at_first)
+        SourceText("shoes", SHOE_ON_FLOOR, "embomatrix"), flat, options=ImportOptions(worst_at_first)
     )
     assert isinstance(imported, ImportedTask)
-    assert len(drawn) == len(set(drawn)) == 1 + REDRAWN
+    assert len(drawn) == len(set(drawn)) == 1 + MAX_REDRAWN
     sandal = dict(zip(imported.instances, imported.about, strict=True))["sandal.n.01_1"]
     assert imported.scene.by_name[sandal].pose_world_asset == drawn[1]

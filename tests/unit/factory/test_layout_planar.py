@@ -1,4 +1,4 @@
-"""Constraints on a plane mean what they say, and what the solver finds meets nothing and is in reach."""
+"""Meaning of the constraints on a plane, and validity of the solver's arrangements."""
 
 import dataclasses
 import math
@@ -16,11 +16,11 @@ from embomatrix.factory.layout.constraints import (
 )
 from embomatrix.factory.layout.planar import arrange
 from embomatrix.factory.layout.values import (
-    Arrangement,
+    ConstraintKind,
     PlacementConstraint,
     PlaneBrief,
     PlaneFootprint,
-    PlaneThing,
+    PlaneObject,
 )
 from embomatrix.factory.scenes.editor import LayoutReason
 from embomatrix.skills.limits import ROBOT
@@ -28,7 +28,7 @@ from embomatrix.skills.limits import ROBOT
 PLANE = (2.0, 1.2)
 CUP = (0.1, 0.1, 0.12)
 EAST = PlaneFootprint("laptop", (0.0, 0.0), 0.0, (0.3, 0.4), 0.0, 0.2)
-"""A thing in the middle whose front looks along the plane's x."""
+"""An object in the middle whose front points along the plane's x axis."""
 
 
 def held(kind, x, y, yaw=0.0, other=EAST, size_m=CUP):
@@ -37,72 +37,72 @@ def held(kind, x, y, yaw=0.0, other=EAST, size_m=CUP):
 
 
 def test_every_constraint_has_a_weight():
-    assert set(WEIGHTS) == set(Arrangement)
+    assert set(WEIGHTS) == set(ConstraintKind)
 
 
 @pytest.mark.parametrize(
     ("kind", "there", "not_there"),
     [
-        (Arrangement.EDGE, (0.92, 0.0), (0.0, 0.0)),
-        (Arrangement.MIDDLE, (0.1, -0.1), (0.7, 0.0)),
-        (Arrangement.NEAR, (0.4, 0.0), (0.94, 0.54)),
-        (Arrangement.FAR, (0.94, 0.54), (0.4, 0.0)),
-        (Arrangement.IN_FRONT_OF, (0.6, 0.1), (-0.6, 0.1)),
-        (Arrangement.SIDE_OF, (0.1, 0.5), (0.6, 0.0)),
-        (Arrangement.CENTER_ALIGNED, (0.0, 0.5), (0.3, 0.4)),
-        (Arrangement.NEXT_TO, (0.22, 0.1), (0.5, 0.1)),
+        (ConstraintKind.EDGE, (0.92, 0.0), (0.0, 0.0)),
+        (ConstraintKind.MIDDLE, (0.1, -0.1), (0.7, 0.0)),
+        (ConstraintKind.NEAR, (0.4, 0.0), (0.94, 0.54)),
+        (ConstraintKind.FAR, (0.94, 0.54), (0.4, 0.0)),
+        (ConstraintKind.IN_FRONT_OF, (0.6, 0.1), (-0.6, 0.1)),
+        (ConstraintKind.SIDE_OF, (0.1, 0.5), (0.6, 0.0)),
+        (ConstraintKind.CENTER_ALIGNED, (0.0, 0.5), (0.3, 0.4)),
+        (ConstraintKind.NEXT_TO, (0.22, 0.1), (0.5, 0.1)),
     ],
 )
-def test_a_constraint_tells_where_it_holds(kind, there, not_there):
+def test_constraint_holds_only_at_matching_spots(kind, there, not_there):
     assert held(kind, *there)
     assert not held(kind, *not_there)
 
 
-def test_a_thing_faces_another_when_its_front_looks_at_it_from_any_side():
+def test_face_to_holds_when_the_front_points_at_the_other_object():
     rng = np.random.default_rng(0)
     for angle in rng.uniform(-math.pi, math.pi, 50):
         x, y = 0.5 * math.cos(angle), 0.5 * math.sin(angle)
-        assert held(Arrangement.FACE_TO, x, y, yaw=angle + math.pi)
-        assert not held(Arrangement.FACE_TO, x, y, yaw=angle + math.pi + 0.2)
-        assert not held(Arrangement.FACE_TO, x, y, yaw=angle)
+        assert held(ConstraintKind.FACE_TO, x, y, yaw=angle + math.pi)
+        assert not held(ConstraintKind.FACE_TO, x, y, yaw=angle + math.pi + 0.2)
+        assert not held(ConstraintKind.FACE_TO, x, y, yaw=angle)
 
 
-def test_front_and_side_turn_with_the_thing_that_they_are_about():
+def test_front_and_side_rotate_with_the_reference_object():
     rng = np.random.default_rng(1)
     for turn in rng.uniform(-math.pi, math.pi, 50):
         turned = dataclasses.replace(EAST, yaw=float(turn))
         ahead = (0.5 * math.cos(turn), 0.5 * math.sin(turn))
         beside = (-ahead[1], ahead[0])
-        assert held(Arrangement.IN_FRONT_OF, *ahead, other=turned)
-        assert not held(Arrangement.SIDE_OF, *ahead, other=turned)
-        assert held(Arrangement.SIDE_OF, *beside, other=turned)
-        assert held(Arrangement.CENTER_ALIGNED, *beside, other=turned)
+        assert held(ConstraintKind.IN_FRONT_OF, *ahead, other=turned)
+        assert not held(ConstraintKind.SIDE_OF, *ahead, other=turned)
+        assert held(ConstraintKind.SIDE_OF, *beside, other=turned)
+        assert held(ConstraintKind.CENTER_ALIGNED, *beside, other=turned)
 
 
-def test_near_and_far_are_each_other_s_contrary():
+def test_near_and_far_are_complementary():
     rng = np.random.default_rng(2)
     for x, y in rng.uniform((-0.9, -0.5), (0.9, 0.5), (50, 2)):
-        assert held(Arrangement.NEAR, x, y) is not held(Arrangement.FAR, x, y)
+        assert held(ConstraintKind.NEAR, x, y) is not held(ConstraintKind.FAR, x, y)
 
 
-def test_next_to_is_within_what_the_engine_calls_so_and_at_the_same_height():
+def test_next_to_matches_the_engine_and_requires_equal_height():
     assert next_to_m(CUP, EAST) >= 0.05
     high = dataclasses.replace(EAST, low_m=0.5, high_m=0.7)
-    assert not held(Arrangement.NEXT_TO, 0.22, 0.1, other=high)
+    assert not held(ConstraintKind.NEXT_TO, 0.22, 0.1, other=high)
     assert near_m((10.0, 10.0)) == 1.0
 
 
-def test_nothing_holds_about_what_is_not_there():
+def test_constraint_about_an_absent_object_never_holds():
     spots = SpotCandidates.of(np.zeros((1, 2)), np.zeros(1), CUP)
-    for kind in set(Arrangement) - {Arrangement.EDGE, Arrangement.MIDDLE}:
+    for kind in set(ConstraintKind) - {ConstraintKind.EDGE, ConstraintKind.MIDDLE}:
         assert not holds(PlacementConstraint(kind, "nobody"), spots, PLANE, CUP, None)[0]
 
 
 def a_brief(seed: int) -> PlaneBrief:
     rng = np.random.default_rng(seed)
-    kinds = [*Arrangement]
-    things = tuple(
-        PlaneThing(
+    kinds = [*ConstraintKind]
+    objects = tuple(
+        PlaneObject(
             f"thing_{n}",
             tuple(rng.uniform(0.04, 0.3, 3).tolist()),
             (PlacementConstraint(kinds[int(rng.integers(len(kinds)))], f"thing_{int(rng.integers(4))}"),),
@@ -122,7 +122,7 @@ def a_brief(seed: int) -> PlaneBrief:
         for n in range(3)
     )
     stands = tuple((x, -1.0) for x in np.arange(-1.0, 1.1, 0.2).tolist())
-    return PlaneBrief("table", PLANE, things, obstacles, stands=stands, seed=seed)
+    return PlaneBrief("table", PLANE, objects, obstacles, stands=stands, seed=seed)
 
 
 def corners(item: PlaneFootprint) -> np.ndarray:
@@ -133,7 +133,7 @@ def corners(item: PlaneFootprint) -> np.ndarray:
 
 
 def apart(a: PlaneFootprint, b: PlaneFootprint) -> bool:
-    """Whether an axis of either rectangle separates the two."""
+    """True if an axis of either rectangle separates the two."""
     return any(
         (corners(a) @ axis).max() <= (corners(b) @ axis).min()
         or (corners(b) @ axis).max() <= (corners(a) @ axis).min()
@@ -143,17 +143,22 @@ def apart(a: PlaneFootprint, b: PlaneFootprint) -> bool:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_what_is_arranged_meets_nothing_lies_on_the_plane_and_is_in_reach(seed):
+def test_arranged_objects_are_separate_on_the_plane_and_in_reach(seed):
     brief = a_brief(seed)
     for way in arrange(brief):
-        sizes = {thing.name: thing.size_m for thing in brief.things}
+        sizes = {thing.name: thing.size_m for thing in brief.objects}
         placed = [
             PlaneFootprint(
-                spot.thing, spot.center_m, spot.yaw, sizes[spot.thing][:2], 0.0, sizes[spot.thing][2]
+                spot.object_name,
+                spot.center_m,
+                spot.yaw,
+                sizes[spot.object_name][:2],
+                0.0,
+                sizes[spot.object_name][2],
             )
             for spot in way.spots
         ]
-        assert {spot.thing for spot in way.spots} | way.left_out.keys() == sizes.keys()
+        assert {spot.object_name for spot in way.spots} | way.left_out.keys() == sizes.keys()
         for number, item in enumerate(placed):
             assert all(apart(item, other) for other in (*placed[:number], *brief.obstacles))
             assert np.all(np.abs(corners(item)) <= np.array(PLANE) / 2)
@@ -162,17 +167,17 @@ def test_what_is_arranged_meets_nothing_lies_on_the_plane_and_is_in_reach(seed):
             assert np.hypot(*off.T).min() <= ROBOT.reach_m
 
 
-def test_equal_briefs_are_arranged_equally_and_other_seeds_otherwise():
+def test_arrangement_is_deterministic_per_seed():
     assert arrange(a_brief(3)) == arrange(a_brief(3))
     assert arrange(a_brief(3)) != arrange(dataclasses.replace(a_brief(3), seed=4))
 
 
-def test_wishes_that_can_hold_do():
-    plate = PlaneThing("plate", (0.24, 0.24, 0.02), (PlacementConstraint(Arrangement.EDGE),))
-    fork = PlaneThing(
-        "fork", (0.18, 0.03, 0.02), (PlacementConstraint(Arrangement.NEXT_TO, "plate", required=True),)
+def test_satisfiable_constraints_are_satisfied():
+    plate = PlaneObject("plate", (0.24, 0.24, 0.02), (PlacementConstraint(ConstraintKind.EDGE),))
+    fork = PlaneObject(
+        "fork", (0.18, 0.03, 0.02), (PlacementConstraint(ConstraintKind.NEXT_TO, "plate", required=True),)
     )
-    vase = PlaneThing("vase", (0.1, 0.1, 0.3), (PlacementConstraint(Arrangement.MIDDLE),))
+    vase = PlaneObject("vase", (0.1, 0.1, 0.3), (PlacementConstraint(ConstraintKind.MIDDLE),))
     best = arrange(PlaneBrief("table", PLANE, (fork, plate, vase)))[0]
     assert all(spot.held for spot in best.spots)
     assert not best.left_out
@@ -186,14 +191,16 @@ def test_wishes_that_can_hold_do():
         ({"stands": ((9.0, 9.0),)}, LayoutReason.OUT_OF_REACH),
         (
             {
-                "things": (
-                    PlaneThing("cup", CUP, (PlacementConstraint(Arrangement.NEXT_TO, "x", required=True),)),
+                "objects": (
+                    PlaneObject(
+                        "cup", CUP, (PlacementConstraint(ConstraintKind.NEXT_TO, "x", required=True),)
+                    ),
                 )
             },
             LayoutReason.RELATION_NOT_HELD,
         ),
     ],
 )
-def test_what_finds_no_spot_says_why(change, reason):
-    brief = PlaneBrief("table", PLANE, (PlaneThing("cup", CUP),))
+def test_object_without_a_spot_gets_a_reason(change, reason):
+    brief = PlaneBrief("table", PLANE, (PlaneObject("cup", CUP),))
     assert arrange(dataclasses.replace(brief, **change))[0].left_out == {"cup": reason}

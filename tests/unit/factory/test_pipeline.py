@@ -1,4 +1,4 @@
-"""A build is balanced, verified, split by rooms and kinds of goal, equal for equal seeds, and goes on where it stopped."""
+"""Builds are balanced, verified, deterministic and resumable, with separate rooms and goal signatures for each split."""
 
 import contextlib
 import json
@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from embomatrix.factory.admission import RefusalReason, objection
+from embomatrix.factory.admission import RefusalReason, plan_failure
 from embomatrix.factory.commands.app import app
 from embomatrix.factory.evaluate.admissions import evaluate_admissions
 from embomatrix.factory.layout.organization import LayoutTree, organize
@@ -74,9 +74,7 @@ def test_every_category_has_its_share(dataset: Dataset, summary: BuildSummary) -
         assert summary.admitted["heldout", category.value] == 1
 
 
-def test_heldout_tasks_are_in_other_rooms_and_ask_for_other_kinds_of_goal(
-    dataset: Dataset, summary: BuildSummary
-) -> None:
+def test_heldout_tasks_have_other_rooms_and_signatures(dataset: Dataset, summary: BuildSummary) -> None:
     for record in dataset.records:
         rooms = summary.rooms[record.split][record.task.scene_id.split("-")[0]]
         assert set(record.rooms) <= set(rooms)
@@ -84,7 +82,7 @@ def test_heldout_tasks_are_in_other_rooms_and_ask_for_other_kinds_of_goal(
     assert not {r.signature for r in dataset.train} & {r.signature for r in dataset.heldout}
 
 
-def test_every_oracle_plan_earns_full_success_from_the_bundle_on_disk(dataset: Dataset) -> None:
+def test_every_oracle_plan_succeeds_from_the_stored_bundle(dataset: Dataset) -> None:
     for record in dataset.records:
         bundle = dataset.bundle(record.bundle_digest)
         assert bundle.tasks[record.task.task_id] == record.task
@@ -96,9 +94,7 @@ def test_every_oracle_plan_earns_full_success_from_the_bundle_on_disk(dataset: D
         simulator.close()
 
 
-def test_build_that_was_cut_short_goes_on_to_the_same_end(
-    folder: Path, dataset: Dataset, tmp_path: Path
-) -> None:
+def test_interrupted_build_resumes_to_the_same_result(folder: Path, dataset: Dataset, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(folder, copy)
     lines = (copy / "build.jsonl").read_text().splitlines(keepends=True)
@@ -109,9 +105,7 @@ def test_build_that_was_cut_short_goes_on_to_the_same_end(
     assert (copy / "build.jsonl").read_bytes() == (folder / "build.jsonl").read_bytes()
 
 
-def test_a_build_keeps_the_processor_time_of_every_variant_beside_the_data_set(
-    folder: Path, dataset: Dataset
-) -> None:
+def test_build_records_cpu_time_of_every_variant(folder: Path, dataset: Dataset) -> None:
     times = [json.loads(line) for line in (folder / "times.jsonl").read_text().splitlines()]
     made = BuildStore.open(folder, asdict(SETTINGS)).results
     assert [(line["split"], line["variant"]) for line in times if "variant" in line] == [
@@ -123,7 +117,7 @@ def test_a_build_keeps_the_processor_time_of_every_variant_beside_the_data_set(
     assert pace.n == len(dataset.records)
 
 
-def test_a_disk_that_is_full_in_the_middle_of_a_line_costs_that_variant_alone(tmp_path: Path) -> None:
+def test_full_disk_in_the_middle_of_a_line_costs_one_variant(tmp_path: Path) -> None:
     store = BuildStore.open(tmp_path, {"seed": 1})
     store.add(VariantResult("train", 0, (), ()), b"", {}, {}, 1.0)
     kept, before = [*store.results], (tmp_path / "build.jsonl").read_bytes()
@@ -139,24 +133,15 @@ def test_a_disk_that_is_full_in_the_middle_of_a_line_costs_that_variant_alone(tm
     assert (tmp_path / "build.jsonl").read_bytes() == before
 
 
-def test_folder_of_another_build_is_left_alone(folder: Path, dataset: Dataset) -> None:
+def test_folder_of_another_build_is_not_changed(folder: Path, dataset: Dataset) -> None:
     with pytest.raises(DatasetError, match="other settings"):
         BuildStore.open(folder, {"seed": 99})
 
 
-def test_difference_to_the_build_of_a_folder_is_told(tmp_path: Path) -> None:
+def test_different_settings_are_listed(tmp_path: Path) -> None:
     BuildStore.open(tmp_path, {"seed": 1, "train": 8})
-    with pytest.raises(DatasetError, match=r"other settings \(seed 1, now 2\): give the same again"):
+    with pytest.raises(DatasetError, match=r"other settings \(seed 1, now 2\): give the same settings again"):
         BuildStore.open(tmp_path, {"seed": 2, "train": 8})
-
-
-def test_a_build_begun_before_robots_proved_tasks_goes_on_as_one_without_proof(tmp_path: Path) -> None:
-    settings = asdict(SETTINGS)
-    old = {name: value for name, value in settings.items() if name != "physical"}
-    (tmp_path / "build.jsonl").write_text(json.dumps({"settings": old}) + "\n")
-    with pytest.raises(DatasetError, match=r"\(physical False, now True\)"):
-        BuildStore.open(tmp_path, {**settings, "physical": True})
-    assert BuildStore.open(tmp_path, settings).results == []
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[1]\n", "not json"])
@@ -168,9 +153,7 @@ def test_build_file_without_settings_is_damaged(tmp_path: Path, content: str) ->
         BuildStore.open(tmp_path, {"seed": 2})
 
 
-def test_every_task_has_its_layout_tree_and_the_page_shows_it(
-    folder: Path, dataset: Dataset, tmp_path: Path
-) -> None:
+def test_every_task_has_a_layout_tree_on_its_page(folder: Path, dataset: Dataset, tmp_path: Path) -> None:
     for record in dataset.records:
         tree = json.loads((folder / "trees" / f"{record.task.task_id}.json").read_text(encoding="utf-8"))
         assert set(tree) <= set(record.rooms)
@@ -184,7 +167,7 @@ def test_every_task_has_its_layout_tree_and_the_page_shows_it(
 
 
 def _things_in(nodes: Iterable[dict[str, dict[str, Any]]]) -> set[str]:
-    """Names of the objects below some nodes; relations stand between them."""
+    """Return the names of the objects below some nodes. Relations stand between them."""
     found: set[str] = set()
     for node in nodes:
         for things in node.values():
@@ -192,7 +175,7 @@ def _things_in(nodes: Iterable[dict[str, dict[str, Any]]]) -> set[str]:
     return found
 
 
-def test_who_lays_things_out_is_chosen_and_is_part_of_the_settings(tmp_path: Path) -> None:
+def test_layout_agents_are_part_of_the_settings(tmp_path: Path) -> None:
     settings = BuildSettings(
         train=1, heldout=0, seed=4, scenes=("Rs_int",), modelled=("room-organizer",), **QUICK
     )
@@ -209,7 +192,7 @@ def test_who_lays_things_out_is_chosen_and_is_part_of_the_settings(tmp_path: Pat
         BuildStore.open(tmp_path, asdict(replace(settings, modelled=())))
 
 
-def test_the_ledger_has_a_line_for_every_attempt_and_its_reason(folder: Path, summary: BuildSummary) -> None:
+def test_attempt_log_has_a_line_with_a_reason_for_every_draft(folder: Path, summary: BuildSummary) -> None:
     lines = [json.loads(line) for line in (folder / "attempts.jsonl").read_text().splitlines()]
     outcomes = Counter(line["outcome"] for line in lines)
     assert outcomes.pop("admitted") == sum(summary.admitted.values())
@@ -217,9 +200,7 @@ def test_the_ledger_has_a_line_for_every_attempt_and_its_reason(folder: Path, su
     assert all("task" in line if line["outcome"] == "admitted" else line["sentence"] for line in lines)
 
 
-def test_a_ledger_that_lost_its_end_is_whole_again_when_the_build_is_taken_up(
-    folder: Path, dataset: Dataset, tmp_path: Path
-) -> None:
+def test_truncated_attempt_log_is_restored_on_resume(folder: Path, dataset: Dataset, tmp_path: Path) -> None:
     whole = (folder / "attempts.jsonl").read_text()
     shutil.copy(folder / "build.jsonl", tmp_path)
     (tmp_path / "attempts.jsonl").write_text(whole[: len(whole) // 2])
@@ -227,21 +208,21 @@ def test_a_ledger_that_lost_its_end_is_whole_again_when_the_build_is_taken_up(
     assert (tmp_path / "attempts.jsonl").read_text() == whole
 
 
-def test_a_build_that_trains_on_nothing_holds_every_room_out(tmp_path: Path) -> None:
+def test_build_without_training_tasks_holds_out_every_room(tmp_path: Path) -> None:
     settings = BuildSettings(train=0, heldout=0, scenes=("Rs_int",), **QUICK)
     rooms = build_dataset(tmp_path, settings).rooms
     assert rooms["train"] == {"Rs_int": ()}
     assert set(rooms["heldout"]["Rs_int"]) == {room.name for room in build_base_scene("Rs_int").rooms}
 
 
-def test_scenes_without_a_room_to_hold_out_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+def test_scenes_without_a_room_to_hold_out_are_refused_before_writing(tmp_path: Path) -> None:
     folder = tmp_path / "dataset"
     with pytest.raises(DatasetError, match=r"no room of Rs_int can be held out.*--heldout 0"):
         build_dataset(folder, BuildSettings(train=1, heldout=1, scenes=("Rs_int",)))
     assert not folder.exists()
 
 
-def test_what_a_second_judge_refuses_is_not_kept(tmp_path: Path) -> None:
+def test_tasks_rejected_by_a_second_check_are_not_kept(tmp_path: Path) -> None:
     settings = BuildSettings(train=2, heldout=0, seed=4, scenes=("Rs_int",), **QUICK)
     asked: list[str] = []
 
@@ -255,7 +236,7 @@ def test_what_a_second_judge_refuses_is_not_kept(tmp_path: Path) -> None:
     assert kept < set(asked)
 
 
-def test_every_room_is_on_one_side_and_every_kind_with_two_rooms_on_both() -> None:
+def test_every_room_is_on_one_side_and_every_type_on_both() -> None:
     scenes = [build_base_scene("Rs_int"), build_base_scene("Wainscott_0_int")]
     types = {(scene.base, room.name): room.type for scene in scenes for room in scene.rooms}
     for seed in range(4):
@@ -270,7 +251,7 @@ def test_every_room_is_on_one_side_and_every_kind_with_two_rooms_on_both() -> No
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_home_that_loses_rooms_keeps_some_to_train_on(seed: int) -> None:
+def test_home_with_held_out_rooms_keeps_rooms_for_training(seed: int) -> None:
     scenes = [build_base_scene(name) for name in ("Benevolence_0_int", "Pomaria_2_int", "Rs_int")]
     kept = split_rooms(scenes, seed)["train"]
     for scene in scenes:
@@ -297,7 +278,7 @@ def test_list_shows_the_tasks(folder: Path, dataset: Dataset) -> None:
     assert all(f" {record.task.task_id} " in output for record in dataset.records)
 
 
-def test_bddl_file_is_imported_and_its_plan_shown(tmp_path: Path) -> None:
+def test_bddl_file_is_imported_and_its_plan_printed(tmp_path: Path) -> None:
     (tmp_path / "apple.bddl").write_text(BDDL)
     file, out = str(tmp_path / "apple.bddl"), str(tmp_path / "d")
     code, output = run("import", "--bddl", file, "--scene", "Rs_int", "--out", out, "--no-look-ahead")
@@ -317,7 +298,7 @@ def test_bddl_file_is_imported_and_its_plan_shown(tmp_path: Path) -> None:
         (":goal", ":gaol", "unknown section ':gaol'"),
     ],
 )
-def test_bad_bddl_is_one_sentence_and_exit_2(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_invalid_bddl_exits_with_2_and_one_sentence(tmp_path: Path, old: str, new: str, message: str) -> None:
     (tmp_path / "bad.bddl").write_text(BDDL.replace(old, new))
     code, output = run("import", "--bddl", str(tmp_path / "bad.bddl"), "--scene", "Rs_int")
     assert code == 2
@@ -344,7 +325,7 @@ def test_bad_bddl_is_one_sentence_and_exit_2(tmp_path: Path, old: str, new: str,
         (["build", "--out", "OUT/a", "--agent", "room-organizer=llm"], "give --llm URL and --model NAME"),
     ],
 )
-def test_unknown_names_are_one_sentence_and_exit_2(
+def test_unknown_names_exit_with_2_and_one_sentence(
     tmp_path: Path, arguments: list[str], message: str
 ) -> None:
     code, output = run(*(argument.replace("OUT", str(tmp_path)) for argument in arguments))
@@ -353,7 +334,7 @@ def test_unknown_names_are_one_sentence_and_exit_2(
     assert "Traceback" not in output
 
 
-def test_tasks_of_conversations_are_proved_by_a_robot_in_physics_and_their_transcripts_kept(tmp_path):
+def test_conversation_tasks_are_proved_in_physics_and_keep_transcripts(tmp_path):
     settings = BuildSettings(
         train=4, heldout=0, seed=13, scenes=("Rs_int",), writer=WriterKind.SOCIAL, look_ahead=False
     )
@@ -366,16 +347,16 @@ def test_tasks_of_conversations_are_proved_by_a_robot_in_physics_and_their_trans
         assert transcript.startswith(f"# {record.task.instruction}\n")
         plan = plan_from_json(list(record.oracle), record.task.profile)
         with contextlib.closing(physical_simulator(dataset.read_bundle(record.bundle_digest))) as robot:
-            assert objection(robot, record.task, plan) == ""
+            assert plan_failure(robot, record.task, plan) == ""
 
 
-def test_several_processes_make_the_same_data_set_as_one(folder, dataset, tmp_path):
+def test_dataset_does_not_depend_on_the_number_of_processes(folder, dataset, tmp_path):
     build_dataset(tmp_path, SETTINGS, jobs=2)
     for file in ("tasks.jsonl", "build.jsonl", "attempts.jsonl"):
         assert (tmp_path / file).read_bytes() == (folder / file).read_bytes()
 
 
-def test_the_cluster_keeps_what_its_slots_solve_and_says_what_the_others_earn(
+def test_cluster_check_keeps_solved_tasks_and_reports_the_reward_of_others(
     folder: Path, summary: BuildSummary
 ) -> None:
     first = BuildStore.open(folder, asdict(SETTINGS)).results[0]

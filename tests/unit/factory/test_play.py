@@ -1,4 +1,4 @@
-"""`embomatrix play`: what a person sees for a plan that works, one that fails, and one that is none."""
+"""`embomatrix play` with valid, failing and unparsable plans."""
 
 import json
 
@@ -45,7 +45,7 @@ def run(folder):
     return call
 
 
-def test_a_plan_that_works_is_shown_step_by_step_with_its_reward(run, tmp_path):
+def test_successful_plan_is_shown_with_steps_and_reward(run, tmp_path):
     plan = tmp_path / "plan.json"
     plan.write_text(json.dumps(GOOD))
     result = run("apple_to_counter", "--plan", str(plan))
@@ -56,11 +56,11 @@ def test_a_plan_that_works_is_shown_step_by_step_with_its_reward(run, tmp_path):
     assert "30.90" in result.output
 
 
-def test_the_plan_is_read_from_standard_input(run):
+def test_plan_is_read_from_standard_input(run):
     assert "success" in run("apple_to_counter", "--plan", "-", text=json.dumps(GOOD)).output
 
 
-def test_a_step_that_fails_is_marked_with_its_reason_and_the_rest_is_not_executed(run):
+def test_failed_step_is_marked_and_later_steps_are_not_executed(run):
     result = run("apple_to_counter", "--plan", "-", text="pick_up 10\nmove 0")
     assert result.exit_code == 0
     assert "✗ pick_up apple_1" in " ".join(result.output.split())
@@ -80,21 +80,21 @@ def test_a_step_that_fails_is_marked_with_its_reason_and_the_rest_is_not_execute
         ("x" * 70_000, "a plan has at most 65536"),
     ],
 )
-def test_a_text_that_is_no_plan_is_explained_and_earns_minus_one(run, text, words):
+def test_unparsable_text_is_explained_and_earns_minus_one(run, text, words):
     result = run("apple_to_counter", "--plan", "-", text=text)
     assert result.exit_code == 1
     assert words in " ".join(result.output.split())
     assert "-1.00" in result.output
 
 
-def test_an_index_outside_the_table_is_a_failed_step_and_not_a_bad_plan(run):
+def test_index_outside_the_table_is_a_failed_step(run):
     result = run("apple_to_counter", "--plan", "-", text="move 9999")
     assert result.exit_code == 0
     told = " ".join(result.output.split())  # however wide the terminal is
     assert "unknown_index: there is no object with index 9999: the table has indices 0 to 14" in told
 
 
-def test_the_oracle_shows_that_the_task_can_be_done(run):
+def test_oracle_option_solves_the_task(run):
     result = run("cook_chicken", "--oracle")
     assert result.exit_code == 0
     assert "toggle_on microwave_1" in result.output
@@ -115,23 +115,23 @@ def test_the_oracle_shows_that_the_task_can_be_done(run):
         ),
     ],
 )
-def test_bad_input_gets_one_sentence_and_no_traceback(run, arguments, env, words):
+def test_bad_input_gives_one_sentence_without_traceback(run, arguments, env, words):
     result = run(*arguments, env=env)
     assert result.exit_code == 2
     assert words in " ".join(result.output.split())
     assert "Traceback" not in result.output
 
 
-def test_an_unknown_task_is_answered_with_close_ones(run):
+def test_unknown_task_suggests_close_ids(run):
     assert "did you mean cook_chicken?" in run("cook_chiken", "--oracle").output
 
 
-def test_the_folder_can_be_given_as_an_option(run, folder):
+def test_dataset_folder_can_be_given_as_an_option(run, folder):
     result = run("cook_chicken", "--oracle", "--dataset", str(folder), env={"EMBOMATRIX_DATASET": "/no/such"})
     assert result.exit_code == 0
 
 
-def test_a_plan_is_drawn_as_an_animation(run, tmp_path):
+def test_plan_is_drawn_as_an_animation(run, tmp_path):
     film = tmp_path / "film.gif"
     plan = tmp_path / "plan.json"
     plan.write_text(json.dumps(GOOD[:2]))
@@ -142,7 +142,7 @@ def test_a_plan_is_drawn_as_an_animation(run, tmp_path):
         assert picture.size == (896, 480)
 
 
-def test_a_film_of_an_unknown_kind_is_refused_before_anything_runs(run):
+def test_unknown_film_suffix_is_refused_before_execution(run):
     result = run("apple_to_counter", "--oracle", "--film", "film.mp4")
     assert result.exit_code == 2
     assert "film.mp4" in result.output
@@ -150,7 +150,7 @@ def test_a_film_of_an_unknown_kind_is_refused_before_anything_runs(run):
     assert "✓" not in result.output
 
 
-def test_a_film_that_can_not_be_written_is_refused_before_anything_runs(run, tmp_path):
+def test_unwritable_film_is_refused_before_execution(run, tmp_path):
     result = run("apple_to_counter", "--oracle", "--film", str(tmp_path / "nowhere" / "film.gif"))
     assert result.exit_code == 2
     assert "film.gif can't be written" in " ".join(result.output.split())

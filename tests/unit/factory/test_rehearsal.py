@@ -1,4 +1,4 @@
-"""Wishes are tried before anybody writes them down, in the simulator that executes plans."""
+"""Wishes are tested for feasibility in the simulator before they are written."""
 
 from dataclasses import replace
 
@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from embomatrix.factory.pipeline.task_poses import SceneSurvey
-from embomatrix.factory.scenes.rehearsal import Rehearsal
-from embomatrix.factory.scenes.view import AnyRobot, SceneView
-from embomatrix.factory.social.requests import RequestedAtom, TaskRequest, Wanted, check_request
+from embomatrix.factory.scenes.rehearsal import SimulatedRobot
+from embomatrix.factory.scenes.view import CapableRobot, SceneView
+from embomatrix.factory.social.requests import RequestedAtom, RequestPredicate, TaskRequest, check_request
 from embomatrix.factory.writer.tasks import PlainWriter
 from embomatrix.factory.writer.variant import Variant
 from embomatrix.sim.physical.survey import ReachabilitySurvey
@@ -28,48 +28,48 @@ def parted(home: Scene) -> Scene:
     return replace(home, objects=(*home.objects, other))
 
 
-def test_what_is_served_from_nowhere_is_neither_fetched_nor_a_place_to_put_things(parted: Scene) -> None:
-    with Rehearsal(parted) as robot:
-        assert robot.fetches("apple_1")
-        assert not robot.fetches("apple_2")
-        assert robot.puts("apple_1", Relation.ONTOP, "countertop_1")
-        assert not robot.puts("apple_1", Relation.ONTOP, "coffee_table_1")
+def test_unreachable_furniture_is_infeasible_as_source_and_target(parted: Scene) -> None:
+    with SimulatedRobot(parted) as robot:
+        assert robot.can_pick_up("apple_1")
+        assert not robot.can_pick_up("apple_2")
+        assert robot.can_place("apple_1", Relation.ONTOP, "countertop_1")
+        assert not robot.can_place("apple_1", Relation.ONTOP, "coffee_table_1")
 
 
-def test_what_is_so_already_is_nothing_to_bring_about(home: Scene) -> None:
-    with Rehearsal(home) as robot:
-        assert robot.swings("fridge_1", shut=False)
-        assert not robot.swings("fridge_1", shut=True)
-        assert robot.switches("stove_1", on=True)
-        assert not robot.switches("stove_1", on=False)
-        assert not robot.puts("apple_1", Relation.ONTOP, "breakfast_table_1")
-        assert robot.exposes("apple_1", "fridge_1", State.FROZEN)
-        assert not robot.exposes("chicken_leg_1", "fridge_1", State.FROZEN)
-        assert robot.exposes("chicken_leg_1", "microwave_1", State.HOT)
+def test_fulfilled_wish_is_infeasible(home: Scene) -> None:
+    with SimulatedRobot(home) as robot:
+        assert robot.can_swing("fridge_1", shut=False)
+        assert not robot.can_swing("fridge_1", shut=True)
+        assert robot.can_switch("stove_1", on=True)
+        assert not robot.can_switch("stove_1", on=False)
+        assert not robot.can_place("apple_1", Relation.ONTOP, "breakfast_table_1")
+        assert robot.can_treat("apple_1", "fridge_1", State.FROZEN)
+        assert not robot.can_treat("chicken_leg_1", "fridge_1", State.FROZEN)
+        assert robot.can_treat("chicken_leg_1", "microwave_1", State.HOT)
 
 
-def test_what_bars_the_arm_on_the_way_to_a_wish_stands_against_it(home: Scene) -> None:
-    with Rehearsal(home, lambda handled: (Handling.OPEN, "fridge_1") in handled) as robot:
-        assert robot.fetches("apple_1")
-        assert not robot.fetches("chicken_leg_1")
-        assert not robot.exposes("apple_1", "fridge_1", State.FROZEN)
-        assert robot.exposes("apple_1", "microwave_1", State.HOT)
+def test_blocked_arm_makes_a_wish_infeasible(home: Scene) -> None:
+    with SimulatedRobot(home, lambda handled: (Handling.OPEN, "fridge_1") in handled) as robot:
+        assert robot.can_pick_up("apple_1")
+        assert not robot.can_pick_up("chicken_leg_1")
+        assert not robot.can_treat("apple_1", "fridge_1", State.FROZEN)
+        assert robot.can_treat("apple_1", "microwave_1", State.HOT)
 
 
-class Clumsy(AnyRobot):
-    """Gets hold of nothing but mugs, and switches nothing."""
+class Clumsy(CapableRobot):
+    """Robot that grasps only mugs and switches nothing."""
 
-    def fetches(self, thing: str) -> bool:
+    def can_pick_up(self, thing: str) -> bool:
         return thing.startswith("mug")
 
-    def puts(self, thing: str, relation: Relation, host: str) -> bool:
-        return self.fetches(thing) and host == "cabinet_1"
+    def can_place(self, thing: str, relation: Relation, host: str) -> bool:
+        return self.can_pick_up(thing) and host == "cabinet_1"
 
-    def switches(self, name: str, *, on: bool) -> bool:
+    def can_switch(self, name: str, *, on: bool) -> bool:
         return False
 
 
-def test_nothing_is_asked_for_that_the_robot_cannot_do(home: Scene) -> None:
+def test_infeasible_wishes_are_never_written(home: Scene) -> None:
     view, rooms = SceneView(home, Clumsy()), tuple(room.name for room in home.rooms)
     variant = Variant(home, rooms, tuple(item.name for item in home.objects if not item.fixed))
     goals = {
@@ -86,12 +86,12 @@ def test_nothing_is_asked_for_that_the_robot_cannot_do(home: Scene) -> None:
     assert not goals[TaskCategory.KITCHEN_OPERATION]
 
 
-def test_a_survey_answers_alike_whatever_was_asked_before(home: Scene) -> None:
+def test_survey_answers_do_not_depend_on_the_order_of_queries(home: Scene) -> None:
     names = ("apple_1", "stove_1")
     foresight = ReachabilitySurvey()
     with SceneSurvey(home, foresight) as at_once, SceneSurvey(home, foresight) as bit_by_bit:
-        assert not bit_by_bit.bars([(Handling.PRESS, "stove_1")])
-        assert not bit_by_bit.bars([(Handling.TAKE, "apple_1")])
+        assert not bit_by_bit.blocks([(Handling.PRESS, "stove_1")])
+        assert not bit_by_bit.blocks([(Handling.TAKE, "apple_1")])
         assert bit_by_bit.poses(names) == at_once.poses(names)
         assert set(bit_by_bit.poses(names[:1]).stands) == {"apple_1"}
 
@@ -99,13 +99,16 @@ def test_a_survey_answers_alike_whatever_was_asked_before(home: Scene) -> None:
 @pytest.mark.parametrize(
     ("wish", "sentence"),
     [
-        (RequestedAtom(predicate=Wanted.TOGGLED_ON, thing="stove_1"), "does not get at stove_1"),
-        (RequestedAtom(predicate=Wanted.HOT, thing="apple_1"), "does not get at apple_1"),
-        (RequestedAtom(predicate=Wanted.ONTOP, thing="mug_1", place="stove_1"), "can't bring mug_1 there"),
+        (RequestedAtom(predicate=RequestPredicate.TOGGLED_ON, thing="stove_1"), "can't reach stove_1"),
+        (RequestedAtom(predicate=RequestPredicate.HOT, thing="apple_1"), "can't reach apple_1"),
+        (
+            RequestedAtom(predicate=RequestPredicate.ONTOP, thing="mug_1", place="stove_1"),
+            "can't place mug_1 there",
+        ),
     ],
 )
-def test_a_model_is_told_what_the_robot_cannot_do(home: Scene, wish: RequestedAtom, sentence: str) -> None:
+def test_model_is_told_the_infeasible_wish(home: Scene, wish: RequestedAtom, sentence: str) -> None:
     request = TaskRequest(instruction="Please do this for me.", wishes=(wish,))
-    with pytest.raises(ValueError, match=f"the robot tried, and {sentence}"):
+    with pytest.raises(ValueError, match=f"the robot tried and {sentence}"):
         check_request(request, SceneView(home, Clumsy()), frozenset(home.by_name))
     check_request(request, SceneView(home), frozenset(home.by_name))

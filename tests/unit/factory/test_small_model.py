@@ -1,4 +1,4 @@
-"""The social agents with what a small local model really answered: nothing gets past the checks, and nothing breaks."""
+"""Social agents with recorded answers of a small local model: invalid answers are caught."""
 
 import asyncio
 import json
@@ -14,7 +14,7 @@ from embomatrix.llm.values import UnusableReplyError
 SHAPES = {"cast": Cast, "converse": Conversation, "summarise": TaskRequest}
 
 
-def test_each_agent_ends_with_a_value_or_a_sentence_that_says_what_was_wrong():
+def test_each_agent_returns_a_value_or_reports_the_problem():
     found = asyncio.run(ask_everything(Cassette(RECORDING, CassetteMode.REPLAY)))
     assert set(found) == set(SHAPES)
     for name, value in found.items():
@@ -25,20 +25,20 @@ def test_each_agent_ends_with_a_value_or_a_sentence_that_says_what_was_wrong():
             assert isinstance(value, SHAPES[name])
 
 
-def test_what_was_wrong_is_quoted_to_the_model_which_answers_again():
+def test_problem_is_quoted_to_the_model_which_answers_again():
     answers = [json.loads(line) for line in RECORDING.read_text(encoding="utf-8").splitlines()]
     by_agent = {}
     for answer in answers:
         by_agent.setdefault(answer["purpose"], []).append(answer)
     assert len(by_agent) == len(SHAPES)
-    # An agent that asked again asked another question: the objection is part of it, and makes it longer.
+    # A repeated request contains the objection and is therefore longer.
     for asked in by_agent.values():
         lengths = [answer["prompt_tokens"] for answer in asked]
         assert lengths == sorted(lengths)
         assert len({answer["question"] for answer in asked}) == len(asked)
 
 
-def test_the_recording_is_small_and_holds_no_secret():
+def test_recording_is_small_and_holds_no_secret():
     text = RECORDING.read_text(encoding="utf-8")
     assert len(text) < 40_000
     assert not re.search(r"sk-[A-Za-z0-9]{8}|Bearer |api[_-]?key|/home/|/tmp/", text)

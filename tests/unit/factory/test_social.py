@@ -1,4 +1,4 @@
-"""Tasks come of conversations: a cast that covers the scene, wishes that change, instructions that name who asks."""
+"""Rule-based social simulation: casts that cover the scene, wishes that change, instructions that name a person."""
 
 import dataclasses
 import re
@@ -14,17 +14,17 @@ from pydantic import ValidationError
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.casting import HOBBIES, NAMES, GrammarRolePlayer
-from embomatrix.factory.social.fitting import is_plausible, themes_of, why_of
+from embomatrix.factory.social.fitting import is_plausible, reasons_for, themes_of
 from embomatrix.factory.social.occasions import Theme, occasion_of, occasions, occasions_in
 from embomatrix.factory.social.phrases import (
     CLAUSES,
-    MANNERS,
-    MATTERS,
+    MANNER_CLAUSES,
+    NEEDS,
     NOUNS,
     TURNS,
-    called,
     room_called,
-    said_once,
+    shorten_repeated_rooms,
+    spoken_category,
 )
 from embomatrix.factory.social.values import ROBOT, Act, Cast, DaySlot, Person
 from embomatrix.factory.social.writer import SocialWriter
@@ -41,7 +41,7 @@ ROOMS = tuple(room.name for room in SCENE.rooms)
 
 @pytest.fixture(scope="module")
 def drafts():
-    """What is asked for in one variant, with the view of it."""
+    """Return the drafts of one variant with its view."""
     rng = np.random.default_rng(5)
     variant = build_variant(SCENE, ROOMS[:4], "Rs_int-talk", rng)
     view, writer = SceneView(variant.scene), SocialWriter(seed=2)
@@ -52,7 +52,7 @@ def drafts():
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32))
-def test_every_room_sees_somebody_and_ties_go_both_ways(seed):
+def test_every_room_has_a_person_and_ties_are_mutual(seed):
     cast = GrammarRolePlayer().cast(SCENE, np.random.default_rng(seed))
     assert cast.rooms_without_anyone(ROOMS) == ()
     for person in cast.people:
@@ -63,7 +63,7 @@ def test_every_room_sees_somebody_and_ties_go_both_ways(seed):
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32))
-def test_all_that_is_done_in_a_room_somebody_does_there(seed):
+def test_every_activity_of_a_room_has_a_person(seed):
     cast = GrammarRolePlayer().cast(SCENE, np.random.default_rng(seed))
     done = {(slot.room, slot.activity) for slot in cast.day}
     for room in SCENE.rooms:
@@ -74,7 +74,7 @@ def test_all_that_is_done_in_a_room_somebody_does_there(seed):
 
 @settings(max_examples=50)
 @given(st.integers(0, 2**32))
-def test_parents_are_a_generation_older_and_a_home_is_called_after_who_lives_in_it(seed):
+def test_parents_are_a_generation_older_and_setting_matches_the_household(seed):
     cast = GrammarRolePlayer().cast(SCENE, np.random.default_rng(seed))
     first = cast.people[0]
     ties = {tie for person in cast.people[1:] for tie in person.ties.values()}
@@ -90,25 +90,25 @@ def test_parents_are_a_generation_older_and_a_home_is_called_after_who_lives_in_
 @pytest.mark.parametrize(
     "base", ["restaurant_diner", "school_gym", "office_bike", "hotel_gym_spa", "grocery_store_cafe"]
 )
-def test_other_scenes_have_other_people(base):
+def test_other_scenes_have_other_casts(base):
     scene = build_base_scene(base, seed=0)
     cast = GrammarRolePlayer().cast(scene, np.random.default_rng(0))
     assert cast.rooms_without_anyone(tuple(room.name for room in scene.rooms)) == ()
     assert {person.job for person in cast.people}.isdisjoint({"pensioner", "lodger"})
 
 
-def test_a_seed_gives_a_scene_its_people_once_and_for_all():
+def test_equal_seeds_give_a_scene_the_same_cast():
     assert SocialWriter(3).cast_of(SCENE) == SocialWriter(3).cast_of(SCENE)
     assert SocialWriter(3).cast_of(SCENE) != SocialWriter(4).cast_of(SCENE)
 
 
-def test_nearly_every_category_finds_somebody_who_asks(drafts):
+def test_nearly_every_category_yields_drafts(drafts):
     found, _ = drafts
     assert len(found) >= 40
     assert {draft.task.category for draft in found} == set(TaskCategory)
 
 
-def test_instructions_name_somebody_and_say_what_was_confirmed_last(drafts):
+def test_instruction_names_a_person_and_the_confirmed_wishes(drafts):
     found, cast = drafts
     for draft in found:
         assert any(name in draft.task.instruction for name in cast.names)
@@ -118,7 +118,7 @@ def test_instructions_name_somebody_and_say_what_was_confirmed_last(drafts):
         assert last_turn.startswith("**Robot** (confirm)")
 
 
-def test_requests_change_on_the_way(drafts):
+def test_requests_change_during_the_conversation(drafts):
     found, _ = drafts
     amended = [draft for draft in found if "(amend)" in draft.transcript]
     refused = [draft for draft in found if "(refuse)" in draft.transcript]
@@ -126,7 +126,7 @@ def test_requests_change_on_the_way(drafts):
     assert len(refused) >= len(found) // 8
 
 
-def test_the_same_generator_writes_the_same_tasks():
+def test_equal_generators_write_equal_tasks():
     def written():
         rng = np.random.default_rng(9)
         variant = build_variant(SCENE, ROOMS[:3], "Rs_int-same", rng)
@@ -136,7 +136,7 @@ def test_the_same_generator_writes_the_same_tasks():
     assert written() == written()
 
 
-def test_every_way_to_ask_of_the_plain_writer_has_its_own_here():
+def test_every_predicate_of_the_plain_writer_has_social_phrases():
     assert set(CLAUSES) == set(PHRASES)
     assert all(len(set(options)) >= 4 for options in CLAUSES.values())
     assert set(TURNS) == set(Act)
@@ -144,15 +144,19 @@ def test_every_way_to_ask_of_the_plain_writer_has_its_own_here():
     assert len(set(HOBBIES)) >= 5
 
 
-def test_people_call_a_category_by_a_name_that_no_other_has():
-    names = Counter(called(name) for name in Catalog.load().category_names)
-    assert {called(name): names[called(name)] for name in NOUNS if names[called(name)] > 1} == {}
+def test_everyday_names_of_categories_are_unique():
+    names = Counter(spoken_category(name) for name in Catalog.load().category_names)
+    assert {
+        spoken_category(name): names[spoken_category(name)]
+        for name in NOUNS
+        if names[spoken_category(name)] > 1
+    } == {}
     assert set(NOUNS) <= set(Catalog.load().category_names)
 
 
 def test_taps_are_turned_and_drawers_pulled_out(drafts):
-    assert {key.rpartition(" ")[0] for key in MANNERS} <= set(CLAUSES)
-    assert set(MANNERS) <= set(MATTERS)
+    assert {key.rpartition(" ")[0] for key in MANNER_CLAUSES} <= set(CLAUSES)
+    assert set(MANNER_CLAUSES) <= set(NEEDS)
     found, _ = drafts
     for draft in found:
         assert not re.search(r"sinks? (over )?(in [\w ]+ )?(switched )?(on|off)\b", draft.task.instruction)
@@ -168,33 +172,33 @@ SLOT = DaySlot(time="07:30", person="Ann", room="kitchen_0", activity="making br
 @pytest.mark.parametrize(
     ("values", "sentence"),
     [
-        ({"people": (ANN, ANN)}, "two people are called 'Ann'"),
+        ({"people": (ANN, ANN)}, "two people have the name 'Ann'"),
         (
             {"people": (BO, ANN.model_copy(update={"name": "Cy"}))},
-            "Bo is tied to 'Ann': expected another one of",
+            "Bo has a tie to 'Ann': expected another person of",
         ),
-        ({"day": (SLOT.model_copy(update={"person": "Zed"}),)}, "'Zed' has something to do at 07:30"),
+        ({"day": (SLOT.model_copy(update={"person": "Zed"}),)}, "the slot at 07:30 names 'Zed'"),
         ({"people": (ANN,)}, "at least 2 items"),
         ({"day": ()}, "at least 1 item"),
     ],
 )
-def test_a_cast_that_does_not_fit_together_is_refused(values, sentence):
+def test_inconsistent_cast_is_rejected(values, sentence):
     whole = {"setting": "a home", "people": (ANN, BO), "day": (SLOT,)}
     with pytest.raises(ValidationError, match=sentence):
         Cast(**{**whole, **values})
 
 
 @pytest.mark.parametrize("time", ["7:30", "24:00", "12:60", "noon"])
-def test_a_time_of_day_has_four_digits(time):
+def test_time_of_day_needs_four_digits(time):
     with pytest.raises(ValidationError, match="time"):
         DaySlot(time=time, person="Ann", room="kitchen_0", activity="eating")
 
 
-def test_the_robot_is_not_one_of_the_people():
+def test_robot_is_not_part_of_the_cast():
     assert ROBOT not in NAMES
 
 
-def test_every_activity_of_the_table_has_reasons_and_every_theme_comes_up():
+def test_every_activity_has_reasons_and_every_theme_occurs():
     found = [occasion for each in occasions().values() for occasion in each]
     assert {theme for occasion in found for theme in occasion.themes} == set(Theme)
     assert all(occasion_of(occasion.doing).doing == occasion.doing for occasion in found)
@@ -203,7 +207,7 @@ def test_every_activity_of_the_table_has_reasons_and_every_theme_comes_up():
 
 @settings(max_examples=40)
 @given(st.integers(0, 2**32), st.sampled_from(["Rs_int", "shop"]))
-def test_people_do_what_somebody_of_their_age_and_place_does(seed, base):
+def test_activities_suit_age_and_place(seed, base):
     cast = GrammarRolePlayer().cast(
         dataclasses.replace(SCENE, base="grocery_x" if base == "shop" else base), np.random.default_rng(seed)
     )
@@ -213,7 +217,7 @@ def test_people_do_what_somebody_of_their_age_and_place_does(seed, base):
         assert base == "Rs_int" or not occasion.private
 
 
-def test_wishes_fit_what_the_person_does(drafts):
+def test_wishes_suit_the_activity(drafts):
     found, cast = drafts
     doing = {slot.activity for slot in cast.day}
     kitchen_work = [draft for draft in found if draft.task.category is TaskCategory.KITCHEN_OPERATION]
@@ -247,11 +251,11 @@ def test_wishes_fit_what_the_person_does(drafts):
         ("bar_soap", "sauna_heater", "sauna", False),
     ],
 )
-def test_nobody_puts_such_things_there(thing, host, room, inside):
+def test_implausible_places_are_rejected(thing, host, room, inside):
     assert not is_plausible(thing, host, room, inside=inside)
 
 
-def test_people_put_things_where_they_belong():
+def test_usual_places_are_plausible():
     assert is_plausible("apple", "furniture_sink", "kitchen", inside=True)
     assert is_plausible("teddy_bear", "bed", "bedroom", inside=False)
     assert is_plausible("carton_of_milk", "fridge", "kitchen", inside=True)
@@ -261,7 +265,7 @@ def test_people_put_things_where_they_belong():
 
 @dataclasses.dataclass(frozen=True)
 class Flat:
-    """A view of a scene in which each thing is called after its category and stands in the kitchen."""
+    """View of a scene in which each object is named after its category and stands in the kitchen."""
 
     scene = dataclasses.replace(SCENE, rooms=tuple(room for room in SCENE.rooms if room.type == "kitchen"))
 
@@ -273,19 +277,19 @@ class Flat:
 
 
 @pytest.mark.parametrize(("thing", "wanted"), [("salt_shaker", False), ("blender", True), ("urinal", False)])
-def test_nobody_has_a_salt_shaker_switched_on(thing, wanted):
+def test_salt_shaker_is_never_switched_on(thing, wanted):
     piece = GoalConjunct(
         Atom("toggled_on", (thing,)), "", (thing,), (f"toggled_on({thing})",), "switch", "it"
     )
     assert bool(themes_of(piece, Flat())) == wanted
 
 
-def test_nobody_wants_the_water_to_run_who_only_tidies_up():
+def test_tidying_person_does_not_ask_for_running_water():
     sinks = [name for name in Catalog.load().used_categories if name.endswith("_sink")]
     assert sinks
     for sink in sinks:
         sign = f"toggled_on({sink})"
-        piece = GoalConjunct(Atom("toggled_on", (sink,)), "", (sink,), (sign,), "switch", "it", manner="tap")
+        piece = GoalConjunct(Atom("toggled_on", (sink,)), "", (sink,), (sign,), "switch", "it", options="tap")
         assert Theme.TIDYING not in themes_of(piece, Flat()), sink
 
 
@@ -300,14 +304,14 @@ def test_nobody_wants_the_water_to_run_who_only_tidies_up():
         ("frozen", "inside", "freezer", True),
     ],
 )
-def test_hot_food_is_served_and_frozen_food_kept_cold(state, relation, host, wanted):
+def test_hot_food_is_served_and_frozen_food_stays_cold(state, relation, host, wanted):
     goal = And((Atom(state, ("potato",)), Atom(relation, ("potato", host))))
     signs = (f"{state}(potato)", f"{relation}(potato,{host})")
     piece = GoalConjunct(goal, "", ("potato", "stove", host), signs, "thermal", "the potato")
     assert bool(themes_of(piece, Flat())) == wanted
 
 
-def test_rooms_are_called_as_people_call_them_and_once_in_a_clause():
+def test_room_names_are_natural_and_shortened_when_repeated():
     two = dataclasses.replace(
         SCENE, rooms=(*SCENE.rooms, dataclasses.replace(SCENE.rooms[0], name="bedroom_1", type="bedroom"))
     )
@@ -333,9 +337,9 @@ def test_rooms_are_called_as_people_call_them_and_once_in_a_clause():
             "The lamp in bedroom 1; then the one in bedroom 10.",
         ),
     ):
-        assert said_once(text, view) == once
+        assert shorten_repeated_rooms(text, view) == once
 
 
-def test_the_grammar_gives_no_reasons_for_what_it_did_not_make_up():
-    assert why_of("juggling eels") == ()
-    assert "the chain is off" in why_of("mending a bicycle")
+def test_unknown_activity_has_no_reasons():
+    assert reasons_for("juggling eels") == ()
+    assert "the chain is off" in reasons_for("mending a bicycle")

@@ -1,4 +1,4 @@
-"""Each agent of the social simulation can be run alone; what one answers, the next one reads."""
+"""Each social agent runs alone; the answer of one agent is the brief of the next."""
 
 import json
 from pathlib import Path
@@ -7,10 +7,10 @@ import pytest
 from tests.fakes.chat_server import ChatServer
 from typer.testing import CliRunner
 
-from embomatrix.factory.commands.agents import EVERY
+from embomatrix.factory.commands.agents import ALL_AGENTS
 from embomatrix.factory.commands.app import app
 from embomatrix.factory.layout.agent_interfaces import AgentName
-from embomatrix.factory.social.agent_interfaces import SOCIAL_DOORS, SocialAgent
+from embomatrix.factory.social.agent_interfaces import SOCIAL_AGENTS, SocialAgent
 from embomatrix.factory.social.values import SummaryBrief, TalkBrief
 
 BRIEF = '{"scene": "Rs_int", "seed": 1}'
@@ -22,34 +22,34 @@ def run(name: str, brief: str, *more: str) -> str:
     return answer.stdout
 
 
-def test_every_agent_has_a_name_of_its_own() -> None:
-    assert set(EVERY) == {*SocialAgent, *AgentName}
-    assert len(EVERY) == len(SocialAgent) + len(AgentName)
+def test_agent_names_are_unique() -> None:
+    assert set(ALL_AGENTS) == {*SocialAgent, *AgentName}
+    assert len(ALL_AGENTS) == len(SocialAgent) + len(AgentName)
 
 
-def test_from_a_scene_to_its_people_to_a_conversation_to_an_instruction() -> None:
+def test_agents_chain_from_scene_to_instruction() -> None:
     people = run("role-player", BRIEF)
     talk = run("social-simulator", people)
-    told = SOCIAL_DOORS[SocialAgent.SUMMARIZER].read(talk)
+    told = SOCIAL_AGENTS[SocialAgent.SUMMARIZER].read(talk)
     assert isinstance(told, SummaryBrief)
-    assert told.cast == SOCIAL_DOORS[SocialAgent.SIMULATOR].read(people).cast
+    assert told.cast == SOCIAL_AGENTS[SocialAgent.SIMULATOR].read(people).cast
     summary = json.loads(run("summarizer", talk))
     assert summary["wishes"] == [*told.conversation.last_wishes]
     assert any(name in summary["instruction"] for name in told.cast.names)
     assert run("social-simulator", people) == talk
 
 
-def test_a_scene_is_told_room_by_room() -> None:
+def test_scene_facts_list_the_rooms() -> None:
     facts = json.loads(run("scene-extractor", BRIEF))
     assert facts["base"] == "Rs_int"
     assert {room["name"] for room in facts["rooms"]} >= {"kitchen_0", "living_room_0"}
 
 
-def test_a_language_model_plays_the_people_when_it_is_asked(tmp_path: Path) -> None:
-    cast = SOCIAL_DOORS[SocialAgent.SIMULATOR].read(run("role-player", BRIEF)).cast
+def test_language_model_plays_the_people_on_request(tmp_path: Path) -> None:
+    cast = SOCIAL_AGENTS[SocialAgent.SIMULATOR].read(run("role-player", BRIEF)).cast
     with ChatServer("no", cast.model_dump_json()).serving() as url:
         found = run("role-player", BRIEF, "--llm", url, "--model", "small-1")
-    assert SOCIAL_DOORS[SocialAgent.SIMULATOR].read(found) == TalkBrief(scene="Rs_int", cast=cast, seed=1)
+    assert SOCIAL_AGENTS[SocialAgent.SIMULATOR].read(found) == TalkBrief(scene="Rs_int", cast=cast, seed=1)
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_a_language_model_plays_the_people_when_it_is_asked(tmp_path: Path) -> N
         ("social-simulator", BRIEF, "cast: field required"),
     ],
 )
-def test_what_is_wrong_with_a_brief_is_told_in_a_sentence(name: str, brief: str, sentence: str) -> None:
+def test_invalid_brief_exits_with_one_sentence(name: str, brief: str, sentence: str) -> None:
     answer = CliRunner().invoke(app, ["agent", name, "--in", "-"], input=brief)
     assert answer.exit_code == 2
     assert sentence in " ".join(answer.output.split())

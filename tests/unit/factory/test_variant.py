@@ -1,4 +1,4 @@
-"""A variant is a scene in which every task can begin: what stands open is in nobody's way."""
+"""Scene variants allow every task to start: open doors obstruct nothing."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def base() -> Scene:
 
 
 @pytest.mark.parametrize("seed", [0, 2])
-def test_doors_that_stand_open_at_the_start_bar_no_way_and_no_other_door(base: Scene, seed: int) -> None:
+def test_open_doors_obstruct_no_path_and_no_other_door(base: Scene, seed: int) -> None:
     rooms = [room.name for room in base.rooms]
     changed = build_variant(base, rooms, "open", np.random.default_rng(seed)).scene
     ajar = [item.name for item in changed.objects if any(item.joints)]
@@ -40,7 +40,7 @@ def test_doors_that_stand_open_at_the_start_bar_no_way_and_no_other_door(base: S
             assert not solids.overlaps(wide), item.name
 
 
-def test_small_things_are_where_such_things_are_found() -> None:
+def test_small_objects_are_on_usual_hosts() -> None:
     office = build_base_scene("office_cubicles_right", seed=0)
     rooms = [room.name for room in office.rooms if room.type in {"private_office", "bathroom", "break_room"}]
     types = {room.name: room.type for room in office.rooms}
@@ -54,7 +54,7 @@ def test_small_things_are_where_such_things_are_found() -> None:
             assert category in BASKETS or belongs(category, types[item.room]), (name, item.room)
 
 
-def test_no_food_is_left_on_a_chair() -> None:
+def test_food_is_never_left_on_a_chair() -> None:
     office = build_base_scene("office_bike", seed=0)
     rooms = [room.name for room in office.rooms if room.type == "break_room"]
     found = []
@@ -80,7 +80,7 @@ def test_no_food_is_left_on_a_chair() -> None:
         ("vase", "coffee_maker", False),
     ],
 )
-def test_things_lie_where_people_leave_them(category: str, host: str, left: bool) -> None:
+def test_objects_lie_on_usual_hosts(category: str, host: str, left: bool) -> None:
     assert is_left_on(category, host) == left
 
 
@@ -95,5 +95,5 @@ def test_things_lie_where_people_leave_them(category: str, host: str, left: bool
         ("vase", "corridor", True),
     ],
 )
-def test_each_kind_of_room_has_its_small_things(category: str, room_type: str, found: bool) -> None:
+def test_each_room_type_has_its_small_objects(category: str, room_type: str, found: bool) -> None:
     assert belongs(category, room_type) == found

@@ -1,11 +1,11 @@
-"""A scene as the writers of tasks see it."""
+"""Scene view for task writers."""
 
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.world.scene import Scene
 
 
-def test_what_nothing_bears_is_on_the_floor_on_the_wall_or_under_the_ceiling() -> None:
+def test_unsupported_object_is_on_floor_wall_or_ceiling() -> None:
     view = SceneView(build_base_scene("restaurant_diner"))
     told = {view.category(name): view.whereabouts(name) for name in view.scene.by_name}
     assert told["fridge"] == told["booth"] == "on the floor"
@@ -13,7 +13,7 @@ def test_what_nothing_bears_is_on_the_floor_on_the_wall_or_under_the_ceiling() -
     assert told["room_light"] == "under the ceiling"
 
 
-def test_what_something_bears_is_told_with_that(home: Scene) -> None:
+def test_supported_object_is_described_with_its_support(home: Scene) -> None:
     view = SceneView(home)
     borne = next(item for item in home.objects if item.host)
     assert view.whereabouts(borne.name) == f"{borne.relation} {borne.host}"

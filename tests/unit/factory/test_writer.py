@@ -1,4 +1,4 @@
-"""The writer's tasks are about what the scene holds, read like requests, and follow from the seed."""
+"""Tasks of the plain writer are about objects of the scene, readable, and deterministic."""
 
 import dataclasses
 
@@ -53,7 +53,7 @@ def drafts(variant: Variant, view: SceneView, category: TaskCategory, count: int
     return [draft for draft in found if draft is not None]
 
 
-def test_view_tells_what_can_be_done_with_things(view: SceneView) -> None:
+def test_view_lists_affordances(view: SceneView) -> None:
     assert view.is_portable("apple_1")
     assert not view.is_portable("fridge_1")
     assert view.is_surface("breakfast_table_1")
@@ -70,7 +70,7 @@ def test_view_tells_what_can_be_done_with_things(view: SceneView) -> None:
 
 
 @pytest.mark.parametrize("category", TaskCategory)
-def test_task_is_whole_and_about_what_the_scene_holds(
+def test_task_is_complete_and_about_scene_objects(
     variant: Variant, view: SceneView, category: TaskCategory
 ) -> None:
     written = drafts(variant, view, category)
@@ -92,7 +92,7 @@ def synsets(view: SceneView) -> dict[str, str]:
     return {item.name: view.asset(item.name).synset for item in view.scene.objects}
 
 
-def test_instruction_names_every_category_that_the_goal_is_about(variant: Variant, view: SceneView) -> None:
+def test_instruction_names_every_category_of_the_goal(variant: Variant, view: SceneView) -> None:
     for draft in drafts(variant, view, TaskCategory.PICK_AND_PLACE):
         for name in objects_of(draft.task.goal, draft.task.types):
             assert view.category(name).replace("_", " ") in draft.task.instruction
@@ -103,13 +103,13 @@ def test_equal_seeds_write_equal_tasks(variant: Variant, view: SceneView) -> Non
         assert drafts(variant, view, category, 5) == drafts(variant, view, category, 5)
 
 
-def test_seeds_write_many_different_tasks(variant: Variant, view: SceneView) -> None:
+def test_different_seeds_write_different_tasks(variant: Variant, view: SceneView) -> None:
     written = drafts(variant, view, TaskCategory.COMPOUND, 40)
     assert len({draft.signature for draft in written}) > 15
     assert len({draft.task.instruction for draft in written}) > 30
 
 
-def test_furniture_that_words_can_t_tell_apart_may_be_any_of_its_kind(variant: Variant, scene: Scene) -> None:
+def test_indistinguishable_furniture_may_be_any_of_its_category(variant: Variant, scene: Scene) -> None:
     second = dataclasses.replace(scene.by_name["cabinet_1"], name="cabinet_2")
     twin = dataclasses.replace(scene, objects=(*scene.objects, second))
     view = SceneView(twin)
@@ -126,7 +126,7 @@ def test_furniture_that_words_can_t_tell_apart_may_be_any_of_its_kind(variant: V
         assert "a cabinet" in task.instruction
 
 
-def test_table_brings_hosts_along_and_its_order_betrays_nothing(view: SceneView) -> None:
+def test_table_includes_supports_and_its_order_reveals_nothing(view: SceneView) -> None:
     first_rows = set()
     for seed in range(30):
         table = object_table(view, ("microwave_1",), np.random.default_rng(seed))
@@ -139,7 +139,7 @@ def test_table_brings_hosts_along_and_its_order_betrays_nothing(view: SceneView)
     assert len(first_rows) > 4
 
 
-def test_room_is_named_where_the_category_is_not_enough(view: SceneView) -> None:
+def test_room_is_named_if_the_category_is_ambiguous(view: SceneView) -> None:
     words = {refer(view, "apple_1", Voice(np.random.default_rng(seed))) for seed in range(10)}
     assert words == {"the apple in the kitchen"}
     assert {refer(view, "bowl_1", Voice(np.random.default_rng(seed))) for seed in range(20)} == {
@@ -148,7 +148,7 @@ def test_room_is_named_where_the_category_is_not_enough(view: SceneView) -> None
     }
 
 
-def test_one_of_several_rooms_of_a_type_goes_by_its_name(scene: Scene) -> None:
+def test_one_of_several_rooms_of_a_type_has_its_own_name(scene: Scene) -> None:
     more = dataclasses.replace(scene.rooms[1], name="kitchen_1", type="kitchen")
     two = SceneView(dataclasses.replace(scene, rooms=(*scene.rooms, more)))
     assert room_words(two, "kitchen_1") == "kitchen_1"
@@ -166,7 +166,7 @@ def test_clauses_become_one_request() -> None:
     )
 
 
-def test_signatures_are_held_out_by_a_fair_draw_that_the_seed_fixes() -> None:
+def test_heldout_signatures_are_a_fair_draw_fixed_by_the_seed() -> None:
     signs = [f"inside(thing_{number},fridge)" for number in range(400)]
     held = [is_heldout_signature(sign, 0) for sign in signs]
     assert held == [is_heldout_signature(sign, 0) for sign in signs]
@@ -175,7 +175,7 @@ def test_signatures_are_held_out_by_a_fair_draw_that_the_seed_fixes() -> None:
 
 
 @pytest.mark.parametrize("category", sorted({name for members in MEMBERS.values() for name in members}))
-def test_every_word_of_the_writer_is_a_thing_that_the_robot_can_carry(category: str) -> None:
+def test_every_category_of_the_writer_is_portable(category: str) -> None:
     catalog = Catalog.load()
     mass = catalog.category(category).mass_kg
     assert any(is_liftable(model.size_m, mass) for model in catalog.models_of(category))
@@ -186,14 +186,14 @@ def test_food_can_be_heated_cooked_and_frozen() -> None:
         assert {"heatable", "cookable", "freezable"} <= set(Catalog.load().category(category).abilities)
 
 
-def test_tables_speak_of_known_rooms_and_groups() -> None:
+def test_tables_use_known_rooms_and_groups() -> None:
     assert set(MEMBERS) == set(ItemKind)
     assert set(ROOM_GROUPS) <= ROOM_TYPES
     assert all(groups_for(room) for room in ROOM_TYPES)
     assert {group for groups in ROOM_GROUPS.values() for group in groups} == set(ItemKind)
 
 
-def test_a_person_puts_food_in_the_fridge_and_not_on_the_bed() -> None:
+def test_fridge_suits_food_and_bed_does_not() -> None:
     assert suits("apple", "fridge")
     assert suits("teddy_bear", "bed")
     assert suits("apple", "breakfast_table")

@@ -1,4 +1,4 @@
-"""Placing: the first verified pose that is free and in reach, or a reason."""
+"""PlacementQuery: the first verified pose that is free and in reach, or a reason."""
 
 from dataclasses import replace
 

@@ -13,9 +13,9 @@ from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.adapters import openrlhf, rows, verl
 from embomatrix.trainer.adapters.scorer import PlanScorer, scorer_for
 from embomatrix.trainer.adapters.trl import AnnouncedSampler, ClusterLookahead, ClusterReward, text_of
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.data.tasks import load_tasks
 from embomatrix.trainer.policy.prompts import plan_text
-from embomatrix.trainer.run.data import load_tasks
-from embomatrix.trainer.run.errors import TrainerError
 from embomatrix.world.task import Profile
 
 TASKS = make_tasks(6, 1)
@@ -119,7 +119,7 @@ async def test_trl_gets_a_number_for_each_completion_and_none_for_a_lost_one():
     assert metrics["embomatrix/lost"] == pytest.approx(1 / 3)
     assert metrics["embomatrix/success"] == 0.5
     assert columns["task"] == [FIRST.task.task_id] * 3
-    assert columns["became"][1] == "lost by the infrastructure"
+    assert columns["outcome"][1] == "lost to the infrastructure"
 
 
 @pytest.mark.parametrize("completion", [None, [], [{"role": "assistant"}], [{"content": None}], 3])
@@ -209,7 +209,7 @@ async def test_openrlhf_gets_tensors_and_what_was_lost_is_executed_again():
     ids = [FIRST.task.task_id, SECOND.task.task_id, FIRST.task.task_id]
     with scorer(SymbolicCluster(TASKS, lost=frozenset({"score-0/"}))) as opened:
         rewards = await openrlhf.rewards_of(opened, ids, [oracle(FIRST), oracle(SECOND), "hm"])
-    told = openrlhf.told(rewards)
+    told = openrlhf.reward_payload(rewards)
     assert told["scores"].tolist() == [1.0, 1.0, 0.0]
     assert told["rewards"].tolist() == pytest.approx([reward.total for reward in rewards])
     assert sum(values[2].item() for values in told["extra_logs"].values()) == -1

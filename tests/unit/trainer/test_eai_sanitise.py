@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from embomatrix.trainer.eai.sanitise import sanitised
+from embomatrix.trainer.eai.sanitise import sanitise_answer
 
 STEP = {"action": "OPEN", "object": "fridge_97"}
 
@@ -24,24 +24,24 @@ STEP = {"action": "OPEN", "object": "fridge_97"}
     ],
 )
 def test_steps_are_found_in_what_models_write(text):
-    assert json.loads(sanitised(text)) == [STEP]
+    assert json.loads(sanitise_answer(text)) == [STEP]
 
 
 @pytest.mark.parametrize(
     "text", ["", "I can't.", "[", "[]", "[[[", '["OPEN"]', '[{"action": "OPEN"}]', "[" * 100_000]
 )
 def test_text_without_steps_is_empty(text):
-    assert sanitised(text) == ""
+    assert sanitise_answer(text) == ""
 
 
 def test_names_lose_what_could_end_a_string_or_a_list():
     text = json.dumps([{"action": "OPEN", "object": 'a"]) or __import__("os")#'}])
-    assert json.loads(sanitised(text)) == [{"action": "OPEN", "object": "a??? or __import__??os???"}]
+    assert json.loads(sanitise_answer(text)) == [{"action": "OPEN", "object": "a??? or __import__??os???"}]
 
 
 @given(st.text(), st.text())
 def test_whatever_is_handed_over_is_a_literal_up_to_the_first_closing_bracket(action, thing):
     """The published parser evaluates the text from the first "[" to the first "]"."""
-    text = sanitised(json.dumps([{"action": action, "object": thing}]))
+    text = sanitise_answer(json.dumps([{"action": action, "object": thing}]))
     value = ast.literal_eval(text[text.find("[") : text.find("]") + 1])
     assert value == json.loads(text)

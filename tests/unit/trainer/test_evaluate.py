@@ -12,7 +12,7 @@ from embomatrix.trainer.evaluation.intervals import bootstrap
 def scored(successes, samples=10, prefix="t", category="pick_and_place"):
     return HeldOutEvaluation(
         tuple(
-            TaskScore(f"{prefix}{at}", category, samples, count, samples, 3.0 * count, 10 - samples)
+            TaskScore(f"{prefix}{at}", category, samples, count, 10 - samples)
             for at, count in enumerate(successes)
         )
     )

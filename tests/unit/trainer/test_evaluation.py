@@ -12,8 +12,9 @@ from tests.fakes.executors import HereExecutor
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.evaluation.answer_sources import EndpointSource, ScriptSource, questions_digest
 from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, EvaluationSetup, read_answers
-from embomatrix.trainer.evaluation.asking import EndpointAsker, WriterAsker, questions_digest
 from embomatrix.trainer.evaluation.baselines import BaselineName, baseline_for
 from embomatrix.trainer.evaluation.benchmark import find_benchmark
 from embomatrix.trainer.evaluation.exam import WorldExam
@@ -21,7 +22,6 @@ from embomatrix.trainer.evaluation.judging import AnswerJudge
 from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
 from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
-from embomatrix.trainer.run.errors import TrainerError
 from embomatrix.worker.slots.rollout_pool import RolloutPool
 from embomatrix.world.task import Profile
 
@@ -64,7 +64,7 @@ def categories(bench):
 
 def written(bench, name):
     plan = baseline_for(name)
-    return WriterAsker(lambda task_id, rng: json.dumps(plan_to_json(plan(bench.tasks[task_id], rng))))
+    return ScriptSource(lambda task_id, rng: json.dumps(plan_to_json(plan(bench.tasks[task_id], rng))))
 
 
 def asked(bench, name, samples=1):
@@ -180,16 +180,19 @@ def test_page_escapes_what_models_and_tasks_say(bench):
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (lambda text: text.replace('"answers": 1', '"answers": 99'), "is of another version"),
-        (lambda text: text.replace('"sample": 0', '"sample": "x"'), "line 2, is damaged: 'sample'"),
+        (lambda text: text.replace('"answers": 1', '"answers": 99'), "has another version"),
+        (lambda text: text.replace('"sample": 0', '"sample": "x"'), "line 2, is damaged: found sample 'x'"),
         (lambda text: "", "holds no answers"),
-        (lambda text: "{}\n" + text, "is no file of answers"),
+        (lambda text: "{}\n" + text, "is not an answer file"),
         (lambda text: text.replace('"samples": 2', '"samples": 1000000000'), "found samples 1000000000"),
-        (lambda text: text.replace('"seed": 0', '"seed": -1'), "found seed -1, expected 0 or more"),
+        (
+            lambda text: text.replace('"seed": 0', '"seed": -1'),
+            "found seed -1, expected: Input should be greater",
+        ),
         (lambda text: text.replace('"temperature": 1.0', '"temperature": NaN'), "found temperature nan"),
         (
             lambda text: text.replace('"codec": "lines"', '"codec": "verse"'),
-            "found codec 'verse', expected eai",
+            "found codec 'verse', expected: String should match pattern .*eai",
         ),
         (lambda text: text + "[" * 100_000 + "\n", "line 3, is damaged"),
         (lambda text: text + "nonsense\n", "is damaged"),
@@ -230,7 +233,7 @@ def test_line_cut_short_by_a_kill_is_asked_again(bench, tmp_path):
 
 def endpoint_asker(url, tmp_path, attempts=1):
     limits = EndpointLimits(attempts=attempts, first_wait_s=0.01, concurrent=3)
-    return EndpointAsker(lambda: Endpoint(url, "scripted", limits=limits), tmp_path / "ledger.jsonl")
+    return EndpointSource(lambda: Endpoint(url, "scripted", limits=limits), tmp_path / "ledger.jsonl")
 
 
 def test_endpoint_is_asked_once_for_each_sample_and_what_it_cost_is_written(bench, tmp_path):
@@ -274,8 +277,8 @@ def test_task_in_a_scene_without_a_bundle_is_named(bench, tmp_path):
 @pytest.mark.parametrize(
     ("named", "split", "words"),
     [
-        ("nowhere", "", "there is no benchmark at nowhere: pass a dataset folder"),
-        ("KITCHEN", "test", "no tasks of the split 'test': it has those of heldout, train"),
+        ("nowhere", "", "no benchmark at nowhere: pass a dataset folder"),
+        ("KITCHEN", "test", "no tasks in the split 'test': it has heldout, train"),
     ],
 )
 def test_benchmark_that_is_not_there_is_named(bench, named, split, words):
@@ -299,5 +302,5 @@ def test_refused_problems_of_an_import_and_goals_beyond_the_profile_are_failed_b
     assert (len(paper.records), paper.failed_by_rule) == (3, {"mopping", lines[0]["task"]["task_id"]})
     assert (len(household.records), household.failed_by_rule) == (4, {"mopping"})
     (folder / "import.json").write_text("[]")
-    with pytest.raises(TrainerError, match="is no report of an import"):
+    with pytest.raises(TrainerError, match="is not an import report"):
         find_benchmark(str(folder), "all")

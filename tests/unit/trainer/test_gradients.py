@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 
-from embomatrix.trainer.parallel.gradients import GradientSum
+from embomatrix.trainer.grpo.gradients import GradientSum
 
 PARTS = [torch.tensor([scale, 1 / scale, 0.1]) for scale in (1e7, 3.0, 1e-7, 0.3, 1e3)]
 
@@ -16,8 +16,8 @@ def summed(order, tensors=PARTS):
     most = 0
     for part in order:
         gradients.add(part, lambda part=part: (weights * tensors[part]).sum().backward())
-        most = max(most, gradients.aside)
-    assert gradients.aside == 0
+        most = max(most, gradients.stored)
+    assert gradients.stored == 0
     assert idle.grad is None
     return weights.grad, most
 
@@ -50,6 +50,6 @@ def test_a_part_without_a_gradient_takes_its_turn():
     gradients = GradientSum([weights])
     gradients.add(1, lambda: weights.sum().backward())
     gradients.add(0, lambda: None)
-    assert gradients.due == 2
+    assert gradients.next_index == 2
     gradients.scale(0.5)
     assert weights.grad.tolist() == [0.5, 0.5, 0.5]

@@ -8,12 +8,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from embomatrix.trainer.config.settings import GrpoSettings, LossKind, RatioLevel
 from embomatrix.trainer.grpo.objective import (
-    LossKind,
-    Objective,
-    RatioLevel,
-    Scale,
-    Terms,
+    LossInputs,
+    LossTotals,
     group_advantages,
     surrogate_loss,
 )
@@ -39,11 +37,15 @@ def terms(new=NEW, **changes):
         "advantages": torch.tensor(ADVANTAGES, dtype=torch.float64),
         "reference": torch.tensor(REFERENCE, dtype=torch.float64),
     }
-    return Terms(**{**values, **changes})
+    return LossInputs(**{**values, **changes})
+
+
+def objective(**changes):
+    return GrpoSettings(**{"kl_coef": 0.0, **changes})
 
 
 LONGEST = 5
-SCALE = Scale(4, 7, LONGEST)
+SCALE = LossTotals(4, 7, LONGEST)
 
 
 def by_hand(kind, ratio, low, high, kl_coef):
@@ -77,29 +79,29 @@ def by_hand(kind, ratio, low, high, kl_coef):
 
 @pytest.mark.parametrize(("kind", "ratio"), list(itertools.product(LossKind, RatioLevel)))
 def test_loss_is_the_formula_written_out(kind, ratio):
-    objective = Objective(kind, ratio, clip_low=0.2, clip_high=0.28, kl_coef=0.1)
-    loss, _ = surrogate_loss(terms(), objective, SCALE)
+    settings = objective(loss=kind, ratio=ratio, kl_coef=0.1)
+    loss, _ = surrogate_loss(terms(), settings, SCALE)
     assert loss.item() == pytest.approx(by_hand(kind, ratio, 0.2, 0.28, 0.1), abs=1e-12)
 
 
 def test_paper_objective_keeps_its_golden_value():
-    objective = Objective(LossKind.PAPER, RatioLevel.SEQUENCE, clip_low=0.2, clip_high=0.2, kl_coef=0.1)
+    settings = objective(loss=LossKind.PAPER, ratio=RatioLevel.SEQUENCE, clip_high=0.2, kl_coef=0.1)
     # ratios exp(0.5), exp(-0.5), exp(-0.5), exp(0.5); clipped at 1.2 and 0.8 where that lowers the gain
     gain = (1.2 - 0.8 + 0.5 * math.exp(-0.5) - 0.5 * math.exp(0.5)) / 4
-    loss, _ = surrogate_loss(terms(reference=None), objective, SCALE)
+    loss, _ = surrogate_loss(terms(reference=None), settings, SCALE)
     assert loss.item() == pytest.approx(-gain, abs=1e-12)
 
 
 @pytest.mark.parametrize(("kind", "ratio"), list(itertools.product(LossKind, RatioLevel)))
 def test_parts_of_a_step_add_up_to_the_whole(kind, ratio):
-    objective = Objective(kind, ratio, kl_coef=0.05, entropy_coef=0.01)
+    settings = objective(loss=kind, ratio=ratio, kl_coef=0.05, entropy_coef=0.01)
     entropy = torch.full((4, 2), 0.3, dtype=torch.float64)
     whole = terms(entropy=entropy)
-    loss, _ = surrogate_loss(whole, objective, SCALE)
+    loss, _ = surrogate_loss(whole, settings, SCALE)
     loss.backward()
     pieces = terms(entropy=entropy)
     for rows in (slice(0, 2), slice(2, 4)):
-        part = Terms(
+        part = LossInputs(
             pieces.logprobs[rows],
             pieces.old_logprobs[rows],
             pieces.mask[rows],
@@ -107,14 +109,14 @@ def test_parts_of_a_step_add_up_to_the_whole(kind, ratio):
             pieces.reference[rows],
             entropy[rows],
         )
-        surrogate_loss(part, objective, SCALE)[0].backward()
+        surrogate_loss(part, settings, SCALE)[0].backward()
     assert torch.allclose(whole.logprobs.grad, pieces.logprobs.grad)
 
 
 @pytest.mark.parametrize(("kind", "ratio"), list(itertools.product(LossKind, RatioLevel)))
 def test_gradient_raises_good_plans_and_lowers_bad_ones(kind, ratio):
     start = terms(new=OLD, reference=None)
-    loss, metrics = surrogate_loss(start, Objective(kind, ratio), SCALE)
+    loss, metrics = surrogate_loss(start, objective(loss=kind, ratio=ratio), SCALE)
     loss.backward()
     for row, advantage in enumerate(ADVANTAGES):
         for at, own in enumerate(MASK[row]):
@@ -126,7 +128,7 @@ def test_gradient_raises_good_plans_and_lowers_bad_ones(kind, ratio):
 
 def test_ratio_beyond_the_clip_gives_no_more_gradient():
     far = terms(new=[[0.9, 0.9]] * 4, reference=None, advantages=torch.ones(4, dtype=torch.float64))
-    loss, metrics = surrogate_loss(far, Objective(), SCALE)
+    loss, metrics = surrogate_loss(far, objective(), SCALE)
     loss.backward()
     assert far.logprobs.grad.abs().max() == 0
     assert metrics.clip_fraction == 1
@@ -136,14 +138,16 @@ def test_lost_rows_move_nothing():
     mask = torch.tensor(MASK)
     mask[2] = False
     part = terms(mask=mask)
-    loss, _ = surrogate_loss(part, Objective(LossKind.PAPER, RatioLevel.SEQUENCE, kl_coef=0.1), SCALE)
+    loss, _ = surrogate_loss(
+        part, objective(loss=LossKind.PAPER, ratio=RatioLevel.SEQUENCE, kl_coef=0.1), SCALE
+    )
     loss.backward()
     assert part.logprobs.grad[2].abs().max() == 0
 
 
 def test_kl_pulls_towards_the_reference():
     part = terms(new=OLD, advantages=torch.zeros(4, dtype=torch.float64))
-    loss, metrics = surrogate_loss(part, Objective(kl_coef=1.0), SCALE)
+    loss, metrics = surrogate_loss(part, objective(kl_coef=1.0), SCALE)
     loss.backward()
     own = torch.tensor(MASK)
     wanted = torch.sign(torch.tensor(REFERENCE) - torch.tensor(OLD))[own]
@@ -178,5 +182,5 @@ def test_a_lost_rollout_changes_nothing_for_the_others(rewards, place):
 @pytest.mark.parametrize("rewards", [[31.5] * 4, [LOST] * 4, [LOST, LOST, 0.5, LOST]])
 def test_groups_without_signal_are_dead(rewards):
     result = group_advantages(torch.tensor([rewards]))
-    assert result.dead.tolist() == [True]
+    assert result.zero_variance.tolist() == [True]
     assert result.values.abs().max() == 0

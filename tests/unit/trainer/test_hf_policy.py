@@ -14,22 +14,21 @@ from tests.fakes.small_llama import random_llama, word_tokenizer
 from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 
 from embomatrix.skills.prompt import Codec, prompt_for
+from embomatrix.trainer.cluster.gateway import Gateway
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, LoraSettings, read_settings
+from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.evaluation.models import load_model
-from embomatrix.trainer.grpo.rollout import Gateway
-from embomatrix.trainer.imitation.augment import Variation
-from embomatrix.trainer.logging.progress import LineDisplay
+from embomatrix.trainer.lifecycle.checkpoint import CheckpointStore, TrainingProgress
+from embomatrix.trainer.logging.display import LineDisplay
 from embomatrix.trainer.logging.recorder import read_metrics
-from embomatrix.trainer.policy.choice import saved_policy
+from embomatrix.trainer.policy.compute_dtype import use_compute_dtype
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.import_gguf import import_gguf
-from embomatrix.trainer.policy.lora import LoraShape
-from embomatrix.trainer.policy.products import multiply_in
-from embomatrix.trainer.policy.prompts import Teller
-from embomatrix.trainer.run.checkpoint import CheckpointStore, TrainingProgress
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.loop import Parts, TrainingRun
-from embomatrix.trainer.run.settings import LANGUAGE_MODEL_DEFAULTS, read_settings
-from embomatrix.trainer.run.starting import usual_threads
+from embomatrix.trainer.policy.loading import saved_policy
+from embomatrix.trainer.policy.prompts import PromptBuilder
+from embomatrix.trainer.run.loop import RunComponents, TrainingRun
+from embomatrix.trainer.run.starting import default_threads
 
 TASKS = make_tasks(6, 2, objects=8)
 
@@ -82,7 +81,7 @@ def test_sharing_the_prompt_keeps_the_gradient(policy):
 def half(policy, tokenizer):
     """The same weights, multiplied in half the bits."""
     model = copy.deepcopy(policy.module)
-    multiply_in(model, torch.bfloat16, model.get_output_embeddings())
+    use_compute_dtype(model, torch.bfloat16, model.get_output_embeddings())
     return HfPolicy(model, tokenizer, Codec.LINES, "random llama")
 
 
@@ -107,31 +106,31 @@ def test_a_model_that_multiplies_in_half_the_bits_shows_what_it_learnt_and_is_sa
     after = half.sample(told, 2, 0.0, 6, torch.Generator()).texts
     assert after != before
     half.save(tmp_path)
-    back = saved_policy(tmp_path, read_settings(None, {"products": "float32"}))
+    back = saved_policy(tmp_path, read_settings(None, {"compute_dtype": "float32"}))
     ours, theirs = half.module.state_dict(), back.module.state_dict()
     assert list(ours) == list(theirs)
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
 
 
-@pytest.mark.parametrize(("able", "products"), [(True, torch.bfloat16), (False, None)])
+@pytest.mark.parametrize(("able", "compute_dtype"), [(True, torch.bfloat16), (False, None)])
 def test_layers_but_not_the_head_multiply_in_half_the_bits_where_the_processor_can(
-    policy, tmp_path, monkeypatch, able, products
+    policy, tmp_path, monkeypatch, able, compute_dtype
 ):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": able})
     policy.save(tmp_path)
     model = saved_policy(tmp_path, read_settings(None, {})).module
-    assert getattr(model.model.layers[0].mlp.down_proj, "products", None) is products
-    assert not hasattr(model.get_output_embeddings(), "products")
+    assert getattr(model.model.layers[0].mlp.down_proj, "compute_dtype", None) is compute_dtype
+    assert not hasattr(model.get_output_embeddings(), "compute_dtype")
 
 
 def test_adapters_learn_beside_products_of_half_the_bits(half, tmp_path):
-    half.adapt(LoraShape(2, 4.0), seed=0)
+    half.adapt(LoraSettings(rank=2, alpha=4.0), seed=0)
     told = prompts(half)
     samples = half.sample(told, 2, 1.0, 6, torch.Generator().manual_seed(0))
     half.logprobs(told, samples.tokens, samples.mask, 2, 1.0).logprobs.sum().backward()
     assert all(parameter.grad is not None for parameter in half.parameters())
     half.save(tmp_path)
-    back = saved_policy(tmp_path, read_settings(None, {"products": "float32"}))
+    back = saved_policy(tmp_path, read_settings(None, {"compute_dtype": "float32"}))
     assert back.module.model.layers[0].mlp.down_proj.weight.dtype is torch.float32
 
 
@@ -154,18 +153,18 @@ def test_a_model_whose_weights_are_damaged_is_one_sentence(policy, tmp_path):
 def test_a_model_that_finds_no_room_leaves_the_checkpoint_before_it_whole(policy, tmp_path, small_files):
     settings = read_settings(None, {})
     store = CheckpointStore(tmp_path, keep=3)
-    before = store.save(policy, {}, TrainingProgress(step=1, prepared=True), settings)
+    before = store.save(policy, {}, TrainingProgress(step=1, grpo_ready=True), settings)
     with (
         small_files(10_000),
-        pytest.raises(TrainerError, match=r"step-000002 can't be written .*--resume goes on"),
+        pytest.raises(TrainerError, match=r"step-000002 can't be written .*--resume continues"),
     ):
-        store.save(policy, {}, TrainingProgress(step=2, prepared=True), settings)
+        store.save(policy, {}, TrainingProgress(step=2, grpo_ready=True), settings)
     assert [path.name for path in tmp_path.iterdir()] == ["step-000001"]
     assert torch.equal(weights(saved_policy(before / "policy", settings)), weights(policy))
 
 
 def test_a_model_that_is_nowhere_is_one_sentence(tmp_path):
-    with pytest.raises(TrainerError, match=r"is no folder here.*pass `tiny`"):
+    with pytest.raises(TrainerError, match=r"is not a folder.*pass `tiny`"):
         HfPolicy.load(tmp_path / "nothing", Codec.LINES)
 
 
@@ -180,10 +179,12 @@ def train(policy, out, **changes):
     settings = read_settings(
         None, {k.replace("__", "."): v for k, v in changes.items()}, LANGUAGE_MODEL_DEFAULTS
     )
-    teller = Teller(policy, settings.prompt.rows, Variation(TASKS.kinds, 0.0, 0.5))
+    prompt_builder = PromptBuilder(policy, settings.prompt.rows, Variation(TASKS.kinds, 0.0, 0.5))
     display = LineDisplay(Console(quiet=True))
     with Gateway(lambda: SymbolicCluster(TASKS), TASKS.bundle_bytes, run_name="hf", run_seed=0) as gateway:
-        return TrainingRun(Parts(policy, teller, TASKS, gateway, display), settings, out).run()
+        return TrainingRun(
+            RunComponents(policy, prompt_builder, TASKS, gateway, display), settings, out
+        ).run()
 
 
 def weights(policy):
@@ -231,7 +232,7 @@ def smollm2(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_smollm2_takes_real_grpo_steps(smollm2, tmp_path):
-    torch.set_num_threads(usual_threads())
+    torch.set_num_threads(default_threads())
     policy = HfPolicy.load(smollm2, Codec.LINES)
     before = weights(policy)
     summary = train(
@@ -248,7 +249,7 @@ def test_smollm2_takes_real_grpo_steps(smollm2, tmp_path):
     )
     rows = read_metrics(tmp_path)
     assert [row["step"] for row in rows] == [1, 2, 3]
-    learnt = [row for row in rows if row["dead_groups"] < 1]
+    learnt = [row for row in rows if row["zero_variance_groups"] < 1]
     assert learnt
     assert all(math.isfinite(row[name]) for row in learnt for name in ("gradient_norm", "kl", "reward"))
     assert summary.rollouts == 18
@@ -267,9 +268,7 @@ def test_without_transformers_a_folder_that_is_not_there_is_told_first(tmp_path,
     (tmp_path / "tokenizer.json").write_text("{}")
     with pytest.raises(TrainerError, match=rf"the model '{tmp_path}' needs transformers: `pip install"):
         HfPolicy.load(tmp_path, Codec.LINES)
-    with pytest.raises(
-        TrainerError, match="'runs/nowhere' is no folder here, and one by a Hugging Face name needs"
-    ):
+    with pytest.raises(TrainerError, match="'runs/nowhere' is not a folder, and a Hugging Face model needs"):
         HfPolicy.load("runs/nowhere", Codec.LINES)
 
 

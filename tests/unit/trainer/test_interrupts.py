@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from embomatrix.trainer.run.interrupts import Interrupts
+from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
 
 
 def interrupt():
@@ -16,8 +16,8 @@ def test_one_interrupt_comes_at_the_end_and_a_second_one_at_once(times, is_whole
     done = []
 
     def whole():
-        with Interrupts() as interrupts:
-            interrupts.put_off()
+        with DeferredInterrupts() as interrupts:
+            interrupts.defer()
             for _ in range(times):
                 interrupt()
             done.append(True)
@@ -29,17 +29,17 @@ def test_one_interrupt_comes_at_the_end_and_a_second_one_at_once(times, is_whole
 
 def test_nothing_is_put_off_before_it_is_said_nor_afterwards():
     before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt), Interrupts():
+    with pytest.raises(KeyboardInterrupt), DeferredInterrupts():
         interrupt()
-    with Interrupts() as interrupts:
-        interrupts.put_off()
+    with DeferredInterrupts() as interrupts:
+        interrupts.defer()
     assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_an_error_that_ends_the_whole_is_not_hidden_by_an_interrupt():
     def spoilt():
-        with Interrupts() as interrupts:
-            interrupts.put_off()
+        with DeferredInterrupts() as interrupts:
+            interrupts.defer()
             interrupt()
             raise ValueError("spoilt")
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.utils.data import BatchSampler, DataLoader, RandomSampler, TensorDataset
 
-from embomatrix.trainer.grpo.lookahead import Lookahead
+from embomatrix.trainer.data.lookahead import Lookahead
 
 
 @given(st.lists(st.integers(), max_size=20), st.integers(0, 25))

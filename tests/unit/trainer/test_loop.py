@@ -10,20 +10,20 @@ import torch
 from rich.console import Console
 from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 
-from embomatrix.trainer.grpo.rollout import Gateway
+from embomatrix.trainer.cluster.gateway import Gateway
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import OnLost, read_settings
+from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.grpo.update import Updater
-from embomatrix.trainer.imitation.augment import Variation
-from embomatrix.trainer.logging.progress import LineDisplay, LiveDisplay
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, read_state
+from embomatrix.trainer.lifecycle.stopwatch import Activity
+from embomatrix.trainer.logging.display import LineDisplay, LiveDisplay
+from embomatrix.trainer.logging.outcome import read_outcome
 from embomatrix.trainer.logging.recorder import read_metrics
 from embomatrix.trainer.logging.report import success_rows, time_rows
-from embomatrix.trainer.policy.choice import new_policy, saved_policy
-from embomatrix.trainer.policy.prompts import Teller
-from embomatrix.trainer.run.checkpoint import CHECKPOINTS, CheckpointStore, read_state
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.loop import REFERENCE, Parts, TrainingRun
-from embomatrix.trainer.run.outcome import read_outcome
-from embomatrix.trainer.run.settings import OnLost, read_settings
-from embomatrix.trainer.run.stopwatch import Activity
+from embomatrix.trainer.policy.loading import new_policy, saved_policy
+from embomatrix.trainer.policy.prompts import PromptBuilder
+from embomatrix.trainer.run.loop import REFERENCE, RunComponents, TrainingRun
 
 TINY = {"tiny.layers": 2, "tiny.width": 32, "tiny.heads": 2, "tiny.inner": 64}
 SHORT = {
@@ -53,13 +53,13 @@ def run(out, cluster=None, tasks=TASKS, resume=False, display=None, **changes):
         progress, settings = read_state(newest)
         policy = saved_policy(newest / "policy", settings)
         reference = saved_policy(out / REFERENCE, settings).frozen_copy()
-    teller = Teller(policy, settings.prompt.rows, Variation(tasks.kinds, 0.5, 0.5))
+    prompt_builder = PromptBuilder(policy, settings.prompt.rows, Variation(tasks.kinds, 0.5, 0.5))
     display = display or LineDisplay(Console(quiet=True))
     with (
         Gateway(lambda: cluster, tasks.bundle_bytes, run_name="test", run_seed=0) as gateway,
         display,
     ):
-        parts = Parts(policy, teller, tasks, gateway, display, reference)
+        parts = RunComponents(policy, prompt_builder, tasks, gateway, display, reference)
         return TrainingRun(parts, settings, out, progress).run(), policy
 
 
@@ -210,7 +210,7 @@ def test_damaged_checkpoints_are_named(tmp_path):
     run(tmp_path)
     newest = CheckpointStore(tmp_path / CHECKPOINTS, keep=9).latest()
     (newest / "state.json").write_text("{}")
-    with pytest.raises(TrainerError, match="no readable checkpoint"):
+    with pytest.raises(TrainerError, match="not a readable checkpoint"):
         read_state(newest)
     (newest / "policy" / "weights.pt").write_bytes(b"rubbish")
     with pytest.raises(TrainerError, match=r"damaged|no policy"):

@@ -9,23 +9,28 @@ from tests.fakes.small_llama import random_llama, word_tokenizer
 from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 
 from embomatrix.skills.prompt import Codec, prompt_for
+from embomatrix.trainer.cluster.gateway import Gateway
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import (
+    LANGUAGE_MODEL_DEFAULTS,
+    ComputeDtype,
+    LoraSettings,
+    read_settings,
+)
+from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.evaluation.models import load_model
-from embomatrix.trainer.grpo.rollout import Gateway
-from embomatrix.trainer.imitation.augment import Variation
-from embomatrix.trainer.logging.progress import LineDisplay
-from embomatrix.trainer.policy.choice import new_policy, saved_policy
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, read_state
+from embomatrix.trainer.logging.display import LineDisplay
 from embomatrix.trainer.policy.hf import HfPolicy
-from embomatrix.trainer.policy.lora import LoraShape, adapters
-from embomatrix.trainer.policy.prompts import Teller
-from embomatrix.trainer.run.checkpoint import CHECKPOINTS, CheckpointStore, read_state
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.loop import REFERENCE, Parts, TrainingRun
-from embomatrix.trainer.run.settings import LANGUAGE_MODEL_DEFAULTS, Products, read_settings
+from embomatrix.trainer.policy.loading import new_policy, saved_policy
+from embomatrix.trainer.policy.lora import ADAPTERS
+from embomatrix.trainer.policy.prompts import PromptBuilder
+from embomatrix.trainer.run.loop import REFERENCE, RunComponents, TrainingRun
 
 TASKS = make_tasks(6, 2, objects=8)
-SHAPE = LoraShape(rank=4, alpha=8.0)
+SHAPE = LoraSettings(rank=4, alpha=8.0)
 SHORT = {
-    "products": "float32",
+    "compute_dtype": "float32",
     "lora.rank": 4,
     "lora.alpha": 8.0,
     "imitation.steps": 2,
@@ -56,16 +61,25 @@ def model_folder(tokenizer, tmp_path_factory):
 
 def policy_of(tokenizer, *, seed=0, recompute=False):
     return HfPolicy(
-        random_llama(tokenizer, seed), tokenizer, Codec.LINES, "random llama", recompute=recompute
+        random_llama(tokenizer, seed),
+        tokenizer,
+        Codec.LINES,
+        "random llama",
+        gradient_checkpointing=recompute,
     )
+
+
+def adapters(module):
+    """Adapted layers by name."""
+    return {name: layer for name, layer in module.named_modules() if hasattr(layer, "lora_B")}
 
 
 def moved(policy):
     """Give the adapters something to say."""
     with torch.no_grad():
         for at, layer in enumerate(adapters(policy.module).values()):
-            drawn = torch.randn(layer.up.shape, generator=torch.Generator().manual_seed(at))
-            layer.up.copy_(0.3 * drawn)
+            up = layer.lora_B["default"].weight
+            up.copy_(0.3 * torch.randn(up.shape, generator=torch.Generator().manual_seed(at)))
     return policy
 
 
@@ -89,10 +103,10 @@ def train(out, changes, *, resume=False):
         reference = saved_policy(out / REFERENCE, settings).frozen_copy()
     else:
         policy = new_policy(settings, TASKS)
-    teller = Teller(policy, settings.prompt.rows, Variation(TASKS.kinds, 0.0, 0.5))
+    prompt_builder = PromptBuilder(policy, settings.prompt.rows, Variation(TASKS.kinds, 0.0, 0.5))
     display = LineDisplay(Console(quiet=True))
     with Gateway(lambda: SymbolicCluster(TASKS), TASKS.bundle_bytes, run_name="lora", run_seed=0) as gateway:
-        parts = Parts(policy, teller, TASKS, gateway, display, reference)
+        parts = RunComponents(policy, prompt_builder, TASKS, gateway, display, reference)
         summary = TrainingRun(parts, settings, out, progress).run()
     return policy, summary
 
@@ -115,7 +129,7 @@ def test_adapters_alone_learn_and_the_output_layer_has_none(tokenizer):
     scored(policy).logprobs.sum().backward()
     names = {name for name, each in policy.module.named_parameters() if each.grad is not None}
     assert names
-    assert all(name.endswith((".up", ".down")) for name in names)
+    assert all("lora_A" in name or "lora_B" in name for name in names)
     assert len(list(policy.parameters())) == 2 * 7 * 2  # seven linear layers in each of two blocks
     assert not any("lm_head" in name for name in adapters(policy.module))
 
@@ -129,7 +143,9 @@ def test_the_merged_model_says_what_the_adapted_one_says(tokenizer, tmp_path):
     assert torch.equal(scored(policy).logprobs, expected)  # saving leaves the adapters where they are
     assert not torch.allclose(before, expected, atol=1e-2)
     assert torch.allclose(
-        scored(HfPolicy.load(tmp_path, Codec.LINES, products=Products.FLOAT32)).logprobs, expected, atol=1e-4
+        scored(HfPolicy.load(tmp_path, Codec.LINES, compute_dtype=ComputeDtype.FLOAT32)).logprobs,
+        expected,
+        atol=1e-4,
     )
 
 
@@ -141,7 +157,7 @@ def test_a_frozen_copy_shares_the_model_and_not_the_adapters(tokenizer):
     moved(policy)
     assert torch.equal(scored(twin).logprobs, before)
     for name, layer in adapters(policy.module).items():
-        assert adapters(twin.module)[name].inner.weight is layer.inner.weight
+        assert adapters(twin.module)[name].base_layer.weight is layer.base_layer.weight
     assert not any(parameter.requires_grad for parameter in twin.module.parameters())
 
 
@@ -154,7 +170,7 @@ def test_four_steps_with_adapters_are_two_and_two_after_a_resume(model_folder, t
     assert learnt(whole).abs().sum() > 0
     frozen = adapters(whole.module)
     for name, layer in adapters(new_policy(settings_of(model_folder), TASKS).module).items():
-        assert torch.equal(layer.inner.weight, frozen[name].inner.weight)
+        assert torch.equal(layer.base_layer.weight, frozen[name].base_layer.weight)
     loaded = load_model(str(summary.checkpoint), Codec.LINES, threads=1, device="cpu").policy
     assert not adapters(loaded.module)
     assert torch.allclose(scored(loaded).logprobs, scored(whole).logprobs, atol=1e-4)
@@ -179,15 +195,15 @@ def test_adapters_of_another_model_or_shape_are_refused(tokenizer, tmp_path):
     with pytest.raises(TrainerError, match="belong to another model"):
         other.adapt(SHAPE, seed=0, saved=tmp_path)
     with pytest.raises(TrainerError, match="resume with the settings of the run"):
-        policy_of(tokenizer).adapt(LoraShape(rank=2, alpha=8.0), seed=0, saved=tmp_path)
-    (tmp_path / "lora.pt").write_bytes(b"rubbish")
+        policy_of(tokenizer).adapt(LoraSettings(rank=2, alpha=8.0), seed=0, saved=tmp_path)
+    (tmp_path / ADAPTERS / "adapter_model.safetensors").write_bytes(b"rubbish")
     with pytest.raises(TrainerError, match="are damaged"):
         policy_of(tokenizer).adapt(SHAPE, seed=0, saved=tmp_path)
 
 
 def test_layers_that_a_model_has_not_are_named(tokenizer):
-    with pytest.raises(TrainerError, match=r"no linear layer called query.*such as q_proj"):
-        policy_of(tokenizer).adapt(LoraShape(4, 8.0, ("query",)), seed=0)
+    with pytest.raises(TrainerError, match=r"no linear layer named query.*such as q_proj"):
+        policy_of(tokenizer).adapt(LoraSettings(rank=4, alpha=8.0, targets=("query",)), seed=0)
 
 
 @pytest.mark.parametrize("changes", [{"lora.rank": 4}, {"gradient_checkpointing": True}])

@@ -10,18 +10,18 @@ from tests.fakes.symbolic_household import make_tasks
 
 from embomatrix.skills.prompt import Codec, PromptRow, plan_in_names, prompt_for
 from embomatrix.skills.syntax import PROFILES
-from embomatrix.trainer.grpo.rollout import parsed
+from embomatrix.trainer.cluster.gateway import parse_policy_text
 from embomatrix.trainer.policy.decoder import DecoderShape
 from embomatrix.trainer.policy.grammar import PlanGrammar
 from embomatrix.trainer.policy.tiny import TinyPolicy
-from embomatrix.trainer.policy.words import END, build_vocabulary
+from embomatrix.trainer.policy.vocabulary import END, build_vocabulary
 from embomatrix.world.task import Profile
 
 TASKS = make_tasks(12, 3)
 
 
 def twins(situation):
-    """A situation with two more things of one category, so that names need numbers."""
+    """A situation with two more object_tokens of one category, so that names need numbers."""
     first = situation.rows[0]
     more = [PromptRow(100 + at, f"{first.category}_{at}", first.category, first.room) for at in (7, 3)]
     return replace(situation, rows=(*situation.rows[1:], *more), table_size=102)
@@ -46,12 +46,12 @@ def prompt_of(situation):
 
 def next_words(situation, written):
     """Words that may follow what is written, in its prompt."""
-    names = GRAMMAR.names(torch.tensor([prompt_of(situation)]))
-    cursor = GRAMMAR.start(1)
+    names = GRAMMAR.prompt_names(torch.tensor([prompt_of(situation)]))
+    state = GRAMMAR.start(1)
     for token in WORDS.encode(written):
-        cursor = GRAMMAR.advanced(cursor, torch.tensor([token]))
-    barred = GRAMMAR.barred(cursor, names)[0]
-    return {WORDS.words[token] for token in (~barred).nonzero()[:, 0].tolist()}
+        state = GRAMMAR.advance(state, torch.tensor([token]))
+    token_mask = GRAMMAR.token_mask(state, names)[0]
+    return {WORDS.words[token] for token in (~token_mask).nonzero()[:, 0].tolist()}
 
 
 @pytest.mark.parametrize("task", TASKS.train, ids=lambda task: task.task.task_id)
@@ -63,7 +63,7 @@ def test_a_policy_that_knows_nothing_still_writes_plans_that_call_what_is_told(t
     assert sum(ended) >= 20
     told = {row.index for row in task.situation.rows}
     for text in (text for text, whole in zip(samples.texts, ended, strict=True) if whole):
-        for call in parsed(text, replace(task.situation, profile=Profile.HOUSEHOLD), Codec.NAMES):
+        for call in parse_policy_text(text, replace(task.situation, profile=Profile.HOUSEHOLD), Codec.NAMES):
             assert {call.object_index, call.source_index} - {None} <= told
             assert call.room_name is None or call.room_name in task.situation.rooms
 
@@ -73,9 +73,11 @@ def test_a_room_that_instructions_call_by_its_number_can_still_be_gone_to():
     room = situation.rooms[0]
     words = build_vocabulary([situation], [f"Put the apple away in {room}."] * 3)
     grammar = PlanGrammar(words, torch.device("cpu"))
-    names = grammar.names(torch.tensor([words.encode(prompt_for(situation, Codec.NAMES).user)]))
-    cursor = grammar.advanced(grammar.start(1), torch.tensor([words.index["go_to_room"]]))
-    allowed = {words.words[token] for token in (~grammar.barred(cursor, names)[0]).nonzero()[:, 0].tolist()}
+    names = grammar.prompt_names(torch.tensor([words.encode(prompt_for(situation, Codec.NAMES).user)]))
+    state = grammar.advance(grammar.start(1), torch.tensor([words.index["go_to_room"]]))
+    allowed = {
+        words.words[token] for token in (~grammar.token_mask(state, names)[0]).nonzero()[:, 0].tolist()
+    }
     assert allowed == {room.rpartition("_")[0] for room in situation.rooms}
 
 
@@ -83,11 +85,11 @@ def test_a_room_that_instructions_call_by_its_number_can_still_be_gone_to():
 def test_no_word_of_an_oracle_s_plan_is_barred(task):
     text = plan_in_names(task.oracle, task.situation)
     tokens = torch.tensor([POLICY.encode_plan(text)])
-    names = GRAMMAR.names(torch.tensor([prompt_of(task.situation)]))
-    cursor = GRAMMAR.start(1)
+    names = GRAMMAR.prompt_names(torch.tensor([prompt_of(task.situation)]))
+    state = GRAMMAR.start(1)
     for token in tokens[0]:
-        assert not GRAMMAR.barred(cursor, names)[0, token]
-        cursor = GRAMMAR.advanced(cursor, token[None])
+        assert not GRAMMAR.token_mask(state, names)[0, token]
+        state = GRAMMAR.advance(state, token[None])
 
 
 def test_every_skill_may_begin_a_call_and_nothing_else():

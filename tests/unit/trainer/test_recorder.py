@@ -4,9 +4,9 @@ import json
 
 import pytest
 
+from embomatrix.trainer.config.errors import TrainerError, reason_of
+from embomatrix.trainer.lifecycle.checkpoint import atomic_folder
 from embomatrix.trainer.logging.recorder import METRICS, SAMPLES, Recorder, read_metrics
-from embomatrix.trainer.run.checkpoint import whole_folder
-from embomatrix.trainer.run.errors import TrainerError, reason_of
 
 
 def test_steps_after_the_checkpoint_and_half_lines_are_forgotten(tmp_path):
@@ -19,17 +19,17 @@ def test_steps_after_the_checkpoint_and_half_lines_are_forgotten(tmp_path):
 
 
 def test_folder_appears_when_it_is_filled(tmp_path):
-    with whole_folder(tmp_path / "final") as partial:
+    with atomic_folder(tmp_path / "final") as partial:
         (partial / "a").write_text("1")
         assert not (tmp_path / "final").exists()
     assert [path.name for path in tmp_path.iterdir()] == ["final"]
 
 
 def test_folder_that_could_not_be_filled_leaves_what_was_there(tmp_path):
-    with whole_folder(tmp_path / "final") as partial:
+    with atomic_folder(tmp_path / "final") as partial:
         (partial / "a").write_text("1")
     told = pytest.raises(TrainerError, match=r"final can't be written \(no room\)")
-    with told, whole_folder(tmp_path / "final"):
+    with told, atomic_folder(tmp_path / "final"):
         raise RuntimeError("no room. And then an essay.\nWith a trace.")
     assert (tmp_path / "final" / "a").read_text() == "1"
     assert [path.name for path in tmp_path.iterdir()] == ["final"]

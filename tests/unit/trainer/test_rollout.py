@@ -10,9 +10,9 @@ from embomatrix.reward.settings import RewardSettings
 from embomatrix.rpc.status import DeadlineError, ManagerUnreachableError, UnavailableError
 from embomatrix.rpc.wire.values import RunTerms
 from embomatrix.skills.prompt import Codec, plan_in_names
-from embomatrix.trainer.grpo.rollout import Gateway, waited
-from embomatrix.trainer.run.data import Schedule, group_seed
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.cluster.gateway import Gateway, result_of
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.data.tasks import Schedule, group_seed
 
 TASKS = make_tasks(6, 2)
 TASK = TASKS.train[0]
@@ -25,7 +25,7 @@ def gateway(cluster, **options):
 
 def outcomes(cluster, *texts, **options):
     with gateway(cluster, **options) as gate:
-        return waited(gate.submit("b", 1, TASK, TASK.situation, texts, Codec.NAMES))
+        return result_of(gate.submit("b", 1, TASK, TASK.situation, texts, Codec.NAMES))
 
 
 def until(condition, seconds=10.0):
@@ -72,7 +72,7 @@ def test_a_bundle_is_sent_once_and_before_its_first_rollout():
     with gateway(cluster) as gate:
         gate.announce({1: TASKS.train[:2], 2: TASKS.train[2:4]}, 8)
         futures = [gate.submit(f"b{at}", 1, TASK, TASK.situation, [ORACLE], Codec.NAMES) for at in range(3)]
-        assert all(waited(future)[0].success for future in futures)
+        assert all(result_of(future)[0].success for future in futures)
         until(lambda: cluster.announced)
     assert cluster.sent == {task.bundle_digest for task in (*TASKS.train[:4], TASK)}
     assert cluster.announced == [(1, [1, 1, 2, 2])]

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.fakes.symbolic_household import make_tasks
 
-from embomatrix.trainer.run.data import Curriculum, Schedule
+from embomatrix.trainer.data.tasks import Curriculum, Schedule
 
 TASKS = make_tasks(12, 0, objects=10).train
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.settings import read_settings
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import read_settings
 
 
 def test_file_stands_above_defaults_and_below_options(tmp_path):
@@ -18,17 +18,17 @@ def test_file_stands_above_defaults_and_below_options(tmp_path):
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        ("speed = 3", r"there is no setting 'speed': mend its name"),
-        ("[grpo]\nspeed = 3", r"there is no setting 'grpo\.speed'"),
+        ("speed = 3", r"unknown setting 'speed': correct its name"),
+        ("[grpo]\nspeed = 3", r"unknown setting 'grpo\.speed'"),
         (
             "[grpo]\ngroup = 1",
             r"setting 'grpo\.group': input should be greater than or equal to 2 \(found 1\)",
         ),
-        ("[reward]\ngaol = 3", r"there is no setting 'reward\.gaol': mend its name"),
+        ("[reward]\ngaol = 3", r"unknown setting 'reward\.gaol': correct its name"),
         ("[reward]\ngoal = -3", r"setting 'reward': .*goal is -3: a tier pays 0 or more"),
         ("[reward]\ngoal = 'much'", r"setting 'reward\.goal': input should be a valid number"),
         ("grpo = 3", r"setting 'grpo': expected a table of settings \(found 3\)"),
-        ("[grpo", r"settings\.toml is no TOML"),
+        ("[grpo", r"settings\.toml is not valid TOML"),
     ],
 )
 def test_wrong_settings_are_named(tmp_path, content, sentence):

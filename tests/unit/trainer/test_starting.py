@@ -8,12 +8,12 @@ from tests.fakes.datasets import write_kitchen_dataset
 from tests.fakes.small_llama import random_llama, word_tokenizer
 
 from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.data.tasks import load_tasks
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.run import starting
-from embomatrix.trainer.run.checkpoint import CHECKPOINTS, CheckpointStore, read_state
-from embomatrix.trainer.run.data import load_tasks
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.starting import resumed, started
+from embomatrix.trainer.run.starting import resume_run, start_run
 
 SMALL = {"tiny.layers": 1, "tiny.width": 16, "tiny.heads": 2, "tiny.inner": 16, "threads": 1}
 
@@ -25,11 +25,11 @@ def kitchen(tmp_path_factory):
 
 @pytest.fixture
 def begun(kitchen, tmp_path):
-    """Saves the checkpoint of a run that took one step of imitation, and of GRPO once it is ``prepared``."""
+    """Saves the checkpoint of a run that took one step of imitation, and of GRPO once it is ``grpo_ready``."""
 
-    def begin(*, prepared=False):
-        start = started(kitchen, tmp_path, "tiny", None, SMALL)
-        start.progress.prepared = prepared
+    def begin(*, grpo_ready=False):
+        start = start_run(kitchen, tmp_path, "tiny", None, SMALL)
+        start.progress.grpo_ready = grpo_ready
         start.progress.imitation.step = start.progress.step = 1
         store = CheckpointStore(tmp_path / CHECKPOINTS, keep=1)
         return store.save(start.policy, {}, start.progress, start.settings)
@@ -39,8 +39,8 @@ def begun(kitchen, tmp_path):
 
 @pytest.mark.parametrize("changes", [{"grpo.steps": 9, "threads": 1}, {"seed": 0}, {"seed": None}])
 def test_a_run_goes_on_for_longer_and_with_what_it_began_with(kitchen, tmp_path, begun, changes):
-    begun(prepared=True)
-    start = resumed(kitchen, tmp_path, changes)
+    begun(grpo_ready=True)
+    start = resume_run(kitchen, tmp_path, changes)
     assert start.progress.step == 1
     assert start.settings.grpo.steps == changes.get("grpo.steps")
 
@@ -52,27 +52,32 @@ def test_a_run_goes_on_for_longer_and_with_what_it_began_with(kitchen, tmp_path,
             {"seed": 7},
             "tiny",
             "",
-            "begun with seed = 0, and is to go on with 7: leave that out, or begin a new",
+            "started with seed = 0, and can't be resumed with 7: leave that out, or start a new",
         ),
-        ({}, "runs/other", "", "begun with model = 'tiny', and is to go on with 'runs/other'"),
-        ({"reward.goal": "10"}, "tiny", "", r"begun with reward\.goal = 30\.0, and is to go on with 10\.0"),
-        ({}, "tiny", "[grpo]\ngroup = 4\n", r"begun with grpo\.group = 8, and is to go on with 4"),
-        ({}, "tiny", "[grpo]\ngruop = 4\n", r"there is no setting 'grpo\.gruop'"),
+        ({}, "runs/other", "", "started with model = 'tiny', and can't be resumed with 'runs/other'"),
+        (
+            {"reward.goal": "10"},
+            "tiny",
+            "",
+            r"started with reward\.goal = 30\.0, and can't be resumed with 10\.0",
+        ),
+        ({}, "tiny", "[grpo]\ngroup = 4\n", r"started with grpo\.group = 8, and can't be resumed with 4"),
+        ({}, "tiny", "[grpo]\ngruop = 4\n", r"unknown setting 'grpo\.gruop'"),
     ],
 )
 def test_a_run_does_not_go_on_with_other_settings(kitchen, tmp_path, begun, changes, model, written, told):
-    begun(prepared=True)
+    begun(grpo_ready=True)
     file = tmp_path / "settings.toml"
     file.write_text(written)
     with pytest.raises(TrainerError, match=told):
-        resumed(kitchen, tmp_path, changes, model=model, settings_file=file)
+        resume_run(kitchen, tmp_path, changes, model=model, settings_file=file)
 
 
 def test_until_imitation_ends_what_comes_after_it_may_change(kitchen, tmp_path, begun):
     begun()
-    assert resumed(kitchen, tmp_path, {"reward.goal": "10"}).settings.reward.goal == 10.0
-    with pytest.raises(TrainerError, match=r"begun with imitation\.patience = 0"):
-        resumed(kitchen, tmp_path, {"imitation.patience": 3})
+    assert resume_run(kitchen, tmp_path, {"reward.goal": "10"}).settings.reward.goal == 10.0
+    with pytest.raises(TrainerError, match=r"started with imitation\.patience = 0"):
+        resume_run(kitchen, tmp_path, {"imitation.patience": 3})
 
 
 def test_a_run_does_not_go_on_with_other_tasks(kitchen, tmp_path, begun):
@@ -81,63 +86,53 @@ def test_a_run_does_not_go_on_with_other_tasks(kitchen, tmp_path, begun):
     tasks = (other / "tasks.jsonl").read_text().splitlines(keepends=True)
     (other / "tasks.jsonl").write_text("".join(tasks[:-1]))
     with pytest.raises(
-        TrainerError, match=r"begun with other tasks than those of .*other: pass the --dataset"
+        TrainerError, match=r"started with other tasks than those of .*other: pass its original --dataset"
     ):
-        resumed(other, tmp_path, {})
+        resume_run(other, tmp_path, {})
 
 
 def test_a_checkpoint_of_another_version_is_told(kitchen, tmp_path, begun):
     state = begun() / "state.json"
     state.write_text(json.dumps({**json.loads(state.read_text()), "schema": 2}))
     with pytest.raises(TrainerError, match="has schema 2, this version reads 3: start a new run"):
-        resumed(kitchen, tmp_path, {})
+        resume_run(kitchen, tmp_path, {})
 
 
 def test_threads_and_processes_suit_the_model_unless_they_are_told(kitchen, tmp_path, monkeypatch):
     monkeypatch.setattr(starting, "usable_cores", lambda: 8)
     shape = {name: value for name, value in SMALL.items() if name != "threads"}
-    by_itself = started(kitchen, tmp_path / "itself", "tiny", None, shape).settings
+    by_itself = start_run(kitchen, tmp_path / "itself", "tiny", None, shape).settings
     assert (by_itself.threads, by_itself.processes) == (4, 2)
     written = tmp_path / "settings.toml"
     written.write_text("threads = 1\nprocesses = 3\n")
-    told = started(kitchen, tmp_path / "told", "tiny", written, {**shape, "threads": None}).settings
+    told = start_run(kitchen, tmp_path / "told", "tiny", written, {**shape, "threads": None}).settings
     assert (told.threads, told.processes) == (1, 3)
 
 
 def test_a_policy_on_another_device_has_one_process_unless_more_are_told(kitchen, tmp_path, monkeypatch):
     monkeypatch.setattr(starting, "usable_cores", lambda: 8)
-    assert started(kitchen, tmp_path, "tiny", None, {**SMALL, "device": "meta"}).settings.processes == 1
-
-
-def test_a_checkpoint_from_when_products_were_the_small_policys_alone_is_read(kitchen, tmp_path, begun):
-    folder = begun()
-    settings = read_state(folder)[1]
-    state = folder / "state.json"
-    told = json.loads(state.read_text())
-    told["settings"]["tiny"]["products"] = told["settings"].pop("products")
-    state.write_text(json.dumps(told))
-    assert resumed(kitchen, tmp_path, {}).settings == settings
+    assert start_run(kitchen, tmp_path, "tiny", None, {**SMALL, "device": "meta"}).settings.processes == 1
 
 
 def test_a_run_from_a_saved_policy_goes_on_with_that_policy_named_again(kitchen, tmp_path, begun):
     policy, arm = str(begun() / "policy"), tmp_path / "arm"
-    start = started(kitchen, arm, policy, None, SMALL)
-    start.progress.prepared = True
+    start = start_run(kitchen, arm, policy, None, SMALL)
+    start.progress.grpo_ready = True
     CheckpointStore(arm / CHECKPOINTS, keep=1).save(start.policy, {}, start.progress, start.settings)
-    assert resumed(kitchen, arm, {"imitation.seconds": 0.0}, model=policy).settings.model == policy
+    assert resume_run(kitchen, arm, {"imitation.seconds": 0.0}, model=policy).settings.model == policy
 
 
-@pytest.mark.parametrize(("able", "products"), [(True, torch.bfloat16), (False, torch.float32)])
+@pytest.mark.parametrize(("able", "compute_dtype"), [(True, torch.bfloat16), (False, torch.float32)])
 def test_the_small_policy_multiplies_in_half_the_bits_where_the_processor_has_instructions_for_it(
-    kitchen, tmp_path, monkeypatch, able, products
+    kitchen, tmp_path, monkeypatch, able, compute_dtype
 ):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": able})
     assert (
-        started(kitchen, tmp_path / "auto", "tiny", None, SMALL).policy.module.blocks[0].qkv.products
-        is products
+        start_run(kitchen, tmp_path / "auto", "tiny", None, SMALL).policy.module.blocks[0].qkv.compute_dtype
+        is compute_dtype
     )
-    whole = started(kitchen, tmp_path / "whole", "tiny", None, {**SMALL, "products": "float32"})
-    assert whole.policy.module.blocks[0].qkv.products is torch.float32
+    whole = start_run(kitchen, tmp_path / "whole", "tiny", None, {**SMALL, "compute_dtype": "float32"})
+    assert whole.policy.module.blocks[0].qkv.compute_dtype is torch.float32
 
 
 @pytest.mark.parametrize(("told", "codec"), [({}, Codec.JSON), ({"codec": "lines"}, Codec.LINES)])
@@ -147,5 +142,5 @@ def test_a_language_model_that_was_taught_here_goes_on_in_its_codec_unless_anoth
     pytest.importorskip("tokenizers")
     tokenizer = word_tokenizer(load_tasks(kitchen).train)
     HfPolicy(random_llama(tokenizer), tokenizer, Codec.JSON, "random llama").save(tmp_path / "taught")
-    start = started(kitchen, tmp_path / "run", str(tmp_path / "taught"), None, {**SMALL, **told})
+    start = start_run(kitchen, tmp_path / "run", str(tmp_path / "taught"), None, {**SMALL, **told})
     assert start.settings.codec is start.policy.codec is codec

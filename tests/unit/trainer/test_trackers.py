@@ -4,11 +4,11 @@ import importlib.util
 
 import pytest
 
-from embomatrix.trainer.imitation.imitate import ImitationProgress
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import read_settings
+from embomatrix.trainer.imitation.teacher_forcing import ImitationProgress
 from embomatrix.trainer.logging.recorder import Recorder, numbers_of
 from embomatrix.trainer.logging.trackers import trackers_of
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.settings import read_settings
 
 
 def test_tensorboard_draws_what_a_run_records(tmp_path):

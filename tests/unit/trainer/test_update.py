@@ -7,10 +7,10 @@ import torch
 from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 from tests.unit.trainer.test_loop import run, weights
 
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import Overlap
 from embomatrix.trainer.grpo.objective import LossKind
 from embomatrix.trainer.logging.recorder import read_metrics
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.settings import Overlap
 
 TASKS = make_tasks(10, 0, objects=10)
 
@@ -49,7 +49,7 @@ def test_a_step_in_which_no_group_has_a_signal_tells_no_mean_over_its_tokens(tmp
     before = trained(tmp_path / "none", grpo__steps=0)[1]
     _, policy = trained(tmp_path / "all", grpo__temperature=1e-4)  # all plans of a group are equal
     rows = read_metrics(tmp_path / "all")
-    assert [row["dead_groups"] for row in rows] == [1.0] * 4
+    assert [row["zero_variance_groups"] for row in rows] == [1.0] * 4
     assert [row[name] for row in rows for name in ("entropy", "kl", "kl_to_old", "clipped")] == [None] * 16
     assert torch.equal(weights(before), weights(policy))
 
@@ -67,7 +67,7 @@ def test_a_reserve_that_is_not_needed_changes_nothing(tmp_path, kind):
     }
     _, plain = trained(tmp_path / "plain", **changes)
     _, reserved = trained(tmp_path / "reserved", grpo__reserve=1, **changes)
-    assert [row["dead_groups"] for row in read_metrics(tmp_path / "plain")] == [0, 0]
+    assert [row["zero_variance_groups"] for row in read_metrics(tmp_path / "plain")] == [0, 0]
     assert torch.equal(weights(plain), weights(reserved))
 
 

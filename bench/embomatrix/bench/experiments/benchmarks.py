@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.bench.report.page import table
 from embomatrix.pages.figures import Better, Figure
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.evaluation.table import ScoreRow, head
 from embomatrix.trainer.evaluation.table import table as table_rows
-from embomatrix.trainer.run.errors import TrainerError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -36,10 +36,10 @@ from embomatrix.cli.failure import fail
 from embomatrix.cli.foreground import no_problem, run_command
 from embomatrix.host.cores import usable_cores
 from embomatrix.pages.figures import shown
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.outcome import read_outcome
-from embomatrix.trainer.run.settings import checked_settings
-from embomatrix.trainer.run.starting import usual_threads
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import checked_settings
+from embomatrix.trainer.logging.outcome import read_outcome
+from embomatrix.trainer.run.starting import default_threads
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -161,7 +161,7 @@ def _experiment(preset: Preset, summary: str) -> Callable[..., None]:
                 imitation=Budget(imitate_seconds, imitate_steps),
                 patience=patience,
                 grpo=Budget(60 * minutes, steps),
-                threads=threads or usual_threads(),
+                threads=threads or default_threads(),
                 shared=parse_settings(settings or ()),
                 arms=arms,
             )

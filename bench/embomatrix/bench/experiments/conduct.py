@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from embomatrix.bench.experiments.design import toml_of
 from embomatrix.cli.foreground import cluster_problem, no_problem, run_command
 from embomatrix.cli.local_cluster import local_cluster
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.outcome import OUTCOME
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.logging.outcome import OUTCOME
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:

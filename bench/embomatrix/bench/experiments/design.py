@@ -9,7 +9,7 @@ import tomllib
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:

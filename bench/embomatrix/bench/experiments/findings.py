@@ -11,15 +11,15 @@ import numpy as np
 from embomatrix.bench.experiments.design import WITHOUT_RELEVANCE
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.trainer.evaluation.intervals import Interval, bootstrap
+from embomatrix.trainer.logging.outcome import OUTCOME, read_outcome
 from embomatrix.trainer.logging.recorder import read_metrics
-from embomatrix.trainer.run.outcome import OUTCOME, read_outcome
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from embomatrix.bench.experiments.design import Design
-    from embomatrix.trainer.run.outcome import RunOutcome, TaskRate
+    from embomatrix.trainer.logging.outcome import RunOutcome, TaskRate
 
 BINS: Final = 10
 """Number of equal stretches of a run that a curve has means of."""

@@ -29,7 +29,7 @@ NOTHING: Final = "–"
 """Cell without a value: no task was held out, or no step has the metric."""
 CURVES: Final = (
     ("success", "success of training plans"),
-    ("dead_groups", "groups without signal"),
+    ("zero_variance_groups", "groups without signal"),
     ("entropy", "entropy of a token, nats"),
     ("plan_steps", "executed steps of a plan"),
 )

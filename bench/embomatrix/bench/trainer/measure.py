@@ -18,10 +18,10 @@ from embomatrix.cli.local_cluster import local_cluster
 from embomatrix.cli.supervisor import embomatrix_command
 from embomatrix.host.cores import usable_cores
 from embomatrix.pages.figures import Better, Figure
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.data.tasks import load_tasks
+from embomatrix.trainer.lifecycle.stopwatch import TimeShares
 from embomatrix.trainer.logging.recorder import read_metrics
-from embomatrix.trainer.run.data import load_tasks
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.stopwatch import TimeShares
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence

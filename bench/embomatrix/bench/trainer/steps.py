@@ -22,15 +22,15 @@ from embomatrix.cli.local_cluster import without_membership
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.skills.prompt import Codec, limited, prompt_for
 from embomatrix.skills.syntax import PROFILES, PlaceRelation
-from embomatrix.trainer.grpo.rollout import PlanOutcome
+from embomatrix.trainer.cluster.gateway import PlanOutcome
+from embomatrix.trainer.config.settings import GrpoSettings
+from embomatrix.trainer.data.variation import Variation
+from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers
+from embomatrix.trainer.grpo.learner import Learner
 from embomatrix.trainer.grpo.update import StepPlan, Updater
-from embomatrix.trainer.imitation.augment import Variation
-from embomatrix.trainer.parallel.data_parallel import Crew
-from embomatrix.trainer.parallel.learner import Learner
+from embomatrix.trainer.lifecycle.stopwatch import Stopwatch
 from embomatrix.trainer.policy.hf import HfPolicy
-from embomatrix.trainer.policy.prompts import Teller
-from embomatrix.trainer.run.settings import GrpoSettings
-from embomatrix.trainer.run.stopwatch import Stopwatch
+from embomatrix.trainer.policy.prompts import PromptBuilder
 from embomatrix.world.task import Profile
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from embomatrix.skills.prompt import Situation
-    from embomatrix.trainer.run.data import TrainingTask
+    from embomatrix.trainer.data.tasks import TrainingTask
 
 END: Final = "<end>"
 UNKNOWN: Final = "<unknown>"
@@ -106,9 +106,9 @@ def own_step_s(load: Load, tasks: Sequence[TrainingTask]) -> list[float]:
     settings = GrpoSettings(
         tasks_per_step=load.tasks, group=load.group, chunk=load.tasks, max_new=load.new, kl_coef=0.0
     )
-    teller = Teller(policy, ROWS, Variation({}, rename=0.0, drop=0.0))
-    crew = Crew(Learner(policy, policy, settings))
-    updater = Updater(policy, crew, teller, LengthScore(), settings, Stopwatch())
+    prompt_builder = PromptBuilder(policy, ROWS, Variation({}, rename=0.0, drop=0.0))
+    workers = DataParallelWorkers(Learner(policy, policy, settings))
+    updater = Updater(policy, workers, prompt_builder, LengthScore(), settings, Stopwatch())
     generator = torch.Generator().manual_seed(load.seed)
     spent_s = []
     for step in range(load.unmeasured + load.steps):

@@ -1,4 +1,4 @@
-"""Placing: poses for the held object, regrasping if the hand can't reach them, and a check that the object stays."""
+"""PlacementQuery: poses for the held object, regrasping if the hand can't reach them, and a check that the object stays."""
 
 from __future__ import annotations
 

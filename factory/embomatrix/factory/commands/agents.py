@@ -1,4 +1,4 @@
-"""``embomatrix factory agent``: each agent of the factory alone, a brief in and its answer out."""
+"""``embomatrix factory agent``: run one agent of the factory on a brief."""
 
 from __future__ import annotations
 
@@ -10,73 +10,81 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from embomatrix.factory.commands.asked_model import Key, Tape, chat_model
-from embomatrix.factory.commands.layout import Llm, Model, mended_layout, modelled_agents
-from embomatrix.factory.commands.terminal import fail
-from embomatrix.factory.layout.agent_interfaces import DOORS, MODELLED, AgentName
-from embomatrix.factory.social.agent_interfaces import SOCIAL_DOORS, SocialAgent, asked
-from embomatrix.factory.social.model_agents import ModelAgents
+from embomatrix.factory.commands.language_model import (
+    Key,
+    Llm,
+    Model,
+    Tape,
+    chat_model,
+    model_layout_agents,
+)
+from embomatrix.factory.commands.terminal import fail, user_errors
+from embomatrix.factory.layout.agent_interfaces import LAYOUT_AGENTS, MODEL_BACKED, AgentName
+from embomatrix.factory.social.agent_interfaces import SOCIAL_AGENTS, SocialAgent, answer_with_model
+from embomatrix.factory.social.model_agents import SocialModelAgents
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
     from embomatrix.factory.layout.agent_interfaces import AgentInterface
 
-EVERY: Final[Mapping[str, AgentInterface]] = {
-    **{name.value: door for name, door in SOCIAL_DOORS.items()},
-    **{name.value: door for name, door in DOORS.items()},
+ALL_AGENTS: Final[Mapping[str, AgentInterface]] = {
+    **{name.value: interface for name, interface in SOCIAL_AGENTS.items()},
+    **{name.value: interface for name, interface in LAYOUT_AGENTS.items()},
 }
-"""All agents by name, in the order of their work."""
+"""Interfaces of all agents by name, in the order in which the pipeline calls them."""
 
 
 BriefFile = Annotated[
-    Path | None, typer.Option("--in", help="File with its brief as JSON; '-' reads standard input.")
+    Path | None, typer.Option("--in", help="File with the agent's brief as JSON; '-' reads standard input.")
 ]
 
 
 def agent(
-    name: Annotated[str, typer.Argument(help=f"Which agent: {', '.join(EVERY)}.")],
+    name: Annotated[str, typer.Argument(help=f"Name of the agent: {', '.join(ALL_AGENTS)}.")],
     brief: BriefFile = None,
-    schema: Annotated[bool, typer.Option("--schema", help="Print the JSON schema of its brief.")] = False,
+    schema: Annotated[bool, typer.Option("--schema", help="Print the JSON schema of the brief.")] = False,
     llm: Llm = "",
     model: Model = "",
     key: Key = "",
     cassette: Tape = None,
 ) -> None:
-    """Run one agent alone: a brief in, its answer out, by rules or by a language model."""
-    if name not in EVERY:
-        fail(f"there is no agent {name!r}: expected one of {', '.join(EVERY)}")
-    door = EVERY[name]
+    """Run one agent on a brief, by rules or with a language model, and print its answer."""
+    if name not in ALL_AGENTS:
+        fail(f"there is no agent {name!r}: expected one of {', '.join(ALL_AGENTS)}")
+    interface = ALL_AGENTS[name]
     if schema:
-        typer.echo(json.dumps(door.brief.json_schema(), indent=1))
+        typer.echo(json.dumps(interface.brief.json_schema(), indent=1))
         return
     if brief is None:
         fail(
-            f"{name}, {door.about}, needs a brief: give --in FILE; `factory lay --out` writes some, `--schema` tells the form"
+            f"{name} ({interface.about}) needs a brief: give --in FILE; `factory lay --out` writes briefs, "
+            "`--schema` prints their schema"
         )
-    with mended_layout():
-        value = door.read(sys.stdin.read() if str(brief) == "-" else brief.read_text(encoding="utf-8"))
-        modelled = bool(llm) or cassette is not None
-        answer = _of_model(name, value, llm, model, key, cassette) if modelled else door.rules(value)
-        typer.echo(door.written(answer))
+    with user_errors():
+        value = interface.read(sys.stdin.read() if str(brief) == "-" else brief.read_text(encoding="utf-8"))
+        use_model = bool(llm) or cassette is not None
+        answer = _ask_model(name, value, llm, model, key, cassette) if use_model else interface.rules(value)
+        typer.echo(interface.to_json(answer))
 
 
-def _of_model(name: str, brief: Any, url: str, model: str, key: str, cassette: Path | None) -> Any:
-    """What a language model answers. Raises LlmError."""
+def _ask_model(name: str, brief: Any, url: str, model: str, key: str, cassette: Path | None) -> Any:
+    """Return the answer of a language model. Raise LlmError."""
     if name in set(SocialAgent):
 
-        async def one() -> Any:
+        async def ask() -> Any:
             async with chat_model(url, model, key, cassette) as chat:
-                return await asked(ModelAgents(chat), SocialAgent(name), brief)
+                return await answer_with_model(SocialModelAgents(chat), SocialAgent(name), brief)
 
-        return asyncio.run(one())
-    if AgentName(name) not in MODELLED:
-        others = ", ".join([*SocialAgent, *sorted(MODELLED)])
-        fail(f"{name} has no form with a language model: leave out --llm; {others} have one")
-    with modelled_agents(url, model, key, cassette) as agents:
-        answers: dict[AgentName, Callable[[Any], Any]] = {
-            AgentName.DISTRIBUTOR: agents.distribute,
-            AgentName.ORGANIZER: lambda value: tuple(agents.organize(value).branches()),
-            AgentName.PLANNER: agents.wish,
-        }
-        return answers[AgentName(name)](brief)
+        return asyncio.run(ask())
+    if AgentName(name) not in MODEL_BACKED:
+        others = ", ".join([*SocialAgent, *sorted(MODEL_BACKED)])
+        fail(f"{name} can't be a language model: leave out --llm, or choose one of {others}")
+    with model_layout_agents(url, model, key, cassette) as agents:
+        match AgentName(name):
+            case AgentName.DISTRIBUTOR:
+                return agents.distribute(brief)
+            case AgentName.ORGANIZER:
+                return tuple(agents.organize(brief).branches())
+            case _:
+                return agents.choose_constraints(brief)

@@ -1,4 +1,4 @@
-"""``embomatrix factory``: build datasets of verified tasks, import BDDL, list what a dataset holds."""
+"""``embomatrix factory``: build, generate, list and export datasets of verified tasks."""
 
 from __future__ import annotations
 
@@ -11,28 +11,29 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from embomatrix.factory.commands.agents import agent
-from embomatrix.factory.commands.asked_model import Key, Tape  # noqa: TC001  typer reads the annotations when a command runs
 from embomatrix.factory.commands.assets import app as assets_app
 from embomatrix.factory.commands.corpus import app as corpus_app
 from embomatrix.factory.commands.evaluate import app as evaluate_app
 from embomatrix.factory.commands.inspection import app as inspect_app
-from embomatrix.factory.commands.layout import (
+from embomatrix.factory.commands.language_model import (
     Forms,
+    Key,
     Llm,
     Model,
-    lay,
-    modelled_agents,
-    modelled_names,
+    Tape,
+    model_backed_agents,
+    model_layout_agents,
+    model_task_writer,
 )
+from embomatrix.factory.commands.layout import lay
+from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Scenes, Seed, processes
 from embomatrix.factory.commands.task_import import app as import_app
-from embomatrix.factory.commands.terminal import fail, mended, progress
+from embomatrix.factory.commands.terminal import fail, progress, user_errors
 from embomatrix.factory.commands.verification import app as verify_app
-from embomatrix.factory.pipeline.build import BuildSummary, Check, build_dataset
-from embomatrix.factory.pipeline.cluster import ClusterJudge
-from embomatrix.factory.pipeline.export import card, encoded, export_rows
-from embomatrix.factory.pipeline.options import Jobs, Physical, is_proved, processes
+from embomatrix.factory.pipeline.build import BuildSummary, VariantCheck, build_dataset
+from embomatrix.factory.pipeline.cluster import ClusterCheck
+from embomatrix.factory.pipeline.export import dataset_card, encode_rows, export_rows
 from embomatrix.factory.pipeline.settings import SCENE_EXTRACTOR, BuildSettings, WriterKind, scene_ids
-from embomatrix.factory.social.asking import ModelSource, asked_writer
 from embomatrix.llm.ledger import Price
 from embomatrix.llm.patience import FailureLimit
 from embomatrix.world.dataset import Dataset
@@ -58,41 +59,29 @@ app.add_typer(corpus_app)
 app.add_typer(verify_app)
 
 Out = Annotated[Path, typer.Option(help="Folder for the dataset.")]
-Seed = Annotated[int, typer.Option(min=0, help="Equal seeds give equal datasets.")]
-Scenes = Annotated[
-    list[str] | None,
-    typer.Option("--scenes", "--scene", help="Base scene, or 'all'; give it again for more."),
-]
-LookAhead = Annotated[
-    bool,
-    typer.Option(
-        help="Find out what the robot's arm can do in each scene, so that rollouts promise no more: most of the time."
-    ),
-]
-
 SocialLlm = Annotated[
     str,
     typer.Option(
-        help="Base URL of an OpenAI-compatible endpoint, such as http://127.0.0.1:8000/v1: the social agents are its model."
+        help="Base URL of an OpenAI-compatible endpoint for the social agents, such as http://127.0.0.1:8000/v1."
     ),
 ]
 PriceOfTokens = Annotated[
-    tuple[float, float], typer.Option(help="Of a million tokens, in and out, for the account.")
+    tuple[float, float], typer.Option(help="Price of a million input and output tokens, for the cost report.")
 ]
 ManagerAt = Annotated[
-    str, typer.Option(help="HOST:PORT of a manager, on whose slots the oracle's plans are executed as well.")
+    str, typer.Option(help="HOST:PORT of a manager. The oracle's plans are also executed on its cluster.")
 ]
 Look = Annotated[
     bool,
-    typer.Option("--look", help="Show the model a plan and views of each scene first: for models that see."),
+    typer.Option("--look", help="Show the model a plan and views of each scene. Needs a vision model."),
 ]
 
 
 @app.command()
 def build(
     out: Out,
-    train: Annotated[int, typer.Option(min=0, help="Tasks to train on.")] = 480,
-    heldout: Annotated[int, typer.Option(min=0, help="Tasks to evaluate on, in other rooms.")] = 40,
+    train: Annotated[int, typer.Option(min=0, help="Number of training tasks.")] = 480,
+    heldout: Annotated[int, typer.Option(min=0, help="Number of evaluation tasks, in other rooms.")] = 40,
     seed: Seed = 0,
     scenes: Scenes = None,
     jobs: Jobs = None,
@@ -105,29 +94,31 @@ def build(
     cassette: Tape = None,
 ) -> None:
     """Write tasks over base scenes, keep those that the oracle solves, and save them with their scenes."""
-    modelled = modelled_names(forms or [])
-    if (llm or cassette) and not modelled:
-        fail("--llm and --cassette are for layout agents here: say which, as --agent room-organizer=llm")
+    model_backed = model_backed_agents(forms or [])
+    if (llm or cassette) and not model_backed:
+        fail(
+            "--llm and --cassette apply to layout agents here: select some, as in --agent room-organizer=llm"
+        )
     settings = BuildSettings(
         train,
         heldout,
         seed,
         scene_ids(scenes),
         look_ahead=look_ahead,
-        physical=is_proved(physical, look_ahead=look_ahead),
-        modelled=tuple(sorted(modelled)),
+        physical=look_ahead if physical is None else physical,
+        modelled=tuple(sorted(model_backed)),
     )
     with contextlib.ExitStack() as stack:
-        stack.enter_context(mended(out))
-        layout = _layout(stack, modelled, llm, model, key, cassette)
+        stack.enter_context(user_errors(out))
+        layout = _layout(stack, model_backed, llm, model, key, cassette)
         _make(out, settings, jobs=jobs, layout=layout)
 
 
 @app.command()
 def generate(
     out: Out,
-    tasks: Annotated[int, typer.Option(min=0, help="Tasks to train on.")] = 480,
-    heldout: Annotated[int, typer.Option(min=0, help="Tasks to evaluate on, in other rooms.")] = 0,
+    tasks: Annotated[int, typer.Option(min=0, help="Number of training tasks.")] = 480,
+    heldout: Annotated[int, typer.Option(min=0, help="Number of evaluation tasks, in other rooms.")] = 0,
     seed: Seed = 0,
     scenes: Scenes = None,
     jobs: Jobs = None,
@@ -141,38 +132,45 @@ def generate(
     price: PriceOfTokens = (0.0, 0.0),
     manager: ManagerAt = "",
     look: Look = False,
-    token: Annotated[str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="Token for it.")] = "",
-    ca: Annotated[Path | None, typer.Option(envvar="EMBOMATRIX_CA", help="Its ca.pem.")] = None,
+    token: Annotated[str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="Access token for the manager.")] = "",
+    ca: Annotated[
+        Path | None, typer.Option(envvar="EMBOMATRIX_CA", help="CA certificate of the manager, ca.pem.")
+    ] = None,
 ) -> None:
-    """Play the people of each scene, and make tasks of what they come to ask the robot for; keep what they said."""
+    """Simulate conversations of a scene's people with the robot, and turn their requests into verified tasks."""
     kind = WriterKind.MODEL if llm or cassette is not None else WriterKind.SOCIAL
     if llm and not model:
-        fail("--llm needs the name of a model there: give --model")
+        fail("--llm needs the name of a model at the endpoint: give --model")
     if look and kind is WriterKind.SOCIAL:
-        fail("--look shows scenes to a language model: give --llm URL and --model NAME, or --cassette FILE")
-    modelled = modelled_names(forms or [])
-    told = sorted([*modelled, *[SCENE_EXTRACTOR] * look])
-    proof = is_proved(physical, look_ahead=look_ahead)
-    settings = BuildSettings(tasks, heldout, seed, scene_ids(scenes), kind, look_ahead, proof, tuple(told))
+        fail("--look needs a language model: give --llm URL and --model NAME, or --cassette FILE")
+    model_backed = model_backed_agents(forms or [])
+    settings = BuildSettings(
+        tasks,
+        heldout,
+        seed,
+        scene_ids(scenes),
+        kind,
+        look_ahead,
+        look_ahead if physical is None else physical,
+        tuple(sorted([*model_backed, *[SCENE_EXTRACTOR] * look])),
+    )
     with contextlib.ExitStack() as stack:
-        stack.enter_context(mended(out))
-        check = _second_judge(stack, manager, token, ca)
-        layout = _layout(stack, modelled, llm, model, key, cassette)
+        stack.enter_context(user_errors(out))
+        check: VariantCheck | None = None
+        if manager:
+            trusted = ca.read_bytes() if ca is not None else b""
+            check = stack.enter_context(ClusterCheck(manager, token, trusted)).check
+        layout = _layout(stack, model_backed, llm, model, key, cassette)
         if kind is WriterKind.SOCIAL:
             _make(out, settings, jobs=jobs, check=check, layout=layout)
             return
-        asked = ModelSource(llm, model, key, cassette, Price(*price), out / "ledger.jsonl", look)
-        writer, ledger = stack.enter_context(asked_writer(asked))
+        writer, ledger = stack.enter_context(
+            model_task_writer(
+                llm, model, key, cassette, price=Price(*price), accounts=out / "ledger.jsonl", look=look
+            )
+        )
         _make(out, settings, writer, check=check, layout=layout)
         _print_account(ledger)
-
-
-def _second_judge(stack: contextlib.ExitStack, manager: str, token: str, ca: Path | None) -> Check | None:
-    """The cluster behind a manager, open as long as the stack is; None where there is none. Raises ClusterError, OSError."""
-    if not manager:
-        return None
-    trusted = ca.read_bytes() if ca is not None else b""
-    return stack.enter_context(ClusterJudge(manager, token, trusted)).check
 
 
 def _layout(
@@ -183,14 +181,14 @@ def _layout(
     key: str,
     cassette: Path | None,
 ) -> LayoutAgents | None:
-    """Layout agents of which these are a language model; None where all are rules."""
+    """Return layout agents with the named ones on a language model; None if all follow rules."""
     if not names:
         return None
-    return stack.enter_context(modelled_agents(url, model, key, cassette, FailureLimit())).agents(names)
+    return stack.enter_context(model_layout_agents(url, model, key, cassette, FailureLimit())).agents(names)
 
 
 def _print_account(ledger: Ledger) -> None:
-    """What the model was asked, by agent."""
+    """Print the model's calls, tokens and cost by agent."""
     table = Table("agent", "calls", "failed", "retries", "tokens in", "tokens out", "seconds", "cost")
     for purpose, account in (*ledger.accounts.items(), ("all", ledger.total())):
         counts = (
@@ -209,13 +207,13 @@ def _make(
     settings: BuildSettings,
     writer: TaskWriter | None = None,
     jobs: int | None = None,
-    check: Check | None = None,
+    check: VariantCheck | None = None,
     layout: LayoutAgents | None = None,
 ) -> None:
-    """A data set in the folder, with progress and a summary."""
+    """Build the dataset with progress bars, then print a summary."""
     console = Console()
-    kept = f": what was built is kept in {out}, and the same command goes on from there"
-    with mended(out, kept), progress(console) as bars:
+    kept = f": finished tasks are kept in {out}; run the same command again to resume"
+    with user_errors(out, kept), progress(console) as bars:
         tasks = {
             "heldout": bars.add_task("held-out tasks", total=settings.heldout),
             "train": bars.add_task("training tasks", total=settings.train),
@@ -237,16 +235,16 @@ def _make(
         if summary.total(split) < wanted:
             fail(
                 f"only {summary.total(split)} of {wanted} {split} tasks were admitted: see {out}/attempts.jsonl, "
-                "or give more scenes"
+                "or add scenes"
             )
 
 
 @app.command("list")
 def list_(folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")]) -> None:
-    """Show the tasks of a dataset."""
-    with mended():
+    """List the tasks of a dataset."""
+    with user_errors():
         dataset = Dataset.load(folder)
-    # a task's id is what other commands ask for: it is never cut short
+    # Other commands take the task's id as an argument, so the column never truncates it.
     table = Table(Column("task", no_wrap=True), "split", "category", "rows", "steps", "instruction")
     for record in dataset.records:
         task = record.task
@@ -264,14 +262,16 @@ def list_(folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")]) 
 @app.command()
 def export(
     folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")],
-    out: Annotated[Path, typer.Option(help="File to write, .jsonl or .parquet; the card goes beside it.")],
+    out: Annotated[
+        Path, typer.Option(help="File to write, .jsonl or .parquet. The card is written beside it.")
+    ],
 ) -> None:
-    """Write the tasks of a dataset for other tools, one row each, with a dataset card."""
-    with mended(out):
+    """Export a dataset for other tools, one row per task, with a dataset card."""
+    with user_errors(out):
         dataset = Dataset.load(folder)
-        data = encoded(export_rows(dataset), out.suffix)
+        data = encode_rows(export_rows(dataset), out.suffix)
         write_whole(out, data)
-        write_whole(out.with_name("README.md"), card(dataset, out.name, data).encode("utf-8"))
+        write_whole(out.with_name("README.md"), dataset_card(dataset, out.name, data).encode("utf-8"))
     Console().print(
         f"{len(dataset.records)} tasks: {out}, card: {out.with_name('README.md')}", highlight=False
     )
@@ -292,6 +292,4 @@ def _print_summary(console: Console, summary: BuildSummary) -> None:
         scenes.add_row(scene, *counts, ", ".join(summary.rooms["heldout"][scene]))
     console.print(scenes)
     refused = ", ".join(f"{count} {reason}" for reason, count in sorted(summary.rejected.items())) or "none"
-    console.print(
-        f"{summary.variants} scene variants; drafts that were not admitted: {refused}", highlight=False
-    )
+    console.print(f"{summary.variants} scene variants; drafts not admitted: {refused}", highlight=False)

@@ -1,4 +1,4 @@
-"""``embomatrix factory corpus``: the set to train on, and Internal-Verified, frozen under its digest."""
+"""``embomatrix factory corpus``: build the training set and the frozen evaluation set Internal-Verified."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from embomatrix.factory.commands.terminal import fail, mended, progress
+from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Seed, processes
+from embomatrix.factory.commands.terminal import fail, progress, user_errors
 from embomatrix.factory.pipeline.build import build_dataset
 from embomatrix.factory.pipeline.corpus import HELDOUT_SCENES, CorpusSettings, check_frozen, freeze
-from embomatrix.factory.pipeline.options import Jobs, Physical, is_proved, processes
 
 if TYPE_CHECKING:
     from embomatrix.factory.pipeline.settings import BuildSettings
@@ -23,33 +23,41 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 @app.command()
 def corpus(
     out: Annotated[Path, typer.Option(help="Folder for the corpus.")] = Path("build/corpus"),
-    train: Annotated[int, typer.Option(min=0, help="Tasks to train on.")] = 2_000,
-    heldout: Annotated[int, typer.Option(min=2, help="Tasks of Internal-Verified.")] = 100,
-    seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal corpora.")] = 0,
+    train: Annotated[int, typer.Option(min=0, help="Number of training tasks.")] = 2_000,
+    heldout: Annotated[int, typer.Option(min=2, help="Number of tasks of Internal-Verified.")] = 100,
+    seed: Seed = 0,
     scenes: Annotated[
-        list[str] | None, typer.Option(help="Scene to train in; give it again for more. Default: 45.")
+        list[str] | None,
+        typer.Option(help="Scene for training. Repeat the option for more scenes. Default: 45 scenes."),
     ] = None,
     unseen: Annotated[
-        list[str] | None, typer.Option(help="Scene that training never sees. Default: six.")
+        list[str] | None, typer.Option(help="Scene that training never sees. Default: six scenes.")
     ] = None,
     jobs: Jobs = None,
-    look_ahead: Annotated[bool, typer.Option(help="Find out what the arm can do in each scene.")] = True,
+    look_ahead: LookAhead = True,
     physical: Physical = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Make nothing: tell whether the corpus is as it was frozen.")
+        bool,
+        typer.Option("--check", help="Build nothing; check that the corpus still has its frozen digest."),
     ] = False,
 ) -> None:
-    """Make the corpus, or go on with one that was cut short; freeze its held-out tasks."""
+    """Build the corpus, or resume an interrupted build, and freeze its held-out tasks."""
     console = Console()
-    kept = f": what was made is kept in {out}, and the same command goes on from there"
-    with mended(out, kept):
+    with user_errors(out, f": finished tasks are kept in {out}; run the same command again to resume"):
         if check:
             frozen = check_frozen(out)
         else:
-            chosen, others = tuple(scenes or ()), tuple(unseen or HELDOUT_SCENES)
-            proof = is_proved(physical, look_ahead=look_ahead)
-            settings = CorpusSettings(train, heldout, seed, chosen, others, look_ahead, proof)
-            _make(console, out, settings, processes(jobs))
+            settings = CorpusSettings(
+                train,
+                heldout,
+                seed,
+                tuple(scenes or ()),
+                tuple(unseen or HELDOUT_SCENES),
+                look_ahead,
+                look_ahead if physical is None else physical,
+            )
+            for name, build in settings.builds().items():
+                _build(console, out / name, build, processes(jobs))
             frozen = freeze(out)
     console.print(
         f"Internal-Verified: {frozen.tasks} tasks, {frozen.unseen} in scenes that training never sees, {frozen.digest}",
@@ -58,22 +66,17 @@ def corpus(
     )
 
 
-def _make(console: Console, out: Path, settings: CorpusSettings, jobs: int) -> None:
-    for name, build in settings.builds().items():
-        _build(console, out / name, build, jobs)
-
-
 def _build(console: Console, folder: Path, settings: BuildSettings, jobs: int) -> None:
-    """One build with its bar."""
+    """Run one build with a progress bar."""
     done: Counter[str] = Counter()
     with progress(console) as bars:
         bar = bars.add_task(folder.name, total=settings.train + settings.heldout)
 
-        def told(split: str, admitted: int) -> None:
+        def update(split: str, admitted: int) -> None:
             done[split] = admitted
             bars.update(bar, completed=done.total())
 
-        summary = build_dataset(folder, settings, told, jobs=jobs)
+        summary = build_dataset(folder, settings, update, jobs=jobs)
     for split, wanted in (("train", settings.train), ("heldout", settings.heldout)):
         if summary.total(split) < wanted:
             fail(

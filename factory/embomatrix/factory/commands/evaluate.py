@@ -12,8 +12,8 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from embomatrix.factory.commands.asked_model import Key, Tape, chat_model
-from embomatrix.factory.commands.terminal import mended, progress, report_evaluation
+from embomatrix.factory.commands.language_model import Key, Tape, chat_model
+from embomatrix.factory.commands.terminal import progress, report_evaluation, user_errors
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
 from embomatrix.factory.evaluate.drafts import asked_of
 from embomatrix.factory.evaluate.judge import judged
@@ -77,7 +77,7 @@ def tasks(
     cassette: Tape = None,
 ) -> None:
     """Diversity of instructions and goals, with and without social simulation."""
-    with mended():
+    with user_errors():
         if llm and not model:
             raise EvaluationError("--llm needs the name of a model there: give --model")
         if dataset is not None:
@@ -116,7 +116,7 @@ def scenes(
 ) -> None:
     """Generation rate, verification pass rate and time of 140 fixed tasks, by layout tree and by two simpler ways."""
     kept = "; what was found is kept, and the same command goes on from there" if outcomes is not None else ""
-    with mended(outcomes, kept):
+    with user_errors(outcomes, kept):
         chosen = fixed_tasks(sample)[::only]
         told = methods or list(LayoutMethod)
         log = OutcomeLog.open(outcomes, seed) if outcomes is not None else None
@@ -139,7 +139,7 @@ def picture(
     out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("side_by_side.png"),
 ) -> None:
     """Draw one fixed task as the three methods lay it out, side by side."""
-    with mended(out):
+    with user_errors(out):
         drawn = draw_side_by_side(named(fixed_tasks(sample), task), seed)
         drawn.save(out)
     Console().print(f"picture: {out}", highlight=False, markup=False)
@@ -158,7 +158,7 @@ def looks(
     cassette: Tape = None,
 ) -> None:
     """The paper's judge of aesthetics: a language model that is shown the plan of each laid out room, with its tree."""
-    with mended():
+    with user_errors():
         chosen, told = fixed_tasks(sample)[::only], methods or list(LayoutMethod)
 
         async def looked(judge: ChatModel) -> EvaluationFigures:
@@ -178,7 +178,7 @@ def admissions(
     json_file: JsonFile = None,
 ) -> None:
     """How many drafts of a build were admitted, how many in an hour of two cores, and why the rest was not."""
-    with mended():
+    with user_errors():
         evaluation = evaluate_admissions(folder)
     report_evaluation(evaluation, json_file)
 
@@ -193,7 +193,7 @@ def aesthetics(
     ] = None,
 ) -> None:
     """How well the geometric score tells hand-made rooms from spoilt ones that its fit did not see."""
-    with mended():
+    with user_errors():
         evaluation, fitted = evaluate_aesthetics(rooms, seed)
         if calibration is not None:
             write_whole(calibration, (json.dumps(asdict(fitted), indent=1) + "\n").encode("ascii"))
@@ -206,7 +206,7 @@ def page(
     out: Annotated[Path, typer.Option(help="Page whose part on the factory is replaced.")] = PAGE,
 ) -> None:
     """Write the factory's part of the page of benchmarks."""
-    with mended(out):
+    with user_errors(out):
         evaluations = [read_evaluation(file) for file in files]
         before = out.read_text(encoding="utf-8") if out.exists() else ""
         write_whole(out, with_factory(before, evaluations).encode("utf-8"))

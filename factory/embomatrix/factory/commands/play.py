@@ -1,10 +1,10 @@
-"""`embomatrix play`: execute a plan in a task and explain every step and the reward."""
+"""``embomatrix play``: execute a plan in a task and explain every step and the reward."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
-from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
@@ -32,6 +32,8 @@ from embomatrix.world.evaluate import GoalError
 from embomatrix.world.whole_file import check_writable
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from embomatrix.reward.breakdown import RewardBreakdown
     from embomatrix.sim.film import Film
     from embomatrix.skills.syntax import Plan
@@ -47,52 +49,49 @@ console = Console(highlight=False)
 
 
 class PlayMode(StrEnum):
-    """How a plan is carried out."""
+    """Execution mode of a plan."""
 
     CACHED = "cached"
     PHYSICAL = "physical"
 
 
-@dataclass(frozen=True, slots=True)
-class Take:
-    """How a plan is to be executed, and where a film of it goes."""
-
-    mode: PlayMode
-    seed: int
-    film: Path | None
-
-
 class PlayError(Exception):
-    """Something that the person can mend. The message is one sentence."""
+    """Bad input that the user can fix. The message is one sentence."""
 
 
 def play(
-    task: Annotated[str, typer.Argument(help="Id of a task of the dataset.")],
+    task: Annotated[str, typer.Argument(help="Id of a task in the dataset.")],
     plan: Annotated[
-        str, typer.Option("--plan", help="File with a plan, JSON or one call a line; - reads standard input.")
+        str,
+        typer.Option(
+            "--plan", help="File with a plan, as JSON or one call per line; '-' reads standard input."
+        ),
     ] = "",
-    oracle: Annotated[bool, typer.Option("--oracle", help="Find a plan with the oracle and run it.")] = False,
+    oracle: Annotated[bool, typer.Option("--oracle", help="Execute the oracle planner's plan.")] = False,
     dataset: Annotated[
         Path | None,
-        typer.Option(help=f"Folder of the dataset; else $EMBOMATRIX_DATASET, else {DEFAULT_DATASET}."),
+        typer.Option(help=f"Folder of the dataset. Default: $EMBOMATRIX_DATASET, or {DEFAULT_DATASET}."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Decides between outcomes that are equally good.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of the execution.")] = 0,
     mode: Annotated[
         PlayMode,
-        typer.Option(help="cached: verified outcomes; physical: a robot does it in stepped physics."),
+        typer.Option(help="cached: pre-verified outcomes; physical: a robot in stepped physics."),
     ] = PlayMode.CACHED,
     film: Annotated[
-        Path | None, typer.Option(help="Draw the plan as an animation: a .gif, .webp or .png file.")
+        Path | None, typer.Option(help="File for an animation of the plan: .gif, .webp or .png.")
     ] = None,
 ) -> None:
-    """Execute a plan in a task: every step with its reason, the final state and the reward.
+    """Execute a plan in a task and print every step, the final state and the reward.
 
-    Exit status: 0 for a plan that was executed, 1 for a text that is no plan, 2 for other bad input.
+    Exit status: 0 if the plan was executed, 1 if the text is not a plan, 2 for other bad input.
     """
     try:
         if film is not None:
-            _check_film(film)
-        status = _play(task, plan, oracle, dataset, Take(mode, seed, film))
+            # Drawing takes minutes, so an unwritable path fails before anything is executed.
+            check_suffix(film)
+            with _film_errors(film):
+                check_writable(film)
+        status = _play(task, plan, oracle, dataset, mode, seed, film)
     except (PlayError, DatasetError, EngineError, FactError, FilmError, GoalError) as error:
         Console(stderr=True, highlight=False).print(f"embomatrix play: {error}", markup=False, soft_wrap=True)
         raise SystemExit(BAD_INPUT) from None
@@ -100,7 +99,15 @@ def play(
         raise SystemExit(status)
 
 
-def _play(task_id: str, plan: str, oracle: bool, folder: Path | None, take: Take) -> int:
+def _play(
+    task_id: str,
+    plan: str,
+    oracle: bool,
+    folder: Path | None,
+    mode: PlayMode,
+    seed: int,
+    film: Path | None,
+) -> int:
     if oracle == bool(plan):
         raise PlayError("expected either --plan FILE or --oracle: give one of them")
     root = folder if folder is not None else Path(os.environ.get("EMBOMATRIX_DATASET", DEFAULT_DATASET))
@@ -113,52 +120,54 @@ def _play(task_id: str, plan: str, oracle: bool, folder: Path | None, take: Take
         found = find_plan(load_simulator(bundle), record.task)
         if isinstance(found, PlanNotFound):
             raise PlayError(f"the oracle finds no plan for {task_id!r}: {found.reason}")
-        _run(bundle, record.task, found, take)
-        return 0
-    try:
-        parsed = parse_plan(text, record.task.profile)
-    except PlanError as error:
-        _show_unparsable(error)
-        return NO_PLAN
-    _run(bundle, record.task, parsed, take)
+    else:
+        try:
+            found = parse_plan(text, record.task.profile)
+        except PlanError as error:
+            console.print(
+                f"[red]✗[/red] the text can't be parsed ({error.reason.value}): {escape(str(error))}"
+            )
+            _show_reward(unparsable())
+            return NO_PLAN
+    _run(bundle, record.task, found, mode, seed, film)
     return 0
 
 
 def _text_of(plan: str) -> str:
-    """The plan's text. One byte more than a plan may have is read at most."""
+    """Read the text of a plan, at most one byte more than a plan may have."""
     try:
         if plan == "-":
             if sys.stdin is None:
-                raise PlayError("there is no standard input to read a plan from: expected --plan FILE")
+                raise PlayError("standard input is closed: expected --plan FILE")
             raw = sys.stdin.buffer.read(MAX_PLAN_BYTES + 1)
         else:
             with Path(plan).open("rb") as file:
                 raw = file.read(MAX_PLAN_BYTES + 1)
     except OSError as error:
         raise PlayError(f"the plan {plan!r} can't be read ({error.strerror}): expected a text file") from None
-    # No byte is refused here: what the text means, or that it means nothing, is the parser's to say.
+    # The parser judges the text, so invalid bytes are replaced here and not refused.
     return raw.decode("utf-8", errors="replace")
 
 
-def _run(bundle: Bundle, task: Task, plan: Plan, take: Take) -> None:
-    actor = PhysicalActor(bundle) if take.mode is PlayMode.PHYSICAL else None
+def _run(bundle: Bundle, task: Task, plan: Plan, mode: PlayMode, seed: int, film: Path | None) -> None:
+    actor = PhysicalActor(bundle) if mode is PlayMode.PHYSICAL else None
     simulator = load_simulator(bundle, actor=actor)
-    trace = simulator.execute(task, plan, take.seed)
+    trace = simulator.execute(task, plan, seed)
     _show_steps(task, trace)
     console.print("\n[bold]Final state[/bold]")
     for line in trace.final:
         console.print(f"  {escape(line)}")
     _show_reward(score(task, trace.touched, simulator.facts))
-    if take.film is None:
+    if film is None:
         return
     if actor is None:
-        _draw(film_cached(simulator, task, plan, take.seed), take.film)
+        _draw(film_cached(simulator, task, plan, seed), film)
     else:
-        _draw(film_physical(simulator, actor, task, plan, take.seed), take.film)
+        _draw(film_physical(simulator, actor, task, plan, seed), film)
 
 
 def _draw(film: Film, path: Path) -> None:
-    """Draw the film, with a bar that tells how far it is, and write it."""
+    """Draw the film with a progress bar and write it."""
     done = [step.ok for step in film.steps]
     captions = [
         Caption(call_in_words(call, film.task.table), done[number] if number < len(done) else None)
@@ -169,26 +178,19 @@ def _draw(film: Film, path: Path) -> None:
         pictures = draw_film(
             film, captions, on_frame=lambda done, count: progress.update(bar, completed=done, total=count)
         )
-    try:
+    with _film_errors(path):
         write_film(path, pictures)
-    except OSError as error:
-        raise _unwritable(path, error) from None
     console.print(f"\nfilm of {len(pictures)} frames: {path}", markup=False)
 
 
-def _check_film(path: Path) -> None:
-    """Before anything is executed: drawing takes minutes, and shall not end at a file that can't be written."""
-    check_suffix(path)
+@contextlib.contextmanager
+def _film_errors(path: Path) -> Iterator[None]:
     try:
-        check_writable(path)
+        yield
     except OSError as error:
-        raise _unwritable(path, error) from None
-
-
-def _unwritable(path: Path, error: OSError) -> PlayError:
-    return PlayError(
-        f"{path} can't be written ({error.strerror}): make room, or name another file with --film"
-    )
+        raise PlayError(
+            f"{path} can't be written ({error.strerror}): free disk space, or name another file with --film"
+        ) from None
 
 
 def _show_task(task: Task) -> None:
@@ -217,18 +219,13 @@ def _show_steps(task: Task, trace: Trace) -> None:
     console.print(table)
 
 
-def _show_unparsable(error: PlanError) -> None:
-    console.print(f"[red]✗[/red] the text can't be parsed ({error.reason.value}): {escape(str(error))}")
-    _show_reward(unparsable())
-
-
 def _show_reward(reward: RewardBreakdown) -> None:
     table = Table(title="Reward", title_justify="left", title_style="bold", show_footer=True)
     table.add_column("tier", footer="total")
-    table.add_column("made of", overflow="fold", footer=_verdict(reward))
+    table.add_column("reason", overflow="fold", footer=_verdict(reward))
     table.add_column("points", justify="right", footer=f"{reward.total:.2f}")
     if reward.format < 0:
-        table.add_row("format", "the text is no plan: it was not executed", f"{reward.format:.2f}")
+        table.add_row("format", "the text is not a plan and was not executed", f"{reward.format:.2f}")
     else:
         _add_tiers(table, reward)
     console.print()

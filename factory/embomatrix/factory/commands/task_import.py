@@ -1,4 +1,4 @@
-"""``embomatrix factory import``: bind others' problems to base scenes, verify them, and report what can't be bound and why."""
+"""``embomatrix factory import``: bind BDDL problems to base scenes, verify them, and report refusals."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from rich.console import Console
 from rich.table import Table
 
 from embomatrix.factory.admission import TaskRefusal
-from embomatrix.factory.commands.terminal import fail, mended, progress
+from embomatrix.factory.commands.options import Jobs, LookAhead, Scenes, Seed, processes
+from embomatrix.factory.commands.terminal import fail, progress, user_errors
 from embomatrix.factory.metrics.figures import EvaluationError, evaluation_to_json
-from embomatrix.factory.pipeline.options import Jobs, processes
 from embomatrix.factory.pipeline.settings import scene_ids
-from embomatrix.factory.pipeline.store import LineLog
+from embomatrix.factory.pipeline.store import ResumableLog
 from embomatrix.factory.task_import.batch import Verified
 from embomatrix.factory.task_import.dialects import read_problem
-from embomatrix.factory.task_import.importer import Depth, Docket, judging
+from embomatrix.factory.task_import.importer import Depth, ImportSettings, importing
 from embomatrix.factory.task_import.reach import unreachable_atoms
 from embomatrix.factory.task_import.report import (
     ProblemOutcome,
@@ -55,41 +55,40 @@ EVERY_ACTIVITY = "all"
 
 
 Report = Annotated[
-    Path | None, typer.Option(help="File for what became of each problem, in JSON; beside it in Markdown.")
+    Path | None,
+    typer.Option(help="File for the outcome of each problem as JSON. Markdown is written beside it."),
 ]
-Eai = Annotated[Path | None, typer.Option(help="Folder of the unpacked wheel of eai-eval: its 100 tasks.")]
+Eai = Annotated[Path | None, typer.Option(help="Folder of the unpacked eai-eval wheel with its 100 tasks.")]
 Instantiate = Annotated[
-    bool, typer.Option("--instantiate", help="Bind goals as well that no skill reaches; no verification.")
+    bool,
+    typer.Option("--instantiate", help="Bind also goals that no skill reaches. Skips the verification."),
 ]
-LookAhead = Annotated[bool, typer.Option(help="Find out what the robot's arm can do in each scene.")]
 Rates = Annotated[Path | None, typer.Option("--json", help="File for the import rates.")]
 Kept = Annotated[
     Path | None,
     typer.Option(
         "--outcomes",
-        help="File for what became of each problem, JSON lines, as it comes: with it an import that was stopped goes on.",
+        help="JSON lines file that each outcome is appended to. An interrupted import resumes from it.",
     ),
 ]
 ReachedBy = Annotated[
-    Profile | None, typer.Option(help="Leave out problems with goals that no skill of this profile reaches.")
+    Profile | None, typer.Option(help="Skip problems with goals that no skill of this profile reaches.")
 ]
-Solids = Annotated[bool, typer.Option("--solids", help="Leave out problems that name a liquid or a powder.")]
-Scenes = Annotated[
-    list[str] | None,
-    typer.Option("--scenes", "--scene", help="Base scene, or 'all'; give it again for more."),
-]
+Solids = Annotated[bool, typer.Option("--solids", help="Skip problems that name a liquid or a powder.")]
 
 
 @app.command("import")
 def import_(
     bddl: Annotated[Path | None, typer.Option(help="A BDDL problem file.")] = None,
     activity: Annotated[str, typer.Option(help="An activity of the bddl package, or 'all'.")] = "",
-    jsonl: Annotated[Path | None, typer.Option(help="Records with 'name' and 'bddl'.")] = None,
+    jsonl: Annotated[
+        Path | None, typer.Option(help="JSON lines file of records with 'name' and 'bddl'.")
+    ] = None,
     eai: Eai = None,
     scenes: Scenes = None,
-    seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal datasets.")] = 0,
+    seed: Seed = 0,
     out: Annotated[Path | None, typer.Option(help="Folder for the admitted tasks.")] = None,
-    bind_only: Annotated[bool, typer.Option("--bind-only", help="Leave out the verification.")] = False,
+    bind_only: Annotated[bool, typer.Option("--bind-only", help="Skip the verification.")] = False,
     instantiate: Instantiate = False,
     reached_by: ReachedBy = None,
     solids: Solids = False,
@@ -99,19 +98,21 @@ def import_(
     outcomes: Kept = None,
     jobs: Jobs = None,
 ) -> None:
-    """Bind BDDL problems to base scenes and verify them, or say why not."""
+    """Bind BDDL problems to base scenes and verify them. Refusals are reported with a reason."""
     console = Console()
     depth = Depth.INSTANTIATE if instantiate else Depth.BIND if bind_only else Depth.VERIFY
-    kept = "; what was found is kept, and the same command goes on from there" if outcomes is not None else ""
-    with mended(out or outcomes, kept):
+    kept = (
+        "; finished outcomes are kept; run the same command again to resume" if outcomes is not None else ""
+    )
+    with user_errors(out or outcomes, kept):
         for file in filter(None, (report, json_file)):
             check_writable(file)
         if out is not None:
             _check_free(out, depth, outcomes)
-        sources = _wanted(_sources(bddl, activity, jsonl, eai), reached_by, solids=solids)
-        docket = Docket(scene_ids(scenes), seed, depth, look_ahead)
-        log = _taken_up(outcomes, sources, docket)
-        made = _judged(console, sources[len(log.outcomes) :], docket, processes(jobs), log)
+        sources = _selected(_sources(bddl, activity, jsonl, eai), reached_by, solids=solids)
+        settings = ImportSettings(scene_ids(scenes), seed, depth, look_ahead)
+        log = _resumed_log(outcomes, sources, settings)
+        made = _import_all(console, sources[len(log.outcomes) :], settings, processes(jobs), log)
         admitted = out is None or _written(out, made)
         told = log.outcomes
         verified = depth is Depth.VERIFY
@@ -122,11 +123,13 @@ def import_(
         return
     _print_outcomes(console, told, depth)
     if not admitted:
-        fail(f"no problem was admitted, so {out} was not written: `--bind-only` shows which could be bound")
+        fail(
+            f"no problem was admitted, so {out} was not written: use --bind-only to see which problems can be bound"
+        )
 
 
 def _written(out: Path, made: Sequence[ImportedTask | Verified | TaskRefusal]) -> bool:
-    """Whether there was any task to put into the dataset."""
+    """Write the admitted tasks as a dataset. Return False if there are none."""
     verified = [item for item in made if isinstance(item, Verified)]
     if verified:
         bundles = {item.record.bundle_digest: item.bundle for item in verified}
@@ -134,28 +137,30 @@ def _written(out: Path, made: Sequence[ImportedTask | Verified | TaskRefusal]) -
     return bool(verified)
 
 
-def _taken_up(
+def _resumed_log(
     path: Path | None,
     sources: Sequence[SourceText],
-    docket: Docket,
-) -> LineLog[ProblemOutcome]:
-    """What is known already of the first of the problems. Raises EvaluationError where a file tells of others."""
-    log = LineLog[ProblemOutcome](path)
+    settings: ImportSettings,
+) -> ResumableLog[ProblemOutcome]:
+    """Return the log of the problems done so far. Raise EvaluationError if the file is about other problems."""
+    log = ResumableLog[ProblemOutcome](path)
     told = {
-        "seed": docket.seed,
-        "depth": docket.depth,
-        "scenes": [*docket.scenes],
-        "look_ahead": docket.look_ahead,
+        "seed": settings.seed,
+        "depth": settings.depth,
+        "scenes": [*settings.scenes],
+        "look_ahead": settings.look_ahead,
     }
-    log.take_up(told, outcome_from_json)
+    log.resume(told, outcome_from_json)
     known = [outcome.name for outcome in log.outcomes]
     if known != [source.name for source in sources[: len(known)]]:
-        raise EvaluationError(f"{path} tells of other problems than are to be imported: name another file")
+        raise EvaluationError(f"{path} is about other problems than this import: name another file")
     return log
 
 
-def _wanted(sources: Sequence[SourceText], profile: Profile | None, *, solids: bool) -> Sequence[SourceText]:
-    """Those with goals that a profile's skills reach, and without substances. Raises SourceError where there is none."""
+def _selected(
+    sources: Sequence[SourceText], profile: Profile | None, *, solids: bool
+) -> Sequence[SourceText]:
+    """Return the problems that pass the filters. Raise ProblemSourceError if none does."""
     found = [(source, read_problem(source)[0]) for source in sources] if profile or solids else []
     if profile is not None:
         found = [(source, problem) for source, problem in found if not unreachable_atoms(problem, profile)]
@@ -188,32 +193,27 @@ def _write(
 
 
 def _check_free(out: Path, depth: Depth, outcomes: Path | None) -> None:
-    """Nothing that is already there is overwritten, and nothing that could not be written is begun."""
+    """Raise ProblemSourceError if the options exclude a dataset, or if the folder already holds one."""
     if depth is not Depth.VERIFY:
         raise ProblemSourceError(
-            f"to {depth.value} admits no task that could be written: leave out --out, or --bind-only and --instantiate"
+            f"the depth {depth.value!r} admits no task, so --out stays empty: leave out --out, or --bind-only and --instantiate"
         )
     if outcomes is not None:
-        raise ProblemSourceError(
-            "an import into a dataset is not taken up again: leave out --out, or --outcomes"
-        )
+        raise ProblemSourceError("an import into a dataset can't be resumed: leave out --out, or --outcomes")
     if (out / TASKS_FILE).exists():
         raise ProblemSourceError(f"{out} holds a dataset already: name another folder with --out")
     out.mkdir(parents=True, exist_ok=True)
 
 
-def _parsed(source: SourceText) -> SourceText:
-    """The source, whose text is BDDL: what is not shall be told before scenes are built."""
-    try:
-        read_problem(source)
-    except BddlError as error:
-        raise ProblemSourceError(f"{source.name}: {error}") from error
-    return source
-
-
 def _sources(bddl: Path | None, activity: str, jsonl: Path | None, eai: Path | None) -> list[SourceText]:
-    """The problems that are given, all of which are BDDL. Raises SourceError."""
-    return [_parsed(source) for source in _given(bddl, activity, jsonl, eai)]
+    """Return the given problems. Raise ProblemSourceError for invalid BDDL, before any scene is built."""
+    sources = list(_given(bddl, activity, jsonl, eai))
+    for source in sources:
+        try:
+            read_problem(source)
+        except BddlError as error:
+            raise ProblemSourceError(f"{source.name}: {error}") from error
+    return sources
 
 
 def _given(bddl: Path | None, activity: str, jsonl: Path | None, eai: Path | None) -> Iterator[SourceText]:
@@ -234,17 +234,20 @@ def _given(bddl: Path | None, activity: str, jsonl: Path | None, eai: Path | Non
         yield read_activity(activity)
 
 
-def _judged(
+def _import_all(
     console: Console,
     sources: Sequence[SourceText],
-    docket: Docket,
+    settings: ImportSettings,
     jobs: int,
-    log: LineLog[ProblemOutcome],
+    log: ResumableLog[ProblemOutcome],
 ) -> list[ImportedTask | Verified | TaskRefusal]:
-    """What becomes of these problems, but for those that another process has bound; each is added to the log."""
+    """Import the problems and append each outcome to the log.
+
+    Return the imported tasks and refusals. Tasks that another process only bound are left out.
+    """
     made: list[ImportedTask | Verified | TaskRefusal] = []
     done = len(log.outcomes)
-    with progress(console) as bars, judging(docket, min(jobs, len(sources) or 1)) as judge:
+    with progress(console) as bars, importing(settings, min(jobs, len(sources) or 1)) as judge:
         bar = bars.add_task("problems", total=done + len(sources), completed=done)
         for judged in judge(sources):
             log.add(judged.outcome)

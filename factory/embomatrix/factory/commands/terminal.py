@@ -1,4 +1,4 @@
-"""How the factory's commands talk: progress with the time that is left, and what a person can mend in one sentence."""
+"""Terminal output of the factory's commands: progress bars, user errors and tables of figures."""
 
 from __future__ import annotations
 
@@ -18,11 +18,14 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from embomatrix.factory.layout.agent_interfaces import BriefError
+from embomatrix.factory.layout.distribution import DistributionError
 from embomatrix.factory.metrics.figures import EvaluationError, evaluation_to_json
 from embomatrix.factory.task_import.sources import ProblemSourceError
 from embomatrix.llm.values import LlmError
 from embomatrix.rpc.status import ClusterError
 from embomatrix.sim.engine import EngineMissingError
+from embomatrix.world.bddl import BddlError
 from embomatrix.world.catalog import CatalogError
 from embomatrix.world.dataset import DatasetError
 from embomatrix.world.whole_file import write_whole
@@ -35,7 +38,7 @@ if TYPE_CHECKING:
 
 
 def progress(console: Console) -> Progress:
-    """Bars with how much is done, since when, and how long it will take yet."""
+    """Return progress bars with count, elapsed time and remaining time."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -48,16 +51,19 @@ def progress(console: Console) -> Progress:
 
 
 @contextlib.contextmanager
-def mended(out: Path | None = None, kept: str = "") -> Iterator[None]:
-    """What a person can mend is one sentence and exit status 2, an interrupt one and 130.
+def user_errors(out: Path | None = None, kept: str = "") -> Iterator[None]:
+    """Print errors that the user can fix as one sentence and exit with status 2; an interrupt exits with 130.
 
-    ``out`` is what is written, ``kept`` what is left in it by an interrupt, a full disk, or others who answer no more.
+    ``out`` is the output path. ``kept`` is appended after an interrupt, a full disk or a lost connection.
     """
     try:
         yield
     except (
+        BddlError,
+        BriefError,
         CatalogError,
         DatasetError,
+        DistributionError,
         EngineMissingError,
         EvaluationError,
         ProblemSourceError,
@@ -66,15 +72,17 @@ def mended(out: Path | None = None, kept: str = "") -> Iterator[None]:
     except (ClusterError, LlmError) as error:
         fail(f"{error}{kept}")
     except OSError as error:
-        if out is None:
+        if out is None and error.filename is None:
             raise
-        fail(f"{out} can't be written ({error.strerror}): make room, or name another{kept}")
+        if out is None:
+            fail(f"{error.filename} can't be used ({error.strerror}): name another file or folder")
+        fail(f"{out} can't be written ({error.strerror}): free disk space, or name another path{kept}")
     except KeyboardInterrupt:
         fail(f"interrupted{kept}", status=130)
 
 
 def fail(sentence: str, status: int = 2) -> NoReturn:
-    """The sentence on standard error, and the end of the command."""
+    """Print a sentence on standard error and exit the command."""
     Console(stderr=True).print(
         f"embomatrix factory: {sentence}", highlight=False, markup=False, soft_wrap=True
     )
@@ -82,7 +90,7 @@ def fail(sentence: str, status: int = 2) -> NoReturn:
 
 
 def report_evaluation(evaluation: EvaluationFigures, json_file: Path | None) -> None:
-    """A table of the figures, the notes below it, and all of it in the file where one is given. Ends what can't be written."""
+    """Print a table of the figures and their notes, and write them to ``json_file`` if one is given."""
     table = Table("figure", "value", "goal", "", "n")
     for figure in evaluation.figures:
         verdict = "" if figure.goal is None else "reached" if figure.is_reached else "short"
@@ -93,7 +101,7 @@ def report_evaluation(evaluation: EvaluationFigures, json_file: Path | None) -> 
     for note in evaluation.notes:
         Console().print(note, highlight=False, markup=False)
     if json_file is not None:
-        with mended(json_file):
+        with user_errors(json_file):
             write_whole(
                 json_file, (json.dumps(evaluation_to_json(evaluation), indent=1) + "\n").encode("ascii")
             )

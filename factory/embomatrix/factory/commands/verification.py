@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from embomatrix.factory.commands.terminal import fail, mended, progress, report_evaluation
-from embomatrix.factory.pipeline.options import Jobs, processes
+from embomatrix.factory.commands.options import Jobs, processes
+from embomatrix.factory.commands.terminal import fail, progress, report_evaluation, user_errors
 from embomatrix.factory.verification.again import sampled, verify_again
 from embomatrix.factory.verification.figures import evaluation_of, objections
 from embomatrix.world.dataset import Dataset
@@ -39,7 +39,7 @@ def verify(
 
     Exit status: 1 when a task is not admitted again, or two processes disagree.
     """
-    with mended(json_file):
+    with user_errors(json_file):
         if json_file is not None:
             check_writable(json_file)
         records = sampled(Dataset.load(folder).records, sample, seed)

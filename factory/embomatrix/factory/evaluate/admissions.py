@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures
 from embomatrix.factory.pipeline.settings import WriterKind
-from embomatrix.factory.pipeline.store import ATTEMPTS_FILE, BUILD_FILE, TIMES_FILE, settings_of
+from embomatrix.factory.pipeline.store import ATTEMPTS_FILE, BUILD_FILE, TIMES_FILE
 from embomatrix.pages.figures import Better, Figure
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def _settings(folder: Path) -> dict[str, Any]:
     path = folder / BUILD_FILE
     try:
         with path.open(encoding="utf-8") as file:
-            value = settings_of(file.readline())
+            value = json.loads(file.readline())["settings"]
         return {name: value[name] for name in ("writer", "look_ahead", "physical")}
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise EvaluationError(

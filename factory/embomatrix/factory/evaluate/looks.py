@@ -17,7 +17,7 @@ from embomatrix.factory.layout.organization import tree_in
 from embomatrix.factory.metrics.figures import EvaluationFigures
 from embomatrix.factory.pictures.sights import sight_of_room
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
+from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
 from embomatrix.llm.structured import ask
 from embomatrix.llm.values import ChatRequest, Message, Speaker, UnusableReplyError
 from embomatrix.pages.figures import Better, Figure
@@ -115,7 +115,7 @@ async def evaluate_looks(
         for number, method in enumerate(methods):
             names: list[str] = []
             laid = _noting(method, names)
-            imported = import_problem(task.source, base, seed=seed, manner=Manner(laid))
+            imported = import_problem(task.source, base, seed=seed, options=ImportOptions(laid))
             if isinstance(imported, ImportedTask) and names:
                 try:
                     impression = await impression_of(model, imported.scene, names, seed)

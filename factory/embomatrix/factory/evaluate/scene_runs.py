@@ -7,7 +7,7 @@ from collections import defaultdict
 from typing import TYPE_CHECKING, Any
 
 from embomatrix.factory.evaluate.scenes import LayoutMethod, LayoutOutcome, SceneTask, evaluation_of, judge
-from embomatrix.factory.pipeline.store import LineLog
+from embomatrix.factory.pipeline.store import ResumableLog
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.process_pool import process_pool
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     Trial = tuple[SceneTask, LayoutMethod]
 
 
-class OutcomeLog(LineLog[LayoutOutcome]):
+class OutcomeLog(ResumableLog[LayoutOutcome]):
     """Outcomes of trials; their seed decides them."""
 
     @staticmethod
     def open(path: Path, seed: int) -> OutcomeLog:
         """Start a log or take one up. A last line that was cut short is dropped. Raises EvaluationError, OSError."""
         log = OutcomeLog(path)
-        log.take_up({"seed": seed}, _outcome)
+        log.resume({"seed": seed}, _outcome)
         return log
 
 

@@ -31,7 +31,7 @@ from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigure
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.batch import poses_for
 from embomatrix.factory.task_import.sources import SourceText, read_activity
-from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
+from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.sim.simulation import load_simulator
@@ -137,7 +137,7 @@ def judge(
     """Lay a task out by a method, look at the scene, and execute the oracle's plan in it."""
     timed = _Timed(METHODS[method])
     began = time.process_time()
-    imported = import_problem(task.source, base, seed=seed, manner=Manner(timed))
+    imported = import_problem(task.source, base, seed=seed, options=ImportOptions(timed))
     spent = time.process_time() - began
 
     def outcome(

@@ -13,7 +13,7 @@ from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.factory.pictures.scene import draw_plan
 from embomatrix.factory.pictures.sights import alone
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.task_import.task import Manner, import_problem
+from embomatrix.factory.task_import.task import ImportOptions, import_problem
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -42,7 +42,7 @@ def draw_side_by_side(task: SceneTask, seed: int) -> Image.Image:
     base = build_base_scene(task.scene)
     panels = []
     for method, lay in METHODS.items():
-        imported = import_problem(task.source, base, seed=seed, manner=Manner(lay))
+        imported = import_problem(task.source, base, seed=seed, options=ImportOptions(lay))
         if isinstance(imported, TaskRefusal):
             panels.append(_reason(method, imported))
         else:

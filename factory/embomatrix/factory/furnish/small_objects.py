@@ -1,7 +1,7 @@
-"""Vocabulary of the task writer: which small things suit which rooms, by category of the catalog.
+"""Small objects and household conventions: groups, suitable rooms and hosts, by catalog category.
 
-The words are few on purpose: a policy with a word-level vocabulary learns from these tasks, and held-out tasks combine the
-same words anew.
+The vocabulary is small on purpose: a policy with a word-level vocabulary learns from these tasks, and held-out tasks
+recombine the same words.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class ItemKind(StrEnum):
-    """Kinds of small things that are found together."""
+    """Group of small objects that are found together."""
 
     FOOD = "food"
     FRUIT = "fruit"
@@ -55,7 +55,7 @@ MEMBERS: Final[Mapping[ItemKind, tuple[str, ...]]] = {
     ),
     ItemKind.DECORATION: ("vase", "picture_frame", "alarm_clock", "pillar_candle", "snow_globe", "wallet", "eyeglasses"),
 }  # fmt: skip
-"""Categories of each group. All of them can be carried; the food can be heated, cooked and frozen."""
+"""Categories of each group. All are portable; the food can be heated, cooked and frozen."""
 
 _KITCHEN: Final = (ItemKind.FOOD, ItemKind.FOOD, ItemKind.FRUIT, ItemKind.TABLEWARE, ItemKind.PACKAGES)
 _DINING: Final = (ItemKind.FRUIT, ItemKind.TABLEWARE, ItemKind.PACKAGES, ItemKind.FOOD, ItemKind.DECORATION)
@@ -122,7 +122,7 @@ HOST_GROUPS: Final[Mapping[str, frozenset[ItemKind]]] = {
         _NOTHING,
     ),
 }  # fmt: skip
-"""What a person would put on or in these hosts. Hosts that are not listed take anything."""
+"""Groups that people put on or in these hosts. Hosts without an entry accept everything."""
 
 NEVER_SWITCHED: Final = frozenset(
     {
@@ -130,40 +130,39 @@ NEVER_SWITCHED: Final = frozenset(
         "room_ventilator", "hand_dryer", "fire_extinguisher", "motorcycle",
     }
 )  # fmt: skip
-"""Things with a switch that no task asks for: out of reach, for an emergency, not for indoors, or no words tell one from
-another."""
+"""Categories with a switch that no task uses: out of reach, for emergencies, for outdoors, or ambiguous by name."""
 FOR_DRINKS: Final = frozenset({"coffee_maker", "espresso_machine"})
-"""What heats drinks, and no food."""
+"""Appliances that heat drinks but no food."""
 
 COOKWARE: Final = frozenset({"frying_pan", "saucepan", "saucepot", "stockpot", "wok", "chopping_board"})
-"""What leaves no kitchen."""
+"""Categories that stay in kitchens."""
 KITCHENS: Final = frozenset({"kitchen", "break_room", "bar"})
 SEATS: Final = ("chair", "stool")
-"""Names of furniture to sit on end so."""
+"""Endings of the names of seats."""
 BASKETS: Final = ("wicker_basket", "storage_box")
-"""Open containers that a variant may put on the floor or on a table."""
+"""Open containers that a variant may add."""
 
 
 def groups_for(room_type: str) -> tuple[ItemKind, ...]:
-    """Groups of small things that suit a room; the first are the most likely."""
+    """Return the groups that suit a room, the likeliest first."""
     return ROOM_GROUPS.get(room_type, DEFAULT_GROUPS)
 
 
 def belongs(category: str, room_type: str) -> bool:
-    """Whether a small thing is found in such a room."""
+    """True if a small object belongs in such a room."""
     if category in COOKWARE:
         return room_type in KITCHENS
     return any(category in MEMBERS[group] for group in groups_for(room_type))
 
 
 def suits(category: str, host_category: str) -> bool:
-    """Whether a person would put a thing of the category on or in such a host."""
+    """True if people put the category on or in such a host."""
     allowed = HOST_GROUPS.get(host_category)
     return allowed is None or any(category in MEMBERS[group] for group in allowed)
 
 
 def is_left_on(category: str, host_category: str) -> bool:
-    """Whether a thing that is lying about lies there: on seats neither food nor tableware."""
+    """True if people leave the object on such a host. Seats hold neither food nor tableware."""
     soft = any(category in MEMBERS[group] for group in _SOFT_GOODS)
     return suits(category, host_category) and (soft or not host_category.endswith(SEATS))
 
@@ -187,23 +186,25 @@ _APPLIANCES: Final = frozenset(
         "dishwasher", "washer", "clothes_dryer", "coffee_maker", "toaster", "hot_tub", "range_hood",
     )
 )  # fmt: skip
-"""Nobody leaves things on top of them."""
+"""Appliances that people put nothing on."""
 
 
 @functools.cache
-def likes(category: str) -> tuple[str, ...]:
-    """Furniture that a thing is put on or in, best first; empty when nothing is known."""
+def preferred_hosts(category: str) -> tuple[str, ...]:
+    """Return the furniture for a category, the best first; empty if nothing is known."""
     found = hosts_of(category)
     group = next((group for group, members in MEMBERS.items() if category in members), None)
     return tuple(dict.fromkeys((*found, *_BY_GROUP[group].split()))) if group else found
 
 
-def may_hold(host: str, category: str) -> bool:
-    """Whether people put such a thing on or in such furniture without a second thought."""
+def is_usual_host(host: str, category: str) -> bool:
+    """True if the host is usual for the category."""
     nothing = HOST_GROUPS.get(host) == frozenset() or host in _APPLIANCES
-    return not nothing and suits(category, host) and (host in likes(category) or host not in NO_HOSTS)
+    return (
+        not nothing and suits(category, host) and (host in preferred_hosts(category) or host not in NO_HOSTS)
+    )
 
 
-def on_appliance(host: str) -> bool:
-    """Whether the top of such furniture is an appliance's."""
+def is_appliance_top(host: str) -> bool:
+    """True if the host is an appliance that people put nothing on."""
     return host in _APPLIANCES

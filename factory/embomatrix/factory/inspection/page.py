@@ -1,7 +1,7 @@
-"""One task as one HTML file that needs nothing else: what is asked and why, layout, objects, the oracle's plan step by step.
+"""HTML page of one task: instruction, transcript, layout, objects, and the oracle's plan step by step.
 
-All text of a dataset is foreign: it is escaped where it becomes HTML, and what the script reads is JSON that can't end its
-element.
+The page needs no other file. All text of a dataset is untrusted: it is escaped in HTML, and the script's JSON can't
+close its element.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from PIL import Image
 
-from embomatrix.factory.inspection.plan_view import PlanView
+from embomatrix.factory.inspection.plan_view import inspection_view
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.pages.head import page_head
+from embomatrix.pages.plan_view import PlanView
 from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.world.evaluate import objects_of
 
 if TYPE_CHECKING:
-    from embomatrix.factory.inspection.playing import PlayMoment, Show
+    from embomatrix.factory.inspection.playing import OraclePlayback, PlayMoment
     from embomatrix.world.dataset import TaskRecord
     from embomatrix.world.scene import Scene
 
@@ -37,13 +38,13 @@ _STRONG: Final = re.compile(r"\*\*(.+?)\*\*")
 def task_page(
     record: TaskRecord,
     scene: Scene,
-    show: Show,
+    show: OraclePlayback,
     transcript: str = "",
     tree: object = None,
     picture: str = "",
 ) -> str:
-    """The page. ``transcript`` is Markdown as the social agents leave it, ``tree`` a layout tree of nested lists and mappings,
-    ``picture`` HTML, as of `scene_picture`.
+    """Return the page. ``transcript`` is Markdown, ``tree`` a nested layout tree, ``picture`` the HTML of
+    `scene_picture`.
     """
     task = record.task
     about = objects_of(task.goal, task.types)
@@ -61,7 +62,7 @@ def task_page(
         instruction=escape(task.instruction),
         facts=_facts(record),
         goal=escape(task.goal_bddl),
-        plan=view.svg(about, things),
+        plan=inspection_view(scene, view, about, things),
         moments=_script_json([_moment_json(moment, view) for moment in show.moments]),
         steps=_steps(show),
         verdict=escape(f"The plan {verdict} and earns {show.reward:.2f}."),
@@ -74,11 +75,11 @@ def task_page(
 
 
 def transcript_html(text: str) -> str:
-    """The Markdown of transcripts as HTML: headings, lists, paragraphs, strong words; anything else stays text."""
+    """Convert a transcript's Markdown to HTML: headings, lists, paragraphs and bold words. Other markup stays text."""
     lines: list[str] = []
     for block in re.split(r"\n\s*\n", text.strip()):
         if block.startswith("# "):
-            continue  # the page has the instruction as its own heading
+            continue  # the instruction is already the page's heading
         if block.startswith("## "):
             lines.append(f"<h3>{_inline(block[3:])}</h3>")
         elif block.startswith("* "):
@@ -120,7 +121,7 @@ def _facts(record: TaskRecord) -> str:
     )
 
 
-def _steps(show: Show) -> str:
+def _steps(show: OraclePlayback) -> str:
     rows = [("start", "")] + [(moment.call, moment.said) for moment in show.moments[1:]]
     return "".join(
         f'<li><button type="button" data-step="{number}"><b>{escape(call)}</b><span>{escape(said)}</span></button></li>'
@@ -143,7 +144,7 @@ def _object_rows(record: TaskRecord, scene: Scene, about: frozenset[str]) -> str
 
 
 def _tree(node: object) -> str:
-    """Nested mappings and lists as nested lists."""
+    """Convert nested mappings and lists to nested HTML lists."""
     if isinstance(node, dict):
         return _list([f"{escape(str(name))}{_tree(inner)}" for name, inner in node.items()])
     if isinstance(node, list):
@@ -152,7 +153,7 @@ def _tree(node: object) -> str:
 
 
 def scene_jpeg(scene: Scene, size_px: tuple[int, int] = PICTURE_PX) -> bytes:
-    """An oblique view. Drawn at twice the size: Bullet's renderer leaves edges jagged."""
+    """Return an oblique view as JPEG. It is rendered at twice the size, since Bullet's renderer leaves jagged edges."""
     width, height = size_px
     pixels = np.asarray(render_oblique(scene, width_px=2 * width, height_px=2 * height))
     picture = Image.fromarray(pixels).convert("RGB").resize(size_px, Image.Resampling.LANCZOS)
@@ -162,7 +163,7 @@ def scene_jpeg(scene: Scene, size_px: tuple[int, int] = PICTURE_PX) -> bytes:
 
 
 def scene_picture(scene: Scene) -> str:
-    """The same as an element that holds it."""
+    """Return the view as an HTML element with embedded data."""
     encoded = base64.b64encode(scene_jpeg(scene)).decode("ascii")
     return f'<img alt="the scene from above, at an angle" src="data:image/jpeg;base64,{encoded}">'
 
@@ -178,5 +179,5 @@ def _moment_json(moment: PlayMoment, view: PlanView) -> dict[str, Any]:
 
 
 def _script_json(value: object) -> str:
-    """JSON inside a script element: nothing in it can close the element or open a comment."""
+    """Return JSON for a script element. No character of it can close the element or open a comment."""
     return json.dumps(value).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

@@ -1,4 +1,4 @@
-"""A plan executed call by call, with what is to be seen after each: where the robot is, what it carries, what moved."""
+"""Playback of a plan call by call: robot pose, carried objects and moved objects after each step."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PlayMoment:
-    """The state after a call; the first moment, without a call, is the start.
+    """State after a call. The first moment, without a call, is the start.
 
-    ``things_m`` are the middles of the table's small things in the world, ``held`` what the hand carries, ``goal`` the goal's
-    atoms with whether each holds.
+    ``things_m`` maps the small objects of the table to their positions, ``held`` lists carried objects, ``goal`` the
+    goal's atoms with their truth.
     """
 
     call: str
@@ -40,8 +40,8 @@ class PlayMoment:
 
 
 @dataclass(frozen=True, slots=True)
-class Show:
-    """The oracle's plan from start to end. ``final`` describes the end in words, ``reward`` what it earns."""
+class OraclePlayback:
+    """Oracle plan from start to end. ``final`` describes the final state, ``reward`` is the reward earned."""
 
     moments: tuple[PlayMoment, ...]
     final: tuple[str, ...]
@@ -49,8 +49,8 @@ class Show:
     success: bool
 
 
-def play_oracle(record: TaskRecord, bundle: Bundle) -> Show:
-    """Execute the record's oracle plan in its bundle. Raises EngineError where the scene can't be loaded."""
+def play_oracle(record: TaskRecord, bundle: Bundle) -> OraclePlayback:
+    """Execute the record's oracle plan in its bundle. Raise EngineError if the scene can't be loaded."""
     task = record.task
     plan = plan_from_json(list(record.oracle), task.profile)
     with contextlib.closing(load_simulator(bundle)) as simulator:
@@ -63,7 +63,7 @@ def play_oracle(record: TaskRecord, bundle: Bundle) -> Show:
                 break
         trace = simulator.execute(task, plan, SEED)
         reward = score(task, trace.touched, simulator.facts)
-    return Show(tuple(moments), trace.final, reward.total, reward.success)
+    return OraclePlayback(tuple(moments), trace.final, reward.total, reward.success)
 
 
 def _moment(simulator: Simulator, record: TaskRecord, call: str, said: str) -> PlayMoment:

@@ -1,6 +1,6 @@
-"""The agents' doors: briefs and answers as JSON, checked by pydantic; inside they are plain frozen values.
+"""Interfaces of the layout agents: briefs and answers as JSON, validated by pydantic.
 
-Four agents by the paper's names. Three of them can be a language model; poses are always sampled by code.
+The four agents follow the paper. Three of them can be a language model; poses are always sampled by code.
 """
 
 from __future__ import annotations
@@ -11,22 +11,22 @@ from typing import TYPE_CHECKING, Any, Final
 
 from pydantic import TypeAdapter, ValidationError
 
-from embomatrix.factory.layout.constraints import wish
+from embomatrix.factory.layout.constraints import choose_constraints
 from embomatrix.factory.layout.distribution import distribute
 from embomatrix.factory.layout.organization import organize
 from embomatrix.factory.layout.planar import arrange
 from embomatrix.factory.layout.sampling import ObjectSampler
 from embomatrix.factory.layout.values import (
-    Arranged,
     Branch,
+    ConstraintBrief,
     Distribution,
     DistributionBrief,
     PlacementConstraints,
+    PlaneArrangement,
     PlaneBrief,
-    PlaneCompany,
     RoomBrief,
     SampleBrief,
-    Sampled,
+    SampledPose,
 )
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.editor import PlacementError, SceneEditor
@@ -39,7 +39,7 @@ import numpy as np
 
 
 class AgentName(StrEnum):
-    """Agents that can be run alone."""
+    """Layout agent that ``factory agent`` can run."""
 
     DISTRIBUTOR = "scene-distributor"
     ORGANIZER = "room-organizer"
@@ -49,12 +49,12 @@ class AgentName(StrEnum):
 
 
 class BriefError(ValueError):
-    """A brief that an agent can't read; one sentence for a person."""
+    """Brief that an agent can't read. The message is one sentence for the user."""
 
 
 @dataclass(frozen=True, slots=True)
 class AgentInterface:
-    """What an agent takes and gives, and its rules."""
+    """Types of an agent's brief and answer, and the rules that answer without a language model."""
 
     about: str
     brief: TypeAdapter[Any]
@@ -62,18 +62,18 @@ class AgentInterface:
     rules: Callable[[Any], Any]
 
     def read(self, text: str) -> Any:
-        """A brief from JSON. Raises BriefError naming the field."""
+        """Parse a brief from JSON. Raise BriefError that names the field."""
         try:
             return self.brief.validate_json(text)
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             where = ".".join(map(str, first["loc"])) or "the brief"
             raise BriefError(
-                f"{where}: {first['msg'].lower()}; `--schema` prints what is expected"
+                f"{where}: {first['msg'].lower()}; `--schema` prints the expected schema"
             ) from error
 
-    def written(self, answer: Any) -> str:
-        """An answer as JSON."""
+    def to_json(self, answer: Any) -> str:
+        """Return an answer as JSON."""
         return self.answer.dump_json(answer, indent=1).decode()
 
 
@@ -81,50 +81,50 @@ def _branches(brief: RoomBrief) -> tuple[Branch, ...]:
     return tuple(organize(brief).branches())
 
 
-def sample(brief: SampleBrief) -> Sampled:
-    """Sample one pose in a base scene, as the object-level agent does."""
+def sample(brief: SampleBrief) -> SampledPose:
+    """Sample one pose in a base scene with the object-level agent."""
     editor = SceneEditor(build_base_scene(brief.scene, seed=brief.seed))
     sampler = ObjectSampler(editor, np.random.default_rng((brief.seed, 3)))
     relation = Relation(brief.relation.value) if brief.relation else None
     try:
         name = sampler.add(brief.category, brief.model or None, relation, brief.host)
     except PlacementError as error:
-        return Sampled(reason=error.reason, detail=str(error))
+        return SampledPose(reason=error.reason, detail=str(error))
     pose = editor.objects[name].pose_world_asset
-    return Sampled(name, pose.position_m, pose.quat_xyzw, editor.objects[name].room)
+    return SampledPose(name, pose.position_m, pose.quat_xyzw, editor.objects[name].room)
 
 
-DOORS: Final[Mapping[AgentName, AgentInterface]] = {
+LAYOUT_AGENTS: Final[Mapping[AgentName, AgentInterface]] = {
     AgentName.DISTRIBUTOR: AgentInterface(
-        "Scene-level Distribution Agent: a room for each thing",
+        "Scene-level Distribution Agent: room of each object",
         TypeAdapter(DistributionBrief),
         TypeAdapter(Distribution),
         distribute,
     ),
     AgentName.ORGANIZER: AgentInterface(
-        "Room-level Organization Agent: a layout tree, as branches",
+        "Room-level Organization Agent: branches of a layout tree",
         TypeAdapter(RoomBrief),
         TypeAdapter(tuple[Branch, ...]),
         _branches,
     ),
     AgentName.PLANNER: AgentInterface(
-        "Planar-Level Placement Generator, first half: constraints",
-        TypeAdapter(PlaneCompany),
+        "Planar-Level Placement Generator, choice of constraints",
+        TypeAdapter(ConstraintBrief),
         TypeAdapter(PlacementConstraints),
-        wish,
+        choose_constraints,
     ),
     AgentName.SOLVER: AgentInterface(
-        "Planar-Level Placement Generator, second half: spots on a plane",
+        "Planar-Level Placement Generator, solver",
         TypeAdapter(PlaneBrief),
-        TypeAdapter(tuple[Arranged, ...]),
+        TypeAdapter(tuple[PlaneArrangement, ...]),
         arrange,
     ),
     AgentName.SAMPLER: AgentInterface(
-        "Object-level Sampling Agent: a pose in a base scene",
+        "Object-level Sampling Agent: pose in a base scene",
         TypeAdapter(SampleBrief),
-        TypeAdapter(Sampled),
+        TypeAdapter(SampledPose),
         sample,
     ),
 }
-MODELLED: Final = frozenset({AgentName.DISTRIBUTOR, AgentName.ORGANIZER, AgentName.PLANNER})
+MODEL_BACKED: Final = frozenset({AgentName.DISTRIBUTOR, AgentName.ORGANIZER, AgentName.PLANNER})
 """Agents that can be a language model."""

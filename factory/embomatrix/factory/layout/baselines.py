@@ -1,6 +1,6 @@
-"""Two simpler ways to lay a task out, in the paper's comparison: sampling without a tree, and poses without a solver.
+"""Baselines of the paper's comparison: random sampling without a tree, and written poses without a solver.
 
-Neither looks at where the robot can stand, neither hears what failed. They take the same items and the same models as ``lay``.
+Both ignore robot positions and earlier failures. They use the same objects and models as ``generator.lay``.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.layout.organization import in_order
-from embomatrix.factory.layout.request import Layout, Record, thing_of
+from embomatrix.factory.layout.organization import hosts_first
+from embomatrix.factory.layout.request import Layout, LayoutRecord, object_brief
 from embomatrix.factory.layout.sampling import LIFT_M, ObjectSampler
 from embomatrix.factory.scenes.editor import LayoutReason, PlacementError
 from embomatrix.world.geometry import Pose
@@ -22,20 +22,20 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from embomatrix.factory.layout.request import RequestedObject
-    from embomatrix.factory.layout.values import Failure
+    from embomatrix.factory.layout.values import LayoutFailure
     from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.world.asset import Asset
 
 TRIES: Final = 10
-"""Samples for one thing: what OmniGibson's own sampler is given in the paper's code."""
-ROUNDED_M: Final = 0.05
-"""Poses that are written down are round numbers."""
+"""Samples per object, as for OmniGibson's sampler in the paper's code."""
+GRID_M: Final = 0.05
+"""Grid of written poses."""
 SPREAD: Final = 0.3
-"""Written poses lie this share of a side around the middle of what they are on."""
+"""Maximum distance of a written pose from the host's centre, as a share of each side."""
 
 
 def lay_at_random(editor: SceneEditor, items: Sequence[RequestedObject], seed: int) -> Layout:
-    """Without tree: each thing at the first random pose that is free, in the relation that the task demands or on a floor."""
+    """Place each object at the first collision-free random pose, in the demanded relation or on a floor."""
     rng = np.random.default_rng((seed, 17))
     sampler = ObjectSampler(editor, rng)
 
@@ -45,48 +45,48 @@ def lay_at_random(editor: SceneEditor, items: Sequence[RequestedObject], seed: i
                 return pose
         raise PlacementError(LayoutReason.NO_FREE_SPOT, f"none of {TRIES} random poses at {host} is free")
 
-    return _laid(editor, items, sampler, rng, first_free)
+    return _lay_each(editor, items, sampler, rng, first_free)
 
 
 def lay_by_poses(editor: SceneEditor, items: Sequence[RequestedObject], seed: int) -> Layout:
-    """As LayoutGPT has a model write them: round absolute poses at what the task names, which nothing looks at."""
+    """Place each object at an unchecked pose rounded to a grid, as a language model writes them in LayoutGPT."""
     rng = np.random.default_rng((seed, 19))
 
     def written(asset: Asset, relation: Relation | None, host: str) -> Pose:
         if host not in editor.rooms and host not in editor.objects:
-            detail = f"what it is to stand at, {host!r}, has no place itself"
+            detail = f"its host {host!r} has no place itself"
             raise PlacementError(LayoutReason.UNKNOWN_HOST, detail)
-        return _written(editor, asset, relation, host, rng)
+        return _rounded_pose(editor, asset, relation, host, rng)
 
-    return _laid(editor, items, ObjectSampler(editor, rng), rng, written)
+    return _lay_each(editor, items, ObjectSampler(editor, rng), rng, written)
 
 
-def _laid(
+def _lay_each(
     editor: SceneEditor,
     items: Sequence[RequestedObject],
     sampler: ObjectSampler,
     rng: np.random.Generator,
     pose_for: Callable[[Asset, Relation | None, str], Pose],
 ) -> Layout:
-    """Each thing at the pose that is found for it, or left out with the reason."""
+    """Place each object at the pose found for it, or leave it out with the reason."""
     names: dict[str, str] = {}
-    failures: list[Failure] = []
+    failures: list[LayoutFailure] = []
     for item in _hosts_first(items):
         asset = item.asset(0)
-        relation, host = _demand(editor, item, names, rng)
+        relation, host = _requested_place(editor, item, names, rng)
         try:
             pose = pose_for(asset, relation, host)
         except PlacementError as error:
             failures.append(item.failure(host, error.reason, str(error)))
         else:
             names[item.name] = editor.insert(asset, pose, *sampler.rests(relation, host))
-    return Layout(names, {}, tuple(failures), Record())
+    return Layout(names, {}, tuple(failures), LayoutRecord())
 
 
-def _written(
+def _rounded_pose(
     editor: SceneEditor, asset: Asset, relation: Relation | None, host: str, rng: np.random.Generator
 ) -> Pose:
-    """A pose at the host's middle, give or take, at the height that its box suggests."""
+    """Return a pose near the host's centre, at the height of its box for the relation."""
     if host in editor.rooms:
         (x, y), (width, depth) = editor.rooms[host].center_m, editor.rooms[host].size_m
         bottom = 0.0
@@ -105,19 +105,19 @@ def _written(
 
 
 def _rounded(value: float) -> float:
-    return round(value / ROUNDED_M) * ROUNDED_M
+    return round(value / GRID_M) * GRID_M
 
 
 def _hosts_first(items: Sequence[RequestedObject]) -> Iterator[RequestedObject]:
     by_name = {item.name: item for item in items}
-    for thing in in_order([thing_of(item, item.asset(0), {}) for item in items]):
+    for thing in hosts_first([object_brief(item, item.asset(0), {}) for item in items]):
         yield by_name[thing.name]
 
 
-def _demand(
+def _requested_place(
     editor: SceneEditor, item: RequestedObject, names: dict[str, str], rng: np.random.Generator
 ) -> tuple[Relation | None, str]:
-    """What the task demands of an item, in the scene's names; else the floor of a room that it may be in."""
+    """Return the relation and host that the task demands, in scene names; otherwise the floor of a permitted room."""
     if item.relation is not None:
         host = names.get(item.host, item.host)
         floor = host in editor.rooms

@@ -1,8 +1,9 @@
-"""What each constraint on a plane means, over whole arrays of candidate spots.
+"""Placement constraints on a plane: their meaning over arrays of candidate spots, and rules that choose them.
 
-All is in the plane's frame: origin in its middle, x and y along its sides. A thing's front looks along its own +x.
-Weights are those of the paper's released planar level, which gets three of the meanings wrong. Here a thing faces another
-when its front looks at it, near and far are told by gaps that suit the plane, and the middle counts.
+All values are in the plane's frame: origin in the centre, x and y along its sides. An object's front points along its
+own +x axis. Weights are those of the paper's released code, which implements three constraints incorrectly. Here
+``face_to`` means that the object's front points at the other object. ``near`` and ``far`` use gaps scaled to the
+plane, and ``middle`` has an effect.
 """
 
 from __future__ import annotations
@@ -14,7 +15,12 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.factory.furnish.roles import FurnitureRole, role_of
-from embomatrix.factory.layout.values import Arrangement, Kind, PlacementConstraint, PlacementConstraints
+from embomatrix.factory.layout.values import (
+    ConstraintKind,
+    PlacementClass,
+    PlacementConstraint,
+    PlacementConstraints,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -22,8 +28,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from embomatrix.factory.layout.values import (
+        ConstraintBrief,
         ObjectBrief,
-        PlaneCompany,
         PlaneFootprint,
         Size2,
         Size3,
@@ -33,25 +39,25 @@ if TYPE_CHECKING:
     BoolArray = NDArray[np.bool_]
 
 
-WEIGHTS: Final[Mapping[Arrangement, float]] = {
-    Arrangement.EDGE: 2.0,
-    Arrangement.MIDDLE: 1.0,
-    Arrangement.NEAR: 0.5,
-    Arrangement.FAR: 0.5,
-    Arrangement.IN_FRONT_OF: 0.5,
-    Arrangement.SIDE_OF: 0.5,
-    Arrangement.CENTER_ALIGNED: 1.5,
-    Arrangement.FACE_TO: 1.5,
-    Arrangement.NEXT_TO: 1.5,
+WEIGHTS: Final[Mapping[ConstraintKind, float]] = {
+    ConstraintKind.EDGE: 2.0,
+    ConstraintKind.MIDDLE: 1.0,
+    ConstraintKind.NEAR: 0.5,
+    ConstraintKind.FAR: 0.5,
+    ConstraintKind.IN_FRONT_OF: 0.5,
+    ConstraintKind.SIDE_OF: 0.5,
+    ConstraintKind.CENTER_ALIGNED: 1.5,
+    ConstraintKind.FACE_TO: 1.5,
+    ConstraintKind.NEXT_TO: 1.5,
 }
 EDGE_M: Final = 0.10
 EDGE_SHARE: Final = 0.15
-"""At the edge is within 10 cm of a side, on small planes within this share of the shorter side."""
+"""``edge``: within 10 cm of a side; on small planes within this share of the shorter side."""
 MIDDLE_SHARE: Final = 0.15
-"""In the middle is within this share of each side from the plane's middle."""
+"""``middle``: within this share of each side from the plane's centre."""
 NEAR_M: Final = 1.0
 NEAR_SHARE: Final = 0.25
-"""Near is a gap of a metre at most, on small planes of this share of the diagonal; far is anything more."""
+"""``near``: a gap of at most 1 m; on small planes at most this share of the diagonal. ``far`` is the opposite."""
 FACE_RAD: Final = math.radians(5.0)
 ALIGNED_RAD: Final = math.radians(5.0)
 FRONT_RAD: Final = math.radians(45.0)
@@ -59,14 +65,16 @@ NEXT_SHARE: Final = 1 / 6
 NEXT_M: Final = (0.05, 0.5)
 """The engine's rule for ``nextto``: a sixth of the mean of the six extents, within these bounds."""
 NEXT_SLACK: Final = 0.8
-"""Round things are farther apart than their boxes: only this much of what the engine allows is used."""
-SHADE: Final = 0.3
-"""How much of a weight is given by degrees, so that what is nearly so counts for more than what is not at all."""
+"""Share of the engine's limit that is used. Round objects are farther apart than their boxes."""
+GRADED_SHARE: Final = 0.3
+"""Share of a weight that grows with partial satisfaction, so that nearly satisfied constraints count."""
 
 
 @dataclass(frozen=True, slots=True)
 class SpotCandidates:
-    """n spots of one thing: middles (n, 2), yaws (n,), and half extents (n, 2) of the box around the turned footprint."""
+    """Candidate spots of one object: centres (n, 2), yaws (n,), and half extents (n, 2) of the box around the rotated
+    footprint.
+    """
 
     center: FloatArray
     yaw: FloatArray
@@ -74,7 +82,7 @@ class SpotCandidates:
 
     @staticmethod
     def of(center: FloatArray, yaw: FloatArray, size_m: Size3) -> SpotCandidates:
-        """Spots of a thing of this size."""
+        """Return the spots of an object with this size."""
         return SpotCandidates(center, yaw, half_extents(yaw, (size_m[0], size_m[1])))
 
     def at(self, rows: FloatArray | BoolArray | NDArray[np.int64]) -> SpotCandidates:
@@ -85,97 +93,99 @@ class SpotCandidates:
 
 
 def half_extents(yaw: FloatArray, size_m: Size2) -> FloatArray:
-    """Half extents, shape (n, 2), of the upright boxes around a rectangle turned by each of n yaws."""
+    """Return half extents, shape (n, 2), of the axis-aligned boxes around a rectangle rotated by n yaws."""
     cosine, sine = np.abs(np.cos(yaw)), np.abs(np.sin(yaw))
     x, y = size_m[0] / 2, size_m[1] / 2
     return np.stack([cosine * x + sine * y, sine * x + cosine * y], axis=-1)
 
 
 def margins(spots: SpotCandidates, plane_m: Size2) -> FloatArray:
-    """Free strip between each spot and the nearest side of the plane, shape (n,); negative where it juts out."""
+    """Distance between each spot's box and the nearest side of the plane, shape (n,). It is negative beyond the side."""
     return np.asarray((np.asarray(plane_m) / 2 - np.abs(spots.center) - spots.half).min(axis=1))
 
 
 def gaps(spots: SpotCandidates, other: PlaneFootprint) -> FloatArray:
-    """Distance between the boxes around each spot and around another footprint, shape (n,); 0 where they overlap."""
+    """Distance between each spot's box and another footprint's box, shape (n,); 0 if they overlap."""
     apart = np.abs(spots.center - np.asarray(other.center_m)) - spots.half - _half(other)
     return np.asarray(np.hypot(*np.maximum(apart, 0.0).T))
 
 
 def near_m(plane_m: Size2) -> float:
-    """How far apart two things on a plane of these sides may be and still be near one another, in metres."""
+    """Return the largest gap in metres at which two objects on a plane of this size are near each other."""
     return min(NEAR_M, NEAR_SHARE * math.hypot(*plane_m))
 
 
 def holds(
-    wish: PlacementConstraint,
+    constraint: PlacementConstraint,
     spots: SpotCandidates,
     plane_m: Size2,
     size_m: Size3,
     other: PlaneFootprint | None,
 ) -> BoolArray:
-    """At which spots a wish holds, shape (n,). A wish about an object that is not on the plane holds nowhere."""
-    if wish.kind is Arrangement.EDGE:
+    """Mask of spots at which a constraint holds, shape (n,). A constraint about an absent object holds nowhere."""
+    if constraint.kind is ConstraintKind.EDGE:
         return margins(spots, plane_m) <= min(EDGE_M, EDGE_SHARE * min(plane_m))
-    if wish.kind is Arrangement.MIDDLE:
+    if constraint.kind is ConstraintKind.MIDDLE:
         return np.asarray((np.abs(spots.center) <= MIDDLE_SHARE * np.asarray(plane_m)).all(axis=1))
     if other is None:
         return np.zeros(len(spots), dtype=bool)
-    match wish.kind:
-        case Arrangement.NEAR:
+    match constraint.kind:
+        case ConstraintKind.NEAR:
             return np.asarray(gaps(spots, other) <= near_m(plane_m))
-        case Arrangement.FAR:
+        case ConstraintKind.FAR:
             return np.asarray(gaps(spots, other) > near_m(plane_m))
-        case Arrangement.NEXT_TO:
+        case ConstraintKind.NEXT_TO:
             return _beside(spots, size_m, other)
-        case Arrangement.IN_FRONT_OF:
+        case ConstraintKind.IN_FRONT_OF:
             return np.asarray(_off_front(spots, other) <= FRONT_RAD)
-        case Arrangement.SIDE_OF:
+        case ConstraintKind.SIDE_OF:
             angle = _off_front(spots, other)
             return np.asarray((angle > FRONT_RAD) & (angle < math.pi - FRONT_RAD))
-        case Arrangement.FACE_TO:
-            return np.asarray(_off_gaze(spots, other) <= FACE_RAD)
+        case ConstraintKind.FACE_TO:
+            return np.asarray(_off_own_front(spots, other) <= FACE_RAD)
         case _:
             return np.asarray(_off_axis(spots, other) <= ALIGNED_RAD)
 
 
-def degrees(
-    wish: PlacementConstraint,
+def satisfaction(
+    constraint: PlacementConstraint,
     spots: SpotCandidates,
     plane_m: Size2,
     size_m: Size3,
     other: PlaneFootprint | None,
 ) -> FloatArray:
-    """How far a wish is met, from 0 to 1, shape (n,): falls off gently where it does not hold."""
-    if wish.kind is Arrangement.EDGE:
+    """Satisfaction of a constraint at each spot, from 0 to 1, shape (n,). It decreases smoothly with the violation."""
+    if constraint.kind is ConstraintKind.EDGE:
         return np.asarray(np.exp(-np.maximum(margins(spots, plane_m), 0.0) / (0.25 * max(plane_m))))
-    if wish.kind is Arrangement.MIDDLE:
+    if constraint.kind is ConstraintKind.MIDDLE:
         return np.asarray(1.0 - np.hypot(*(spots.center / np.asarray(plane_m)).T) * math.sqrt(2))
     if other is None:
         return np.zeros(len(spots))
-    match wish.kind:
-        case Arrangement.NEAR | Arrangement.NEXT_TO:
+    match constraint.kind:
+        case ConstraintKind.NEAR | ConstraintKind.NEXT_TO:
             return np.asarray(np.exp(-gaps(spots, other) / near_m(plane_m)))
-        case Arrangement.FAR:
+        case ConstraintKind.FAR:
             return np.asarray(1.0 - np.exp(-gaps(spots, other) / near_m(plane_m)))
-        case Arrangement.IN_FRONT_OF:
+        case ConstraintKind.IN_FRONT_OF:
             return np.asarray((1.0 + np.cos(_off_front(spots, other))) / 2)
-        case Arrangement.SIDE_OF:
+        case ConstraintKind.SIDE_OF:
             return np.asarray(np.abs(np.sin(_off_front(spots, other))))
-        case Arrangement.FACE_TO:
-            return np.asarray((1.0 + np.cos(_off_gaze(spots, other))) / 2)
+        case ConstraintKind.FACE_TO:
+            return np.asarray((1.0 + np.cos(_off_own_front(spots, other))) / 2)
         case _:
             return np.asarray(np.cos(_off_axis(spots, other)) ** 8)
 
 
 def next_to_m(size_m: Size3, other: PlaneFootprint) -> float:
-    """The largest gap at which the engine calls two boxes next to each other."""
+    """Return the largest gap at which the engine considers two boxes next to each other."""
     mean = (sum(size_m) + sum(other.size_m) + other.high_m - other.low_m) / 6
     return min(max(NEXT_SHARE * mean, NEXT_M[0]), NEXT_M[1])
 
 
 def _beside(spots: SpotCandidates, size_m: Size3, other: PlaneFootprint) -> BoolArray:
-    """Side by side: their heights overlap, they face each other along one axis, and the gap is small."""
+    """Mask of spots side by side with a footprint: overlapping heights, a shared span along one axis, and a small
+    gap.
+    """
     if other.low_m >= size_m[2] or other.high_m <= 0.0:
         return np.zeros(len(spots), dtype=bool)
     apart = np.abs(spots.center - np.asarray(other.center_m)) - spots.half - _half(other)  # (n, 2)
@@ -185,19 +195,19 @@ def _beside(spots: SpotCandidates, size_m: Size3, other: PlaneFootprint) -> Bool
 
 
 def _off_front(spots: SpotCandidates, other: PlaneFootprint) -> FloatArray:
-    """Angle, 0 to pi, between where another's front looks and the way from it to each spot."""
+    """Angle from 0 to pi between another object's front and the direction from it to each spot."""
     way = spots.center - np.asarray(other.center_m)
     return _turn(np.arctan2(way[:, 1], way[:, 0]) - other.yaw)
 
 
-def _off_gaze(spots: SpotCandidates, other: PlaneFootprint) -> FloatArray:
-    """Angle, 0 to pi, between where the thing's own front looks and the way to another's middle."""
+def _off_own_front(spots: SpotCandidates, other: PlaneFootprint) -> FloatArray:
+    """Angle from 0 to pi between the object's own front and the direction to another object's centre."""
     way = np.asarray(other.center_m) - spots.center
     return _turn(np.arctan2(way[:, 1], way[:, 0]) - spots.yaw)
 
 
 def _off_axis(spots: SpotCandidates, other: PlaneFootprint) -> FloatArray:
-    """Angle, 0 to pi/4, between the way from another to each spot and the nearest of the other's four axes."""
+    """Angle from 0 to pi/4 between the direction from another object to each spot and the nearest of its four axes."""
     way = spots.center - np.asarray(other.center_m)
     angle = np.arctan2(way[:, 1], way[:, 0]) - other.yaw
     quarter = math.pi / 2
@@ -229,67 +239,67 @@ _COMPANIONS: Final[Mapping[str, str]] = {
 COMPANIONS: Final = {
     category: frozenset(others.split()) for names, others in _COMPANIONS.items() for category in names.split()
 }
-"""What a thing is put beside where both are on one table."""
+"""Categories that an object is placed next to on a table."""
 _CENTREPIECES: Final = "vase pillar_candle snow_globe fruit_bowl candelabrum bouquet wicker_basket"
 CENTREPIECES: Final = frozenset(_CENTREPIECES.split())
 _BOARDS: Final = "breakfast_table dining_table coffee_table conference_table pedestal_table garden_coffee_table garden_table"
 BOARDS: Final = frozenset(_BOARDS.split())
-"""Tables that people stand or sit around: their middle is for show."""
+"""Tables that people stand or sit around. Their middle is for decoration."""
 TABLES: Final = BOARDS | {"desk", "booth", "lab_table"}
-"""What seats are drawn up to."""
+"""Furniture that seats are placed at."""
 SEATED: Final = frozenset(["plate", "bowl", "place_mat", "laptop", "notebook"])
-"""What is laid where somebody sits: at the edge of such a table."""
+"""Objects at the place of a seated person, at the edge of the table."""
 _BACKED: Final = (
     "alarm_clock picture_frame radio table_lamp microwave toaster coffee_maker box_of_tissues hardback "
     "paperback_book folder magazine newspaper comic_book board_game jigsaw_puzzle clipboard envelope box_of_cereal "
     "box_of_crackers"
 )
 BACKED: Final = frozenset(_BACKED.split())
-"""What stands or lies at an edge, out of the way."""
+"""Objects that stand or lie at an edge, out of the way."""
 
 
-def wish(company: PlaneCompany) -> PlacementConstraints:
-    """Constraints for each thing of a plane, the most important first; none for what may stand anywhere."""
+def choose_constraints(brief: ConstraintBrief) -> PlacementConstraints:
+    """Return the constraints of each object, the most important first. Objects that may stand anywhere have none."""
     return PlacementConstraints(
-        {thing.name: tuple(dict.fromkeys(_wishes(thing, company))) for thing in company.things}
+        {thing.name: tuple(dict.fromkeys(_constraints_for(thing, brief))) for thing in brief.objects}
     )
 
 
-def _wishes(thing: ObjectBrief, company: PlaneCompany) -> Iterator[PlacementConstraint]:
-    others = dict(company.others)
-    rank = company.things.index(thing)
-    before = {**others, **{each.name: each.category for each in company.things[:rank]}}
+def _constraints_for(thing: ObjectBrief, brief: ConstraintBrief) -> Iterator[PlacementConstraint]:
+    others = dict(brief.others)
+    rank = brief.objects.index(thing)
+    before = {**others, **{each.name: each.category for each in brief.objects[:rank]}}
     for other in thing.beside:
-        yield PlacementConstraint(Arrangement.NEXT_TO, other, required=True)
-    if company.on_floor:
+        yield PlacementConstraint(ConstraintKind.NEXT_TO, other, required=True)
+    if brief.on_floor:
         yield from _on_floor(thing, before)
         return
     alike = next((name for name, category in before.items() if category == thing.category), "")
     if alike:
-        yield PlacementConstraint(Arrangement.NEXT_TO, alike)
-        yield PlacementConstraint(Arrangement.CENTER_ALIGNED, alike)
+        yield PlacementConstraint(ConstraintKind.NEXT_TO, alike)
+        yield PlacementConstraint(ConstraintKind.CENTER_ALIGNED, alike)
         return
-    everyone = {**before, **{each.name: each.category for each in company.things[rank + 1 :]}}
+    everyone = {**before, **{each.name: each.category for each in brief.objects[rank + 1 :]}}
     likes = COMPANIONS.get(thing.category, frozenset())
     friend = next((name for name, category in everyone.items() if category in likes), "")
     if friend:
-        yield PlacementConstraint(Arrangement.NEXT_TO, friend)
-        yield PlacementConstraint(Arrangement.SIDE_OF, friend)
+        yield PlacementConstraint(ConstraintKind.NEXT_TO, friend)
+        yield PlacementConstraint(ConstraintKind.SIDE_OF, friend)
         return
-    if company.host in BOARDS and thing.category in CENTREPIECES:
-        yield PlacementConstraint(Arrangement.MIDDLE)
-    elif thing.category in BACKED or (company.host in BOARDS and thing.category in SEATED):
-        yield PlacementConstraint(Arrangement.EDGE)
+    if brief.host in BOARDS and thing.category in CENTREPIECES:
+        yield PlacementConstraint(ConstraintKind.MIDDLE)
+    elif thing.category in BACKED or (brief.host in BOARDS and thing.category in SEATED):
+        yield PlacementConstraint(ConstraintKind.EDGE)
 
 
 def _on_floor(thing: ObjectBrief, before: Mapping[str, str]) -> Iterator[PlacementConstraint]:
-    """Seats go to a table, tables stand in the open, the rest at a wall."""
-    role = role_of(thing.category, thing.size_m, 0.0) if thing.kind is Kind.FURNITURE else None
+    """Yield floor constraints: seats face a table, tables stand in the middle, other furniture at a wall."""
+    role = role_of(thing.category, thing.size_m, 0.0) if thing.kind is PlacementClass.FURNITURE else None
     table = next((name for name, category in before.items() if category in TABLES), "")
     if role is FurnitureRole.SEAT and table:
-        yield PlacementConstraint(Arrangement.FACE_TO, table)
-        yield PlacementConstraint(Arrangement.NEXT_TO, table)
+        yield PlacementConstraint(ConstraintKind.FACE_TO, table)
+        yield PlacementConstraint(ConstraintKind.NEXT_TO, table)
     elif role in (FurnitureRole.LOW_TABLE, FurnitureRole.OPEN) or thing.category in BOARDS:
-        yield PlacementConstraint(Arrangement.MIDDLE)
+        yield PlacementConstraint(ConstraintKind.MIDDLE)
     else:
-        yield PlacementConstraint(Arrangement.EDGE)
+        yield PlacementConstraint(ConstraintKind.EDGE)

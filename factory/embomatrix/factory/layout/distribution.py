@@ -1,7 +1,7 @@
-"""Scene-level Distribution Agent: which room each of a task's things goes to, by rules as in the paper.
+"""Scene-level Distribution Agent: rules that assign each object of a task to a room, as in the paper.
 
-What the task says comes first: things that are in a relation to one another are in one room, with the room of what is there
-already. Then the room's function, its furniture, its size, and how much it was given so far decide.
+The task's demands come first: objects that a relation ties together share a room. The rules then score room type,
+furniture, size and the number of objects already assigned.
 """
 
 from __future__ import annotations
@@ -12,54 +12,57 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.furnish.small_objects import belongs, likes, may_hold
-from embomatrix.factory.layout.values import Distribution, Kind
+from embomatrix.factory.furnish.small_objects import belongs, is_usual_host, preferred_hosts
+from embomatrix.factory.layout.values import Distribution, PlacementClass
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from embomatrix.factory.layout.values import DistributionBrief, LayoutRoomFacts, ObjectBrief
 
-FUNCTION: Final = 1.0
-"""What it is worth that a room of such a type is where people keep the thing."""
-HOST: Final = 0.8
-"""What the thing's favourite furniture is worth, where the room has it."""
-BARE: Final = -5.0
-"""Of a room where it would have to lie on the floor."""
-SIZE: Final = 0.25
-"""What a room is worth that is e times as large as another."""
-CROWD: Final = 0.15
-"""What each thing costs that a room was given already."""
-CHANCE: Final = 0.3
+ROOM_TYPE_SCORE: Final = 1.0
+"""Score of a room whose type suits the object."""
+PREFERRED_HOST_SCORE: Final = 0.8
+"""Score of a room that has the object's preferred furniture."""
+NO_HOST_SCORE: Final = -5.0
+"""Score of a room in which the object would have to lie on the floor."""
+SIZE_SCORE: Final = 0.25
+"""Score of a room that is e times as large as another."""
+LOAD_PENALTY: Final = 0.15
+"""Penalty for each object that the room already received."""
+RANDOM_SCORE: Final = 0.3
 
 
 class DistributionError(ValueError):
-    """A brief that no distribution fits; the sentence names the thing and what it may be."""
+    """Brief that no distribution satisfies. The message names the object and the allowed rooms."""
 
 
 def distribute(brief: DistributionBrief) -> Distribution:
-    """A room for each thing. Raises DistributionError where a thing may be in none of the rooms, or in two at once."""
+    """Return a room for each object. Raise DistributionError if an object fits no room, or if demands contradict one
+    another.
+    """
     rooms = {room.name: room for room in brief.rooms}
     rng = np.random.default_rng((brief.seed, 5))
     given: Counter[str] = Counter()
     found: dict[str, str] = {}
     reasons: dict[str, str] = {}
-    for family in families(brief.things):
+    for family in tied_groups(brief.objects):
         allowed, why = _allowed(family, brief, rooms)
         scores = {
-            name: _score(family, rooms[name], given[name]) + CHANCE * float(rng.random()) for name in allowed
+            name: _score(family, rooms[name], given[name]) + RANDOM_SCORE * float(rng.random())
+            for name in allowed
         }
         room = max(scores, key=lambda name: (scores[name], name))
         given[room] += len(family)
         for thing in family:
             found[thing.name] = room
-            reasons[thing.name] = why or _because(thing, rooms[room])
+            reasons[thing.name] = why or _reason_for(thing, rooms[room])
     return Distribution(found, reasons)
 
 
-def families(things: Sequence[ObjectBrief]) -> list[tuple[ObjectBrief, ...]]:
-    """Things grouped by the relations that the task puts them in, directly or through others: each group in one room."""
-    leader = {thing.name: thing.name for thing in things}
+def tied_groups(objects: Sequence[ObjectBrief]) -> list[tuple[ObjectBrief, ...]]:
+    """Group the objects that the task's relations tie together, directly or indirectly. Each group shares a room."""
+    leader = {thing.name: thing.name for thing in objects}
 
     def head(name: str) -> str:
         while leader[name] != name:
@@ -67,13 +70,13 @@ def families(things: Sequence[ObjectBrief]) -> list[tuple[ObjectBrief, ...]]:
         return name
 
     anchors: dict[str, str] = {}
-    for thing in things:
+    for thing in objects:
         for other in filter(None, (thing.host, *thing.beside)):
-            # what is there already ties together all that the task puts at it
+            # An existing object ties together all objects that the task puts at it.
             tied = other if other in leader else anchors.setdefault(other, thing.name)
             leader[head(thing.name)] = head(tied)
     grouped: dict[str, list[ObjectBrief]] = {}
-    for thing in things:
+    for thing in objects:
         grouped.setdefault(head(thing.name), []).append(thing)
     return [tuple(group) for group in grouped.values()]
 
@@ -81,7 +84,7 @@ def families(things: Sequence[ObjectBrief]) -> list[tuple[ObjectBrief, ...]]:
 def _allowed(
     family: Sequence[ObjectBrief], brief: DistributionBrief, rooms: Mapping[str, LayoutRoomFacts]
 ) -> tuple[list[str], str]:
-    """Rooms that all of the family may be in, and why there is no choice where there is none."""
+    """Return the rooms that all objects of the group may be in, and the reason if there is no choice."""
     names = {thing.name for thing in family}
     held = {
         rooms_of
@@ -97,36 +100,37 @@ def _allowed(
     if not allowed:
         wanted = sorted(held | {room for thing in family for room in thing.rooms})
         raise DistributionError(
-            f"{', '.join(sorted(names))} belong together and are wanted in {', '.join(wanted)}: name one room of "
+            f"{', '.join(sorted(names))} belong together but are demanded in {', '.join(wanted)}: expected one room of "
             f"{', '.join(rooms)}"
         )
     if held:
-        return allowed, "with what the task puts it at"
-    return allowed, "as the task says" if len(allowed) == 1 < len(rooms) else ""
+        return allowed, "same room as the object that the task puts it at"
+    return allowed, "demanded by the task" if len(allowed) == 1 < len(rooms) else ""
 
 
 def _score(family: Sequence[ObjectBrief], room: LayoutRoomFacts, given: int) -> float:
     liking = sum(
-        FUNCTION * belongs(thing.category, room.type) + HOST * _welcome(thing, room) for thing in family
+        ROOM_TYPE_SCORE * belongs(thing.category, room.type) + PREFERRED_HOST_SCORE * _host_score(thing, room)
+        for thing in family
     )
-    return liking / len(family) + SIZE * math.log(max(room.area_m2, 1.0)) - CROWD * given
+    return liking / len(family) + SIZE_SCORE * math.log(max(room.area_m2, 1.0)) - LOAD_PENALTY * given
 
 
-def _welcome(thing: ObjectBrief, room: LayoutRoomFacts) -> float:
-    """How much of what the thing likes to stand on or in the room has, from 0 to 1; less where it has nothing at all."""
-    if thing.kind is not Kind.GOODS:
+def _host_score(thing: ObjectBrief, room: LayoutRoomFacts) -> float:
+    """Score from 0 to 1 for the object's preferred hosts in the room; negative if the room has no host for it."""
+    if thing.kind is not PlacementClass.GOODS:
         return 0.5
     here = set(room.furniture)
-    if not any(may_hold(host, thing.category) for host in here):
-        return BARE
-    wanted = likes(thing.category)
+    if not any(is_usual_host(host, thing.category) for host in here):
+        return NO_HOST_SCORE
+    wanted = preferred_hosts(thing.category)
     return max((1.0 - rank / len(wanted) for rank, host in enumerate(wanted) if host in here), default=0.2)
 
 
-def _because(thing: ObjectBrief, room: LayoutRoomFacts) -> str:
-    liked = next((host for host in likes(thing.category) if host in room.furniture), "")
+def _reason_for(thing: ObjectBrief, room: LayoutRoomFacts) -> str:
+    liked = next((host for host in preferred_hosts(thing.category) if host in room.furniture), "")
     if liked:
         return f"{room.name} has a {liked}"
     if belongs(thing.category, room.type):
-        return f"such things belong in a {room.type}"
-    return f"{room.name} has room: {room.area_m2:.0f} m2"
+        return f"such objects belong in a {room.type}"
+    return f"{room.name} has space: {room.area_m2:.0f} m2"

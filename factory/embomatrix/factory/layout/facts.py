@@ -1,4 +1,4 @@
-"""What agents are told of a scene: its rooms, and what furniture can hold, where and how much."""
+"""Facts about a scene for the agents' briefs: rooms, and the spaces that furniture offers."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from embomatrix.world.asset import Asset
 
 OFFERED: Final = (LayoutRelation.ONTOP, LayoutRelation.INSIDE, LayoutRelation.UNDER)
-LEAST_M: Final = 0.08
-"""Spaces that are narrower hold nothing that is worth telling."""
-LOW_SKIRT_M: Final = 0.05
-"""Things go under what leaves this much over the floor."""
+MIN_SPACE_M: Final = 0.08
+"""Narrower spaces are not offered."""
+MIN_UNDER_M: Final = 0.05
+"""Free height below an object from which on objects can go under it."""
 
 
 def rooms_of(editor: SceneEditor) -> tuple[LayoutRoomFacts, ...]:
-    """All rooms of the scene, with the categories of what could hold things there."""
+    """Return all rooms of the scene with the categories of the objects that can hold others."""
     furniture: dict[str, list[str]] = {name: [] for name in editor.rooms}
     for item in editor.objects.values():
         asset = editor.asset_of(item.name)
@@ -39,19 +39,20 @@ def rooms_of(editor: SceneEditor) -> tuple[LayoutRoomFacts, ...]:
 
 
 def hosts_in(editor: SceneEditor, room: str, named: Container[str] = ()) -> tuple[HostFacts, ...]:
-    """What could hold things in a room: furniture that people put things on or in, and objects that the task names.
+    """Return the possible hosts in a room: furniture that people put objects on or in, and objects that the task
+    names.
 
-    Left out is what the robot can't get at.
+    Furniture that the robot can't reach is left out.
     """
-    guests: dict[str, list[str]] = {}
+    contents: dict[str, list[str]] = {}
     for item in editor.objects.values():
         if item.host:
-            guests.setdefault(item.host, []).append(editor.asset_of(item.name).category)
-    return tuple(_hosts(editor, room, named, guests))
+            contents.setdefault(item.host, []).append(editor.asset_of(item.name).category)
+    return tuple(_hosts(editor, room, named, contents))
 
 
 def _hosts(
-    editor: SceneEditor, room: str, named: Container[str], guests: dict[str, list[str]]
+    editor: SceneEditor, room: str, named: Container[str], contents: dict[str, list[str]]
 ) -> Iterator[HostFacts]:
     for item in editor.objects.values():
         asset = editor.asset_of(item.name)
@@ -65,7 +66,7 @@ def _hosts(
         if shut and not given and not editor.view.opens(item.name):
             offers = tuple(offer for offer in offers if offer.relation is not LayoutRelation.INSIDE)
         if offers:
-            yield HostFacts(item.name, asset.category, offers, tuple(guests.get(item.name, ())), shut)
+            yield HostFacts(item.name, asset.category, offers, tuple(contents.get(item.name, ())), shut)
 
 
 def _offers(asset: Asset, base_m: float, *, asked: bool) -> tuple[HostOffer, ...]:
@@ -79,7 +80,7 @@ def _offers(asset: Asset, base_m: float, *, asked: bool) -> tuple[HostOffer, ...
 
 
 def _spaces(asset: Asset, relation: LayoutRelation) -> tuple[tuple[float, float, float, float], ...]:
-    """Extents along x and y, free height, and height in the asset's frame, of each space that a relation offers."""
+    """Return extents along x and y, free height, and height in the asset's frame of each space for a relation."""
     return tuple(
         (
             surface.size_m[0] - 2 * EDGE_M,
@@ -88,27 +89,27 @@ def _spaces(asset: Asset, relation: LayoutRelation) -> tuple[tuple[float, float,
             surface.center_m[2],
         )
         for surface in surfaces_for(asset, Relation(relation.value))
-        if min(surface.size_m) >= LEAST_M
+        if min(surface.size_m) >= MIN_SPACE_M
     )
 
 
 def _offer(asset: Asset, relation: LayoutRelation, base_m: float, highest_m: float) -> HostOffer | None:
     spaces = _spaces(asset, relation)
-    if relation is LayoutRelation.UNDER and _skirt_m(asset) < LOW_SKIRT_M:
+    if relation is LayoutRelation.UNDER and _height_below_m(asset) < MIN_UNDER_M:
         return None
     reachable = [
         space for space in spaces if relation is LayoutRelation.UNDER or base_m + space[3] <= highest_m
     ]
     if not reachable:
         return None
-    # Low shelves of tall furniture are no reason to leave out the higher ones.
+    # A low shelf of tall furniture must not exclude the higher shelves.
     heights = [base_m + space[3] for space in reachable]
     height = min((h for h in heights if h >= LOWEST_M), default=min(heights))
     return HostOffer(relation, tuple((x, y, high) for x, y, high, _ in reachable), round(height, 3))
 
 
-def _skirt_m(asset: Asset) -> float:
-    """Free height in the middle below an asset's base."""
+def _height_below_m(asset: Asset) -> float:
+    """Return the free height below the centre of an asset's base."""
     low = -asset.size_m[2] / 2
     over = [
         part.pose.position_m[2] - part.size_m[2] / 2 - low

@@ -1,4 +1,4 @@
-"""Where things hang: on walls at their height, clear of doors and windows, and under the ceiling."""
+"""Poses on walls, clear of doors and windows, and under the ceiling."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 
 TRIES: Final = 80
 GAP_M: Final = 0.002
-"""Between a thing's back and its wall, or its top and the ceiling."""
+"""Gap between an object and its wall, or between its top and the ceiling."""
 SPARE_M: Final = 0.05
 """Free strip beside doors, windows and corners."""
 
 
 class Hanger:
-    """Finds places on the walls and under the ceiling of one room."""
+    """Search for places on the walls and under the ceiling of one room."""
 
     def __init__(self, editor: SceneEditor, room: Room, rng: np.random.Generator) -> None:
         self._editor = editor
@@ -38,7 +38,7 @@ class Hanger:
         self._rng = rng
 
     def on_wall(self, asset: Asset) -> Pose:
-        """A pose with the asset's back to a wall, within the robot's reach. Raises PlacementError."""
+        """Return a reachable pose with the asset's back to a wall. Raise PlacementError."""
         free = 0
         for pose in self._on_walls(asset):
             objection = self._editor.objection(asset, pose)
@@ -48,11 +48,11 @@ class Hanger:
         reason = LayoutReason.OUT_OF_REACH if free else LayoutReason.NO_FREE_SPOT
         raise PlacementError(
             reason,
-            f"no wall of {self._room.name} has room for {asset.asset_id}, {asset.size_m[1]:.2f} m wide: try another room",
+            f"no wall of {self._room.name} has space for {asset.asset_id}, {asset.size_m[1]:.2f} m wide: try another room",
         )
 
     def under_ceiling(self, asset: Asset) -> Pose:
-        """A pose under the ceiling, in reach or not, near the middle first. Raises PlacementError."""
+        """Return a pose under the ceiling, near the room's centre first. Reach is not required. Raise PlacementError."""
         (cx, cy), (sx, sy) = self._room.center_m, self._room.size_m
         z = WALL_HEIGHT_M - GAP_M - bounds_of(asset).box(Pose((0.0, 0.0, 0.0))).high_m[2]
         for number in range(TRIES):
@@ -63,7 +63,7 @@ class Hanger:
                 return pose
         raise PlacementError(
             LayoutReason.NO_FREE_SPOT,
-            f"the ceiling of {self._room.name} has no room for {asset.asset_id}: try another room",
+            f"the ceiling of {self._room.name} has no space for {asset.asset_id}: try another room",
         )
 
     def _on_walls(self, asset: Asset) -> Iterator[Pose]:
@@ -93,7 +93,7 @@ class Hanger:
     def _meets_opening(
         self, axis: int, edge_m: float, span_m: tuple[float, float], heights_m: tuple[float, float]
     ) -> bool:
-        """Whether a door or a window of this wall lies behind a stretch of it."""
+        """True if a door or window of this wall overlaps the span and heights."""
         scene = self._editor.base
         openings: tuple[Doorway | Window, ...] = (*scene.doorways, *scene.windows)
         for opening in openings:
@@ -110,5 +110,5 @@ class Hanger:
 
 
 def _heights(opening: Doorway | Window) -> tuple[float, float]:
-    """From where to where above the floor an opening reaches."""
+    """Return the lower and upper end of an opening above the floor."""
     return (0.0, opening.height_m) if isinstance(opening, Doorway) else (opening.sill_m, opening.head_m)

@@ -1,7 +1,7 @@
-"""Room-level Organization Agent, by rules: what each thing of a room stands on, in or under, as a layout tree.
+"""Room-level Organization Agent: layout trees, and the rules that choose a host for each object of a room.
 
-Hosts are filtered by footprint, height and free height, as in the paper; what is left is ranked by where people keep such
-things, by how much stands there already, and by what has failed before.
+Hosts are filtered by footprint, height and free height, as in the paper. The rules rank the rest by household
+conventions, by the objects already there, and by earlier failures.
 """
 
 from __future__ import annotations
@@ -13,71 +13,84 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from embomatrix.factory.furnish.hosts import NO_HOSTS, kept_behind_doors
-from embomatrix.factory.furnish.small_objects import likes, on_appliance, suits
-from embomatrix.factory.layout.values import MEANS, Branch, Kind, LayoutRelation, RelationMethod
+from embomatrix.factory.furnish.small_objects import is_appliance_top, preferred_hosts, suits
+from embomatrix.factory.layout.values import (
+    RELATION_METHODS,
+    Branch,
+    LayoutRelation,
+    PlacementClass,
+    RelationMethod,
+)
 from embomatrix.factory.scenes.editor import LayoutReason
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from embomatrix.factory.layout.values import Failure, HostFacts, HostOffer, ObjectBrief, RoomBrief, Size3
+    from embomatrix.factory.layout.values import (
+        HostFacts,
+        HostOffer,
+        LayoutFailure,
+        ObjectBrief,
+        RoomBrief,
+        Size3,
+    )
     from embomatrix.world.scene import SceneObject
 
 
-CHANCES: Final = 3
-AFTERWARDS: Final = frozenset({LayoutReason.UNSTABLE, LayoutReason.NOT_AT_HAND})
-"""Reasons that speak against a spot and not against its host."""
+MAX_ATTEMPTS: Final = 3
+SPOT_REASONS: Final = frozenset({LayoutReason.UNSTABLE, LayoutReason.INACCESSIBLE})
+"""Reasons that exclude a spot but not its host."""
 HIGHEST_M: Final = 1.5
-"""Nothing is put higher than this: the paper's bound."""
+"""Maximum height for objects, from the paper."""
 LOWEST_M: Final = 0.15
-"""Furniture surfaces lower than this are floor."""
-LIKED: Final = 1.2
-LIKED_STEP: Final = 0.12
-"""What a thing's favourite furniture is worth, and how much less each next one."""
-STRANGE: Final = 0.2
-"""Of furniture that nothing is known about."""
-UNLIKED: Final = -0.6
-"""Of furniture that people put nothing down on unless they must."""
-UNSUITED: Final = -2.0
-FLOOR: Final = -2.5
-"""Of the floor, for what does not belong there."""
+"""Lower furniture surfaces count as floor."""
+PREFERRED_SCORE: Final = 1.2
+RANK_PENALTY: Final = 0.12
+"""Score of an object's preferred host, and its decrease for each further host in the list."""
+UNKNOWN_SCORE: Final = 0.2
+"""Score of a host without a known convention."""
+AVOIDED_SCORE: Final = -0.6
+"""Score of a host that people avoid."""
+UNSUITABLE_SCORE: Final = -2.0
+FLOOR_SCORE: Final = -2.5
+"""Score of the floor for objects that don't belong there."""
 _FLOOR_GOODS: Final = (
     "wicker_basket storage_box bucket hamper shopping_basket carton toolbox toy_box suitcase backpack duffel_bag "
     "tote_bag ashcan recycling_bin trash_can plastic_bin broom mop vacuum watering_can basketball soccer_ball cage "
     "cooler crate"
 )
-FLOOR_GOODS: Final = frozenset(_FLOOR_GOODS.split())
-"""What people put on the floor."""
-SHUT: Final = -0.5
-"""Things lie in the open rather than behind doors, unless that is where they are kept."""
-CROWD: Final = 0.12
-COMPANY: Final = 0.35
-"""Equal things stand together."""
-CHANCE: Final = 0.45
+FLOOR_OBJECTS: Final = frozenset(_FLOOR_GOODS.split())
+"""Categories that people put on the floor."""
+CLOSED_SCORE: Final = -0.5
+"""Score of a closed cavity, unless the object is usually stored there."""
+CROWD_PENALTY: Final = 0.12
+SAME_CATEGORY_BONUS: Final = 0.35
+"""Bonus for standing with an object of the same category."""
+RANDOM_SCORE: Final = 0.45
 
 
 def organize(brief: RoomBrief) -> LayoutTree:
-    """A layout tree that holds every thing of the brief for which any host is left; hosts hang on the floor, the root."""
+    """Return a layout tree with every object that has a host left. Hosts are children of the root, the floor."""
     rng = np.random.default_rng((brief.seed, len(brief.failures), 7))
-    guests = {host.name: Counter(host.guests) for host in brief.hosts}
+    contents = {host.name: Counter(host.contents) for host in brief.hosts}
     hung: dict[str, Branch] = {
         host.name: Branch(brief.room.name, LayoutRelation.ONTOP, host.name) for host in brief.hosts
     }
-    for thing in in_order(brief.things):
+    for thing in hosts_first(brief.objects):
         options = list(choices(brief, thing, hung))
         if not options:
             continue
-        worths = [_worth(brief, thing, branch, guests) for branch in options]
-        best = options[int(np.argmax(np.asarray(worths) + CHANCE * rng.random(len(options))))]
+        worths = [_branch_score(brief, thing, branch, contents) for branch in options]
+        best = options[int(np.argmax(np.asarray(worths) + RANDOM_SCORE * rng.random(len(options))))]
         hung[thing.name] = best
-        guests.setdefault(best.parent, Counter())[thing.category] += 1
+        contents.setdefault(best.parent, Counter())[thing.category] += 1
     return LayoutTree.of(brief.room.name, hung.values())
 
 
-def in_order(things: Sequence[ObjectBrief]) -> list[ObjectBrief]:
-    """Things such that each comes after what the task puts it at, as far as that is one of them; the given order else."""
+def hosts_first(objects: Sequence[ObjectBrief]) -> list[ObjectBrief]:
+    """Return the objects with hosts before the objects at them, otherwise in the given order."""
     order: list[ObjectBrief] = []
-    waiting = list(things)
+    waiting = list(objects)
     while waiting:
         names = {thing.name for thing in waiting}
         ready = next((thing for thing in waiting if not names & {thing.host, *thing.beside}), waiting[0])
@@ -87,50 +100,53 @@ def in_order(things: Sequence[ObjectBrief]) -> list[ObjectBrief]:
 
 
 def choices(brief: RoomBrief, thing: ObjectBrief, hung: Mapping[str, Branch]) -> Iterator[Branch]:
-    """Branches that a thing may hang on: what the task demands, else every host that has room for it; none that failed.
+    """Yield the branches that an object may take: the task's demand, or every host with room for it. Failed branches
+    are left out.
 
-    ``hung`` are the branches of the tree so far, by child.
+    ``hung`` holds the branches of the tree so far, by child.
     """
-    failed = Counter((item.host, item.relation) for item in brief.failures if item.thing == thing.name)
+    failed = Counter((item.host, item.relation) for item in brief.failures if item.object_name == thing.name)
     for branch in _open_choices(brief, thing, hung):
         here = branch.parent == brief.room.name or branch.parent in hung
-        if here and failed[branch.parent, branch.relation] < _chances(branch, brief):
+        if here and failed[branch.parent, branch.relation] < _max_attempts(branch, brief):
             yield branch
 
 
-def _chances(branch: Branch, brief: RoomBrief) -> int:
-    """How often a host is tried: what failed after it was placed may stand well elsewhere on the same host."""
+def _max_attempts(branch: Branch, brief: RoomBrief) -> int:
+    """Return the number of attempts at a host. An object that failed after its placement may be stable elsewhere on
+    the host.
+    """
     reasons = {
         item.reason
         for item in brief.failures
-        if (item.thing, item.host, item.relation) == (branch.child, branch.parent, branch.relation)
+        if (item.object_name, item.host, item.relation) == (branch.child, branch.parent, branch.relation)
     }
-    return CHANCES if reasons and reasons <= AFTERWARDS else 1
+    return MAX_ATTEMPTS if reasons and reasons <= SPOT_REASONS else 1
 
 
 def _open_choices(brief: RoomBrief, thing: ObjectBrief, hung: Mapping[str, Branch]) -> Iterator[Branch]:
     floor = Branch(brief.room.name, LayoutRelation.ONTOP, thing.name)
     if thing.relation is not None:
-        if MEANS[thing.relation] is not RelationMethod.NONE:
+        if RELATION_METHODS[thing.relation] is not RelationMethod.NONE:
             yield Branch(thing.host or brief.room.name, thing.relation, thing.name)
         return
     beside = next((hung[other] for other in thing.beside if other in hung), None)
     if beside is not None:
         yield replace(beside, child=thing.name)
         return
-    if thing.kind in (Kind.HUNG, Kind.OVERHEAD):
+    if thing.kind in (PlacementClass.HUNG, PlacementClass.OVERHEAD):
         yield replace(floor, relation=LayoutRelation.ATTACHED)
         return
-    if thing.kind is Kind.GOODS:
+    if thing.kind is PlacementClass.GOODS:
         for host in brief.hosts:
             for offer in host.offers:
-                if offer.relation is not LayoutRelation.UNDER and takes(offer, thing.size_m):
+                if offer.relation is not LayoutRelation.UNDER and fits_offer(offer, thing.size_m):
                     yield Branch(host.name, offer.relation, thing.name)
     yield floor
 
 
-def takes(offer: HostOffer, size_m: Size3) -> bool:
-    """Whether any space of an offer is larger than a thing, turned either way, and no higher than things are put."""
+def fits_offer(offer: HostOffer, size_m: Size3) -> bool:
+    """True if a space of the offer is larger than the object, in either orientation, and at a permitted height."""
     if not LOWEST_M <= offer.height_m <= HIGHEST_M:
         return False
     short, long = sorted(size_m[:2])
@@ -140,47 +156,57 @@ def takes(offer: HostOffer, size_m: Size3) -> bool:
     )
 
 
-def _worth(brief: RoomBrief, thing: ObjectBrief, branch: Branch, guests: Mapping[str, Counter[str]]) -> float:
+def _branch_score(
+    brief: RoomBrief, thing: ObjectBrief, branch: Branch, contents: Mapping[str, Counter[str]]
+) -> float:
     host = next((item for item in brief.hosts if item.name == branch.parent), None)
     if host is None:
-        return LIKED if thing.kind is not Kind.GOODS or thing.category in FLOOR_GOODS else FLOOR
-    there = guests[host.name]
-    crowd = CROWD * sum(there.values()) - COMPANY * (there[thing.category] > 0)
+        return (
+            PREFERRED_SCORE
+            if thing.kind is not PlacementClass.GOODS or thing.category in FLOOR_OBJECTS
+            else FLOOR_SCORE
+        )
+    there = contents[host.name]
+    crowd = CROWD_PENALTY * sum(there.values()) - SAME_CATEGORY_BONUS * (there[thing.category] > 0)
     tired = sum(item.host == host.name for item in brief.failures)
-    return liking(thing.category, host, branch.relation) - crowd - 0.5 * tired
+    return host_score(thing.category, host, branch.relation) - crowd - 0.5 * tired
 
 
-def liking(category: str, host: HostFacts, relation: LayoutRelation) -> float:
-    """How much people would have such a thing there."""
-    if category in FLOOR_GOODS or not suits(category, host.category):
-        return UNSUITED
-    wanted = likes(category)
-    if relation is LayoutRelation.ONTOP and on_appliance(host.category):
-        worth = UNLIKED
+def host_score(category: str, host: HostFacts, relation: LayoutRelation) -> float:
+    """Return how well a host suits a category."""
+    if category in FLOOR_OBJECTS or not suits(category, host.category):
+        return UNSUITABLE_SCORE
+    wanted = preferred_hosts(category)
+    if relation is LayoutRelation.ONTOP and is_appliance_top(host.category):
+        worth = AVOIDED_SCORE
     elif host.category in wanted:
-        worth = LIKED - LIKED_STEP * wanted.index(host.category)
+        worth = PREFERRED_SCORE - RANK_PENALTY * wanted.index(host.category)
     else:
-        worth = UNLIKED if host.category in NO_HOSTS else STRANGE
+        worth = AVOIDED_SCORE if host.category in NO_HOSTS else UNKNOWN_SCORE
     if relation is LayoutRelation.INSIDE and not kept_behind_doors(category, host.category):
-        worth += UNSUITED if on_appliance(host.category) and host.category not in wanted else SHUT
+        worth += (
+            UNSUITABLE_SCORE
+            if is_appliance_top(host.category) and host.category not in wanted
+            else CLOSED_SCORE
+        )
     return worth
 
 
-def described(failures: Sequence[Failure]) -> str:
-    """What has failed, a line each, for people and models."""
+def describe_failures(failures: Sequence[LayoutFailure]) -> str:
+    """Return the failures as text, one per line."""
     return "\n".join(
-        f"- {item.thing} {item.relation.value} {item.host}: {item.reason.value}, {item.detail}"
+        f"- {item.object_name} {item.relation.value} {item.host}: {item.reason.value}, {item.detail}"
         for item in failures
     )
 
 
 class TreeError(ValueError):
-    """Branches that make no tree; the sentence says which and what to do."""
+    """Branches that form no tree. The message names the branch and the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class RelationNode:
-    """All that is in one relation to an object."""
+    """Children of an object in one relation."""
 
     relation: LayoutRelation
     children: tuple[ObjectNode, ...]
@@ -188,7 +214,7 @@ class RelationNode:
 
 @dataclass(frozen=True, slots=True)
 class ObjectNode:
-    """An object, or the floor of a room at the root, and what stands in relations to it."""
+    """Object, or the floor at the root, with its relations."""
 
     name: str
     relations: tuple[RelationNode, ...] = ()
@@ -196,20 +222,22 @@ class ObjectNode:
 
 @dataclass(frozen=True, slots=True)
 class LayoutTree:
-    """How the objects of a room hang together. Every object has one parent, the root none."""
+    """Layout tree of a room. Every object has one parent; the root has none."""
 
     root: ObjectNode
 
     @staticmethod
     def of(root: str, branches: Iterable[Branch]) -> LayoutTree:
-        """The tree of these branches, in their order. Raises TreeError for a second parent, a cycle or a loose end."""
+        """Build a tree from branches in their order. Raise TreeError for a second parent, a cycle or an unconnected
+        branch.
+        """
         children: defaultdict[str, dict[LayoutRelation, list[str]]] = defaultdict(dict)
         parents: dict[str, str] = {}
         for branch in branches:
             if branch.child == root or branch.child in parents:
-                first = parents.get(branch.child, "nothing, being the root")
+                first = parents.get(branch.child, "nothing, as the root")
                 raise TreeError(
-                    f"{branch.child!r} hangs on {branch.parent!r} and on {first}: give every object one parent"
+                    f"{branch.child!r} has the parents {branch.parent!r} and {first}: give every object one parent"
                 )
             parents[branch.child] = branch.parent
             children[branch.parent].setdefault(branch.relation, []).append(branch.child)
@@ -228,13 +256,13 @@ class LayoutTree:
         made = node(root)
         if loose := [name for name in parents if name not in reached]:
             raise TreeError(
-                f"{loose[0]!r} hangs on {parents[loose[0]]!r}, which does not lead to the root {root!r}: name an object of "
-                "the room as its parent"
+                f"{loose[0]!r} has the parent {parents[loose[0]]!r}, which is not connected to the root {root!r}: name an "
+                "object of the room as its parent"
             )
         return LayoutTree(made)
 
     def branches(self) -> Iterator[Branch]:
-        """All edges, parents before their children."""
+        """Yield all edges, parents before children."""
         waiting = [self.root]
         while waiting:
             parent = waiting.pop(0)
@@ -243,16 +271,12 @@ class LayoutTree:
                     yield Branch(parent.name, node.relation, child.name)
                     waiting.append(child)
 
-    def parent_of(self, name: str) -> Branch | None:
-        """The edge that ends at an object; None for the root and for what is not in the tree."""
-        return next((branch for branch in self.branches() if branch.child == name), None)
-
     def nested(self) -> dict[str, Any]:
-        """Object and relation names in turn, leaves empty: the form in which the paper's factory writes its trees."""
+        """Return nested mappings of object and relation names, in the form of the paper's trees."""
         return {self.root.name: _nested(self.root)}
 
     def pruned(self, names: Iterable[str]) -> LayoutTree:
-        """The part of the tree that leads to these objects."""
+        """Return the part of the tree that leads to these objects."""
         above = {branch.child: branch for branch in self.branches()}
         kept: set[str] = set()
         for name in names:
@@ -262,7 +286,7 @@ class LayoutTree:
         return LayoutTree.of(self.root.name, [branch for branch in self.branches() if branch.child in kept])
 
     def drawn(self, labels: Mapping[str, str] | None = None) -> str:
-        """The tree as indented lines for people; ``labels`` are added to the names that they know."""
+        """Return the tree as indented lines. ``labels`` are appended to object names."""
         lines = [self.root.name]
 
         def add(node: ObjectNode, indent: str) -> None:
@@ -279,7 +303,7 @@ class LayoutTree:
 
 
 def tree_in(objects: Iterable[SceneObject], room: str, names: Iterable[str]) -> LayoutTree:
-    """How some objects of a scene's room hang together with what they are on, in or under."""
+    """Return the layout tree of the named objects of a scene's room, with the objects that support them."""
     branches = [
         Branch(
             item.host or room,

@@ -1,7 +1,7 @@
-"""Who has a place in a room and who waits for one, and what makes way for those that wait.
+"""Requested objects of one room: pending and placed ones, and the fallbacks that make room for pending ones.
 
-What was placed is exchanged for its next model, put down elsewhere, or exchanged for a narrower one; what the task does not
-need is taken away.
+A placed object can be replaced by its next model, moved, or replaced by a narrower model. Objects that the task
+doesn't need can be removed.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.furnish.roles import FurnitureRole, role_of
-from embomatrix.factory.layout.request import kind_of
-from embomatrix.factory.layout.values import Failure, Kind, LayoutRelation
+from embomatrix.factory.layout.request import placement_class_of
+from embomatrix.factory.layout.values import LayoutFailure, LayoutRelation, PlacementClass
 from embomatrix.factory.scenes.editor import LayoutReason
 from embomatrix.world.state import Relation
 
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Pose
 
-CLEARED: Final = 3
-"""Things of the base scene that are taken away from a full host, for what the task puts there."""
-MOVES: Final = 2
-"""Times that a thing is put elsewhere because the robot does not get at what is on or in it."""
-RESIGNED: Final = 2
-"""After so many places at which the robot does not get at a thing, one is taken as it is: verification tells."""
-STANDS_M: Final = 0.05
-"""What begins below this stands on the floor."""
+MAX_REMOVALS: Final = 3
+"""Maximum number of scene objects removed from a full host for one requested object."""
+MAX_MOVES: Final = 2
+"""Maximum number of moves of an object whose contents the robot can't reach."""
+MAX_UNREACHED: Final = 2
+"""Number of unreachable places after which an object is accepted as unreachable. Verification then judges the task."""
+FLOOR_CONTACT_M: Final = 0.05
+"""Objects whose lower end is below this height stand on the floor."""
 MOVABLE: Final = frozenset(
     {
         FurnitureRole.SEAT,
@@ -43,23 +43,23 @@ MOVABLE: Final = frozenset(
     }
 )
 PLUMBED: Final = frozenset({"toilet", "urinal", "pedestal_sink"})
-"""Furniture of these roles people would carry out of a room to make place for other, but for what a bathroom needs."""
+"""Furniture of these categories is never removed from a room, although its role is movable."""
 FULL: Final = frozenset({LayoutReason.NO_FREE_SPOT, LayoutReason.TOO_LARGE})
-CROWDED: Final = frozenset({LayoutReason.NO_FREE_SPOT, LayoutReason.BARS_THE_WAY})
-FAR: Final = frozenset({LayoutReason.OUT_OF_REACH, LayoutReason.NOT_AT_HAND})
+CROWDED: Final = frozenset({LayoutReason.NO_FREE_SPOT, LayoutReason.BLOCKS_PATH})
+FAR: Final = frozenset({LayoutReason.OUT_OF_REACH, LayoutReason.INACCESSIBLE})
 
 
 @dataclass(frozen=True, slots=True)
-class Seat:
-    """What a thing was put on, in, under or next to, in the scene's names; without a relation, the floor of a room."""
+class Support:
+    """Support of a placed object, in scene names. Without a relation, ``host`` is the room whose floor it stands on."""
 
     relation: Relation | None
     host: str
 
 
 @dataclass(slots=True)
-class Guest:
-    """An item, which of its models is tried, where it is, and why it had no place before."""
+class PendingObject:
+    """Requested object with its current model, its support once placed, and its last failure."""
 
     item: RequestedObject
     asset: Asset
@@ -68,167 +68,186 @@ class Guest:
     moved: int = 0
     unreached: int = 0
     crowded: bool = False
-    seat: Seat | None = None
-    last: Failure | None = None
+    support: Support | None = None
+    last_failure: LayoutFailure | None = None
 
     def choose(self, choice: int) -> None:
-        """Try another of its models."""
+        """Switch to another model."""
         self.choice, self.asset = choice, self.item.asset(choice)
 
     def narrowest(self, first: int) -> int:
-        """Which of its models from the ``first`` on takes the least room."""
+        """Return the index of the model with the smallest footprint, starting at ``first``."""
         return min(
             range(first, len(self.item.models)),
             key=lambda choice: math.prod(self.item.asset(choice).size_m[:2]),
         )
 
     @property
-    def is_resigned(self) -> bool:
-        """Whether it is to be taken as it is, though the robot does not get at it."""
-        return self.unreached >= RESIGNED
+    def accepts_unreachable(self) -> bool:
+        """True if the object is accepted although the robot can't reach it."""
+        return self.unreached >= MAX_UNREACHED
 
-    def failure(self, room: str) -> Failure:
-        """Why it found no place in a room."""
-        if self.last is not None:
-            return self.last
+    def failure(self, room: str) -> LayoutFailure:
+        """Return the reason for the missing place in a room."""
+        if self.last_failure is not None:
+            return self.last_failure
         size = " x ".join(f"{extent:.2f}" for extent in self.asset.size_m)
-        detail = (
-            f"nothing in {room} takes {self.asset.asset_id}, {size} m: try another room or a smaller model"
-        )
+        detail = f"no host in {room} has space for {self.asset.asset_id}, {size} m: try another room or a smaller model"
         return self.item.failure(self.item.host or room, LayoutReason.NO_HOST, detail)
 
 
-class Seating:
-    """The items of one room: ``waiting`` and ``placed`` by name, ``names`` of the placed in the scene, what failed so far."""
+class PendingObjects:
+    """Requested objects of one room: ``waiting`` and ``placed`` by name, scene ``names`` of the placed ones, and
+    failures.
+    """
 
     def __init__(self, editor: SceneEditor, room: str, items: Sequence[RequestedObject]) -> None:
         self.names: dict[str, str] = {}
-        self.waiting = {item.name: Guest(item, item.asset(0)) for item in items}
-        self.placed: dict[str, Guest] = {}
-        self.failures: list[Failure] = []
-        self.given_up: list[Failure] = []
+        self.waiting = {item.name: PendingObject(item, item.asset(0)) for item in items}
+        self.placed: dict[str, PendingObject] = {}
+        self.failures: list[LayoutFailure] = []
+        self.abandoned: list[LayoutFailure] = []
         self._editor = editor
         self._room = room
-        self._barring = False
+        self._may_block = False
 
-    def owners(self) -> dict[str, str]:
-        """Placed items by their names in the scene."""
+    def items_by_scene_name(self) -> dict[str, str]:
+        """Names of the placed objects by scene name."""
         return {there: name for name, there in self.names.items()}
 
-    def seat(self, name: str, pose: Pose, rests: tuple[Relation | None, str], at: Seat) -> str:
-        """Put a waiting item into the scene at a pose, and return its name there. ``rests`` is what it is on or in."""
-        guest = self.placed[name] = self.waiting.pop(name)
-        guest.seat = at
-        self.names[name] = self._editor.insert(guest.asset, pose, *rests, self._room)
+    def place(self, name: str, pose: Pose, rests: tuple[Relation | None, str], at: Support) -> str:
+        """Insert a waiting object into the scene and return its scene name. ``rests`` is the relation and host that
+        support it.
+        """
+        pending = self.placed[name] = self.waiting.pop(name)
+        pending.support = at
+        self.names[name] = self._editor.insert(pending.asset, pose, *rests, self._room)
         return self.names[name]
 
-    def refuse(
+    def record_failure(
         self, name: str, relation: LayoutRelation, host: str, reason: LayoutReason, detail: str
     ) -> None:
-        """Keep why a waiting item can't be at a host."""
-        failure = Failure(name, relation, host, reason, detail)
-        guest = self.waiting[name]
-        guest.last = failure
-        guest.crowded |= reason in CROWDED
+        """Record the reason why a waiting object can't be at a host."""
+        failure = LayoutFailure(name, relation, host, reason, detail)
+        pending = self.waiting[name]
+        pending.last_failure = failure
+        pending.crowded |= reason in CROWDED
         self.failures.append(failure)
 
-    def unseat(self, name: str, reason: LayoutReason, detail: str) -> None:
-        """Take a placed item out again, with all that rests on it, and keep why it can't be there."""
-        item, seat = self._editor.known(self.names[name]), self.placed[name].seat
+    def withdraw(self, name: str, reason: LayoutReason, detail: str) -> None:
+        """Remove a placed object with all objects on it, and record the reason."""
+        item, seat = self._editor.known(self.names[name]), self.placed[name].support
         if seat is not None and seat.relation is Relation.UNDER:
             relation, host = LayoutRelation.UNDER, seat.host
         else:
             relation = LayoutRelation(item.relation.value) if item.relation else LayoutRelation.ONTOP
             host = item.host or self._room
-        self._take_out(name)
-        self.refuse(name, relation, host, reason, detail)
+        self._remove(name)
+        self.record_failure(name, relation, host, reason, detail)
 
     def next_model(self, name: str) -> None:
-        """Try an item with its next model, as if nothing had been tried; give it up after the last, if nothing makes way."""
-        guest = self.waiting[name]
-        if guest.choice + 1 < len(guest.item.models):
-            guest.choose(guest.choice + 1)
+        """Switch an object to its next model and clear its failures. After the last model, try the fallbacks, then
+        abandon it.
+        """
+        pending = self.waiting[name]
+        if pending.choice + 1 < len(pending.item.models):
+            pending.choose(pending.choice + 1)
             self._forget((name,))
-        elif self.waiting.keys() & {guest.item.host, *guest.item.beside}:
-            return  # what it is to stand at has no place yet
-        elif not any(way(guest) for way in (self.offer_another, self._narrow, self._bar, self._make_room)):
+        elif self.waiting.keys() & {pending.item.host, *pending.item.beside}:
+            return  # its host or neighbour has no place yet
+        elif not any(
+            way(pending)
+            for way in (self.replace_host, self._shrink_sibling, self._allow_blocking, self._remove_spare)
+        ):
             del self.waiting[name]
-            self.given_up.append(guest.failure(self._room))
+            self.abandoned.append(pending.failure(self._room))
 
-    def offer_another(self, guest: Guest) -> bool:
-        """Exchange what an item is to be at for its next model, or put it elsewhere; False where it is not of the task."""
-        host = self.placed.get(guest.item.host)
+    def replace_host(self, pending: PendingObject) -> bool:
+        """Switch the object's host to its next model, or move the host. Return False if the task doesn't bring the
+        host.
+        """
+        host = self.placed.get(pending.item.host)
         if host is None:
             return False
         if host.choice + 1 < len(host.item.models):
-            self._exchange(host)
+            self._replace_host_model(host)
             return True
-        if guest.last is None or guest.last.reason not in FAR or host.moved == MOVES:
+        if pending.last_failure is None or pending.last_failure.reason not in FAR or host.moved == MAX_MOVES:
             return False
         host.moved += 1
-        detail = f"the robot gets at nothing {guest.last.relation.value} it there"
-        self.unseat(host.item.name, LayoutReason.NOT_AT_HAND, detail)
-        self._start_anew(host)
+        detail = f"the robot can't reach objects {pending.last_failure.relation.value} it there"
+        self.withdraw(host.item.name, LayoutReason.INACCESSIBLE, detail)
+        self._restart_others(host)
         return True
 
-    def _exchange(self, host: Guest) -> None:
-        self._take_out(host.item.name)
-        self._start_anew(host)
+    def _replace_host_model(self, host: PendingObject) -> None:
+        self._remove(host.item.name)
+        self._restart_others(host)
         self.next_model(host.item.name)
 
-    def _start_anew(self, host: Guest) -> None:
-        """All that waits but one is tried with its first model, as if nothing had been tried."""
+    def _restart_others(self, host: PendingObject) -> None:
+        """Reset all other waiting objects to their first model and clear their failures."""
         others = [name for name in self.waiting if name != host.item.name]
         for name in others:
             self.waiting[name].choose(0)
         self._forget(others)
 
-    def _narrow(self, guest: Guest) -> bool:
-        """Exchange the widest other thing at a full host that the task demands for the narrowest model; False without one."""
-        if guest.last is None or guest.last.reason not in FULL or not guest.item.host:
+    def _shrink_sibling(self, pending: PendingObject) -> bool:
+        """Replace the widest other object at a full host by its narrowest model. Return False if there is none."""
+        if pending.last_failure is None or pending.last_failure.reason not in FULL or not pending.item.host:
             return False
         others = [
             other
             for other in self.placed.values()
-            if (other.item.host, other.item.relation) == (guest.item.host, guest.item.relation)
+            if (other.item.host, other.item.relation) == (pending.item.host, pending.item.relation)
             and other.choice + 1 < len(other.item.models)
         ]
         if not others:
             return False
         widest = max(others, key=lambda other: math.prod(other.asset.size_m[:2]))
-        self._take_out(widest.item.name)
+        self._remove(widest.item.name)
         widest.choose(widest.narrowest(widest.choice + 1))
-        guest.choose(0)
-        self._forget((guest.item.name, widest.item.name))
+        pending.choose(0)
+        self._forget((pending.item.name, widest.item.name))
         return True
 
-    def make_way(self, guest: Guest) -> bool:
-        """Take the largest spare piece of furniture off a floor where the robot does not get at an item; False without one."""
-        if not self._is_on_floor(guest):
+    def clear_floor(self, pending: PendingObject) -> bool:
+        """Remove the largest spare furniture from a floor on which the object is unreachable. Return False if there
+        is none.
+        """
+        if not self._is_on_floor(pending):
             return False
-        guest.crowded = True
-        return self._make_room(guest)
+        pending.crowded = True
+        return self._remove_spare(pending)
 
-    def _make_room(self, guest: Guest) -> bool:
-        """Take the largest spare thing from a full host that the task demands, or from a full floor; False without one."""
-        host = self.names.get(guest.item.host, guest.item.host)
-        if not guest.crowded or guest.cleared == CLEARED:
+    def _remove_spare(self, pending: PendingObject) -> bool:
+        """Remove the largest spare object from a full host or floor. Return False if there is none."""
+        host = self.names.get(pending.item.host, pending.item.host)
+        if not pending.crowded or pending.cleared == MAX_REMOVALS:
             return False
-        spare = self._furniture() if self._is_on_floor(guest) else self._loose_on(host) if host else []
+        spare = (
+            self._removable_furniture()
+            if self._is_on_floor(pending)
+            else self._loose_on(host)
+            if host
+            else []
+        )
         if not spare:
             return False
         self._editor.remove(max(spare, key=lambda name: math.prod(self._editor.box_of(name).size_m)))
-        guest.cleared += 1
-        self._try_again(guest)
+        pending.cleared += 1
+        self._restart(pending)
         return True
 
-    def _is_on_floor(self, guest: Guest) -> bool:
-        """Whether an item is to stand on the room's floor."""
-        host = guest.item.host
-        return host in self._editor.rooms or (not host and kind_of(guest.asset) is Kind.FURNITURE)
+    def _is_on_floor(self, pending: PendingObject) -> bool:
+        """True if the object must stand on the room's floor."""
+        host = pending.item.host
+        return host in self._editor.rooms or (
+            not host and placement_class_of(pending.asset) is PlacementClass.FURNITURE
+        )
 
     def _loose_on(self, host: str) -> list[str]:
-        """Loose things at a host that the task is not about."""
+        """Return loose objects at a host that the task doesn't name."""
         editor = self._editor
         return [
             name
@@ -236,8 +255,8 @@ class Seating:
             if item.host == host and not item.fixed and editor.is_spare(name)
         ]
 
-    def _furniture(self) -> list[str]:
-        """What stands on the room's floor, with nothing on or over it that the task is about, and is not built in."""
+    def _removable_furniture(self) -> list[str]:
+        """Return furniture on the room's floor that is movable and supports nothing that the task names."""
         editor = self._editor
         return [
             name
@@ -245,38 +264,44 @@ class Seating:
             if item.room == self._room
             and not item.host
             and editor.is_spare(name)
-            and editor.box_of(name).low_m[2] < STANDS_M
+            and editor.box_of(name).low_m[2] < FLOOR_CONTACT_M
             and _is_movable(editor.asset_of(name))
         ]
 
-    def _bar(self, guest: Guest) -> bool:
-        """Let what must stand on a narrow floor bar the robot's way to what the task is not about; False once it may."""
-        if guest.last is None or guest.last.reason is not LayoutReason.BARS_THE_WAY or self._barring:
+    def _allow_blocking(self, pending: PendingObject) -> bool:
+        """Let a floor object block the path to objects that the task doesn't name. Return False if that is already
+        allowed.
+        """
+        if (
+            pending.last_failure is None
+            or pending.last_failure.reason is not LayoutReason.BLOCKS_PATH
+            or self._may_block
+        ):
             return False
-        self._barring = True
+        self._may_block = True
         editor = self._editor
         editor.given_up.update(
             name for name, item in editor.objects.items() if item.room == self._room and editor.is_spare(name)
         )
-        self._try_again(guest)
+        self._restart(pending)
         return True
 
-    def _try_again(self, guest: Guest) -> None:
-        """With its first model, as if nothing had been tried."""
-        guest.choose(0)
-        guest.crowded = False
-        self._forget((guest.item.name,))
+    def _restart(self, pending: PendingObject) -> None:
+        """Reset the object to its first model and clear its failures."""
+        pending.choose(0)
+        pending.crowded = False
+        self._forget((pending.item.name,))
 
-    def _take_out(self, name: str) -> None:
-        """Remove an item from the scene, with all that rests on it: they wait again."""
-        owners = self.owners()
+    def _remove(self, name: str) -> None:
+        """Remove an object and all objects on it from the scene. They become waiting again."""
+        items_by_scene_name = self.items_by_scene_name()
         for gone in self._editor.remove(self.names[name]):
-            owner = owners[gone]
+            owner = items_by_scene_name[gone]
             del self.names[owner]
             self.waiting[owner] = self.placed.pop(owner)
 
     def _forget(self, names: Sequence[str]) -> None:
-        self.failures = [failure for failure in self.failures if failure.thing not in names]
+        self.failures = [failure for failure in self.failures if failure.object_name not in names]
 
 
 def _is_movable(asset: Asset) -> bool:

@@ -1,8 +1,8 @@
-"""Planar-Level Placement Generator: several things on one plane, by a grid of spots and a beam search.
+"""Planar-Level Placement Generator: beam search for a joint arrangement of objects on one plane.
 
-Two constraints are hard, as in the paper: a thing meets nothing, and the robot can stand where it reaches it. Required wishes
-are hard as well; the others add their weights to a score. Boxes around turned footprints stand for the things: what is found
-free is free, what is found taken may not be.
+Two constraints are hard, as in the paper: objects don't overlap, and the robot can stand where it reaches them.
+Required constraints are hard as well; the others add their weights to a score. Objects are modelled as boxes around
+rotated footprints. Free spots are really free, but some free spots are rejected.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.factory.layout.constraints import (
-    SHADE,
+    GRADED_SHARE,
     WEIGHTS,
     SpotCandidates,
-    degrees,
     gaps,
     half_extents,
     holds,
     margins,
+    satisfaction,
 )
 from embomatrix.factory.layout.values import (
-    Arranged,
-    Arrangement,
+    ConstraintKind,
+    PlaneArrangement,
     PlaneBrief,
     PlaneFootprint,
+    PlaneObject,
     PlaneSpot,
-    PlaneThing,
 )
 from embomatrix.factory.scenes.editor import LayoutReason
 from embomatrix.skills.limits import ROBOT
@@ -48,24 +48,26 @@ RESULTS: Final = 8
 SURFACE_CELLS: Final = 900
 FLOOR_CELLS: Final = 1800
 STEP_M: Final = (0.01, 0.05)
-"""Finest step of the grid on furniture and on floors; large planes take coarser ones, of at most these many cells."""
+"""Finest grid step on furniture and on floors. Larger planes get coarser steps, so that the number of cells is
+bounded.
+"""
 GAP_M: Final = 0.01
-"""Free strip around a thing."""
-COMFORT_M: Final = 0.06
-COMFORT: Final = 0.3
-"""Things that are this far from one another and from the rim are worth this much more than those that touch."""
-FRONT: Final = 0.4
-"""What it is worth that a thing looks where its furniture looks, or lies along it."""
-BACK: Final = 1.5
-"""What it is worth that furniture has its back to the nearest wall."""
-CHANCE: Final = 0.25
-"""Scores vary by this much, so that not every table looks the same."""
-LEFT_OUT: Final = 6.0
-"""A thing without a spot costs more than any wish."""
+"""Free strip around an object."""
+CLEARANCE_M: Final = 0.06
+CLEARANCE_BONUS: Final = 0.3
+"""Bonus for a distance of ``CLEARANCE_M`` from other objects and from the rim."""
+FRONT_BONUS: Final = 0.4
+"""Bonus for facing the same way as the furniture, or for lying along it."""
+WALL_BONUS: Final = 1.5
+"""Bonus for furniture with its back to the nearest wall."""
+RANDOM_SCORE: Final = 0.25
+"""Amplitude of the random score, so that layouts differ."""
+LEFT_OUT_PENALTY: Final = 6.0
+"""Penalty for an object without a spot. It exceeds every constraint's weight."""
 BATCH: Final = 96
-"""Spots whose reach is looked at together, the best first."""
-SCANNED: Final = 12 * BATCH
-TURNS: Final = (0.0, math.pi / 2, math.pi, -math.pi / 2)
+"""Number of spots whose reach is checked together, the best first."""
+MAX_SCANNED: Final = 12 * BATCH
+YAWS: Final = (0.0, math.pi / 2, math.pi, -math.pi / 2)
 REACH_M: Final = ROBOT.reach_m - 0.05
 
 
@@ -77,28 +79,30 @@ class _Beam:
     left_out: tuple[tuple[str, LayoutReason], ...] = ()
 
 
-def arrange(brief: PlaneBrief) -> tuple[Arranged, ...]:
-    """Joint arrangements of the brief's things, the best first; each says what it left out. At least one."""
+def arrange(brief: PlaneBrief) -> tuple[PlaneArrangement, ...]:
+    """Return joint arrangements of the brief's objects, the best first, at least one. Each lists the objects left
+    out.
+    """
     grown = [_Beam()]
-    for thing in _in_order(brief.things):
+    for thing in _in_order(brief.objects):
         grown = sorted(
-            (child for beam in grown[:BEAMS] for child in _grown(brief, thing, beam)),
+            (child for beam in grown[:BEAMS] for child in _extended(brief, thing, beam)),
             key=lambda beam: -beam.score,
         )
-    return tuple(Arranged(beam.spots, beam.score, dict(beam.left_out)) for beam in grown[:RESULTS])
+    return tuple(PlaneArrangement(beam.spots, beam.score, dict(beam.left_out)) for beam in grown[:RESULTS])
 
 
-def _in_order(things: Sequence[PlaneThing]) -> list[PlaneThing]:
-    """The largest first, but none before what its wishes are about."""
-    waiting = sorted(things, key=lambda thing: -thing.size_m[0] * thing.size_m[1])
-    order: list[PlaneThing] = []
+def _in_order(objects: Sequence[PlaneObject]) -> list[PlaneObject]:
+    """Return the largest objects first, but no object before those that its constraints name."""
+    waiting = sorted(objects, key=lambda thing: -thing.size_m[0] * thing.size_m[1])
+    order: list[PlaneObject] = []
     while waiting:
         left = {thing.name for thing in waiting}
         ready = next(
             (
                 thing
                 for thing in waiting
-                if not any(wish.other in left - {thing.name} for wish in thing.wishes)
+                if not any(constraint.other in left - {thing.name} for constraint in thing.constraints)
             ),
             waiting[0],
         )
@@ -107,12 +111,14 @@ def _in_order(things: Sequence[PlaneThing]) -> list[PlaneThing]:
     return order
 
 
-def _grown(brief: PlaneBrief, thing: PlaneThing, beam: _Beam) -> list[_Beam]:
-    """The beam with the thing at each of its best spots, or without it."""
+def _extended(brief: PlaneBrief, thing: PlaneObject, beam: _Beam) -> list[_Beam]:
+    """Extend the beam by the object at each of its best spots, or without the object if it has none."""
     search = _Search(brief, thing, beam.footprints)
     found = search.best()
     if isinstance(found, LayoutReason):
-        return [replace(beam, score=beam.score - LEFT_OUT, left_out=(*beam.left_out, (thing.name, found)))]
+        return [
+            replace(beam, score=beam.score - LEFT_OUT_PENALTY, left_out=(*beam.left_out, (thing.name, found)))
+        ]
     return [
         _Beam(
             (*beam.spots, spot),
@@ -125,9 +131,9 @@ def _grown(brief: PlaneBrief, thing: PlaneThing, beam: _Beam) -> list[_Beam]:
 
 
 class _Search:
-    """The spots of one thing, given where the others are."""
+    """Search for spots of one object, given the positions of the others."""
 
-    def __init__(self, brief: PlaneBrief, thing: PlaneThing, placed: tuple[PlaneFootprint, ...]) -> None:
+    def __init__(self, brief: PlaneBrief, thing: PlaneObject, placed: tuple[PlaneFootprint, ...]) -> None:
         self._brief = brief
         self._thing = thing
         self._others = {item.name: item for item in (*brief.obstacles, *placed)}
@@ -138,7 +144,7 @@ class _Search:
         return PlaneFootprint(self._thing.name, spot.center_m, spot.yaw, (x, y), 0.0, height)
 
     def best(self) -> list[tuple[PlaneSpot, float]] | LayoutReason:
-        """The best spots with their scores, apart from one another; the reason where there is none."""
+        """Return the best spots with their scores, apart from one another, or the reason if there is none."""
         spots = self._candidates()
         spots = spots.at(margins(spots, self._brief.size_m) >= self._brief.rim_m - 1e-9)
         if not len(spots):
@@ -146,8 +152,10 @@ class _Search:
         spots = spots.at(~self._taken(spots))
         if not len(spots):
             return LayoutReason.NO_FREE_SPOT
-        held = [self._holds(number, spots) for number in range(len(self._thing.wishes))]
-        needed = [row for row, wish in zip(held, self._thing.wishes, strict=True) if wish.required]
+        held = [self._holds(number, spots) for number in range(len(self._thing.constraints))]
+        needed = [
+            row for row, constraint in zip(held, self._thing.constraints, strict=True) if constraint.required
+        ]
         if needed:
             fits = np.logical_and.reduce(needed)
             spots, held = spots.at(fits), [row[fits] for row in held]
@@ -156,28 +164,30 @@ class _Search:
         return self._chosen(spots, held, self._scores(spots, held))
 
     def _candidates(self) -> SpotCandidates:
-        """Grid points, with lines through the middles of what wishes are about, at all turns; gazes at what is to be faced."""
+        """Return grid points with all yaws. Lines through the objects that constraints name, and yaws that face them,
+        are added.
+        """
         brief = self._brief
         width, depth = brief.size_m
         most = FLOOR_CELLS if brief.on_floor else SURFACE_CELLS
         step = max(STEP_M[brief.on_floor], math.sqrt(width * depth / most))
-        about = [self._others[w.other] for w in self._thing.wishes if w.other in self._others]
+        about = [self._others[w.other] for w in self._thing.constraints if w.other in self._others]
         xs, ys = (
-            np.unique(np.concatenate([_line(extent, step), [item.center_m[axis] for item in about]]))
+            np.unique(np.concatenate([_grid_line(extent, step), [item.center_m[axis] for item in about]]))
             for axis, extent in enumerate((width, depth))
         )
         points = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2)  # (k, 2)
         gazes = [
-            np.arctan2(*(np.asarray(self._others[wish.other].center_m) - points).T[::-1])
-            for wish in self._thing.wishes
-            if wish.kind is Arrangement.FACE_TO and wish.other in self._others
+            np.arctan2(*(np.asarray(self._others[constraint.other].center_m) - points).T[::-1])
+            for constraint in self._thing.constraints
+            if constraint.kind is ConstraintKind.FACE_TO and constraint.other in self._others
         ]
-        turns = TURNS if self._thing.has_front else TURNS[:2]
+        turns = YAWS if self._thing.has_front else YAWS[:2]
         yaws = np.concatenate([*(np.full(len(points), turn) for turn in turns), *gazes])
         return SpotCandidates.of(np.tile(points, (len(turns) + len(gazes), 1)), yaws, self._thing.size_m)
 
     def _taken(self, spots: SpotCandidates) -> BoolArray:
-        """Which spots meet something, or a zone that stays clear."""
+        """Mask of spots that collide with an object or lie in a zone that stays free, shape (n,)."""
         height = self._thing.size_m[2]
         rows = [
             (*item.center_m, *(half_extents(np.asarray(item.yaw), item.size_m) + GAP_M).tolist())
@@ -193,43 +203,47 @@ class _Search:
         return np.asarray(meets.any(axis=1))
 
     def _holds(self, number: int, spots: SpotCandidates) -> BoolArray:
-        wish = self._thing.wishes[number]
-        other = self._others.get(wish.other)
-        return holds(wish, spots, self._brief.size_m, self._thing.size_m, other)
+        constraint = self._thing.constraints[number]
+        other = self._others.get(constraint.other)
+        return holds(constraint, spots, self._brief.size_m, self._thing.size_m, other)
 
     def _scores(self, spots: SpotCandidates, held: Sequence[BoolArray]) -> FloatArray:
         brief, thing = self._brief, self._thing
-        score = CHANCE * self._rng.random(len(spots))
-        kinds = {wish.kind for wish in thing.wishes}
-        for wish, row in zip(thing.wishes, held, strict=True):
-            shade = degrees(wish, spots, brief.size_m, thing.size_m, self._others.get(wish.other))
-            score += WEIGHTS[wish.kind] * ((1 - SHADE) * row + SHADE * shade)
-        if Arrangement.EDGE not in kinds:
-            score += COMFORT * np.minimum(margins(spots, brief.size_m) / COMFORT_M, 1.0)
+        score = RANDOM_SCORE * self._rng.random(len(spots))
+        kinds = {constraint.kind for constraint in thing.constraints}
+        for constraint, row in zip(thing.constraints, held, strict=True):
+            shade = satisfaction(
+                constraint, spots, brief.size_m, thing.size_m, self._others.get(constraint.other)
+            )
+            score += WEIGHTS[constraint.kind] * ((1 - GRADED_SHARE) * row + GRADED_SHARE * shade)
+        if ConstraintKind.EDGE not in kinds:
+            score += CLEARANCE_BONUS * np.minimum(margins(spots, brief.size_m) / CLEARANCE_M, 1.0)
         nearest = [gaps(spots, item) for item in self._others.values()]
         if nearest:
-            score += COMFORT * np.minimum(np.min(nearest, axis=0) / COMFORT_M, 1.0)
-        if thing.has_front and Arrangement.FACE_TO not in kinds:
-            looks = _inwards(spots, brief.size_m) if brief.on_floor else np.cos(spots.yaw)
-            score += (BACK if brief.on_floor else FRONT) * (looks > 0.9)
+            score += CLEARANCE_BONUS * np.minimum(np.min(nearest, axis=0) / CLEARANCE_M, 1.0)
+        if thing.has_front and ConstraintKind.FACE_TO not in kinds:
+            looks = _inward_facing(spots, brief.size_m) if brief.on_floor else np.cos(spots.yaw)
+            score += (WALL_BONUS if brief.on_floor else FRONT_BONUS) * (looks > 0.9)
         elif not thing.has_front and not brief.on_floor:
-            score += FRONT / 2 * (spots.half[:, 1] >= spots.half[:, 0])
+            score += FRONT_BONUS / 2 * (spots.half[:, 1] >= spots.half[:, 0])
         return np.asarray(score)
 
     def _chosen(
         self, spots: SpotCandidates, held: Sequence[BoolArray], scores: FloatArray
     ) -> list[tuple[PlaneSpot, float]] | LayoutReason:
-        """The best spots in reach, none within a quarter of the plane's shorter side of a better one."""
+        """Return the best reachable spots. Spots closer than a quarter of the plane's shorter side to a better one
+        are skipped.
+        """
         apart = 0.25 * min(self._brief.size_m)
         chosen: list[tuple[PlaneSpot, float]] = []
-        order = np.argsort(-scores, kind="stable")[:SCANNED]
+        order = np.argsort(-scores, kind="stable")[:MAX_SCANNED]
         for start in range(0, len(order), BATCH):
             rows = order[start : start + BATCH]
             for row in rows[self._reached(spots.at(rows))].tolist():
                 x, y = spots.center[row].tolist()
                 if any(math.hypot(x - s.center_m[0], y - s.center_m[1]) < apart for s, _ in chosen):
                     continue
-                kept = tuple(w for w, h in zip(self._thing.wishes, held, strict=True) if h[row])
+                kept = tuple(w for w, h in zip(self._thing.constraints, held, strict=True) if h[row])
                 chosen.append(
                     (PlaneSpot(self._thing.name, (x, y), float(spots.yaw[row]), kept), float(scores[row]))
                 )
@@ -240,7 +254,7 @@ class _Search:
         return chosen or LayoutReason.OUT_OF_REACH
 
     def _reached(self, spots: SpotCandidates) -> BoolArray:
-        """Which spots the arm reaches from some place where the robot can stand, shape (n,)."""
+        """Mask of spots that the arm reaches from a robot position, shape (n,)."""
         if not self._brief.stands:
             return np.ones(len(spots), dtype=bool)
         stands = np.asarray(self._brief.stands)  # (k, 2)
@@ -249,8 +263,8 @@ class _Search:
         return np.asarray(((away >= ROBOT.shoulder_m) & (away <= REACH_M)).any(axis=1))
 
 
-def _inwards(spots: SpotCandidates, plane_m: Size2) -> FloatArray:
-    """Cosine between where each spot's front looks and the way inwards from the nearest side, shape (n,)."""
+def _inward_facing(spots: SpotCandidates, plane_m: Size2) -> FloatArray:
+    """Cosine between each spot's front and the inward normal of the nearest side, shape (n,)."""
     strips = np.asarray(plane_m) / 2 - np.abs(spots.center) - spots.half  # (n, 2)
     axis = np.argmin(strips, axis=1)
     inward = -np.sign(spots.center[np.arange(len(spots)), axis])
@@ -258,7 +272,7 @@ def _inwards(spots: SpotCandidates, plane_m: Size2) -> FloatArray:
     return np.asarray(inward * front[np.arange(len(spots)), axis])
 
 
-def _line(extent: float, step: float) -> NDArray[np.float64]:
-    """Grid points along one side, the middle among them."""
+def _grid_line(extent: float, step: float) -> NDArray[np.float64]:
+    """Return grid coordinates along one side, symmetric about the centre."""
     count = int(extent / 2 / step)
     return np.asarray(np.arange(-count, count + 1) * step, dtype=np.float64)

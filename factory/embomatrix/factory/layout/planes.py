@@ -1,4 +1,4 @@
-"""Planes of a scene that is being edited: the surfaces of furniture and the floors of rooms, as planar briefs see them."""
+"""Planes of a scene editor: surfaces of furniture and floors of rooms, converted to planar briefs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from embomatrix.factory.layout.constraints import half_extents
 from embomatrix.factory.layout.sampling import LIFT_M
-from embomatrix.factory.layout.values import PlacementConstraint, PlaneBrief, PlaneFootprint, PlaneThing
+from embomatrix.factory.layout.values import PlacementConstraint, PlaneBrief, PlaneFootprint, PlaneObject
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.candidates import surfaces_for
 from embomatrix.skills.limits import ROBOT
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Aabb
 
-STANDS: Final = 72
-"""Spots for the robot that a brief holds at most: more add nothing but time."""
+MAX_STANDS: Final = 72
+"""Maximum number of robot positions in a brief. More positions only cost time."""
 LOWEST_M: Final = 0.05
 HIGHEST_M: Final = 1.75
-"""Surfaces between these heights over the floor are used before others."""
+"""Surfaces between these heights above the floor are preferred."""
 RIM_M: Final = 0.01
 FLOOR_RIM_M: Final = 0.02
 """Free strip at the edge of a surface, and at walls."""
@@ -38,9 +38,10 @@ _IDENTITY: Final = Pose((0.0, 0.0, 0.0))
 
 @dataclass(frozen=True, slots=True)
 class Plane:
-    """A rectangle that things can stand on; ``pose`` is its middle's, in the world, x and y along its sides.
+    """Rectangle that objects can stand on. ``pose`` is the pose of its centre in the world, with x and y along its
+    sides.
 
-    ``host`` is the object whose surface it is, empty for the floor of ``room``.
+    ``host`` is the object that the surface belongs to; it is empty for the floor of ``room``.
     """
 
     name: str
@@ -56,7 +57,9 @@ class Plane:
 
 
 def planes_of(editor: SceneEditor, host: str) -> list[Plane]:
-    """Open surfaces of an object, the largest at a good height first; or the floor of a room. Raises PlacementError."""
+    """Return the floor of a room, or the open surfaces of an object, the largest at a preferred height first. Raise
+    PlacementError.
+    """
     if host in editor.rooms:
         room = editor.rooms[host]
         return [Plane(host, "", host, Pose((*room.center_m, 0.0)), room.size_m, math.inf)]
@@ -64,13 +67,13 @@ def planes_of(editor: SceneEditor, host: str) -> list[Plane]:
     found = []
     for surface in surfaces_for(asset, Relation.ONTOP):
         if surface.link:
-            continue  # what rides on a drawer is the sampler's
+            continue  # surfaces of drawers are left to the sampler
         pose = item.pose_world_asset @ Pose(surface.center_m)
         found.append(
             Plane(f"{host}:{surface.name}", host, item.room, pose, surface.size_m, surface.clearance_m)
         )
     if not found and asset.supports:
-        # Every asset has a surface by definition: the top of its box, as the lid of a chest.
+        # Every asset has at least one surface: the top of its box, such as the lid of a chest.
         x, y, z = asset.size_m
         pose = item.pose_world_asset @ Pose((0.0, 0.0, z / 2))
         found.append(Plane(f"{host}:top", host, item.room, pose, (x, y), math.inf))
@@ -86,20 +89,20 @@ def planes_of(editor: SceneEditor, host: str) -> list[Plane]:
 def brief_for(
     editor: SceneEditor,
     plane: Plane,
-    things: Sequence[tuple[ObjectBrief, Asset]],
-    wishes: Mapping[str, tuple[PlacementConstraint, ...]],
+    objects: Sequence[tuple[ObjectBrief, Asset]],
+    constraints: Mapping[str, tuple[PlacementConstraint, ...]],
     seed: int,
 ) -> PlaneBrief:
-    """What the planar generator is told of a plane, as things stand. Wishes name objects as the scene does."""
+    """Return the planar brief of a plane in its current state. Constraints use the scene's object names."""
     width, depth = plane.size_m
     return PlaneBrief(
         plane=plane.name,
         size_m=(width, depth),
-        things=tuple(
-            PlaneThing(thing.name, _extent(asset), wishes.get(thing.name, ()), thing.has_front)
-            for thing, asset in things
+        objects=tuple(
+            PlaneObject(thing.name, _extent(asset), constraints.get(thing.name, ()), thing.has_front)
+            for thing, asset in objects
         ),
-        obstacles=tuple(_obstacles(editor, plane, max((a.size_m[2] for _, a in things), default=0.0))),
+        obstacles=tuple(_obstacles(editor, plane, max((a.size_m[2] for _, a in objects), default=0.0))),
         zones=tuple(_zones(editor, plane)) if plane.on_floor else (),
         stands=() if plane.on_floor else _stands(editor, plane),
         rim_m=min(FLOOR_RIM_M if plane.on_floor else RIM_M, min(width, depth) / 20),
@@ -111,7 +114,10 @@ def brief_for(
 def pose_at(
     plane: Plane, asset: Asset, spot: PlaneSpot, shift_m: Size2 = (0.0, 0.0), turn: float = 0.0
 ) -> Pose:
-    """Pose in the world of an asset whose box's middle is at a spot, moved and turned a little, its underside on the plane."""
+    """Return the world pose of an asset with its box centred at a spot and its underside on the plane.
+
+    ``shift_m`` and ``turn`` move and rotate it slightly.
+    """
     box = bounds_of(asset).box(_IDENTITY)
     yaw = spot.yaw + turn
     cosine, sine = math.cos(yaw), math.sin(yaw)
@@ -125,8 +131,8 @@ def pose_at(
     return plane.pose @ local
 
 
-def company_on(editor: SceneEditor, plane: Plane) -> tuple[tuple[str, str], ...]:
-    """Names and categories of the objects that stand on a plane already."""
+def objects_on(editor: SceneEditor, plane: Plane) -> tuple[tuple[str, str], ...]:
+    """Return name and category of the objects on a plane."""
     if plane.on_floor:
         names = [n for n, item in editor.objects.items() if item.room == plane.room and not item.host]
     else:
@@ -139,7 +145,7 @@ def _extent(asset: Asset) -> tuple[float, float, float]:
 
 
 def _obstacles(editor: SceneEditor, plane: Plane, height_m: float) -> Iterator[PlaneFootprint]:
-    """Whatever reaches into the space over the plane: objects by their turned boxes, the host by its parts."""
+    """Yield everything that reaches into the space above the plane: objects as rotated boxes, the host by its parts."""
     ground = plane.pose.position_m[2]
     inverse = plane.pose.inverse()
     half = half_extents(np.asarray(plane.pose.yaw), plane.size_m)  # (2,)
@@ -177,7 +183,9 @@ def _zones(editor: SceneEditor, plane: Plane) -> Iterator[tuple[float, float, fl
 
 
 def _stands(editor: SceneEditor, plane: Plane) -> tuple[Size2, ...]:
-    """Spots from which the robot may reach the plane, in its frame: evenly thinned, of furniture with doors those before it."""
+    """Return evenly thinned robot positions near the plane, in its frame. Furniture with doors is served from its
+    front.
+    """
     x, y, _ = plane.pose.position_m
     away = math.hypot(*plane.size_m) / 2 + ROBOT.reach_m
     cells = editor.floor.cells((x - away, y - away), (x + away, y + away))  # (n, 2)
@@ -186,5 +194,5 @@ def _stands(editor: SceneEditor, plane: Plane) -> tuple[Size2, ...]:
     local = (cells - (x, y)) @ turn  # rows times the rotation are its inverse applied to columns
     if editor.asset_of(plane.host).joints:
         local = local[local[:, 0] > 0.0]
-    step = max(1, len(local) // STANDS)
-    return tuple((float(a), float(b)) for a, b in local[step // 2 :: step][:STANDS])
+    step = max(1, len(local) // MAX_STANDS)
+    return tuple((float(a), float(b)) for a, b in local[step // 2 :: step][:MAX_STANDS])

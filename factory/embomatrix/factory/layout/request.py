@@ -1,4 +1,4 @@
-"""What is to be laid out, who does it, and what came of it."""
+"""Objects to lay out, the agents that decide, and the result of a layout."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.furnish.roles import FurnitureRole, role_of
-from embomatrix.factory.layout.constraints import wish
+from embomatrix.factory.layout.constraints import choose_constraints
 from embomatrix.factory.layout.distribution import distribute
 from embomatrix.factory.layout.organization import organize
 from embomatrix.factory.layout.planar import arrange
 from embomatrix.factory.layout.values import (
-    Arranged,
+    ConstraintBrief,
     Distribution,
     DistributionBrief,
-    Failure,
-    Kind,
+    LayoutFailure,
     LayoutRelation,
     ObjectBrief,
+    PlacementClass,
     PlacementConstraints,
+    PlaneArrangement,
     PlaneBrief,
-    PlaneCompany,
     RoomBrief,
 )
 from embomatrix.world.catalog import Catalog
@@ -37,26 +37,27 @@ _FRONTED: Final = (
     "alarm_clock picture_frame radio laptop monitor microwave toaster toaster_oven coffee_maker printer standing_tv "
     "cash_register desk_phone digital_camera loudspeaker table_lamp keyboard teddy_bear"
 )
-FRONTED: Final = frozenset(_FRONTED.split())
-"""Small things and appliances of which it matters where their front looks; of furniture it always does."""
+HAS_FRONT: Final = frozenset(_FRONTED.split())
+"""Small objects and appliances whose front direction matters. For furniture it always matters."""
 
 
 _KINDS: Final = {
-    FurnitureRole.SURFACE: Kind.GOODS,
-    FurnitureRole.FITTED: Kind.GOODS,
-    FurnitureRole.WALL: Kind.HUNG,
-    FurnitureRole.HUNG_CABINET: Kind.HUNG,
-    FurnitureRole.CEILING: Kind.OVERHEAD,
+    FurnitureRole.SURFACE: PlacementClass.GOODS,
+    FurnitureRole.FITTED: PlacementClass.GOODS,
+    FurnitureRole.WALL: PlacementClass.HUNG,
+    FurnitureRole.HUNG_CABINET: PlacementClass.HUNG,
+    FurnitureRole.CEILING: PlacementClass.OVERHEAD,
 }
-"""Roles of what does not stand on the floor."""
+"""Placement class of furniture roles that don't stand on the floor."""
 
 
 @dataclass(frozen=True, slots=True)
 class RequestedObject:
-    """An object that a task brings into a scene. ``models`` are (category, model), the best first.
+    """Object that a task adds to a scene. ``models`` lists (category, model) pairs, the best first.
 
-    ``relation`` and ``host`` are what the task demands: another item, a scene object, or a room, whose floor it is; None and
-    empty leave it to the agents. ``rooms`` are those it may be in, all when empty; ``beside`` what it must be next to.
+    ``relation`` and ``host`` are demanded by the task; the host is another requested object, a scene object, or a
+    room for its floor. None and an empty string leave the choice to the agents. ``rooms`` lists the allowed rooms;
+    empty means all. ``beside`` lists the objects that it must stand next to.
     """
 
     name: str
@@ -67,17 +68,17 @@ class RequestedObject:
     beside: tuple[str, ...] = ()
 
     def asset(self, choice: int) -> Asset:
-        """The asset of one of its models. Raises IndexError beyond the last one."""
+        """Return the asset of a model. Raise IndexError for an unknown choice."""
         return build_asset(Catalog.load(), *self.models[choice])
 
-    def failure(self, host: str, reason: LayoutReason, detail: str) -> Failure:
-        """That it found no place at ``host``, in the relation that the task demands or else on top."""
-        return Failure(self.name, self.relation or LayoutRelation.ONTOP, host, reason, detail)
+    def failure(self, host: str, reason: LayoutReason, detail: str) -> LayoutFailure:
+        """Return a failure of this object at ``host``, in the demanded relation or else on top."""
+        return LayoutFailure(self.name, self.relation or LayoutRelation.ONTOP, host, reason, detail)
 
 
-def thing_of(item: RequestedObject, asset: Asset, names: Mapping[str, str]) -> ObjectBrief:
-    """An item as agents see it; ``names`` are those in the scene of what was placed already."""
-    kind = kind_of(asset)
+def object_brief(item: RequestedObject, asset: Asset, names: Mapping[str, str]) -> ObjectBrief:
+    """Return the brief of a requested object. ``names`` maps the objects placed so far to scene names."""
+    kind = placement_class_of(asset)
     x, y, z = asset.size_m
     return ObjectBrief(
         name=item.name,
@@ -87,53 +88,53 @@ def thing_of(item: RequestedObject, asset: Asset, names: Mapping[str, str]) -> O
         relation=item.relation,
         host=names.get(item.host, item.host),
         beside=tuple(names.get(other, other) for other in item.beside),
-        has_front=kind is Kind.FURNITURE or asset.category in FRONTED,
+        has_front=kind is PlacementClass.FURNITURE or asset.category in HAS_FRONT,
         kind=kind,
     )
 
 
-def kind_of(asset: Asset) -> Kind:
-    """Where such a thing belongs, by its role in the furnishing of rooms."""
-    return _KINDS.get(role_of(asset.category, asset.size_m, asset.mass_kg), Kind.FURNITURE)
+def placement_class_of(asset: Asset) -> PlacementClass:
+    """Return the placement class of an asset, from its furniture role."""
+    return _KINDS.get(role_of(asset.category, asset.size_m, asset.mass_kg), PlacementClass.FURNITURE)
 
 
 @dataclass(frozen=True, slots=True)
 class LayoutAgents:
-    """Who decides, by the paper's names: each a function of a brief alone. The defaults are rules."""
+    """Agents of a layout, named as in the paper. Each is a function of its brief; the defaults are rules."""
 
     distribute: Callable[[DistributionBrief], Distribution] = distribute
     """Scene-level Distribution Agent."""
     organize: Callable[[RoomBrief], LayoutTree] = organize
     """Room-level Organization Agent."""
-    wish: Callable[[PlaneCompany], PlacementConstraints] = wish
-    """Planar-Level Placement Generator: which constraints."""
-    arrange: Callable[[PlaneBrief], tuple[Arranged, ...]] = arrange
-    """Planar-Level Placement Generator: the solver."""
+    choose_constraints: Callable[[ConstraintBrief], PlacementConstraints] = choose_constraints
+    """Planar-Level Placement Generator: choice of constraints."""
+    arrange: Callable[[PlaneBrief], tuple[PlaneArrangement, ...]] = arrange
+    """Planar-Level Placement Generator: solver."""
 
 
 @dataclass(slots=True)
-class Record:
-    """All that the agents were asked and answered, in order: for people, and for running an agent again alone."""
+class LayoutRecord:
+    """Briefs and answers of all agents in call order. Each brief can be replayed with ``factory agent``."""
 
     distribution: tuple[DistributionBrief, Distribution] | None = None
     rooms: list[tuple[RoomBrief, LayoutTree]] = field(default_factory=list)
-    company: list[tuple[PlaneCompany, PlacementConstraints]] = field(default_factory=list)
-    planes: list[tuple[PlaneBrief, tuple[Arranged, ...]]] = field(default_factory=list)
+    constraints: list[tuple[ConstraintBrief, PlacementConstraints]] = field(default_factory=list)
+    planes: list[tuple[PlaneBrief, tuple[PlaneArrangement, ...]]] = field(default_factory=list)
     planar_s: dict[str, float] = field(default_factory=dict)
-    """Seconds of CPU that the planar solver took, by room."""
+    """CPU seconds of the planar solver, by room."""
     settled: int = 0
-    """Things that no geometry proved stable, and that were let go in physics."""
+    """Number of objects whose stability needed a physics simulation."""
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What came of a layout: names in the scene by item, trees by room in those names, and a failure for each item left out.
+    """Result of a layout: scene names by object, trees by room, and a failure for each object left out.
 
-    ``out_of_hand`` tells of items that were given a place at which the robot does not get at them, as no better one was found.
+    ``unreachable`` lists placed objects that the robot can't reach. No better place was found for them.
     """
 
     names: Mapping[str, str]
     trees: Mapping[str, LayoutTree]
-    failures: tuple[Failure, ...]
-    record: Record
-    out_of_hand: tuple[Failure, ...] = ()
+    failures: tuple[LayoutFailure, ...]
+    record: LayoutRecord
+    unreachable: tuple[LayoutFailure, ...] = ()

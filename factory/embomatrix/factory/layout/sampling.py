@@ -1,4 +1,6 @@
-"""Object-level Sampling Agent: continuous poses on, in, under and beside things, each free, in reach and barring nothing."""
+"""Object-level Sampling Agent: continuous poses on, in, under and beside objects. Each pose is free, reachable and
+blocks no path.
+"""
 
 from __future__ import annotations
 
@@ -26,22 +28,24 @@ if TYPE_CHECKING:
 
 TRIES: Final = 64
 PACKING_GAP_M: Final = 0.004
-"""Between things that are packed side by side."""
+"""Gap in metres between objects packed side by side."""
 FLOOR_TRIES: Final = 200
-PEEPING: Final = 24
-PEEPING_SHARE: Final = 0.15
-"""Poses under the edges of a carrier that are looked at, and how much of a thing's width its middle is behind the edge."""
-BARRED: Final = 16
-"""Poses that would bar the robot's way after which a search ends: each costs a look at all ways."""
+EDGE_POSES: Final = 24
+EDGE_SHARE: Final = 0.15
+"""Number of poses tried under a carrier's edges, and distance of the object's centre behind the edge as a share of
+its width.
+"""
+MAX_BLOCKING: Final = 16
+"""Number of poses that block the robot's path after which a search ends. Each costs a check of all paths."""
 MODELS: Final = 8
-"""Models of a category that are looked at where none is given."""
+"""Maximum number of a category's models tried if no model is given."""
 LIFT_M: Final = 0.0005
-"""Things start this high over what they stand on, so that none begins in contact."""
+"""Initial gap between an object and its support, so that no object starts in contact."""
 
 
 @dataclass(slots=True)
-class _Tally:
-    """How many candidate poses there were, how many of them collided with nothing, and how many of these were in reach."""
+class _PoseCounts:
+    """Number of candidate poses, of collision-free ones, and of reachable ones among these."""
 
     seen: int = 0
     free: int = 0
@@ -49,7 +53,7 @@ class _Tally:
 
 
 class ObjectSampler:
-    """Samples poses for single things in a scene that is being edited. The generator's state decides all."""
+    """Sampler of poses for single objects in a scene editor. The random generator's state decides every pose."""
 
     def __init__(self, editor: SceneEditor, rng: np.random.Generator) -> None:
         self._editor = editor
@@ -60,8 +64,8 @@ class ObjectSampler:
     ) -> str:
         """Place a new object and return its name, ``category_N``.
 
-        ``host`` is an object that it goes on, in, under or next to, or a room when ``relation`` is None or INROOM: then it
-        stands on that room's floor. Without a model one of the category is drawn, any that fits. Raises PlacementError.
+        ``host`` is an object, or a room if ``relation`` is None or INROOM; then the object stands on the room's
+        floor. Without a model, models of the category are tried in random order. Raise PlacementError.
         """
         errors: list[PlacementError] = []
         for asset in assets_of(category, model, self._rng):
@@ -74,14 +78,14 @@ class ObjectSampler:
         raise errors[-1]
 
     def find(self, asset: Asset, relation: Relation | None, host: str) -> Pose:
-        """A pose at which nothing stands against the thing. Raises PlacementError with the rule that did the most."""
+        """Return a valid pose. Raise PlacementError with the rule that rejected most poses."""
         target = host if relation in (Relation.ONTOP, Relation.INSIDE, Relation.UNDER) else ""
         return self.first_free(asset, self.poses(asset, relation, host), target)
 
     def pack(self, asset: Asset, host: str) -> Pose:
-        """A pose in a container, in a corner of it or of what is left between things that lie there. Raises PlacementError.
+        """Return a pose in a corner of a container, or in a corner between the objects in it. Raise PlacementError.
 
-        Where no corner takes the thing, any free pose.
+        If no corner fits, return any valid pose in the container.
         """
         target = self._editor.known(host)
         for local in self._corners(asset, target):
@@ -91,7 +95,7 @@ class ObjectSampler:
         return self.find(asset, Relation.INSIDE, host)
 
     def _corners(self, asset: Asset, target: SceneObject) -> Iterator[Pose]:
-        """Poses in the container's frame, row after row from one corner on, at the walls and at what lies there."""
+        """Yield corner poses in the container's frame, row by row, at its walls and at the objects in it."""
         editor, bounds = self._editor, bounds_of(asset)
         carrier = editor.asset_of(target.name)
         inverse = target.pose_world_asset.inverse()
@@ -119,7 +123,7 @@ class ObjectSampler:
                     yield pose
 
     def poses(self, asset: Asset, relation: Relation | None, host: str) -> Iterator[Pose]:
-        """Poses in the relation to a host, in random order, looked at by nobody. Raises PlacementError where there is none."""
+        """Yield unchecked poses in the relation to a host, in random order. Raise PlacementError if there is none."""
         editor = self._editor
         if relation is None or relation is Relation.INROOM:
             if host not in editor.rooms:
@@ -136,7 +140,7 @@ class ObjectSampler:
         carrier = editor.asset_of(host)
         local = list(candidates(asset, carrier, relation, self._shift(), TRIES))
         if relation is Relation.UNDER:
-            local += self._peeping(asset, carrier)
+            local += self._under_edges(asset, carrier)
         found = [target.pose_world_asset @ pose for pose in local]
         if not found:
             reason = LayoutReason.TOO_LARGE if carrier.supports else LayoutReason.NO_SURFACE
@@ -149,7 +153,7 @@ class ObjectSampler:
             yield found[index]
 
     def rests(self, relation: Relation | None, host: str) -> tuple[Relation | None, str]:
-        """What a thing in this relation to a host rests on or in: relation and object, or nothing: the floor."""
+        """Return the relation and host that support an object placed at this host. (None, "") means the floor."""
         if relation in (Relation.ONTOP, Relation.INSIDE):
             return relation, host
         if relation is Relation.NEXTTO:
@@ -158,26 +162,26 @@ class ObjectSampler:
         return None, ""
 
     def first_free(self, asset: Asset, poses: Iterable[Pose], target: str) -> Pose:
-        """The first of some poses at which nothing stands against a thing. Raises PlacementError."""
-        tally = _Tally()
+        """Return the first valid pose. Raise PlacementError."""
+        counts = _PoseCounts()
         for pose in poses:
-            tally.seen += 1
+            counts.seen += 1
             objection = self._editor.objection(asset, pose, target)
             if objection is None:
                 return pose
-            tally.free += objection is not LayoutReason.NO_FREE_SPOT
-            tally.reached += objection is LayoutReason.BARS_THE_WAY
-            if tally.reached == BARRED:
+            counts.free += objection is not LayoutReason.NO_FREE_SPOT
+            counts.reached += objection is LayoutReason.BLOCKS_PATH
+            if counts.reached == MAX_BLOCKING:
                 break
-        raise _none_of(tally, asset, target or "the floor")
+        raise _no_pose_error(counts, asset, target or "the floor")
 
-    def _peeping(self, asset: Asset, carrier: Asset) -> Iterator[Pose]:
-        """Poses in a carrier's frame under its edges, a good third of the thing in the open: so shoes stand under a bed."""
+    def _under_edges(self, asset: Asset, carrier: Asset) -> Iterator[Pose]:
+        """Yield poses under a carrier's edges with a good third of the object in the open, such as shoes under a bed."""
         x, y, z = carrier.size_m
-        for _ in range(PEEPING):
+        for _ in range(EDGE_POSES):
             side, along = int(self._rng.integers(4)), float(self._rng.uniform(-0.4, 0.4))
             turned = float(self._rng.integers(2)) * math.pi / 2
-            depth = asset.size_m[(side >= 2) != (turned > 0)] * PEEPING_SHARE
+            depth = asset.size_m[(side >= 2) != (turned > 0)] * EDGE_SHARE
             px = (x / 2 - depth) * (1, -1)[side] if side < 2 else along * x
             py = (y / 2 - depth) * (1, -1)[side - 2] if side >= 2 else along * y
             yield Pose.from_xyz_yaw(px, py, (asset.size_m[2] - z) / 2 + LIFT_M, turned)
@@ -189,7 +193,7 @@ class ObjectSampler:
             yield self._standing(asset, float(x), float(y))
 
     def _beside(self, asset: Asset, target: SceneObject) -> Iterator[Pose]:
-        """Poses at the height of what the target stands on, a few centimetres from its sides."""
+        """Yield poses a few centimetres from the target's sides, at the height of the target's support."""
         box = self._editor.box_of(target.name)
         gap = 0.03 + max(asset.size_m[:2]) / 2
         support = self._editor.objects.get(target.host)
@@ -206,7 +210,7 @@ class ObjectSampler:
                 yield Pose.from_xyz_yaw(x, y, box.low_m[2] + asset.size_m[2] / 2, self._yaw())
 
     def _carries(self, support: SceneObject, x: float, y: float, z: float) -> bool:
-        """Whether a surface of the object lies under the point, at its height."""
+        """True if a surface of the support lies under the point, at its height."""
         px, py, pz = support.pose_world_asset.inverse().apply((x, y, z))
         return any(
             abs(px - s.center_m[0]) < s.size_m[0] / 2
@@ -226,7 +230,7 @@ class ObjectSampler:
 
 
 def assets_of(category: str, model: str | None, rng: np.random.Generator) -> list[Asset]:
-    """The model's asset, or some of the category in random order. Raises PlacementError for what is in no catalog."""
+    """Return the model's asset, or assets of the category in random order. Raise PlacementError for unknown names."""
     catalog = Catalog.load()
     try:
         if model is not None:
@@ -237,15 +241,15 @@ def assets_of(category: str, model: str | None, rng: np.random.Generator) -> lis
     return [build_asset(catalog, category, models[i].model_id) for i in rng.permutation(len(models))[:MODELS]]
 
 
-def _none_of(tally: _Tally, asset: Asset, host: str) -> PlacementError:
-    if tally.reached:
-        reason = LayoutReason.BARS_THE_WAY
+def _no_pose_error(counts: _PoseCounts, asset: Asset, host: str) -> PlacementError:
+    if counts.reached:
+        reason = LayoutReason.BLOCKS_PATH
     else:
-        reason = LayoutReason.OUT_OF_REACH if tally.free else LayoutReason.NO_FREE_SPOT
+        reason = LayoutReason.OUT_OF_REACH if counts.free else LayoutReason.NO_FREE_SPOT
     return PlacementError(
         reason,
-        f"no place for {asset.asset_id}, {_metres(asset)}, at {host}: of {tally.seen} poses {tally.free} were free, "
-        f"{tally.reached} of them in the robot's reach, none without barring its way: try another host",
+        f"no place for {asset.asset_id}, {_metres(asset)}, at {host}: of {counts.seen} poses {counts.free} were free, "
+        f"{counts.reached} of them reachable, none without blocking the robot's path: try another host",
     )
 
 

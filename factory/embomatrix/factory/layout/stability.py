@@ -1,6 +1,6 @@
-"""Whether things stay where they were put, and whether the robot gets at them there: asked of the runtime that executes plans.
+"""Stability and reachability of placed objects, tested with the runtime that executes plans.
 
-Rest is proved by geometry where it can be, else the thing is let go in physics.
+Geometry proves stability if it can. Otherwise the object is dropped in physics.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.scenes.rehearsal import Rehearsal
+from embomatrix.factory.scenes.rehearsal import SimulatedRobot
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.geometry.statics import base_of, is_level, rest_pose
@@ -22,22 +22,22 @@ if TYPE_CHECKING:
     from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.world.geometry import Pose
 
-    Elsewhere = Callable[[str], Iterable[Pose]]
-    """Other free poses for an object at what it is on, in or under."""
+    AlternativePoses = Callable[[str], Iterable[Pose]]
+    """Other collision-free poses for an object at its host."""
 
 
 HIGH_M: Final = 2.0
-"""Nobody asks the robot to get at what hangs higher."""
-NO_STAND: Final = "the robot can stand nowhere with a clear way for its arm"
-NOT_FETCHED: Final = "the robot opens what it lies in, and can't take it out"
+"""Objects above this height need not be reachable."""
+NO_STAND: Final = "the robot finds no position from which its arm reaches it"
+CANNOT_TAKE_OUT: Final = "the robot opens its container but can't take it out"
 
 
 @dataclass(frozen=True, slots=True)
-class Settling:
-    """What came of things that were put down.
+class StabilityReport:
+    """Result of a stability check.
 
-    ``dropped`` counts those that had to be let go; ``unstable`` tells in words what is wrong with those that don't stay,
-    ``unreached`` what with those that the robot can't get at.
+    ``dropped`` counts the objects tested in physics. ``unstable`` and ``unreached`` map object names to a sentence
+    that states the problem.
     """
 
     dropped: int
@@ -45,23 +45,26 @@ class Settling:
     unreached: Mapping[str, str]
 
 
-def settle(editor: SceneEditor, names: Sequence[str], elsewhere: Elsewhere = lambda _: ()) -> Settling:
-    """Find where objects come to rest, and move them there; tell which don't stay, and which the robot doesn't get at.
+def settle(
+    editor: SceneEditor, names: Sequence[str], alternatives: AlternativePoses = lambda _: ()
+) -> StabilityReport:
+    """Move objects to their resting poses. Report unstable objects and objects that the robot can't reach.
 
-    What moves less than 1 cm and tilts less than 10 degrees stays. A thing that no standing robot gets at is first tried
-    ``elsewhere``. Hosts stand before what rests on them. Raises EngineError where the engine is missing.
+    An object is stable if it moves less than 1 cm and tilts less than 10 degrees. For an unreachable object, the
+    poses of ``alternatives`` are tried first. ``names`` lists hosts before the objects on them. Raise EngineError if the
+    engine is missing.
     """
     if not names:
-        return Settling(0, {}, {})
-    loose = {name for name in names if not editor.known(name).fixed and not is_proved(editor, name)}
+        return StabilityReport(0, {}, {})
+    loose = {name for name in names if not editor.known(name).fixed and not is_provably_stable(editor, name)}
     rested: dict[str, Pose] = {}
     unstable: dict[str, str] = {}
     with contextlib.closing(BulletEngine(editor.freeze(editor.base.scene_id))) as engine:
-        hands = _Hands(engine)
+        hands = _ReachProbe(engine)
         unreached: dict[str, str] = {}
         for name in [name for name in names if editor.box_of(name).low_m[2] < HIGH_M]:
             if not hands.reach(name):
-                if hands.place(name, elsewhere(name)):
+                if hands.place(name, alternatives(name)):
                     loose.add(name)
                 else:
                     unreached[name] = NO_STAND
@@ -71,30 +74,32 @@ def settle(editor: SceneEditor, names: Sequence[str], elsewhere: Elsewhere = lam
                 engine.set_pose(name, settled.pose)
                 rested[name] = settled.pose
             else:
-                unstable[name] = f"let go, it moves by {settled.moved_m:.3f} m: try a flatter place"
-        unstable |= _leaning(editor, Relations(engine), [name for name in names if name not in unstable])
+                unstable[name] = f"it moves by {settled.moved_m:.3f} m when dropped: try a flatter place"
+        unstable |= _resting_on_others(
+            editor, Relations(engine), [name for name in names if name not in unstable]
+        )
     editor.move(rested)
     shut_in = [name for name in names if name not in unstable.keys() | unreached.keys()]
-    unreached |= dict.fromkeys(_not_fetched(editor, shut_in), NOT_FETCHED)
-    return Settling(len(loose), unstable, unreached)
+    unreached |= dict.fromkeys(_untakeable(editor, shut_in), CANNOT_TAKE_OUT)
+    return StabilityReport(len(loose), unstable, unreached)
 
 
-def _leaning(editor: SceneEditor, relations: Relations, names: Sequence[str]) -> dict[str, str]:
-    """Those of some things that lie on another loose thing than they are to be on, with the sentence against it.
+def _resting_on_others(editor: SceneEditor, relations: Relations, names: Sequence[str]) -> dict[str, str]:
+    """Return objects that came to rest on a loose object other than their host, with a sentence each.
 
-    What is packed into a basket comes to lie on what is in there already, which nobody could then take out.
+    Objects packed into a basket can end up on one another. Nobody could then take out the lower one.
     """
     found = {}
     for name in names:
         host = relations.host_of(name)
         if host is None or host.name == editor.known(name).host or editor.known(host.name).fixed:
             continue
-        found[name] = f"it comes to lie on {host.name}: try a place beside it"
+        found[name] = f"it comes to rest on {host.name}: try a place beside it"
     return found
 
 
-class _Hands:
-    """Where the robot could stand to work on things, in an engine whose objects are being moved."""
+class _ReachProbe:
+    """Reachability test in an engine while objects are moved."""
 
     def __init__(self, engine: BulletEngine) -> None:
         self._engine = engine
@@ -104,7 +109,7 @@ class _Hands:
         return bool(self._navigator.stands_past_shut(name, self._navigator.start))
 
     def place(self, name: str, poses: Iterable[Pose]) -> bool:
-        """Leave a thing at the first of some poses at which it is reached; False, and where it was, without one."""
+        """Leave an object at the first reachable pose. Otherwise restore its pose and return False."""
         before = self._engine.pose(name)
         for pose in poses:
             self._move(name, pose)
@@ -118,22 +123,22 @@ class _Hands:
         self._navigator.refresh()
 
 
-def _not_fetched(editor: SceneEditor, names: Sequence[str]) -> tuple[str, ...]:
-    """Those of some things behind doors that the robot fails to fetch in the simulator: an open leaf takes floor."""
+def _untakeable(editor: SceneEditor, names: Sequence[str]) -> tuple[str, ...]:
+    """Return objects behind doors that the robot fails to take out in the simulator. An open door panel covers floor."""
     bearing = {item.host for item in editor.objects.values()}
     behind = [
         name
         for name in names
-        if name not in bearing and not editor.known(name).fixed and _is_shut_in(editor, name)
+        if name not in bearing and not editor.known(name).fixed and _is_behind_door(editor, name)
     ]
     if not behind:
         return ()
-    with Rehearsal(editor.freeze(editor.base.scene_id)) as rehearsal:
-        return tuple(name for name in behind if not rehearsal.fetches(name))
+    with SimulatedRobot(editor.freeze(editor.base.scene_id)) as rehearsal:
+        return tuple(name for name in behind if not rehearsal.can_pick_up(name))
 
 
-def _is_shut_in(editor: SceneEditor, name: str) -> bool:
-    """Whether an object, or what it rests on or in, lies in something with doors."""
+def _is_behind_door(editor: SceneEditor, name: str) -> bool:
+    """True if an object, or any of its supports, is inside furniture with doors."""
     item = editor.known(name)
     while item.host:
         if item.relation is Relation.INSIDE and any(
@@ -144,8 +149,8 @@ def _is_shut_in(editor: SceneEditor, name: str) -> bool:
     return False
 
 
-def is_proved(editor: SceneEditor, name: str) -> bool:
-    """Whether geometry alone tells that an object rests where it is."""
+def is_provably_stable(editor: SceneEditor, name: str) -> bool:
+    """True if geometry alone proves that an object is at rest."""
     item, asset = editor.known(name), editor.asset_of(name)
     base = base_of(asset)
     if base is None:

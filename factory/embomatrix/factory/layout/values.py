@@ -1,6 +1,6 @@
-"""What the layout agents hand to one another: plain values, so that each agent can be run and looked at alone.
+"""Briefs and answers of the layout agents, as plain values. Each agent can be run on a brief alone.
 
-All field types are resolved at run time: pydantic reads these dataclasses at the door (``layout.doors``).
+Field types are resolved at run time, because pydantic reads these dataclasses in ``layout.agent_interfaces``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Size3 = tuple[float, float, float]
 
 
 class LayoutRelation(StrEnum):
-    """The nine relations of a layout tree (EmboMatrix, appendix A; OmniGibson's object states)."""
+    """Relation between two objects of a layout tree (EmboMatrix, appendix A; OmniGibson's object states)."""
 
     ONTOP = "ontop"
     INSIDE = "inside"
@@ -32,14 +32,14 @@ class LayoutRelation(StrEnum):
 
 
 class RelationMethod(StrEnum):
-    """What makes a relation of the tree true in a scene."""
+    """Mechanism that makes a relation of the tree hold in a scene."""
 
     POSE = "pose"  # the child is placed
-    FACT = "fact"  # the child is a substance, and the parent has it
-    NONE = "none"  # rigid bodies can't: it takes cloth
+    FACT = "fact"  # the child is a substance that the parent holds
+    NONE = "none"  # impossible for rigid bodies: needs cloth
 
 
-MEANS: Final = {
+RELATION_METHODS: Final = {
     LayoutRelation.ONTOP: RelationMethod.POSE,
     LayoutRelation.INSIDE: RelationMethod.POSE,
     LayoutRelation.UNDER: RelationMethod.POSE,
@@ -52,8 +52,8 @@ MEANS: Final = {
 }
 
 
-class Kind(StrEnum):
-    """Where things of a sort belong."""
+class PlacementClass(StrEnum):
+    """Part of a room in which objects of a category stand."""
 
     GOODS = "goods"  # on and in furniture
     FURNITURE = "furniture"  # on the floor
@@ -62,10 +62,10 @@ class Kind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Failure:
-    """A thing that could not be where a tree said; what the organizer hears of it in the next round."""
+class LayoutFailure:
+    """Object that could not be placed as a tree demands. The organizer gets it in the brief of its next round."""
 
-    thing: str
+    object_name: str
     relation: LayoutRelation
     host: str
     reason: LayoutReason
@@ -75,7 +75,9 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class LayoutRoomFacts:
-    """A room, its floor in metres along the world's x and y, and the categories of what can hold things there, one by one."""
+    """Facts about a room: floor size along the world's x and y axes, and the category of each object that can hold
+    others.
+    """
 
     name: str
     type: str
@@ -90,11 +92,11 @@ class LayoutRoomFacts:
 
 @dataclass(frozen=True, slots=True)
 class ObjectBrief:
-    """An object that a task brings. What is empty is left to the agents.
+    """Object that a task adds to the scene. Empty fields are decided by the agents.
 
-    ``size_m`` is the extent along the asset's x (depth), y (width) and z; ``has_front`` says that it matters where its front,
-    +x, looks. ``relation`` and ``host`` are what the task's start demands, ``rooms`` where it may be; ``beside`` are objects
-    that it must stand next to.
+    ``size_m`` is the extent along the asset's x (depth), y (width) and z axes. ``has_front`` is true if the direction
+    of its front, +x, matters. ``relation`` and ``host`` are demanded by the task's start. ``rooms`` lists the allowed
+    rooms, and ``beside`` the objects that it must stand next to.
     """
 
     name: str
@@ -105,16 +107,18 @@ class ObjectBrief:
     host: str = ""
     beside: tuple[str, ...] = ()
     has_front: bool = False
-    kind: Kind = Kind.GOODS
+    kind: PlacementClass = PlacementClass.GOODS
     __pydantic_config__: ClassVar = _STRICT
 
 
 @dataclass(frozen=True, slots=True)
 class DistributionBrief:
-    """What the Scene-level Distribution Agent decides on. ``homes`` are the rooms of objects that are there already."""
+    """Brief of the Scene-level Distribution Agent. ``homes`` gives the rooms of the scene's own objects that the task
+    names.
+    """
 
     rooms: tuple[LayoutRoomFacts, ...]
-    things: tuple[ObjectBrief, ...]
+    objects: tuple[ObjectBrief, ...]
     homes: dict[str, str] = field(default_factory=dict)
     seed: int = 0
     __pydantic_config__: ClassVar = _STRICT
@@ -122,7 +126,7 @@ class DistributionBrief:
 
 @dataclass(frozen=True, slots=True)
 class Distribution:
-    """The room of each thing, and why, in a few words."""
+    """Room of each object, and a short reason for it."""
 
     rooms: dict[str, str]
     reasons: dict[str, str] = field(default_factory=dict)
@@ -131,10 +135,10 @@ class Distribution:
 
 @dataclass(frozen=True, slots=True)
 class HostOffer:
-    """One way to put things at a piece of furniture: on its open surfaces, in its cavities, under it.
+    """Relation that a piece of furniture offers to objects: on its open surfaces, in its cavities, or under it.
 
-    ``spaces_m`` are the spaces there: extents along the host's x and y and the free height; ``height_m`` is that of the lowest
-    above the floor.
+    ``spaces_m`` lists the free spaces as extents along the host's x and y axes and free height. ``height_m`` is the
+    height of the lowest space above the floor.
     """
 
     relation: LayoutRelation
@@ -145,31 +149,31 @@ class HostOffer:
 
 @dataclass(frozen=True, slots=True)
 class HostFacts:
-    """An object of a room that can hold others. ``guests`` are the categories of what it holds already."""
+    """Object of a room that can hold others. ``contents`` lists the categories of the objects that it holds."""
 
     name: str
     category: str
     offers: tuple[HostOffer, ...]
-    guests: tuple[str, ...] = ()
+    contents: tuple[str, ...] = ()
     shut: bool = False
     __pydantic_config__: ClassVar = _STRICT
 
 
 @dataclass(frozen=True, slots=True)
 class RoomBrief:
-    """What the Room-level Organization Agent decides on: things assigned to a room, what could hold them, what has failed."""
+    """Brief of the Room-level Organization Agent: objects of a room, possible hosts, and earlier failures."""
 
     room: LayoutRoomFacts
     hosts: tuple[HostFacts, ...]
-    things: tuple[ObjectBrief, ...]
-    failures: tuple[Failure, ...] = ()
+    objects: tuple[ObjectBrief, ...]
+    failures: tuple[LayoutFailure, ...] = ()
     seed: int = 0
     __pydantic_config__: ClassVar = _STRICT
 
 
 @dataclass(frozen=True, slots=True)
 class Branch:
-    """One edge of a layout tree: the child is in the relation to the parent, as in ``ontop(child, parent)``."""
+    """Edge of a layout tree: the child is in the relation to the parent, as in ``ontop(child, parent)``."""
 
     parent: str
     relation: LayoutRelation
@@ -177,8 +181,10 @@ class Branch:
     __pydantic_config__: ClassVar = _STRICT
 
 
-class Arrangement(StrEnum):
-    """Constraints on a plane (EmboMatrix, appendix A, after Holodeck). ``edge`` and ``middle`` are about the plane alone."""
+class ConstraintKind(StrEnum):
+    """Kind of a placement constraint (EmboMatrix, appendix A, after Holodeck). ``edge`` and ``middle`` refer to the
+    plane alone.
+    """
 
     EDGE = "edge"
     MIDDLE = "middle"
@@ -191,29 +197,30 @@ class Arrangement(StrEnum):
     NEXT_TO = "next_to"
 
 
-ABOUT_THE_PLANE: Final = frozenset({Arrangement.EDGE, Arrangement.MIDDLE})
+PLANE_CONSTRAINTS: Final = frozenset({ConstraintKind.EDGE, ConstraintKind.MIDDLE})
 
 
 @dataclass(frozen=True, slots=True)
 class PlacementConstraint:
-    """A constraint on a thing, against another object of the plane; ``required`` ones must hold."""
+    """Constraint on an object relative to another object of the plane. ``required`` constraints must hold."""
 
-    kind: Arrangement
+    kind: ConstraintKind
     other: str = ""
     required: bool = False
     __pydantic_config__: ClassVar = _STRICT
 
 
 @dataclass(frozen=True, slots=True)
-class PlaneCompany:
-    """What shares a plane: things to be put there, and names and categories of what is there already.
+class ConstraintBrief:
+    """Brief for the choice of placement constraints: objects to place on a plane, and name and category of those on
+    it.
 
-    ``host`` is the category of the furniture whose plane it is; ``on_floor`` tells the floor of a room.
+    ``host`` is the category of the furniture that the plane belongs to. ``on_floor`` is true for the floor of a room.
     """
 
     plane: str
     host: str
-    things: tuple[ObjectBrief, ...]
+    objects: tuple[ObjectBrief, ...]
     others: tuple[tuple[str, str], ...] = ()
     on_floor: bool = False
     seed: int = 0
@@ -222,7 +229,7 @@ class PlaneCompany:
 
 @dataclass(frozen=True, slots=True)
 class PlacementConstraints:
-    """Constraints by thing, the most important first."""
+    """Placement constraints by object, the most important first."""
 
     of: dict[str, tuple[PlacementConstraint, ...]]
     __pydantic_config__: ClassVar = _STRICT
@@ -230,9 +237,10 @@ class PlacementConstraints:
 
 @dataclass(frozen=True, slots=True)
 class PlaneFootprint:
-    """A box that stands on a plane, in the plane's frame: its centre, its yaw, extents along its own x and y, heights over it.
+    """Box on a plane, in the plane's frame: centre, yaw, extents along its own x and y axes, and heights above the
+    plane.
 
-    Its front looks along its own +x.
+    Its front points along its own +x axis.
     """
 
     name: str
@@ -245,28 +253,28 @@ class PlaneFootprint:
 
 
 @dataclass(frozen=True, slots=True)
-class PlaneThing:
-    """A thing to be put on a plane, with its wishes, the most important first."""
+class PlaneObject:
+    """Object to place on a plane, with its constraints, the most important first."""
 
     name: str
     size_m: Size3
-    wishes: tuple[PlacementConstraint, ...] = ()
+    constraints: tuple[PlacementConstraint, ...] = ()
     has_front: bool = False
     __pydantic_config__: ClassVar = _STRICT
 
 
 @dataclass(frozen=True, slots=True)
 class PlaneBrief:
-    """What the Planar-Level Placement Generator decides on, in the plane's frame: origin in its middle, metres, radians.
+    """Brief of the planar solver, in the plane's frame: origin in the middle, metres, radians.
 
-    ``obstacles`` stand on the plane or reach into the space over it, and wishes may name them; ``zones`` are rectangles
-    (x0, y0, x1, y1) that stay clear. ``stands`` are spots on the floor where the robot can stand; empty: reach is not asked.
-    ``rim_m`` is the free strip at the plane's edge. ``on_floor`` tells the floor of a room.
+    ``obstacles`` stand on the plane or reach into the space above it; constraints may name them. ``zones`` are
+    rectangles (x0, y0, x1, y1) that stay free. ``stands`` are floor positions of the robot; if empty, reach is not
+    checked. ``rim_m`` is the free strip at the plane's edge. ``on_floor`` is true for the floor of a room.
     """
 
     plane: str
     size_m: Size2
-    things: tuple[PlaneThing, ...]
+    objects: tuple[PlaneObject, ...]
     obstacles: tuple[PlaneFootprint, ...] = ()
     zones: tuple[tuple[float, float, float, float], ...] = ()
     stands: tuple[Size2, ...] = ()
@@ -278,9 +286,9 @@ class PlaneBrief:
 
 @dataclass(frozen=True, slots=True)
 class PlaneSpot:
-    """Where a thing's middle goes on a plane, how it is turned, and which of its wishes hold there."""
+    """Centre and yaw of an object on a plane, with the constraints that hold there."""
 
-    thing: str
+    object_name: str
     center_m: Size2
     yaw: float
     held: tuple[PlacementConstraint, ...] = ()
@@ -289,9 +297,9 @@ class PlaneSpot:
 
 @dataclass(frozen=True, slots=True)
 class SampleBrief:
-    """What the Object-level Sampling Agent decides on: one model of a category, any where empty, at a host of a base scene.
+    """Brief of the Object-level Sampling Agent: a model of a category, to place at a host of a base scene.
 
-    Without a relation the host is a room, on whose floor it goes.
+    An empty model means any model. Without a relation, the host is a room and the object stands on its floor.
     """
 
     scene: str
@@ -304,8 +312,8 @@ class SampleBrief:
 
 
 @dataclass(frozen=True, slots=True)
-class Sampled:
-    """A pose in the world, or why there is none."""
+class SampledPose:
+    """Pose in the world frame, or the reason for its absence."""
 
     name: str = ""
     position_m: Size3 | None = None
@@ -317,8 +325,8 @@ class Sampled:
 
 
 @dataclass(frozen=True, slots=True)
-class Arranged:
-    """One joint arrangement of a plane's things with its score, and what found no place, with the reason."""
+class PlaneArrangement:
+    """Joint arrangement of a plane's objects with its score, and the reason for each object left out."""
 
     spots: tuple[PlaneSpot, ...]
     score: float

@@ -1,7 +1,7 @@
-"""The pipeline: base scenes, variants, written tasks, admission, data set. Deterministic for its settings, resumable.
+"""Build of a dataset: base scenes, variants, written tasks, admission. Builds are deterministic and resumable.
 
-Variants are made in rounds: all of a round know what the rounds before it yielded, and nothing of one another. So they can be
-made in several processes, and the data set is the same however many there are.
+Variants are made in rounds. The variants of a round know the tasks of earlier rounds but not those of their own
+round. Therefore the dataset does not depend on the number of processes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.pipeline.store import BuildStore, Rejection
-from embomatrix.factory.pipeline.variants import TASKS_EACH, VariantMaker, VariantOrder, VariantYield, key_of
+from embomatrix.factory.pipeline.variants import (
+    TASKS_PER_VARIANT,
+    VariantMaker,
+    VariantOrder,
+    VariantYield,
+    uniqueness_key,
+)
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.sim.process_pool import shared_work
@@ -30,8 +36,8 @@ if TYPE_CHECKING:
     from embomatrix.factory.pipeline.settings import BuildSettings
     from embomatrix.factory.writer.tasks import TaskWriter
 
-    Make = Callable[[Sequence[VariantOrder]], Iterator[VariantYield]]
-    """Makes variants; what comes of them comes in the order of the orders."""
+    MakeVariants = Callable[[Sequence[VariantOrder]], Iterator[VariantYield]]
+    """Function that makes variants and yields the results in the order of the orders."""
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
@@ -39,43 +45,43 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 
-Check = Callable[[VariantYield], VariantYield]
-"""A second judge: leaves of a variant what is to be kept, and adds its refusals."""
-ROUND: Final = 6
-"""Variants of a round, at most."""
-HOME: Final = 3
-"""Pieces of furniture with a surface or a cavity that a scene's rooms must hold for tasks to be written about them."""
-VARIANTS_FOR: Final = 4
-"""Variants at most, for each one that would do if every draft were admitted."""
+VariantCheck = Callable[[VariantYield], VariantYield]
+"""Second check of a variant: removes tasks and adds their rejections."""
+ROUND_VARIANTS: Final = 6
+"""Maximum number of variants in a round."""
+MIN_FURNITURE: Final = 3
+"""Minimum number of furniture pieces with a surface or cavity in a scene's rooms. Scenes with fewer get no tasks."""
+VARIANTS_PER_FULL: Final = 4
+"""Maximum number of variants, as a multiple of the number needed if every draft were admitted."""
 
 
 @dataclass(frozen=True, slots=True)
 class BuildSummary:
-    """What a build yielded. Counters by (split, category), (split, scene) and reason."""
+    """Result of a build, with counters by (split, category), by (split, scene) and by reason."""
 
     admitted: Mapping[tuple[str, str], int]
     scenes: Mapping[tuple[str, str], int]
     rejected: Mapping[str, int]
     variants: int
     rooms: Mapping[str, Mapping[str, tuple[str, ...]]]
-    """Rooms by split and scene."""
+    """Room names by split and scene."""
 
     def total(self, split: str) -> int:
         return sum(count for (name, _), count in self.admitted.items() if name == split)
 
 
 def split_rooms(scenes: Sequence[Scene], seed: int) -> dict[str, dict[str, tuple[str, ...]]]:
-    """Held-out rooms, and those for training, by split and scene.
+    """Return the rooms of the held-out split and of the training split, by scene.
 
-    Of each type of room, one in three is held out, at least one where there are two: every kind of room is on both
-    sides. Which one turns with the seed and the type, so that they lie in several scenes; rooms without which a scene
-    would have nothing left to train on come last.
+    One in three rooms of each type is held out, at least one if there are two, so both splits contain every type. The
+    choice rotates with seed and type, so that held-out rooms lie in several scenes. Rooms that a scene needs for
+    training are held out last.
     """
     by_type: defaultdict[str, list[tuple[str, str]]] = defaultdict(list)
     for scene in scenes:
         for room in scene.rooms:
             by_type[room.type].append((scene.base, room.name))
-    spared = _Spared(scenes)
+    spared = _HeldOutRooms(scenes)
     for rank, (_, rooms) in enumerate(sorted(by_type.items())):
         if len(rooms) > 1:
             first = (rank + seed) % len(rooms)
@@ -93,16 +99,16 @@ def split_rooms(scenes: Sequence[Scene], seed: int) -> dict[str, dict[str, tuple
     }
 
 
-class _Spared:
-    """Rooms that are held out, and how much each scene keeps to train on."""
+class _HeldOutRooms:
+    """Held-out rooms, and the furniture that remains for training in each scene."""
 
     def __init__(self, scenes: Sequence[Scene]) -> None:
         self.heldout: set[tuple[str, str]] = set()
-        self._worth = {scene.base: _worth(scene) for scene in scenes}
+        self._worth = {scene.base: _usable_furniture(scene) for scene in scenes}
         self._left = {base: sum(worth.values()) for base, worth in self._worth.items()}
 
     def hold_out(self, rooms: Sequence[tuple[str, str]], count: int) -> None:
-        """So many of the rooms, in their order; those that their scene needs only where no others are left."""
+        """Hold out ``count`` of the rooms in order. Rooms that their scene needs are used only if no others are left."""
         kept: list[tuple[str, str]] = []
         wanted = count
         for room in rooms:
@@ -115,9 +121,9 @@ class _Spared:
             self._take(*room)
 
     def _can_go(self, base: str, room: str) -> bool:
-        """A scene that has too little anyhow loses nothing."""
+        """True if the scene keeps enough furniture, or has too little anyway."""
         left, worth = self._left[base], self._worth[base][room]
-        return left < HOME or left - worth >= HOME
+        return left < MIN_FURNITURE or left - worth >= MIN_FURNITURE
 
     def _take(self, base: str, room: str) -> None:
         self.heldout.add((base, room))
@@ -125,18 +131,18 @@ class _Spared:
 
 
 def _check_rooms(settings: BuildSettings) -> None:
-    """Raises CatalogError for an unknown scene, DatasetError where tasks are to be held out and no room can be."""
+    """Raise CatalogError for an unknown scene, or DatasetError if tasks are held out but no room can be."""
     catalog = Catalog.load()
     types = Counter(room.type for scene_id in settings.scenes for room in catalog.inventory(scene_id).rooms)
     if settings.train and settings.heldout and max(types.values(), default=0) < 2:
         raise DatasetError(
-            f"no room of {', '.join(settings.scenes)} can be held out, each is the only one of its type: give a further "
-            "--scene, or --heldout 0"
+            f"no room of {', '.join(settings.scenes)} can be held out, each is the only one of its type: add another "
+            "--scene, or give --heldout 0"
         )
 
 
 def _all_held_out(scenes: Sequence[Scene]) -> dict[str, dict[str, tuple[str, ...]]]:
-    """Rooms by split and scene, where nothing is trained on: training sees none of them."""
+    """Return all rooms as held-out rooms, for a build without training tasks."""
     everything = {scene.base: tuple(room.name for room in scene.rooms) for scene in scenes}
     return {"train": dict.fromkeys(everything, ()), "heldout": everything}
 
@@ -147,43 +153,43 @@ def build_dataset(
     progress: Callable[[str, int], None] = lambda _split, _admitted: None,
     writer: TaskWriter | None = None,
     jobs: int = 1,
-    check: Check | None = None,
+    check: VariantCheck | None = None,
     layout: LayoutAgents | None = None,
 ) -> BuildSummary:
-    """Write a data set, or go on with one that was cut short. ``progress`` hears of each split's admitted tasks.
+    """Build a dataset, or resume an interrupted build. ``progress`` is called with each split's number of admitted
+    tasks.
 
-    ``check`` is a second judge, who leaves of each variant what is to be kept: a cluster, say.
+    ``check`` is a second check of each variant, such as a cluster. ``writer`` and ``layout`` replace the writer of
+    the settings and the rule-based layout agents; they run in this process. Otherwise ``jobs`` processes are used.
 
-    ``writer`` stands in for the one that the settings name, ``layout`` for layout agents that are rules, in this process;
-    ``jobs`` is the number of processes otherwise.
-    Raises CatalogError for an unknown scene, DatasetError when the scenes have no room to hold out, when the folder holds a
-    build of other settings, or when a process dies.
+    Raise CatalogError for an unknown scene. Raise DatasetError if no room can be held out, if the folder holds a
+    build with other settings, or if a process dies.
     """
-    _check_rooms(settings)  # before anything is written: what is wrong shall leave no folder behind
+    _check_rooms(settings)  # checked before anything is written, so that an error leaves no folder behind
     store = BuildStore.open(folder, dataclasses.asdict(settings))
     began = time.process_time()
     bases = [build_base_scene(scene_id, seed=settings.seed) for scene_id in settings.scenes]
     store.spent_on_scenes(len(bases), time.process_time() - began)
     rooms = split_rooms(bases, settings.seed) if settings.train else _all_held_out(bases)
     with contextlib.ExitStack() as stack:
-        make: Make | None = None
+        make: MakeVariants | None = None
         for split, target in (("heldout", settings.heldout), ("train", settings.train)):
-            filler = _SplitFiller(store, bases, rooms[split], split, target)
-            while orders := filler.round():
-                progress(split, filler.admitted)
+            orders = _SplitOrders(store, bases, rooms[split], split, target)
+            while round_orders := orders.next_round():
+                progress(split, orders.admitted)
                 if make is None:
-                    make = stack.enter_context(makers(settings, writer, layout, jobs))
-                for made in make(orders):
-                    filler.take(made if check is None else check(made))
-                    progress(split, filler.admitted)
-            progress(split, filler.admitted)
+                    make = stack.enter_context(variant_makers(settings, writer, layout, jobs))
+                for made in make(round_orders):
+                    orders.add(made if check is None else check(made))
+                    progress(split, orders.admitted)
+            progress(split, orders.admitted)
     records = [record for result in store.results for record in result.records]
     write_dataset(folder, records, {})
     return _summary(store, rooms)
 
 
-class _SplitFiller:
-    """Variant after variant until a split has its tasks, the scenes taking turns."""
+class _SplitOrders:
+    """Orders of variants for one split until it has its tasks. The scenes take turns."""
 
     def __init__(
         self,
@@ -194,42 +200,43 @@ class _SplitFiller:
         target: int,
     ) -> None:
         self._store = store
-        self._homes = [base.base for base in bases if _is_home(base, rooms[base.base])]
+        self._usable = [base.base for base in bases if _is_usable(base, rooms[base.base])]
         self._rooms = rooms
         self._split = split
         self._quota = {category: _share(target, index) for index, category in enumerate(TaskCategory)}
-        self._end = VARIANTS_FOR * (target // TASKS_EACH + 1)
+        self._end = VARIANTS_PER_FULL * (target // TASKS_PER_VARIANT + 1)
         self._number = 0
 
     @property
     def admitted(self) -> int:
         return len(self._store.records_of(self._split))
 
-    def round(self) -> list[VariantOrder]:
-        """The next variants to make, those left out that a build before this one made; none when the split is done.
+    def next_round(self) -> list[VariantOrder]:
+        """Return the next variants to make, without those that the store already holds. Empty if the split is
+        complete.
 
-        The first round that the store does not hold whole is made whole: its orders know of no variant of their own round.
+        An incomplete round is repeated with the orders of its first start, which know no task of their own round.
         """
-        while self._homes and self._number < self._end:
+        while self._usable and self._number < self._end:
             missing = self._missing(self._number)
             if not any(missing.values()):
                 break
-            wanted = -(-sum(missing.values()) // TASKS_EACH)
-            numbers = range(self._number, min(self._number + min(ROUND, wanted), self._end))
+            wanted = -(-sum(missing.values()) // TASKS_PER_VARIANT)
+            numbers = range(self._number, min(self._number + min(ROUND_VARIANTS, wanted), self._end))
             known = self._known(self._number)
             self._number = numbers.stop
             orders = [
                 VariantOrder(self._split, number, base, self._rooms[base], missing, known)
                 for number in numbers
                 if not self._store.has(self._split, number)
-                for base in (self._homes[number % len(self._homes)],)
+                for base in (self._usable[number % len(self._usable)],)
             ]
             if orders:
                 return orders
         return []
 
-    def take(self, made: VariantYield) -> None:
-        """Keep what a variant yielded, but for what another of its round yielded too, or what is no longer wanted."""
+    def add(self, made: VariantYield) -> None:
+        """Store a variant's result without duplicates of its round and without surplus tasks."""
         number = made.result.number
         left, known = self._missing(number), self._known(number)
         kept = []
@@ -245,7 +252,7 @@ class _SplitFiller:
         )
 
     def _missing(self, before: int) -> dict[TaskCategory, int]:
-        """How many tasks of each category the variants before this number leave to be made."""
+        """Return the number of tasks of each category that are missing before this variant."""
         done = Counter(record.task.category for record in self._before(before))
         return {category: max(0, quota - done[category]) for category, quota in self._quota.items()}
 
@@ -259,17 +266,17 @@ class _SplitFiller:
 
 
 def _key(record: TaskRecord) -> str:
-    return key_of(record.signature, record.task.instruction)
+    return uniqueness_key(record.signature, record.task.instruction)
 
 
-def _is_home(base: Scene, rooms: Sequence[str]) -> bool:
-    """Whether the rooms hold enough furniture to write tasks about: empty corridors and storage rooms do not."""
-    worth = _worth(base)
-    return sum(worth[room] for room in rooms) >= HOME
+def _is_usable(base: Scene, rooms: Sequence[str]) -> bool:
+    """True if the rooms hold enough furniture for tasks. Empty corridors and storage rooms don't."""
+    worth = _usable_furniture(base)
+    return sum(worth[room] for room in rooms) >= MIN_FURNITURE
 
 
-def _worth(base: Scene) -> dict[str, int]:
-    """Furniture to write tasks about, by room: what has a surface or holds things."""
+def _usable_furniture(base: Scene) -> dict[str, int]:
+    """Return the number of furniture pieces with a surface or cavity, by room."""
     view = SceneView(base)
     return {
         room.name: sum(view.is_surface(name) or view.is_container(name) for name in view.in_room[room.name])
@@ -278,7 +285,7 @@ def _worth(base: Scene) -> dict[str, int]:
 
 
 def _share(target: int, index: int) -> int:
-    """Whole tasks of one category, the remainder going to the first ones."""
+    """Return the quota of one category. The remainder goes to the first categories."""
     kinds = len(TaskCategory)
     return target // kinds + (index < target % kinds)
 
@@ -296,17 +303,19 @@ def _summary(store: BuildStore, rooms: Mapping[str, Mapping[str, tuple[str, ...]
 
 
 @contextlib.contextmanager
-def makers(
+def variant_makers(
     settings: BuildSettings, writer: TaskWriter | None, layout: LayoutAgents | None, jobs: int
-) -> Iterator[Make]:
-    """For as long as this is held. ``writer`` and ``layout`` work in this process alone: they may hold a connection."""
+) -> Iterator[MakeVariants]:
+    """Yield a function that makes variants. ``writer`` and ``layout`` stay in this process, since they may hold a
+    connection.
+    """
     if writer is not None or layout is not None:
         with contextlib.closing(VariantMaker(settings, writer, layout)) as maker:
             yield lambda orders: map(maker.make, orders)
         return
     died = DatasetError(
-        "a process that makes scene variants died, perhaps for want of memory: what was built is kept; call the same "
-        "command again, with fewer --jobs"
+        "a process that makes scene variants died, possibly for lack of memory: finished variants are kept; run the "
+        "same command again with fewer --jobs"
     )
     with shared_work(jobs, VariantMaker, VariantMaker.make, settings, died=died) as make:
         yield make

@@ -1,4 +1,4 @@
-"""A cluster's slots as a second judge: the oracle's plans are executed there as well before their tasks are kept."""
+"""Cluster as a second check: its slots execute the oracle's plans before their tasks are admitted."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from embomatrix.world.dataset import TaskRecord
 
 RUN: Final = "factory"
-"""Name of the run on the cluster's pages."""
+"""Name of the run on the manager's pages."""
 
 
-class ClusterJudge:
-    """Context manager over one event loop and one run of the cluster. ``token`` and ``ca`` (PEM) as clients have them."""
+class ClusterCheck:
+    """Context manager of one event loop and one run on the cluster. ``token`` and ``ca`` (PEM) are those of a client."""
 
     def __init__(self, address: str, token: str = "", ca: bytes = b"") -> None:
         self._client = ClusterClient(address, token, ca=ca)
@@ -32,7 +32,7 @@ class ClusterJudge:
         self._run_id = ""
 
     def __enter__(self) -> Self:
-        """Open the run. Raises ClusterError."""
+        """Open the run. Raise ClusterError."""
         try:
             self._run_id = self._runner.run(self._open())
         except BaseException:
@@ -47,7 +47,9 @@ class ClusterJudge:
             self._runner.close()
 
     def check(self, made: VariantYield) -> VariantYield:
-        """What the cluster's slots admit of a variant. Raises ClusterError, DatasetError where a slot could not execute."""
+        """Return the variant with the tasks that the cluster admits. Raise ClusterError, or DatasetError if a slot
+        can't execute a plan.
+        """
         if not made.result.records:
             return made
         return admitted_by(made, self._runner.run(self._execute(made)))
@@ -81,14 +83,14 @@ class ClusterJudge:
 
 
 def admitted_by(made: VariantYield, results: Mapping[str, RolloutResult]) -> VariantYield:
-    """What is left of a variant after its plans were executed; ``results`` by task id.
+    """Return the variant without the tasks whose plans failed. ``results`` are keyed by task id.
 
-    Raises DatasetError where a plan was not executed at all: that says nothing about its task.
+    Raise DatasetError if a plan was not executed, since that says nothing about its task.
     """
     kept: list[TaskRecord] = []
     rejected: list[Rejection] = []
     for record in made.result.records:
-        sentence = _objection(results[record.task.task_id])
+        sentence = _cluster_objection(results[record.task.task_id])
         if sentence:
             rejected.append(_rejection(record, sentence))
         else:
@@ -98,12 +100,12 @@ def admitted_by(made: VariantYield, results: Mapping[str, RolloutResult]) -> Var
     return dataclasses.replace(made, result=result)
 
 
-def _objection(result: RolloutResult) -> str:
-    """What the cluster has against a task; empty where its plan reaches the goal there too."""
+def _cluster_objection(result: RolloutResult) -> str:
+    """Return the cluster's objection to a task; empty if its plan reaches the goal."""
     if not isinstance(result.outcome, Completed):
         raise DatasetError(
-            f"the cluster could not execute {result.rollout_id}: {result.outcome}; what was built is kept: see "
-            "`embomatrix cluster workers`, then call the same command again"
+            f"the cluster could not execute {result.rollout_id}: {result.outcome}; finished variants are kept: check "
+            "`embomatrix cluster workers`, then run the same command again"
         )
     reward = result.outcome.reward
     if reward.success:

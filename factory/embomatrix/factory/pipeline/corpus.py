@@ -1,7 +1,7 @@
-"""The corpora: tasks to train on in 45 scenes, and Internal-Verified, held-out tasks that are frozen under a digest.
+"""Corpus: training tasks in 45 scenes, and Internal-Verified, held-out tasks that are frozen under a digest.
 
-Both come of builds with one seed, by which goal signatures are dealt out: what is held out in one build is held out in the
-other. More than half of Internal-Verified lies in six scenes that training never sees, the rest in rooms that it never sees.
+Two builds share one seed, which splits the goal signatures, so a signature held out in one build is held out in the
+other. More than half of Internal-Verified lies in six scenes that training never sees, the rest in unseen rooms.
 """
 
 from __future__ import annotations
@@ -30,19 +30,21 @@ HELDOUT_SCENES: Final = (
     "office_bike",
     "school_chemistry",
 )
-"""Three homes, a restaurant, an office and a school: of every milieu with enough scenes to spare one."""
+"""Three homes, a restaurant, an office and a school. Each kind of place keeps enough other scenes for training."""
 TRAIN: Final = "train"
 UNSEEN: Final = "unseen"
 VERIFIED: Final = "internal-verified"
-"""Folders of a corpus: what is trained on, the build in unseen scenes, and the frozen tasks."""
+"""Folders of a corpus: training build, build in unseen scenes, and the frozen tasks."""
 FROZEN_FILE: Final = "frozen.json"
 UNSEEN_SHARE: Final = 0.6
-"""Of the held-out tasks, those in scenes that training never sees."""
+"""Share of the held-out tasks in scenes that training never sees."""
 
 
 @dataclass(frozen=True, slots=True)
 class CorpusSettings:
-    """Equal settings give equal corpora. ``scenes`` and ``unseen`` are the scenes of training and of the rest."""
+    """Settings of a corpus. ``scenes`` are those of training, ``unseen`` those of the second build. Equal settings
+    give equal corpora.
+    """
 
     train: int = 2_000
     heldout: int = 100
@@ -53,7 +55,7 @@ class CorpusSettings:
     physical: bool = True
 
     def builds(self) -> dict[str, BuildSettings]:
-        """The builds of the corpus by folder."""
+        """Return the settings of both builds by folder."""
         away = round(self.heldout * UNSEEN_SHARE)
         scenes = self.scenes or training_scenes()
         how = (WriterKind.SOCIAL, self.look_ahead, self.physical)
@@ -65,7 +67,7 @@ class CorpusSettings:
 
 @dataclass(frozen=True, slots=True)
 class Frozen:
-    """What Internal-Verified is: ``digest`` is over its records, which name their bundles by digest."""
+    """Contents of Internal-Verified. ``digest`` covers the records, which name their bundles by digest."""
 
     tasks: int
     unseen: int
@@ -74,12 +76,12 @@ class Frozen:
 
 
 def training_scenes() -> tuple[str, ...]:
-    """All base scenes but the held-out ones."""
+    """Return all base scenes but the held-out ones."""
     return tuple(scene for scene in Catalog.load().scene_ids if scene not in HELDOUT_SCENES)
 
 
 def freeze(folder: Path) -> Frozen:
-    """Put the held-out tasks of both builds together and write down what they are. Raises DatasetError."""
+    """Combine the held-out tasks of both builds and write their digest. Raise DatasetError."""
     builds = [Dataset.load(folder / name) for name in (TRAIN, UNSEEN)]
     train = builds[0].train
     records = [record for build in builds for record in build.heldout]
@@ -97,27 +99,28 @@ def freeze(folder: Path) -> Frozen:
 
 
 def check_frozen(folder: Path) -> Frozen:
-    """Whether a corpus is still what was frozen, and training is apart from it. Raises DatasetError with what is not so."""
+    """Check that a corpus matches its frozen digest and that training is separate from it. Raise DatasetError."""
     path = folder / VERIFIED / FROZEN_FILE
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
-        said = Frozen(value["tasks"], value["unseen"], tuple(value["scenes"]), value["digest"])
+        recorded = Frozen(value["tasks"], value["unseen"], tuple(value["scenes"]), value["digest"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DatasetError(
-            f"{path} does not tell what was frozen ({error}): make the corpus again"
+            f"{path} does not describe a frozen corpus ({error}): build the corpus again"
         ) from error
     train = Dataset.load(folder / TRAIN).train
     verified = Dataset.load(folder / VERIFIED)
     found = _frozen(folder / VERIFIED, {_base(record) for record in train})
-    if found != said:
+    if found != recorded:
         raise DatasetError(
-            f"{folder / VERIFIED} is not what was frozen: found {found.tasks} tasks with digest {found.digest}, expected "
-            f"{said.tasks} with {said.digest}; take the folder back from where it was kept"
+            f"{folder / VERIFIED} differs from the frozen corpus: found {found.tasks} tasks with digest "
+            f"{found.digest}, expected "
+            f"{recorded.tasks} with {recorded.digest}; restore the folder from a backup"
         )
     for record in verified.records:
         verified.bundle(record.bundle_digest)
     _check_apart(train, verified.records)
-    return said
+    return recorded
 
 
 def _frozen(folder: Path, trained_in: set[str]) -> Frozen:
@@ -129,18 +132,18 @@ def _frozen(folder: Path, trained_in: set[str]) -> Frozen:
 
 
 def _check_apart(train: Sequence[TaskRecord], heldout: Sequence[TaskRecord]) -> None:
-    """No goal signature on both sides, no room either, and at least half of what is held out in scenes of its own."""
+    """Raise DatasetError if both sides share a goal signature, or if most held-out tasks lie in scenes of training."""
     shared = {record.signature for record in train} & {record.signature for record in heldout}
     if shared:
         raise DatasetError(
-            f"goals of the kind {min(shared)!r} are trained on and held out: give both one seed"
+            f"goals with the signature {min(shared)!r} are trained on and held out: use one seed for both builds"
         )
     trained_in = {_base(record) for record in train}
     seen = sum(_base(record) in trained_in for record in heldout)
     if 2 * seen > len(heldout):
         raise DatasetError(
-            f"{seen} of {len(heldout)} held-out tasks lie in scenes of training: expected at most half; the other scenes "
-            "gave too few"
+            f"{seen} of {len(heldout)} held-out tasks lie in scenes of training: expected at most half; the unseen "
+            "scenes yielded too few"
         )
 
 

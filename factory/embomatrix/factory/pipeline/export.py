@@ -1,4 +1,4 @@
-"""A dataset for other tools: one row a task in JSON lines or Parquet, with a card that says what is in it."""
+"""Export of a dataset for other tools: one row per task as JSON lines or Parquet, with a dataset card."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ if TYPE_CHECKING:
     from embomatrix.world.dataset import Dataset, TaskRecord
 
 FIELDS: Final[Mapping[str, str]] = {
-    "task_id": "unique in the dataset",
+    "task_id": "unique id in the dataset",
     "split": "`train` or `heldout`",
-    "scene_id": "the scene variant that it belongs to; tasks of one variant share a bundle",
-    "base_scene": "the BEHAVIOR-1K inventory that the scene was built from",
+    "scene_id": "scene variant of the task; tasks of one variant share a bundle",
+    "base_scene": "BEHAVIOR-1K inventory that the scene was built from",
     "rooms": "rooms of the goal's objects",
     "category": "`pick_and_place`, `appliance_use`, `kitchen_operation` or `compound`",
-    "instruction": "what a person says",
+    "instruction": "request in natural language",
     "goal": "BDDL over the scene's objects",
-    "signature": "kind of goal: predicates over categories",
-    "table": "names of the objects that a plan may name, by row",
-    "types": "JSON: synset to object names, what the goal's quantifiers range over",
-    "oracle": "JSON: a plan that reaches the goal, executed in the simulator before the task was kept",
-    "oracle_steps": "its calls",
-    "profile": "which skills a plan may use",
-    "source": "where the task comes from",
-    "bundle": "digest of the bundle that it runs in; bundles are not part of the export",
-    "transcript": "Markdown: what people said, empty where nobody talked",
+    "signature": "kind of goal: its predicates over categories",
+    "table": "objects that a plan may name, by row",
+    "types": "JSON: object names by synset, the domain of the goal's quantifiers",
+    "oracle": "JSON: plan that reaches the goal, verified in the simulator",
+    "oracle_steps": "number of calls of the oracle plan",
+    "profile": "skill profile of the task",
+    "source": "origin of the task",
+    "bundle": "digest of the bundle; bundles are not part of the export",
+    "transcript": "Markdown: conversation behind the request, empty if there is none",
 }
 SUFFIXES: Final = (".jsonl", ".parquet")
 
 
 def export_rows(dataset: Dataset) -> list[dict[str, Any]]:
-    """A row for each task, with the fields of ``FIELDS`` in their order."""
+    """Return a row for each task with the fields of ``FIELDS`` in their order."""
     return [_row(dataset, record) for record in dataset.records]
 
 
@@ -69,12 +69,12 @@ def _row(dataset: Dataset, record: TaskRecord) -> dict[str, Any]:
     }
 
 
-def encoded(rows: Sequence[Mapping[str, Any]], suffix: str) -> bytes:
-    """The rows as a file's content. Raises DatasetError for another suffix, or for Parquet without pyarrow."""
+def encode_rows(rows: Sequence[Mapping[str, Any]], suffix: str) -> bytes:
+    """Encode the rows as a file. Raise DatasetError for an unknown suffix, or if pyarrow is missing."""
     if suffix == ".jsonl":
         return "".join(f"{json.dumps(row, ensure_ascii=False)}\n" for row in rows).encode("utf-8")
     if suffix != ".parquet":
-        raise DatasetError(f"found a file that ends in {suffix!r}: expected {' or '.join(SUFFIXES)}")
+        raise DatasetError(f"found the suffix {suffix!r}: expected {' or '.join(SUFFIXES)}")
     try:
         arrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
     except ImportError as error:
@@ -89,8 +89,8 @@ def encoded(rows: Sequence[Mapping[str, Any]], suffix: str) -> bytes:
     return out.getvalue()
 
 
-def card(dataset: Dataset, file_name: str, data: bytes) -> str:
-    """The dataset card in Markdown, with the head that dataset hubs read."""
+def dataset_card(dataset: Dataset, file_name: str, data: bytes) -> str:
+    """Return the dataset card in Markdown, with the header that dataset hubs read."""
     records = dataset.records
     scenes = {record.task.scene_id.split("-")[0] for record in records}
     kinds = {record.signature for record in records}
@@ -103,22 +103,22 @@ def card(dataset: Dataset, file_name: str, data: bytes) -> str:
         "---",
         "# EmboMatrix tasks",
         "",
-        f"{len(records):,} household tasks in {len(scenes)} base scenes, each with a plan of the oracle planner that was "
-        f"executed in the simulator and reaches the goal. {len(kinds):,} kinds of goals.",
+        f"{len(records):,} household tasks in {len(scenes)} base scenes, each with an oracle plan that reaches the "
+        f"goal in the simulator. {len(kinds):,} kinds of goals.",
         "",
         f"File: `{file_name}`, SHA-256 `{hashlib.sha256(data).hexdigest()}`.",
         "",
         *_counts(records),
         "",
-        "| field | what it holds |",
+        "| field | content |",
         "| --- | --- |",
         *(f"| `{name}` | {words} |" for name, words in FIELDS.items()),
         "",
-        "## How it was made",
+        "## Settings",
         "",
         _settings(dataset.folder),
         "",
-        "## What it is made of",
+        "## Sources and limits",
         "",
         _SOURCES,
         "",
@@ -127,7 +127,7 @@ def card(dataset: Dataset, file_name: str, data: bytes) -> str:
 
 
 def _counts(records: Sequence[TaskRecord]) -> list[str]:
-    """A table of how many tasks of each category there are in each split."""
+    """Return a table of the number of tasks by category and split."""
     categories = Counter((record.task.category.value, record.split) for record in records)
     splits = Counter(record.split for record in records)
     lines = ["| category | train | heldout |", "| --- | ---: | ---: |"]
@@ -139,25 +139,25 @@ def _counts(records: Sequence[TaskRecord]) -> list[str]:
 
 _SOURCES: Final = (
     "Scenes, categories, sizes and masses come from the BEHAVIOR-1K knowledge base (PyPI `bddl` 3.6.0, MIT, Stanford Vision "
-    "and Learning Lab). People, conversations and instructions are made up, by a grammar unless the settings name a language "
-    "model; no person is meant. Geometry is generated; there are no meshes of others in it. Tasks were checked in kinematic "
-    "execution: a robot with noise, slip or perception may fail where the oracle's plan succeeds."
+    "and Learning Lab). People, conversations and instructions are fictional, generated by a grammar unless the settings "
+    "name a language model. Geometry is generated; no third-party meshes are included. Tasks were verified in kinematic "
+    "execution: a robot with noise, slip or perception may fail where the oracle plan succeeds."
 )
 
 
 def _settings(folder: Path) -> str:
-    """What the build was called with, as far as its file tells."""
+    """Describe the settings of the build, if its log exists."""
     path = folder / BUILD_FILE
     try:
         settings = json.loads(path.read_text(encoding="utf-8").splitlines()[0])["settings"]
     except (OSError, ValueError, LookupError, TypeError):
-        return "The folder does not tell the settings of a build: these tasks were imported."
+        return "The folder holds no build settings: these tasks were imported."
     told = ", ".join(f"{name} `{value}`" for name, value in settings.items() if name != "scenes")
     return f"`embomatrix factory`, settings: {told}, {len(settings.get('scenes', ()))} scenes."
 
 
 def _size(count: int) -> str:
-    """The bracket of sizes that hubs know."""
+    """Return the size bracket of dataset hubs."""
     for limit, name in ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K")):
         if count < limit:
             return name

@@ -1,4 +1,4 @@
-"""What decides a build of a data set."""
+"""Settings of a dataset build."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ DEFAULT_SCENES: Final = ("Rs_int", "Wainscott_0_int", "restaurant_diner")
 
 
 class WriterKind(StrEnum):
-    """Where tasks come from."""
+    """Source of tasks."""
 
-    PLAIN = "plain"  # what a goal says, in a bounded vocabulary: small policies learn from it
-    SOCIAL = "social"  # what people come to ask for in conversations, each with its transcript
-    MODEL = "model"  # the same with a language model in the place of the grammar
+    PLAIN = "plain"  # states the goal in a bounded vocabulary that small policies can learn
+    SOCIAL = "social"  # requests from simulated conversations, each with its transcript
+    MODEL = "model"  # the same with a language model instead of the grammar
 
 
 @dataclass(frozen=True, slots=True)
 class BuildSettings:
-    """What decides a build: equal settings give equal data sets."""
+    """Settings of a build. Equal settings give equal datasets."""
 
     train: int = 480
     heldout: int = 40
@@ -29,20 +29,22 @@ class BuildSettings:
     scenes: tuple[str, ...] = DEFAULT_SCENES
     writer: WriterKind = WriterKind.PLAIN
     look_ahead: bool = True
-    """Whether to find out what the arm can do in each variant: about 12 s of CPU for one."""
+    """Analyse the arm's reach in each variant: about 12 s of CPU per variant."""
     physical: bool = True
-    """Whether a robot must carry each plan out in stepped physics before its task is admitted: about 1 s of CPU for one."""
+    """Require that a robot carries each plan out in stepped physics: about 1 s of CPU per task."""
     modelled: tuple[str, ...] = ()
-    """Agents that are a language model besides the writer's, by name: those of the layout, and what looks at scenes."""
+    """Names of the agents, besides the writer's, that are a language model."""
 
 
 SCENE_EXTRACTOR: Final = "scene-extractor"
-"""Scene information extraction, in `modelled` where a model that sees does it."""
+"""Name of scene information extraction in `modelled`, for builds with a vision model."""
 EVERY_SCENE: Final = "all"
 
 
 def scene_ids(asked: list[str] | None) -> tuple[str, ...]:
-    """The scenes asked for, without repetition; "all" stands for every base scene of the catalog, nothing for three."""
+    """Return the requested scenes without repetition. "all" stands for every base scene; no request means the three
+    defaults.
+    """
     if asked and EVERY_SCENE in asked:
         return Catalog.load().scene_ids
     return tuple(dict.fromkeys(asked or DEFAULT_SCENES))

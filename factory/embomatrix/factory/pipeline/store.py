@@ -1,10 +1,9 @@
-"""What a build has done so far, on disk: one line a variant, so that a build that was cut short goes on from there."""
+"""Resumable logs: the folder of a build with one line per variant, and a generic log of outcomes."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from embomatrix.factory.admission import RefusalReason
@@ -20,7 +19,7 @@ from embomatrix.world.dataset import (
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from _typeshed import DataclassInstance
@@ -28,19 +27,17 @@ if TYPE_CHECKING:
 
 BUILD_FILE: Final = "build.jsonl"
 ATTEMPTS_FILE: Final = "attempts.jsonl"
-"""The ledger: a line for every draft, with the reason where it was not admitted."""
+"""Log with a line for every draft and the reason of each rejection."""
 TIMES_FILE: Final = "times.jsonl"
-"""Seconds of processor time, a line for each variant and one for the base scenes of each call: no part of the dataset."""
+"""CPU seconds of each variant and of the base scenes of each call. They are not part of the dataset."""
 TRANSCRIPTS_FOLDER: Final = "transcripts"
 TREES_FOLDER: Final = "trees"
-"""Layout trees as nested JSON, a file for each task."""
-_BEFORE_PROOFS: Final = MappingProxyType({"physical": False})
-"""What builds of before decision 0047 don't tell: robots proved nothing."""
+"""Layout trees as nested JSON, one file per task."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rejection:
-    """A draft that was not admitted; ``instruction`` and ``goal`` are empty where nobody gave one."""
+    """Draft that was not admitted. ``instruction`` and ``goal`` are empty if the writer gave none."""
 
     scene: str
     category: str
@@ -52,7 +49,7 @@ class Rejection:
 
 @dataclass(frozen=True, slots=True)
 class VariantResult:
-    """What one variant yielded."""
+    """Records and rejections of one variant."""
 
     split: str
     number: int
@@ -62,22 +59,20 @@ class VariantResult:
 
 @dataclass
 class BuildStore:
-    """The folder of a build. The first line of its file holds the settings, each other line a variant."""
+    """Folder of a build. Its log holds the settings in the first line and one variant in each further line."""
 
     folder: Path
     results: list[VariantResult] = field(default_factory=list)
 
     @staticmethod
     def open(folder: Path, settings: Mapping[str, Any]) -> BuildStore:
-        """Start a build or take one up again. Raises DatasetError when the folder holds one of other settings."""
-        wanted = {**_BEFORE_PROOFS, **json.loads(json.dumps(settings))}
+        """Start a build or resume one. Raise DatasetError if the folder holds a build with other settings."""
         path = folder / BUILD_FILE
         try:
             (folder / BUNDLES_FOLDER).mkdir(parents=True, exist_ok=True)
-            if not path.exists():
-                write_whole(path, (json.dumps({"settings": wanted}) + "\n").encode("ascii"))
-            first, *lines = path.read_text(encoding="utf-8").splitlines()
-            found = settings_of(first)
+            lines = _read_or_start(path, {"settings": settings})
+            wanted, found = json.loads(json.dumps(settings)), json.loads(lines[0])["settings"]
+            store = BuildStore(folder)
         except OSError as error:
             raise DatasetError(
                 f"the folder {folder} can't be written ({error.strerror}): choose another one"
@@ -88,10 +83,10 @@ class BuildStore:
             ) from error
         if found != wanted:
             raise DatasetError(
-                f"{folder} holds a build of other settings ({_differences(found, wanted)}): give the same again, or choose "
-                "another folder"
+                f"{folder} holds a build with other settings ({_differences(found, wanted)}): give the same settings "
+                "again, or choose another folder"
             )
-        store = BuildStore(folder, _whole(path, lines))
+        store.results += _read_outcomes(path, lines, _from_json, DatasetError)
         store._write_attempts()
         return store
 
@@ -109,7 +104,7 @@ class BuildStore:
         trees: Mapping[str, Mapping[str, Any]],
         cpu_s: float,
     ) -> None:
-        """Keep a variant's result. What goes into files of its own is written first: a line means that it is there."""
+        """Store a variant's result. Its other files are written before its line in the log."""
         self._spent({"split": result.split, "variant": result.number, "cpu_s": round(cpu_s, 3)})
         if result.records:
             path = self.folder / BUNDLES_FOLDER / bundle_file(result.records[0].bundle_digest)
@@ -127,7 +122,7 @@ class BuildStore:
             file.write(_attempt_lines(result))
 
     def spent_on_scenes(self, scenes: int, cpu_s: float) -> None:
-        """Keep how long the base scenes of one call took. Raises OSError."""
+        """Record the CPU time of the base scenes of one call. Raise OSError."""
         self._spent({"base_scenes": scenes, "cpu_s": round(cpu_s, 3)})
 
     def _spent(self, line: Mapping[str, str | int | float]) -> None:
@@ -135,18 +130,13 @@ class BuildStore:
             file.write(json.dumps(line) + "\n")
 
     def _write_attempts(self) -> None:
-        """The whole ledger, from what is known: a build that was cut short may lack its last lines."""
+        """Rewrite the whole log, because an interrupted build may lack its last lines."""
         text = "".join(_attempt_lines(result) for result in self.results)
         write_whole(self.folder / ATTEMPTS_FILE, text.encode("utf-8"))
 
 
-def settings_of(line: str) -> dict[str, Any]:
-    """The settings in the first line of a build's file. Raises ValueError, LookupError or TypeError for another line."""
-    return {**_BEFORE_PROOFS, **json.loads(line)["settings"]}
-
-
 def _attempt_lines(result: VariantResult) -> str:
-    """A line for each draft of a variant: the admitted ones, then the others."""
+    """Return one line per draft of a variant: the admitted drafts, then the rejected ones."""
     lines: list[dict[str, str | int]] = [
         {
             "split": result.split,
@@ -183,20 +173,6 @@ def _differences(found: object, wanted: Mapping[str, Any]) -> str:
     )
 
 
-def _whole(path: Path, lines: list[str]) -> list[VariantResult]:
-    """Results of the lines. A last line that was cut short is dropped from the file: its variant is made again."""
-    results: list[VariantResult] = []
-    for number, line in enumerate(lines):
-        try:
-            results.append(_from_json(json.loads(line)))
-        except ValueError as error:
-            if number != len(lines) - 1:
-                raise DatasetError(f"{path}:{number + 2}: {error}; choose another folder") from error
-            kept = path.read_text(encoding="utf-8").splitlines()[:-1]
-            write_whole(path, "".join(f"{item}\n" for item in kept).encode("utf-8"))
-    return results
-
-
 def _to_json(result: VariantResult) -> dict[str, Any]:
     return {
         "split": result.split,
@@ -219,57 +195,67 @@ T = TypeVar("T", bound="DataclassInstance")
 
 
 @dataclass
-class LineLog(Generic[T]):
-    """What decides the outcomes in the first line of a file, an outcome in each other. Without a path, in memory alone."""
+class ResumableLog(Generic[T]):
+    """Outcomes of a long run as JSON lines, preceded by the settings that decide them. Without a path, memory only."""
 
     path: Path | None = None
     outcomes: list[T] = field(default_factory=list)
 
-    def take_up(self, settings: Mapping[str, Any], read: Callable[[Any], T]) -> None:
-        """Read what the file holds, or begin it. A last line that was cut short is dropped. Raises EvaluationError, OSError.
+    def resume(self, settings: Mapping[str, Any], read: Callable[[Any], T]) -> None:
+        """Read the outcomes of an earlier run, or start the file. Raise EvaluationError or OSError.
 
-        ``read`` makes an outcome of a line's value; it raises ValueError, TypeError or KeyError where that is none.
+        ``read`` converts the JSON value of a line. It raises ValueError, TypeError or KeyError for an invalid value.
         """
         if self.path is None:
             return
+        lines = _read_or_start(self.path, settings)
         wanted = json.loads(json.dumps(settings))
-        if not self.path.exists():
-            write_whole(self.path, (json.dumps(wanted) + "\n").encode())
-        lines = self.path.read_text(encoding="utf-8").splitlines()
-        found = _settings(self.path, lines[:1])
+        try:
+            found = json.loads(lines[0])
+        except (ValueError, IndexError) as error:
+            raise EvaluationError(
+                f"{self.path} is not a log of outcomes: expected its settings in the first line; name another file"
+            ) from error
         if found != wanted:
             raise EvaluationError(
-                f"{self.path} holds outcomes of {_told(found)}, not of {_told(wanted)}: name another file"
+                f"{self.path} holds outcomes of {_in_words(found)}, not of {_in_words(wanted)}: name another file"
             )
-        for number, line in enumerate(lines[1:], start=2):
-            try:
-                self.outcomes.append(read(json.loads(line)))
-            except (ValueError, TypeError, KeyError) as error:
-                if number != len(lines):
-                    raise EvaluationError(
-                        f"{self.path}, line {number}, is no outcome ({error}): remove the line"
-                    ) from error
-                write_whole(self.path, "".join(f"{kept}\n" for kept in lines[:-1]).encode())
+        self.outcomes += _read_outcomes(self.path, lines, read, EvaluationError)
 
     def add(self, outcome: T) -> None:
-        """Keep an outcome. Raises OSError."""
+        """Append an outcome. Raise OSError."""
         if self.path is not None:
             with self.path.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(asdict(outcome)) + "\n")
         self.outcomes.append(outcome)
 
 
-def _told(settings: object) -> str:
-    """Settings in words: seed 0, method tree."""
+def _read_or_start(path: Path, head: Mapping[str, Any]) -> list[str]:
+    """Return the lines of a log. A missing log is created with ``head`` as its first line."""
+    if not path.exists():
+        write_whole(path, (json.dumps(head) + "\n").encode("ascii"))
+    return path.read_text(encoding="utf-8").splitlines()
+
+
+def _read_outcomes(
+    path: Path, lines: list[str], read: Callable[[Any], T], error_type: type[Exception]
+) -> list[T]:
+    """Return the outcomes after the first line. A truncated last line is removed from the file."""
+    outcomes: list[T] = []
+    for number, line in enumerate(lines[1:], start=2):
+        try:
+            outcomes.append(read(json.loads(line)))
+        except (ValueError, TypeError, KeyError) as error:
+            if number != len(lines):
+                raise error_type(
+                    f"{path}:{number} is not an outcome ({error}): remove the line, or name another path"
+                ) from error
+            write_whole(path, "".join(f"{kept}\n" for kept in lines[:-1]).encode("utf-8"))
+    return outcomes
+
+
+def _in_words(settings: object) -> str:
+    """Return settings as text, such as ``seed 0, method tree``."""
     if not isinstance(settings, dict):
         return repr(settings)
     return ", ".join(f"{name} {value}" for name, value in settings.items())
-
-
-def _settings(path: Path, first: Sequence[str]) -> Any:
-    try:
-        return json.loads(first[0])
-    except (ValueError, IndexError) as error:
-        raise EvaluationError(
-            f"{path} is no file of outcomes: expected what decides them in its first line; name another file"
-        ) from error

@@ -1,6 +1,10 @@
-"""The pose cache of a task's scene: verified poses for what the goals bring together, standing poses that reach for all rows.
+"""Pose cache of a task's scene: verified poses for objects that goals bring together, and standing poses for all
+rows.
 
-Other pairs are left to the executor's live search: a plan that goes its own way costs milliseconds, not minutes here.
+Other pairs are left to the executor's live search, which takes milliseconds at run time. No skill aims at ``nextto``,
+so the cache holds only suitable poses for pairs that a goal wants next to each other. The neighbour stays where it
+is, or both objects are carried to one host; then the neighbour has one pose there, and all poses of the other lie
+beside it.
 """
 
 from __future__ import annotations
@@ -40,31 +44,34 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Needs:
-    """What one task asks of a cache.
+class PoseNeeds:
+    """Requirements of one task for a pose cache.
 
-    ``about`` are the objects that its goal brings together, ``table`` all its rows; ``beside`` are pairs that it wants next to
-    one another.
+    ``about`` lists the objects that the goal brings together, ``table`` all rows, ``beside`` the pairs wanted next to
+    each other.
     """
 
     about: tuple[str, ...]
     table: tuple[str, ...]
-    beside: tuple[Beside, ...] = ()
+    beside: tuple[NeighbourPair, ...] = ()
 
 
 class SceneSurvey:
-    """Where the robot stands to work on the objects of a scene, and what the arm can't do there; found out when it is asked.
+    """Standing poses of the robot for the objects of a scene, and the handlings that its arm can't do. Computed on
+    demand.
 
-    Context manager over an engine. Answers do not depend on the order of questions.
+    Context manager of an engine. The answers don't depend on the order of the queries.
     """
 
     def __init__(self, scene: Scene, foresight: ReachabilitySurvey | None) -> None:
-        """Without ``foresight`` nothing is looked up about the arm. Raises EngineError when the scene can't be loaded."""
+        """Load the scene. Without ``foresight``, the arm is not analysed. Raise EngineError if the scene can't be
+        loaded.
+        """
         self._foresight = foresight
         self._engine = BulletEngine(scene)
         self._world = LiveWorld(Bundle(scene, {}, PoseCache()), self._engine)
         self._stands: dict[str, tuple[StandPose, ...]] = {}
-        self._barred: dict[Handling, dict[str, str]] = {}
+        self._blocked: dict[Handling, dict[str, str]] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -72,24 +79,24 @@ class SceneSurvey:
     def __exit__(self, *_: object) -> None:
         self._engine.close()
 
-    def bars(self, handled: Sequence[tuple[Handling, str]]) -> bool:
-        """Whether the arm finds no way to do one of some things, each to an object, as the scene begins."""
+    def blocks(self, handled: Sequence[tuple[Handling, str]]) -> bool:
+        """True if the arm can't do one of the handlings in the initial scene."""
         self._look_at(name for _, name in handled)
-        return any(name in self._barred.get(handling, {}) for handling, name in handled)
+        return any(name in self._blocked.get(handling, {}) for handling, name in handled)
 
     def poses(self, names: Iterable[str]) -> PoseCache:
-        """What is known of these objects, as a bundle carries it; no placements."""
+        """Return standing poses and arm limits of these objects as a bundle carries them, without placements."""
         wanted = dict.fromkeys(names)
         self._look_at(wanted)
         barred = {
             handling: {name: found[name] for name in wanted if name in found}
             for handling in Handling
-            if (found := self._barred.get(handling, {})).keys() & wanted.keys()
+            if (found := self._blocked.get(handling, {})).keys() & wanted.keys()
         }
         return PoseCache({}, {name: self._stands[name] for name in wanted}, barred)
 
     def placement_reachability(self, poses: PoseCache, placings: Iterable[PlacementQuery]) -> PoseCache:
-        """A cache of placements and standing poses, with at which of its poses the arm gets with what is placed."""
+        """Return the cache with the reachable poses of each placed object."""
         return poses if self._foresight is None else placement_reachability(self._world, poses, placings)
 
     def _look_at(self, names: Iterable[str]) -> None:
@@ -101,16 +108,16 @@ class SceneSurvey:
             found = self._foresight.survey(self._world, found, fresh)
         self._stands.update(found.stands)
         for handling, others in found.barred.items():
-            self._barred.setdefault(handling, {}).update(others)
+            self._blocked.setdefault(handling, {}).update(others)
 
 
 def cache_poses(
-    view: SceneView, tasks: Iterable[Needs], library: PlacementLibrary, survey: SceneSurvey, seed: int
+    view: SceneView, tasks: Iterable[PoseNeeds], library: PlacementLibrary, survey: SceneSurvey, seed: int
 ) -> PoseCache:
-    """Poses for every thing of a task on, or in, whatever of the same task can hold it, and what the survey knows of all rows.
+    """Return poses for the objects that each goal brings together, and the survey's results for all rows.
 
-    What a goal brings together has poses of its own, beside what it must be next to; for all other rows of a task's table
-    there are those of their footprints.
+    Pairs that a goal wants next to each other get poses beside each other. Other rows of a task's table get the poses
+    of their footprints.
     """
     scene, tasks = view.scene, tuple(tasks)
     placements: dict[PlacementKey, tuple[Pose, ...]] = {}
@@ -119,7 +126,7 @@ def cache_poses(
         rows.update(dict.fromkeys(task.table))
         placements.update(poses_beside(view, task.beside, library))
         if any(pair.host for pair in task.beside):
-            together = Neighbourhoods(view, library, lambda name: survey.poses([name]).stands[name], seed)
+            together = PairedPlacements(view, library, lambda name: survey.poses([name]).stands[name], seed)
             placements.update(together.poses(task.beside))
         for thing, host, relation in _pairs(view, task.about):
             key = PlacementKey(view.item(thing).asset_id, view.item(host).asset_id, relation)
@@ -130,8 +137,8 @@ def cache_poses(
     return survey.placement_reachability(replace(survey.poses(rows), placements=kept), _placings(view, tasks))
 
 
-def _placings(view: SceneView, tasks: Sequence[Needs]) -> Iterator[PlacementQuery]:
-    """What may be placed where: what a goal brings together first, then what is heated or cooled, then the rest."""
+def _placings(view: SceneView, tasks: Sequence[PoseNeeds]) -> Iterator[PlacementQuery]:
+    """Yield possible placements: those of the goals first, then those at heat and cold sources, then the rest."""
     for task in tasks:
         yield from itertools.starmap(PlacementQuery, _pairs(view, task.about))
     pairs = [
@@ -148,8 +155,8 @@ def _is_source(asset: Asset) -> bool:
     return heat_source(asset) is not None or cold_source(asset) is not None
 
 
-def _portable_and_holders(view: SceneView, task: Needs) -> tuple[list[str], list[str]]:
-    """Rows of a task that can be carried, and those in or on which something can be put."""
+def _portable_and_holders(view: SceneView, task: PoseNeeds) -> tuple[list[str], list[str]]:
+    """Return the rows of a task that can be carried, and the rows that can hold objects."""
     portable = [name for name in task.table if view.is_portable(name)]
     holders = [
         name
@@ -173,16 +180,16 @@ def _pairs(view: SceneView, about: tuple[str, ...]) -> Iterator[tuple[str, str, 
 
 
 @dataclass(frozen=True, slots=True)
-class Beside:
-    """A goal wants one thing next to another: one that stays where it is, or is carried to ``host`` as the first is."""
+class NeighbourPair:
+    """Two objects that a goal wants next to each other. The neighbour stays, or both are carried to ``host``."""
 
     thing: str
     neighbour: str
     host: str = ""
 
 
-def poses_beside(view: SceneView, pairs: Iterable[Beside], library: PlacementLibrary) -> Poses:
-    """Poses next to what stays, on or in what that stands on or in."""
+def poses_beside(view: SceneView, pairs: Iterable[NeighbourPair], library: PlacementLibrary) -> Poses:
+    """Return poses beside neighbours that stay, on or in the neighbour's host."""
     found: Poses = {}
     for pair in pairs:
         near = view.item(pair.neighbour)
@@ -197,8 +204,8 @@ def poses_beside(view: SceneView, pairs: Iterable[Beside], library: PlacementLib
     return found
 
 
-class Neighbourhoods:
-    """Poses of things that are carried to one host, there to stand next to one another."""
+class PairedPlacements:
+    """Poses of objects that are carried to one host and must stand next to each other there."""
 
     def __init__(
         self,
@@ -207,7 +214,7 @@ class Neighbourhoods:
         stand_at: Callable[[str], tuple[StandPose, ...]],
         seed: int,
     ) -> None:
-        """``stand_at`` tells where the robot stands to work on an object."""
+        """``stand_at`` returns the robot's standing poses for an object."""
         self._view = view
         self._library = library
         self._stand_at = stand_at
@@ -216,8 +223,10 @@ class Neighbourhoods:
         self._taken: list[Aabb] = []
         self._at: dict[tuple[str, str, Relation], Pose] = {}
 
-    def poses(self, pairs: Iterable[Beside]) -> Poses:
-        """Of each pair one pose of the neighbour, and those of the thing beside it: of two alike, one of them."""
+    def poses(self, pairs: Iterable[NeighbourPair]) -> Poses:
+        """Return one pose of each neighbour, and the poses of the other object beside it. For two equal models, one
+        pose each.
+        """
         found: Poses = {}
         for pair in pairs:
             for relation in (Relation.ONTOP, Relation.INSIDE):
@@ -225,7 +234,7 @@ class Neighbourhoods:
                     found[key] = (*found.get(key, ()), *poses)
         return found
 
-    def _chosen(self, pair: Beside, relation: Relation) -> Poses:
+    def _chosen(self, pair: NeighbourPair, relation: Relation) -> Poses:
         view = self._view
         thing, neighbour, host = (view.asset(name) for name in (pair.thing, pair.neighbour, pair.host))
         known = self._at.get((pair.neighbour, pair.host, relation))
@@ -246,8 +255,8 @@ class Neighbourhoods:
             return {**({} if known else stays), key: near}
         return {}
 
-    def _free(self, pair: Beside, asset: Asset, relation: Relation) -> Iterator[Pose]:
-        """Poses of an asset on or in the host, the nearest to the robot first, where nothing is yet."""
+    def _free(self, pair: NeighbourPair, asset: Asset, relation: Relation) -> Iterator[Pose]:
+        """Yield free poses of an asset on or in the host, the nearest to the robot first."""
         found = self._library.poses(asset, self._view.asset(pair.host), relation, self._seed)
         for stand in self._stand_at(pair.host)[:1]:
             frame = self._view.item(pair.host).pose_world_asset
@@ -258,7 +267,7 @@ class Neighbourhoods:
 
             yield from (pose for pose in sorted(found, key=away_m) if self._is_free(pair, asset, pose))
 
-    def _is_free(self, pair: Beside, asset: Asset, pose: Pose) -> bool:
+    def _is_free(self, pair: NeighbourPair, asset: Asset, pose: Pose) -> bool:
         frame = self._view.item(pair.host).pose_world_asset
         met = self._solids.overlaps(placed_parts(asset, frame @ pose))
         box = self._world_box(pair.host, asset, pose)

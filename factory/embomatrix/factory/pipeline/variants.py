@@ -1,4 +1,4 @@
-"""One variant of a base scene at a time: furnished with small things, written about, judged, and bundled."""
+"""Scene variants: one variant at a time is furnished with small objects, described by tasks, judged and bundled."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ import numpy as np
 from embomatrix.factory.admission import Admitted, TaskRefusal, admit
 from embomatrix.factory.pipeline.settings import WriterKind
 from embomatrix.factory.pipeline.store import Rejection, VariantResult
-from embomatrix.factory.pipeline.task_poses import Needs, SceneSurvey, cache_poses
+from embomatrix.factory.pipeline.task_poses import PoseNeeds, SceneSurvey, cache_poses
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.scenes.rehearsal import Rehearsal
+from embomatrix.factory.scenes.rehearsal import SimulatedRobot
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.writer import SocialWriter
-from embomatrix.factory.writer.tasks import DraftOrder, ManyAtOnce, PlainWriter, is_heldout_signature
+from embomatrix.factory.writer.tasks import BatchTaskWriter, DraftOrder, PlainWriter, is_heldout_signature
 from embomatrix.factory.writer.variant import Variant, build_variant
 from embomatrix.sim.live_world import prepare
 from embomatrix.sim.physical.actor import physical_simulator
@@ -43,19 +43,21 @@ if TYPE_CHECKING:
     from embomatrix.skills.syntax import Plan
     from embomatrix.world.scene import Scene
 
-TASKS_EACH: Final = 8
-"""Tasks that one variant is to yield."""
-DRAFTS: Final = 14
-"""Drafts that are written for a variant: some are not admitted."""
+TASKS_PER_VARIANT: Final = 8
+"""Number of tasks that a variant should yield."""
+MAX_DRAFTS: Final = 14
+"""Number of drafts per variant. Some are not admitted."""
 WRITE_TRIES: Final = 120
-"""Tasks that are written for the drafts: those of the other split's kinds are thrown away."""
+"""Maximum number of tasks written for the drafts. Tasks with signatures of the other split are discarded."""
 FOCUS_ROOMS: Final = 3
-"""Rooms that a variant furnishes with small things, and whose things its tasks are about."""
+"""Number of rooms that get small objects and that the variant's tasks are about."""
 
 
 @dataclass(frozen=True, slots=True)
 class VariantOrder:
-    """One variant to make, of a base scene. ``rooms`` are those of its split; ``known`` are tasks that exist already."""
+    """Order for one variant of a base scene. ``rooms`` are those of its split; ``known`` holds keys of existing
+    tasks.
+    """
 
     split: str
     number: int
@@ -67,9 +69,9 @@ class VariantOrder:
 
 @dataclass(frozen=True, slots=True)
 class VariantYield:
-    """What came of it: records, the bundle that they run in, and transcripts and layout trees by task id.
+    """Result of a variant: records, their bundle, and transcripts and layout trees by task id.
 
-    ``cpu_s`` is the processor time that it took, no part of what the variant is.
+    ``cpu_s`` is the CPU time and does not affect equality.
     """
 
     result: VariantResult
@@ -80,10 +82,10 @@ class VariantYield:
 
 
 class VariantMaker:
-    """Makes variants in this process; what one finds out about furniture and places serves the next ones.
+    """Maker of variants in this process. Placement results are reused between variants.
 
-    ``writer`` stands in for the one that the settings name, ``layout`` for agents that are rules; with a language model only
-    they can be given. Each answer follows from settings and order alone. Close it after use.
+    ``writer`` replaces the writer of the settings, ``layout`` the rule-based layout agents. Each result depends only
+    on the settings and the order. Close the maker after use.
     """
 
     def __init__(
@@ -95,7 +97,7 @@ class VariantMaker:
         if writer is None:
             writer = SocialWriter(settings.seed) if settings.writer is WriterKind.SOCIAL else PlainWriter()
         foresight = ReachabilitySurvey() if settings.look_ahead else None
-        self._bench = _Workbench(settings, writer, PlacementLibrary(), foresight)
+        self._bench = _SharedTools(settings, writer, PlacementLibrary(), foresight)
         self._layout = layout
         self._bases: dict[str, Scene] = {}
 
@@ -120,14 +122,14 @@ class VariantMaker:
         self._bench.library.close()
 
 
-def key_of(signature: str, instruction: str) -> str:
-    """What two tasks of a data set must not have in common."""
+def uniqueness_key(signature: str, instruction: str) -> str:
+    """Return the key that must be unique among the tasks of a dataset."""
     return f"{signature}|{instruction}"
 
 
 @dataclass(frozen=True)
-class _Workbench:
-    """What all variants of a build share."""
+class _SharedTools:
+    """Objects shared by all variants of a build."""
 
     settings: BuildSettings
     writer: TaskWriter
@@ -138,7 +140,7 @@ class _Workbench:
 def _focus(
     base: Scene, rooms: Sequence[str], missing: Mapping[TaskCategory, int], rng: np.random.Generator
 ) -> tuple[str, ...]:
-    """Rooms of a variant: a kitchen while kitchen tasks are wanted, and others at random."""
+    """Return the rooms of a variant: a kitchen while kitchen tasks are missing, and random others."""
     types = {room.name: room.type for room in base.rooms}
     order = [str(name) for name in rng.permutation(list(rooms))]
     wants_kitchen = missing[TaskCategory.KITCHEN_OPERATION] > 0
@@ -147,9 +149,9 @@ def _focus(
 
 
 class _VariantJob:
-    """Writes and judges the tasks of one variant."""
+    """Writing and judging of one variant's tasks."""
 
-    def __init__(self, variant: Variant, order: VariantOrder, bench: _Workbench) -> None:
+    def __init__(self, variant: Variant, order: VariantOrder, bench: _SharedTools) -> None:
         self._variant = variant
         self._order = order
         self._seed = bench.settings.seed
@@ -162,13 +164,13 @@ class _VariantJob:
         self._rejections: list[Rejection] = []
 
     def run(self, rng: np.random.Generator) -> VariantYield:
-        """The variant's records with their bundle, the missing categories in turns."""
+        """Return the variant's records with their bundle. The missing categories take turns."""
         missing = self._order.missing
         scene = self._variant.scene
         with SceneSurvey(scene, self._foresight) as survey:
-            with Rehearsal(scene, survey.bars) as rehearsal:
+            with SimulatedRobot(scene, survey.blocks) as rehearsal:
                 drafts = self._write(missing, SceneView(scene, rehearsal), rng)
-            needs = [Needs(draft.about, draft.task.table) for draft in drafts]
+            needs = [PoseNeeds(draft.about, draft.task.table) for draft in drafts]
             poses = cache_poses(SceneView(scene), needs, self._library, survey, self._seed)
         left = dict(missing)
         bundle = Bundle(scene, {}, poses)
@@ -180,7 +182,7 @@ class _VariantJob:
                 else None
             )
             for draft in drafts:
-                if len(self._admitted) == TASKS_EACH:
+                if len(self._admitted) == TASKS_PER_VARIANT:
                     break
                 if left[draft.task.category] > 0 and self._judge(stage, robot, draft):
                     left[draft.task.category] -= 1
@@ -191,30 +193,30 @@ class _VariantJob:
     def _write(
         self, missing: Mapping[TaskCategory, int], view: SceneView, rng: np.random.Generator
     ) -> list[Draft]:
-        """Drafts whose kinds of goal belong to this split, all different, the missing categories in turns."""
+        """Return distinct drafts with signatures of this split. The missing categories take turns."""
         wanted = [category for category, count in missing.items() if count > 0]
         drafts: list[Draft] = []
         turns = itertools.islice(itertools.cycle(wanted), WRITE_TRIES)
-        while len(drafts) < DRAFTS and (written := self._written(turns, view, len(drafts), rng)):
+        while len(drafts) < MAX_DRAFTS and (written := self._written(turns, view, len(drafts), rng)):
             for category, draft in written:
                 if isinstance(draft, TaskRefusal):
                     self._reject(category, draft)
                 elif draft is not None and self._is_new(draft):
                     named = replace(draft.task, task_id=self._task_id(len(drafts)))
                     drafts.append(replace(draft, task=named))
-                    self._known.add(key_of(draft.signature, draft.task.instruction))
+                    self._known.add(uniqueness_key(draft.signature, draft.task.instruction))
         return drafts
 
     def _written(
         self, turns: Iterator[TaskCategory], view: SceneView, known: int, rng: np.random.Generator
     ) -> list[tuple[TaskCategory, Draft | TaskRefusal | None]]:
-        """What comes of the next turn, or of several at once where a writer waits for answers; nothing at their end."""
-        if not isinstance(self._writer, ManyAtOnce):
+        """Write the next draft, or several at once if the writer waits for answers. Empty after the last turn."""
+        if not isinstance(self._writer, BatchTaskWriter):
             return [
                 (category, self._writer.write(self._variant, view, category, self._task_id(known), rng))
                 for category in itertools.islice(turns, 1)
             ]
-        categories = list(itertools.islice(turns, min(self._writer.at_once, DRAFTS - known)))
+        categories = list(itertools.islice(turns, min(self._writer.at_once, MAX_DRAFTS - known)))
         orders = [
             DraftOrder(category, self._task_id(known + number), each)
             for number, (category, each) in enumerate(
@@ -228,11 +230,11 @@ class _VariantJob:
         return f"{self._variant.scene.scene_id}-{number:02d}"
 
     def _transcripts(self) -> dict[str, str]:
-        """Of the admitted tasks that somebody talked about, by task id."""
+        """Return the transcripts of the admitted tasks by task id."""
         return {draft.task.task_id: draft.transcript for draft, _ in self._admitted if draft.transcript}
 
     def _trees(self) -> dict[str, Mapping[str, Any]]:
-        """How what was added in the rooms of an admitted task hangs together, by task id."""
+        """Return the layout trees of the admitted tasks' rooms, by task id."""
         trees = self._variant.trees
         return {
             draft.task.task_id: {
@@ -245,8 +247,8 @@ class _VariantJob:
         }
 
     def _is_new(self, draft: Draft) -> bool:
-        """Whether the goal's kind belongs to this split, and nothing like it was asked for in these words."""
-        key = key_of(draft.signature, draft.task.instruction)
+        """True if the signature belongs to this split and the task is not known yet."""
+        key = uniqueness_key(draft.signature, draft.task.instruction)
         mine = is_heldout_signature(draft.signature, self._seed) is (self._order.split == "heldout")
         return mine and key not in self._known
 

@@ -1,7 +1,6 @@
-"""A base scene that is being changed: what stands in it, what is still free, what the robot would still reach.
+"""Editor of a base scene: its objects, free space and the floor that the robot can reach.
 
-The editor decides nothing about where things go; ``layout`` does. It keeps the objects, and tells whether one more may be where
-somebody wants it.
+The editor checks poses; the layout agents choose them.
 """
 
 from __future__ import annotations
@@ -32,12 +31,12 @@ if TYPE_CHECKING:
 _ON_FLOOR_M: Final = 0.05
 _FLAT_M: Final = 0.03
 _SUNK_M: Final = 0.008
-"""How deep the plate of a floor lies: near enough for things to be on it, too deep for them to touch it (5 mm)."""
+"""Depth of a floor plate: near enough for objects to rest on it, too deep for contact (5 mm)."""
 _PLATE_M: Final = 0.01
 
 
 class LayoutReason(StrEnum):
-    """Why a thing found no place."""
+    """Reason why an object has no place."""
 
     UNKNOWN_HOST = "unknown_host"
     UNKNOWN_MODEL = "unknown_model"
@@ -46,14 +45,14 @@ class LayoutReason(StrEnum):
     TOO_LARGE = "too_large"
     NO_FREE_SPOT = "no_free_spot"
     OUT_OF_REACH = "out_of_reach"
-    BARS_THE_WAY = "bars_the_way"
+    BLOCKS_PATH = "blocks_path"
     UNSTABLE = "unstable"
-    NOT_AT_HAND = "not_at_hand"
+    INACCESSIBLE = "inaccessible"
     RELATION_NOT_HELD = "relation_not_held"
 
 
 class PlacementError(ValueError):
-    """An object can't be placed; ``reason`` says which rule stood against it."""
+    """Object that can't be placed. ``reason`` names the violated rule."""
 
     def __init__(self, reason: LayoutReason, message: str) -> None:
         super().__init__(message)
@@ -61,14 +60,14 @@ class PlacementError(ValueError):
 
 
 class SceneEditor:
-    """Collects changes to a base scene; ``freeze`` makes the new scene. The base scene itself is never changed."""
+    """Changes to a base scene. ``freeze`` returns the new scene; the base scene is never changed."""
 
     def __init__(self, scene: Scene) -> None:
         self.base = scene
         self.rooms: Mapping[str, Room] = {room.name: room for room in scene.rooms}
         self.clearance = Clearance(scene)
         self.view = SceneView(scene)
-        """The base scene."""
+        """View of the base scene."""
         self._objects: dict[str, SceneObject] = {item.name: item for item in scene.objects}
         self._assets: dict[str, Asset] = dict(scene.assets)
         self._boxes: dict[str, Aabb] = {}
@@ -77,23 +76,23 @@ class SceneEditor:
         self._floor = ReachableFloor(scene)
         self._unreached = {problem.names for problem in reach_problems(scene)}
         self.unserved = frozenset(name for names in self._unreached for name in names)
-        """Objects of the base scene that the robot could not get at to begin with."""
+        """Objects of the base scene that the robot can't reach initially."""
         self.given_up: set[str] = set()
-        """Objects of the base scene that what is to come may bar the robot from."""
+        """Objects of the base scene that new objects may make unreachable."""
         self._counts = Counter(self._assets[item.asset_id].category for item in scene.objects)
 
     @property
     def objects(self) -> Mapping[str, SceneObject]:
-        """The objects so far, by name, in the order of the scene."""
+        """Current objects by name, in scene order."""
         return self._objects
 
     @property
     def floor(self) -> ReachableFloor:
-        """Where the robot gets to, as things stand."""
+        """Floor that the robot can reach in the current scene."""
         return self._floor
 
     def known(self, name: str) -> SceneObject:
-        """An object. Raises PlacementError for an unknown name."""
+        """Return an object. Raise PlacementError for an unknown name."""
         if name not in self._objects:
             raise PlacementError(
                 LayoutReason.UNKNOWN_HOST,
@@ -102,11 +101,11 @@ class SceneEditor:
         return self._objects[name]
 
     def asset_of(self, name: str) -> Asset:
-        """An object's asset. Raises PlacementError for an unknown name."""
+        """Return an object's asset. Raise PlacementError for an unknown name."""
         return self._assets[self.known(name).asset_id]
 
     def box_of(self, name: str) -> Aabb:
-        """An object's box in the world, joints shut. Raises PlacementError for an unknown name."""
+        """Return an object's box in the world with closed joints. Raise PlacementError for an unknown name."""
         box = self._boxes.get(name)
         if box is None:
             item = self.known(name)
@@ -114,22 +113,22 @@ class SceneEditor:
         return box
 
     def keep(self, names: Iterable[str]) -> None:
-        """Tell which objects of the base scene must stay: the task is about them."""
+        """Protect objects of the base scene that the task is about."""
         self._kept.update(names)
 
     def is_spare(self, name: str) -> bool:
-        """Whether an object of the base scene may be taken away, with all that rests on it."""
+        """True if an object of the base scene may be removed with all objects on it."""
         guests = {item.name for item in self._objects.values() if item.host == name}
         return name in self.base.by_name and not self._kept & {name, *guests}
 
     def is_free(self, asset: Asset, pose: Pose) -> bool:
-        """Whether an asset would overlap nothing at a pose."""
+        """True if an asset overlaps nothing at a pose."""
         return not self._solids.overlaps(placed_parts(asset, pose))
 
     def objection(self, asset: Asset, pose: Pose, target: str = "") -> LayoutReason | None:
-        """What stands against an asset at a pose: it meets something, is out of reach, or bars the robot's way. None: nothing.
+        """Return the rule that an asset violates at a pose: collision, reach, or a blocked path. None if it is valid.
 
-        ``target`` is what it would be on or in: furniture with doors is served from its front.
+        ``target`` is its host. Furniture with doors is served from its front.
         """
         if not self.is_free(asset, pose):
             return LayoutReason.NO_FREE_SPOT
@@ -139,12 +138,12 @@ class SceneEditor:
             return LayoutReason.NO_FREE_SPOT
         if not self._in_reach(box, target):
             return LayoutReason.OUT_OF_REACH
-        return None if self._leaves_ways(asset, pose, box, room) else LayoutReason.BARS_THE_WAY
+        return None if self._keeps_paths_clear(asset, pose, box, room) else LayoutReason.BLOCKS_PATH
 
     def insert(self, asset: Asset, pose: Pose, relation: Relation | None, host: str, room: str = "") -> str:
-        """Add an object at a pose, looked at or not, and return its name, ``category_N``.
+        """Add an object at a pose without checks, and return its name, ``category_N``.
 
-        ``host`` is what it rests on or in by ``relation``; empty: the floor. Without a room it is where its middle is.
+        ``host`` supports it in ``relation``; empty means the floor. Without a room, the object's position decides.
         """
         self._counts[asset.category] += 1
         name = f"{asset.category}_{self._counts[asset.category]}"
@@ -166,34 +165,36 @@ class SceneEditor:
         return name
 
     def fasten(self, name: str) -> None:
-        """Make an object one that never moves, as what hangs on a wall. Raises PlacementError for an unknown name."""
+        """Make an object fixed, such as a picture on a wall. Raise PlacementError for an unknown name."""
         self._objects[name] = replace(self.known(name), fixed=True)
 
     def loosen(self, name: str) -> None:
-        """Make an object one that can be carried, if the arm lifts it. Raises PlacementError for an unknown name."""
+        """Make an object movable. Raise PlacementError for an unknown name."""
         self._objects[name] = replace(self.known(name), fixed=False)
 
     def remove(self, name: str) -> tuple[str, ...]:
-        """Take an object out again, with all that rests on or in it; their names. Raises PlacementError for an unknown name."""
+        """Remove an object with all objects on or in it, and return their names. Raise PlacementError for an unknown
+        name.
+        """
         self.known(name)
         gone = {name: None}
-        for item in self._objects.values():  # hosts stand before their guests
+        for item in self._objects.values():  # hosts precede the objects on them
             if item.host in gone:
                 gone[item.name] = None
         for each in gone:
             del self._objects[each]
-        self._look_again(gone)
+        self._refresh(gone)
         return tuple(gone)
 
     def move(self, poses: Mapping[str, Pose]) -> None:
-        """Give objects other poses, such as those at which they came to rest. Raises PlacementError for an unknown name."""
+        """Set the poses of objects. Raise PlacementError for an unknown name."""
         for name, pose in poses.items():
             self._objects[name] = replace(self.known(name), pose_world_asset=pose)
         if poses:
-            self._look_again(poses)
+            self._refresh(poses)
 
     def add_pieces(self, whole: str, asset: Asset, count: int) -> tuple[str, ...]:
-        """Add absent objects that come in when ``whole`` is sliced, and return their names. Raises PlacementError."""
+        """Add absent objects that appear when ``whole`` is sliced, and return their names. Raise PlacementError."""
         origin = self.known(whole)
         names: list[str] = []
         for _ in range(count):
@@ -213,24 +214,24 @@ class SceneEditor:
         return tuple(names)
 
     def set_states(self, name: str, states: frozenset[State]) -> None:
-        """Give an object these symbolic states. Raises PlacementError for an unknown name."""
+        """Set an object's symbolic states. Raise PlacementError for an unknown name."""
         self._objects[name] = replace(self.known(name), states=frozenset(states))
 
     def set_joints(self, name: str, fractions: Sequence[float]) -> None:
-        """Open or shut an object's joints, one share of the travel for each, with all that lies in its drawers.
+        """Set the joints of an object as fractions of their travel. Objects in its drawers move with them.
 
-        Raises PlacementError, ValueError.
+        Raise PlacementError or ValueError.
         """
         item = self.known(name)
         joints = self._assets[item.asset_id].joints
         if len(fractions) != len(joints) or not all(0.0 <= f <= 1.0 for f in fractions):
             raise ValueError(
-                f"{name!r} was given joints {tuple(fractions)}: expected {len(joints)} numbers between 0 and 1"
+                f"{name!r} has joint fractions {tuple(fractions)}: expected {len(joints)} numbers between 0 and 1"
             )
         self._objects.update(with_joints(self._objects, self._assets, name, fractions))
 
     def freeze(self, scene_id: str) -> Scene:
-        """The scene as it is now, with the assets that it uses."""
+        """Return the current scene with the assets that it uses."""
         objects = tuple(self._objects.values())
         used = {item.asset_id: self._assets[item.asset_id] for item in objects}
         return replace(self.base, scene_id=scene_id, objects=objects, assets=used)
@@ -238,7 +239,7 @@ class SceneEditor:
     def _as_scene(self) -> Scene:
         return replace(self.base, objects=tuple(self._objects.values()), assets=self._assets)
 
-    def _look_again(self, changed: Mapping[str, object]) -> None:
+    def _refresh(self, changed: Mapping[str, object]) -> None:
         for name in changed:
             self._boxes.pop(name, None)
         scene = self._as_scene()
@@ -251,8 +252,8 @@ class SceneEditor:
         front = self.known(target).pose_world_asset if target and self.asset_of(target).joints else None
         return len(self._floor.spots(box, front_of=front)) > 0
 
-    def _leaves_ways(self, asset: Asset, pose: Pose, box: Aabb, room: str) -> bool:
-        """Whether, with the object on the floor, doorways stay clear and the robot gets to all that it got to before."""
+    def _keeps_paths_clear(self, asset: Asset, pose: Pose, box: Aabb, room: str) -> bool:
+        """True if doorways stay clear and everything reachable before stays reachable with this object on the floor."""
         if box.low_m[2] > _ON_FLOOR_M or box.high_m[2] < _FLAT_M:
             return True
         if self.clearance.bars_a_doorway(box):
@@ -265,7 +266,7 @@ class SceneEditor:
 
 
 def box_at(asset: Asset, pose: Pose) -> Aabb:
-    """Box in the world of an asset at a pose, joints shut."""
+    """Return the box in the world of an asset at a pose, with closed joints."""
     return Aabb.around(part.aabb(pose) for link in asset.links for part in link.parts)
 
 
@@ -279,7 +280,7 @@ def add_floor(editor: SceneEditor, room: str) -> str:
 
 
 def floor_asset(room: Room) -> Asset:
-    """The floor of a room as a fixed thing: a plate just below the ground, and a surface that is the ground itself."""
+    """Return the floor of a room as a fixed asset: a plate below the ground with a support surface at ground level."""
     size = (*room.size_m, _PLATE_M)
     return Asset(
         asset_id=f"floors-{room.name}",

@@ -1,8 +1,8 @@
-"""Wishes are tried before they are written: by the routines of the oracle, in the simulator that executes plans, one at a time.
+"""Feasibility of wishes, tested one at a time before they are written: oracle routines run in the simulator.
 
-What fits a scene on paper is often out of the robot's reach in it: food in the corner behind a microwave, a cabinet behind
-a console table, an oven whose door takes the only place from which its inside is served. A wish that fails alone fails in
-every task. That all wishes of a task can be met together is not asked here; admission tells.
+Many plausible wishes are out of the robot's reach: food behind a microwave, a cabinet behind a table, an oven whose
+open door covers the only position to serve it. A wish that fails alone fails in every task. Combinations of wishes
+are only checked by admission.
 """
 
 from __future__ import annotations
@@ -30,20 +30,22 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
     from embomatrix.world.state import Relation
 
-    Bars = Callable[[Sequence[tuple[Handling, str]]], bool]
-    """Whether the arm finds no way to do one of some things to an object each, as the scene begins."""
+    ArmLimits = Callable[[Sequence[tuple[Handling, str]]], bool]
+    """True if the arm can't do one of these handlings in the initial scene."""
 
 SEED: Final = 0
 """Seed of the trials."""
 
 
-class Rehearsal:
-    """Tries wishes in a scene, each once. Close it after use; not for use by several threads."""
+class SimulatedRobot:
+    """Feasibility checks in the simulator. Each check runs once. Close after use; not thread-safe."""
 
-    def __init__(self, scene: Scene, bars: Bars = lambda _: False) -> None:
-        """``bars`` knows the arm. Raises EngineError when the scene can't be loaded."""
+    def __init__(self, scene: Scene, blocks: ArmLimits = lambda _: False) -> None:
+        """Load the scene. ``blocks`` reports handlings that the arm can't do. Raise EngineError if the scene can't be
+        loaded.
+        """
         self._view = SceneView(scene)
-        self._bars = bars
+        self._blocks = blocks
         self._simulator = load_simulator(Bundle(scene, {}, PoseCache()))
         self._known: dict[tuple[str, ...], bool] = {}
 
@@ -53,27 +55,27 @@ class Rehearsal:
     def __exit__(self, *_: object) -> None:
         self._simulator.close()
 
-    def fetches(self, thing: str) -> bool:
-        """Whether it gets the thing into its hand."""
+    def can_pick_up(self, thing: str) -> bool:
+        """True if the robot can pick the object up."""
         return self._tries(f"take {thing}", (thing,), None, lambda script: script.take(thing))
 
-    def puts(self, thing: str, relation: Relation, host: str) -> bool:
-        """Whether it brings the thing on or into another, where it is not yet."""
+    def can_place(self, thing: str, relation: Relation, host: str) -> bool:
+        """True if the robot can place the object on or in the host, where it is not yet."""
         placed = Subgoals(placements=(PlacementGoal(thing, relation, host),))
         return self._brings_about(Atom(relation.value, (thing, host)), placed, thing, host)
 
-    def swings(self, name: str, *, shut: bool) -> bool:
-        """Whether it opens, or shuts, all doors and drawers of an object that is not so yet."""
+    def can_swing(self, name: str, *, shut: bool) -> bool:
+        """True if the robot can open, or close, all doors and drawers of the object, and they are not so yet."""
         atom = Atom(State.OPEN.value, (name,))
         return self._brings_about(Not(atom) if shut else atom, Subgoals(open={name: not shut}), name)
 
-    def switches(self, name: str, *, on: bool) -> bool:
-        """Whether it switches an object on, or off, that is not so yet."""
+    def can_switch(self, name: str, *, on: bool) -> bool:
+        """True if the robot can switch the object on, or off, and it is not so yet."""
         atom = Atom(State.TOGGLED_ON.value, (name,))
         return self._brings_about(atom if on else Not(atom), Subgoals(on={name: on}), name)
 
-    def exposes(self, thing: str, source: str, state: State) -> bool:
-        """Whether the thing becomes hot, cooked or frozen at a source, and is not so yet."""
+    def can_treat(self, thing: str, source: str, state: State) -> bool:
+        """True if the object can become hot, cooked or frozen at the source and is not so yet."""
         exposure = Exposure(thing, source, hot=state is not State.FROZEN)
         return self._brings_about(Atom(state.value, (thing,)), Subgoals(exposures=(exposure,)), thing, source)
 
@@ -84,7 +86,7 @@ class Rehearsal:
     def _tries(
         self, deed: str, names: tuple[str, ...], goal: Formula | None, do: Callable[[PlanScript], None]
     ) -> bool:
-        """Whether the deed succeeds, to which these objects and what they rest on or in are all that is needed."""
+        """True if the action succeeds. ``names`` lists the objects that it needs besides their supports."""
         key = (deed, *names)
         if key not in self._known:
             self._known[key] = self._succeeds(names, goal, do)
@@ -108,10 +110,12 @@ class Rehearsal:
             for call in script.plan
             if call.skill in HANDLINGS and call.object_index is not None
         ]
-        return not self._bars(handled)
+        return not self._blocks(handled)
 
     def _task_about(self, names: tuple[str, ...]) -> Task:
-        """What the simulator takes: a table of the objects and what they rest on or in, and any goal."""
+        """Return a task for the simulator with these objects and their supports in its table. Its goal is a
+        placeholder.
+        """
         goal = Atom(State.OPEN.value, names[:1])
         rows = dict.fromkeys(row for name in names for row in (name, *self._view.hosts(name)))
         return Task(

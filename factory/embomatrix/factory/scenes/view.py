@@ -1,4 +1,4 @@
-"""What a task writer sees of a scene: which things can be carried, stood on, filled, opened or switched, and where they are."""
+"""Index of a scene for task writing: affordances and places of its objects."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ if TYPE_CHECKING:
 
 
 MIN_SURFACE_M: Final = 0.18
-"""Both extents of a surface that a task may ask to put things on."""
+"""Minimum extents of a surface for placement requests."""
 MIN_CAVITY_M: Final = 0.12
 LOW_SURFACE_M: Final = 0.15
 HIGH_SURFACE_M: Final = 1.5
-"""Heights above the floor between which tasks ask to put things down."""
+"""Heights above the floor between which tasks request placements."""
 HUNG_M: Final = 0.05
-"""What begins higher above the floor hangs, where nothing bears it."""
+"""Objects without support whose lower end is above this height hang."""
 
 
 class SceneView:
-    """A scene indexed for writing tasks. Names are those of scene objects."""
+    """Scene indexed for task writing, by the names of scene objects."""
 
-    def __init__(self, scene: Scene, robot: Robot | None = None) -> None:
+    def __init__(self, scene: Scene, robot: RobotFeasibility | None = None) -> None:
         self.scene = scene
-        self.robot: Robot = robot if robot is not None else AnyRobot()
-        """Who is to do what is asked for. Without one nobody asks whether it can."""
+        self.robot: RobotFeasibility = robot if robot is not None else CapableRobot()
+        """Feasibility checks of the robot. By default everything is feasible."""
         self._opens: dict[str, bool] = {}
 
     @cached_property
@@ -71,11 +71,11 @@ class SceneView:
         return self.item(name).room
 
     def alike(self, name: str) -> tuple[str, ...]:
-        """Objects of the same category in the same room, with this one."""
+        """Return the objects of the same category in the same room, including this one."""
         return self._of_kind[self.category(name), self.room(name)]
 
     def floor_of(self, room: str) -> str:
-        """The floor of a room where it is an object; "" elsewhere."""
+        """Return the floor object of a room, or "" if it has none."""
         return next(
             (name for name in self.in_room.get(room, ()) if self.category(name) == FLOOR_CATEGORY), ""
         )
@@ -84,7 +84,9 @@ class SceneView:
         return tuple(room.name for room in self.scene.rooms if (category, room.name) in self._of_kind)
 
     def whereabouts(self, name: str) -> str:
-        """What it is on or in, as ``ontop stove_1``, ``on the floor``, ``on the wall`` or ``under the ceiling``."""
+        """Return the place of an object: ``ontop stove_1``, ``on the floor``, ``on the wall`` or ``under the
+        ceiling``.
+        """
         item = self.item(name)
         if item.host and item.relation is not None:
             return f"{item.relation.value} {item.host}"
@@ -94,12 +96,12 @@ class SceneView:
         return "on the wall" if self.scene.box_of(name).low_m[2] > HUNG_M else "on the floor"
 
     def is_portable(self, name: str) -> bool:
-        """Whether the robot can carry it."""
+        """True if the robot can carry the object."""
         asset = self.asset(name)
         return not self.item(name).fixed and is_liftable(asset.size_m, asset.mass_kg)
 
     def is_surface(self, name: str) -> bool:
-        """Whether it is furniture with an open surface at a height to work at."""
+        """True for furniture with an open surface at working height."""
         item, asset = self.item(name), self.asset(name)
         shut_off = {interior.name for interior in asset.interiors if interior.closed_by}
         base = item.pose_world_asset.position_m[2]
@@ -111,7 +113,7 @@ class SceneView:
         )
 
     def is_container(self, name: str) -> bool:
-        """Whether it is furniture or an appliance with a cavity."""
+        """True for furniture or an appliance with a cavity."""
         item, asset = self.item(name), self.asset(name)
         base = item.pose_world_asset.position_m[2]
         return item.fixed and any(
@@ -121,7 +123,7 @@ class SceneView:
         )
 
     def is_basket(self, name: str) -> bool:
-        """Whether it is a portable thing with a cavity that is always open."""
+        """True for a portable object with a cavity that is always open."""
         asset = self.asset(name)
         return not self.item(name).fixed and any(
             not interior.closed_by and min(interior.size_m[:2]) >= MIN_CAVITY_M
@@ -129,7 +131,7 @@ class SceneView:
         )
 
     def takes(self, host: str, thing: str, *, inside: bool) -> bool:
-        """Whether a cavity, or an open surface, of the host is larger than the thing on every side."""
+        """True if a cavity or an open surface of the host is larger than the object."""
         size, asset = sorted(self.asset(thing).size_m), self.asset(host)
         if inside:
             return any(
@@ -144,7 +146,7 @@ class SceneView:
         return bool(self.asset(name).joints) and self.asset(name).can("openable")
 
     def is_switchable(self, name: str) -> bool:
-        """Whether a task may ask to open it or to switch it on: in reach, and telling by its words."""
+        """True if a task may ask to open or switch the object: it is in reach and its name is unambiguous."""
         low = self.item(name).pose_world_asset.position_m[2] - self.asset(name).size_m[2] / 2
         return (
             self.category(name) not in NEVER_SWITCHED
@@ -156,7 +158,7 @@ class SceneView:
         return any(share > OPEN_FRACTION for share in self.item(name).joints)
 
     def opens(self, name: str) -> bool:
-        """Whether its doors and drawers meet nothing on their way, where it has any."""
+        """True if the object's doors and drawers, if any, open without a collision."""
         if name not in self._opens:
             joints = len(self.asset(name).joints)
             self._opens[name] = not joints or not any(
@@ -175,7 +177,7 @@ class SceneView:
         return State.TOGGLED_ON in self.item(name).states
 
     def thermal_effects(self, food: str, source: str) -> tuple[State, ...]:
-        """States that the source can give the food."""
+        """Return the states that the source can give the food."""
         asset, place = self.asset(food), self.asset(source)
         heat, cold = heat_source(place), cold_source(place)
         effects: list[State] = []
@@ -188,14 +190,14 @@ class SceneView:
         return tuple(effects)
 
     def is_source(self, name: str) -> bool:
-        """Whether food can be heated or frozen in or on it."""
+        """True if food can be heated or frozen in or on the object."""
         heat, cold = heat_source(self.asset(name)), cold_source(self.asset(name))
         inside = any(source.requires_inside for source in (heat, cold) if source is not None)
         works = (heat is not None and heats(heat)) or (cold is not None and freezes(cold))
         return works and (self.is_container(name) if inside else self.is_surface(name))
 
     def hosts(self, name: str) -> tuple[str, ...]:
-        """What the object rests on or in, from the nearest to the furniture on the floor."""
+        """Return the supports of an object, from the nearest to the furniture on the floor."""
         chain: list[str] = []
         host = self.item(name).host
         while host and host not in chain:
@@ -209,48 +211,48 @@ class SceneView:
 
 
 def is_liftable(size_m: tuple[float, float, float], mass_kg: float) -> bool:
-    """Whether the arm lifts it and the gripper takes it."""
+    """True if the arm can lift the object and the gripper can grasp it."""
     return mass_kg <= ROBOT.mass_kg and min(size_m) <= ROBOT.grip_m and max(size_m) <= ROBOT.extent_m
 
 
-class Robot(Protocol):
-    """Answers about one thing at a time, from the start of the scene. Names are those of scene objects."""
+class RobotFeasibility(Protocol):
+    """Feasibility of single actions from the start of a scene. Names are those of scene objects."""
 
-    def fetches(self, thing: str) -> bool:
-        """Whether it gets the thing into its hand."""
+    def can_pick_up(self, thing: str) -> bool:
+        """True if the robot can pick the object up."""
         ...
 
-    def puts(self, thing: str, relation: Relation, host: str) -> bool:
-        """Whether it brings the thing on or into another."""
+    def can_place(self, thing: str, relation: Relation, host: str) -> bool:
+        """True if the robot can place the object on or in the host."""
         ...
 
-    def swings(self, name: str, *, shut: bool) -> bool:
-        """Whether it opens, or shuts, all doors and drawers of an object."""
+    def can_swing(self, name: str, *, shut: bool) -> bool:
+        """True if the robot can open, or close, all doors and drawers of the object."""
         ...
 
-    def switches(self, name: str, *, on: bool) -> bool:
-        """Whether it switches an object on, or off."""
+    def can_switch(self, name: str, *, on: bool) -> bool:
+        """True if the robot can switch the object on, or off."""
         ...
 
-    def exposes(self, thing: str, source: str, state: State) -> bool:
-        """Whether the thing becomes hot, cooked or frozen at a source, and was not so before."""
+    def can_treat(self, thing: str, source: str, state: State) -> bool:
+        """True if the object can become hot, cooked or frozen at the source and is not so yet."""
         ...
 
 
-class AnyRobot:
-    """One that can do all: nobody was asked."""
+class CapableRobot:
+    """Feasibility without a check: every action is possible."""
 
-    def fetches(self, thing: str) -> bool:
+    def can_pick_up(self, thing: str) -> bool:
         return True
 
-    def puts(self, thing: str, relation: Relation, host: str) -> bool:
+    def can_place(self, thing: str, relation: Relation, host: str) -> bool:
         return True
 
-    def swings(self, name: str, *, shut: bool) -> bool:
+    def can_swing(self, name: str, *, shut: bool) -> bool:
         return True
 
-    def switches(self, name: str, *, on: bool) -> bool:
+    def can_switch(self, name: str, *, on: bool) -> bool:
         return True
 
-    def exposes(self, thing: str, source: str, state: State) -> bool:
+    def can_treat(self, thing: str, source: str, state: State) -> bool:
         return True

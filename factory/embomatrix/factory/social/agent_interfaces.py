@@ -1,6 +1,6 @@
-"""Each agent of the social simulation alone: briefs and answers as JSON, by rules or by a language model.
+"""Interfaces of the social agents: briefs and answers as JSON, by rules or with a language model.
 
-The answer of one is the brief of the next: from a scene to its people, to a conversation, to one instruction.
+The answer of one agent is the brief of the next: scene, people, conversation, instruction.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.conversing import starting_slots
 from embomatrix.factory.social.facts import SceneFacts, facts_of, with_sights
-from embomatrix.factory.social.fitting import why_of
+from embomatrix.factory.social.fitting import reasons_for
 from embomatrix.factory.social.summary import instruction_of
 from embomatrix.factory.social.values import RequestSummary, SceneBrief, SummaryBrief, TalkBrief
 from embomatrix.factory.social.writer import SocialWriter
@@ -28,20 +28,20 @@ from embomatrix.factory.writer.words import Voice
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from embomatrix.factory.social.model_agents import ModelAgents
+    from embomatrix.factory.social.model_agents import SocialModelAgents
     from embomatrix.factory.social.values import Cast
     from embomatrix.factory.writer.variant import Variant
     from embomatrix.world.scene import Scene
 
 ROOMS: Final = 3
-"""Rooms of a scene that a conversation is about."""
-TALKS: Final = 40
-"""Conversations that are tried: not every goal of a scene has somebody who would wish for it."""
+"""Number of a scene's rooms that a conversation is about."""
+MAX_CONVERSATIONS: Final = 40
+"""Maximum number of conversations tried. Not every goal of a scene suits one of its people."""
 NO_REASON: Final = "there is much to do today"
 
 
 class SocialAgent(StrEnum):
-    """Agents of the social simulation."""
+    """Agent of the social simulation."""
 
     EXTRACTOR = "scene-extractor"
     PLAYER = "role-player"
@@ -49,8 +49,8 @@ class SocialAgent(StrEnum):
     SUMMARIZER = "summarizer"
 
 
-class _SameCast:
-    """Role-Playing Agent that has played already."""
+class _FixedCast:
+    """Role-Playing Agent that returns a given cast."""
 
     def __init__(self, cast: Cast) -> None:
         self._cast = cast
@@ -60,45 +60,47 @@ class _SameCast:
 
 
 def extract(brief: SceneBrief) -> SceneFacts:
-    """Scene information extraction from the inventory. Raises CatalogError."""
+    """Extract scene information from the inventory. Raise CatalogError."""
     return _facts(build_base_scene(brief.scene, seed=brief.seed))
 
 
 def play(brief: SceneBrief) -> TalkBrief:
-    """Role-Playing Agent. Raises CatalogError."""
+    """Role-Playing Agent. Raise CatalogError."""
     cast = SocialWriter(brief.seed).cast_of(build_base_scene(brief.scene, seed=brief.seed))
     return TalkBrief(scene=brief.scene, cast=cast, seed=brief.seed)
 
 
 def simulate(brief: TalkBrief) -> SummaryBrief:
-    """Social Simulation Agent. Raises CatalogError, BriefError where nobody comes to such a wish."""
+    """Social Simulation Agent. Raise CatalogError, or BriefError if no conversation leads to a request of the
+    category.
+    """
     rng = _rng(brief.scene, brief.seed)
     variant = _variant(brief.scene, brief.seed, rng)
-    writer, view = SocialWriter(brief.seed, _SameCast(brief.cast)), SceneView(variant.scene)
-    for _ in range(TALKS):
+    writer, view = SocialWriter(brief.seed, _FixedCast(brief.cast)), SceneView(variant.scene)
+    for _ in range(MAX_CONVERSATIONS):
         talked = writer.talk(variant, view, brief.category, rng)
         if talked is not None:
             return SummaryBrief(
                 scene=brief.scene, cast=brief.cast, conversation=talked.conversation, seed=brief.seed
             )
     raise BriefError(
-        f"nobody in {brief.scene} comes to a wish of the kind {brief.category.value!r} in {TALKS} tries: another seed plays in "
-        "other rooms"
+        f"no conversation in {brief.scene} leads to a request of the category {brief.category.value!r} in "
+        f"{MAX_CONVERSATIONS} tries: try another seed, which selects other rooms"
     )
 
 
 def summarise(brief: SummaryBrief) -> RequestSummary:
-    """Summarization Agent. Raises CatalogError."""
+    """Summarization Agent. Raise CatalogError."""
     rng = _rng(brief.scene, brief.seed)
     view = SceneView(build_base_scene(brief.scene, seed=brief.seed))
     voice = Voice(rng)
-    why = voice.choose(why_of(brief.conversation.slot.activity) or (NO_REASON,))
+    why = voice.choose(reasons_for(brief.conversation.slot.activity) or (NO_REASON,))
     instruction = instruction_of(brief.conversation, brief.cast, view, voice, why)
     return RequestSummary(instruction=instruction, wishes=brief.conversation.last_wishes)
 
 
-async def asked(agents: ModelAgents, name: SocialAgent, brief: Any) -> Any:
-    """The same of a language model. Raises LlmError, CatalogError."""
+async def answer_with_model(agents: SocialModelAgents, name: SocialAgent, brief: Any) -> Any:
+    """Answer a brief with a language model. Raise LlmError or CatalogError."""
     if name in (SocialAgent.EXTRACTOR, SocialAgent.PLAYER):
         scene = build_base_scene(brief.scene, seed=brief.seed)
         facts = _facts(scene)
@@ -128,33 +130,33 @@ def _rng(scene: str, seed: int) -> np.random.Generator:
 
 
 def _variant(name: str, seed: int, rng: np.random.Generator) -> Variant:
-    """Some rooms of a base scene with small things about, the same for one seed."""
+    """Return a variant of random rooms of a base scene, with small objects."""
     base = build_base_scene(name, seed=seed)
     rooms = [str(room) for room in rng.permutation([room.name for room in base.rooms])[:ROOMS]]
     return build_variant(base, rooms, f"{base.base}-alone", rng)
 
 
-SOCIAL_DOORS: Final[Mapping[SocialAgent, AgentInterface]] = {
+SOCIAL_AGENTS: Final[Mapping[SocialAgent, AgentInterface]] = {
     SocialAgent.EXTRACTOR: AgentInterface(
-        "scene information extraction: rooms, things and what can be done with them",
+        "scene information extraction: rooms, objects and possible actions",
         TypeAdapter(SceneBrief),
         TypeAdapter(SceneFacts),
         extract,
     ),
     SocialAgent.PLAYER: AgentInterface(
-        "Role-Playing Agent: the people of a scene and their day",
+        "Role-Playing Agent: people of a scene and their schedule",
         TypeAdapter(SceneBrief),
         TypeAdapter(TalkBrief),
         play,
     ),
     SocialAgent.SIMULATOR: AgentInterface(
-        "Social Simulation Agent: a conversation that comes to a request",
+        "Social Simulation Agent: conversation that leads to a request",
         TypeAdapter(TalkBrief),
         TypeAdapter(SummaryBrief),
         simulate,
     ),
     SocialAgent.SUMMARIZER: AgentInterface(
-        "Summarization Agent: one instruction",
+        "Summarization Agent: instruction",
         TypeAdapter(SummaryBrief),
         TypeAdapter(RequestSummary),
         summarise,

@@ -1,4 +1,4 @@
-"""Role-Playing Agent, offline: a seeded cast for a scene that covers every room, with a day for everyone."""
+"""Rule-based Role-Playing Agent: roles by kind of place, and a seeded cast with a schedule that covers every room."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Room, Scene
 
 
-SLOTS_EACH: Final = 5
-"""Things that a person does on the day, at least; every room sees somebody besides."""
+MIN_SLOTS: Final = 5
+"""Number of activities of a person in their own rooms. Further activities cover the remaining rooms."""
 
 
 class RolePlayingAgent(Protocol):
-    """Makes up the people of a scene."""
+    """Agent that invents the people of a scene."""
 
     def cast(self, scene: Scene, rng: np.random.Generator) -> Cast: ...
 
 
 class GrammarRolePlayer:
-    """Draws roles of the scene's milieu. The generator decides all."""
+    """Role-playing by rules: draws roles that suit the kind of place."""
 
     def cast(self, scene: Scene, rng: np.random.Generator) -> Cast:
-        """Two to five people; every room of the scene is somebody's, or somebody is there on this day."""
+        """Return two to five people. Every room belongs to somebody or is visited on this day."""
         milieu = milieu_of(scene.base)
         count = int(rng.integers(2, min(5, len(milieu.roles)) + 1))
         others = rng.permutation(len(milieu.roles) - 1)[: count - 1]
@@ -76,12 +76,14 @@ def _person(
 def _day(
     people: Sequence[Person], rooms: Sequence[Room], milieu: Milieu, rng: np.random.Generator
 ) -> tuple[DaySlot, ...]:
-    """Everyone's own rooms first; then somebody for all else that is done in each room, and for rooms that nobody came to."""
-    types = {room.name: _done_in(room.type, milieu) for room in rooms}
+    """Return the schedule: activities in the people's own rooms, then every other activity of each room, then
+    unvisited rooms.
+    """
+    types = {room.name: _activities_in(room.type, milieu) for room in rooms}
     slots = []
     for person in people:
         own = person.rooms or tuple(types)
-        for _ in range(SLOTS_EACH):
+        for _ in range(MIN_SLOTS):
             slots.append(_slot(person, own[int(rng.integers(len(own)))], types, rng))
     for room, done in types.items():
         for occasion in done:
@@ -94,21 +96,21 @@ def _day(
     return tuple(sorted(dict.fromkeys(slots), key=lambda slot: (slot.time, slot.person, slot.room)))
 
 
-def _done_in(room_type: str, milieu: Milieu) -> tuple[Occasion, ...]:
-    """What is done in such a room of such a place."""
+def _activities_in(room_type: str, milieu: Milieu) -> tuple[Occasion, ...]:
+    """Return the activities of a room type in this kind of place."""
     return tuple(each for each in occasions_in(room_type) if milieu.lived_in or not each.private)
 
 
 def _slot(
     person: Person, room: str, types: Mapping[str, tuple[Occasion, ...]], rng: np.random.Generator
 ) -> DaySlot:
-    """Something that such a person does there; who does nothing of what the room is for passes through."""
+    """Return a slot with an activity of the room that suits the person, or a general activity if none does."""
     options = [each for each in types[room] if each.suits(person)] or occasions_in(ELSEWHERE)
     return _at(options[int(rng.integers(len(options)))], person, room, rng)
 
 
 def _at(occasion: Occasion, person: Person, room: str, rng: np.random.Generator) -> DaySlot:
-    """The occasion in its hour."""
+    """Return a slot at the activity's hour."""
     minute = 15 * int(rng.integers(4))
     return DaySlot(
         time=f"{occasion.hour:02d}:{minute:02d}", person=person.name, room=room, activity=occasion.doing
@@ -116,8 +118,8 @@ def _at(occasion: Occasion, person: Person, room: str, rng: np.random.Generator)
 
 
 @dataclass(frozen=True, slots=True)
-class CastSetting:
-    """A setting for a cast in which all of some ties to the first one are found."""
+class HouseholdSetting:
+    """Setting of a cast that contains all of these ties to the first person."""
 
     words: str
     ties: frozenset[str]
@@ -125,9 +127,9 @@ class CastSetting:
 
 @dataclass(frozen=True, slots=True)
 class SocialRole:
-    """A part that a person can play. ``tie`` is what they are to the first of the cast, ``back`` what that one is to them.
+    """Role of a person. ``tie`` is their relation to the first person of the cast, ``back`` the inverse relation.
 
-    ``apart`` is how many years older they are than the first at least, younger where it is negative; 0: any.
+    ``apart`` is the minimum age difference to the first person in years; negative means younger, 0 means any age.
     """
 
     job: tuple[str, ...]
@@ -135,23 +137,25 @@ class SocialRole:
     tie: str
     back: str
     rooms: tuple[str, ...] = ()
-    """Types of rooms that are theirs, as far as the scene has them."""
+    """Types of rooms that belong to the person, if the scene has them."""
     apart: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class Milieu:
-    """The first role is always played; others are drawn. The first household whose ties a cast has is its setting."""
+    """Kind of place. The first role is always cast, others are drawn. The first matching household becomes the
+    setting.
+    """
 
     setting: tuple[str, ...]
     roles: tuple[SocialRole, ...]
     lived_in: bool = False
-    """Whether people sleep and wash there."""
-    households: tuple[CastSetting, ...] = ()
+    """True if people sleep and wash there."""
+    households: tuple[HouseholdSetting, ...] = ()
 
 
 GENERATION: Final = 20
-"""Years between parents and children at least."""
+"""Minimum age difference between parents and children, in years."""
 _OFFICES: Final = ("private_office", "shared_office", "meeting_room", "break_room", "copy_room", "phone_room")
 _HOME: Final = Milieu(
     ("a home",),
@@ -168,11 +172,11 @@ _HOME: Final = Milieu(
     ),
     lived_in=True,
     households=(
-        CastSetting("a home that three generations share", frozenset({"parent", "child"})),
-        CastSetting("a family home", frozenset({"child"})),
-        CastSetting("a home that somebody shares with a parent", frozenset({"parent"})),
-        CastSetting("a house with a lodger", frozenset({"lodger"})),
-        CastSetting("a home that two people share", frozenset({"partner"})),
+        HouseholdSetting("a home that three generations share", frozenset({"parent", "child"})),
+        HouseholdSetting("a family home", frozenset({"child"})),
+        HouseholdSetting("a home that somebody shares with a parent", frozenset({"parent"})),
+        HouseholdSetting("a house with a lodger", frozenset({"lodger"})),
+        HouseholdSetting("a home that two people share", frozenset({"partner"})),
     ),
 )  # fmt: skip
 _RESTAURANT: Final = Milieu(
@@ -310,5 +314,5 @@ HOBBIES: Final = (
 
 
 def milieu_of(base: str) -> Milieu:
-    """Of a base scene, by the first word of its name; houses that are named after places are homes."""
+    """Return the kind of place of a base scene, from the first word of its name. Scenes named after towns are homes."""
     return _BY_STEM.get(base.split("_")[0], _HOME)

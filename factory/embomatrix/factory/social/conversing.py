@@ -1,7 +1,7 @@
-"""Social Simulation Agent, offline: a conversation in which a request takes shape over several rounds.
+"""Rule-based Social Simulation Agent: a conversation in which a request takes shape over several rounds.
 
-The wishes that it ends with are pieces of a goal that the scene allows. What comes before is made from them: a vague need with
-its reason, a question, a first answer that is changed later, a chore that the robot has to refuse, a wish more.
+The final wishes are conjuncts of a feasible goal. The conversation is derived from them: a vague need with its
+reason, a question, an answer that may change, a request that the robot refuses, and further wishes.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.factory.social.fitting import themes_of
 from embomatrix.factory.social.phrases import (
     AGREEMENTS,
-    JOINS,
-    MATTERS,
+    CONJUNCTIONS,
+    NEEDS,
     QUESTIONS,
     TURNS,
-    called,
-    filled,
-    said_once,
+    fill,
+    shorten_repeated_rooms,
+    spoken_category,
 )
 from embomatrix.factory.social.values import ROBOT, Act, Conversation, DialogueTurn
 from embomatrix.factory.writer.goals import placed_elsewhere
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from embomatrix.factory.scenes.view import SceneView
     from embomatrix.factory.social.values import Cast, DaySlot
-    from embomatrix.factory.writer.goals import GoalConjunct, Workshop
+    from embomatrix.factory.writer.goals import GoalConjunct, GoalContext
     from embomatrix.factory.writer.words import Voice
 
 
@@ -39,59 +39,61 @@ REFUSED_SHARE: Final = 0.35
 AMENDED_SHARE: Final = 0.7
 PLACES_TRIED: Final = 5
 INTERJECTED_SHARE: Final = 0.4
-"""Of amendments, those that somebody else brings up who is at home in the same room."""
+"""Share of the changes that another person in the same room brings up."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConversationScenario:
-    """Who needs what, where, when, and why. ``pieces`` are the wishes that the conversation is to end with."""
+    """Person, time, place and reason of a need. ``conjuncts`` are the wishes that the conversation ends with."""
 
     cast: Cast
     slot: DaySlot
-    pieces: tuple[GoalConjunct, ...]
+    conjuncts: tuple[GoalConjunct, ...]
     why: str
 
 
 class GrammarConversation:
-    """One conversation, turn by turn."""
+    """Generator of one conversation, turn by turn."""
 
-    def __init__(self, scenario: ConversationScenario, shop: Workshop, voice: Voice) -> None:
+    def __init__(self, scenario: ConversationScenario, context: GoalContext, voice: Voice) -> None:
         self._scenario = scenario
-        self._shop = shop
-        self._rng = shop.rng
+        self._shop = context
+        self._rng = context.rng
         self._voice = voice
         self._turns: list[DialogueTurn] = []
 
     def run(self) -> Conversation:
-        """Need, question, answer, changes, what the robot can't do and offers in its place, wishes more, confirmation."""
-        slot, pieces = self._scenario.slot, self._scenario.pieces
-        first, further = pieces[0], list(pieces[1:])
+        """Return the conversation: need, question, answer, changes, refusal with a proposal, further wishes,
+        confirmation.
+        """
+        slot, conjuncts = self._scenario.slot, self._scenario.conjuncts
+        first, further = conjuncts[0], list(conjuncts[1:])
         self._open(first)
-        earlier = self._earlier(first) if self._rng.random() < AMENDED_SHARE else None
+        earlier = self._alternative_place(first) if self._rng.random() < AMENDED_SHARE else None
         wished = self._settle(first, earlier)
         if self._rng.random() < REFUSED_SHARE:
             self._refuse(further)
-        for piece in further:
-            self._say(self._someone_near(), Act.ADD, clause=piece.clause)
-        self._say(ROBOT, Act.CONFIRM, clauses=self._joined(pieces))
+        for conjunct in further:
+            self._say(self._person_nearby(), Act.ADD, clause=conjunct.clause)
+        self._say(ROBOT, Act.CONFIRM, clauses=self._joined(conjuncts))
         return Conversation(
             slot=slot,
             turns=tuple(self._turns),
             first_wish=wished,
-            last_wishes=tuple(piece.clause for piece in pieces),
+            last_wishes=tuple(conjunct.clause for conjunct in conjuncts),
         )
 
     def _open(self, first: GoalConjunct) -> None:
         sign = "place" if first.kind == "place" else first.signs[0].partition("(")[0]
-        matters = MATTERS.get(f"{sign} {first.manner}", MATTERS[sign])
-        matter = filled(self._voice.choose(matters), thing=first.thing)
+        matters = NEEDS.get(f"{sign} {first.manner}", NEEDS[sign])
+        matter = fill(self._voice.choose(matters), thing=first.thing)
         slot = self._scenario.slot
         self._say(slot.person, Act.NEED, activity=slot.activity, matter=matter, why=self._scenario.why)
-        question = filled(self._voice.choose(QUESTIONS[first.kind]), thing=first.thing)
+        question = fill(self._voice.choose(QUESTIONS[first.kind]), thing=first.thing)
         self._say(ROBOT, Act.CLARIFY, question=question)
 
-    def _earlier(self, first: GoalConjunct) -> GoalConjunct | None:
-        """Another place for the same thing, where a person would put it too."""
+    def _alternative_place(self, first: GoalConjunct) -> GoalConjunct | None:
+        """Return another plausible place for the same object, or None."""
         for _ in range(PLACES_TRIED):
             other = placed_elsewhere(self._shop, first)
             if other is not None and themes_of(other, self._shop.view):
@@ -99,9 +101,9 @@ class GrammarConversation:
         return None
 
     def _refuse(self, further: list[GoalConjunct]) -> None:
-        """Somebody asks for what the robot can't do; it offers the next wish, which is then no longer among the ``further``."""
+        """Add a request that the robot refuses. It proposes the next wish instead, which leaves ``further``."""
         slot = self._scenario.slot
-        chore, reason = impossible_chore(self._shop.view, slot.room, self._rng)
+        chore, reason = impossible_request(self._shop.view, slot.room, self._rng)
         self._say(slot.person, Act.ADD, clause=chore)
         self._say(ROBOT, Act.REFUSE, chore=chore, reason=reason)
         if further:
@@ -111,38 +113,38 @@ class GrammarConversation:
             )
 
     def _settle(self, first: GoalConjunct, earlier: GoalConjunct | None) -> str:
-        """The first wish is agreed on, at once or after a change; returns what was wished at first."""
+        """Agree on the first wish, directly or after a change, and return the initial wish."""
         person = self._scenario.slot.person
         if earlier is None:
             self._say(person, Act.ANSWER, clause=first.clause)
             return first.clause
         self._say(person, Act.ANSWER, clause=earlier.clause)
         self._say(ROBOT, Act.CONFIRM, clauses=earlier.clause)
-        changer = self._someone_near() if self._rng.random() < INTERJECTED_SHARE else person
+        changer = self._person_nearby() if self._rng.random() < INTERJECTED_SHARE else person
         self._say(changer, Act.AMEND, clause=first.clause)
         return earlier.clause
 
-    def _someone_near(self) -> str:
-        """The person, or another one who is at home in this room: who hears what is said here."""
+    def _person_nearby(self) -> str:
+        """Return the person of the slot, or another person who belongs to the room and hears the conversation."""
         slot, cast = self._scenario.slot, self._scenario.cast
         near = [
             person.name for person in cast.people if slot.room in person.rooms and person.name != slot.person
         ]
         return near[int(self._rng.integers(len(near)))] if near and self._rng.random() < 0.5 else slot.person
 
-    def _joined(self, pieces: Sequence[GoalConjunct]) -> str:
-        text = pieces[0].clause
-        for piece in pieces[1:]:
-            text += self._voice.choose(JOINS) + piece.clause
+    def _joined(self, conjuncts: Sequence[GoalConjunct]) -> str:
+        text = conjuncts[0].clause
+        for conjunct in conjuncts[1:]:
+            text += self._voice.choose(CONJUNCTIONS) + conjunct.clause
         return text
 
     def _say(self, speaker: str, act: Act, **words: str) -> None:
-        text = said_once(filled(self._voice.choose(TURNS[act]), **words), self._shop.view)
+        text = shorten_repeated_rooms(fill(self._voice.choose(TURNS[act]), **words), self._shop.view)
         self._turns.append(DialogueTurn(speaker=speaker, act=act, text=text))
 
 
 def starting_slots(cast: Cast, rooms: Sequence[str], rng: np.random.Generator) -> list[DaySlot]:
-    """The day's slots in random order, those in the given rooms first."""
+    """Return the day's slots in random order, those in the given rooms first."""
     order = [cast.day[int(at)] for at in rng.permutation(len(cast.day))]
     return sorted(order, key=lambda slot: slot.room not in rooms)
 
@@ -164,20 +166,20 @@ _BY_ROOM: Final[Mapping[str, tuple[tuple[str, str], ...]]] = {
     "classroom": (("wipe the board", "I don't wipe"),),
     "private_office": (("call them back", "I don't use the telephone"),),
 }
-HEAVY_KG: Final = 2.0
-"""So many times the arm's load: nobody doubts that it is too heavy."""
+HEAVY_LOADS: Final = 2.0
+"""Multiple of the arm's load from which on an object is obviously too heavy."""
 
 
-def impossible_chore(view: SceneView, room: str, rng: np.random.Generator) -> tuple[str, str]:
-    """A chore and why the robot can't do it; furniture of the room counts, if it is too heavy."""
+def impossible_request(view: SceneView, room: str, rng: np.random.Generator) -> tuple[str, str]:
+    """Return a request and the reason why the robot can't fulfil it. Heavy furniture of the room is a candidate."""
     types = {item.name: item.type for item in view.scene.rooms}
     options = [*_ANYWHERE, *_BY_ROOM.get(types.get(room, ""), ())]
     options += [
         (
-            f"push the {called(view.category(name))} to the other wall",
+            f"push the {spoken_category(view.category(name))} to the other wall",
             f"it weighs more than the {ROBOT_LIMITS.mass_kg:g} kg that my arm lifts",
         )
         for name in view.in_room.get(room, ())
-        if view.asset(name).mass_kg > HEAVY_KG * ROBOT_LIMITS.mass_kg and len(view.alike(name)) == 1
+        if view.asset(name).mass_kg > HEAVY_LOADS * ROBOT_LIMITS.mass_kg and len(view.alike(name)) == 1
     ]
     return options[int(rng.integers(len(options)))]

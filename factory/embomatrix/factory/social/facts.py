@@ -1,4 +1,4 @@
-"""Scene information extraction: what a language model is told of a scene, from its inventory."""
+"""Scene information extraction: description of a scene for a language model, from its inventory."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ if TYPE_CHECKING:
 
     from embomatrix.factory.scenes.view import SceneView
 
-MOST_IN_ROOM: Final = 40
-"""Things that are told of a room; those that a task can be about come first."""
+MAX_OBJECTS_IN_ROOM: Final = 40
+"""Maximum number of objects described per room. Objects that a task can be about come first."""
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectFacts:
-    """One object: what a person calls it, what it rests on or in, and what can be done with it."""
+    """Facts about one object: name, category, room, support, and possible actions."""
 
     name: str
     category: str
@@ -29,7 +29,7 @@ class ObjectFacts:
 
 @dataclass(frozen=True, slots=True)
 class RoomFacts:
-    """A room with its floor's area in m² and what it holds. ``left_out`` things are not listed."""
+    """Room with its floor area in m² and its objects. ``left_out`` objects are not listed."""
 
     name: str
     type: str
@@ -37,41 +37,41 @@ class RoomFacts:
     things: tuple[ObjectFacts, ...]
     left_out: int
     sight: str = ""
-    """What it looks like, in words, where a model has seen it."""
+    """Appearance of the room in words, if a vision model described it."""
 
 
 @dataclass(frozen=True, slots=True)
 class SceneFacts:
-    """All that is told. Objects are known by their names in the scene."""
+    """Facts about a scene. Objects have their scene names."""
 
     base: str
     rooms: tuple[RoomFacts, ...]
 
     @property
     def things(self) -> dict[str, ObjectFacts]:
-        """By name."""
+        """Objects by name."""
         return {thing.name: thing for room in self.rooms for thing in room.things}
 
     def described(self) -> str:
-        """Rooms as a list, things one a line: name, place, what can be done."""
+        """Return the description: rooms, and one line per object with name, place and possible actions."""
         return "\n".join(_room_lines(room) for room in self.rooms)
 
 
 def facts_of(view: SceneView, rooms: Sequence[str]) -> SceneFacts:
-    """What the given rooms of a scene hold."""
+    """Return the facts about the given rooms of a scene."""
     found = []
     for room in view.scene.rooms:
         if room.name not in rooms:
             continue
         names = sorted(view.in_room[room.name], key=lambda name: not _abilities(view, name))
-        kept = tuple(_thing(view, name) for name in names[:MOST_IN_ROOM])
+        kept = tuple(_thing(view, name) for name in names[:MAX_OBJECTS_IN_ROOM])
         area_m2 = round(room.size_m[0] * room.size_m[1], 2)
         found.append(RoomFacts(room.name, room.type, area_m2, kept, len(names) - len(kept)))
     return SceneFacts(view.scene.base, tuple(found))
 
 
 def with_sights(facts: SceneFacts, sights: Mapping[str, str]) -> SceneFacts:
-    """The facts, with what the rooms look like, by name."""
+    """Return the facts with the appearance of each room."""
     return replace(facts, rooms=tuple(replace(room, sight=sights.get(room.name, "")) for room in facts.rooms))
 
 
@@ -82,7 +82,7 @@ def _thing(view: SceneView, name: str) -> ObjectFacts:
 
 
 def _abilities(view: SceneView, name: str) -> tuple[str, ...]:
-    """What a task may do with it, in the words of the goal's predicates."""
+    """Return the possible actions of a task on an object, in the words of the goal's predicates."""
     tests = (
         ("can be carried", view.is_portable(name)),
         ("things can be put on it", view.is_surface(name)),

@@ -1,4 +1,4 @@
-"""Which wishes a person would have: what they do decides, and where people keep such things."""
+"""Plausibility of wishes: a wish must suit a person's activity and household conventions."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ GROUP_THEMES: Final[Mapping[ItemKind, frozenset[Theme]]] = {
     ItemKind.TOILETRIES: _themes("washing"),
     ItemKind.DECORATION: _themes("guests tidying leaving"),
 }
-"""What somebody has in mind who wants a thing of the group elsewhere."""
+"""Themes of a wish to move an object of the group."""
 
 _KITCHEN: Final = frozenset(
     {"kitchen", "bar", "break_room", "pantry_room", "dining_room", "garden", "grocery_store"}
@@ -63,18 +63,18 @@ GROUP_ROOMS: Final[Mapping[ItemKind, frozenset[str]]] = {
     ItemKind.TABLEWARE: _EATING | _WORKING | {"storage_room"},
     ItemKind.TOILETRIES: _WASHING,
 }
-"""Types of rooms that people take things of a group to; of the groups that are not listed, to any but those of `NOT_IN`."""
+"""Room types that people bring objects of a group to. Groups without an entry go to any room not in `NOT_IN`."""
 _WET: Final = frozenset({"bathroom", "spa", "hammam", "sauna", "locker_room"})
-NOT_IN: Final[Mapping[ItemKind, frozenset[str]]] = {
+EXCLUDED_ROOMS: Final[Mapping[ItemKind, frozenset[str]]] = {
     **dict.fromkeys((ItemKind.DEVICES, ItemKind.OFFICE, ItemKind.TOYS), _WET),
     ItemKind.BOOKS: frozenset({"hammam", "sauna"}),
 }
-"""Types of rooms that nobody takes things of a group to."""
+"""Room types that people bring no objects of the group to."""
 FOR_DISHES: Final = frozenset({"dishwasher", "dish_rack", "dish_rack_cart"})
 NOT_FOR_FOOD: Final = frozenset({"bookcase", "bookshelf", "piano"})
 _EATEN: Final = frozenset({ItemKind.FOOD, ItemKind.FRUIT, ItemKind.PACKAGES})
-NOT_NAMED: Final = frozenset({"eyeglasses"})
-"""Words that take a plural verb, which the sentences have not."""
+PLURAL_NOUNS: Final = frozenset({"eyeglasses"})
+"""Plural nouns, which the sentence templates don't support."""
 NOT_ON_SOFT: Final = frozenset(
     {
         ItemKind.DECORATION,
@@ -176,8 +176,8 @@ SWITCHES: Final[Mapping[str, frozenset[Theme]]] = {
     "checkout_counter": _themes("stock"),
     "grandfather_clock": _themes("guests"),
 }
-"""What somebody has in mind who wants such a thing opened or switched."""
-NEVER: Final = frozenset(
+"""Themes of a wish to open or switch an object of the category."""
+NEVER_REQUESTED: Final = frozenset(
     {
         "fire_extinguisher",
         "pay_phone",
@@ -194,8 +194,10 @@ NEVER: Final = frozenset(
         "water_cooler",
     }
 )
-_NEVER_ENDINGS: Final = ("_shaker", "_atomizer", "_bottle", "_grinder", "_dispenser", "_can")
-"""Nobody asks a robot to open or to switch these, nor what ends so: in the catalog a salt shaker has a switch."""
+_NEVER_REQUESTED_ENDINGS: Final = ("_shaker", "_atomizer", "_bottle", "_grinder", "_dispenser", "_can")
+"""Categories, and endings of categories, that nobody asks to open or switch. In the catalog, a salt shaker has a
+switch.
+"""
 STORAGE_THEMES: Final[Mapping[str, frozenset[Theme]]] = {
     **dict.fromkeys(_KITCHEN, _themes("cooking meals tidying stock guests")),
     **dict.fromkeys(
@@ -204,42 +206,46 @@ STORAGE_THEMES: Final[Mapping[str, frozenset[Theme]]] = {
     ),
     **dict.fromkeys(_WASHING, _themes("washing leaving tidying")),
 }
-_PLAIN: Final = _themes("tidying leaving")
+_GENERAL: Final = _themes("tidying leaving")
 
 
-def fits(piece: GoalConjunct, view: SceneView, slot: DaySlot) -> bool:
-    """Whether somebody who does this would wish for that, for a slot that the grammar made."""
+def fits(conjunct: GoalConjunct, view: SceneView, slot: DaySlot) -> bool:
+    """True if the activity of a rule-based slot suits the wish."""
     occasion = occasion_of(slot.activity)
-    return occasion is not None and bool(themes_of(piece, view) & occasion.themes)
+    return occasion is not None and bool(themes_of(conjunct, view) & occasion.themes)
 
 
-def themes_of(piece: GoalConjunct, view: SceneView) -> frozenset[Theme]:
-    """What a wish can be for; nothing for what no person would ask for."""
-    thing = view.category(piece.objects[0])
-    if thing in NOT_NAMED:
+def themes_of(conjunct: GoalConjunct, view: SceneView) -> frozenset[Theme]:
+    """Return the themes of a wish; empty if the wish is implausible."""
+    thing = view.category(conjunct.objects[0])
+    if thing in PLURAL_NOUNS:
         return frozenset()
-    if piece.kind == "thermal":
-        warmed = any(sign.startswith(("cooked", "hot")) for sign in piece.signs)
-        by_coffee = any(view.category(name) in FOR_DRINKS for name in piece.objects)
-        odd = by_coffee or (warmed and thing in NOT_COOKED) or not _is_served_well(piece, view, warmed=warmed)
+    if conjunct.kind == "thermal":
+        warmed = any(sign.startswith(("cooked", "hot")) for sign in conjunct.signs)
+        by_coffee = any(view.category(name) in FOR_DRINKS for name in conjunct.objects)
+        odd = (
+            by_coffee
+            or (warmed and thing in NOT_COOKED)
+            or not _is_served_well(conjunct, view, warmed=warmed)
+        )
         return frozenset() if odd else _themes("cooking meals")
-    room_type = _room_type(view, piece.objects[0])
-    if piece.kind == "switch":
-        if thing in NEVER or thing.endswith(_NEVER_ENDINGS):
+    room_type = _room_type(view, conjunct.objects[0])
+    if conjunct.kind == "switch":
+        if thing in NEVER_REQUESTED or thing.endswith(_NEVER_REQUESTED_ENDINGS):
             return frozenset()
-        return SWITCHES.get(thing, STORAGE_THEMES.get(room_type, _PLAIN))
-    places = piece.objects[1:]
-    inside = any(sign.startswith("inside") for sign in piece.signs)
+        return SWITCHES.get(thing, STORAGE_THEMES.get(room_type, _GENERAL))
+    places = conjunct.objects[1:]
+    inside = any(sign.startswith("inside") for sign in conjunct.signs)
     if not places or not is_plausible(
         thing, view.category(places[0]), _room_type(view, places[0]), inside=inside
     ):
         return frozenset()
-    return GROUP_THEMES.get(_GROUP_OF[thing], _PLAIN) if thing in _GROUP_OF else _PLAIN
+    return GROUP_THEMES.get(_GROUP_OF[thing], _GENERAL) if thing in _GROUP_OF else _GENERAL
 
 
-def _is_served_well(piece: GoalConjunct, view: SceneView, *, warmed: bool) -> bool:
-    """Whether food that was heated, cooked or frozen ends up where a person would want it; true where nobody says where."""
-    for sign in piece.signs:
+def _is_served_well(conjunct: GoalConjunct, view: SceneView, *, warmed: bool) -> bool:
+    """True if heated, cooked or frozen food ends up in a plausible place, or if the wish names no place."""
+    for sign in conjunct.signs:
         relation, _, names = sign.rstrip(")").partition("(")
         food, _, host = names.partition(",")
         if not host:
@@ -247,17 +253,17 @@ def _is_served_well(piece: GoalConjunct, view: SceneView, *, warmed: bool) -> bo
         inside = relation == "inside"
         if inside and host not in (OVENS if warmed else COLD):
             return False
-        room = next(_room_type(view, name) for name in piece.objects if view.category(name) == host)
+        room = next(_room_type(view, name) for name in conjunct.objects if view.category(name) == host)
         if not is_plausible(food, host, room, inside=inside):
             return False
     return True
 
 
 def is_plausible(thing: str, host: str, room_type: str, *, inside: bool) -> bool:
-    """Whether a person would put a thing of the category on or in such a host in such a room."""
+    """True if people put such an object on or in such a host in such a room."""
     group = _GROUP_OF.get(thing)
     if group is not None and (
-        room_type not in GROUP_ROOMS.get(group, {room_type}) or room_type in NOT_IN.get(group, ())
+        room_type not in GROUP_ROOMS.get(group, {room_type}) or room_type in EXCLUDED_ROOMS.get(group, ())
     ):
         return False
     if host in NOT_FOR_FOOD and group in _EATEN:
@@ -280,19 +286,19 @@ def is_plausible(thing: str, host: str, room_type: str, *, inside: bool) -> bool
 
 
 def best_slot(
-    cast: Cast, pieces: Sequence[GoalConjunct], view: SceneView, asked: Mapping[str, int]
+    cast: Cast, conjuncts: Sequence[GoalConjunct], view: SceneView, asked: Mapping[str, int]
 ) -> tuple[float, DaySlot] | None:
-    """The slot of the day in which somebody would wish for all of it, with a score; None where nobody would.
+    """Return the slot that suits all wishes best, with its score; None if none does.
 
-    Somebody who is where the things are counts more, and so does who has asked for less until now.
+    Slots in the rooms of the objects score higher. People and activities with earlier requests score lower.
     """
-    rooms = [[view.room(name) for name in piece.objects] for piece in pieces]
+    rooms = [[view.room(name) for name in conjunct.objects] for conjunct in conjuncts]
     found: list[tuple[float, DaySlot]] = []
     for slot in cast.day:
-        if not all(fits(piece, view, slot) for piece in pieces):
+        if not all(fits(conjunct, view, slot) for conjunct in conjuncts):
             continue
-        here = sum(slot.room in each for each in rooms) / len(pieces)
-        owned = sum(bool({*each} & {*cast.of(slot.person).rooms}) for each in rooms) / len(pieces)
+        here = sum(slot.room in each for each in rooms) / len(conjuncts)
+        owned = sum(bool({*each} & {*cast.of(slot.person).rooms}) for each in rooms) / len(conjuncts)
         if here or owned:
             found.append(
                 (2 * here + owned - 0.5 * asked.get(slot.person, 0) - asked.get(slot.activity, 0), slot)
@@ -300,8 +306,8 @@ def best_slot(
     return max(found, key=lambda item: item[0]) if found else None
 
 
-def why_of(activity: str) -> tuple[str, ...]:
-    """Reasons to want help with something else; none where the grammar does not know the activity."""
+def reasons_for(activity: str) -> tuple[str, ...]:
+    """Return reasons for needing help during an activity; empty for an unknown activity."""
     occasion: Occasion | None = occasion_of(activity)
     return occasion.why if occasion is not None else ()
 

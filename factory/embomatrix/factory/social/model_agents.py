@@ -1,7 +1,7 @@
-"""Role-Playing, Social Simulation and Summarization Agent behind a language model.
+"""Role-Playing, Social Simulation and Summarization Agent on a language model.
 
-Each asks for a typed answer and has it checked against the scene; what is wrong goes back to the model as a sentence. What
-stands between the marks of a scene's description is data: a name in it that reads like an order is a name.
+Each agent requests a typed answer and checks it against the scene. Problems are returned to the model as a sentence.
+The scene's description is marked as data, so that instructions in names are ignored.
 """
 
 from __future__ import annotations
@@ -38,19 +38,19 @@ SIGHT: Final = "scene information extraction"
 CAST: Final = "role-playing agent"
 TALK: Final = "social simulation agent"
 SUMMARY: Final = "summarization agent"
-"""Who asks, for ledgers and errors."""
+"""Purposes of the requests, for ledgers and errors."""
 
 
 class RoomSighting(BaseModel):
-    """What a model that sees says of each room."""
+    """Description of each room by a vision model."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     rooms: dict[str, Annotated[str, Field(min_length=10, max_length=300, pattern=r"^[^\n<>]*$")]]
 
 
-class Talk(BaseModel):
-    """What the model writes of a conversation."""
+class ConversationAnswer(BaseModel):
+    """Conversation as written by the model."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -59,8 +59,8 @@ class Talk(BaseModel):
     last_wishes: tuple[str, ...] = Field(min_length=1, max_length=6)
 
 
-class ModelAgents:
-    """All three agents on one model; ``temperature`` is that of what is made up, ``max_tokens`` bounds an answer."""
+class SocialModelAgents:
+    """Social agents on one model. ``temperature`` applies to invented content; ``max_tokens`` limits an answer."""
 
     def __init__(
         self, model: ChatModel, *, temperature: float = 0.9, attempts: int = 3, max_tokens: int = 2048
@@ -71,14 +71,14 @@ class ModelAgents:
         self._max_tokens = max_tokens
 
     async def describe(self, facts: SceneFacts, pictures: tuple[bytes, ...], seed: int) -> RoomSighting:
-        """Scene information extraction: what rooms look like, from pictures of them as PNG files. Raises LlmError."""
+        """Describe the rooms from pictures in PNG format. Raise LlmError."""
         rooms = [room.name for room in facts.rooms]
 
         def check(sight: RoomSighting) -> None:
             if unknown := sorted(set(sight.rooms) - set(rooms)):
                 raise ValueError(f"there is no room {unknown[0]!r}: the rooms are {', '.join(rooms)}")
             if missing := [room for room in rooms if room not in sight.rooms]:
-                raise ValueError(f"nothing is said of {', '.join(missing)}: give each room a sentence")
+                raise ValueError(f"no sentence describes {', '.join(missing)}: give each room a sentence")
 
         user = Message(Speaker.USER, SIGHT_USER.format(scene=facts.described()), pictures)
         messages = (Message(Speaker.SYSTEM, SIGHT_SYSTEM), user)
@@ -86,7 +86,7 @@ class ModelAgents:
         return (await ask(self._model, request, RoomSighting, check=check, attempts=self._attempts)).value
 
     async def cast(self, facts: SceneFacts, seed: int) -> Cast:
-        """People who fit the scene and are found in every room of it. Raises LlmError."""
+        """Invent people who suit the scene and cover every room. Raise LlmError."""
         rooms = tuple(room.name for room in facts.rooms)
 
         def check(cast: Cast) -> None:
@@ -104,13 +104,13 @@ class ModelAgents:
     async def converse(
         self, facts: SceneFacts, cast: Cast, slot: DaySlot, category: TaskCategory, seed: int
     ) -> Conversation:
-        """Several rounds between people and the robot, in which a request takes shape. Raises LlmError."""
+        """Write a conversation between people and the robot that leads to a request. Raise LlmError."""
 
-        def check(talk: Talk) -> None:
+        def check(talk: ConversationAnswer) -> None:
             speakers = {turn.speaker for turn in talk.turns}
             if unknown := sorted(speakers - {ROBOT, *cast.names}):
                 raise ValueError(
-                    f"nobody is called {unknown[0]!r}: speakers are {ROBOT}, {', '.join(cast.names)}"
+                    f"there is no speaker {unknown[0]!r}: the speakers are {ROBOT}, {', '.join(cast.names)}"
                 )
             if (
                 ROBOT not in speakers
@@ -131,7 +131,9 @@ class ModelAgents:
             hint=CATEGORY_HINTS[category.value],
         )
         request = self._request(TALK, TALK_SYSTEM.format(limits=ROBOT_LIMITS), user, seed)
-        talk = (await ask(self._model, request, Talk, check=check, attempts=self._attempts)).value
+        talk = (
+            await ask(self._model, request, ConversationAnswer, check=check, attempts=self._attempts)
+        ).value
         return Conversation(
             slot=slot, turns=talk.turns, first_wish=talk.first_wish, last_wishes=talk.last_wishes
         )
@@ -139,7 +141,7 @@ class ModelAgents:
     async def summarise(
         self, facts: SceneFacts, view: SceneView, conversation: Conversation, seed: int
     ) -> TaskRequest:
-        """The conversation's outcome over things that are there. Raises LlmError."""
+        """Summarise the conversation as a request about existing objects. Raise LlmError."""
         known = frozenset(facts.things)
         said = "\n".join(f"{turn.speaker}: {turn.text}" for turn in conversation.turns)
         user = SUMMARY_USER.format(scene=facts.described(), conversation=said)

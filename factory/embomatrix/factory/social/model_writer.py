@@ -1,4 +1,4 @@
-"""Tasks by social simulation with a language model: its agents make up people, talk and request; the scene decides."""
+"""Task writer by social simulation with a language model. The scene decides which requests become drafts."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.factory.admission import RefusalReason, TaskRefusal
 from embomatrix.factory.social.conversing import starting_slots
 from embomatrix.factory.social.facts import facts_of, with_sights
-from embomatrix.factory.social.requests import piece_of
+from embomatrix.factory.social.requests import conjunct_of
 from embomatrix.factory.social.summary import transcript_of
-from embomatrix.factory.writer.goals import Workshop
+from embomatrix.factory.writer.goals import GoalContext
 from embomatrix.factory.writer.tasks import Draft, DraftOrder, draft_of
 from embomatrix.llm.loop import OnOneLoop
 from embomatrix.llm.patience import FailureLimit
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from embomatrix.factory.scenes.view import SceneView
     from embomatrix.factory.social.facts import SceneFacts
-    from embomatrix.factory.social.model_agents import ModelAgents
+    from embomatrix.factory.social.model_agents import SocialModelAgents
     from embomatrix.factory.social.values import Cast
     from embomatrix.factory.writer.variant import Variant
     from embomatrix.world.scene import Scene
@@ -33,28 +33,28 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 SEEDS = 2**31
-AT_ONCE: Final = 8
-"""Drafts that are asked for at once: as many as an endpoint is asked at a time."""
+CONCURRENT_DRAFTS: Final = 8
+"""Number of concurrent drafts, equal to the endpoint's limit of concurrent requests."""
 
 
 class ModelWriter(OnOneLoop):
-    """Writes drafts by what the agents answer. An answer that stays unusable, or does not come, costs its draft and no more.
+    """Task writer on the social agents. An unusable or missing answer costs only its draft.
 
-    ``look`` gives pictures of a scene, for a model that sees: then each base scene is looked at once, before anything is asked.
+    ``look`` renders pictures of a scene for a vision model, once per base scene.
     """
 
-    at_once = AT_ONCE
+    at_once = CONCURRENT_DRAFTS
 
     def __init__(
         self,
-        agents: ModelAgents,
+        agents: SocialModelAgents,
         endpoint: AbstractAsyncContextManager[object] | None = None,
         look: Callable[[Scene], tuple[bytes, ...]] | None = None,
     ) -> None:
         super().__init__(endpoint)
         self._agents = agents
         self._look = look
-        self._patience = FailureLimit()
+        self._failure_limit = FailureLimit()
         self._casts: dict[str, Cast] = {}
         self._sights: dict[str, Mapping[str, str]] = {}
 
@@ -66,50 +66,53 @@ class ModelWriter(OnOneLoop):
         task_id: str,
         rng: np.random.Generator,
     ) -> Draft | TaskRefusal:
-        """A draft, or why the model gave none. Raises EndpointError where nobody answered a few times in a row."""
+        """Return a draft, or the reason for its absence. Raise EndpointError after several missing answers in a row."""
         return self.write_all(variant, view, [DraftOrder(category, task_id, rng)])[0]
 
     def write_all(
         self, variant: Variant, view: SceneView, orders: Sequence[DraftOrder]
     ) -> list[Draft | TaskRefusal]:
-        """What comes of orders that are asked for at once; of the first alone where nobody makes up the people.
+        """Return the drafts of concurrent orders; only the first one if the model gives no cast.
 
-        Raises EndpointError where nobody answered a few times in a row.
+        Raise EndpointError after several missing answers in a row.
         """
-        answers = self._runner.run(self._answers(variant, view, orders))
-        return [self._told(order, answer) for order, answer in zip(orders, answers, strict=False)]
+        answers = self._runner.run(self._drafts(variant, view, orders))
+        return [self._outcome(order, answer) for order, answer in zip(orders, answers, strict=False)]
 
-    def _told(self, order: DraftOrder, answer: Draft | LlmError) -> Draft | TaskRefusal:
+    def _outcome(self, order: DraftOrder, answer: Draft | LlmError) -> Draft | TaskRefusal:
         if isinstance(answer, EndpointError):
-            self._patience.unanswered(answer)
+            self._failure_limit.unanswered(answer)
             return _refused(order.task_id, RefusalReason.NO_ANSWER, answer)
-        self._patience.answered()
+        self._failure_limit.answered()
         if isinstance(answer, LlmError):
             return _refused(order.task_id, RefusalReason.UNUSABLE_ANSWER, answer)
         return answer
 
-    async def _answers(
+    async def _drafts(
         self, variant: Variant, view: SceneView, orders: Sequence[DraftOrder]
     ) -> list[Draft | LlmError]:
         seeds = [int(order.rng.integers(SEEDS)) for order in orders]
         try:
-            cast = await self._people(variant, view, seeds[0])
+            cast = await self._cast(variant, view, seeds[0])
         except LlmError as error:
             return [error]
         return await asyncio.gather(
-            *(self._one(variant, view, order, cast, seed) for order, seed in zip(orders, seeds, strict=True))
+            *(
+                self._draft(variant, view, order, cast, seed)
+                for order, seed in zip(orders, seeds, strict=True)
+            )
         )
 
-    async def _people(self, variant: Variant, view: SceneView, seed: int) -> Cast:
-        """Those of the base scene, made up once."""
+    async def _cast(self, variant: Variant, view: SceneView, seed: int) -> Cast:
+        """Return the cast of the base scene, which is requested once."""
         base = variant.scene.base
         if base not in self._casts:
             everywhere = facts_of(view, [room.name for room in variant.scene.rooms])
-            sights = self._sights[base] = await self._seen(variant.scene, everywhere, seed)
+            sights = self._sights[base] = await self._sights_of(variant.scene, everywhere, seed)
             self._casts[base] = await self._agents.cast(with_sights(everywhere, sights), seed)
         return self._casts[base]
 
-    async def _one(
+    async def _draft(
         self, variant: Variant, view: SceneView, order: DraftOrder, cast: Cast, seed: int
     ) -> Draft | LlmError:
         facts = with_sights(facts_of(view, variant.rooms), self._sights[variant.scene.base])
@@ -119,19 +122,19 @@ class ModelWriter(OnOneLoop):
             request = await self._agents.summarise(facts, view, conversation, seed)
         except LlmError as error:
             return error
-        pieces = [piece_of(wish, view) for wish in request.wishes]
-        transcript = transcript_of(cast, conversation, request.instruction, pieces)
-        shop = Workshop(view, variant, order.rng)
-        return draft_of(shop, order.category, order.task_id, pieces, request.instruction, transcript)
+        conjuncts = [conjunct_of(wish, view) for wish in request.wishes]
+        transcript = transcript_of(cast, conversation, request.instruction, conjuncts)
+        context = GoalContext(view, variant, order.rng)
+        return draft_of(context, order.category, order.task_id, conjuncts, request.instruction, transcript)
 
-    async def _seen(self, scene: Scene, facts: SceneFacts, seed: int) -> Mapping[str, str]:
-        """What each room looks like; nothing where nobody looks, or what the model says of it can't be used."""
+    async def _sights_of(self, scene: Scene, facts: SceneFacts, seed: int) -> Mapping[str, str]:
+        """Return the appearance of each room; empty without ``look`` or after an unusable answer."""
         if self._look is None:
             return {}
         try:
             return (await self._agents.describe(facts, self._look(scene), seed)).rooms
         except UnusableReplyError as error:
-            logger.warning("%s is told of by its inventory alone: %s", scene.base, error)
+            logger.warning("%s is described by its inventory alone: %s", scene.base, error)
             return {}
 
 

@@ -1,4 +1,4 @@
-"""What people do in which room at which hour, who does it, why they want help, and which wishes go with it.
+"""Activities by room type: hour, people, reasons for needing help, and themes of suitable wishes.
 
 The table is ``occasions.toml`` beside this module.
 """
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Theme(StrEnum):
-    """What an activity is about, and what a wish can be for."""
+    """Theme of an activity and of a wish."""
 
     COOKING = "cooking"
     MEALS = "meals"
@@ -40,15 +40,15 @@ class Theme(StrEnum):
 
 FILE: Final = "occasions.toml"
 ELSEWHERE: Final = "elsewhere"
-"""Stands in the table for types of rooms that are not in it."""
+"""Key of the table for room types without an entry."""
 SERVED: Final = frozenset({"guest", "regular guest", "customer", "visitor", "speaker", "pupil"})
-"""Jobs of those who are served in a place: they don't do what the house does."""
+"""Jobs of people who are guests of a place. They do no staff activities."""
 
 
 class Occasion(BaseModel):
-    """An activity, as a phrase that follows "is". ``why`` are clauses that tell why help is wanted.
+    """Activity, as a phrase that follows "is". ``why`` lists clauses with a reason for needing help.
 
-    Somebody of such an age does it, and where it is ``staff``, nobody who is only served there.
+    ``ages`` limits the people; ``staff`` excludes guests.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -60,22 +60,22 @@ class Occasion(BaseModel):
     ages: tuple[int, int] = (3, 110)
     staff: bool = False
     private: bool = False
-    """Whether it is done only where people live."""
+    """True if people do it only at home."""
 
     def suits(self, person: Person) -> bool:
-        """Whether such a person does this."""
+        """True if the person may do this."""
         return self.ages[0] <= person.age <= self.ages[1] and not (self.staff and person.job in SERVED)
 
 
 @functools.cache
 def occasions() -> Mapping[str, tuple[Occasion, ...]]:
-    """The whole table, by type of room."""
+    """Return the table by room type."""
     text = (resources.files("embomatrix.factory.social") / FILE).read_text(encoding="utf-8")
     return TypeAdapter(dict[str, tuple[Occasion, ...]]).validate_python(tomllib.loads(text))
 
 
 def occasions_in(room_type: str) -> tuple[Occasion, ...]:
-    """For rooms of any type."""
+    """Return the activities of a room type."""
     return occasions().get(room_type, occasions()[ELSEWHERE])
 
 
@@ -85,5 +85,5 @@ def _by_phrase() -> Mapping[str, Occasion]:
 
 
 def occasion_of(activity: str) -> Occasion | None:
-    """The occasion that a slot of a day tells of; None where somebody else than the grammar made it up."""
+    """Return the activity of a rule-based slot; None for an invented activity."""
     return _by_phrase().get(activity)

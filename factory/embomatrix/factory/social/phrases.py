@@ -1,4 +1,4 @@
-"""What people and the robot say: templates by speech act, wider than those of the plain task writer."""
+"""Sentence templates of people and robot by speech act. The vocabulary is wider than that of the plain task writer."""
 
 from __future__ import annotations
 
@@ -85,9 +85,9 @@ CLAUSES: Final[Mapping[str, tuple[str, ...]]] = {
         "chill {thing} in {place} until it is frozen",
     ),
 }
-"""Ways to ask for an atom. ``place`` is the host or the source."""
+"""Phrases that request an atom. ``place`` is the host or the source."""
 
-MANNERS: Final[Mapping[str, tuple[str, ...]]] = {
+MANNER_CLAUSES: Final[Mapping[str, tuple[str, ...]]] = {
     "toggled_on tap": (
         "turn on the tap of {thing}",
         "let the water run in {thing}",
@@ -113,7 +113,7 @@ MANNERS: Final[Mapping[str, tuple[str, ...]]] = {
         "leave the drawers of {thing} closed",
     ),
 }
-"""Ways to ask for an atom about a thing that has a tap, or drawers and no door."""
+"""Phrases that request an atom of an object with a tap, or with drawers but no door."""
 
 NOUNS: Final[Mapping[str, str]] = {
     "bottom_cabinet": "low cabinet",
@@ -141,7 +141,7 @@ NOUNS: Final[Mapping[str, str]] = {
     "washer": "washing machine",
     "pot_plant": "potted plant",
 }
-"""What people call a category whose name is a catalog's. Two never share a name."""
+"""Everyday names of categories with technical names. They are unique."""
 
 TURNS: Final[Mapping[Act, tuple[str, ...]]] = {
     Act.NEED: (
@@ -199,12 +199,12 @@ TURNS: Final[Mapping[Act, tuple[str, ...]]] = {
         "Consider it done: {clauses}.",
     ),
 }
-"""Sentences by act. A name with a capital stands for the same words at the start of a sentence."""
+"""Sentences by act. A capitalised placeholder starts with a capital letter."""
 
 AGREEMENTS: Final = ("Yes, do that, please.", "That would help as well.", "Oh, gladly.", "Right, that too.")
-"""What somebody says to a proposal."""
+"""Replies to a proposal."""
 
-MATTERS: Final[Mapping[str, tuple[str, ...]]] = {
+NEEDS: Final[Mapping[str, tuple[str, ...]]] = {
     "place": (
         "{thing} is not where it belongs",
         "{thing} has been lying about since yesterday",
@@ -225,7 +225,7 @@ MATTERS: Final[Mapping[str, tuple[str, ...]]] = {
     "open drawers": ("{thing} is shut, and I have no hand free", "I need something out of {thing}"),
     "not open drawers": ("everybody bumps into the drawers of {thing}", "a drawer of {thing} sticks out"),
 }
-"""What is the matter, by what is wished for, and by manner."""
+"""Statements of a need, by the wish and its manner."""
 
 QUESTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "place": (
@@ -263,9 +263,9 @@ INSTRUCTIONS: Final = (
     "Could you spare {who} the walk and {what}?",
     "{Who} can't leave {room} just now. {What}, please.",
 )
-"""The request as a robot is given it; every one names a person."""
+"""Final instructions. Each names a person."""
 
-JOINS: Final = (
+CONJUNCTIONS: Final = (
     ", then ",
     ", and ",
     ", after that ",
@@ -275,25 +275,25 @@ JOINS: Final = (
     "; when that is done, ",
 )
 
-WHERE: Final = ("in {room}", "over in {room}")
-"""Ways to say in which room a thing is."""
-WHENCE: Final = ("from {room}",)
-"""The same of a thing that is to be taken away."""
+ROOM_OF_OBJECT: Final = ("in {room}", "over in {room}")
+"""Phrases for the room of an object."""
+ROOM_OF_ORIGIN: Final = ("from {room}",)
+"""Phrases for the room that an object is taken from."""
 _PAUSE: Final = re.compile(r"[,;:.?]")
 
 
-def called(category: str) -> str:
-    """A category as people call it."""
+def spoken_category(category: str) -> str:
+    """Return the everyday name of a category."""
     return NOUNS.get(category, spoken(category))
 
 
 def room_called(view: SceneView, room: str) -> str:
-    """A room as people call it: ``the kitchen``, or ``bedroom 1`` where there are several."""
+    """Return the everyday name of a room: ``the kitchen``, or ``bedroom 1`` if there are several."""
     return spoken(room_words(view, room)).replace("childs", "child's")
 
 
-def said_once(text: str, view: SceneView) -> str:
-    """The text with ``there`` for a room that was the last one to be named, once in a clause."""
+def shorten_repeated_rooms(text: str, view: SceneView) -> str:
+    """Replace a room that was just named by ``there``, at most once per clause."""
     rooms = sorted((room_called(view, room.name) for room in view.scene.rooms), key=len, reverse=True)
     named = re.compile(
         rf"(?:(?P<way> from| over in| in) )?\b(?P<room>{'|'.join(map(re.escape, rooms))})\b", re.IGNORECASE
@@ -313,12 +313,12 @@ def said_once(text: str, view: SceneView) -> str:
     return named.sub(shown, text)
 
 
-def filled(template: str, **words: str) -> str:
-    """The template with its words, each also with a capital where the template's name has one."""
+def fill(template: str, **words: str) -> str:
+    """Fill a template with words, capitalised where the placeholder is."""
     capitals = {name.capitalize(): capital(text) for name, text in words.items()}
     return template.format(**words, **capitals)
 
 
 def capital(text: str) -> str:
-    """The text with a capital first letter, the rest as it is."""
+    """Capitalise the first letter only."""
     return text[:1].upper() + text[1:]

@@ -1,4 +1,4 @@
-"""What the agents of social simulation ask a language model. One constant a prompt, filled with str.format."""
+"""Prompts of the social agents, filled with str.format."""
 
 from __future__ import annotations
 
@@ -64,4 +64,4 @@ CATEGORY_HINTS: Final = {
     "kitchen_operation": "food is to be heated, cooked or frozen",
     "compound": "two or three of these are wanted: things put somewhere, something switched or opened, food prepared",
 }
-"""What a conversation is to come to, by the task's category."""
+"""Required result of a conversation by task category."""

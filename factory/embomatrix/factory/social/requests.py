@@ -1,4 +1,4 @@
-"""What a conversation came to, typed: an instruction and the atoms that are to hold, over things that are there."""
+"""Typed result of a conversation: an instruction and the atoms that must hold, about existing objects."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from embomatrix.factory.scenes.view import SceneView
 
 
-class Wanted(StrEnum):
-    """Predicates that a request may use; the robot's skills bring all of them about."""
+class RequestPredicate(StrEnum):
+    """Predicates that a request may use. The robot's skills can achieve all of them."""
 
     ONTOP = "ontop"
     INSIDE = "inside"
@@ -27,23 +27,23 @@ class Wanted(StrEnum):
     FROZEN = "frozen"
 
 
-PLACED: Final = frozenset({Wanted.ONTOP, Wanted.INSIDE})
-THERMAL: Final = frozenset({Wanted.COOKED, Wanted.HOT, Wanted.FROZEN})
+PLACED: Final = frozenset({RequestPredicate.ONTOP, RequestPredicate.INSIDE})
+THERMAL: Final = frozenset({RequestPredicate.COOKED, RequestPredicate.HOT, RequestPredicate.FROZEN})
 
 
 class RequestedAtom(BaseModel):
-    """One atom. ``place`` is the host of a relation; ``holds`` false asks for the contrary: closed, switched off."""
+    """Requested atom. ``place`` is the host of a relation. ``holds`` is false for closed or switched off."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    predicate: Wanted
+    predicate: RequestPredicate
     thing: str
     place: str = ""
     holds: bool = True
 
 
 class TaskRequest(BaseModel):
-    """A concrete request."""
+    """Instruction with its wishes."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -52,13 +52,13 @@ class TaskRequest(BaseModel):
 
 
 def check_request(request: TaskRequest, view: SceneView, known: frozenset[str]) -> None:
-    """Raise ValueError, with a sentence for whoever made the request, where a wish is not about what is there."""
+    """Raise ValueError with a sentence for the model if a wish is not feasible in the scene."""
     for number, wish in enumerate(request.wishes, start=1):
         problem = _problem(wish, view, known)
         if problem:
             raise ValueError(f"wish {number}, {wish.predicate.value}: {problem}")
     if len(set(request.wishes)) < len(request.wishes):
-        raise ValueError("the same wish stands there twice")
+        raise ValueError("two wishes are equal: leave one out")
 
 
 def _problem(wish: RequestedAtom, view: SceneView, known: frozenset[str]) -> str:
@@ -71,49 +71,49 @@ def _problem(wish: RequestedAtom, view: SceneView, known: frozenset[str]) -> str
         return f"it takes no place, found {wish.place!r}"
     if wish.predicate in THERMAL:
         if not wish.holds:
-            return "only what is to be cooked, hot or frozen can be asked for, not the contrary"
+            return "cooked, hot and frozen can only be requested, not the contrary"
         if not view.asset(wish.thing).can("cookable"):
-            return f"{wish.thing} is nothing to cook, heat or freeze"
-        return "" if view.robot.fetches(wish.thing) else _beyond(wish.thing)
-    if wish.predicate is Wanted.OPEN:
+            return f"{wish.thing} can't be cooked, heated or frozen"
+        return "" if view.robot.can_pick_up(wish.thing) else _out_of_reach(wish.thing)
+    if wish.predicate is RequestPredicate.OPEN:
         if not view.is_openable(wish.thing):
             return f"{wish.thing} has no door or drawer"
-        done, works = view.is_open(wish.thing), view.robot.swings(wish.thing, shut=not wish.holds)
+        done, works = view.is_open(wish.thing), view.robot.can_swing(wish.thing, shut=not wish.holds)
     else:
         if not view.is_toggleable(wish.thing):
             return f"{wish.thing} can't be switched"
-        done, works = view.is_on(wish.thing), view.robot.switches(wish.thing, on=wish.holds)
+        done, works = view.is_on(wish.thing), view.robot.can_switch(wish.thing, on=wish.holds)
     if done is wish.holds:
-        return f"{wish.thing} is so already"
-    return "" if works else _beyond(wish.thing)
+        return f"{wish.thing} is already in this state"
+    return "" if works else _out_of_reach(wish.thing)
 
 
 def _placing_problem(wish: RequestedAtom, view: SceneView) -> str:
     if not wish.holds:
-        return "say where the thing is to be, not where it is not to be"
+        return "name the place where the object must be, not one where it must not be"
     if not wish.place:
         return "it takes a place"
-    inside = wish.predicate is Wanted.INSIDE
+    inside = wish.predicate is RequestPredicate.INSIDE
     hosts = (
         view.is_container(wish.place) or view.is_basket(wish.place) if inside else view.is_surface(wish.place)
     )
     if not view.is_portable(wish.thing):
         return f"{wish.thing} can't be carried"
     if not hosts or not view.takes(wish.place, wish.thing, inside=inside):
-        return f"{wish.thing} does not go {'into' if inside else 'onto'} {wish.place}"
+        return f"{wish.thing} does not fit {'into' if inside else 'onto'} {wish.place}"
     if view.item(wish.thing).host == wish.place:
         return f"{wish.thing} is there already"
-    if not view.robot.puts(wish.thing, Relation(wish.predicate.value), wish.place):
-        return f"the robot tried, and can't bring {wish.thing} there: ask for another thing or place"
+    if not view.robot.can_place(wish.thing, Relation(wish.predicate.value), wish.place):
+        return f"the robot tried and can't place {wish.thing} there: request another object or place"
     return ""
 
 
-def _beyond(name: str) -> str:
-    return f"the robot tried, and does not get at {name}: ask for something else"
+def _out_of_reach(name: str) -> str:
+    return f"the robot tried and can't reach {name}: request something else"
 
 
-def piece_of(wish: RequestedAtom, view: SceneView) -> GoalConjunct:
-    """The wish as a piece of a goal. Its words stand in the request's instruction."""
+def conjunct_of(wish: RequestedAtom, view: SceneView) -> GoalConjunct:
+    """Return the wish as a conjunct of a goal. The request's instruction holds its words."""
     names = (wish.thing, wish.place) if wish.place else (wish.thing,)
     atom: Formula = Atom(wish.predicate.value, names)
     categories = ",".join(view.category(name) for name in names)

@@ -1,10 +1,16 @@
-"""Summarization Agent, offline: from a conversation to one instruction that names who asks and why."""
+"""Rule-based Summarization Agent: instruction and transcript of a conversation."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from embomatrix.factory.social.phrases import INSTRUCTIONS, JOINS, filled, room_called, said_once
+from embomatrix.factory.social.phrases import (
+    CONJUNCTIONS,
+    INSTRUCTIONS,
+    fill,
+    room_called,
+    shorten_repeated_rooms,
+)
 from embomatrix.factory.social.values import ROBOT
 
 if TYPE_CHECKING:
@@ -17,14 +23,14 @@ if TYPE_CHECKING:
 
 
 def instruction_of(conversation: Conversation, cast: Cast, view: SceneView, voice: Voice, why: str) -> str:
-    """One or two sentences. What the robot is to do are the conversation's last wishes, in their order; ``why`` is a clause."""
+    """Return one or two sentences with the final wishes in their order. ``why`` is a clause with the reason."""
     slot = conversation.slot
     who = cast.of(slot.person)
     others = [person.name for person in cast.people if person.name != who.name]
     what = conversation.last_wishes[0]
     for clause in conversation.last_wishes[1:]:
-        what += voice.choose(JOINS) + clause
-    text = filled(
+        what += voice.choose(CONJUNCTIONS) + clause
+    text = fill(
         voice.choose(INSTRUCTIONS),
         who=who.name,
         other=others[int(voice.rng.integers(len(others)))],
@@ -37,13 +43,13 @@ def instruction_of(conversation: Conversation, cast: Cast, view: SceneView, voic
         hobby=who.hobby,
         why=why,
     )
-    return said_once(text, view)
+    return shorten_repeated_rooms(text, view)
 
 
 def transcript_of(
-    cast: Cast, conversation: Conversation, instruction: str, pieces: Sequence[GoalConjunct]
+    cast: Cast, conversation: Conversation, instruction: str, conjuncts: Sequence[GoalConjunct]
 ) -> str:
-    """All that led to the task, for a reader."""
+    """Return the conversation, its people and the goal as Markdown."""
     slot = conversation.slot
     people = "\n".join(
         f"* **{person.name}**, {person.age}, {person.job}, likes {person.hobby}"
@@ -54,7 +60,7 @@ def transcript_of(
         f"**{'Robot' if turn.speaker == ROBOT else turn.speaker}** ({turn.act.value}): {turn.text}"
         for turn in conversation.turns
     )
-    signs = "\n".join(f"* {sign}" for piece in pieces for sign in piece.signs)
+    signs = "\n".join(f"* {sign}" for conjunct in conjuncts for sign in conjunct.signs)
     return (
         f"# {instruction}\n\n## The people\n\n{cast.setting[:1].upper()}{cast.setting[1:]}.\n\n{people}\n\n"
         f"## {slot.time}, {slot.room}: {slot.person} is {slot.activity}\n\n{talk}\n\n## What is to be true\n\n{signs}\n"

@@ -1,4 +1,4 @@
-"""People, their day, and what they say to the robot: the same values whether a grammar or a language model made them."""
+"""People, schedule and conversation. Rules and language models produce the same values."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from embomatrix.world.task import TaskCategory
 
 ROBOT = "robot"
-"""Who answers the people."""
+"""Speaker name of the robot."""
 
 
 class _Value(BaseModel):
@@ -17,7 +17,9 @@ class _Value(BaseModel):
 
 
 class Person(_Value):
-    """One of the cast. ``ties`` says what this person is to others: {"Mia": "mother"}; ``rooms`` are where they are at home."""
+    """Member of a cast. ``ties`` maps other people to this person's relation to them: {"Mia": "mother"}. ``rooms``
+    are their own rooms.
+    """
 
     name: str = Field(min_length=1, max_length=40)
     age: int = Field(ge=3, le=110)
@@ -28,7 +30,7 @@ class Person(_Value):
 
 
 class DaySlot(_Value):
-    """Something that a person does on this day, somewhere."""
+    """Activity of a person at a time and place."""
 
     time: str = Field(pattern=r"^([01]\d|2[0-3]):[0-5]\d$")
     person: str
@@ -37,7 +39,7 @@ class DaySlot(_Value):
 
 
 class Cast(_Value):
-    """Who lives or works in a scene, and how their day goes."""
+    """People of a scene, and their schedule."""
 
     setting: str = Field(min_length=1, max_length=120)
     people: tuple[Person, ...] = Field(min_length=2, max_length=5)
@@ -48,21 +50,21 @@ class Cast(_Value):
         names = [person.name for person in self.people]
         if len(set(names)) < len(names):
             raise ValueError(
-                f"two people are called {max(names, key=names.count)!r}: every name must be unique"
+                f"two people have the name {max(names, key=names.count)!r}: every name must be unique"
             )
         for person in self.people:
             for other in person.ties:
                 if other not in names or other == person.name:
-                    raise ValueError(f"{person.name} is tied to {other!r}: expected another one of {names}")
+                    raise ValueError(
+                        f"{person.name} has a tie to {other!r}: expected another person of {names}"
+                    )
         for slot in self.day:
             if slot.person not in names:
-                raise ValueError(
-                    f"{slot.person!r} has something to do at {slot.time}: expected one of {names}"
-                )
+                raise ValueError(f"the slot at {slot.time} names {slot.person!r}: expected one of {names}")
         return self
 
     def of(self, name: str) -> Person:
-        """Raises KeyError for a name that nobody has."""
+        """Return the person with this name. Raise KeyError."""
         return {person.name: person for person in self.people}[name]
 
     @property
@@ -70,7 +72,7 @@ class Cast(_Value):
         return tuple(person.name for person in self.people)
 
     def rooms_without_anyone(self, rooms: tuple[str, ...]) -> tuple[str, ...]:
-        """Rooms that nobody is at home in or does anything in."""
+        """Return the rooms that nobody owns or visits."""
         lived_in = {room for person in self.people for room in person.rooms} | {
             slot.room for slot in self.day
         }
@@ -78,16 +80,16 @@ class Cast(_Value):
 
 
 class Act(StrEnum):
-    """What a turn of a conversation does."""
+    """Speech act of a turn."""
 
-    NEED = "need"  # a person says what is the matter
-    CLARIFY = "clarify"  # the robot asks which thing or which place
-    ANSWER = "answer"  # the person says
-    REFUSE = "refuse"  # the robot can't, and says why
-    PROPOSE = "propose"  # the robot offers what it can do
-    AMEND = "amend"  # somebody changes what was asked for
-    ADD = "add"  # somebody asks for one thing more
-    CONFIRM = "confirm"  # the robot says what it will do
+    NEED = "need"  # a person states a need
+    CLARIFY = "clarify"  # the robot asks for the object or place
+    ANSWER = "answer"  # the person answers
+    REFUSE = "refuse"  # the robot refuses and says why
+    PROPOSE = "propose"  # the robot proposes something that it can do
+    AMEND = "amend"  # a person changes the request
+    ADD = "add"  # a person adds a wish
+    CONFIRM = "confirm"  # the robot confirms the request
 
 
 class DialogueTurn(_Value):
@@ -97,7 +99,7 @@ class DialogueTurn(_Value):
 
 
 class Conversation(_Value):
-    """A dialogue about one request. ``first_wish`` and ``last_wishes`` tell how the request changed, clause by clause."""
+    """Dialogue about one request. ``first_wish`` and ``last_wishes`` show its change, clause by clause."""
 
     slot: DaySlot
     turns: tuple[DialogueTurn, ...] = Field(min_length=2)
@@ -106,7 +108,7 @@ class Conversation(_Value):
 
     @property
     def rounds(self) -> int:
-        """How often the floor passed to a person."""
+        """Number of times that a person takes the floor."""
         return sum(
             turn.speaker != ROBOT and (number == 0 or self.turns[number - 1].speaker == ROBOT)
             for number, turn in enumerate(self.turns)
@@ -114,19 +116,19 @@ class Conversation(_Value):
 
     @property
     def changed(self) -> bool:
-        """Whether what was asked for at last is not what was asked for first."""
+        """True if the final request differs from the first wish."""
         return self.last_wishes != (self.first_wish,)
 
 
 class SceneBrief(_Value):
-    """A base scene by its name."""
+    """Brief with the name of a base scene."""
 
     scene: str
     seed: int = 0
 
 
 class TalkBrief(_Value):
-    """Who lives in a scene, and which kind of wish somebody is to come to."""
+    """Brief of a conversation: cast, and category of the request."""
 
     scene: str
     cast: Cast
@@ -135,7 +137,7 @@ class TalkBrief(_Value):
 
 
 class SummaryBrief(_Value):
-    """What was said."""
+    """Brief of a summary: cast and conversation."""
 
     scene: str
     cast: Cast
@@ -144,7 +146,7 @@ class SummaryBrief(_Value):
 
 
 class RequestSummary(_Value):
-    """One instruction, and what it asks for: clauses of the conversation, or a model's wishes as JSON."""
+    """Instruction with its wishes, as clauses of the conversation or as JSON of a model."""
 
     instruction: str
     wishes: tuple[str, ...]

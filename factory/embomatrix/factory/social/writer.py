@@ -1,4 +1,4 @@
-"""Tasks by social simulation: a cast for each scene, a conversation for each task."""
+"""Task writer by rule-based social simulation: a cast for each scene, a conversation for each task."""
 
 from __future__ import annotations
 
@@ -12,11 +12,18 @@ import numpy as np
 
 from embomatrix.factory.social.casting import GrammarRolePlayer
 from embomatrix.factory.social.conversing import ConversationScenario, GrammarConversation
-from embomatrix.factory.social.fitting import best_slot, why_of
-from embomatrix.factory.social.phrases import CLAUSES, MANNERS, NOUNS, WHENCE, WHERE, room_called
+from embomatrix.factory.social.fitting import best_slot, reasons_for
+from embomatrix.factory.social.phrases import (
+    CLAUSES,
+    MANNER_CLAUSES,
+    NOUNS,
+    ROOM_OF_OBJECT,
+    ROOM_OF_ORIGIN,
+    room_called,
+)
 from embomatrix.factory.social.summary import instruction_of, transcript_of
-from embomatrix.factory.writer.goals import Workshop
-from embomatrix.factory.writer.tasks import Draft, draft_of, pieces_of
+from embomatrix.factory.writer.goals import GoalContext
+from embomatrix.factory.writer.tasks import Draft, draft_of, draw_conjuncts
 from embomatrix.factory.writer.words import FreshVoice
 
 if TYPE_CHECKING:
@@ -30,24 +37,24 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
     from embomatrix.world.task import TaskCategory
 
-SAME_WISHES: Final = 2
-"""Wishes of one kind in one variant: a third person who wants a sink running is one too many."""
+MAX_EQUAL_WISHES: Final = 2
+"""Maximum number of equal wishes in one variant."""
 GOALS_TRIED: Final = 10
-"""Goals that are looked at for one task: somebody must want it."""
+"""Number of goals considered for one task. Each must suit one of the people."""
 
 
 @dataclass(frozen=True, slots=True)
-class Talked:
-    """A conversation with what led to it; ``shop`` and ``voice`` are for what is still to be said."""
+class Talk:
+    """Conversation with its scenario. ``context`` and ``voice`` serve the texts that follow."""
 
     scenario: ConversationScenario
     conversation: Conversation
-    shop: Workshop
+    context: GoalContext
     voice: FreshVoice
 
 
 class SocialWriter:
-    """Plays the people of a scene. The same seed gives a base scene the same cast, whichever variant is asked about."""
+    """Task writer that simulates the people of a scene. Equal seeds give a base scene the same cast in all variants."""
 
     def __init__(self, seed: int, role_player: RolePlayingAgent | None = None) -> None:
         self._seed = seed
@@ -56,14 +63,16 @@ class SocialWriter:
         self._said: tuple[str, Counter[str]] = ("", Counter())
 
     def cast_of(self, scene: Scene) -> Cast:
-        """The people of a base scene."""
+        """Return the cast of a base scene."""
         if scene.base not in self._casts:
             sequence = np.random.SeedSequence((self._seed, zlib.crc32(scene.base.encode())))
             self._casts[scene.base] = self._role_player.cast(scene, np.random.default_rng(sequence))
         return self._casts[scene.base]
 
     def _said_in(self, variant: Variant) -> Counter[str]:
-        """What was said in this variant so far. Others don't count: a build that is resumed writes the same again."""
+        """Return the phrases used in this variant. Other variants don't count, so that a resumed build writes the
+        same tasks.
+        """
         if self._said[0] != variant.scene.scene_id:
             self._said = (variant.scene.scene_id, Counter())
         return self._said[1]
@@ -76,67 +85,69 @@ class SocialWriter:
         task_id: str,
         rng: np.random.Generator,
     ) -> Draft | None:
-        """What somebody who is in one of the variant's rooms on this day comes to ask for."""
+        """Return a draft of a request by one of the people."""
         talked = self.talk(variant, view, category, rng)
         if talked is None:
             return None
-        shop, cast, talk = talked.shop, talked.scenario.cast, talked.conversation
-        pieces = talked.scenario.pieces
+        context, cast, talk = talked.context, talked.scenario.cast, talked.conversation
+        conjuncts = talked.scenario.conjuncts
         instruction = instruction_of(talk, cast, view, talked.voice, talked.scenario.why)
-        transcript = transcript_of(cast, talk, instruction, pieces)
-        return draft_of(shop, category, task_id, pieces, instruction, transcript)
+        transcript = transcript_of(cast, talk, instruction, conjuncts)
+        return draft_of(context, category, task_id, conjuncts, instruction, transcript)
 
     def talk(
         self, variant: Variant, view: SceneView, category: TaskCategory, rng: np.random.Generator
-    ) -> Talked | None:
-        """A conversation that comes to a wish of this category; None where nobody would have one."""
+    ) -> Talk | None:
+        """Return a conversation that leads to a wish of this category; None if no goal suits the people."""
         cast = self.cast_of(variant.scene)
         said = self._said_in(variant)
         voice = FreshVoice(rng, said)
-        phrases = {**CLAUSES, **MANNERS}
-        shop = Workshop(
+        phrases = {**CLAUSES, **MANNER_CLAUSES}
+        context = GoalContext(
             view,
             variant,
             rng,
             phrases=phrases,
-            where=WHERE,
-            whence=WHENCE,
+            where=ROOM_OF_OBJECT,
+            whence=ROOM_OF_ORIGIN,
             nouns=NOUNS,
             room_called=room_called,
             voice=voice,
         )
-        chosen = _scenario(cast, shop, category, said)
+        chosen = _scenario(cast, context, category, said)
         if chosen is None:
             return None
-        pieces, slot = chosen.pieces, chosen.slot
-        said.update((slot.person, slot.activity, _wish_of(pieces)))
-        used = frozenset(name for piece in pieces for name in piece.objects)
-        talk = GrammarConversation(chosen, dataclasses.replace(shop, used=used), voice).run()
-        return Talked(chosen, talk, shop, voice)
+        conjuncts, slot = chosen.conjuncts, chosen.slot
+        said.update((slot.person, slot.activity, _signature_of(conjuncts)))
+        used = frozenset(name for conjunct in conjuncts for name in conjunct.objects)
+        talk = GrammarConversation(chosen, dataclasses.replace(context, used=used), voice).run()
+        return Talk(chosen, talk, context, voice)
 
 
-def _wish_of(pieces: Sequence[GoalConjunct]) -> str:
-    """The kind of a goal: nobody asks for the same again while there is something else to ask for."""
-    return " ".join(sign for piece in pieces for sign in piece.signs)
+def _signature_of(conjuncts: Sequence[GoalConjunct]) -> str:
+    """Return the signature of a goal. Repeated signatures are avoided while others are available."""
+    return " ".join(sign for conjunct in conjuncts for sign in conjunct.signs)
 
 
 def _scenario(
-    cast: Cast, shop: Workshop, category: TaskCategory, said: Counter[str]
+    cast: Cast, context: GoalContext, category: TaskCategory, said: Counter[str]
 ) -> ConversationScenario | None:
-    """Of some goals that the scene allows, that which suits best somebody's day; None where nobody would wish for any.
+    """Return the scenario of the goal that suits somebody's schedule best; None if none does.
 
-    The clauses of goals that are not taken count as said: so the words stay fresh for whatever is tried next.
+    Clauses of rejected goals count as used, which keeps the wording varied.
     """
     best: tuple[float, tuple[GoalConjunct, ...], DaySlot] | None = None
     for _ in range(GOALS_TRIED):
-        pieces = tuple(pieces_of(shop, category))
-        found = best_slot(cast, pieces, shop.view, said) if pieces else None
-        if found is None or said[_wish_of(pieces)] >= SAME_WISHES:
+        conjuncts = tuple(draw_conjuncts(context, category))
+        found = best_slot(cast, conjuncts, context.view, said) if conjuncts else None
+        if found is None or said[_signature_of(conjuncts)] >= MAX_EQUAL_WISHES:
             continue
-        score, slot = found[0] - said[_wish_of(pieces)], found[1]
+        score, slot = found[0] - said[_signature_of(conjuncts)], found[1]
         if best is None or score > best[0]:
-            best = (score, pieces, slot)
+            best = (score, conjuncts, slot)
     if best is None:
         return None
-    _, pieces, slot = best
-    return ConversationScenario(cast, slot, pieces, FreshVoice(shop.rng, said).choose(why_of(slot.activity)))
+    _, conjuncts, slot = best
+    return ConversationScenario(
+        cast, slot, conjuncts, FreshVoice(context.rng, said).choose(reasons_for(slot.activity))
+    )

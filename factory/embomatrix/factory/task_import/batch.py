@@ -1,4 +1,6 @@
-"""Imports of many problems: each is bound to the first scene that has what it needs, then judged in the simulator."""
+"""Import of problems over many scenes: each problem is bound to the first suitable scene and verified in the
+simulator.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +9,14 @@ import itertools
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from embomatrix.factory.admission import MOST_HELD, Admitted, RefusalReason, TaskRefusal, admit
-from embomatrix.factory.pipeline.task_poses import Needs, SceneSurvey, cache_poses
+from embomatrix.factory.admission import MAX_HELD_SHARE, Admitted, RefusalReason, TaskRefusal, admit
+from embomatrix.factory.pipeline.task_poses import PoseNeeds, SceneSurvey, cache_poses
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.neighbours import neighbours_of
-from embomatrix.factory.task_import.size_requirements import demands_of
+from embomatrix.factory.task_import.size_requirements import requirements_of
 from embomatrix.factory.task_import.sources import BEHAVIOR, EAI
-from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
+from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
 from embomatrix.sim.live_world import prepare
 from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.sim.simulation import load_simulator
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
     from embomatrix.world.task import Task
 
 
-OF_THE_PROBLEM: Final = frozenset(
+SCENE_INDEPENDENT: Final = frozenset(
     {
         RefusalReason.UNKNOWN_TYPE,
         RefusalReason.SUBSTANCE,
@@ -43,77 +45,76 @@ OF_THE_PROBLEM: Final = frozenset(
         RefusalReason.AGENT_IN_GOAL,
     }
 )
-"""Reasons that are the same in every scene."""
-DRAWS: Final = 3
-"""Ways to lay a problem out in its first scene, from seeds of their own, before another scene is looked at."""
-MOST_UNSOLVED: Final = 6
-"""Scenes in which a problem is laid out and not solved before it is given up: what stops it is then no scene's fault.
+"""Reasons that do not depend on the scene."""
+OWN_SCENE_DRAWS: Final = 3
+"""Number of layouts drawn in the problem's own scene before other scenes are tried."""
+MAX_UNSOLVED: Final = 6
+"""Maximum number of scenes in which a problem is laid out but not solved. Then the problem itself is the cause.
 
-So many more are looked at with a snug layout, where things are to share a cavity or a surface.
+The same number of scenes is tried again with a compact layout if objects share a cavity or a surface.
 """
-MOST_ALIKE: Final = 3
-"""Such scenes in a row of which the same is told."""
-STRIDE: Final = 1_000_003
-"""Between the seeds of two draws: no other problem is imported with such a one."""
-MOST_MISFITS: Final = 12
-"""Scenes with all rooms and furniture in which a problem's things find no place, before the next way is tried: laying out forty
-things takes seconds.
-"""
+MAX_SAME_REFUSAL: Final = 3
+"""Maximum number of such scenes in a row with the same refusal."""
+SEED_STRIDE: Final = 1_000_003
+"""Distance between the seeds of two draws. No other import uses such a seed."""
+MAX_MISFITS: Final = 12
+"""Maximum number of scenes per round in which the objects find no place. Laying out forty objects takes seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """An imported task that was admitted, with its bundle."""
+    """Admitted task with its bundle."""
 
     record: TaskRecord
     bundle: bytes
     notes: tuple[str, ...] = ()
-    """As those of the import."""
+    """Notes of the import."""
 
 
 def bind_first(
-    source: SourceText, bases: Sequence[Scene], *, seed: int = 0, manner: Manner | None = None
+    source: SourceText, bases: Sequence[Scene], *, seed: int = 0, options: ImportOptions | None = None
 ) -> ImportedTask | TaskRefusal:
-    """The problem in the first scene that it can be bound to, else the refusal that came furthest. Raises BddlError.
+    """Bind the problem to the first suitable scene. Otherwise return the refusal that came furthest. Raise BddlError.
 
-    The scene that it was written for comes first, then those that have all furniture, then those that lack some.
+    The problem's own scene comes first, then scenes with all furniture, then scenes that lack some.
     """
-    return _first(imports(source, bases, seed=seed, manner=manner or Manner()))
+    return _first(imports(source, bases, seed=seed, options=options or ImportOptions()))
 
 
 def imports(
-    source: SourceText, bases: Sequence[Scene], *, seed: int, manner: Manner, draws: int = 1
+    source: SourceText, bases: Sequence[Scene], *, seed: int, options: ImportOptions, draws: int = 1
 ) -> Iterator[ImportedTask | TaskRefusal]:
-    """The problem in each scene as it is, then, where the manner says so, in each with the furniture that it lacks.
+    """Yield imports of the problem into each scene as it is, and with missing furniture added if the options allow
+    it.
 
-    Last come the same scenes with their rooms counted otherwise. The scene that it was written for comes before all that,
-    in both ways, ``draws`` times; once no scene would do, none is looked at further.
+    The problem's own scene is tried ``draws`` times before all others. The last round renumbers rooms. Refusals that
+    do not depend on the scene end the search.
     """
     own = [base for base in bases if base.base == source.scene]
     others = [base for base in bases if base.base != source.scene]
-    as_it_is = replace(manner, furnishing=False)
+    as_it_is = replace(options, furnishing=False)
     for draw, base in itertools.product(range(draws), own):
-        drawn = seed + draw * STRIDE
-        outcome = import_problem(source, base, seed=drawn, manner=as_it_is)
+        drawn = seed + draw * SEED_STRIDE
+        outcome = import_problem(source, base, seed=drawn, options=as_it_is)
         yield outcome
-        if isinstance(outcome, TaskRefusal) and outcome.reason in OF_THE_PROBLEM:
+        if isinstance(outcome, TaskRefusal) and outcome.reason in SCENE_INDEPENDENT:
             return
-        if isinstance(outcome, TaskRefusal) and manner.furnishing:
-            yield import_problem(source, base, seed=drawn, manner=manner)
+        if isinstance(outcome, TaskRefusal) and options.furnishing:
+            yield import_problem(source, base, seed=drawn, options=options)
     rounds = [(as_it_is, others)]
-    if manner.furnishing:
-        rounds += [(manner, others), (replace(manner, renumbering=True), [*own, *others])]
+    if options.furnishing:
+        rounds += [(options, others), (replace(options, renumbering=True), [*own, *others])]
     for tried, scenes in rounds:
         misfits = 0
         for base in scenes:
-            outcome = import_problem(source, base, seed=seed, manner=tried)
+            outcome = import_problem(source, base, seed=seed, options=tried)
             yield outcome
             if not isinstance(outcome, TaskRefusal):
                 continue
-            if outcome.reason in OF_THE_PROBLEM:
+            if outcome.reason in SCENE_INDEPENDENT:
                 return
             misfits += outcome.reason is RefusalReason.DOES_NOT_FIT
-            if misfits == MOST_MISFITS:
+            if misfits == MAX_MISFITS:
                 break
 
 
@@ -124,18 +125,19 @@ def verify_first(
     foresight: ReachabilitySurvey | None,
     *,
     seed: int = 0,
-    manner: Manner | None = None,
+    options: ImportOptions | None = None,
 ) -> Verified | TaskRefusal:
-    """The problem in the first scene in which it is admitted, else the refusal that came furthest. Raises BddlError.
+    """Import the problem into the first scene in which it is admitted. Otherwise return the refusal that came
+    furthest.
 
-    The scene that it was written for comes first, then those that have all furniture, then those that lack some.
+    The order of the scenes is that of `bind_first`. Raise BddlError.
     """
 
     def judged() -> Iterator[Verified | TaskRefusal]:
-        given = manner or Manner()
-        for tried in (given, replace(given, snug=True)) if shares_room(source) else (given,):
-            laid_out, misfits, told = 0, 0, list[str]()
-            for imported in imports(source, bases, seed=seed, manner=tried, draws=DRAWS):
+        given = options or ImportOptions()
+        for tried in (given, replace(given, compact=True)) if has_shared_host(source) else (given,):
+            laid_out, misfits, sentences = 0, 0, list[str]()
+            for imported in imports(source, bases, seed=seed, options=tried, draws=OWN_SCENE_DRAWS):
                 if isinstance(imported, TaskRefusal):
                     misfits += imported.reason is RefusalReason.DOES_NOT_FIT
                     yield imported
@@ -143,9 +145,9 @@ def verify_first(
                 judged = verify(imported, library, foresight, seed=seed)
                 yield judged
                 laid_out += 1
-                told.append(judged.sentence if isinstance(judged, TaskRefusal) else "")
-                alike = told[-MOST_ALIKE:].count(told[-1])
-                if laid_out == MOST_UNSOLVED or alike == MOST_ALIKE:
+                sentences.append(judged.sentence if isinstance(judged, TaskRefusal) else "")
+                repeated = sentences[-MAX_SAME_REFUSAL:].count(sentences[-1])
+                if laid_out == MAX_UNSOLVED or repeated == MAX_SAME_REFUSAL:
                     break
             if not laid_out and not misfits:
                 return
@@ -153,10 +155,10 @@ def verify_first(
     return _first(judged())
 
 
-def shares_room(source: SourceText) -> bool:
-    """Whether a problem has more than one thing in or on another, at the start or in the end. Raises BddlError."""
+def has_shared_host(source: SourceText) -> bool:
+    """True if several objects share a host at the start or in the goal. Raise BddlError."""
     problem, _ = read_problem(source)
-    return any(max(len(each.contents), len(each.burden)) > 1 for each in demands_of(problem).values())
+    return any(max(len(each.contents), len(each.burden)) > 1 for each in requirements_of(problem).values())
 
 
 T = TypeVar("T", ImportedTask, Verified)
@@ -169,7 +171,7 @@ def _first(outcomes: Iterable[T | TaskRefusal]) -> T | TaskRefusal:
             return outcome
         refusals.append(outcome)
     if not refusals:
-        raise ValueError("no scene to bind to: expected at least one")
+        raise ValueError("found no base scene: expected at least one")
     order = list(RefusalReason)
     return max(refusals, key=lambda refusal: order.index(refusal.reason))
 
@@ -177,10 +179,12 @@ def _first(outcomes: Iterable[T | TaskRefusal]) -> T | TaskRefusal:
 def verify(
     imported: ImportedTask, library: PlacementLibrary, foresight: ReachabilitySurvey | None, *, seed: int = 0
 ) -> Verified | TaskRefusal:
-    """Judge an imported task by execution, and pack it when it is admitted. Without ``foresight`` the arm is not asked."""
+    """Verify an imported task by execution, and pack its bundle. Without ``foresight``, the arm is not analysed."""
     poses = poses_for(imported, SceneView(imported.scene), library, foresight, seed)
     with contextlib.closing(load_simulator(Bundle(imported.scene, {}, poses))) as stage:
-        verdict = admit(stage, imported.task, find_plan, imported.init, most_held=most_held_in(imported.task))
+        verdict = admit(
+            stage, imported.task, find_plan, imported.init, most_held=max_held_share(imported.task)
+        )
         if not isinstance(verdict, Admitted):
             return verdict
         bundle = Bundle(imported.scene, {imported.task.task_id: imported.task}, poses)
@@ -188,7 +192,7 @@ def verify(
     record = TaskRecord(
         task=imported.task,
         bundle_digest=bundle_digest(data),
-        split="heldout" if imported.examines else "train",
+        split="heldout" if imported.is_held_out else "train",
         oracle=tuple(plan_to_json(verdict.plan)),
         rooms=imported.rooms,
         signature=imported.signature,
@@ -203,13 +207,13 @@ def poses_for(
     foresight: ReachabilitySurvey | None,
     seed: int,
 ) -> PoseCache:
-    """The pose cache of an imported task's scene."""
+    """Return the pose cache of an imported task's scene."""
     task = imported.task
-    needs = Needs(imported.about, task.table, neighbours_of(task.goal, task.types, view.is_portable))
+    needs = PoseNeeds(imported.about, task.table, neighbours_of(task.goal, task.types, view.is_portable))
     with SceneSurvey(imported.scene, foresight) as survey:
         return cache_poses(view, [needs], library, survey, seed)
 
 
-def most_held_in(task: Task) -> float:
-    """Share of a task's atoms that may hold at the start: the questions of published benchmarks are as they are."""
-    return 1.0 if task.source in (BEHAVIOR, EAI) else MOST_HELD
+def max_held_share(task: Task) -> float:
+    """Return the share of a task's atoms that may hold at the start. Tasks of published benchmarks have no limit."""
+    return 1.0 if task.source in (BEHAVIOR, EAI) else MAX_HELD_SHARE

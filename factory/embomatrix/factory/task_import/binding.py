@@ -1,8 +1,8 @@
-"""Binding: the objects of a BDDL problem are found in a base scene, or refused for a reason.
+"""Binding: a BDDL problem's objects are assigned to objects of a base scene, or refused with a reason.
 
-``inroom`` names the scene's own objects; they are found by backtracking over room instances and categories. What the
-problem puts on, in, under or beside something is added later by the editor. Substances have no place: they are what things
-are covered, filled or soaked with. Objects that are still to come are the halves of things that can be sliced.
+``inroom`` names the scene's own objects, found by backtracking over rooms and categories. Objects that the problem
+puts on, in, under or beside something are added later. Substances have no place: objects are covered, filled or
+soaked with them. Future objects are the halves of sliceable objects.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from embomatrix.factory.admission import RefusalReason, RefusedError
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.expressible import AGENT, FLOORS, check_evaluable, check_expressible
 from embomatrix.factory.task_import.reach import pieces_of
-from embomatrix.factory.task_import.search import needs_of, search
+from embomatrix.factory.task_import.search import abilities_needed, search
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.state import Relation
 from embomatrix.world.substances import is_substance
@@ -28,16 +28,16 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 PLACING: Final = (Relation.INSIDE, Relation.ONTOP, Relation.UNDER, Relation.NEXTTO)
-"""Relations by which ``:init`` places an object, the most telling first."""
+"""Relations by which ``:init`` places an object, the most specific first."""
 
 
 @dataclass(frozen=True, slots=True)
 class Addition:
-    """An object that must be added.
+    """Object that must be added to the scene.
 
-    ``host`` is another object of the problem; on top of none is on the floor of ``room``. Without a relation it may be anywhere
-    in ``room``, without a room anywhere in the problem's rooms. ``beside`` are objects that it is next to, besides; ``needs``
-    are what it must be able to do.
+    ``host`` is another object of the problem; on top of no host means the floor of ``room``. Without a relation it
+    may be anywhere in ``room``, and without a room anywhere in the problem's rooms. ``beside`` lists its neighbours,
+    and ``needs`` its required abilities.
     """
 
     name: str
@@ -51,9 +51,9 @@ class Addition:
 
 @dataclass(frozen=True, slots=True)
 class Binding:
-    """``found`` maps objects of the problem to scene objects, ``floors`` to rooms; ``additions`` are in order of need.
+    """Result of a binding. ``found`` maps the problem's objects to scene objects, ``floors`` to rooms.
 
-    ``problem`` is the one that was bound, with its wildcards spelt out.
+    ``additions`` are ordered with hosts first. ``problem`` is the bound problem with its wildcards expanded.
     """
 
     problem: BddlProblem
@@ -61,7 +61,7 @@ class Binding:
     floors: Mapping[str, str]
     additions: tuple[Addition, ...]
     rooms: Mapping[str, str]
-    """The problem's words for rooms, and the rooms of the scene that they stand for."""
+    """Scene rooms by the problem's room names."""
     robot_room: str
 
 
@@ -73,13 +73,13 @@ def bind(
     furnishing: bool = True,
     reachable: bool = True,
     renumbering: bool = False,
-    shunned: Container[str] = (),
+    excluded: Container[str] = (),
 ) -> Binding:
-    """Find the problem's objects in the scene. Raises RefusedError with the first thing that can't be bound.
+    """Find the problem's objects in the scene. Raise RefusedError for the first object that can't be bound.
 
-    Furniture that its rooms lack is to be added when ``furnishing``, as the paper's factory does; else that is a refusal.
-    A goal that no skill reaches is a refusal when it is to be ``reachable``; a room's number counts unless ``renumbering``.
-    Scene objects that are ``shunned`` are left.
+    With ``furnishing``, missing furniture is added, as in the paper's factory. With ``reachable``, a goal that no
+    skill reaches is refused. With ``renumbering``, room numbers don't count. Scene objects in ``excluded`` are not
+    used.
     """
     (check_expressible if reachable else check_evaluable)(problem)
     inroom = {
@@ -98,19 +98,26 @@ def bind(
         and name not in problem.wildcards
     ]
     rooms, found = search(
-        problem, view, inroom, fixtures, rng, furnishing=furnishing, renumbering=renumbering, shunned=shunned
+        problem,
+        view,
+        inroom,
+        fixtures,
+        rng,
+        furnishing=furnishing,
+        renumbering=renumbering,
+        excluded=excluded,
     )
-    problem = _spelt_out(problem, view, rooms, found)
+    problem = _with_wildcards_expanded(problem, view, rooms, found)
     floors = {name: rooms[room] for name, room in inroom.items() if problem.objects.get(name) in FLOORS}
-    loose = {name: rooms[inroom[name]] for name in fixtures if name not in found}
-    additions = _in_order(problem, placed, found, floors, loose)
+    unassigned = {name: rooms[inroom[name]] for name in fixtures if name not in found}
+    additions = _in_order(problem, placed, found, floors, unassigned)
     return Binding(problem, found, floors, additions, rooms, _robot_room(problem, placed, floors, scene))
 
 
-def _spelt_out(
+def _with_wildcards_expanded(
     problem: BddlProblem, view: SceneView, rooms: Mapping[str, str], found: dict[str, str]
 ) -> BddlProblem:
-    """The problem with wildcards replaced by all further objects of the type in the room, which are added to ``found``."""
+    """Expand each wildcard to all further objects of its type in the room, and add them to ``found``."""
     catalog = Catalog.load()
     members: dict[str, tuple[str, ...]] = {}
     for wildcard, word in problem.wildcards.items():
@@ -129,7 +136,7 @@ def _spelt_out(
 
 
 def _placements(problem: BddlProblem) -> dict[str, tuple[Relation, str]]:
-    """How ``:init`` places each object that it places."""
+    """Return the relation and host that ``:init`` gives to each object."""
     placed: dict[str, tuple[Relation, str]] = {}
     for relation in PLACING:
         for item in problem.init:
@@ -145,8 +152,8 @@ def _in_order(
     floors: Mapping[str, str],
     loose: Mapping[str, str],
 ) -> tuple[Addition, ...]:
-    """Additions such that each host is there before its guest. What the start places nowhere may be anywhere."""
-    needs = needs_of(problem)
+    """Return the additions with hosts first. Objects without a place in the start may be anywhere."""
+    needs = abilities_needed(problem)
     additions: list[Addition] = []
     ready = {*found, *floors}
     waiting = _to_add(problem, ready)
@@ -158,7 +165,7 @@ def _in_order(
         if name is None:
             raise RefusedError(
                 RefusalReason.NO_PLACE_GIVEN,
-                f"the start puts {waiting[0]!r} at {placed[waiting[0]][1]!r}, and says of neither where it is",
+                f"the start puts {waiting[0]!r} at {placed[waiting[0]][1]!r}, but gives a place for neither",
             )
         waiting.remove(name)
         ready.add(name)
@@ -170,7 +177,7 @@ def _in_order(
 
 
 def _neighbours(problem: BddlProblem, name: str, ready: Container[str]) -> tuple[str, ...]:
-    """Objects that are there before and that the start puts next to one, in either order."""
+    """Return existing neighbours that the start puts next to the object, in either order."""
     pairs = (
         item.atom.args for item in problem.init if item.positive and item.atom.predicate == Relation.NEXTTO
     )
@@ -179,7 +186,7 @@ def _neighbours(problem: BddlProblem, name: str, ready: Container[str]) -> tuple
 
 
 def _to_add(problem: BddlProblem, ready: Container[str]) -> list[str]:
-    """The problem's objects that the scene lacks: no halves, which come of slicing, and nothing without a body."""
+    """Return the problem's objects that the scene lacks, without halves, agents, floors and substances."""
     absent = {half for halves in pieces_of(problem).values() for half in halves}
     return [
         name
@@ -193,7 +200,7 @@ def _to_add(problem: BddlProblem, ready: Container[str]) -> list[str]:
 
 
 def _place_of(at: tuple[Relation, str], floors: Mapping[str, str]) -> tuple[Relation | None, str, str]:
-    """Relation, host and room of an addition; what the start puts on a floor is on top of no object."""
+    """Return relation, host and room of an addition. Objects on a floor have no host."""
     relation, host = at
     if host in floors:
         return Relation.ONTOP, "", floors[host]

@@ -1,8 +1,7 @@
-"""What problems of other worlds call things, in the words of the catalog; and what they leave unsaid, said.
+"""Translation of other datasets' problems to the catalog's types, with implied rooms made explicit.
 
-A word that the catalog's package has renamed is read as the new one. A word for a whole group of things (a table, a book)
-stands for a thing of the group that the catalog has models of, the first that the problem does not name already: what
-quantifiers range over stays the same.
+Renamed types are replaced. A type for a whole group (a table, a book) is replaced by the first member with models
+that the problem does not name yet. The domains of the quantifiers stay the same.
 """
 
 from __future__ import annotations
@@ -36,9 +35,9 @@ RENAMED: Final[Mapping[str, tuple[str, ...]]] = {
     "basket.n.03": ("wicker_basket.n.01", "shopping_basket.n.01"),
     "duffel_bag.n.01": ("backpack.n.01", "shoulder_bag.n.01"),
 }
-"""Words of the paper's tasks that bddl 3.6 has under another synset, or, of the duffel bag, no more.
+"""Types of the paper's tasks that bddl 3.6 renamed or, like the duffel bag, removed.
 
-A basket of the third sense is a basketball hoop there, which no task means.
+The third sense of "basket" is a basketball hoop there, which no task means.
 """
 
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -131,34 +130,34 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "wrapping.n.01": ("wrapping_paper.n.01",),
     "yogurt.n.01": ("cup__of__yogurt.n.01",),
 }
-"""Words of BEHAVIOR-100, in which EAI's tasks are written: groups, and foods and liquids that are things there, packed here.
+"""Types of BEHAVIOR-100, used by EAI's tasks: groups, and foods and liquids, which are packed objects here.
 
-A thing whose models don't do what these tasks are about is another of its kind: the catalog's only backpack is wider than a
-hand opens, its shirt is spread out, its package has no lid and its alarm clock no switch.
+Types whose models can't do what the tasks need are replaced as well. The catalog's only backpack is too wide for the
+gripper, its shirt is spread out, its package has no lid, and its alarm clock has no switch.
 """
 LAMPS: Final[Mapping[str, tuple[str, ...]]] = {"room_light.n.01": ("floor_lamp.n.01",)}
-"""What stands for a light that is switched: those under ceilings have no switch in the catalog, and hang out of reach."""
+"""Replacement for lights that are switched. Ceiling lights have no switch in the catalog and are out of reach."""
 _TYPE: Final = re.compile(r"(?<![\w.])([a-z_\-]+\.n\.\d+)(?![\d_])", re.IGNORECASE)
 _SWITCHED: Final = re.compile(r"\(\s*toggled_on\s+\??([a-z_\-]+\.n\.\d+)", re.IGNORECASE)
 
 
 @functools.lru_cache(maxsize=16)
 def read_problem(source: SourceText) -> tuple[BddlProblem, tuple[str, ...]]:
-    """The problem of a source in the words of the catalog, whole, and what was read into it. Raises BddlError."""
+    """Parse a source, translate its types and add implied rooms. Return the problem and notes. Raise BddlError."""
     words = GROUPS if source.source == EAI else RENAMED
-    text, replaced = in_catalog_words(source.text, {**words, **_lamps_for(source.text)})
-    problem, added = said_whole(parse_problem(text))
+    text, replaced = translate_types(source.text, {**words, **_lamps_for(source.text)})
+    problem, added = with_implied_rooms(parse_problem(text))
     return problem, (*replaced, *added)
 
 
 def _lamps_for(text: str) -> dict[str, tuple[str, ...]]:
-    """Lights that start or goal switch, and the lamps that stand for them."""
+    """Return the replacements for lights that the start or the goal switches."""
     switched = {name.lower() for name in _SWITCHED.findall(text)}
     return {name: lamps for name, lamps in LAMPS.items() if name in switched}
 
 
-def in_catalog_words(text: str, words: Mapping[str, tuple[str, ...]]) -> tuple[str, tuple[str, ...]]:
-    """BDDL with types replaced by what they stand for, and a sentence for each replacement. Names of objects stay."""
+def translate_types(text: str, words: Mapping[str, tuple[str, ...]]) -> tuple[str, tuple[str, ...]]:
+    """Replace types in BDDL text, and return a sentence for each replacement. Object names stay."""
     found = dict.fromkeys(name.lower() for name in _TYPE.findall(text))
     chosen: dict[str, str] = {}
     for name in found:
@@ -170,11 +169,10 @@ def in_catalog_words(text: str, words: Mapping[str, tuple[str, ...]]) -> tuple[s
     return _TYPE.sub(lambda match: chosen.get(match[1].lower(), match[1]), text), notes
 
 
-def said_whole(problem: BddlProblem) -> tuple[BddlProblem, tuple[str, ...]]:
-    """The problem with what it leaves unsaid, and a sentence for each addition.
+def with_implied_rooms(problem: BddlProblem) -> tuple[BddlProblem, tuple[str, ...]]:
+    """Add implied rooms, and return a sentence for each addition.
 
-    A room in the place of a host is the room that the thing is in. A floor whose room is not told is the floor of the room
-    of what stands on it.
+    A room used as a host becomes the room of the object. A floor without a room gets the room of the objects on it.
     """
     notes: list[str] = []
     problem = _rooms_as_rooms(problem, notes)
@@ -214,7 +212,7 @@ def _placed(problem: BddlProblem, notes: list[str]) -> BddlProblem:
     def put(name: str, room: str) -> None:
         known[name] = room
         added.append(InitLiteral(Atom(Relation.INROOM.value, (name, room))))
-        notes.append(f"of {name} no room is told: it is taken to be that of {room}")
+        notes.append(f"{name} has no room: {room} is assumed")
 
     first = next(iter(known.values()))
     for name, type_name in problem.objects.items():

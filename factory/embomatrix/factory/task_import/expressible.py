@@ -1,4 +1,6 @@
-"""What a problem must be before any scene is looked at: of known types, about what the world holds, in the skills' reach."""
+"""Checks of a problem before any scene is considered: known types, representable state, and goals within the skills'
+reach.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,7 @@ import difflib
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.admission import RefusalReason, RefusedError
-from embomatrix.factory.task_import.reach import FUTURE, HELD, INSOURCE, Horizon, pieces_of
+from embomatrix.factory.task_import.reach import FUTURE, HELD, INSOURCE, Reachability, pieces_of
 from embomatrix.world.bddl import is_room_instance
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.evaluate import atoms_of, render
@@ -18,25 +20,25 @@ if TYPE_CHECKING:
     from embomatrix.world.goal import Atom
 
 FLOORS: Final = frozenset({"floor.n.01", "driveway.n.01", "lawn.n.01"})
-"""What things stand on where nothing else is said: a garden is one plane here, its lawn and its driveway are its floor."""
+"""Types of floors. A garden is one plane here; lawn and driveway are its floor."""
 AGENT: Final = "agent.n.01"
 
 
 def check_expressible(problem: BddlProblem) -> None:
-    """Raise RefusedError for what no scene could hold and no skill could reach, whatever the scene."""
+    """Raise RefusedError if no scene can represent the problem or no skill can reach its goal."""
     _check_types(problem)
     _check_goal(problem)
     _check_start(problem)
 
 
 def check_evaluable(problem: BddlProblem) -> None:
-    """Raise RefusedError for what no scene could hold, or of which nobody could tell whether it holds. Reach is not asked."""
+    """Raise RefusedError if no scene can represent the problem or its goal can't be evaluated. Reach is not checked."""
     _check_types(problem)
     for atom in atoms_of(problem.goal):
         if atom.predicate not in HELD:
             raise RefusedError(
                 RefusalReason.INEXPRESSIBLE,
-                f"the goal asks for {render(atom)}, which the world does not hold",
+                f"the goal needs {render(atom)}, which scenes can't represent",
             )
         _check_goal_args(problem, atom)
     _check_start(problem)
@@ -64,14 +66,14 @@ def _close_synsets(type_name: str) -> str:
 
 
 def _check_goal(problem: BddlProblem) -> None:
-    obstacle = Horizon(problem).obstacle(problem.goal)
-    if obstacle is not None:
+    unreachable_part = Reachability(problem).unreachable_part(problem.goal)
+    if unreachable_part is not None:
         solid = not any(
-            is_substance(_type(problem, arg)) for atom in atoms_of(obstacle) for arg in atom.args[:1]
+            is_substance(_type(problem, arg)) for atom in atoms_of(unreachable_part) for arg in atom.args[:1]
         )
         raise RefusedError(
             RefusalReason.INEXPRESSIBLE if solid else RefusalReason.SUBSTANCE,
-            f"the goal asks for {render(obstacle)}, which no skill brings about",
+            f"the goal needs {render(unreachable_part)}, which no skill achieves",
         )
     for atom in atoms_of(problem.goal):
         _check_goal_args(problem, atom)
@@ -84,23 +86,23 @@ def _check_start(problem: BddlProblem) -> None:
         if item.positive and predicate not in HELD | {INSOURCE}:
             raise RefusedError(
                 RefusalReason.INEXPRESSIBLE,
-                f"the start asks for {predicate!r}, which the world does not hold",
+                f"the start needs {predicate!r}, which scenes can't represent",
             )
         if predicate in set(Relation) and any(is_substance(_type(problem, arg)) for arg in args):
             raise RefusedError(
-                RefusalReason.SUBSTANCE, f"the start asks for {render(item.atom)}: a substance has no place"
+                RefusalReason.SUBSTANCE, f"the start needs {render(item.atom)}: a substance has no place"
             )
         if predicate == FUTURE and args[0] not in pieces and not is_substance(_type(problem, args[0])):
             raise RefusedError(
                 RefusalReason.INEXPRESSIBLE,
-                f"{args[0]!r} is to come, and no skill makes it: only halves are made",
+                f"{args[0]!r} is a future object that no skill makes: only halves are made",
             )
         for arg in args[: 1 if predicate == Relation.INROOM else 2]:
             _check_no_room(problem, arg)
 
 
 def _type(problem: BddlProblem, arg: str) -> str:
-    """Type of an object, or of a bound variable that is called by it, ``?water.n.06``."""
+    """Return the type of an object, or of a bound variable named after its type, such as ``?water.n.06``."""
     return problem.objects.get(arg, arg.lstrip("?"))
 
 
@@ -111,11 +113,9 @@ def _check_goal_args(problem: BddlProblem, atom: Atom) -> None:
             continue
         _check_no_room(problem, arg)
         if problem.objects[arg] == AGENT:
-            raise RefusedError(RefusalReason.AGENT_IN_GOAL, "the goal is about where the robot stands")
+            raise RefusedError(RefusalReason.AGENT_IN_GOAL, "the goal is about the robot's own position")
 
 
 def _check_no_room(problem: BddlProblem, arg: str) -> None:
     if arg not in problem.objects and is_room_instance(arg):
-        raise RefusedError(
-            RefusalReason.ROOM_AS_OBJECT, f"{arg!r} is a room and stands where an object should"
-        )
+        raise RefusedError(RefusalReason.ROOM_AS_OBJECT, f"{arg!r} is a room: expected an object")

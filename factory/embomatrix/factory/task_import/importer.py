@@ -1,4 +1,4 @@
-"""Who imports problems: this process, or several."""
+"""Importer of problems in this process or in several processes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.batch import Verified, bind_first, verify_first
 from embomatrix.factory.task_import.report import ProblemOutcome, outcome_of
-from embomatrix.factory.task_import.task import ImportedTask, Manner
+from embomatrix.factory.task_import.task import ImportedTask, ImportOptions
 from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.process_pool import shared_work
@@ -22,21 +22,21 @@ if TYPE_CHECKING:
     from embomatrix.factory.admission import TaskRefusal
     from embomatrix.factory.task_import.sources import SourceText
 
-    Judging = Callable[[Sequence[SourceText]], Iterator["ImportOutcome"]]
-    """Imports problems; what comes of them comes in their order."""
+    ImportMany = Callable[[Sequence[SourceText]], Iterator["ImportOutcome"]]
+    """Function that imports problems and yields the outcomes in order."""
 
 
 class Depth(StrEnum):
-    """How far an import goes."""
+    """Depth of an import."""
 
     VERIFY = "verify"  # bound, and solved by the oracle in the simulator
-    BIND = "bind"  # bound to a scene, the goal within the skills' reach
-    INSTANTIATE = "instantiate"  # bound to a scene, whatever the skills can do
+    BIND = "bind"  # bound to a scene, with a goal within the skills' reach
+    INSTANTIATE = "instantiate"  # bound to a scene, with any goal
 
 
 @dataclass(frozen=True, slots=True)
-class Docket:
-    """What decides the imports of one command."""
+class ImportSettings:
+    """Settings that decide the imports of one command."""
 
     scenes: tuple[str, ...]
     seed: int
@@ -46,23 +46,23 @@ class Docket:
 
 @dataclass(frozen=True, slots=True)
 class ImportOutcome:
-    """What became of a problem, as a report tells it and as a value. What was only bound stays where it was made."""
+    """Outcome of a problem, for the report and as a value. Bound tasks stay in the process that made them."""
 
     outcome: ProblemOutcome
     item: ImportedTask | Verified | TaskRefusal | None
 
 
 class ProblemImporter:
-    """Imports problems one after the other, with the base scenes and a client to settle things in. Close it after use."""
+    """Importer with loaded base scenes and a placement library. Close it after use."""
 
-    def __init__(self, docket: Docket) -> None:
-        self._docket = docket
-        self._bases = [build_base_scene(scene_id) for scene_id in docket.scenes]
-        self._foresight = ReachabilitySurvey() if docket.look_ahead else None
+    def __init__(self, settings: ImportSettings) -> None:
+        self._settings = settings
+        self._bases = [build_base_scene(scene_id) for scene_id in settings.scenes]
+        self._foresight = ReachabilitySurvey() if settings.look_ahead else None
         self._library = PlacementLibrary()
 
-    def judge(self, source: SourceText) -> ImportOutcome:
-        """Import one problem. Raises BddlError where it is none."""
+    def run(self, source: SourceText) -> ImportOutcome:
+        """Import one problem. Raise BddlError."""
         item = self._imported(source)
         return ImportOutcome(outcome_of(source, item), item)
 
@@ -70,10 +70,10 @@ class ProblemImporter:
         self._library.close()
 
     def _imported(self, source: SourceText) -> ImportedTask | Verified | TaskRefusal:
-        seed = self._docket.seed
-        match self._docket.depth:
+        seed = self._settings.seed
+        match self._settings.depth:
             case Depth.INSTANTIATE:
-                return bind_first(source, self._bases, seed=seed, manner=Manner(reachable=False))
+                return bind_first(source, self._bases, seed=seed, options=ImportOptions(reachable=False))
             case Depth.BIND:
                 return bind_first(source, self._bases, seed=seed)
             case Depth.VERIFY:
@@ -81,18 +81,18 @@ class ProblemImporter:
 
 
 @contextlib.contextmanager
-def judging(docket: Docket, jobs: int) -> Iterator[Judging]:
-    """For as long as this is held. Raises EvaluationError when one of several processes dies."""
+def importing(settings: ImportSettings, jobs: int) -> Iterator[ImportMany]:
+    """Yield a function that imports problems. Raise EvaluationError if a process dies."""
     died = EvaluationError(
-        "a process that imports problems died, perhaps for want of memory: call the same command with fewer --jobs"
+        "a process that imports problems died, possibly for lack of memory: run the same command with fewer --jobs"
     )
     with shared_work(
-        jobs, ProblemImporter, ProblemImporter.judge if jobs == 1 else _sent, docket, died=died
+        jobs, ProblemImporter, ProblemImporter.run if jobs == 1 else _picklable_import, settings, died=died
     ) as judge:
         yield judge
 
 
-def _sent(judge: ProblemImporter, source: SourceText) -> ImportOutcome:
-    """What another process tells."""
-    judged = judge.judge(source)
-    return ImportOutcome(judged.outcome, None) if isinstance(judged.item, ImportedTask) else judged
+def _picklable_import(importer: ProblemImporter, source: SourceText) -> ImportOutcome:
+    """Import one problem in another process, and drop bound tasks from the outcome."""
+    outcome = importer.run(source)
+    return ImportOutcome(outcome.outcome, None) if isinstance(outcome.item, ImportedTask) else outcome

@@ -1,4 +1,8 @@
-"""Which models of a type are tried for an object that a problem brings, the best first."""
+"""Models and sizes for the objects that a problem adds.
+
+The catalog has only one model, of one size, for many types: a sausage larger than its box, a backpack too wide for
+the gripper. If no model of a type meets the requirements, a scaled model is used, within limits.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +12,8 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.scenes.view import is_liftable
-from embomatrix.factory.task_import.search import serves
-from embomatrix.factory.task_import.size_requirements import CavityFit, Demand, floor_needed_m2, room_for
+from embomatrix.factory.task_import.search import has_abilities
+from embomatrix.factory.task_import.size_requirements import CavityFit, Requirement, floor_needed_m2, room_for
 from embomatrix.sim.geometry.candidates import candidates, surfaces_for
 from embomatrix.sim.planner.subgoals import CANDIDATES, MIDDLE
 from embomatrix.world.catalog import Catalog
@@ -26,17 +30,17 @@ if TYPE_CHECKING:
 
 
 MODEL_TRIES: Final = 5
-"""Models of a type that are tried before it counts as not fitting its place."""
+"""Maximum number of models tried for an object."""
 LOOKED_AT: Final = 4 * MODEL_TRIES
-"""Models of which it is asked whether they can do what they must."""
+"""Maximum number of models whose abilities are checked."""
 
 
-def models_for(addition: Addition, rng: np.random.Generator, demand: Demand) -> list[Model]:
-    """At most five models of the type that can do what is asked, the liftable ones before furniture.
+def models_for(addition: Addition, rng: np.random.Generator, requirement: Requirement) -> list[Model]:
+    """Return at most five models of the type with the required abilities, liftable ones first.
 
-    Of what can be lifted large ones come first where it bears others, else small ones. Of furniture two of a middling
-    size come first, then the smallest: where these don't fit, none does. On other furniture only small ones go. Where none
-    that can be lifted takes all that goes in, what does so comes first, unless the thing is to be carried.
+    Among liftable models, large ones come first if the object supports others, otherwise small ones. Among furniture,
+    two of medium size come first, then the smallest. On other furniture only small models are used. If no liftable
+    model has space for all contents, models that do come first, unless the object is carried.
     """
     catalog = Catalog.load()
     models = [
@@ -49,20 +53,20 @@ def models_for(addition: Addition, rng: np.random.Generator, demand: Demand) -> 
     for model, mass in models:
         volume = math.prod(model.size_m) * float(rng.uniform(0.7, 1.4))
         if is_liftable(model.size_m, mass):
-            light.append((-math.prod(model.size_m) if demand.bears else volume, model))
+            light.append((-math.prod(model.size_m) if requirement.bears else volume, model))
         else:
             heavy.append((volume, model))
     order = [*_ranked(light), *(_ranked(heavy) if addition.host else _middling_first(heavy))]
-    able = [model for model in order[:LOOKED_AT] if serves(_asset(model), addition.needs)]
-    if demand.contents:
-        # A sort that keeps the order: among those that take everything, and among the others.
-        carried = [model for _, model in light] if demand.carried else []
-        able.sort(key=lambda model: (bool(carried) and model not in carried, _room(model, demand)))
+    able = [model for model in order[:LOOKED_AT] if has_abilities(_asset(model), addition.needs)]
+    if requirement.contents:
+        # A stable sort: models with space for everything come first.
+        carried = [model for _, model in light] if requirement.carried else []
+        able.sort(key=lambda model: (bool(carried) and model not in carried, _room(model, requirement)))
     return able[:MODEL_TRIES]
 
 
-def _room(model: Model, demand: Demand) -> CavityFit:
-    return room_for(_asset(model), demand.contents)
+def _room(model: Model, requirement: Requirement) -> CavityFit:
+    return room_for(_asset(model), requirement.contents)
 
 
 def _asset(model: Model) -> Asset:
@@ -70,12 +74,12 @@ def _asset(model: Model) -> Asset:
 
 
 def _ranked(models: Sequence[tuple[float, Model]]) -> list[Model]:
-    """Models by a number, the least first."""
+    """Return the models sorted by their number, the smallest first."""
     return [model for _, model in sorted(models, key=lambda item: item[0])]
 
 
 def _middling_first(models: Sequence[tuple[float, Model]]) -> list[Model]:
-    """Models by volume, the least first, after two from the middle."""
+    """Return the models by volume, the smallest first, after two of medium size."""
     order = _ranked(models)
     middle = len(order) // 2
     first = order[max(0, middle - 1) : middle + 1]
@@ -84,53 +88,59 @@ def _middling_first(models: Sequence[tuple[float, Model]]) -> list[Model]:
 
 SMALLER: Final = (0.9, 0.8, 0.7, 0.6, 0.5)
 LARGER: Final = (1.2, 1.4, 1.6)
-"""Shares at which models are tried, the nearest to their own size first."""
+"""Scale factors of models, the nearest to 1 first."""
 KEPT: Final = 2
-"""Models of another size that are tried before the catalog's own."""
+"""Maximum number of scaled models tried before the catalog's own."""
 
 
 @dataclass(frozen=True, slots=True)
 class HostPlacement:
-    """Where a thing is, or is to be: in ``relation`` to a host, at most at this share of its size."""
+    """Placement of an object at the start or in the goal: relation, host, and maximum scale of the object."""
 
     relation: Relation
     host: Asset
     share: float
 
 
-def sized(
+def with_sizes(
     orders: Mapping[str, Sequence[Model]],
     additions: Sequence[Addition],
-    demands: Mapping[str, Demand],
+    requirements: Mapping[str, Requirement],
     found: Mapping[str, Asset],
     *,
-    snug: bool = False,
+    compact: bool = False,
 ) -> dict[str, list[Model]]:
-    """Models to try for each addition: those of its order that do what is asked first, else some of another size.
+    """Return the models to try for each addition. Models that meet the requirements come first, otherwise scaled
+    ones.
 
-    ``demands`` are those on each thing of the problem, ``found`` assets of the scene's objects that it is bound to. Things that
-    bear others are chosen first, so that those know what they are to be put on. When ``snug``, what shares a cavity or a
-    surface is small enough for all to lie side by side.
+    ``requirements`` are those of each object of the problem; ``found`` holds the assets of bound scene objects. Hosts
+    are chosen before the objects on them. With ``compact``, objects that share a host are scaled to fit side by side.
     """
     chosen = {name: list(models) for name, models in orders.items()}
-    for addition in sorted(additions, key=lambda each: not demands[each.name].bears):
-        demand = demands[addition.name] if snug else replace(demands[addition.name], burden=())
+    for addition in sorted(additions, key=lambda each: not requirements[each.name].bears):
+        requirement = (
+            requirements[addition.name] if compact else replace(requirements[addition.name], burden=())
+        )
         places = [
-            HostPlacement(relation, host, _share_of_all(host, demands[name]) if snug else math.inf)
-            for relation, name in demand.places
+            HostPlacement(relation, host, _share_of_all(host, requirements[name]) if compact else math.inf)
+            for relation, name in requirement.places
             if (host := found.get(name) or _first(chosen.get(name, ()))) is not None
         ]
-        models = _ordered(chosen[addition.name], demand, places)
-        if snug and (demand.contents or demand.burden) and not _suits(models[0], demand, places):
-            models = [*_grown(models, demand, places), *models]
+        models = _ordered(chosen[addition.name], requirement, places)
+        if (
+            compact
+            and (requirement.contents or requirement.burden)
+            and not _meets(models[0], requirement, places)
+        ):
+            models = [*_enlarged(models, requirement, places), *models]
         chosen[addition.name] = models
     return chosen
 
 
-def _share_of_all(host: Asset, demand: Demand) -> float:
-    """Share of their size at which all that goes into or onto a host has floor there; no limit where all has it."""
+def _share_of_all(host: Asset, requirement: Requirement) -> float:
+    """Return the scale at which all objects fit into or onto a host; infinite if they fit at full size."""
     least = math.inf
-    for relation, types in ((Relation.INSIDE, demand.contents), (Relation.ONTOP, demand.burden)):
+    for relation, types in ((Relation.INSIDE, requirement.contents), (Relation.ONTOP, requirement.burden)):
         floor_m2 = sum(math.prod(surface.size_m) for surface in surfaces_for(host, relation))
         needed_m2 = floor_needed_m2(types)
         if needed_m2 > floor_m2:
@@ -138,43 +148,49 @@ def _share_of_all(host: Asset, demand: Demand) -> float:
     return least
 
 
-def _ordered(models: list[Model], demand: Demand, places: Sequence[HostPlacement]) -> list[Model]:
+def _ordered(models: list[Model], requirement: Requirement, places: Sequence[HostPlacement]) -> list[Model]:
     most = max(SMALLER[-1], min((place.share for place in places), default=math.inf))
-    fit = [model for model in models if model.share <= most and _suits(model, demand, places)]
+    fit = [model for model in models if model.share <= most and _meets(model, requirement, places)]
     if fit:
         return [*fit, *(model for model in models if model not in fit)]
     made = [
-        model for model in _resized(models, demand) if model.share <= most and _suits(model, demand, places)
+        model
+        for model in _resized(models, requirement)
+        if model.share <= most and _meets(model, requirement, places)
     ]
-    if not made and demand.carried:
-        # what does not do all of it is at least to be carried
-        made = [model for model in (*models, *_resized(models, Demand())) if _is_liftable(model)]
+    if not made and requirement.carried:
+        # a model that meets only part of the requirements must at least be portable
+        made = [model for model in (*models, *_resized(models, Requirement())) if _is_liftable(model)]
     return [*made[:KEPT], *models]
 
 
-def _grown(models: Sequence[Model], demand: Demand, places: Sequence[HostPlacement]) -> list[Model]:
-    """The models as large as can be, for more than any has room for: what goes in is made smaller too."""
+def _enlarged(
+    models: Sequence[Model], requirement: Requirement, places: Sequence[HostPlacement]
+) -> list[Model]:
+    """Return the models at the largest scale, for more contents than any model has space for. The contents are scaled
+    down too.
+    """
     largest = [model.at(LARGER[-1]) for model in models if model.share == 1]
-    less = replace(demand, contents=(), burden=())
-    return [model for model in largest if _suits(model, less, places)][:KEPT]
+    less = replace(requirement, contents=(), burden=())
+    return [model for model in largest if _meets(model, less, places)][:KEPT]
 
 
-def _resized(models: Sequence[Model], demand: Demand) -> Iterator[Model]:
-    """The models at other shares of their size: larger ones of what others go into, then smaller ones."""
-    for share in (*(LARGER if demand.contents or demand.burden else ()), *SMALLER):
+def _resized(models: Sequence[Model], requirement: Requirement) -> Iterator[Model]:
+    """Yield the models at other scales: larger ones for hosts, then smaller ones."""
+    for share in (*(LARGER if requirement.contents or requirement.burden else ()), *SMALLER):
         for model in models:
             yield model.at(share)
 
 
-def _suits(model: Model, demand: Demand, places: Sequence[HostPlacement]) -> bool:
+def _meets(model: Model, requirement: Requirement, places: Sequence[HostPlacement]) -> bool:
     asset = _asset(model)
-    if demand.carried and not _is_liftable(model):
+    if requirement.carried and not _is_liftable(model):
         return False
-    if demand.contents and room_for(asset, demand.contents) is not CavityFit.FOR_ALL:
+    if requirement.contents and room_for(asset, requirement.contents) is not CavityFit.FOR_ALL:
         return False
-    if demand.burden and room_for(asset, demand.burden, Relation.ONTOP) is not CavityFit.FOR_ALL:
+    if requirement.burden and room_for(asset, requirement.burden, Relation.ONTOP) is not CavityFit.FOR_ALL:
         return False
-    return all(_goes(asset, place) for place in places)
+    return all(_fits_host(asset, place) for place in places)
 
 
 def _is_liftable(model: Model) -> bool:
@@ -182,8 +198,8 @@ def _is_liftable(model: Model) -> bool:
     return is_liftable(asset.size_m, asset.mass_kg)
 
 
-def _goes(asset: Asset, place: HostPlacement) -> bool:
-    """Whether a thing has a pose on or in its host, by geometry alone."""
+def _fits_host(asset: Asset, place: HostPlacement) -> bool:
+    """True if the object has a pose on or in its host, by geometry alone."""
     return next(candidates(asset, place.host, place.relation, MIDDLE, CANDIDATES), None) is not None
 
 

@@ -1,7 +1,7 @@
-"""Which goals the skills can reach, judged from a problem alone: before any scene is at hand, and before any plan is sought.
+"""Reachability of goals by the skills, judged from a problem alone, before any scene or plan exists.
 
-A ground atom can come true, or become false, when some skill of the household profile does that to things of such a type;
-or it is so from the start. What no skill does and the start does not hold makes a goal inexpressible.
+A ground atom can become true or false if a skill of the profile has this effect on objects of its type. A goal with
+an atom that does not hold at the start and that no skill achieves is inexpressible.
 """
 
 from __future__ import annotations
@@ -46,18 +46,18 @@ if TYPE_CHECKING:
 INSOURCE: Final = "insource"
 REAL, FUTURE = "real", "future"
 HELD: Final = frozenset((*Relation, *State, *SubstanceRelation, REAL, FUTURE))
-"""Predicates that a scene can hold and a goal can ask for."""
+"""Predicates that a scene can represent and a goal can use."""
 HOUSEHOLD: Final = frozenset((State.SLICED, *MEANINGS, *SubstanceRelation, REAL, FUTURE))
-"""Predicates that ask for the household profile's skills."""
+"""Predicates that need skills of the household profile."""
 
 
 def profile_for(goal: Formula) -> Profile:
-    """The smaller of the profiles that a goal needs."""
+    """Return the smaller profile whose skills suffice for a goal."""
     return Profile.HOUSEHOLD if any(atom.predicate in HOUSEHOLD for atom in atoms_of(goal)) else Profile.PAPER
 
 
 def pieces_of(problem: BddlProblem) -> Mapping[str, tuple[str, ...]]:
-    """Objects that can be sliced, and the absent objects of the problem that are their two halves."""
+    """Return the sliceable objects with their two absent halves."""
     future = [item.atom.args[0] for item in problem.init if item.positive and item.atom.predicate == FUTURE]
     waiting: dict[str, list[str]] = {}
     for name in future:
@@ -72,16 +72,16 @@ def pieces_of(problem: BddlProblem) -> Mapping[str, tuple[str, ...]]:
 
 
 def unreachable_atoms(problem: BddlProblem, profile: Profile) -> tuple[str, ...]:
-    """Literals of the goal that no skill of the profile can make hold, in BDDL, each once.
+    """Return the goal's literals that no skill of the profile achieves, as BDDL without repetition.
 
-    A literal about a variable counts when that is so for all that the variable ranges over.
+    A literal with a variable counts if it is unreachable for every value of the variable.
     """
-    horizon = Horizon(problem, profile)
+    reachability = Reachability(problem, profile)
     found = [
         render(atom if positive else Not(atom))
         for atom, positive, scope in literals(problem.goal, True, {})
         if not any(
-            horizon.possible(substitute(atom, dict(zip(scope, names, strict=True))), positive)
+            reachability.possible(substitute(atom, dict(zip(scope, names, strict=True))), positive)
             for names in itertools.product(*(problem.types[type_name] for type_name in scope.values()))
         )
     ]
@@ -91,7 +91,7 @@ def unreachable_atoms(problem: BddlProblem, profile: Profile) -> tuple[str, ...]
 def literals(
     formula: Formula, positive: bool, scope: Mapping[str, str]
 ) -> Iterator[tuple[Atom, bool, Mapping[str, str]]]:
-    """Atoms with their sign, and the types of the variables that they name."""
+    """Yield the atoms with their sign and the types of their variables."""
     match formula:
         case Atom(_, args):
             yield formula, positive, {name: kind for name, kind in scope.items() if name in args}
@@ -109,29 +109,29 @@ def literals(
             yield from literals(body, positive, {**scope, a: kind_a, b: kind_b})
 
 
-class Horizon:
-    """What can become of the objects of one problem by the skills of a profile."""
+class Reachability:
+    """Possible effects of a profile's skills on the objects of one problem."""
 
     def __init__(self, problem: BddlProblem, profile: Profile = Profile.HOUSEHOLD) -> None:
         self._problem = problem
         self._profile = profile
-        self._true = {_meaning(item.atom, problem) for item in problem.init if item.positive}
+        self._true = {_canonical(item.atom, problem) for item in problem.init if item.positive}
         self._pieces = pieces_of(problem)
         self._halves = {half for halves in self._pieces.values() for half in halves}
 
-    def obstacle(self, formula: Formula) -> Formula | None:
-        """A conjunct of the goal that has to come true and can't; None when the goal can be reached."""
+    def unreachable_part(self, formula: Formula) -> Formula | None:
+        """Return a conjunct of the goal that can't become true; None if the goal is reachable."""
         match formula:
             case And(parts):
-                return next((found for part in parts if (found := self.obstacle(part))), None)
+                return next((found for part in parts if (found := self.unreachable_part(part))), None)
             case Forall(variable, type_name, body):
                 grounded = self._ground(variable, type_name, body)
-                return next((found for part in grounded if (found := self.obstacle(part))), None)
+                return next((found for part in grounded if (found := self.unreachable_part(part))), None)
             case _:
                 return None if self.possible(formula) else formula
 
     def possible(self, formula: Formula, positive: bool = True) -> bool:
-        """Whether the formula, or its negation, can be made to hold, each of its parts taken by itself."""
+        """True if the formula, or its negation, can become true. Its parts are judged independently."""
         match formula:
             case Atom():
                 return self._reachable(formula)[0 if positive else 1]
@@ -178,10 +178,10 @@ class Horizon:
         return tuple(substitute(body, {variable: name}) for name in self._problem.types[type_name])
 
     def _reachable(self, atom: Atom) -> tuple[bool, bool]:
-        """Whether the atom can be true in the end, and whether it can be false."""
+        """Return whether the atom can be true at the end, and whether it can be false."""
         if atom.predicate not in HELD:
             return False, False
-        known = _meaning(atom, self._problem)
+        known = _canonical(atom, self._problem)
         at_start = known in self._true
         if atom.predicate == REAL:
             at_start = Atom(FUTURE, atom.args) not in self._true
@@ -191,7 +191,7 @@ class Horizon:
         return at_start or gain, not at_start or loss
 
     def _changes(self, atom: Atom) -> tuple[bool, bool]:
-        """Whether skills can make the atom true, and whether they can make it false."""
+        """Return whether skills can make the atom true, and whether they can make it false."""
         predicate, name = atom.predicate, atom.args[0]
         if is_substance(self._type(name)) or (self._profile is Profile.PAPER and predicate in HOUSEHOLD):
             return False, False
@@ -213,17 +213,19 @@ class Horizon:
                 return False, True
 
     def _flows(self, fact: SubstanceFact, name: str) -> tuple[bool, bool]:
-        """Cleaning takes a covering off; soaking leaves a liquid in what takes it up, or in a vessel."""
+        """Return the changes to a substance. Cleaning removes a covering; soaking adds a liquid to an absorbent
+        object or a vessel.
+        """
         if fact.relation is SubstanceRelation.COVERED:
             return False, comes_off(fact.substance)
         holds = "particleRemover" if fact.relation is SubstanceRelation.SATURATED else "fillable"
         takes_up = self._can(name, holds) or (
             fact.relation is SubstanceRelation.SATURATED and self._can(name, "fillable")
         )
-        return takes_up and self._is_at_hand(fact.substance), False
+        return takes_up and self._is_available(fact.substance), False
 
-    def _is_at_hand(self, substance: str) -> bool:
-        """Whether the substance is a liquid that something of the problem holds or gives; water comes from any tap."""
+    def _is_available(self, substance: str) -> bool:
+        """True if the substance is a liquid that an object of the problem holds or gives. Water comes from any tap."""
         if kind_of(substance) is not SubstanceKind.LIQUID:
             return False
         holding = (SubstanceRelation.FILLED, SubstanceRelation.CONTAINS)
@@ -244,8 +246,10 @@ def _type_can(type_name: str, ability: str) -> bool:
     return any(ability in catalog.category(name).abilities for name in catalog.categories_of(type_name))
 
 
-def _meaning(atom: Atom, problem: BddlProblem) -> Atom:
-    """The atom in one dialect: substances by their synsets, ``dusty`` and the like as facts about them, sources as holders."""
+def _canonical(atom: Atom, problem: BddlProblem) -> Atom:
+    """Return the atom in canonical form: substances by synset, ``dusty`` and similar states as facts, sources as
+    containers.
+    """
     names = tuple(
         problem.objects[arg] if is_substance(problem.objects.get(arg, "")) and index else arg
         for index, arg in enumerate(atom.args)

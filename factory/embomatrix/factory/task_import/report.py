@@ -1,4 +1,4 @@
-"""What became of imported problems, for programs and for people: what could not be bound and why, what was read into them."""
+"""Report on imported problems: outcomes, refusals with reasons, unreachable goals, and import rates."""
 
 from __future__ import annotations
 
@@ -27,15 +27,17 @@ FIGURES: Final[Mapping[str, tuple[str, float]]] = {
     BEHAVIOR: ("import_rate_behavior", 0.6),
     EAI: ("import_rate_eai", 1.0),
 }
-"""Figure and goal by source."""
+"""Name and target of the figure for each source."""
 SOLVED_GOAL: Final = 0.95
 
 
 @dataclass(frozen=True, slots=True)
 class ProblemOutcome:
-    """One problem. ``scene`` is the base scene that it is bound to; empty, with reason and sentence, where it is refused.
+    """Outcome of one problem. ``scene`` is its base scene; if the problem is refused, ``reason`` and ``sentence`` are
+    set instead.
 
-    ``unreachable`` are the goal's literals that no skill makes hold, by profile; ``notes`` what was read into the problem.
+    ``unreachable`` lists the goal's literals that no skill achieves, by profile. ``notes`` lists changes made to the
+    problem.
     """
 
     name: str
@@ -52,13 +54,13 @@ class ProblemOutcome:
 
 
 def outcome_from_json(value: dict[str, Any]) -> ProblemOutcome:
-    """What `dataclasses.asdict` made of an outcome, read back from JSON. Raises KeyError, TypeError."""
+    """Decode an outcome from JSON. Raise KeyError or TypeError."""
     unreachable = {profile: tuple(atoms) for profile, atoms in value["unreachable"].items()}
     return ProblemOutcome(**{**value, "unreachable": unreachable, "notes": tuple(value["notes"])})
 
 
 def outcome_of(source: SourceText, judged: ImportedTask | Verified | TaskRefusal) -> ProblemOutcome:
-    """What is told of a problem. Raises BddlError where the source is no BDDL."""
+    """Return the outcome of a problem for the report. Raise BddlError."""
     problem, notes = read_problem(source)
     unreachable = {profile.value: unreachable_atoms(problem, profile) for profile in Profile}
     if isinstance(judged, TaskRefusal):
@@ -72,7 +74,7 @@ def outcome_of(source: SourceText, judged: ImportedTask | Verified | TaskRefusal
 
 
 def report_to_json(outcomes: Sequence[ProblemOutcome]) -> dict[str, Any]:
-    """Plain JSON values: counts by outcome, then every problem."""
+    """Return the report as a JSON-serialisable dict: counts, then every problem."""
     return {
         "problems": len(outcomes),
         "bound": sum(outcome.is_bound for outcome in outcomes),
@@ -82,7 +84,7 @@ def report_to_json(outcomes: Sequence[ProblemOutcome]) -> dict[str, Any]:
 
 
 def report_to_markdown(outcomes: Sequence[ProblemOutcome]) -> str:
-    """The same for a reader: counts, what is refused and why, then what each profile can't reach, and what was read in."""
+    """Return the report as Markdown."""
     bound = sum(outcome.is_bound for outcome in outcomes)
     lines = ["# Imported problems", "", f"{bound} of {len(outcomes)} are bound to a scene.", ""]
     refused = Counter(outcome.reason for outcome in outcomes if outcome.reason)
@@ -110,7 +112,7 @@ def report_to_markdown(outcomes: Sequence[ProblemOutcome]) -> str:
 
 
 def evaluation_of(outcomes: Sequence[ProblemOutcome], seed: int) -> EvaluationFigures:
-    """Import rates by source, and how many goals each profile reaches."""
+    """Return import rates by source, and the share of goals that each profile reaches."""
     figures: list[Figure] = []
     for source, (name, goal) in FIGURES.items():
         mine = [outcome for outcome in outcomes if outcome.source == source]
@@ -125,9 +127,9 @@ def evaluation_of(outcomes: Sequence[ProblemOutcome], seed: int) -> EvaluationFi
 
 
 def solved_of(outcomes: Sequence[ProblemOutcome], seed: int, *, solids: bool = False) -> EvaluationFigures:
-    """By source, how many of the goals that a profile reaches the oracle solved in a scene: of problems that were verified.
+    """Return the share of reachable goals that the oracle solved, by source and profile.
 
-    ``solids`` says that those with substances were left out.
+    ``solids`` is true if problems with substances were left out.
     """
     without = " without liquids" if solids else ""
     figures: list[Figure] = []

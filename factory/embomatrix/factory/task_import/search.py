@@ -1,4 +1,4 @@
-"""Finding a problem's furniture in a scene: by backtracking over room instances, and over objects of the right category."""
+"""Search for a problem's furniture in a scene, by backtracking over rooms and objects."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.admission import RefusalReason, RefusedError
 from embomatrix.factory.scenes.view import is_liftable
-from embomatrix.factory.task_import.size_requirements import demand_on, demands_of, room_for
+from embomatrix.factory.task_import.size_requirements import requirement_on, requirements_of, room_for
 from embomatrix.world.bddl import is_room_instance
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.evaluate import atoms_of
@@ -26,19 +26,19 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 MAX_STEPS: Final = 20_000
-"""Assignments that are looked at before a scene counts as lacking the objects."""
-ALIKE: Final[Mapping[str, str]] = {
+"""Maximum number of assignments tried."""
+SIMILAR_ROOMS: Final[Mapping[str, str]] = {
     "television_room": "living_room",
     "childs_room": "bedroom",
     "pantry_room": "storage_room",
     "utility_room": "storage_room",
     "playroom": "living_room",
 }
-"""Rooms that do for one that a scene lacks, when rooms are counted otherwise."""
+"""Room types that replace a missing type when rooms are renumbered."""
 COVER_M: Final = 0.08
-"""What begins this near over a top leaves no room on it."""
+"""Objects within this height above a surface cover it."""
 MAX_CHOICES: Final = 200
-"""Ways to tell the problem's rooms among the scene's that are looked at."""
+"""Maximum number of room assignments tried."""
 
 
 def search(
@@ -50,23 +50,23 @@ def search(
     *,
     furnishing: bool,
     renumbering: bool = False,
-    shunned: Container[str] = (),
+    excluded: Container[str] = (),
 ) -> tuple[dict[str, str], dict[str, str]]:
-    """Rooms for the problem's rooms, and scene objects for its fixtures. All objects of one word are in one room.
+    """Return scene rooms for the problem's rooms, and scene objects for its fixtures.
 
-    Of the rooms that lack furniture those are taken that lack least. When ``renumbering``, ``kitchen_0`` is any kitchen,
-    another one before that of this name, and a room of a type that the scene lacks is one of a type like it. Scene objects
-    that are ``shunned`` are not taken.
+    All objects with one room name are in one room. If furniture is missing, the rooms that lack least are used. With
+    ``renumbering``, ``kitchen_0`` may be any kitchen, preferably another one, and a missing room type is replaced by
+    a similar one. Scene objects in ``excluded`` are not used.
     """
     words = sorted(set(inroom.values()))
     find = _renumbered if renumbering else _rooms_for
     options = {word: find(view.scene, word, rng) for word in words}
-    needs = needs_of(problem)
+    needs = abilities_needed(problem)
     best: tuple[int, dict[str, str], dict[str, str]] | None = None
     lacking = ""
     for rooms in itertools.islice(_room_choices(words, options), MAX_CHOICES):
         found, missing = _assign(
-            problem, view, {name: rooms[inroom[name]] for name in fixtures}, needs, rng, shunned
+            problem, view, {name: rooms[inroom[name]] for name in fixtures}, needs, rng, excluded
         )
         if not missing:
             return rooms, found
@@ -98,7 +98,7 @@ def _rooms_for(scene: Scene, word: str, rng: np.random.Generator) -> list[str]:
 def _renumbered(scene: Scene, word: str, rng: np.random.Generator) -> list[str]:
     stem = word.rpartition("_")[0] if is_room_instance(word) else word
     if not any(room.type == stem for room in scene.rooms):
-        stem = ALIKE.get(stem, stem)
+        stem = SIMILAR_ROOMS.get(stem, stem)
     return sorted(_rooms_for(scene, stem, rng), key=lambda name: name == word)
 
 
@@ -112,8 +112,8 @@ def _room_choices(words: list[str], options: Mapping[str, list[str]]) -> Iterato
                 yield {words[0]: room, **rest}
 
 
-def needs_of(problem: BddlProblem) -> Mapping[str, frozenset[str]]:
-    """What an object, or a whole type, must be able to do for start and goal to make sense."""
+def abilities_needed(problem: BddlProblem) -> Mapping[str, frozenset[str]]:
+    """Return the abilities that start and goal require of each object or type."""
     needs: defaultdict[str, set[str]] = defaultdict(set)
     for atom in (*atoms_of(problem.goal), *(item.atom for item in problem.init if item.positive)):
         if atom.predicate == State.OPEN:
@@ -131,13 +131,13 @@ def _assign(
     wanted: Mapping[str, str],
     needs: Mapping[str, frozenset[str]],
     rng: np.random.Generator,
-    shunned: Container[str],
+    excluded: Container[str],
 ) -> tuple[dict[str, str], list[str]]:
-    """A scene object of its own for as many names as there is one for, and the names of furniture for which none is left.
+    """Assign distinct scene objects to as many names as possible, and return the names of missing furniture.
 
-    Small things that the scene lacks are in neither.
+    Small objects that the scene lacks are in neither result.
     """
-    domains, missing = _domains(problem, view, wanted, needs, rng, shunned)
+    domains, missing = _domains(problem, view, wanted, needs, rng, excluded)
     while True:
         found: dict[str, str] = {}
         failed = _backtrack(sorted(domains, key=lambda name: len(domains[name])), domains, found, [0])
@@ -153,27 +153,27 @@ def _domains(
     wanted: Mapping[str, str],
     needs: Mapping[str, frozenset[str]],
     rng: np.random.Generator,
-    shunned: Container[str],
+    excluded: Container[str],
 ) -> tuple[dict[str, list[str]], list[str]]:
-    """Objects of the scene that each name may stand for, the first choice first, and the names of furniture that has none."""
+    """Return candidate scene objects for each name, the best first, and the names of furniture without any."""
     catalog = Catalog.load()
     hosts = {
         item.atom.args[1]
         for item in problem.init
         if item.positive and item.atom.predicate in {Relation.ONTOP, Relation.INSIDE}
     }
-    demands = demands_of(problem)
+    requirements = requirements_of(problem)
     domains: dict[str, list[str]] = {}
     missing: list[str] = []
     for name, room in wanted.items():
-        contents = demand_on(demands, name, problem.objects[name]).contents
+        contents = requirement_on(requirements, name, problem.objects[name]).contents
         categories = set(catalog.categories_of(problem.objects[name]))
         fits = [
             other
             for other in view.in_room.get(room, ())
             if view.category(other) in categories
-            and other not in shunned
-            and serves(view.asset(other), needs.get(name, frozenset()))
+            and other not in excluded
+            and has_abilities(view.asset(other), needs.get(name, frozenset()))
         ]
         if fits:
             order = [str(other) for other in rng.permutation(fits)]
@@ -188,9 +188,9 @@ def _domains(
 
 
 def _spare_m2(view: SceneView, name: str) -> float:
-    """Area of the largest surface of an object, less what stands on it already: what holds more is bound before others.
+    """Return the area of the object's largest surface minus the objects on it. Larger areas are bound first.
 
-    A top that something lies over, as a worktop over an oven, is none.
+    A surface covered by another object, such as a worktop below an oven, has no free area.
     """
     asset, item = view.asset(name), view.item(name)
     x, y, z = item.pose_world_asset.position_m
@@ -215,7 +215,7 @@ def _spare_m2(view: SceneView, name: str) -> float:
 def _backtrack(
     order: list[str], domains: Mapping[str, list[str]], found: dict[str, str], steps: list[int]
 ) -> str:
-    """Fill ``found``; returns the name that could not be served, or empty."""
+    """Fill ``found``. Return the name without a free object, or an empty string."""
     if len(found) == len(order):
         return ""
     name = order[len(found)]
@@ -233,8 +233,8 @@ def _backtrack(
     return failed
 
 
-def serves(asset: Asset, needs: Iterable[str]) -> bool:
-    """Whether an asset can do all that is asked of it; a container has a cavity."""
+def has_abilities(asset: Asset, needs: Iterable[str]) -> bool:
+    """True if the asset has all abilities. A container has a cavity."""
     return all(bool(asset.interiors) if need == "container" else asset.can(need) for need in needs)
 
 

@@ -1,4 +1,4 @@
-"""What a problem asks of the size of its things: what must go into them, and whether they are to be carried themselves."""
+"""Size requirements of a problem: contents of its objects, and objects that must be carried."""
 
 from __future__ import annotations
 
@@ -25,31 +25,32 @@ if TYPE_CHECKING:
     from embomatrix.world.goal import Atom
 
 SLACK: Final = 2.2
-"""Floor of a cavity over the footprints of all that goes in: things are put where they fall, not packed."""
+"""Ratio of a cavity's floor to the footprints of its contents. Objects are placed loosely, not packed."""
 PLACED: Final = frozenset(set(Relation) - {Relation.INROOM})
-"""Relations between two things."""
+"""Relations between two objects."""
 
 
 @dataclass(frozen=True, slots=True)
-class Demand:
-    """What is asked of one thing, or of all of a type.
+class Requirement:
+    """Requirements on one object, or on all objects of a type.
 
-    ``contents`` are the types of what goes into it, one for each thing: those of the start, or those of the goal.
+    ``contents`` lists the types of the objects inside, one per object: those of the start or of the goal, whichever
+    are more.
     """
 
     bears: bool = False
-    """Something is, or is to be, on or in it."""
+    """True if an object is on or in it at the start or in the goal."""
     contents: tuple[str, ...] = ()
     carried: bool = False
-    """The goal wants it where it is not yet."""
+    """True if the goal requires a place where it is not yet."""
     places: tuple[tuple[Relation, str], ...] = ()
-    """What it is on or in, at the start or in the end, by name."""
+    """Relations and hosts at the start or in the goal, by name."""
     burden: tuple[str, ...] = ()
-    """Types of what goes on top of it, one for each thing, as ``contents``."""
+    """Types of the objects on top of it, one per object, like ``contents``."""
 
 
-def demands_of(problem: BddlProblem) -> Mapping[str, Demand]:
-    """Demands on objects, and on types that the goal's variables range over, by name."""
+def requirements_of(problem: BddlProblem) -> Mapping[str, Requirement]:
+    """Return the requirements on objects, and on the types of the goal's variables, by name."""
     fixtures = {item.atom.args[0] for item in problem.init if item.atom.predicate == Relation.INROOM}
     bears: set[str] = set()
     carried: set[str] = set()
@@ -58,7 +59,7 @@ def demands_of(problem: BddlProblem) -> Mapping[str, Demand]:
     places: defaultdict[str, dict[tuple[Relation, str], None]] = defaultdict(dict)
     goal = list(literals(problem.goal, True, {}))
     for atom, positive, _ in goal:
-        if not positive and atom.predicate in PLACED and _is_so(problem, atom):
+        if not positive and atom.predicate in PLACED and _holds_at_start(problem, atom):
             carried.add(atom.args[0].lstrip("?"))
     moments = (
         (started, [item.atom for item in problem.init if item.positive]),
@@ -69,8 +70,8 @@ def demands_of(problem: BddlProblem) -> Mapping[str, Demand]:
             if atom.predicate not in PLACED:
                 continue
             thing, host = (name.lstrip("?") for name in atom.args)
-            if borne is ended and not _is_so(problem, atom):
-                # of two that are to be neighbours, what the rooms don't have already
+            if borne is ended and not _holds_at_start(problem, atom):
+                # of two neighbours, the one that is not in the room yet
                 carried.add(host if atom.predicate == Relation.NEXTTO and thing in fixtures else thing)
             if atom.predicate in (Relation.INSIDE, Relation.ONTOP):
                 bears.add(host)
@@ -84,14 +85,14 @@ def demands_of(problem: BddlProblem) -> Mapping[str, Demand]:
             else tuple(ended[relation, name])
             for relation in (Relation.INSIDE, Relation.ONTOP)
         )
-        found[name] = Demand(name in bears, contents, name in carried, tuple(places[name]), burden)
+        found[name] = Requirement(name in bears, contents, name in carried, tuple(places[name]), burden)
     return found
 
 
-def demand_on(demands: Mapping[str, Demand], name: str, type_name: str) -> Demand:
-    """What is asked of an object by its own name and by its type's."""
-    own, all_alike = demands.get(name, Demand()), demands.get(type_name, Demand())
-    return Demand(
+def requirement_on(requirements: Mapping[str, Requirement], name: str, type_name: str) -> Requirement:
+    """Return the requirements on an object by its name and by its type."""
+    own, all_alike = requirements.get(name, Requirement()), requirements.get(type_name, Requirement())
+    return Requirement(
         own.bears or all_alike.bears,
         max(own.contents, all_alike.contents, key=len),
         own.carried or all_alike.carried,
@@ -101,15 +102,15 @@ def demand_on(demands: Mapping[str, Demand], name: str, type_name: str) -> Deman
 
 
 class CavityFit(IntEnum):
-    """What an asset has for things that are to go in, the best first."""
+    """Space of an asset for its contents, the best first."""
 
-    FOR_ALL = 0  # floor for all of them, side by side
-    FOR_EACH = 1  # floor for each, if not for all
-    FOR_SOME = 2  # not even that
+    FOR_ALL = 0  # floor for all objects side by side
+    FOR_EACH = 1  # floor for each object, but not for all together
+    FOR_SOME = 2  # at least one object does not fit
 
 
 def room_for(asset: Asset, contents: tuple[str, ...], relation: Relation = Relation.INSIDE) -> CavityFit:
-    """What the cavities of an asset, or its surfaces, have for some types' smallest models."""
+    """Return the space of an asset's cavities or surfaces for the smallest models of these types."""
     floors = surfaces_for(asset, relation)
     sizes_m = [size_m for size_m in map(smallest_m, contents) if size_m is not None]
     if not all(any(_fits(size_m, floor) for floor in floors) for size_m in sizes_m):
@@ -122,20 +123,22 @@ def room_for(asset: Asset, contents: tuple[str, ...], relation: Relation = Relat
 
 
 def floor_needed_m2(contents: tuple[str, ...]) -> float:
-    """Floor for things of some types side by side, as they fall, by their smallest models."""
+    """Return the floor area for objects of these types side by side, by their smallest models."""
     sizes_m = [size_m for size_m in map(smallest_m, contents) if size_m is not None]
     return SLACK * sum(size_m[0] * size_m[1] for size_m in sizes_m)
 
 
 def _fits(size_m: Vec3, floor: SupportSurface) -> bool:
-    """Whether a thing has its whole footprint on a floor, along either side, and its height below what is above."""
+    """True if the footprint fits on the floor in either orientation and the height fits below the ceiling of the
+    cavity.
+    """
     footprint = sorted(size_m[:2])
     return all(map(operator.le, footprint, sorted(floor.size_m))) and size_m[2] <= floor.clearance_m
 
 
 @functools.cache
 def smallest_m(type_name: str) -> Vec3 | None:
-    """Size of the type's model with the smallest footprint, of those that the arm lifts where there are any."""
+    """Return the size of the type's model with the smallest footprint, preferring liftable models."""
     catalog = Catalog.load()
     try:
         models = [
@@ -150,8 +153,8 @@ def smallest_m(type_name: str) -> Vec3 | None:
     return min(models, key=lambda pair: (pair[0], math.prod(pair[1][:2])))[1]
 
 
-def _is_so(problem: BddlProblem, atom: Atom) -> bool:
-    """Whether the start says so of everything that an atom of the goal is about."""
+def _holds_at_start(problem: BddlProblem, atom: Atom) -> bool:
+    """True if the atom holds at the start for everything that its names stand for."""
     first, second = (problem.types.get(name.lstrip("?"), (name.lstrip("?"),)) for name in atom.args)
     told = {
         item.atom.args for item in problem.init if item.positive and item.atom.predicate == atom.predicate
@@ -160,7 +163,7 @@ def _is_so(problem: BddlProblem, atom: Atom) -> bool:
 
 
 def _share(problem: BddlProblem, thing: str, host: str) -> list[str]:
-    """Types of what one host gets of things that may be many, as hosts may be: as many for each."""
+    """Return the types of the objects for one host if the objects are distributed evenly."""
     things = problem.types.get(thing, (thing,))
     hosts = problem.types.get(host, (host,))
     type_name = problem.objects.get(thing, thing)

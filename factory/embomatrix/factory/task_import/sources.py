@@ -1,4 +1,4 @@
-"""Where BDDL problems come from: BEHAVIOR-1K's activities, a file, or a JSONL file as the paper's factory wrote it."""
+"""Sources of BDDL problems: BEHAVIOR-1K's activities, EAI's tasks, a file, or a JSON lines file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 MAX_PROBLEM_BYTES: Final = 1024 * 1024
 MAX_RECORDS_BYTES: Final = 256 * 1024 * 1024
-"""A hundred thousand tasks as the paper's factory writes them take half of that."""
+"""Twice the size of a hundred thousand tasks as the paper's factory writes them."""
 
 BEHAVIOR: Final = "behavior-1k"
 EAI: Final = "eai"
@@ -41,19 +41,19 @@ _NAMESAKES: Final = (
     "re_shelving_library_books rearranging_furniture serving_hors_d_oeuvres setting_mousetraps sorting_mail "
     "storing_food thawing_frozen_food unpacking_suitcase vacuuming_floors washing_floor washing_pots_and_pans"
 )
-NAMESAKES: Final = frozenset(_NAMESAKES.split())
-"""Activities of BEHAVIOR-1K that are called as tasks of EAI's: who was trained on them could not be examined by those."""
+EAI_NAMESAKES: Final = frozenset(_NAMESAKES.split())
+"""BEHAVIOR-1K activities that share a name with a task of EAI. Training on them would contaminate that evaluation."""
 
 
 class ProblemSourceError(ValueError):
-    """A source can't be read. The message is a sentence with the remedy."""
+    """Source that can't be read. The message is a sentence with the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class SourceText:
-    """One problem as text. ``request`` is what a person says, empty where the problem's own name says it.
+    """Text of one problem. ``request`` is the instruction; if it is empty, the problem's name is the instruction.
 
-    ``scene`` is the base scene that it was written for, empty where any will do.
+    ``scene`` is the base scene that the problem was written for; empty means any scene.
     """
 
     name: str
@@ -63,18 +63,18 @@ class SourceText:
     scene: str = ""
 
     @property
-    def examines(self) -> bool:
-        """Whether it is a task of EAI's, or is called like one: kept for examinations, never trained on."""
-        return self.source == EAI or self.name.replace("-", "_") in NAMESAKES
+    def is_held_out(self) -> bool:
+        """True for EAI's tasks and their namesakes. They are used for evaluation only, never for training."""
+        return self.source == EAI or self.name.replace("-", "_") in EAI_NAMESAKES
 
 
 def activity_names() -> tuple[str, ...]:
-    """Names of the activities of the installed ``bddl`` package. Raises SourceError when it is not installed."""
+    """Return the activities of the installed ``bddl`` package. Raise ProblemSourceError if it is missing."""
     return tuple(sorted(path.parent.name for path in _definitions().glob("*/problem0.bddl")))
 
 
 def read_activity(name: str) -> SourceText:
-    """One activity of BEHAVIOR-1K. Raises SourceError with close names when there is none of this name."""
+    """Return an activity of BEHAVIOR-1K. Raise ProblemSourceError that names close matches."""
     path = _definitions() / name / "problem0.bddl"
     if "/" in name or not path.is_file():
         close = difflib.get_close_matches(name, activity_names(), n=3)
@@ -84,12 +84,14 @@ def read_activity(name: str) -> SourceText:
 
 
 def read_file(path: Path) -> SourceText:
-    """A ``.bddl`` file. Raises SourceError when it can't be read."""
+    """Return the problem of a ``.bddl`` file. Raise ProblemSourceError."""
     return SourceText(path.stem, _read(path, at_most=MAX_PROBLEM_BYTES), "file")
 
 
 def read_jsonl(path: Path) -> Iterator[SourceText]:
-    """Problems of a JSONL file with the fields ``name`` and ``bddl``. Raises SourceError naming the line."""
+    """Yield the problems of a JSON lines file with the fields ``name`` and ``bddl``. Raise ProblemSourceError that
+    names the line.
+    """
     for number, line in enumerate(_read(path).splitlines(), start=1):
         if not line.strip():
             continue
@@ -102,9 +104,9 @@ def read_jsonl(path: Path) -> Iterator[SourceText]:
 
 
 def read_eai(folder: Path) -> tuple[SourceText, ...]:
-    """The tasks of EAI's BEHAVIOR split, from the package's folder ``behavior_eval`` or the one that holds it.
+    """Return the tasks of EAI's BEHAVIOR split, from the package's folder ``behavior_eval`` or its parent.
 
-    ``onfloor`` is what BEHAVIOR-100 calls being on a floor. Raises SourceError when the folder lacks its files.
+    BEHAVIOR-100's ``onfloor`` is read as ``ontop``. Raise ProblemSourceError if files are missing.
     """
     root = folder / EAI_FOLDER if (folder / EAI_FOLDER).is_dir() else folder
     try:
@@ -122,7 +124,7 @@ def read_eai(folder: Path) -> tuple[SourceText, ...]:
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ProblemSourceError(
-            f"{folder} holds no tasks of EAI ({error!r}): unpack the wheel of eai-eval 1.0.5 and name the folder that holds "
+            f"{folder} holds no tasks of EAI ({error!r}): unpack the wheel of eai-eval 1.0.5 and name the folder that contains "
             f"{EAI_FOLDER}"
         ) from error
 
@@ -136,16 +138,14 @@ def _read(path: Path, *, at_most: int = MAX_RECORDS_BYTES) -> str:
         return read_whole(path, at_most=at_most).decode("utf-8")
     except OSError as error:
         raise ProblemSourceError(
-            f"{path} can't be read ({error.strerror}): name a file of BDDL problems"
+            f"{path} can't be read ({error.strerror}): expected a file of BDDL problems"
         ) from error
     except UnicodeDecodeError as error:
-        raise ProblemSourceError(f"{path} is no text in UTF-8: expected BDDL problems") from error
+        raise ProblemSourceError(f"{path} is not UTF-8 text: expected BDDL problems") from error
 
 
 def _definitions() -> Path:
     spec = importlib.util.find_spec("bddl")
     if spec is None or spec.origin is None:
-        raise ProblemSourceError(
-            "the activities of BEHAVIOR-1K are in the bddl package: pip install 'bddl==3.6.0'"
-        )
+        raise ProblemSourceError("BEHAVIOR-1K's activities need the bddl package: pip install 'bddl==3.6.0'")
     return Path(spec.origin).parent / "activity_definitions"

@@ -1,4 +1,4 @@
-"""How a scene starts: where the robot stands, what is open, on, hot or frozen, and what is covered or filled with what."""
+"""Start state of a scene: position of the robot, open doors, symbolic states and substances."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 
 def with_robot_in(scene: Scene, room_name: str) -> Scene:
-    """The scene with the robot on the free floor nearest to the middle of a room. Raises RefusedError without one."""
+    """Return the scene with the robot on the free floor nearest to the room's centre. Raise RefusedError if there is
+    none.
+    """
     if scene.robot.room == room_name:
         return scene
     room = next(room for room in scene.rooms if room.name == room_name)
@@ -35,7 +37,7 @@ def with_robot_in(scene: Scene, room_name: str) -> Scene:
 
 
 def with_states(scene: Scene, literals: Iterable[InitLiteral]) -> Scene:
-    """The scene with doors, symbolic states and substances as the literals say. Relations are passed over."""
+    """Return the scene with doors, states and substances as the literals say. Relations are ignored."""
     shares: dict[str, float] = {}
     facts: dict[str, set[SubstanceFact]] = {}
     denied: dict[str, set[SubstanceFact]] = {}

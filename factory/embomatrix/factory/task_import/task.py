@@ -1,4 +1,4 @@
-"""The importer: a BDDL problem becomes a task in a scene of its own, or a refusal with a reason."""
+"""Import of one BDDL problem: a task in its own scene, or a refusal with a reason."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from embomatrix.factory.scenes.view import SceneView, is_liftable
 from embomatrix.factory.task_import.binding import bind
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.expressible import AGENT, FLOORS
-from embomatrix.factory.task_import.models import models_for, sized
+from embomatrix.factory.task_import.models import models_for, with_sizes
 from embomatrix.factory.task_import.neighbours import neighbours_of
 from embomatrix.factory.task_import.reach import FUTURE, INSOURCE, REAL, pieces_of, profile_for
-from embomatrix.factory.task_import.size_requirements import demand_on, demands_of
+from embomatrix.factory.task_import.size_requirements import requirement_on, requirements_of
 from embomatrix.factory.task_import.start_state import with_robot_in, with_states
 from embomatrix.factory.task_import.task_fields import (
     SWITCHED,
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from embomatrix.factory.layout.request import Layout
-    from embomatrix.factory.layout.values import Failure
+    from embomatrix.factory.layout.values import LayoutFailure
     from embomatrix.factory.task_import.binding import Addition, Binding
     from embomatrix.factory.task_import.sources import SourceText
     from embomatrix.world.asset import Asset
@@ -58,66 +58,68 @@ if TYPE_CHECKING:
 
 
 class Lay(Protocol):
-    """What puts a task's objects into a scene: ``layout.generator.lay``, or another method that it is compared with."""
+    """Layout method: ``layout.generator.lay`` or a baseline."""
 
     def __call__(self, editor: SceneEditor, items: Sequence[RequestedObject], seed: int) -> Layout: ...
 
 
-SHUNNED: Final = 3
-"""Pieces of furniture that are given up for a problem at most, because they can't hold what it puts there."""
-REDRAWN: Final = 3
-"""Layouts that are drawn anew at most, where the robot does not get at all that was laid out."""
+MAX_EXCLUDED: Final = 3
+"""Maximum number of furniture pieces excluded because they can't hold what the problem puts there."""
+MAX_REDRAWN: Final = 3
+"""Maximum number of further layouts drawn if the robot can't reach all objects."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImportedTask:
-    """A task bound to a scene. ``init`` is what must hold at the start; the simulator has not seen it yet."""
+    """Task bound to a scene. ``init`` must hold at the start; it is not verified yet."""
 
     scene: Scene
     task: Task
     init: tuple[InitLiteral, ...]
     about: tuple[str, ...]
-    """The problem's objects, by their names in the scene."""
+    """Scene names of the problem's objects."""
     rooms: tuple[str, ...]
     signature: str
     instances: tuple[str, ...] = ()
-    """The same objects by the problem's own names."""
+    """The problem's own names of the same objects."""
     notes: tuple[str, ...] = ()
-    """What was read into the problem, and which furniture was added to the scene for it."""
-    examines: bool = False
-    """Whether the task is kept for examinations."""
+    """Changes made to the problem, and furniture added to the scene."""
+    is_held_out: bool = False
+    """True if the task is used for evaluation only."""
 
 
 @dataclass(frozen=True, slots=True)
-class Manner:
-    """How problems are given scenes: by which method, and whether rooms get the furniture that they lack."""
+class ImportOptions:
+    """Options of an import: layout method, and whether missing furniture is added."""
 
     lay: Lay = lay
     furnishing: bool = True
     reachable: bool = True
-    """Whether a goal that no skill reaches is refused; else it must only be told whether it holds."""
+    """If true, goals that no skill reaches are refused. Otherwise goals must only be evaluable."""
     renumbering: bool = False
-    """Whether ``kitchen_0`` may be another kitchen: problems of other worlds count other rooms."""
-    snug: bool = False
-    """Whether what goes into one thing together is made small enough to lie there side by side."""
+    """If true, ``kitchen_0`` may be another kitchen, since other datasets number rooms differently."""
+    compact: bool = False
+    """If true, objects that share a host are scaled to fit side by side."""
 
 
 def import_problem(
-    source: SourceText, base: Scene, *, seed: int = 0, manner: Manner | None = None
+    source: SourceText, base: Scene, *, seed: int = 0, options: ImportOptions | None = None
 ) -> ImportedTask | TaskRefusal:
-    """Bind a problem to a base scene and lay out what the scene lacks. Raises BddlError when the text can't be read."""
+    """Bind a problem to a base scene and add missing objects. Raise BddlError for invalid text."""
     problem, notes = read_problem(source)
     digest = hashlib.sha256(f"{seed} {base.scene_id} {source.text}".encode()).digest()
     rng = np.random.default_rng(np.random.SeedSequence(list(digest[:8])))
     try:
-        imported = _Binder(source, problem, base, rng, digest.hex()[:6], manner or Manner()).imported()
-        return dataclasses.replace(imported, notes=(*notes, *imported.notes), examines=source.examines)
+        imported = _Binder(
+            source, problem, base, rng, digest.hex()[:6], options or ImportOptions()
+        ).imported()
+        return dataclasses.replace(imported, notes=(*notes, *imported.notes), is_held_out=source.is_held_out)
     except RefusedError as error:
         return error.refusal
 
 
 class _Binder:
-    """One import. ``names`` grows from the found objects to all of the problem's."""
+    """One import. ``names`` maps the problem's objects to scene objects."""
 
     def __init__(
         self,
@@ -126,93 +128,91 @@ class _Binder:
         base: Scene,
         rng: np.random.Generator,
         key: str,
-        manner: Manner,
+        options: ImportOptions,
     ) -> None:
         self._source = source
         self._problem = problem
         self._substances = {name: synset for name, synset in problem.objects.items() if is_substance(synset)}
         self._base = base
         self._rng = rng
-        self._manner = manner
+        self._manner = options
         self._scene_id = f"{base.base}-{_slug(source.name)}-{key}"
-        self._demands = demands_of(problem)
+        self._requirements = requirements_of(problem)
 
     def imported(self) -> ImportedTask:
         binding, editor, names = self._bound()
         self._problem = binding.problem
         for whole, halves in pieces_of(self._problem).items():
             names |= zip(halves, self._add_pieces(editor, names[whole], halves), strict=True)
-        for name in self._to_be_loose(editor, names):
+        for name in self._portable_fixtures(editor, names):
             editor.loosen(name)
-        for floor in self._floors_asked_for(editor, names, binding):
+        for floor in self._floor_objects(editor, names, binding):
             names[floor] = self._add_floor(editor, floor, binding)
         start = self._start(names, binding)
         scene = with_states(with_robot_in(editor.freeze(self._scene_id), binding.robot_room), start)
         return self._task(scene, names, binding, start)
 
     def _bound(self) -> tuple[Binding, SceneEditor, dict[str, str]]:
-        """The problem bound and laid out; furniture of the scene that can't hold what it must is left for other furniture.
+        """Bind the problem and lay it out. Furniture that can't hold the problem's objects is excluded in further
+        attempts.
 
-        So is furniture at which the robot does not get at what it must hold, as long as there is other; then the layout is
-        drawn anew, and of those in which something stays out of hand the best is taken.
+        Furniture whose contents the robot can't reach is excluded too, while other furniture is left. After that, the
+        layout is redrawn, and the layout with the fewest unreachable objects is used.
         """
-        shunned, redrawn = set[str](), 0
+        excluded, redrawn = set[str](), 0
         first: RefusedError | None = None
-        resort: tuple[Binding, SceneEditor, dict[str, str]] | None = None
-        least = math.inf
+        fallback: tuple[Binding, SceneEditor, dict[str, str]] | None = None
+        fewest = math.inf
         while True:
             try:
-                binding = self._bound_to_furniture(shunned)
+                binding = self._bind(excluded)
             except RefusedError as error:
-                if resort is not None:
-                    return resort
+                if fallback is not None:
+                    return fallback
                 raise first or error from error
             editor = SceneEditor(self._base)
-            layout = self._laid(editor, binding)
+            layout = self._lay(editor, binding)
             if not layout.failures:
                 bound = binding, editor, {**binding.found, **layout.names}
-                if not layout.out_of_hand:
+                if not layout.unreachable:
                     return bound
-                if len(layout.out_of_hand) < least:
-                    least, resort = len(layout.out_of_hand), bound
-            wrong = (*layout.failures, *layout.out_of_hand)[0]
+                if len(layout.unreachable) < fewest:
+                    fewest, fallback = len(layout.unreachable), bound
+            wrong = (*layout.failures, *layout.unreachable)[0]
             first = first or _misfit(wrong)
-            if wrong.host in binding.found.values() and len(shunned) < SHUNNED:
-                shunned.add(wrong.host)
-            elif not layout.failures and redrawn < REDRAWN:
+            if wrong.host in binding.found.values() and len(excluded) < MAX_EXCLUDED:
+                excluded.add(wrong.host)
+            elif not layout.failures and redrawn < MAX_REDRAWN:
                 redrawn += 1
-            elif resort is not None:
-                return resort
+            elif fallback is not None:
+                return fallback
             else:
                 raise first
 
-    def _bound_to_furniture(self, shunned: set[str]) -> Binding:
-        """The problem bound to other furniture of the scene than is shunned. Raises RefusedError."""
-        manner = self._manner
+    def _bind(self, excluded: set[str]) -> Binding:
+        """Bind the problem without the excluded furniture. Raise RefusedError."""
+        options = self._manner
         return bind(
             self._problem,
             self._base,
             self._rng,
-            furnishing=manner.furnishing,
-            reachable=manner.reachable,
-            renumbering=manner.renumbering,
-            shunned=shunned,
+            furnishing=options.furnishing,
+            reachable=options.reachable,
+            renumbering=options.renumbering,
+            excluded=excluded,
         )
 
     def _add_floor(self, editor: SceneEditor, floor: str, binding: Binding) -> str:
         if floor not in binding.floors:
             raise RefusedError(
-                RefusalReason.NO_PLACE_GIVEN, f"the start does not say of which room {floor!r} is the floor"
+                RefusalReason.NO_PLACE_GIVEN, f"the start gives no room for the floor {floor!r}"
             )
         return add_floor(editor, binding.floors[floor])
 
-    def _floors_asked_for(
+    def _floor_objects(
         self, editor: SceneEditor, names: Mapping[str, str], binding: Binding
     ) -> tuple[str, ...]:
-        """Floors that the goal is about, or on which it wants something beside what stands there: these become objects.
-
-        Others are just where things stand.
-        """
+        """Return the floors that become objects: those in the goal, and those with an object that gets a neighbour."""
         about = {arg for atom in atoms_of(self._problem.goal) for arg in atom.args} | types_of(
             self._problem.goal
         )
@@ -234,37 +234,39 @@ class _Binder:
     def _is_portable(self, editor: SceneEditor, name: str) -> bool:
         return name in editor.objects and not editor.known(name).fixed and _is_liftable(editor.asset_of(name))
 
-    def _to_be_loose(self, editor: SceneEditor, names: Mapping[str, str]) -> Iterator[str]:
-        """Appliances of which a scene makes fixtures, a kettle or a toaster, that this problem wants carried."""
+    def _portable_fixtures(self, editor: SceneEditor, names: Mapping[str, str]) -> Iterator[str]:
+        """Yield portable appliances, such as a kettle, that the scene treats as fixed but this problem wants carried."""
         for name, type_name in self._problem.objects.items():
-            if demand_on(self._demands, name, type_name).carried and name in names:
+            if requirement_on(self._requirements, name, type_name).carried and name in names:
                 asset = editor.asset_of(names[name])
                 if _is_liftable(asset) and not is_portable(asset):
                     yield names[name]
 
-    def _laid(self, editor: SceneEditor, binding: Binding) -> Layout:
-        """Put all that the scene lacks into it."""
+    def _lay(self, editor: SceneEditor, binding: Binding) -> Layout:
+        """Add all missing objects to the scene."""
         editor.keep(binding.found.values())
         models = self._models(binding, editor)
         items = [self._item(addition, binding, models[addition.name]) for addition in binding.additions]
         return self._manner.lay(editor, items, int(self._rng.integers(2**31)))
 
     def _models(self, binding: Binding, editor: SceneEditor) -> Mapping[str, Sequence[Model]]:
-        """Models to try for each addition, the best first; some at another size than the catalog's."""
-        demands = {
-            name: demand_on(self._demands, name, type_name)
+        """Return the models to try for each addition, the best first. Some are scaled."""
+        requirements = {
+            name: requirement_on(self._requirements, name, type_name)
             for name, type_name in self._problem.objects.items()
         }
-        orders = {each.name: models_for(each, self._rng, demands[each.name]) for each in binding.additions}
+        orders = {
+            each.name: models_for(each, self._rng, requirements[each.name]) for each in binding.additions
+        }
         for addition in binding.additions:
             if not orders[addition.name]:
-                asked = f" that can do what the task asks of it: {', '.join(sorted(addition.needs))}"
+                abilities = f" with the abilities that the task needs: {', '.join(sorted(addition.needs))}"
                 raise RefusedError(
                     RefusalReason.DOES_NOT_FIT,
-                    f"{addition.name!r} has no place: its type has no model{asked if addition.needs else ''}",
+                    f"{addition.name!r} has no place: its type has no model{abilities if addition.needs else ''}",
                 )
         found = {name: editor.asset_of(there) for name, there in binding.found.items()}
-        return sized(orders, binding.additions, demands, found, snug=self._manner.snug)
+        return with_sizes(orders, binding.additions, requirements, found, compact=self._manner.compact)
 
     def _item(self, addition: Addition, binding: Binding, models: Sequence[Model]) -> RequestedObject:
         rooms = (addition.room,) if addition.room else tuple(dict.fromkeys(binding.rooms.values()))
@@ -280,7 +282,7 @@ class _Binder:
         )
 
     def _add_pieces(self, editor: SceneEditor, whole: str, halves: tuple[str, ...]) -> tuple[str, ...]:
-        """The halves of a thing, of the model whose volume is nearest to half of the whole's."""
+        """Add the halves of an object, with the model whose volume is nearest to half of the whole."""
         catalog = Catalog.load()
         half_m3 = math.prod(editor.asset_of(whole).size_m) / 2
         models = [
@@ -308,7 +310,7 @@ class _Binder:
         if missing:
             raise RefusedError(
                 RefusalReason.TABLE_TOO_LONG,
-                f"the goal is about {len(about)} objects: a table has at most {MAX_TABLE} rows",
+                f"the goal has {len(about)} objects: expected at most {MAX_TABLE}, the rows of a table",
             )
         task = Task(
             task_id=self._scene_id,
@@ -328,7 +330,7 @@ class _Binder:
         return ImportedTask(scene, task, start, tuple(names.values()), rooms, signature, tuple(names), notes)
 
     def _notes(self, view: SceneView, names: Mapping[str, str], binding: Binding) -> tuple[str, ...]:
-        """What was done to scene and problem to bring them together, a sentence each."""
+        """Return a sentence for each change to scene and problem."""
         added = tuple(
             f"{self._base.base} lacks {each.type}: {names[each.name]} was added to {view.room(names[each.name])}"
             for each in binding.additions
@@ -340,21 +342,21 @@ class _Binder:
             if is_room_instance(word) and word != room
         )
         gone = tuple(
-            f"{item.name} was taken out of {item.room}: its place was needed"
+            f"{item.name} was removed from {item.room} to make room"
             for item in self._base.objects
             if item.fixed and item.name not in view.scene.by_name
         )
         resized = tuple(
-            f"{names[each.name]} is made at {share:g} of its size: no model of its type does what is asked"
+            f"{names[each.name]} is scaled by {share:g}: no model of its type meets the requirements"
             for each in binding.additions
             if (share := share_of(view.item(names[each.name]).asset_id)) != 1
         )
         return (*added, *moved, *gone, *resized)
 
     def _start(self, names: dict[str, str], binding: Binding) -> tuple[InitLiteral, ...]:
-        """``:init`` in the scene's names, without the floors that are no objects, the robot, and what is not the case.
+        """Return ``:init`` in scene names, without floors, the robot, and negative literals of other states.
 
-        What a thing is the source of, a shaker of its salt, it contains; water flows out of a sink by itself.
+        A source of a substance, such as a salt shaker, contains it. Sinks give water without a literal.
         """
         skipped = {
             name
@@ -367,11 +369,11 @@ class _Binder:
             for literal in self._problem.init
             if not skipped & set(literal.atom.args)
             and (literal.positive or literal.atom.predicate in SWITCHED)
-            and not self._is_understood(literal.atom)
+            and not self._is_implied(literal.atom)
         )
 
-    def _is_understood(self, atom: Atom) -> bool:
-        """Whether the scene need not be told: a substance is to come, or flows out of what it is said to come from."""
+    def _is_implied(self, atom: Atom) -> bool:
+        """True if the atom needs no literal: a future substance, or a substance that its source gives by itself."""
         type_name = self._problem.objects.get(atom.args[0], "")
         if atom.predicate == INSOURCE:
             return self._substances.get(atom.args[1], "") in flows_from(type_name)
@@ -390,10 +392,10 @@ def _renamed(literal: InitLiteral, names: dict[str, str]) -> Atom:
     )
 
 
-def _misfit(wrong: Failure) -> RefusedError:
+def _misfit(wrong: LayoutFailure) -> RefusedError:
     return RefusedError(
         RefusalReason.DOES_NOT_FIT,
-        f"{wrong.thing!r} has no place {wrong.relation} {wrong.host}: {wrong.detail}",
+        f"{wrong.object_name!r} has no place {wrong.relation} {wrong.host}: {wrong.detail}",
     )
 
 

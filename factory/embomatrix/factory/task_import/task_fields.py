@@ -1,4 +1,4 @@
-"""What kind of task a problem is, and how a person asks for it."""
+"""Fields of an imported task: instruction, category, signature, and appliances that the goal needs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _ROOM_OR_TEXT: Final = re.compile(
 
 
 def instruction_of(source: SourceText, problem: BddlProblem) -> str:
-    """What a person asks for. The paper's tasks carry it as the problem's name, with underscores for spaces."""
+    """Return the instruction. The paper's tasks encode it in the problem's name, with underscores for spaces."""
     words = source.request or problem.name
     words = re.sub(r"-\d+$", "", words)
     words = re.sub(r"\.n\.\d+(_\d+)?", "", words)
@@ -46,7 +46,7 @@ def instruction_of(source: SourceText, problem: BddlProblem) -> str:
 
 
 def category_of(goal: Formula) -> TaskCategory:
-    """Which of the paper's four kinds a goal is."""
+    """Return the task category of a goal."""
     predicates = {atom.predicate for atom in atoms_of(goal)}
     moves = bool(predicates & set(Relation))
     switches = bool(predicates & (SWITCHED | CLEANED))
@@ -59,7 +59,7 @@ def category_of(goal: Formula) -> TaskCategory:
 
 
 def signature_of(goal: Formula, view: SceneView) -> str:
-    """Kind of a goal: its predicates over categories, sorted. Variables stand for their type."""
+    """Return the signature of a goal: its predicates over categories, sorted. Variables stand for their type."""
     signs = []
     for atom in atoms_of(goal):
         args = (view.category(arg) if arg in view.scene.by_name else arg.lstrip("?") for arg in atom.args)
@@ -73,9 +73,9 @@ _THERMAL: Final = frozenset({State.COOKED, State.FROZEN, State.HOT})
 def sources_for(
     view: SceneView, goal: Formula, types: Mapping[str, tuple[str, ...]], known: Iterable[str]
 ) -> Iterator[str]:
-    """Objects of the scene that heat, cook or freeze what the goal asks for, where no object of the problem does.
+    """Yield appliances of the scene that heat, cook or freeze what the goal requires and the problem's objects can't.
 
-    The paper's own tasks freeze things in coolers, which keep drinks cool and no more.
+    The paper's tasks freeze food in coolers, which only keep drinks cool.
     """
     for atom in atoms_of(goal):
         if atom.predicate not in _THERMAL:
@@ -99,9 +99,9 @@ def sources_for(
 
 
 def taps_for(view: SceneView, goal: Formula, known: Iterable[str]) -> Iterator[str]:
-    """A tap of the scene where the goal asks for something wet, or clean, and no object of the problem gives water.
+    """Yield a tap of the scene if the goal needs water and no object of the problem gives any.
 
-    EAI's tasks soak things in a teapot, which is empty in our world.
+    EAI's tasks soak objects in a teapot, which is empty here.
     """
     asked = {atom.predicate for atom in atoms_of(goal)}
     if not asked & {State.SOAKED, State.STAINED}:

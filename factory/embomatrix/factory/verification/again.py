@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.admission import SEED, Admitted, admit, objection
-from embomatrix.factory.task_import.batch import most_held_in
+from embomatrix.factory.admission import SEED, Admitted, admit, plan_failure
+from embomatrix.factory.task_import.batch import max_held_share
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.sim.process_pool import process_pool
@@ -138,7 +138,7 @@ def _look_at(order: _Order) -> list[Look]:
 
 def _cached(stage: Simulator, record: TaskRecord) -> Look:
     """Judge a task as admission does, and execute the plan that is found."""
-    verdict = admit(stage, record.task, find_plan, most_held=most_held_in(record.task))
+    verdict = admit(stage, record.task, find_plan, most_held=max_held_share(record.task))
     if not isinstance(verdict, Admitted):
         return Look(record.task.task_id, f"{verdict.reason}: {verdict.sentence}", "", same_plan=False)
     trace = stage.execute(record.task, verdict.plan, SEED)
@@ -150,4 +150,4 @@ def _physical(bundle: Bundle, record: TaskRecord) -> str:
     """What is against the dataset's plan when a robot carries it out in physics; empty where it reaches the goal."""
     plan = plan_from_json(list(record.oracle), record.task.profile)
     with contextlib.closing(physical_simulator(bundle)) as stage:
-        return objection(stage, record.task, plan)
+        return plan_failure(stage, record.task, plan)

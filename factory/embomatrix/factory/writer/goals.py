@@ -1,4 +1,4 @@
-"""Pieces of goals: each kind of thing that a task can ask for, with the words that ask for it."""
+"""Goal conjuncts: each kind of request with its words."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ if TYPE_CHECKING:
     from embomatrix.factory.scenes.view import SceneView
     from embomatrix.factory.writer.variant import Variant
 
-TAP: Final = "tap"
-DRAWERS: Final = "drawers"
+TAP_MANNER: Final = "tap"
+DRAWER_MANNER: Final = "drawers"
 MAX_ALIKE: Final = 4
-"""Furniture of one category in one room, of which a goal may mean any."""
-PICKS: Final = 4
-"""Objects that the robot tries before a wish is given up."""
+"""Maximum number of equal furniture conjuncts in a room for a goal that accepts any of them."""
+MAX_PICKS: Final = 4
+"""Number of objects tried before a request is abandoned."""
 
 
 @dataclass(frozen=True, slots=True)
 class GoalConjunct:
-    """One conjunct of a goal. ``objects`` are all that it is about, ``signs`` its part of the goal's signature.
+    """Conjunct of a goal. ``objects`` lists all objects involved, ``signs`` its part of the goal's signature.
 
-    ``clause`` asks for it; ``thing`` is what it is about, in words; ``kind`` is "place", "switch" or "thermal"; ``manner``
-    tells how a thing is switched that people have other words for: by its tap, or its drawers.
+    ``clause`` is the request, and ``thing`` names the object in words. ``kind`` is "place", "switch" or "thermal".
+    ``manner`` is set for objects that are switched by a tap or opened by drawers.
     """
 
     goal: Formula
@@ -48,12 +48,12 @@ class GoalConjunct:
 
 
 @dataclass(frozen=True)
-class Workshop:
-    """What the makers of pieces draw from. ``used`` are objects that earlier pieces of the same goal are about.
+class GoalContext:
+    """Scene, vocabulary and random generator for goals. ``used`` lists objects of earlier conjuncts of the same goal.
 
-    ``phrases`` are the ways to ask for an atom, by predicate, or by predicate and manner where they know some; ``where`` those
-    to say in which room a thing is, ``whence`` the same of what is to be taken away, ``room_called`` what a room is called,
-    ``nouns`` what categories are, where not by their names; ``voice`` chooses among them, equally where none is given.
+    ``phrases`` maps a predicate, or a predicate with a manner, to its phrases. ``where`` and ``whence`` name the room
+    of an object, and of an object that is taken away. ``room_called`` and ``nouns`` name rooms and categories.
+    ``voice`` chooses phrases; by default all are equally likely.
     """
 
     view: SceneView
@@ -68,23 +68,23 @@ class Workshop:
     voice: Voice | None = None
 
     def phrase(self, kind: str, *, thing: str, place: str = "", manner: str = "") -> str:
-        """One imperative clause."""
+        """Return one imperative clause."""
         options = self.phrases.get(f"{kind} {manner}", self.phrases[kind])
         return phrase(options, self._voice, thing=thing, place=place)
 
     def refer(self, name: str) -> str:
-        """A noun phrase for an object."""
+        """Return a noun phrase for an object."""
         return self._referred(name, self.where)
 
     def refer_taken(self, name: str) -> str:
-        """A noun phrase for an object that is to be taken away."""
+        """Return a noun phrase for an object that is taken away."""
         return self._referred(name, self.whence)
 
     def _referred(self, name: str, where: Sequence[str]) -> str:
         return refer(self.view, name, self._voice, where, self.noun(name), self.room_called)
 
     def noun(self, name: str) -> str:
-        """What an object is called."""
+        """Return the noun for an object."""
         category = self.view.category(name)
         return self.nouns.get(category, spoken(category))
 
@@ -93,13 +93,13 @@ class Workshop:
         return self.voice or Voice(self.rng)
 
     def pick(self, names: Sequence[str], works: Callable[[str], bool] = lambda _: True) -> str | None:
-        """One of some objects, none that is used already, with which it works; None where the first few do not."""
+        """Return an unused object that passes ``works``; None if the first few don't."""
         fresh = [name for name in names if name not in self.used]
-        order = self.rng.permutation(len(fresh))[:PICKS]
+        order = self.rng.permutation(len(fresh))[:MAX_PICKS]
         return next((fresh[index] for index in order if works(fresh[index])), None)
 
     def fixtures(self, wanted: Callable[[str], bool]) -> list[str]:
-        """Objects of the variant's rooms that are wanted, that open, and that words can name, alone or as one of a few."""
+        """Return suitable objects of the variant's rooms that can open and that words can identify."""
         return [
             name
             for room in self.variant.rooms
@@ -108,33 +108,38 @@ class Workshop:
         ]
 
     def things(self) -> list[str]:
-        """Small things that can be carried and that bear nothing themselves."""
+        """Return small portable objects that support nothing."""
         hosts = {item.host for item in self.view.scene.objects}
         return [name for name in self.variant.added if self.view.is_portable(name) and name not in hosts]
 
 
-def place_piece(shop: Workshop) -> GoalConjunct | None:
-    """Put a thing on or in another: furniture, an appliance or a basket."""
-    thing = shop.pick(
-        [name for name in shop.things() if not shop.view.is_basket(name)], shop.view.robot.fetches
+def placement_goal(context: GoalContext) -> GoalConjunct | None:
+    """Put an object on or in furniture, an appliance or a basket."""
+    thing = context.pick(
+        [name for name in context.things() if not context.view.is_basket(name)],
+        context.view.robot.can_pick_up,
     )
     if thing is None:
         return None
-    return _placed(shop, thing, shop.refer_taken(thing))
+    return _place_goal(context, thing, context.refer_taken(thing))
 
 
-def _placed(shop: Workshop, thing: str, called: str) -> GoalConjunct | None:
-    """Put the thing, called so in the request, on or in something that it is not at already and that is large enough."""
-    view, rng = shop.view, shop.rng
+def _place_goal(context: GoalContext, thing: str, called: str) -> GoalConjunct | None:
+    """Put the object on or in a sufficiently large host other than its current one. ``called`` names it in the
+    request.
+    """
+    view, rng = context.view, context.rng
     inside = rng.random() < 0.5
-    baskets = [name for name in shop.variant.added if view.is_basket(name) and name != thing]
+    baskets = [name for name in context.variant.added if view.is_basket(name) and name != thing]
     targets = (
-        [*shop.fixtures(view.is_container), *baskets, *baskets] if inside else shop.fixtures(view.is_surface)
+        [*context.fixtures(view.is_container), *baskets, *baskets]
+        if inside
+        else context.fixtures(view.is_surface)
     )
     here = {view.category(host) for host in view.hosts(thing)}
     category = view.category(thing)
     relation = Relation.INSIDE if inside else Relation.ONTOP
-    target = shop.pick(
+    target = context.pick(
         [
             name
             for name in targets
@@ -142,15 +147,15 @@ def _placed(shop: Workshop, thing: str, called: str) -> GoalConjunct | None:
             and suits(category, view.category(name))
             and view.takes(name, thing, inside=inside)
         ],
-        lambda host: view.robot.puts(thing, relation, host),
+        lambda host: view.robot.can_place(thing, relation, host),
     )
     if target is None:
         return None
     predicate = relation.value
-    goal, types, objects, place = _one_of(shop, target, lambda host: Atom(predicate, (thing, host)))
+    goal, types, objects, place = _any_alike(context, target, lambda host: Atom(predicate, (thing, host)))
     return GoalConjunct(
         goal=goal,
-        clause=shop.phrase(predicate, thing=called, place=place),
+        clause=context.phrase(predicate, thing=called, place=place),
         objects=(thing, *objects),
         signs=(f"{predicate}({view.category(thing)},{view.category(target)})",),
         kind="place",
@@ -159,36 +164,38 @@ def _placed(shop: Workshop, thing: str, called: str) -> GoalConjunct | None:
     )
 
 
-def placed_elsewhere(shop: Workshop, piece: GoalConjunct) -> GoalConjunct | None:
-    """The thing of a piece put in another place than the piece says; None where it is about no thing to be placed."""
-    if piece.kind != "place":
+def placed_elsewhere(context: GoalContext, conjunct: GoalConjunct) -> GoalConjunct | None:
+    """Return the object of a placement goal in another place; None for other goals."""
+    if conjunct.kind != "place":
         return None
-    other = dataclasses.replace(shop, used=shop.used | frozenset(piece.objects[1:]))
-    return _placed(other, piece.objects[0], piece.thing)
+    other = dataclasses.replace(context, used=context.used | frozenset(conjunct.objects[1:]))
+    return _place_goal(other, conjunct.objects[0], conjunct.thing)
 
 
-def _one_of(
-    shop: Workshop, target: str, atom: Callable[[str], Formula]
+def _any_alike(
+    context: GoalContext, target: str, atom: Callable[[str], Formula]
 ) -> tuple[Formula, Mapping[str, tuple[str, ...]], tuple[str, ...], str]:
-    """The atom about the target, or about any of those that the same words mean; with the words."""
-    view = shop.view
+    """Return the atom about the target, or about any object that the same words describe, with its types, objects and
+    words.
+    """
+    view = context.view
     alike = view.alike(target)
     if len(alike) == 1:
-        return atom(target), {}, (target,), shop.refer(target)
+        return atom(target), {}, (target,), context.refer(target)
     synset = view.asset(target).synset
     variable = f"?{synset}"
     return (
         Exists(variable, synset, atom(variable)),
         {synset: alike},
         alike,
-        shop.refer(target),
+        context.refer(target),
     )
 
 
-def switch_piece(shop: Workshop) -> GoalConjunct | None:
-    """Open or close a door, switch an appliance or a light on or off."""
-    view, rng = shop.view, shop.rng
-    name = shop.pick(shop.fixtures(view.is_switchable))
+def switch_goal(context: GoalContext) -> GoalConjunct | None:
+    """Open or close a door, or switch an appliance or a light."""
+    view, rng = context.view, context.rng
+    name = context.pick(context.fixtures(view.is_switchable))
     if name is None:
         return None
     options = [("open", view.is_open(name))] * view.is_openable(name)
@@ -197,11 +204,11 @@ def switch_piece(shop: Workshop) -> GoalConjunct | None:
     if len(view.alike(name)) > 1 and any(
         _holds(view, predicate, other) != holds for other in view.alike(name)
     ):
-        return None  # "open a cabinet" asks for nothing where one is open already
+        return None  # "open a cabinet" asks for nothing if one is already open
     if not (
-        view.robot.swings(name, shut=holds)
+        view.robot.can_swing(name, shut=holds)
         if predicate == "open"
-        else view.robot.switches(name, on=not holds)
+        else view.robot.can_switch(name, on=not holds)
     ):
         return None
     kind = f"not {predicate}" if holds else predicate
@@ -209,11 +216,11 @@ def switch_piece(shop: Workshop) -> GoalConjunct | None:
     def atom(target: str) -> Formula:
         return Not(Atom(predicate, (target,))) if holds else Atom(predicate, (target,))
 
-    goal, types, objects, words = _one_of(shop, name, atom)
+    goal, types, objects, words = _any_alike(context, name, atom)
     manner = _manner(view, name, predicate)
     return GoalConjunct(
         goal=goal,
-        clause=shop.phrase(kind, thing=words, manner=manner),
+        clause=context.phrase(kind, thing=words, manner=manner),
         objects=objects,
         signs=(f"{kind}({view.category(name)})",),
         kind="switch",
@@ -224,58 +231,58 @@ def switch_piece(shop: Workshop) -> GoalConjunct | None:
 
 
 def _manner(view: SceneView, name: str, predicate: str) -> str:
-    """What of a thing is switched or opened, where that is neither a button nor a door."""
+    """Return the manner of an object that is switched by a tap or opened by drawers."""
     asset = view.asset(name)
     if predicate == "toggled_on":
-        return TAP if flows_from(asset.synset) else ""
-    return DRAWERS if all(joint.kind is JointKind.PRISMATIC for _, joint in asset.joints) else ""
+        return TAP_MANNER if flows_from(asset.synset) else ""
+    return DRAWER_MANNER if all(joint.kind is JointKind.PRISMATIC for _, joint in asset.joints) else ""
 
 
 def _holds(view: SceneView, predicate: str, name: str) -> bool:
     return view.is_open(name) if predicate == "open" else view.is_on(name)
 
 
-def thermal_piece(shop: Workshop) -> GoalConjunct | None:
-    """Heat, cook or freeze food with a source of the variant's rooms, and now and then leave it there."""
-    view, rng = shop.view, shop.rng
-    foods = [name for name in shop.things() if view.asset(name).can("cookable")]
-    food = shop.pick(foods, view.robot.fetches)
-    source = shop.pick(
-        shop.fixtures(lambda name: view.is_source(name) and view.category(name) not in FOR_DRINKS)
+def thermal_goal(context: GoalContext) -> GoalConjunct | None:
+    """Heat, cook or freeze food with a source of the variant's rooms, sometimes leaving it there."""
+    view, rng = context.view, context.rng
+    foods = [name for name in context.things() if view.asset(name).can("cookable")]
+    food = context.pick(foods, view.robot.can_pick_up)
+    source = context.pick(
+        context.fixtures(lambda name: view.is_source(name) and view.category(name) not in FOR_DRINKS)
     )
     if food is None or source is None or source in view.hosts(food):
         return None
     effects = [
-        state for state in view.thermal_effects(food, source) if view.robot.exposes(food, source, state)
+        state for state in view.thermal_effects(food, source) if view.robot.can_treat(food, source, state)
     ]
     if not effects:
         return None
-    return _thermal(shop, food, source, effects[int(rng.integers(len(effects)))].value)
+    return _thermal(context, food, source, effects[int(rng.integers(len(effects)))].value)
 
 
-def _thermal(shop: Workshop, food: str, source: str, predicate: str) -> GoalConjunct:
-    view, rng = shop.view, shop.rng
-    place = shop.refer(source)
+def _thermal(context: GoalContext, food: str, source: str, predicate: str) -> GoalConjunct:
+    view, rng = context.view, context.rng
+    place = context.refer(source)
     goal: Formula = Atom(predicate, (food,))
     objects: tuple[str, ...] = (food,)
     signs: tuple[str, ...] = (f"{predicate}({view.category(food)})",)
-    called = shop.refer_taken(food)
-    clause = shop.phrase(predicate, thing=called, place=place)
+    called = context.refer_taken(food)
+    clause = context.phrase(predicate, thing=called, place=place)
     if view.is_container(source) and len(view.alike(source)) == 1 and rng.random() < 0.35:
         goal = And((goal, Atom("inside", (food, source))))
         objects = (food, source)
         signs = (*signs, f"inside({view.category(food)},{view.category(source)})")
-        clause += f" and leave it in the {shop.noun(source)}"
+        clause += f" and leave it in the {context.noun(source)}"
     return GoalConjunct(goal, clause, (*objects, *(view.alike(source))), signs, "thermal", called)
 
 
-def serve_piece(shop: Workshop) -> GoalConjunct | None:
+def serving_goal(context: GoalContext) -> GoalConjunct | None:
     """Heat, cook or freeze food, then put it somewhere else."""
-    first = thermal_piece(shop)
+    first = thermal_goal(context)
     if first is None or isinstance(first.goal, And):
         return None
     food = first.objects[0]
-    second = _placed(shop, food, "it")
+    second = _place_goal(context, food, "it")
     if second is None or set(second.objects[1:]) & set(first.objects[1:]):
         return None
     return GoalConjunct(

@@ -1,4 +1,4 @@
-"""The task writer: seeded tasks over what a scene variant holds, in the paper's four categories."""
+"""Task writer: seeded tasks about the objects of a scene variant, in the paper's four categories."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
 
 from embomatrix.factory.writer.goals import (
     GoalConjunct,
-    Workshop,
-    place_piece,
-    serve_piece,
-    switch_piece,
-    thermal_piece,
+    GoalContext,
+    placement_goal,
+    serving_goal,
+    switch_goal,
+    thermal_goal,
 )
 from embomatrix.factory.writer.words import sentence
 from embomatrix.world.evaluate import render
@@ -29,43 +29,43 @@ if TYPE_CHECKING:
     from embomatrix.factory.scenes.view import SceneView
     from embomatrix.factory.writer.variant import Variant
 
-    Maker = Callable[[Workshop], GoalConjunct | None]
+    Maker = Callable[[GoalContext], GoalConjunct | None]
 
 ROWS: Final = (16, 24)
-"""Rows of an object table, least and most, where the rooms hold enough."""
+"""Minimum and maximum number of rows of an object table."""
 TRIES: Final = 12
 HELDOUT_OF: Final = 4
-"""One goal signature in this many belongs to the held-out split."""
+"""One in this many goal signatures belongs to the held-out split."""
 
 _RECIPES: Final[Mapping[TaskCategory, tuple[tuple[Maker, ...], ...]]] = {
     TaskCategory.PICK_AND_PLACE: (
-        (place_piece,),
-        (place_piece,),
-        (place_piece, place_piece),
+        (placement_goal,),
+        (placement_goal,),
+        (placement_goal, placement_goal),
     ),
     TaskCategory.APPLIANCE_USE: (
-        (switch_piece,),
-        (switch_piece, switch_piece),
-        (switch_piece, switch_piece),
+        (switch_goal,),
+        (switch_goal, switch_goal),
+        (switch_goal, switch_goal),
     ),
-    TaskCategory.KITCHEN_OPERATION: ((thermal_piece,), (thermal_piece,), (serve_piece,)),
+    TaskCategory.KITCHEN_OPERATION: ((thermal_goal,), (thermal_goal,), (serving_goal,)),
     TaskCategory.COMPOUND: (
-        (place_piece, switch_piece),
-        (switch_piece, place_piece),
-        (thermal_piece, switch_piece),
-        (thermal_piece, place_piece),
-        (serve_piece, switch_piece),
-        (place_piece, place_piece, switch_piece),
+        (placement_goal, switch_goal),
+        (switch_goal, placement_goal),
+        (thermal_goal, switch_goal),
+        (thermal_goal, placement_goal),
+        (serving_goal, switch_goal),
+        (placement_goal, placement_goal, switch_goal),
     ),
 }
-"""The pieces that make up a goal of each category; those written twice are twice as likely."""
+"""Conjuncts of a goal by category. Repeated recipes are twice as likely."""
 
 
 @dataclass(frozen=True, slots=True)
 class Draft:
-    """A written task, not yet known to be feasible.
+    """Written task whose feasibility is not yet verified.
 
-    ``about`` are the goal's objects and the appliances that it takes, ``rooms`` the rooms that they are in.
+    ``about`` lists the goal's objects and the appliances that it needs, ``rooms`` their rooms.
     """
 
     task: Task
@@ -73,12 +73,12 @@ class Draft:
     rooms: tuple[str, ...]
     signature: str
     transcript: str = ""
-    """How the request came about, in Markdown; empty where nobody talked."""
+    """Conversation behind the request in Markdown; empty if there is none."""
 
 
 @dataclass(frozen=True, slots=True)
 class DraftOrder:
-    """One draft that is asked for. The generator decides all that is drawn for it."""
+    """Order for one draft. The random generator decides everything drawn for it."""
 
     category: TaskCategory
     task_id: str
@@ -86,7 +86,7 @@ class DraftOrder:
 
 
 class TaskWriter(Protocol):
-    """Writes tasks about the things of a variant."""
+    """Writer of tasks about the objects of a variant."""
 
     def write(
         self,
@@ -96,29 +96,30 @@ class TaskWriter(Protocol):
         task_id: str,
         rng: np.random.Generator,
     ) -> Draft | TaskRefusal | None:
-        """A task of the category, None when the variant's rooms hold nothing for one. The generator decides all.
+        """Return a task of the category, or None if the variant's rooms hold nothing for one. The generator decides
+        all draws.
 
-        A refusal tells why whoever was asked for a task gave none.
+        A refusal gives the reason why a language model produced no draft.
         """
         ...
 
 
 @runtime_checkable
-class ManyAtOnce(Protocol):
-    """A writer that waits for somebody's answers, and so asks for several drafts at once."""
+class BatchTaskWriter(Protocol):
+    """Writer that waits for answers and therefore requests several drafts at once."""
 
     at_once: int
-    """Drafts that are worth asking for together."""
+    """Number of drafts to request together."""
 
     def write_all(
         self, variant: Variant, view: SceneView, orders: Sequence[DraftOrder]
     ) -> Sequence[Draft | TaskRefusal]:
-        """What came of the first so many of the orders, of one at least: a draft, or why there is none."""
+        """Return a draft or a refusal for each order; at least for the first one."""
         ...
 
 
 class PlainWriter:
-    """Asks for what a goal says in a bounded vocabulary, and no more."""
+    """Writer that states the goal in a bounded vocabulary."""
 
     def write(
         self,
@@ -128,58 +129,60 @@ class PlainWriter:
         task_id: str,
         rng: np.random.Generator,
     ) -> Draft | None:
-        shop = Workshop(view, variant, rng)
-        pieces = pieces_of(shop, category)
-        if not pieces:
+        context = GoalContext(view, variant, rng)
+        conjuncts = draw_conjuncts(context, category)
+        if not conjuncts:
             return None
-        return draft_of(shop, category, task_id, pieces, sentence([piece.clause for piece in pieces], rng))
+        return draft_of(
+            context, category, task_id, conjuncts, sentence([conjunct.clause for conjunct in conjuncts], rng)
+        )
 
 
-def pieces_of(shop: Workshop, category: TaskCategory) -> list[GoalConjunct]:
-    """Pieces that make up a goal of the category; none where the variant's rooms hold nothing for one."""
+def draw_conjuncts(context: GoalContext, category: TaskCategory) -> list[GoalConjunct]:
+    """Return the conjuncts of a goal of the category; empty if the variant's rooms hold nothing for one."""
     recipes = _RECIPES[category]
     for _ in range(TRIES):
-        pieces = _made(shop, recipes[int(shop.rng.integers(len(recipes)))])
-        if pieces:
-            return pieces
+        conjuncts = _drawn(context, recipes[int(context.rng.integers(len(recipes)))])
+        if conjuncts:
+            return conjuncts
     return []
 
 
-def _made(shop: Workshop, recipe: Sequence[Maker]) -> list[GoalConjunct]:
-    """One piece by each maker about objects of its own, or none at all."""
-    pieces: list[GoalConjunct] = []
+def _drawn(context: GoalContext, recipe: Sequence[Maker]) -> list[GoalConjunct]:
+    """Return one conjunct per maker, each about different objects, or an empty list."""
+    conjuncts: list[GoalConjunct] = []
     for make in recipe:
-        used = frozenset(name for piece in pieces for name in piece.objects)
-        piece = make(dataclasses.replace(shop, used=used))
-        if piece is None or any(set(piece.types) & set(other.types) for other in pieces):
+        used = frozenset(name for conjunct in conjuncts for name in conjunct.objects)
+        conjunct = make(dataclasses.replace(context, used=used))
+        if conjunct is None or any(set(conjunct.types) & set(other.types) for other in conjuncts):
             return []
-        if used & set(piece.objects):
+        if used & set(conjunct.objects):
             return []
-        pieces.append(piece)
-    return pieces
+        conjuncts.append(conjunct)
+    return conjuncts
 
 
 def draft_of(
-    shop: Workshop,
+    context: GoalContext,
     category: TaskCategory,
     task_id: str,
-    pieces: Sequence[GoalConjunct],
+    conjuncts: Sequence[GoalConjunct],
     instruction: str,
     transcript: str = "",
 ) -> Draft:
-    """The task that asks for these pieces in these words."""
-    view = shop.view
-    goal = _conjunction([piece.goal for piece in pieces])
-    types = {key: names for piece in pieces for key, names in piece.types.items()}
-    needed = dict.fromkeys(name for piece in pieces for name in piece.objects)
+    """Return the task with these conjuncts and this instruction."""
+    view = context.view
+    goal = _conjunction([conjunct.goal for conjunct in conjuncts])
+    types = {key: names for conjunct in conjuncts for key, names in conjunct.types.items()}
+    needed = dict.fromkeys(name for conjunct in conjuncts for name in conjunct.objects)
     task = Task(
         task_id=task_id,
-        scene_id=shop.variant.scene.scene_id,
+        scene_id=context.variant.scene.scene_id,
         instruction=instruction,
         category=category,
         goal=goal,
         goal_bddl=render(goal),
-        table=object_table(view, tuple(needed), shop.rng),
+        table=object_table(view, tuple(needed), context.rng),
         types=types,
         source="writer",
     )
@@ -187,7 +190,7 @@ def draft_of(
         task=task,
         about=tuple(needed),
         rooms=tuple(sorted({view.room(name) for name in needed})),
-        signature=" ".join(sorted(sign for piece in pieces for sign in piece.signs)),
+        signature=" ".join(sorted(sign for conjunct in conjuncts for sign in conjunct.signs)),
         transcript=transcript,
     )
 
@@ -200,9 +203,9 @@ def _conjunction(parts: list[Formula]) -> Formula:
 
 
 def object_table(view: SceneView, needed: Sequence[str], rng: np.random.Generator) -> tuple[str, ...]:
-    """The needed objects with all that they rest on or in, and distractors of the same rooms, shuffled.
+    """Return the needed objects with their supports, and distractors of the same rooms, shuffled.
 
-    Distractors bring their own hosts along, so a row's place can always be told.
+    Distractors are added with their supports, so the place of each row can always be stated.
     """
     rows: dict[str, None] = {}
 
@@ -213,7 +216,7 @@ def object_table(view: SceneView, needed: Sequence[str], rng: np.random.Generato
         add(name)
     rooms = dict.fromkeys(view.room(name) for name in needed)
     others = [name for room in rooms for name in view.in_room.get(room, ())]
-    telling = [name for name in others if _is_telling(view, name)]
+    telling = [name for name in others if _is_useful(view, name)]
     wanted = int(rng.integers(ROWS[0], ROWS[1] + 1))
     for name in rng.permutation(telling) if telling else ():
         if len(rows) >= wanted:
@@ -223,8 +226,8 @@ def object_table(view: SceneView, needed: Sequence[str], rng: np.random.Generato
     return tuple(table[int(index)] for index in rng.permutation(len(table)))[:MAX_TABLE]
 
 
-def _is_telling(view: SceneView, name: str) -> bool:
-    """Whether a plan could have any use for the object: pictures and blinds fill a table with noise."""
+def _is_useful(view: SceneView, name: str) -> bool:
+    """True if a plan can use the object. Pictures and blinds would only add noise."""
     return (
         view.is_portable(name)
         or view.is_surface(name)
@@ -235,6 +238,6 @@ def _is_telling(view: SceneView, name: str) -> bool:
 
 
 def is_heldout_signature(signature: str, seed: int) -> bool:
-    """Whether goals of this signature belong to the held-out split: a fair draw by hash, fixed for a seed."""
+    """True if goals of this signature belong to the held-out split: a hash draw that is fixed for a seed."""
     digest = hashlib.sha256(f"{seed} {signature}".encode()).digest()
     return digest[0] % HELDOUT_OF == 0

@@ -1,4 +1,4 @@
-"""Scene variants: a base scene with small things about, some doors open and some lights on. Several tasks share one."""
+"""Scene variants: a base scene with small objects, some open doors and some lights on. Several tasks share one."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 
-THINGS: Final = 12
-"""Small things that a variant adds, over all its rooms."""
+SMALL_OBJECTS: Final = 12
+"""Number of small objects that a variant adds over all its rooms."""
 TRIES: Final = 3
-"""Models that are tried for one thing before it is left out."""
+"""Number of models tried for one object."""
 BASKET_SHARE: Final = 0.5
 OPEN_SHARE: Final = 0.2
 ON_SHARE: Final = 0.3
@@ -46,9 +46,9 @@ ON_SHARE: Final = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """A scene to write tasks in. ``rooms`` are those that the tasks may use; ``added`` the small things in them.
+    """Scene for tasks. ``rooms`` are the rooms that tasks may use; ``added`` lists the small objects in them.
 
-    ``trees`` tell by room how what was added hangs together.
+    ``trees`` holds the layout tree of the added objects by room.
     """
 
     scene: Scene
@@ -64,13 +64,13 @@ def build_variant(
     rng: np.random.Generator,
     agents: LayoutAgents | None = None,
 ) -> Variant:
-    """Put small things about in these rooms of a base scene. The same generator state gives the same variant."""
+    """Add small objects to these rooms of a base scene. Equal generator states give equal variants."""
     editor = SceneEditor(base)
     view = SceneView(base)
-    items = _things(view, rooms, rng)
+    items = _requested_objects(view, rooms, rng)
     layout = lay(editor, items, int(rng.integers(2**31)), agents)
     for name in [*layout.names.values()]:
-        if name in editor.objects and not _is_in_its_place(editor, name):
+        if name in editor.objects and not _is_well_placed(editor, name):
             editor.remove(name)
     _set_doors_and_lights(editor, view, rooms, rng)
     added = tuple(layout.names[item.name] for item in items if layout.names.get(item.name) in editor.objects)
@@ -78,18 +78,20 @@ def build_variant(
     return Variant(editor.freeze(scene_id), tuple(rooms), added, trees)
 
 
-def _is_in_its_place(editor: SceneEditor, name: str) -> bool:
-    """Whether an added thing stands where people leave such things, or is one that they put on the floor."""
+def _is_well_placed(editor: SceneEditor, name: str) -> bool:
+    """True if an added object stands on a usual host, or on the floor if it belongs there."""
     category, host = editor.asset_of(name).category, editor.objects[name].host
     if category in BASKETS:
         return True
     return bool(host) and is_left_on(category, editor.asset_of(host).category)
 
 
-def _things(view: SceneView, rooms: Sequence[str], rng: np.random.Generator) -> list[RequestedObject]:
-    """What goes into the rooms: a basket now and then, and things that suit them, each of another category than what is there.
+def _requested_objects(
+    view: SceneView, rooms: Sequence[str], rng: np.random.Generator
+) -> list[RequestedObject]:
+    """Return the objects to add: sometimes a basket, and objects that suit the rooms, each of a new category.
 
-    So words can tell them apart. Which of the rooms that suit a thing it goes to is not decided here.
+    Distinct categories let words identify the objects. The layout agents choose the rooms.
     """
     types = {room.name: room.type for room in view.scene.rooms}
     present = {view.category(name) for room in rooms for name in view.in_room[room]}
@@ -97,7 +99,7 @@ def _things(view: SceneView, rooms: Sequence[str], rng: np.random.Generator) -> 
     for room in rooms:
         if rng.random() < BASKET_SHARE:
             chosen.setdefault(BASKETS[int(rng.integers(len(BASKETS)))], (room,))
-        share = max(4, round(THINGS / len(rooms)))
+        share = max(4, round(SMALL_OBJECTS / len(rooms)))
         fresh = (name for name in _categories(types[room], rng) if name not in present | chosen.keys())
         for name in itertools.islice(fresh, share):
             chosen[name] = tuple(each for each in rooms if belongs(name, types[each]))
@@ -105,7 +107,7 @@ def _things(view: SceneView, rooms: Sequence[str], rng: np.random.Generator) -> 
 
 
 def _categories(room_type: str, rng: np.random.Generator) -> list[str]:
-    """Categories that suit a room, in random order, the likelier groups first."""
+    """Return the categories that suit a room in random order, likelier groups first."""
     groups = groups_for(room_type)
     pools: dict[ItemKind, list[str]] = {
         group: [str(name) for name in rng.permutation(MEMBERS[group])] for group in dict.fromkeys(groups)
@@ -119,7 +121,7 @@ def _categories(room_type: str, rng: np.random.Generator) -> list[str]:
 
 
 def _models(category: str, rng: np.random.Generator) -> tuple[tuple[str, str], ...]:
-    """Models that the robot can carry, in random order."""
+    """Return portable models in random order."""
     catalog = Catalog.load()
     mass = catalog.category(category).mass_kg
     models = [model for model in catalog.models_of(category) if is_liftable(model.size_m, mass)]
@@ -129,9 +131,11 @@ def _models(category: str, rng: np.random.Generator) -> tuple[tuple[str, str], .
 def _set_doors_and_lights(
     editor: SceneEditor, view: SceneView, rooms: Sequence[str], rng: np.random.Generator
 ) -> None:
-    """Open some doors that have room, switch some things on. What runs only when closed stays off: its door may be open."""
+    """Open some doors that have space and switch some devices on. Devices with doors stay off, since they only run
+    closed.
+    """
     names = [name for room in rooms for name in view.in_room[room]]
-    starts = OpenStarts(editor, filter(view.is_openable, names))
+    starts = DoorOpener(editor, filter(view.is_openable, names))
     for name in names:
         if view.is_openable(name) and rng.random() < OPEN_SHARE:
             starts.open(name)
@@ -140,11 +144,11 @@ def _set_doors_and_lights(
 
 
 SWEEP: Final = (1 / 3, 2 / 3, 1.0)
-"""Shares of a travel at which a door is looked at while it swings."""
+"""Fractions of a door's travel at which its swing is checked."""
 
 
-class OpenStarts:
-    """Opens doors in an editor's scene. ``doors`` are those that tasks may ask to open."""
+class DoorOpener:
+    """Opener of doors in an editor's scene. ``doors`` are those that tasks may ask to open."""
 
     def __init__(self, editor: SceneEditor, doors: Iterable[str]) -> None:
         self._editor = editor
@@ -154,7 +158,7 @@ class OpenStarts:
         self._lost = _out_of_reach(self._scene)
 
     def open(self, name: str) -> bool:
-        """Open an object's doors and drawers fully, unless that is in the way of something. Whether they are open now."""
+        """Open an object's doors and drawers fully. Return False if that would obstruct something."""
         item = self._scene.by_name[name]
         asset = self._scene.asset_of(name)
         wide = (1.0,) * len(asset.joints)
@@ -186,7 +190,7 @@ class OpenStarts:
 
 
 def _out_of_reach(scene: Scene) -> frozenset[str]:
-    """Rooms and furniture that the robot can't get at, and loose things that it can't reach from where it can drive."""
+    """Return rooms and furniture that the robot can't reach, and loose objects out of its reach."""
     floor = ReachableFloor(scene)
     found = {name for problem in reach_problems(scene) for name in problem.names}
     for item in scene.objects:

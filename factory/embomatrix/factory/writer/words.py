@@ -1,4 +1,4 @@
-"""Instructions: how a person refers to things and asks for what the goal says. A bounded vocabulary with natural variation."""
+"""Instructions in a bounded vocabulary with natural variation: references to objects and phrases for goals."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ PHRASES: Final[Mapping[str, tuple[str, ...]]] = {
     "hot": ("heat {thing}", "heat up {thing} with {place}", "warm {thing} with {place}"),
     "frozen": ("freeze {thing}", "freeze {thing} in {place}", "chill {thing} in {place} until it is frozen"),
 }
-"""Ways to ask for an atom, by predicate; ``place`` is the host or the source."""
+"""Phrases that request an atom, by predicate. ``place`` is the host or the source."""
 
 _OPENERS: Final = (
     "{request}.",
@@ -47,19 +47,19 @@ _JOINS: Final = (" and ", ", then ", " and then ")
 
 
 def spoken(name: str) -> str:
-    """A category or a room type in words."""
+    """Return a category or room type in words."""
     return name.replace("_", " ")
 
 
 def room_words(view: SceneView, room: str) -> str:
-    """``the kitchen`` where there is one, else the room's own name: ``living_room_2``."""
+    """Return ``the kitchen`` if there is one kitchen, otherwise the room's own name such as ``living_room_2``."""
     types = [item.type for item in view.scene.rooms]
     stem = room.rpartition("_")[0] if is_room_instance(room) else room
     return f"the {spoken(stem)}" if types.count(stem) == 1 else room
 
 
 class Voice:
-    """Chooses among ways to say a thing: here, any with equal chance."""
+    """Random choice among phrases with equal probability."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
@@ -69,7 +69,7 @@ class Voice:
 
 
 class FreshVoice(Voice):
-    """Says nothing twice while there is another way to say it."""
+    """Random choice among the least used phrases."""
 
     def __init__(self, rng: np.random.Generator, said: Counter[str]) -> None:
         super().__init__(rng)
@@ -90,10 +90,10 @@ def refer(
     noun: str = "",
     room_called: Callable[[SceneView, str], str] = room_words,
 ) -> str:
-    """A noun phrase for an object, or for any of those of its category in its room.
+    """Return a noun phrase for an object, or for any object of its category in its room.
 
-    The room is named, in one of the ways of ``where`` and as ``room_called`` says, if the category does not tell which one is
-    meant. ``noun`` is what the category is called, where that is not its name.
+    The room is named if the category alone is ambiguous, with a phrase of ``where`` and the name from
+    ``room_called``. ``noun`` replaces the category's name.
     """
     noun = noun or spoken(view.category(name))
     article = "the" if len(view.alike(name)) == 1 else "an" if noun[0] in "aeiou" else "a"
@@ -105,13 +105,13 @@ def refer(
 
 
 def phrase(phrases: Sequence[str], voice: Voice, *, thing: str, place: str = "") -> str:
-    """One imperative clause. Without a place, only phrases that name none."""
+    """Return one imperative clause. Without a place, only phrases without one are used."""
     options = [text for text in phrases if place or "{place}" not in text]
     return voice.choose(options).format(thing=thing, place=place)
 
 
 def sentence(phrases: Sequence[str], rng: np.random.Generator) -> str:
-    """The clauses, in their order, as one request."""
+    """Join the clauses to one request."""
     request = phrases[0]
     for clause in phrases[1:]:
         request += _JOINS[int(rng.integers(len(_JOINS)))] + clause

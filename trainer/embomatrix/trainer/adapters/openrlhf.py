@@ -1,7 +1,7 @@
-"""OpenRLHF on our cluster, by either of its two ways to ask for rewards.
+"""Adapter for OpenRLHF, which can ask for rewards in two ways.
 
-``--reward.remote_url http://MANAGER:PORT/api/v1/rewards`` asks the manager itself, which needs the bundles first
-(``give_bundles``); ``--reward.remote_url THIS_FILE`` calls ``reward_func`` in OpenRLHF's own process.
+``--reward.remote_url http://MANAGER:PORT/api/v1/rewards`` asks the manager, which needs the bundles first
+(``give_bundles``). ``--reward.remote_url THIS_FILE`` calls ``reward_func`` in OpenRLHF's own process.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import torch
 from embomatrix.rpc.reward_label import RewardLabel, answer_in
 from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.trainer.adapters.rows import messages, tasks_of
-from embomatrix.trainer.adapters.scorer import ATTEMPTS, given_up, scorer_for
-from embomatrix.trainer.run.data import group_seed, load_tasks
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.adapters.scorer import ATTEMPTS, retries_exhausted, scorer_for
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.data.tasks import group_seed, load_tasks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -48,7 +48,7 @@ def rows(dataset: str | Path, split: str = "train", seed: int = 0) -> list[dict[
 
 
 async def give_bundles(dataset: str | Path, client: ClusterClient) -> int:
-    """Give the manager the scenes that it lacks; returns how many. Raises ClusterError."""
+    """Upload the scenes that the manager lacks, and return their number. Raises ClusterError."""
     tasks = load_tasks(Path(dataset))
     digests = {task.bundle_digest for task in (*tasks.train, *tasks.heldout)}
     sent = 0
@@ -61,24 +61,24 @@ async def give_bundles(dataset: str | Path, client: ClusterClient) -> int:
 def _scorer() -> PlanScorer:
     dataset = os.environ.get(DATASET, "")
     if not dataset:
-        raise TrainerError(f"{DATASET} is not set: it names the dataset's folder")
+        raise TrainerError(f"{DATASET} is not set: set it to the dataset's folder")
     return scorer_for(dataset)
 
 
 def reward_func(queries: Sequence[str], prompts: Sequence[str], labels: Sequence[str]) -> dict[str, Any]:
-    """OpenRLHF's hook. The dataset and the cluster come from the environment. Raises TrainerError."""
+    """OpenRLHF's hook. Dataset and cluster come from the environment. Raises TrainerError."""
     try:
         answers = [answer_in(query, prompt) for query, prompt in zip(queries, prompts, strict=True)]
         task_ids = [RewardLabel.parse(label).task_id for label in labels]
     except InvalidRequestError as error:
         raise TrainerError(str(error)) from error
-    return told(asyncio.run(rewards_of(_scorer(), task_ids, answers)))
+    return reward_payload(asyncio.run(rewards_of(_scorer(), task_ids, answers)))
 
 
 async def rewards_of(
     scorer: PlanScorer, task_ids: Sequence[str], answers: Sequence[str]
 ) -> list[RewardBreakdown]:
-    """The reward of each answer. What the infrastructure lost is executed again, and given up after ``ATTEMPTS``."""
+    """Return the reward of each answer. Lost rollouts are repeated up to ``ATTEMPTS`` times."""
     found: dict[int, RewardBreakdown] = {}
     missing = list(range(len(answers)))
     for _attempt in range(ATTEMPTS):
@@ -91,11 +91,11 @@ async def rewards_of(
         missing = [at for at in missing if at not in found]
         if not missing:
             return [found[at] for at in range(len(answers))]
-    raise given_up(task_ids[missing[0]])
+    raise retries_exhausted(task_ids[missing[0]])
 
 
-def told(rewards: Sequence[RewardBreakdown]) -> dict[str, Any]:
-    """As OpenRLHF reads it: rewards, scores in 0…1 for its filter, and what is logged."""
+def reward_payload(rewards: Sequence[RewardBreakdown]) -> dict[str, Any]:
+    """OpenRLHF's format: rewards, scores in [0, 1] for its filter, and extra logs."""
     return {
         "rewards": torch.tensor([reward.total for reward in rewards]),
         "scores": torch.tensor([float(reward.success) for reward in rewards]),

@@ -1,4 +1,4 @@
-"""Rows of a dataset as other trainers read them: the prompt, and by what the reward finds the task again."""
+"""Dataset rows for other trainers: the prompt, and the key by which the reward finds the task."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from embomatrix.skills.prompt import Codec, prompt_for
-from embomatrix.trainer.run.data import load_tasks
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.data.tasks import load_tasks
 
 if TYPE_CHECKING:
     from embomatrix.skills.prompt import Situation
-    from embomatrix.trainer.run.data import TrainingTask
+    from embomatrix.trainer.data.tasks import TrainingTask
 
 SOURCE = "embomatrix"
 
 
 def messages(situation: Situation, codec: Codec = Codec.JSON) -> list[dict[str, str]]:
-    """The prompt of a task as chat messages."""
+    """Prompt of a task as chat messages."""
     prompt = prompt_for(situation, codec)
     return [{"role": "system", "content": prompt.system}, {"role": "user", "content": prompt.user}]
 
@@ -31,7 +31,7 @@ def prompt_rows(dataset: str | Path, split: str = "train", codec: Codec = Codec.
 
 
 def verl_rows(dataset: str | Path, split: str = "train", codec: Codec = Codec.JSON) -> list[dict[str, Any]]:
-    """The columns of verl's datasets; the ground truth is the task's id. Raises TrainerError."""
+    """Rows in the format of verl's datasets. The ground truth is the task's id. Raises TrainerError."""
     return [
         {
             "data_source": SOURCE,
@@ -45,7 +45,7 @@ def verl_rows(dataset: str | Path, split: str = "train", codec: Codec = Codec.JS
 
 
 def tasks_of(dataset: str | Path, split: str) -> tuple[TrainingTask, ...]:
-    """The tasks of a dataset's split. Raises TrainerError."""
+    """Tasks of a dataset's split. Raises TrainerError."""
     tasks = load_tasks(Path(dataset))
     splits = {"train": tasks.train, "heldout": tasks.heldout}
     if split not in splits:

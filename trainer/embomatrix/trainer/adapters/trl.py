@@ -1,6 +1,6 @@
-"""TRL's ``GRPOTrainer`` on our cluster: a reward function, and a mixin that announces the tasks of coming steps.
+"""Adapter for TRL's ``GRPOTrainer``: a reward function, and a mixin that announces the tasks of coming steps.
 
-Nothing of TRL is imported here: the reward is a callable, the mixin overrides one method of the class that it is mixed into.
+TRL itself is not imported: the reward is a callable, and the mixin overrides one method of the trainer class.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from embomatrix.trainer.adapters.scorer import scorer_for
-from embomatrix.trainer.grpo.lookahead import Lookahead
+from embomatrix.trainer.data.lookahead import Lookahead
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from typing import Self
 
     from embomatrix.trainer.adapters.scorer import PlanScorer
-    from embomatrix.trainer.grpo.rollout import PlanOutcome
+    from embomatrix.trainer.cluster.gateway import PlanOutcome
 
 
 class ClusterReward:
-    """An asynchronous reward function for ``reward_funcs``. The dataset's rows need the column ``task_id``.
+    """Asynchronous reward function for ``reward_funcs``. The dataset needs the column ``task_id``.
 
-    A plan that the infrastructure lost is None, which TRL leaves out of its group's mean and spread. The tiers are logged as
-    metrics, causes and rewards beside the completions.
+    Lost plans get None, which TRL leaves out of the group's mean and deviation. Tiers are logged as metrics, outcomes beside
+    the completions.
     """
 
     __name__ = "cluster"
@@ -36,7 +36,7 @@ class ClusterReward:
 
     @classmethod
     def at(cls, dataset: str | Path, manager: str = "", **options: Any) -> Self:
-        """On the cluster of this address, as ``scorer_for``."""
+        """Create a reward on the cluster at this address; see ``scorer_for``."""
         return cls(scorer_for(dataset, manager, **options))
 
     async def __call__(
@@ -49,21 +49,21 @@ class ClusterReward:
         log_extra: Callable[[str, list[Any]], None] | None = None,
         **_: object,
     ) -> list[float | None]:
-        """One reward for each completion: the sum of the three tiers. Raises TrainerError."""
+        """Return one reward per completion: the sum of the three tiers. Raises TrainerError."""
         outcomes = await self.scorer.score(task_id, [text_of(completion) for completion in completions])
         if log_metric is not None:
             for name, value in tiers(outcomes).items():
                 log_metric(f"embomatrix/{name}", value)
         if log_extra is not None:
             log_extra("task", list(task_id))
-            log_extra("became", [became(outcome) for outcome in outcomes])
+            log_extra("outcome", [outcome_summary(outcome) for outcome in outcomes])
         return [None if outcome.reward is None else outcome.reward.total for outcome in outcomes]
 
 
 class ClusterLookahead:
-    """Mixin before ``GRPOTrainer``: the cluster hears which tasks the coming generations need, and loads their scenes.
+    """Mixin before ``GRPOTrainer``: announces the tasks of coming generations, so that the cluster loads their scenes.
 
-    It speaks for the first ``ClusterReward`` among the reward functions, in the main process alone.
+    It uses the first ``ClusterReward`` among the reward functions, in the main process only.
     """
 
     lookahead_steps = 3
@@ -87,9 +87,9 @@ class ClusterLookahead:
 
 
 class AnnouncedSampler:
-    """Gives the indices of a sampler in their order; before each portion it tells what this and the next ones hold.
+    """Sampler that announces the current and the next portions before each portion.
 
-    ``portion`` is how many indices one generation takes, repetitions included; ``announce`` gets the distinct ones of each.
+    ``portion`` is the number of indices per generation, including repetitions. ``announce`` gets the distinct indices of each.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class AnnouncedSampler:
 
 
 class _Portions:
-    """A sampler's indices in portions, anew in each epoch."""
+    """Indices of a sampler in portions, anew in each epoch."""
 
     def __init__(self, sampler: Iterable[int], size: int) -> None:
         self._sampler = sampler
@@ -126,7 +126,7 @@ class _Portions:
 
 
 def text_of(completion: object) -> str:
-    """The text of a completion: a string, or chat messages of which the last is the answer."""
+    """Text of a completion: a string, or the last of several chat messages."""
     if isinstance(completion, str):
         return completion
     if isinstance(completion, (list, tuple)) and completion and isinstance(completion[-1], dict):
@@ -135,24 +135,24 @@ def text_of(completion: object) -> str:
 
 
 def tiers(outcomes: Sequence[PlanOutcome]) -> dict[str, float]:
-    """Means of the tiers and of success over the plans that have a reward, and the share of lost ones."""
+    """Means of the tiers and of success over known rewards, and the share of lost plans."""
     known = [outcome.reward for outcome in outcomes if outcome.reward is not None]
-    told = {"lost": 1.0 - len(known) / len(outcomes)} if outcomes else {}
+    means = {"lost": 1.0 - len(known) / len(outcomes)} if outcomes else {}
     if known:
-        told |= {
+        means |= {
             "format": float(np.mean([reward.format for reward in known])),
             "relevance": float(np.mean([reward.relevance for reward in known])),
             "goal": float(np.mean([reward.goal for reward in known])),
             "success": float(np.mean([reward.success for reward in known])),
         }
-    return told
+    return means
 
 
-def became(outcome: PlanOutcome) -> str:
-    """What became of a plan, in a few words: why it is none, its last step, or that it was lost."""
+def outcome_summary(outcome: PlanOutcome) -> str:
+    """Outcome of a plan in a few words: the parser's error, the last step's message, or that it was lost."""
     if outcome.problem:
         return outcome.problem
     if outcome.reward is None:
-        return "lost by the infrastructure"
+        return "lost to the infrastructure"
     steps = getattr(outcome.outcome, "steps", ())
     return steps[-1].message if steps else "an empty plan"

@@ -1,7 +1,8 @@
-"""A taskset for ``verifiers`` (its v1 interface), and so for prime-rl: prompts of a dataset, rewards of a cluster.
+"""Adapter for ``verifiers`` (its v1 interface), and so for prime-rl: a taskset with a dataset's prompts and a cluster's "
+"rewards.
 
-Its commands find a taskset by a module of one word, such as `docs/examples/embomatrix_household.py`; the cluster comes from
-the environment.
+Its commands load a taskset from a single-word module such as `docs/examples/embomatrix_household.py`. The environment
+configures the cluster.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import verifiers.v1 as vf
 
 from embomatrix.skills.prompt import Codec, prompt_for
 from embomatrix.trainer.adapters.rows import tasks_of
-from embomatrix.trainer.adapters.scorer import given_up, scorer_for
+from embomatrix.trainer.adapters.scorer import retries_exhausted, scorer_for
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -21,45 +22,45 @@ if TYPE_CHECKING:
     from embomatrix.trainer.adapters.scorer import PlanScorer
 
 __all__ = ["HouseholdTaskset"]
-UNNAMED = "name the dataset's folder with --env.taskset.dataset"
+NO_DATASET = "no dataset: pass its folder with --env.taskset.dataset"
 
 
 class HouseholdConfig(vf.TasksetConfig):  # type: ignore[misc]  # untyped where it is not installed
-    """``dataset``: a dataset's folder; ``split``: train or heldout."""
+    """``dataset``: folder of a dataset; ``split``: train or heldout."""
 
     dataset: str = ""
     split: str = "train"
 
 
 class HouseholdData(vf.TaskData):  # type: ignore[misc]
-    """``dataset`` travels with each task, so that whoever scores it finds its scene."""
+    """``dataset`` is stored with each task, so that any process can find its scene."""
 
     dataset: str
     category: str
 
 
 class HouseholdTask(vf.Task[HouseholdData, vf.State, vf.TaskConfig]):  # type: ignore[misc]
-    """One answer, one plan. What the infrastructure lost is an error of the rollout, never a number."""
+    """Task with one plan as its answer. A lost rollout is an error of the rollout, never a number."""
 
     @vf.reward  # type: ignore[untyped-decorator]
     async def tiers(self, trace: vf.Trace) -> dict[str, float]:
-        """The three tiers, which add up to the reward; success is a metric beside them."""
+        """Return the three tiers, which add up to the reward. Success is a separate metric."""
         task_id = str(self.data.id)
         outcome = await _scorer(self.data.dataset).score_one(task_id, trace.last_reply)
         if outcome.reward is None:
-            raise given_up(task_id)
+            raise retries_exhausted(task_id)
         trace.record_metrics({"success": float(outcome.success)})
         reward = outcome.reward
         return {"format": reward.format, "relevance": reward.relevance, "goal": reward.goal}
 
 
 class HouseholdTaskset(vf.Taskset[HouseholdTask, HouseholdConfig]):  # type: ignore[misc]
-    """The tasks of one split."""
+    """Tasks of one split."""
 
     def load(self) -> Iterator[HouseholdTask]:
-        """Raises TrainerError where the dataset can't be read, ValueError where none is named."""
+        """Raises TrainerError if the dataset can't be read, ValueError if none is given."""
         if not self.config.dataset:
-            raise ValueError(UNNAMED)
+            raise ValueError(NO_DATASET)
         for task in tasks_of(self.config.dataset, self.config.split):
             prompt = prompt_for(task.situation, Codec.JSON)
             data = HouseholdData(

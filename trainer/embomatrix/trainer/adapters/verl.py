@@ -1,6 +1,7 @@
-"""verl's custom reward function: ``custom_reward_function.path`` names this file, ``.name`` is ``compute_score``.
+"""Adapter for verl: its custom reward function. Set ``custom_reward_function.path`` to this file, ``.name`` to "
+"``compute_score``.
 
-verl scores each sample as soon as it is generated, so that simulation and generation overlap without further ado.
+verl scores each sample as soon as it is generated, so simulation and generation overlap.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import functools
 from typing import TYPE_CHECKING
 
-from embomatrix.trainer.adapters.scorer import ATTEMPTS, given_up, scorer_for
+from embomatrix.trainer.adapters.scorer import ATTEMPTS, retries_exhausted, scorer_for
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 @functools.cache
 def scorer_of(dataset: str, manager: str, token: str, ca: str) -> PlanScorer:
-    """One scorer for each cluster and process."""
+    """Return the process's scorer for a cluster."""
     return scorer_for(dataset, manager, token, ca)
 
 
@@ -35,25 +36,28 @@ async def compute_score(
     ca: str = "",
     **_: object,
 ) -> dict[str, float]:
-    """The reward of one answer; ``ground_truth`` is the task's id. The rest are ``custom_reward_function.reward_kwargs``."""
+    """Score one answer.
+
+    ``ground_truth`` is the task's id; the keyword arguments are ``custom_reward_function.reward_kwargs``.
+    """
     return await scored(scorer_of(dataset, manager, token, ca), ground_truth, solution_str)
 
 
 async def scored(scorer: PlanScorer, task_id: str, text: str) -> dict[str, float]:
-    """The tiers of one answer.
+    """Return the tiers of one answer.
 
-    verl has no mark for an answer without a reward, and NaN would spoil its step: what the infrastructure lost is executed
-    again, and given up with TrainerError after ``ATTEMPTS``.
+    verl has no mark for a missing reward, and NaN would spoil its step. Lost rollouts are repeated; after ``ATTEMPTS``, a
+    TrainerError is raised.
     """
     for _attempt in range(ATTEMPTS):
         outcome = await scorer.score_one(task_id, text)
         if outcome.reward is not None:
-            return told(outcome.reward)
-    raise given_up(task_id)
+            return reward_payload(outcome.reward)
+    raise retries_exhausted(task_id)
 
 
-def told(reward: RewardBreakdown) -> dict[str, float]:
-    """The score with what verl logs beside it: always the same keys."""
+def reward_payload(reward: RewardBreakdown) -> dict[str, float]:
+    """verl's format: the score and the values that it logs, always with the same keys."""
     return {
         "score": reward.total,
         "format": reward.format,

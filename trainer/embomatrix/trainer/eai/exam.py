@@ -1,4 +1,4 @@
-"""EAI-native as an exam: EAI's own prompts and vocabulary, judged by its published judge. Our simulator has no part in it."""
+"""EAI-native exam: EAI's own prompts and vocabulary, judged by its published judge. Our simulator is not involved."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.skills.prompt import Prompt
 from embomatrix.trainer.eai.environment import PACKAGE
-from embomatrix.trainer.evaluation.exam import Marked, Question
+from embomatrix.trainer.evaluation.exam import ExamResult, Question
 from embomatrix.trainer.evaluation.intervals import mean_over_tasks
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
 from embomatrix.trainer.evaluation.taxonomy import Cause
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 NAME: Final = "eai-native"
 CODEC: Final = "eai"
-_KINDS: Final[Mapping[str, Cause]] = {
+_CAUSES: Final[Mapping[str, Cause]] = {
     "parsing": Cause.UNPARSABLE,
     "arguments": Cause.WRONG_ARGUMENT,
     "unknown_execution": Cause.HALLUCINATED_SKILL,
@@ -34,9 +34,9 @@ _KINDS: Final[Mapping[str, Cause]] = {
     "ErrorType.WRONG_TEMPORAL_ORDER": Cause.WRONG_ORDER,
     "ErrorType.MISSING_STEP": Cause.MISSING_STEP,
 }
-"""The judge's own kinds of error as our causes. ADDITIONAL_STEP stops no plan there."""
+"""Causes for the judge's kinds of error. ADDITIONAL_STEP does not stop a plan there."""
 _HALLUCINATION: Final = "hullucination"
-"""As the package spells it; its words begin with what was made up: an action or an object."""
+"""Spelled as in the package. The message starts with the kind of the invented name: action or object."""
 
 
 class NativeExam:
@@ -59,23 +59,23 @@ class NativeExam:
 
     @cached_property
     def digest(self) -> str:
-        told = json.dumps(
+        content = json.dumps(
             [PACKAGE, *((task.demo, task.prompt, task.category) for task in self._tasks.values())]
         )
-        return f"sha256:{hashlib.sha256(told.encode()).hexdigest()}"
+        return f"sha256:{hashlib.sha256(content.encode()).hexdigest()}"
 
     def questions(self, codec: Codec, rows: int) -> tuple[Question, ...]:
-        """EAI's prompts as they are published; neither argument changes them."""
+        """EAI's published prompts. Neither argument changes them."""
         return tuple(Question(task.demo, Prompt("", task.prompt)) for task in self._tasks.values())
 
     def human(self, task_id: str) -> str:
-        """The human plan that the package publishes."""
+        """Return the human plan that the package publishes."""
         return self._tasks[task_id].human
 
     def judge(
         self, setup: EvaluationSetup, answers: Sequence[Answer], report: Callable[[int, int], None]
-    ) -> Marked:
-        """Equal answers of a task are judged once. Raises TrainerError where the judge can't start."""
+    ) -> ExamResult:
+        """Judge answers; equal answers of a task are judged once. Raises TrainerError if the judge can't start."""
         categories = {task.demo: TaskCategory(task.category) for task in self._tasks.values()}
         known: dict[tuple[str, str], NativeResult | None] = {}
         results = []
@@ -90,13 +90,13 @@ class NativeExam:
             "goal exactly true and executed": _share(results, lambda result: result.exact),
             "executed to the end": _share(results, lambda result: result.executed),
         }
-        return Marked(board, (), others)
+        return ExamResult(board, (), others)
 
 
 def _share(
     results: Sequence[tuple[Answer, NativeResult | None]], of: Callable[[NativeResult], bool]
 ) -> Estimate:
-    """Mean over tasks of the share of answers."""
+    """Mean over tasks of the share of answers with the property."""
     by_task: dict[str, list[bool]] = {}
     for answer, result in results:
         if result is not None:
@@ -105,7 +105,7 @@ def _share(
 
 
 def _verdict(answer: Answer, result: NativeResult | None) -> AnswerVerdict:
-    """An answer that the judge did not survive is lost: it is no evidence. ``partial`` is over the goal's conjuncts."""
+    """Verdict on an answer. Without a result it counts as lost. ``partial`` is the share of the goal's conjuncts."""
     if result is None:
         return AnswerVerdict(answer.task_id, answer.sample, success=False, partial=0.0, lost=True)
     partial = sum(result.goals) / len(result.goals) if result.goals else 0.0
@@ -116,11 +116,11 @@ def _verdict(answer: Answer, result: NativeResult | None) -> AnswerVerdict:
 
 
 def _cause(result: NativeResult) -> tuple[Cause, str]:
-    told = result.errors.get(_HALLUCINATION)
-    if told is not None:
-        made_up = Cause.HALLUCINATED_OBJECT if told.startswith("object") else Cause.HALLUCINATED_SKILL
-        return made_up, ""
-    for kind, cause in _KINDS.items():
+    hallucination = result.errors.get(_HALLUCINATION)
+    if hallucination is not None:
+        cause = Cause.HALLUCINATED_OBJECT if hallucination.startswith("object") else Cause.HALLUCINATED_SKILL
+        return cause, ""
+    for kind, cause in _CAUSES.items():
         if kind in result.errors and not result.executed:
             return cause, ""
     return (Cause.GOAL_NOT_MET, "choices_cut_short") if result.exact else (Cause.GOAL_NOT_MET, "")

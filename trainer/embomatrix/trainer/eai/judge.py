@@ -1,4 +1,4 @@
-"""EAI's judge in a process of its own: orders go in, results come out, and what a text does to it costs that text alone."""
+"""EAI's judge in a separate process, so a hostile answer can only affect its own verdict."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from embomatrix.trainer.eai.sanitise import sanitised
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.eai.sanitise import sanitise_answer
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from embomatrix.trainer.eai.environment import JudgeEnvironment
 
 ANSWER_S: Final = 60.0
-"""For one answer; the longest of the human plans takes 0.2 s. Starting takes a few seconds more."""
+"""Timeout per answer. The longest human plan takes 0.2 s; starting takes a few seconds."""
 MEMORY_BYTES: Final = 4 * 1024**3
 INSIDE: Final = ("embomatrix", "trainer", "eai", "inside")
 
 
 @dataclass(frozen=True, slots=True)
 class NativeTask:
-    """A task as EAI asks it. ``category`` is by the rule of ``inside.categories``; ``human`` is the published plan."""
+    """Task as EAI publishes it. ``category`` follows ``inside.categories``; ``human`` is the published plan."""
 
     demo: str
     task: str
@@ -41,10 +41,10 @@ class NativeTask:
 
 @dataclass(frozen=True, slots=True)
 class NativeResult:
-    """What the judge says of one answer.
+    """Result of one answer.
 
-    ``official`` is the published success, ``exact`` that of the goal's formula itself; both ask for an execution to the end.
-    ``goals`` are the truths of the goal's conjuncts in the state reached. ``errors`` are the judge's own words by kind.
+    ``official`` is the published success, ``exact`` the truth of the goal's formula; both require a complete execution.
+    ``goals`` are the truths of the goal's conjuncts in the final state. ``errors`` are the judge's messages by kind.
     """
 
     official: bool
@@ -55,10 +55,10 @@ class NativeResult:
 
 
 class NativeJudge:
-    """Context manager over the process; started anew where an answer ended it."""
+    """Context manager over the judge's process, which is restarted after a crash."""
 
     def __init__(self, environment: JudgeEnvironment, *, published: bool = True) -> None:
-        """``published``: use what the package tells of the real simulator's first state."""
+        """``published``: use the initial state of the real simulator, as far as the package publishes it."""
         self._environment = environment
         self._arguments = () if published else ("--withhold-published",)
         self._stack = contextlib.ExitStack()
@@ -76,8 +76,8 @@ class NativeJudge:
         self._stack.close()
 
     def tasks(self) -> tuple[NativeTask, ...]:
-        """The hundred tasks. Raises TrainerError where the judge can't start."""
-        found = self._asked({"op": "tasks"})
+        """Return the hundred tasks. Raises TrainerError if the judge can't start."""
+        found = self._request({"op": "tasks"})
         if found is None:
             raise TrainerError(
                 f"EAI's judge in {self._environment.folder} does not start: remove the folder and run `embomatrix eai install`"
@@ -85,22 +85,24 @@ class NativeJudge:
         return tuple(NativeTask(**task) for task in found["tasks"])
 
     def judge(self, demo: str, text: str) -> NativeResult | None:
-        """The verdict on an answer, sanitised first; None where the judge did not survive it or took too long."""
-        found = self._asked({"op": "judge", "id": demo, "demo": demo, "text": sanitised(text)})
+        """Return the result of an answer after sanitising it. None if the judge crashed or timed out."""
+        found = self._request({"op": "judge", "id": demo, "demo": demo, "text": sanitise_answer(text)})
         if found is None:
             return None
         goals = tuple(found["goals"])
         return NativeResult(found["official"], found["exact"], found["executed"], goals, found["errors"])
 
     def first_truths(self, demo: str) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
-        """Truths of the published goals at the start: in the reconstruction, and in the real simulator."""
-        found = self._asked({"op": "start", "demo": demo})
+        """Truths of the published goals in the initial state: in the reconstruction, and in the real simulator."""
+        found = self._request({"op": "start", "demo": demo})
         if found is None:
-            raise TrainerError(f"EAI's judge can't set up {demo}")
+            raise TrainerError(
+                f"EAI's judge can't set up the task {demo}: reinstall it with `embomatrix eai install`"
+            )
         there = tuple(bool(true) for true in found["there"])
         return tuple(at in found["here"] for at in range(len(there))), there
 
-    def _asked(self, order: Mapping[str, Any]) -> dict[str, Any] | None:
+    def _request(self, order: Mapping[str, Any]) -> dict[str, Any] | None:
         process = self._process or self._start()
         assert process.stdin is not None
         assert process.stdout is not None
@@ -124,7 +126,7 @@ class NativeJudge:
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             start_new_session=True,
-            preexec_fn=_confine,
+            preexec_fn=_limit_resources,
         )
         return self._process
 
@@ -135,8 +137,8 @@ class NativeJudge:
             process.communicate()
 
 
-def _confine() -> None:
-    """In the child, before it runs: bounded memory, no file of any size, no core."""
+def _limit_resources() -> None:
+    """Runs in the child process before the judge: limit memory, forbid files and core dumps."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

@@ -1,4 +1,4 @@
-"""From what a model wrote to the pure JSON that EAI's judge may be given: its parser calls ``eval`` on it."""
+"""Sanitising of model texts for EAI's judge, whose parser calls ``eval`` on them."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ if TYPE_CHECKING:
 
 MAX_CHARS: Final = 64 * 1024
 MAX_STARTS: Final = 256
-"""Brackets at which a list is looked for: bounds the work on adversarial text."""
-_STRANGE: Final = re.compile(r"[^A-Za-z0-9_., -]")
-"""No name of the benchmark holds any other character. A bracket would end the published parser's text, a quote its string."""
+"""Maximum brackets at which a list is looked for: bounds the work on adversarial text."""
+_FORBIDDEN_CHARACTERS: Final = re.compile(r"[^A-Za-z0-9_., -]")
+"""Characters that no name in the benchmark contains. Brackets or quotes could break out of the published parser's text."""
 
 
-def sanitised(text: str) -> str:
-    """The last list of steps in the text, with nothing but ``action`` and ``object`` of each; "" where there is none.
+def sanitise_answer(text: str) -> str:
+    """Return the last list of steps as JSON with only ``action`` and ``object``; "" if there is none.
 
-    What follows the last closed <think> counts. Strange characters of names become "?": such a name stays unknown.
+    Text before the last </think> is ignored. Forbidden characters become "?", so such a name stays unknown.
     """
     answer = text.rpartition("</think>")[2][:MAX_CHARS]
     found: list[dict[str, str]] = []
@@ -31,7 +31,7 @@ def sanitised(text: str) -> str:
 
 
 def _lists(text: str) -> Iterator[list[Any]]:
-    """Every list that begins at a bracket and is JSON or, as the published parser takes it, a Python literal."""
+    """All lists in the text that are JSON, or Python literals, which the published parser accepts too."""
     decoder = json.JSONDecoder()
     position = text.find("[")
     for _ in range(MAX_STARTS):
@@ -56,7 +56,7 @@ def _literal(text: str) -> Any:
 
 def _steps(value: list[Any]) -> list[dict[str, str]]:
     return [
-        {key: _STRANGE.sub("?", step[key]) for key in ("action", "object")}
+        {key: _FORBIDDEN_CHARACTERS.sub("?", step[key]) for key in ("action", "object")}
         for step in value
         if isinstance(step, dict) and all(isinstance(step.get(key), str) for key in ("action", "object"))
     ]

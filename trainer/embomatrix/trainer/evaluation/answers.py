@@ -1,6 +1,6 @@
-"""What models answered, kept: a file whose first line says what was asked of whom, and a line for each answer.
+"""Answer file of an evaluation: a line with the setup, then one JSON line per answer.
 
-Lines are appended as answers come, so that an interrupted evaluation loses none and goes on where it was.
+Each answer is appended as it arrives, so an interrupted evaluation continues without loss.
 """
 
 from __future__ import annotations
@@ -8,11 +8,14 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import asdict, dataclass, fields
-from typing import TYPE_CHECKING, Any, Final, Self
+from dataclasses import asdict, fields
+from typing import TYPE_CHECKING, Annotated, Any, Final, Self
+
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
 
 from embomatrix.skills.prompt import Codec
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -20,41 +23,44 @@ if TYPE_CHECKING:
     from typing import IO
 
 VERSION: Final = 1
-"""Of the file's format and of what a verdict depends on. Answers of another version can't be judged by this one."""
+"""Version of the file format and of everything that a verdict depends on."""
 FILE: Final = "answers.jsonl"
 MOST_SAMPLES: Final = 1000
-"""Of a task."""
-CODECS: Final = frozenset({*(codec.value for codec in Codec), "eai"})
-"""Our own, and EAI's."""
+"""Maximum samples per task."""
+CODECS: Final = "|".join([*Codec, "eai"])
+_STRICT: Final = ConfigDict(extra="forbid", strict=True)
+_Count = Annotated[int, Field(ge=1)]
+_Natural = Annotated[int, Field(ge=0)]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=_STRICT)
 class EvaluationSetup:
-    """What was asked, and of whom. Equal setups ask equal questions.
+    """Question and subject of an evaluation. Equal setups ask equal questions.
 
-    ``bench_digest`` names the tasks; ``questions`` is a hash of all prompts, empty where a baseline was not asked in words.
-    ``rows`` are the rows of the object table that a prompt tells at most; ``seed`` also seeds the execution.
+    ``bench_digest`` identifies the tasks. ``questions`` is a hash of all prompts, empty for baselines, which get no prompt.
+    ``rows`` is the maximum number of table rows in a prompt. ``seed`` also seeds the execution. ``by_rule`` counts the tasks
+    that can't be expressed and count as failed.
     """
 
     bench: str
     bench_digest: str
     split: str
-    tasks: int
+    tasks: _Count
     model: str
-    codec: str
-    rows: int
-    samples: int
-    temperature: float
-    max_tokens: int
-    seed: int
+    codec: Annotated[str, Field(pattern=f"^({CODECS})$")]
+    rows: _Count
+    samples: Annotated[int, Field(ge=1, le=MOST_SAMPLES)]
+    temperature: Annotated[float, Field(ge=0, lt=math.inf)]
+    max_tokens: _Count
+    seed: _Natural
     questions: str = ""
-    by_rule: int = 0
+    by_rule: _Natural = 0
     profile: str = "household"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=_STRICT)
 class Answer:
-    """One sample of one task. ``finish`` is "length" where the text was cut off; tokens are 0 where nobody counted."""
+    """One sample of one task. ``finish`` is "length" for a truncated text. Token counts are 0 if unknown."""
 
     task_id: str
     sample: int
@@ -65,10 +71,10 @@ class Answer:
 
 
 class AnswerSheet:
-    """Context manager over the file: what is there already, and where more goes."""
+    """Context manager over an answer file: stored answers, and a place for new ones."""
 
     def __init__(self, path: Path, setup: EvaluationSetup) -> None:
-        """Raises TrainerError when the file holds answers to other questions, or can't be read or written."""
+        """Raises TrainerError if the file answers other questions, or can't be read or written."""
         self.path = path
         self.setup = setup
         self._answers: dict[tuple[str, int], Answer] = {}
@@ -77,11 +83,11 @@ class AnswerSheet:
     def __enter__(self) -> Self:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            begun = self.path.exists() and b"\n" in self.path.read_bytes()
-            if begun:
-                self._take_up()
-            self._file = self.path.open("ab" if begun else "wb")
-            if not begun:
+            exists = self.path.exists() and b"\n" in self.path.read_bytes()
+            if exists:
+                self._load()
+            self._file = self.path.open("ab" if exists else "wb")
+            if not exists:
                 self._write({"answers": VERSION, **asdict(self.setup)})
         except OSError as error:
             raise TrainerError(
@@ -100,7 +106,7 @@ class AnswerSheet:
         return key in self._answers
 
     def add(self, answers: Iterable[Answer]) -> None:
-        """Keep answers; those that are there already stay as they are."""
+        """Store new answers. Answers to the same sample of a task are ignored."""
         for answer in answers:
             key = (answer.task_id, answer.sample)
             if key not in self._answers:
@@ -108,11 +114,11 @@ class AnswerSheet:
                 self._write(asdict(answer))
 
     def ordered(self, task_ids: Iterable[str]) -> tuple[Answer, ...]:
-        """Answers task by task, sample by sample: the order in which they came leaves no trace."""
+        """Return the answers by task and sample, independent of their order of arrival."""
         return ordered(self._answers, task_ids, self.setup.samples)
 
-    def _take_up(self) -> None:
-        setup, answers, whole = _read(self.path)
+    def _load(self) -> None:
+        setup, answers, complete_bytes = _read(self.path)
         differing = [
             f"{entry.name} {getattr(setup, entry.name)!r}, now {getattr(self.setup, entry.name)!r}"
             for entry in fields(EvaluationSetup)
@@ -120,11 +126,13 @@ class AnswerSheet:
         ]
         if differing:
             raise TrainerError(
-                f"{self.path} holds answers to other questions ({'; '.join(differing)}): pass the same again, or another --out"
+                f"{self.path} holds answers to other questions ({'; '.join(differing)}): pass the same options again, or "
+                "another "
+                "--out"
             )
-        # A line that was cut short by a kill or a full disk is asked for again.
-        os.truncate(self.path, whole)
-        self._answers = {(answer.task_id, answer.sample): answer for answer in answers}
+        # A kill or a full disk may truncate the last line: drop it, so its question is asked again.
+        os.truncate(self.path, complete_bytes)
+        self._answers = answers
 
     def _write(self, value: Mapping[str, Any]) -> None:
         assert self._file is not None
@@ -133,112 +141,77 @@ class AnswerSheet:
             self._file.flush()
         except OSError as error:
             raise TrainerError(
-                f"the answers {self.path} can't be written ({error.strerror}): make room; what came before is kept, and the "
-                "same command goes on from there"
+                f"the answers {self.path} can't be written ({error.strerror}): free disk space; earlier answers are kept, "
+                "and the "
+                "same command continues from there"
             ) from error
 
 
 def read_answers(path: Path) -> tuple[EvaluationSetup, dict[tuple[str, int], Answer]]:
-    """What a file holds. Raises TrainerError when it can't be read or is of another version."""
+    """Read an answer file. Raises TrainerError if it is unreadable, damaged or of another version."""
     try:
         setup, answers, _ = _read(path)
     except OSError as error:
         raise TrainerError(
             f"the answers {path} can't be read ({error.strerror}): expected the {FILE} of an evaluation"
         ) from error
-    return setup, {(answer.task_id, answer.sample): answer for answer in answers}
+    return setup, answers
 
 
 def ordered(
     answers: Mapping[tuple[str, int], Answer], task_ids: Iterable[str], samples: int
 ) -> tuple[Answer, ...]:
-    """Answers of these tasks, task by task, sample by sample; what is missing is left out."""
+    """Return the answers of these tasks by task and sample. Missing answers are left out."""
     keys = ((task_id, sample) for task_id in task_ids for sample in range(samples))
     return tuple(answers[key] for key in keys if key in answers)
 
 
-def check_asked_for(
+def check_expected(
     stored: Iterable[tuple[str, int]], task_ids: Iterable[str], setup: EvaluationSetup, path: Path
 ) -> None:
-    """Raises TrainerError where a (task, sample) that was answered was never asked for."""
+    """Raise TrainerError if an answer's task or sample is not part of the setup."""
     known = set(task_ids)
     for task_id, sample in stored:
         if task_id not in known or not 0 <= sample < setup.samples:
             raise TrainerError(
-                f"{path} holds an answer to sample {sample} of the task {task_id[:80]!r}, which was never asked for: remove "
-                "its line"
+                f"{path} holds an answer to sample {sample} of the task {task_id[:80]!r}, which is not part of the evaluation: "
+                "remove its line"
             )
 
 
-def _read(path: Path) -> tuple[EvaluationSetup, list[Answer], int]:
-    """The setup, the answers, and the length in bytes of the lines that are whole."""
+def _read(path: Path) -> tuple[EvaluationSetup, dict[tuple[str, int], Answer], int]:
+    """Return the setup, the answers, and the length of all complete lines in bytes."""
     data = path.read_bytes()
-    whole = data.rfind(b"\n") + 1
-    lines = data[:whole].splitlines()
+    complete_bytes = data.rfind(b"\n") + 1
+    lines = data[:complete_bytes].splitlines()
     if not lines:
         raise TrainerError(f"{path} holds no answers: expected the {FILE} of an evaluation")
-    header = _line(lines[0], path, 1)
-    if "answers" not in header:
+    try:
+        header = json.loads(lines[0])
+        version = header.pop("answers")
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise TrainerError(
-            f"{path} is no file of answers (its first line names no version): expected the {FILE} of an evaluation"
-        )
-    version = header.pop("answers")
+            f"{path} is not an answer file (its first line has no version): expected the {FILE} of an evaluation"
+        ) from error
     if version != VERSION:
         raise TrainerError(
-            f"{path} is of another version (found {version!r}, expected {VERSION}): ask the model again, or judge it with the "
-            "version of embomatrix that wrote it"
+            f"{path} has another version (found {version!r}, expected {VERSION}): ask the model again, or judge the answers "
+            "with "
+            "the version of embomatrix that wrote them"
         )
-    setup = _made(EvaluationSetup, header, path, 1)
-    _check(setup, path)
+    setup = _validate(EvaluationSetup, json.dumps(header).encode(), path, 1, "ask the model again")
     answers = [
-        _made(Answer, _line(line, path, number), path, number) for number, line in enumerate(lines[1:], 2)
+        _validate(Answer, line, path, number, "remove the line") for number, line in enumerate(lines[1:], 2)
     ]
-    return setup, answers, whole
+    return setup, {(answer.task_id, answer.sample): answer for answer in answers}, complete_bytes
 
 
-def _check(setup: EvaluationSetup, path: Path) -> None:
-    """What were options of the command is what it takes. Raises TrainerError."""
-    for name, sound, expected in (
-        ("samples", 1 <= setup.samples <= MOST_SAMPLES, f"1 to {MOST_SAMPLES}"),
-        ("tasks", setup.tasks >= 1, "1 or more"),
-        ("rows", setup.rows >= 1, "1 or more"),
-        ("max_tokens", setup.max_tokens >= 1, "1 or more"),
-        ("seed", setup.seed >= 0, "0 or more"),
-        ("by_rule", setup.by_rule >= 0, "0 or more"),
-        ("temperature", 0 <= setup.temperature < math.inf, "0 or more"),
-        ("codec", setup.codec in CODECS, ", ".join(sorted(CODECS))),
-    ):
-        if not sound:
-            raise TrainerError(
-                f"{path}, line 1, is damaged: found {name} {getattr(setup, name)!r}, expected {expected}; ask the model again"
-            )
-
-
-def _line(line: bytes, path: Path, number: int) -> dict[str, Any]:
+def _validate(kind: type[Any], line: bytes, path: Path, number: int, remedy: str) -> Any:
     try:
-        value = json.loads(line)
-    except (ValueError, RecursionError) as error:
-        raise TrainerError(f"{path}, line {number}, is damaged ({error}): remove the line") from error
-    if not isinstance(value, dict):
-        raise TrainerError(f"{path}, line {number}, is damaged (expected an object): remove the line")
-    return value
-
-
-def _made(kind: type[Any], value: Mapping[str, Any], path: Path, number: int) -> Any:
-    """A record of the file. Fields must be there, known and of their types."""
-    types = {entry.name: str(entry.type) for entry in fields(kind)}
-    plain: Mapping[str, tuple[type, ...]] = {"str": (str,), "int": (int,), "float": (int, float)}
-    wrong = sorted(
-        name
-        for name in value.keys() | types.keys()
-        if not _fits(value, name, plain.get(types.get(name, ""), ()))
-    )
-    if wrong:
+        return TypeAdapter(kind).validate_json(line)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "the line"
         raise TrainerError(
-            f"{path}, line {number}, is damaged: {wrong[0]!r} is missing, unknown or of a wrong type; remove the line"
-        )
-    return kind(**value)
-
-
-def _fits(value: Mapping[str, Any], name: str, types: tuple[type, ...]) -> bool:
-    return name in value and isinstance(value[name], types) and not isinstance(value[name], bool)
+            f"{path}, line {number}, is damaged: found {where} {first['input']!r:.80}, expected: {first['msg']}; {remedy}"
+        ) from error

@@ -1,10 +1,10 @@
-"""Baselines that need no model: what a measured model has to beat, and what it can reach.
+"""Baselines without a model: lower and upper bounds for measured models.
 
-* ``oracle``: the plan that the dataset carries, found by a planner that knows the goal and the simulator.
-* ``greedy``: a script that knows the goal, not the simulator. It takes the sub-goals in their order and writes the same few
-  calls for each, from what a prompt tells of the start; it does not look at what its own earlier steps changed.
-* ``random``: a few deeds (put something somewhere, open or close, switch), each with the moves that it takes, on objects that
-  it fits by what a prompt tells. It knows nothing of the goal.
+* ``oracle``: the dataset's own plan, found by a planner that knows the goal and the simulator.
+* ``greedy``: a script that knows the goal, but not the simulator. It takes the subgoals in order and writes a few fixed
+  calls for each, from the prompt's initial state. It ignores the effects of its own earlier steps.
+* ``random``: a few random actions (place an object, open or close, switch), each with the moves that it needs, on objects
+  that fit by the prompt. It does not know the goal.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.skills.syntax import MAX_STEPS, PlaceRelation, Skill, SkillCall
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.world.evaluate import substitute
 from embomatrix.world.goal import And, Atom, Exists, Forall, ForN, ForNPairs, ForPairs, Imply, Not, Or
 from embomatrix.world.state import Relation, State
@@ -25,74 +25,74 @@ if TYPE_CHECKING:
 
     from embomatrix.skills.prompt import PromptRow
     from embomatrix.skills.syntax import Plan
-    from embomatrix.trainer.run.data import TrainingTask
+    from embomatrix.trainer.data.tasks import TrainingTask
     from embomatrix.world.goal import Formula
 
     Baseline = Callable[[TrainingTask, np.random.Generator], Plan]
 
-MAX_DEEDS: Final = 4
-"""Of a random plan."""
+MAX_ACTIONS: Final = 4
+"""Maximum actions of a random plan."""
 _DOORS: Final = frozenset({"open", "closed"})
 _SWITCHES: Final = frozenset({"on", "off"})
 HEATERS: Final = ("microwave", "oven", "stove")
 COOLERS: Final = ("fridge", "freezer")
-"""What the script looks for in a category's name, best first, to warm and to cool things."""
+"""Category names of machines that heat and cool, in order of preference."""
 
 
 class BaselineName(StrEnum):
-    """Who writes plans without a model."""
+    """Name of a baseline."""
 
     ORACLE = "oracle"
     GREEDY = "greedy"
     RANDOM = "random"
     HUMAN = "human"
-    """Not ours to write: the plans that EAI publishes."""
+    """Plans that EAI publishes; not for our own tasks."""
 
 
 def baseline_for(name: BaselineName) -> Baseline:
-    """The function that writes a task's plan; equal generators give equal plans. Not for ``HUMAN``."""
+    """Return the function that writes a task's plan. Equal generators give equal plans. Not for ``HUMAN``."""
     return PLANNERS[name]
 
 
 def oracle_plan(task: TrainingTask, rng: np.random.Generator) -> Plan:
-    """The dataset's own plan. Raises TrainerError for a task without one."""
+    """Return the dataset's plan. Raises TrainerError for a task without one."""
     if not task.oracle:
         raise TrainerError(
-            f"the task {task.task.task_id!r} carries no oracle plan: build the dataset with `embomatrix factory`, or measure "
-            "another baseline"
+            f"the task {task.task.task_id!r} has no oracle plan: build the dataset with `embomatrix factory`, or use another "
+            "baseline"
         )
     return task.oracle
 
 
 def random_plan(task: TrainingTask, rng: np.random.Generator) -> Plan:
-    """One to ``MAX_DEEDS`` deeds, each about another thing: kind of deed, then objects, drawn uniformly from what fits."""
+    """Return one to ``MAX_ACTIONS`` actions on different objects. Kind and objects are drawn uniformly from those that fit."""
     script = _Script(task)
     loose = [row for row in task.situation.rows if not row.fixed]
     places = [row for row in task.situation.rows if row.fixed]
     doors = [row for row in places if _DOORS & set(row.states)]
     switches = [row for row in task.situation.rows if _SWITCHES & set(row.states)]
     calls: list[SkillCall] = []
-    for _ in range(int(rng.integers(1, MAX_DEEDS + 1))):
+    for _ in range(int(rng.integers(1, MAX_ACTIONS + 1))):
         kinds = [kind for kind in (loose if places else [], doors, switches) if kind]
         if not kinds:
             break
         kind = kinds[int(rng.integers(len(kinds)))]
-        thing = kind.pop(int(rng.integers(len(kind))))
+        item = kind.pop(int(rng.integers(len(kind))))
         if kind is loose:
             place = places[int(rng.integers(len(places)))]
             relation = tuple(PlaceRelation)[int(rng.integers(len(PlaceRelation)))]
-            calls += script.carry(thing, place, relation)
+            calls += script.carry(item, place, relation)
         elif kind is doors:
-            calls += _at(thing, Skill.CLOSE if "open" in thing.states else Skill.OPEN)
+            calls += _at(item, Skill.CLOSE if "open" in item.states else Skill.OPEN)
         else:
-            calls += _at(thing, Skill.TOGGLE_OFF if "on" in thing.states else Skill.TOGGLE_ON)
+            calls += _at(item, Skill.TOGGLE_OFF if "on" in item.states else Skill.TOGGLE_ON)
     return tuple(calls) or (SkillCall(Skill.MOVE, 0),)
 
 
 def greedy_plan(task: TrainingTask, rng: np.random.Generator) -> Plan:
-    """The script's plan; it draws nothing. Where it knows no step at all, it moves to the first row."""
+    """Return the script's plan. Without any known step, it moves to the first row."""
     script = _Script(task)
-    calls = [call for atom, _ in task.task.goal_atoms for call in script.towards(atom)]
+    calls = [call for atom, _ in task.task.goal_atoms for call in script.calls_for(atom)]
     return tuple(calls[:MAX_STEPS]) or (SkillCall(Skill.MOVE, 0),)
 
 
@@ -101,14 +101,14 @@ class _Script:
         self._types = task.task.types
         self._rows = {row.name: row for row in task.situation.rows}
 
-    def towards(self, atom: Formula) -> Iterator[SkillCall]:
-        """Calls for a scored sub-goal: of choices the first one."""
+    def calls_for(self, atom: Formula) -> Iterator[SkillCall]:
+        """Calls that achieve a scored subgoal. Of alternatives, the first is taken."""
         for literal in self._literals(atom):
             match literal:
                 case Atom(predicate, args):
-                    yield from self._make(predicate, args)
+                    yield from self._achieve(predicate, args)
                 case Not(Atom(predicate, args)):
-                    yield from self._undo(predicate, args)
+                    yield from self._negate(predicate, args)
 
     def _literals(self, formula: Formula) -> Iterator[Formula]:
         match formula:
@@ -135,28 +135,28 @@ class _Script:
         for name in names:
             yield from self._literals(substitute(body, {variable: name}))
 
-    def _make(self, predicate: str, args: tuple[str, ...]) -> Iterator[SkillCall]:
+    def _achieve(self, predicate: str, args: tuple[str, ...]) -> Iterator[SkillCall]:
         rows = [self._rows[name] for name in args if name in self._rows]
         if len(rows) != len(args):
             return
         match predicate, rows:
-            case Relation.INSIDE | Relation.ONTOP | Relation.UNDER, [thing, place]:
-                yield from self.carry(thing, place, PlaceRelation(predicate))
-            case Relation.TOUCHING, [thing, place]:
-                yield from self.carry(thing, place, PlaceRelation.ONTOP)
-            case Relation.NEXTTO, [thing, other] if other.host in self._rows and other.relation is not None:
+            case Relation.INSIDE | Relation.ONTOP | Relation.UNDER, [item, place]:
+                yield from self.carry(item, place, PlaceRelation(predicate))
+            case Relation.TOUCHING, [item, place]:
+                yield from self.carry(item, place, PlaceRelation.ONTOP)
+            case Relation.NEXTTO, [item, other] if other.host in self._rows and other.relation is not None:
                 place = self._rows[other.host]
-                yield from self.carry(thing, place, PlaceRelation(other.relation.value))
-            case State.OPEN, [thing] if "closed" in thing.states:
-                yield from _at(thing, Skill.OPEN)
-            case State.TOGGLED_ON, [thing] if "off" in thing.states:
-                yield from _at(thing, Skill.TOGGLE_ON)
-            case State.HOT | State.COOKED, [thing]:
-                yield from self._process(thing, HEATERS, switch=True)
-            case State.FROZEN, [thing]:
-                yield from self._process(thing, COOLERS, switch=False)
+                yield from self.carry(item, place, PlaceRelation(other.relation.value))
+            case State.OPEN, [item] if "closed" in item.states:
+                yield from _at(item, Skill.OPEN)
+            case State.TOGGLED_ON, [item] if "off" in item.states:
+                yield from _at(item, Skill.TOGGLE_ON)
+            case State.HOT | State.COOKED, [item]:
+                yield from self._process(item, HEATERS, switch=True)
+            case State.FROZEN, [item]:
+                yield from self._process(item, COOLERS, switch=False)
 
-    def _undo(self, predicate: str, args: tuple[str, ...]) -> Iterator[SkillCall]:
+    def _negate(self, predicate: str, args: tuple[str, ...]) -> Iterator[SkillCall]:
         row = self._rows.get(args[0])
         if row is None:
             return
@@ -165,29 +165,29 @@ class _Script:
         elif predicate == State.TOGGLED_ON and "on" in row.states:
             yield from _at(row, Skill.TOGGLE_OFF)
 
-    def carry(self, thing: PromptRow, place: PromptRow, relation: PlaceRelation) -> Iterator[SkillCall]:
-        """Calls that put a thing somewhere, none where it is there already."""
-        if thing.host == place.name and thing.relation is not None and thing.relation.value == relation:
+    def carry(self, item: PromptRow, place: PromptRow, relation: PlaceRelation) -> Iterator[SkillCall]:
+        """Calls that put an object somewhere; none if it is already there."""
+        if item.host == place.name and item.relation is not None and item.relation.value == relation:
             return
         if relation is PlaceRelation.INSIDE:
-            yield from _opened(place)
-        yield from self._fetch(thing)
+            yield from _open(place)
+        yield from self._fetch(item)
         yield SkillCall(Skill.MOVE, place.index)
         yield SkillCall(Skill.PLACE, place.index, relation=relation)
 
-    def _fetch(self, thing: PromptRow) -> Iterator[SkillCall]:
-        host = self._rows.get(thing.host)
-        if host is not None and thing.relation is Relation.INSIDE:
-            yield from _opened(host)
-        yield from _at(thing, Skill.PICK_UP)
+    def _fetch(self, item: PromptRow) -> Iterator[SkillCall]:
+        host = self._rows.get(item.host)
+        if host is not None and item.relation is Relation.INSIDE:
+            yield from _open(host)
+        yield from _at(item, Skill.PICK_UP)
 
-    def _process(self, thing: PromptRow, kinds: Sequence[str], *, switch: bool) -> Iterator[SkillCall]:
-        """Into the first machine of these kinds, shut, and switched on where it has to be."""
+    def _process(self, item: PromptRow, kinds: Sequence[str], *, switch: bool) -> Iterator[SkillCall]:
+        """Put the object into the first machine of these kinds, close it, and switch it on if necessary."""
         found = [row for kind in kinds for row in self._rows.values() if kind in row.category]
         if not found:
             return
         machine = found[0]
-        yield from self.carry(thing, machine, PlaceRelation.INSIDE)
+        yield from self.carry(item, machine, PlaceRelation.INSIDE)
         if _DOORS & set(machine.states):
             yield SkillCall(Skill.CLOSE, machine.index)
         if switch and "off" in machine.states:
@@ -199,7 +199,7 @@ def _at(row: PromptRow, skill: Skill) -> Iterator[SkillCall]:
     yield SkillCall(skill, row.index)
 
 
-def _opened(row: PromptRow) -> Iterator[SkillCall]:
+def _open(row: PromptRow) -> Iterator[SkillCall]:
     if "closed" in row.states:
         yield from _at(row, Skill.OPEN)
 
@@ -209,4 +209,4 @@ PLANNERS: Final[Mapping[BaselineName, Baseline]] = {
     BaselineName.GREEDY: greedy_plan,
     BaselineName.RANDOM: random_plan,
 }
-"""Baselines of our own world."""
+"""Baselines for our own tasks."""

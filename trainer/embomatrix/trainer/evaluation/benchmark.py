@@ -1,4 +1,4 @@
-"""What is measured: tasks of a dataset or of a file, and a digest that names exactly these."""
+"""Benchmarks: tasks of a dataset or of a file, identified by a digest."""
 
 from __future__ import annotations
 
@@ -9,37 +9,37 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.trainer.run.data import training_task
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.data.tasks import training_task
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, record_to_json
 from embomatrix.world.task import Profile
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from embomatrix.trainer.run.data import TrainingTask
+    from embomatrix.trainer.data.tasks import TrainingTask
     from embomatrix.world.dataset import TaskRecord
     from embomatrix.world.scene import Scene
 
 ALL: Final = "all"
 IMPORT_REPORT: Final = "import.json"
-"""What `embomatrix factory import --report` wrote, in the dataset's folder: problems that were refused count as failed."""
+"""Report of `embomatrix factory import --report` in the dataset's folder. Rejected problems count as failed."""
 NAMED: Final[Mapping[str, Path]] = {
     "internal-verified": Path("build/internal-verified"),
     "eai": Path("build/eai"),
 }
-"""Benchmarks that go by a name, and the dataset folders in which they lie."""
+"""Benchmarks by name, and their dataset folders."""
 _BUILD_IT: Final[Mapping[str, str]] = {
-    "internal-verified": "freeze one with `embomatrix factory`, or pass its folder",
-    "eai": "make it with `embomatrix factory import`, or pass its folder",
+    "internal-verified": "create it with `embomatrix factory`, or pass its folder",
+    "eai": "create it with `embomatrix factory import`, or pass its folder",
 }
 
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Tasks in the order of their file. ``failed_by_rule`` are those that were refused or that no skill reaches.
+    """Tasks in the order of their file. ``failed_by_rule``: tasks that were rejected or that the skills can't express.
 
-    Those count as failures in the success over all tasks, and not at all in the other figures.
+    These count as failures in the success over all tasks, and are left out of all other figures.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Benchmark:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 over the tasks, their goals, tables and scenes: equal benchmarks have equal ones wherever they lie."""
+        """SHA-256 of the tasks, goals, tables and scenes. Equal benchmarks have equal digests in any folder."""
         content = hashlib.sha256()
         for record in self.records:
             content.update(json.dumps(record_to_json(record), sort_keys=True).encode())
@@ -60,12 +60,12 @@ class Benchmark:
 
     @cached_property
     def dataset(self) -> Dataset:
-        """Where the bundles are."""
+        """Dataset with the bundles."""
         return Dataset(self.folder, self.records)
 
     @cached_property
     def tasks(self) -> Mapping[str, TrainingTask]:
-        """The tasks with what a prompt tells of them, by their ids. Raises TrainerError where a bundle is missing."""
+        """Tasks with the content of their prompts, by id. Raises TrainerError if a bundle is missing."""
         found: dict[str, TrainingTask] = {}
         by_bundle: dict[str, list[TaskRecord]] = {}
         for record in self.records:
@@ -79,7 +79,7 @@ class Benchmark:
         return {record.task.task_id: found[record.task.task_id] for record in self.records}
 
     def scene(self, record: TaskRecord) -> Scene:
-        """The scene of a task. Raises TrainerError."""
+        """Return a task's scene. Raises TrainerError."""
         try:
             return self.dataset.read_bundle(record.bundle_digest).scene
         except DatasetError as error:
@@ -89,35 +89,37 @@ class Benchmark:
 def find_benchmark(
     named: str, split: str = "", limit: int | None = None, profile: Profile = Profile.HOUSEHOLD
 ) -> Benchmark:
-    """A benchmark by its name, its dataset folder, or a file of task records with its bundles beside it.
+    """Find a benchmark by name, dataset folder, or a file of task records with its bundles beside it.
 
-    ``split`` is one of the dataset's or "all"; empty takes the held-out tasks where there are any, else all. ``limit`` takes
-    the first so many. With the profile ``PAPER``, tasks that need one of the household's three skills more are failed by rule.
-    Raises TrainerError.
+    ``split`` is a split of the dataset or "all". By default, held-out tasks are used if there are any, else all. ``limit``
+    takes the first tasks only. With the profile ``PAPER``, tasks that need another household skill fail by rule. Raises
+    TrainerError.
     """
     path = NAMED.get(named, Path(named))
     if path.is_file():
-        records = _of_file(path)
+        records = _records_of_file(path)
         folder = path.parent
     elif path.is_dir():
-        records, folder = _of_folder(path), path
+        records, folder = _records_of_folder(path), path
     else:
         remedy = _BUILD_IT.get(
             named, f"pass a dataset folder, its {TASKS_FILE}, or one of {', '.join(NAMED)}"
         )
-        raise TrainerError(f"there is no benchmark at {path}: {remedy}")
-    chosen, told = _of_split(records, split, path)
+        raise TrainerError(f"no benchmark at {path}: {remedy}")
+    chosen, found_split = _select_split(records, split, path)
     within = [record for record in chosen if record.task.profile in (Profile.PAPER, profile)]
-    beyond = {record.task.task_id for record in chosen} - {record.task.task_id for record in within}
+    inexpressible = {record.task.task_id for record in chosen} - {record.task.task_id for record in within}
     if not within:
         raise TrainerError(
-            f"no task of {path} can be done with the skills of the profile {profile}: pass another --profile"
+            f"no task of {path} can be solved with the skills of the profile {profile}: pass another --profile"
         )
-    return Benchmark(named, folder, told, tuple(within[:limit]), frozenset(beyond | _refused(folder)))
+    return Benchmark(
+        named, folder, found_split, tuple(within[:limit]), frozenset(inexpressible | _rejected(folder))
+    )
 
 
-def _refused(folder: Path) -> set[str]:
-    """Names of the problems that an import refused."""
+def _rejected(folder: Path) -> set[str]:
+    """Names of the problems that an import rejected."""
     path = folder / IMPORT_REPORT
     try:
         outcomes = json.loads(path.read_bytes())["outcomes"]
@@ -126,19 +128,19 @@ def _refused(folder: Path) -> set[str]:
         return set()
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrainerError(
-            f"{path} is no report of an import ({error!r}): write it again with `embomatrix factory import --report`"
+            f"{path} is not an import report ({error!r}): create it again with `embomatrix factory import --report`"
         ) from error
 
 
-def _of_folder(folder: Path) -> tuple[TaskRecord, ...]:
+def _records_of_folder(folder: Path) -> tuple[TaskRecord, ...]:
     try:
         return Dataset.load(folder).records
     except DatasetError as error:
         raise TrainerError(str(error)) from error
 
 
-def _of_file(path: Path) -> tuple[TaskRecord, ...]:
-    """Records of a file that may have any name; their scenes must be among the bundles beside it."""
+def _records_of_file(path: Path) -> tuple[TaskRecord, ...]:
+    """Read the records of a file with any name. Their bundles must lie beside it."""
     try:
         found = Dataset.load_file(path)
     except DatasetError as error:
@@ -147,19 +149,20 @@ def _of_file(path: Path) -> tuple[TaskRecord, ...]:
         if not found.has_bundle(record.bundle_digest):
             raise TrainerError(
                 f"the task {record.task.task_id!r} of {path} is in the unknown scene {record.task.scene_id!r}: its bundle "
-                f"{record.bundle_digest} is not in {path.parent / 'bundles'}; copy it there from the dataset that the task "
-                "was made for"
+                f"{record.bundle_digest} is not in {path.parent / 'bundles'}; copy it there from the task's original dataset"
             )
     return found.records
 
 
-def _of_split(records: tuple[TaskRecord, ...], split: str, path: Path) -> tuple[tuple[TaskRecord, ...], str]:
+def _select_split(
+    records: tuple[TaskRecord, ...], split: str, path: Path
+) -> tuple[tuple[TaskRecord, ...], str]:
     held_out = tuple(record for record in records if record.split == "heldout")
-    told = split or ("heldout" if held_out else ALL)
-    chosen = records if told == ALL else tuple(record for record in records if record.split == told)
+    split = split or ("heldout" if held_out else ALL)
+    chosen = records if split == ALL else tuple(record for record in records if record.split == split)
     if not chosen:
         splits = ", ".join(sorted({record.split for record in records}))
         raise TrainerError(
-            f"{path} has no tasks of the split {told!r}: it has {f'those of {splits}' if splits else 'no task at all'}"
+            f"{path} has no tasks in the split {split!r}: it has {splits or 'no tasks'}; pass another --split"
         )
-    return chosen, told
+    return chosen, split

@@ -1,4 +1,4 @@
-"""What can be measured on: something that asks questions, and marks the answers to them."""
+"""Exams: benchmarks with their questions and their judge."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from embomatrix.skills.prompt import Codec, Prompt
+    from embomatrix.trainer.cluster.executor import Executor
     from embomatrix.trainer.evaluation.answers import Answer, EvaluationSetup
     from embomatrix.trainer.evaluation.benchmark import Benchmark
     from embomatrix.trainer.evaluation.intervals import Estimate
-    from embomatrix.trainer.evaluation.judging import Executor
-    from embomatrix.trainer.evaluation.page import Picture
+    from embomatrix.trainer.evaluation.pictures import Picture
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What is asked about one task."""
+    """Prompt of one task."""
 
     task_id: str
     prompt: Prompt
 
 
 @dataclass(frozen=True)
-class Marked:
-    """The figures, plans worth a picture, and figures that only this exam has, by what they are called."""
+class ExamResult:
+    """Figures of an exam, plans to draw, and additional figures by name."""
 
     board: Scoreboard
     pictures: Sequence[Picture]
@@ -39,7 +39,7 @@ class Marked:
 
 
 class Exam(Protocol):
-    """Tasks in their order. ``digest`` names exactly these; ``by_rule`` more can't be expressed and count as failed."""
+    """Tasks in order. ``digest`` identifies them. ``by_rule`` counts the tasks that can't be expressed and count as failed."""
 
     @property
     def name(self) -> str: ...
@@ -57,18 +57,18 @@ class Exam(Protocol):
     def by_rule(self) -> int: ...
 
     def questions(self, codec: Codec, rows: int) -> Sequence[Question]:
-        """A question for each task, with so many rows of its object table at most. Raises TrainerError."""
+        """Return one question per task, with at most ``rows`` rows of its object table. Raises TrainerError."""
         ...
 
     def judge(
         self, setup: EvaluationSetup, answers: Sequence[Answer], report: Callable[[int, int], None]
-    ) -> Marked:
-        """Mark answers; ``report`` is told of plans done and in all. Raises TrainerError and ClusterError."""
+    ) -> ExamResult:
+        """Judge answers. ``report`` gets the number of judged plans and the total. Raises TrainerError and ClusterError."""
         ...
 
 
 class WorldExam:
-    """A benchmark of our own tasks, executed in our simulator."""
+    """Benchmark of our own tasks, executed in our simulator."""
 
     def __init__(self, bench: Benchmark, executor: Executor) -> None:
         self.bench = bench
@@ -85,8 +85,8 @@ class WorldExam:
 
     def judge(
         self, setup: EvaluationSetup, answers: Sequence[Answer], report: Callable[[int, int], None]
-    ) -> Marked:
+    ) -> ExamResult:
         judged = AnswerJudge(self.bench, setup, self._executor).judge(answers, report)
         categories = {record.task.task_id: record.task.category for record in self.bench.records}
         board = Scoreboard.of(categories, judged.verdicts, self.by_rule)
-        return Marked(board, chosen_pictures(self.bench, board, judged.plans))
+        return ExamResult(board, chosen_pictures(self.bench, board, judged.plans))

@@ -1,4 +1,4 @@
-"""Numbers with their uncertainty. Tasks are the unit of chance: samples of one task are not independent."""
+"""Confidence intervals over tasks: samples of one task are not independent."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _Z: Final = 1.959963984540054
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """An estimate with its 95 % interval."""
+    """Estimate with its 95 % interval."""
 
     value: float
     low: float
@@ -31,7 +31,7 @@ class Interval:
 
 
 class IntervalMethod(StrEnum):
-    """How an interval was made."""
+    """Method of an interval."""
 
     BOOTSTRAP = "bootstrap"
     WILSON = "wilson"
@@ -40,7 +40,7 @@ class IntervalMethod(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A mean over tasks. ``tasks`` are those of which something is known."""
+    """Mean over tasks. ``tasks`` counts the tasks with a known value."""
 
     interval: Interval
     method: IntervalMethod
@@ -51,7 +51,7 @@ NOTHING: Final = Interval(math.nan, math.nan, math.nan)
 
 
 def bootstrap(values: Sequence[float], seed: int = 0) -> Interval:
-    """Mean and percentile interval over resampled values; NaN values (nothing known of a task) are left out."""
+    """Mean and percentile bootstrap interval. NaN values are left out."""
     known = np.array([value for value in values if value == value])
     if not known.size:
         return NOTHING
@@ -62,7 +62,7 @@ def bootstrap(values: Sequence[float], seed: int = 0) -> Interval:
 
 
 def wilson(share: float, count: int) -> Interval:
-    """Wilson's score interval (1927) of a share of ``count`` independent trials, at least one."""
+    """Wilson score interval (1927) of a share of ``count`` >= 1 independent trials."""
     middle = share + _Z**2 / (2 * count)
     spread = _Z * math.sqrt(share * (1 - share) / count + _Z**2 / (4 * count**2))
     scale = 1 + _Z**2 / count
@@ -70,10 +70,10 @@ def wilson(share: float, count: int) -> Interval:
 
 
 def mean_over_tasks(shares: Sequence[float]) -> Estimate:
-    """The mean of each task's share, all in [0, 1]; NaN where nothing is known of a task.
+    """Mean of the tasks' shares in [0, 1]; NaN shares are left out.
 
-    Tasks are resampled, each with all its samples. Where all tasks are alike there is nothing to resample, and a bootstrap
-    would claim certainty: there it is Wilson's interval with the tasks as trials, whatever the samples of each.
+    The interval is a bootstrap over tasks. If all shares are equal, the bootstrap would be falsely certain, so a Wilson
+    interval with the tasks as trials is used.
     """
     known = [share for share in shares if share == share]
     if not known:
@@ -84,9 +84,9 @@ def mean_over_tasks(shares: Sequence[float]) -> Estimate:
 
 
 def pass_at(k: int, samples: int, successes: int) -> float:
-    """Chance that at least one of ``k`` samples succeeds, drawn from these without replacement: Chen et al. 2021, eq. 1.
+    """Probability that at least one of ``k`` samples succeeds, drawn without replacement: Chen et al. 2021, eq. 1.
 
-    NaN where there are fewer than ``k`` samples.
+    NaN if there are fewer than ``k`` samples.
     """
     if k > samples:
         return math.nan

@@ -1,46 +1,37 @@
-"""From answers to verdicts: texts are parsed, plans are executed wherever there are simulators, results are judged."""
+"""Judging of answers: parse the texts, execute the plans, judge the results."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from embomatrix.rpc.wire.values import Rollout
 from embomatrix.skills.parse import PlanError, parse_plan
 from embomatrix.skills.prompt import Codec, limited, with_indices
-from embomatrix.trainer.evaluation.verdicts import of_plan, of_text
-from embomatrix.trainer.run.data import group_seed
+from embomatrix.trainer.data.tasks import group_seed
+from embomatrix.trainer.evaluation.verdicts import executed_verdict, unparsable_verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from embomatrix.rpc.wire.values import Outcome
     from embomatrix.skills.syntax import Plan
+    from embomatrix.trainer.cluster.executor import Executor
     from embomatrix.trainer.evaluation.answers import Answer, EvaluationSetup
     from embomatrix.trainer.evaluation.benchmark import Benchmark
     from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
 
-    OnResult = Callable[[str, Outcome], None]
-
-
-class Executor(Protocol):
-    """Where plans are executed: a cluster, or processes of this machine. Both give equal outcomes."""
-
-    def execute(self, rollouts: Sequence[Rollout], on_result: OnResult) -> None:
-        """Execute each once; ``on_result`` gets a rollout's id and its one outcome. Raises ClusterError."""
-        ...
-
 
 @dataclass(frozen=True)
 class JudgedAnswers:
-    """A verdict for each answer, in their order, and by (task, sample) the plans of those texts that are one."""
+    """Verdicts in the order of the answers, and the plans of parsable texts by (task, sample)."""
 
     verdicts: tuple[AnswerVerdict, ...]
     plans: Mapping[tuple[str, int], Plan]
 
 
 class AnswerJudge:
-    """Judges the answers to one benchmark. ``setup`` says how they name objects, and seeds the execution."""
+    """Judge for the answers to one benchmark. ``setup`` defines the codec and the seed of the execution."""
 
     def __init__(self, bench: Benchmark, setup: EvaluationSetup, executor: Executor) -> None:
         self._bench = bench
@@ -51,9 +42,9 @@ class AnswerJudge:
     def judge(
         self, answers: Sequence[Answer], report: Callable[[int, int], None] = lambda done, total: None
     ) -> JudgedAnswers:
-        """Judge every answer. ``report`` is told of plans executed and in all.
+        """Judge all answers. ``report`` gets the number of executed plans and the total.
 
-        Equal plans of a task are executed once: they share a seed, so their outcomes are equal.
+        Equal plans of a task share a seed, so they have equal outcomes and are executed once.
         """
         plans: dict[tuple[str, int], Plan] = {}
         refused: dict[tuple[str, int], AnswerVerdict] = {}
@@ -61,7 +52,7 @@ class AnswerJudge:
             try:
                 plans[answer.task_id, answer.sample] = self._plan(answer)
             except PlanError as error:
-                refused[answer.task_id, answer.sample] = of_text(answer, error)
+                refused[answer.task_id, answer.sample] = unparsable_verdict(answer, error)
         distinct = dict.fromkeys((task_id, plan) for (task_id, _), plan in plans.items())
         outcomes = self._executed(list(distinct), report)
         verdicts = []
@@ -71,7 +62,7 @@ class AnswerJudge:
                 verdicts.append(refused[key])
                 continue
             task, plan = self._records[answer.task_id].task, plans[key]
-            verdicts.append(of_plan(answer, task, plan, outcomes.get((answer.task_id, plan))))
+            verdicts.append(executed_verdict(answer, task, plan, outcomes.get((answer.task_id, plan))))
         return JudgedAnswers(tuple(verdicts), plans)
 
     def _plan(self, answer: Answer) -> Plan:
@@ -85,7 +76,7 @@ class AnswerJudge:
     def _executed(
         self, plans: Sequence[tuple[str, Plan]], report: Callable[[int, int], None]
     ) -> dict[tuple[str, Plan], Outcome]:
-        """The outcome of each (task, plan)."""
+        """Outcome of each (task, plan)."""
         outcomes: dict[tuple[str, Plan], Outcome] = {}
         named = {f"plan-{number}": key for number, key in enumerate(plans)}
 

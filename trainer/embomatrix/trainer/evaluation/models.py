@@ -1,4 +1,4 @@
-"""A model to measure by its folder or name: a checkpoint of a run, a policy's own folder, or any Hugging Face model."""
+"""Models to evaluate: a checkpoint of a run, a saved policy, or any Hugging Face model."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import torch
 
 from embomatrix.skills.prompt import Codec
-from embomatrix.trainer.policy.choice import saved_policy
+from embomatrix.trainer.config.errors import TrainerError, reason_of
+from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, LoraSettings, read_settings
+from embomatrix.trainer.lifecycle.checkpoint import read_state
 from embomatrix.trainer.policy.hf import HfPolicy
+from embomatrix.trainer.policy.loading import saved_policy
 from embomatrix.trainer.policy.tiny import TinyPolicy
-from embomatrix.trainer.run.checkpoint import read_state
-from embomatrix.trainer.run.errors import TrainerError, reason_of
-from embomatrix.trainer.run.settings import LANGUAGE_MODEL_DEFAULTS, LoraSettings, read_settings
 
 if TYPE_CHECKING:
     from embomatrix.trainer.policy.protocol import Policy
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class LoadedModel:
-    """A policy, the rows of a table that it is told, and the tokens that it writes at most."""
+    """Policy with its maximum table rows and maximum tokens per plan."""
 
     policy: Policy
     rows: int
@@ -30,25 +30,22 @@ class LoadedModel:
 
 
 def load_model(named: str, codec: Codec | None, *, threads: int | None, device: str) -> LoadedModel:
-    """A policy speaks the codec that it was trained in, any other model ``codec``, JSON for None. Raises TrainerError.
-
-    A language model that was saved outside of a checkpoint can be told another.
-    """
+    """Load a model. A trained policy keeps its codec; any other model uses ``codec``, by default JSON. Raises TrainerError."""
     folder = Path(named)
     if folder.is_dir() and (folder / "policy").is_dir():
         _, settings = read_state(folder)
         # A checkpoint holds the merged model: the one that adapters were added to need not be here.
         settings = settings.model_copy(update={"device": device, "lora": LoraSettings()})
-        _prepare(threads or settings.threads, device)
+        _configure_torch(threads or settings.threads, device)
         policy: Policy = saved_policy(folder / "policy", settings)
         return LoadedModel(policy, settings.prompt.rows, settings.grpo.max_new)
-    _prepare(threads or torch.get_num_threads(), device)
+    _configure_torch(threads or torch.get_num_threads(), device)
     if folder.is_dir() and TinyPolicy.is_saved_in(folder):
         settings = read_settings(None, {"device": device})
         return LoadedModel(saved_policy(folder, settings), settings.prompt.rows, settings.grpo.max_new)
     if folder.is_dir() and not HfPolicy.is_saved_in(folder):
         raise TrainerError(
-            f"{folder} is no model: expected runs/NAME/checkpoints/step-000050, or a folder with config.json"
+            f"{folder} is not a model: expected runs/NAME/checkpoints/step-000050, or a folder with config.json"
         )
     settings = read_settings(None, {"device": device}, LANGUAGE_MODEL_DEFAULTS)
     return LoadedModel(
@@ -58,7 +55,7 @@ def load_model(named: str, codec: Codec | None, *, threads: int | None, device: 
     )
 
 
-def _prepare(threads: int, device: str) -> None:
+def _configure_torch(threads: int, device: str) -> None:
     torch.set_num_threads(threads)
     try:
         torch.empty(0, device=device)

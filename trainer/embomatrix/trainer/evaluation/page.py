@@ -1,16 +1,15 @@
-"""The evaluation as one HTML file with everything in it. It loads nothing and runs no script."""
+"""HTML page of an evaluation: one file without scripts or external resources."""
 
 from __future__ import annotations
 
 import html
 import string
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.pages.head import page_head
-from embomatrix.trainer.evaluation.plan_view import Drawn, plan_view
+from embomatrix.trainer.evaluation.plan_view import ExecutedPlan, plan_view
 from embomatrix.trainer.evaluation.table import (
     COLUMNS,
     INTERVALS,
@@ -26,10 +25,7 @@ from embomatrix.trainer.evaluation.table import (
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from embomatrix.skills.syntax import Plan
-    from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
-    from embomatrix.world.scene import Scene
-    from embomatrix.world.task import Task
+    from embomatrix.trainer.evaluation.pictures import Picture
 
 _CHART_W: Final = 560
 _LINE_H: Final = 44
@@ -37,21 +33,10 @@ _LABEL_W: Final = 130
 _VALUE_W: Final = 120
 
 
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """A plan to show, with what became of it; ``lines`` are its calls in words."""
-
-    scene: Scene
-    task: Task
-    plan: Plan
-    lines: tuple[str, ...]
-    verdict: AnswerVerdict
-
-
 def evaluation_page(
     report: Mapping[str, Any], pictures: Sequence[Picture], beside: Sequence[ScoreRow] = ()
 ) -> str:
-    """The page of a report, with other rows on the same tasks under its own."""
+    """Return the page of a report, with the rows of other reports on the same tasks below its own."""
     template = files("embomatrix.trainer.evaluation").joinpath("page.html").read_text(encoding="utf-8")
     setup = report["setup"]
     rows = [ScoreRow(setup["model"], report), *beside]
@@ -79,7 +64,7 @@ def evaluation_page(
 
 def _about(report: Mapping[str, Any]) -> str:
     setup = report["setup"]
-    lost = f" · {report['lost']} plans lost by the infrastructure" if report["lost"] else ""
+    lost = f" · {report['lost']} plans lost to the infrastructure" if report["lost"] else ""
     return (
         f"{report['tasks']} tasks ({setup['split']}) · {setup['samples']} samples each · temperature "
         f"{setup['temperature']:g} · plans as {setup['codec']}{lost}"
@@ -93,13 +78,13 @@ def _table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _cell(text: str) -> str:
-    """The estimate stands out from its interval."""
+    """Highlight the estimate against its interval."""
     value, bracket, rest = html.escape(text).partition(" [")
     return f"<b>{value}</b> <span>[{rest}</span>" if bracket else value
 
 
 def _notes(report: Mapping[str, Any]) -> str:
-    """Figures that stand beside the table: of all tasks, and those that only this exam has."""
+    """Additional figures: success over all tasks, and the exam's own figures."""
     others = "".join(
         f'<p class="note">{html.escape(name)}: {percent(found)} %.</p>'
         for name, found in report["others"].items()
@@ -107,13 +92,13 @@ def _notes(report: Mapping[str, Any]) -> str:
     if not report["tasks_failed_by_rule"]:
         return others
     return others + (
-        f'<p class="note">{report["tasks_failed_by_rule"]} more tasks can\'t be expressed with these skills, or were refused. '
-        f"Where they count as failed: {percent(report['success_over_all'])} %.</p>"
+        f'<p class="note">{report["tasks_failed_by_rule"]} more tasks can\'t be expressed with these skills, or were rejected. '
+        f"If they count as failed: {percent(report['success_over_all'])} %.</p>"
     )
 
 
 def _chart(report: Mapping[str, Any]) -> str:
-    """Bars of success with their intervals, and partial credit as a ring."""
+    """Bars of success with intervals, and rings for partial credit."""
     groups = [("all tasks", report["overall"])]
     groups += [
         (title, report["categories"][category.value])
@@ -138,8 +123,8 @@ def _chart(report: Mapping[str, Any]) -> str:
         )
     height = len(groups) * _LINE_H
     return (
-        f'<svg class="chart" viewBox="0 0 {_CHART_W} {height}" role="img" aria-label="Success of each category">'
-        f'{"".join(shapes)}</svg><p class="note">Bar: success, with its interval; ring: partial credit.</p>'
+        f'<svg class="chart" viewBox="0 0 {_CHART_W} {height}" role="img" aria-label="Success by category">'
+        f'{"".join(shapes)}</svg><p class="note">Bar: success with its interval. Ring: partial credit.</p>'
     )
 
 
@@ -154,7 +139,7 @@ def _causes(report: Mapping[str, Any]) -> str:
         f'<td class="words">{html.escape(meaning)}</td></tr>'
         for name, count, share, meaning in rows
     )
-    top = "<tr><th>cause</th><th>plans</th><th>share</th><th></th><th>what it means</th></tr>"
+    top = "<tr><th>cause</th><th>plans</th><th>share</th><th></th><th>meaning</th></tr>"
     return f'<div class="scroll"><table>{top}{body}</table></div>'
 
 
@@ -176,8 +161,8 @@ def _task_row(task: Mapping[str, Any]) -> tuple[str, ...]:
 
 def _picture(picture: Picture) -> str:
     verdict, task = picture.verdict, picture.task
-    told = "success" if verdict.success else (verdict.cause or "").replace("_", " ")
-    drawn = Drawn(picture.plan, verdict.done, failed=verdict.step > 0)
+    title = "success" if verdict.success else (verdict.cause or "").replace("_", " ")
+    drawn = ExecutedPlan(picture.plan, verdict.done, failed=verdict.step > 0)
     items = []
     for number, line in enumerate(picture.lines, start=1):
         failed = number == verdict.step
@@ -187,6 +172,6 @@ def _picture(picture: Picture) -> str:
     kind = "ok" if verdict.success else "bad"
     return (
         f'<section class="half plan"><h3>{html.escape(task.task_id)}</h3>'
-        f'<p><span class="verdict {kind}">{html.escape(told)}</span> {html.escape(task.instruction)}</p>'
+        f'<p><span class="verdict {kind}">{html.escape(title)}</span> {html.escape(task.instruction)}</p>'
         f"{plan_view(picture.scene, task, drawn)}<ol>{''.join(items)}</ol></section>"
     )

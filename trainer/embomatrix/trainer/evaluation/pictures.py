@@ -1,11 +1,11 @@
-"""Which plans are worth a picture: of each category one that succeeds, and one for what fails most often."""
+"""Selection of the plans to draw: per category, one success and one failure of the most frequent cause."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.skills.describe import call_in_words
-from embomatrix.trainer.evaluation.page import Picture
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -14,32 +14,41 @@ if TYPE_CHECKING:
     from embomatrix.trainer.evaluation.benchmark import Benchmark
     from embomatrix.trainer.evaluation.scoreboard import Scoreboard
     from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
+    from embomatrix.world.scene import Scene
+    from embomatrix.world.task import Task
 
-MOST: Final = 8
+MAX_PICTURES: Final = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """Plan to draw, with its verdict. ``lines`` are its calls in words."""
+
+    scene: Scene
+    task: Task
+    plan: Plan
+    lines: tuple[str, ...]
+    verdict: AnswerVerdict
 
 
 def chosen_pictures(
     bench: Benchmark, board: Scoreboard, plans: Mapping[tuple[str, int], Plan]
 ) -> tuple[Picture, ...]:
-    """At most ``MOST``, the same for the same verdicts. ``plans`` by task and sample: texts that are no plan have none."""
+    """Return at most ``MAX_PICTURES`` pictures, equal for equal verdicts.
+
+    ``plans`` holds the parsable plans by (task, sample).
+    """
     records = {record.task.task_id: record for record in bench.records}
-    return tuple(
-        Picture(
-            bench.scene(records[verdict.task_id]),
-            records[verdict.task_id].task,
-            plans[verdict.task_id, verdict.sample],
-            tuple(
-                call_in_words(call, records[verdict.task_id].task.table)
-                for call in plans[verdict.task_id, verdict.sample]
-            ),
-            verdict,
-        )
-        for verdict in list(_chosen(board, plans))[:MOST]
-    )
+    pictures = []
+    for verdict in list(_chosen(board, plans))[:MAX_PICTURES]:
+        record, plan = records[verdict.task_id], plans[verdict.task_id, verdict.sample]
+        calls = tuple(call_in_words(call, record.task.table) for call in plan)
+        pictures.append(Picture(bench.scene(record), record.task, plan, calls, verdict))
+    return tuple(pictures)
 
 
 def _chosen(board: Scoreboard, plans: Mapping[tuple[str, int], Plan]) -> Iterator[AnswerVerdict]:
-    """The first of each kind, in the order of the benchmark."""
+    """First verdict of each kind, in benchmark order."""
     for category in board.categories:
         verdicts = [
             verdict

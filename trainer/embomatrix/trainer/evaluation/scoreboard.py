@@ -1,4 +1,4 @@
-"""The numbers of an evaluation: success and partial credit, overall and by category, pass@k, and why plans failed."""
+"""Figures of an evaluation: success, partial credit and pass@k, overall and by category, and causes of failure."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
 
 KS: Final = (1, 2, 3, 5, 10, 20, 50, 100)
-"""The k of pass@k, as far as there are samples."""
+"""Values of k for pass@k, as far as there are samples."""
 
 
 @dataclass(frozen=True)
 class TaskResult:
-    """One task's verdicts, in the order of the samples. Figures are over those that the infrastructure did not lose."""
+    """Verdicts of one task by sample. Figures leave out lost plans."""
 
     task_id: str
     category: TaskCategory
@@ -39,18 +39,18 @@ class TaskResult:
 
     @property
     def rate(self) -> float:
-        """Share of the samples that succeed; NaN where nothing is known."""
+        """Share of successful samples, NaN if unknown."""
         return self.successes / len(self.known) if self.known else math.nan
 
     @property
     def partial(self) -> float:
-        """Mean share of the goal's atoms that hold at the end; NaN where nothing is known."""
+        """Mean share of the goal's atoms that hold at the end, NaN if unknown."""
         return sum(verdict.partial for verdict in self.known) / len(self.known) if self.known else math.nan
 
 
 @dataclass(frozen=True)
 class Scoreboard:
-    """Results of all tasks, in the order of the benchmark. ``by_rule`` tasks can't be expressed: no answer was asked for."""
+    """Results of all tasks in benchmark order. ``by_rule`` counts the tasks that can't be expressed and were not asked."""
 
     tasks: tuple[TaskResult, ...]
     by_rule: int = 0
@@ -59,7 +59,7 @@ class Scoreboard:
     def of(
         tasks: Mapping[str, TaskCategory], verdicts: Sequence[AnswerVerdict], by_rule: int = 0
     ) -> Scoreboard:
-        """Verdicts in any order, sorted to their tasks; ``tasks`` are the ids and categories of all that were asked."""
+        """Group verdicts by task. ``tasks`` maps all asked task ids to categories."""
         found: dict[str, list[AnswerVerdict]] = {task_id: [] for task_id in tasks}
         for verdict in verdicts:
             found[verdict.task_id].append(verdict)
@@ -75,7 +75,7 @@ class Scoreboard:
 
     @property
     def categories(self) -> tuple[TaskCategory, ...]:
-        """Those that come up, in the order of the paper's table."""
+        """Present categories, in the order of the paper's table."""
         present = {task.category for task in self.tasks}
         return tuple(category for category in TaskCategory if category in present)
 
@@ -88,23 +88,23 @@ class Scoreboard:
         return sum(len(task.verdicts) - len(task.known) for task in self.tasks)
 
     def of_category(self, category: TaskCategory | None) -> tuple[TaskResult, ...]:
-        """Tasks of a category, or all for None."""
+        """Tasks of a category; None: all tasks."""
         return tuple(task for task in self.tasks if category in (None, task.category))
 
     def success(self, category: TaskCategory | None = None) -> Estimate:
-        """Mean over the tasks of the share of samples that succeed."""
+        """Mean success rate over tasks."""
         return mean_over_tasks([task.rate for task in self.of_category(category)])
 
     def success_over_all(self) -> Estimate:
-        """The same, where tasks that can't be expressed count as failed."""
+        """Mean success rate, with inexpressible tasks as failures."""
         return mean_over_tasks([*(task.rate for task in self.tasks), *([0.0] * self.by_rule)])
 
     def partial(self, category: TaskCategory | None = None) -> Estimate:
-        """Mean over the tasks of the share of the goal's atoms that hold at the end."""
+        """Mean share of goal atoms that hold at the end, over tasks."""
         return mean_over_tasks([task.partial for task in self.of_category(category)])
 
     def pass_at(self, category: TaskCategory | None = None) -> dict[int, Estimate]:
-        """k to the mean over the tasks of the chance that one of k samples succeeds."""
+        """Mean pass@k over tasks, by k."""
         tasks = self.of_category(category)
         most = max((len(task.known) for task in tasks), default=0)
         return {
@@ -114,7 +114,7 @@ class Scoreboard:
         }
 
     def causes(self, category: TaskCategory | None = None) -> Counter[Cause]:
-        """How many plans failed for each cause, in the order of the causes."""
+        """Number of failed plans by cause, in the order of ``Cause``."""
         counted = Counter(
             verdict.cause
             for task in self.of_category(category)
@@ -125,7 +125,7 @@ class Scoreboard:
 
     @cached_property
     def reasons(self) -> Mapping[Cause, Counter[str]]:
-        """Under each cause how many plans failed for each reason of a step or a text."""
+        """Number of failed plans by reason, for each cause."""
         found: dict[Cause, Counter[str]] = {}
         for task in self.tasks:
             for verdict in task.known:
@@ -134,7 +134,7 @@ class Scoreboard:
         return {cause: found[cause] for cause in Cause if cause in found}
 
     def as_json(self) -> dict[str, Any]:
-        """All figures, and every verdict. Nothing in it depends on when or where the plans were executed."""
+        """All figures and verdicts. The result does not depend on when or where the plans were executed."""
         return {
             "tasks": len(self.tasks),
             "tasks_failed_by_rule": self.by_rule,
@@ -144,7 +144,7 @@ class Scoreboard:
             "success_over_all": estimate_to_json(self.success_over_all()),
             "categories": {category.value: self._figures(category) for category in self.categories},
             "reasons": {cause.value: dict(sorted(counts.items())) for cause, counts in self.reasons.items()},
-            "verdicts": [_verdicts_to_json(task) for task in self.tasks],
+            "verdicts": [_task_to_json(task) for task in self.tasks],
         }
 
     def _figures(self, category: TaskCategory | None) -> dict[str, Any]:
@@ -158,7 +158,7 @@ class Scoreboard:
 
 
 def estimate_to_json(estimate: Estimate) -> dict[str, Any]:
-    """Numbers as they are, null where nothing is known."""
+    """JSON-serialisable dict of an estimate. Unknown numbers are null."""
     interval = estimate.interval
     plain: Callable[[float], float | None] = lambda value: None if math.isnan(value) else value  # noqa: E731
     return {
@@ -170,7 +170,7 @@ def estimate_to_json(estimate: Estimate) -> dict[str, Any]:
     }
 
 
-def _verdicts_to_json(task: TaskResult) -> dict[str, Any]:
+def _task_to_json(task: TaskResult) -> dict[str, Any]:
     return {
         "task": task.task_id,
         "category": task.category.value,

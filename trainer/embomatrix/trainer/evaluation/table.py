@@ -1,4 +1,4 @@
-"""The table of an evaluation in the form of the paper's: a row for each model, a column for all tasks and for each category."""
+"""Tables of an evaluation in the form of the paper's: a row per model, a column per category."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import json
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.evaluation.scoreboard import estimate_to_json
 from embomatrix.trainer.evaluation.taxonomy import MEANINGS, Cause
-from embomatrix.trainer.run.errors import TrainerError
 from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from embomatrix.trainer.evaluation.answers import EvaluationSetup
-    from embomatrix.trainer.evaluation.exam import Marked
+    from embomatrix.trainer.evaluation.exam import ExamResult
 
 VERSION: Final = 1
 NONE: Final = "–"
@@ -26,35 +26,35 @@ COLUMNS: Final[Mapping[TaskCategory, str]] = {
     TaskCategory.KITCHEN_OPERATION: "kitchen operation",
     TaskCategory.COMPOUND: "compound",
 }
-"""The categories by the paper's names, in its order."""
+"""Categories by the paper's names, in its order."""
 INTERVALS: Final = (
-    "Brackets: 95 % intervals over tasks (percentile bootstrap of tasks with all their samples; Wilson's, with the tasks as "
-    "trials, where all tasks are alike)."
+    "Brackets: 95 % intervals over tasks (percentile bootstrap over tasks; Wilson intervals with tasks as trials if all tasks "
+    "have the same rate)."
 )
 
 
 @dataclass(frozen=True, slots=True)
 class ScoreRow:
-    """One line of the table: a model's name and its figures as a report holds them."""
+    """Table row: a model's name, and its figures as in a report."""
 
     label: str
     figures: Mapping[str, Any]
 
 
-def report_of(setup: EvaluationSetup, marked: Marked) -> dict[str, Any]:
-    """The evaluation as JSON. Equal answers give equal bytes, wherever their plans are executed."""
+def report_of(setup: EvaluationSetup, marked: ExamResult) -> dict[str, Any]:
+    """JSON report of an evaluation. Equal answers give equal bytes, wherever the plans are executed."""
     others = {name: estimate_to_json(found) for name, found in marked.others.items()}
     return {"report": VERSION, "setup": asdict(setup), **marked.board.as_json(), "others": others}
 
 
 def read_row(path: Path, bench_digest: str) -> ScoreRow:
-    """The row of another evaluation's report on the same tasks. Raises TrainerError."""
+    """Read the row of another report on the same tasks. Raises TrainerError."""
     try:
         value = json.loads(path.read_bytes())
         version, setup = value["report"], value["setup"]
         if version != VERSION:
             raise TrainerError(
-                f"the report {path} is of another version (found {version!r}, expected {VERSION}): evaluate its answers again"
+                f"the report {path} has another version (found {version!r}, expected {VERSION}): evaluate its answers again"
             )
         label, digest = str(setup["model"]), setup["bench_digest"]
         row = ScoreRow(label, {"overall": value["overall"], "categories": value["categories"]})
@@ -64,7 +64,7 @@ def read_row(path: Path, bench_digest: str) -> ScoreRow:
             f"the report {path} can't be read ({error.strerror}): expected the report.json of an evaluation"
         ) from error
     except (ValueError, KeyError, TypeError) as error:
-        raise TrainerError(f"{path} is no report of an evaluation: expected its report.json") from error
+        raise TrainerError(f"{path} is not an evaluation report: expected its report.json") from error
     if digest != bench_digest:
         raise TrainerError(
             f"{path} reports on other tasks: only rows on the same benchmark stand in one table"
@@ -79,7 +79,7 @@ def head(figures: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def table(rows: Iterable[ScoreRow], figure: str) -> list[tuple[str, ...]]:
-    """A line for each row with "success" or "partial" of all tasks and of each category, in percent."""
+    """Rows with "success" or "partial" of all tasks and of each category, in percent."""
     return [
         (
             row.label,
@@ -96,7 +96,7 @@ def table(rows: Iterable[ScoreRow], figure: str) -> list[tuple[str, ...]]:
 
 
 def percent(estimate: Mapping[str, Any]) -> str:
-    """An estimate of a report: ``48.7 [40.1, 57.3]``."""
+    """Format an estimate of a report: ``48.7 [40.1, 57.3]``."""
     if estimate["value"] is None:
         return NONE
     value, low, high = (100 * estimate[name] for name in ("value", "low", "high"))
@@ -104,7 +104,7 @@ def percent(estimate: Mapping[str, Any]) -> str:
 
 
 def pass_rows(figures: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """A line for each k: pass@k of all tasks and of each category."""
+    """Rows of pass@k for all tasks and each category."""
     groups = [figures["overall"], *(figures["categories"].get(category.value) for category in COLUMNS)]
     return [
         (
@@ -116,34 +116,39 @@ def pass_rows(figures: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 
 def cause_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
-    """Cause, plans, share of all plans that have a result, and what the cause means, with the reasons counted."""
+    """Rows of cause, number of plans, share of all known plans, and meaning with the counted reasons."""
     known = max(1, report["samples"] - report["lost"])
     rows = []
     for name, count in report["overall"]["causes"].items():
         reasons = report["reasons"][name]
-        told = ", ".join(f"{reason} {times}" for reason, times in reasons.items() if reason != name)
+        counts = ", ".join(f"{reason} {times}" for reason, times in reasons.items() if reason != name)
         meaning = MEANINGS[Cause(name)]
-        rows.append((name, str(count), f"{count / known:.1%}", f"{meaning} ({told})" if told else meaning))
+        rows.append(
+            (name, str(count), f"{count / known:.1%}", f"{meaning} ({counts})" if counts else meaning)
+        )
     return rows
 
 
 def text_report(report: Mapping[str, Any], beside: Sequence[ScoreRow] = ()) -> str:
-    """The whole evaluation as plain text, for a terminal, a log or an e-mail."""
+    """Whole evaluation as plain text."""
     setup = report["setup"]
     rows = [ScoreRow(setup["model"], report), *beside]
     parts = [
         f"{setup['bench']} ({setup['split']}): {report['tasks']} tasks, {setup['samples']} samples each, temperature "
-        f"{setup['temperature']:g}, {report['lost']} of {report['samples']} plans lost by the infrastructure",
+        f"{setup['temperature']:g}, {report['lost']} of {report['samples']} plans lost to the infrastructure",
         _grid("success, %", [head(report), *table(rows, "success")]),
         _grid(
-            "partial credit (share of sub-goals that hold at the end), %",
+            "partial credit (share of subgoals that hold at the end), %",
             [head(report), *table(rows, "partial")],
         ),
-        _grid("chance that one of k samples succeeds, %", [("", *head(report)[1:]), *pass_rows(report)]),
+        _grid(
+            "probability that at least one of k samples succeeds, %",
+            [("", *head(report)[1:]), *pass_rows(report)],
+        ),
     ]
     if report["tasks_failed_by_rule"]:
         parts.append(
-            f"{report['tasks_failed_by_rule']} more tasks can't be expressed with these skills, or were refused; where they "
+            f"{report['tasks_failed_by_rule']} more tasks can't be expressed with these skills, or were rejected; if they "
             f"count as failed: {percent(report['success_over_all'])} %"
         )
     if report["others"]:

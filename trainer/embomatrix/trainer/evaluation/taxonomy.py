@@ -1,6 +1,6 @@
-"""Why a plan does not reach its goal: one cause for each plan, by rules that look at the plan and its trace alone.
+"""Causes of failure: rules that assign one cause to a failed plan from the plan and its trace alone.
 
-The first thing that went wrong decides. `docs/evaluation.md` tells the rules in words; a test holds the table complete.
+The first failure decides. `docs/evaluation.md` explains the rules; a test proves the tables complete.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Cause(StrEnum):
-    """The kinds of failure, in the order in which a table lists them."""
+    """Causes of failure, in table order."""
 
     UNPARSABLE = "unparsable"
     HALLUCINATED_SKILL = "hallucinated_skill"
@@ -38,20 +38,20 @@ class Cause(StrEnum):
 
 
 MEANINGS: Final[Mapping[Cause, str]] = {
-    Cause.UNPARSABLE: "the text holds no plan, or one that is too long",
+    Cause.UNPARSABLE: "the text contains no plan, or a plan that is too long",
     Cause.HALLUCINATED_SKILL: "the plan calls a skill that does not exist",
     Cause.WRONG_ARGUMENT: "an argument of a call is missing or of the wrong kind",
     Cause.HALLUCINATED_OBJECT: "a step names an object or a room that does not exist",
-    Cause.AFFORDANCE: "a step asks of an object what it can never do",
-    Cause.MISSING_STEP: "a step lacks another one before it, which the plan holds nowhere after it either",
-    Cause.WRONG_ORDER: "a step lacks another one before it, which the plan holds only after it",
-    Cause.ADDITIONAL_STEP: "a step asks for what is so already",
-    Cause.UNREACHABLE: "the robot or its arm can't get there",
-    Cause.NO_ROOM: "there is no free place for the thing",
-    Cause.MISHAP: "physical mode: the robot collided, or the thing slipped or fell",
-    Cause.GOAL_NOT_MET: "every step succeeded, and the goal does not hold",
+    Cause.AFFORDANCE: "a step asks an object for something that it can never do",
+    Cause.MISSING_STEP: "a step needs another one before it, which the plan does not contain",
+    Cause.WRONG_ORDER: "a step needs another one before it, which the plan contains only after it",
+    Cause.ADDITIONAL_STEP: "a step asks for a state that already holds",
+    Cause.UNREACHABLE: "the robot or its arm can't reach the target",
+    Cause.NO_ROOM: "there is no free place for the object",
+    Cause.MISHAP: "physical mode: the robot collided, or the object slipped or fell",
+    Cause.GOAL_NOT_MET: "all steps succeeded, but the goal does not hold",
 }
-"""Each cause in words."""
+"""Explanation of each cause."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,10 @@ REMEDIES: Final[Mapping[FailureReason, Remedy]] = {
     FailureReason.TOOL_NOT_HELD: Remedy(Skill.PICK_UP),
     FailureReason.NEEDS_SOAKING: Remedy(Skill.SOAK),
 }
-"""Preconditions that another call makes true. Whether the plan holds that call later tells wrong order from missing step."""
+"""Preconditions that another call can satisfy.
+
+If the plan contains the call later, the cause is wrong order, else missing step.
+"""
 
 STEP_CAUSES: Final[Mapping[FailureReason, Cause]] = {
     FailureReason.UNKNOWN_INDEX: Cause.HALLUCINATED_OBJECT,
@@ -135,16 +138,19 @@ STEP_CAUSES: Final[Mapping[FailureReason, Cause]] = {
         Cause.AFFORDANCE,
     ),
 }
-"""What a failed step is by its reason alone."""
+"""Causes that follow from the failure reason alone."""
 
 
 def cause_of_text(reason: PlanReason) -> Cause:
-    """Why a text is no plan, as a cause."""
+    """Cause for a text without a valid plan."""
     return _PLAN_CAUSES[reason]
 
 
 def cause_of_trace(plan: Plan, steps: Sequence[Step], table: Sequence[str]) -> Cause:
-    """Why an executed plan did not reach its goal. ``table`` is the task's object table, ``steps`` end with the failure."""
+    """Cause for an executed plan that missed its goal.
+
+    ``table`` is the task's object table; ``steps`` end with the failed step.
+    """
     last = steps[-1] if steps else None
     if last is None or last.failure is None:
         return Cause.GOAL_NOT_MET

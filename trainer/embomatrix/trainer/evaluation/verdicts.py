@@ -1,4 +1,4 @@
-"""From what became of a plan to a verdict: success, partial credit, and the cause where it failed."""
+"""Verdict on one answer: success, partial credit, and the cause of failure."""
 
 from __future__ import annotations
 
@@ -18,13 +18,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class AnswerVerdict:
-    """What became of one answer.
+    """Verdict on one answer.
 
-    ``partial`` is the share of the goal's atoms that hold at the end, 0 for a text that is no plan. ``cause`` says why the goal
-    was not reached, None for a success. ``step``, from 1, is the step that failed, 0 where none did: a goal may be reached
-    before it. ``reason`` (a ``PlanReason`` or ``FailureReason``) and ``sentence`` are the step's or the parser's own. ``done``
-    are the steps that succeeded of the plan's ``steps``. ``lost``: the infrastructure has no result, which says nothing
-    about the plan.
+    ``partial`` is the share of goal atoms that hold at the end, 0 for unparsable text. ``cause`` is None for a success.
+    ``step`` is the number of the failed step from 1, 0 if none failed; a goal may hold in spite of a failed step. ``reason`` (a
+    ``PlanReason`` or ``FailureReason``) and ``sentence`` come from the step or the parser. ``done`` of the plan's ``steps``
+    succeeded. ``lost``: the infrastructure lost the result, which says nothing about the plan.
     """
 
     task_id: str
@@ -40,8 +39,8 @@ class AnswerVerdict:
     lost: bool = False
 
 
-def of_text(answer: Answer, error: PlanError) -> AnswerVerdict:
-    """The verdict on a text that is no plan: it is not executed."""
+def unparsable_verdict(answer: Answer, error: PlanError) -> AnswerVerdict:
+    """Verdict on a text without a valid plan, which is not executed."""
     return AnswerVerdict(
         answer.task_id,
         answer.sample,
@@ -53,8 +52,8 @@ def of_text(answer: Answer, error: PlanError) -> AnswerVerdict:
     )
 
 
-def of_plan(answer: Answer, task: Task, plan: Plan, outcome: Outcome | None) -> AnswerVerdict:
-    """The verdict on a plan that was executed, or that the infrastructure lost."""
+def executed_verdict(answer: Answer, task: Task, plan: Plan, outcome: Outcome | None) -> AnswerVerdict:
+    """Verdict on an executed or lost plan."""
     if not isinstance(outcome, Completed):
         return AnswerVerdict(
             answer.task_id, answer.sample, success=False, partial=0.0, steps=len(plan), lost=True

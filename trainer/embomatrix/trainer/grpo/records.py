@@ -1,4 +1,4 @@
-"""What one step of GRPO did, for logs and displays."""
+"""Record of one GRPO step, for logs and displays."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from embomatrix.rpc.wire.values import Completed
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from embomatrix.trainer.cluster.gateway import PlanOutcome
+    from embomatrix.trainer.data.tasks import TrainingTask
     from embomatrix.trainer.grpo.objective import LossMetrics
-    from embomatrix.trainer.grpo.rollout import PlanOutcome
-    from embomatrix.trainer.run.data import TrainingTask
 
 
 @dataclass(frozen=True, slots=True)
 class StepRecord:
-    """What one step did. Rates are over rollouts that have a result; token means over the plans that moved the policy, None
-    where none did.
+    """Metrics of one step.
 
-    ``reward_format``, ``reward_relevance`` and ``reward_goal`` are the tiers' means, which add up to ``reward``;
-    ``success_by_category`` holds the categories that came up.
+    Rates are over rollouts with a result. Token means are over the plans that had a gradient, None if there were none.
+    ``reward_format``, ``reward_relevance`` and ``reward_goal`` are the means of the tiers and add up to ``reward``.
+    ``kl`` is to the reference policy, ``kl_to_old`` to the policy that sampled.
     """
 
     step: int
@@ -33,7 +33,7 @@ class StepRecord:
     success_by_category: Mapping[str, float]
     well_formed: float
     plan_steps: float
-    dead_groups: float
+    zero_variance_groups: float
     groups: int
     entropy: float | None
     kl: float | None
@@ -48,18 +48,18 @@ class StepRecord:
 
 @dataclass(frozen=True, slots=True)
 class GroupLog:
-    """One task's plans of a step. ``dead``: they carried no signal, as all rewards were equal or too few came back."""
+    """One task's plans of a step. ``zero_variance``: equal rewards or too few of them, so the group had no learning signal."""
 
     task: TrainingTask
     outcomes: tuple[PlanOutcome, ...]
     advantages: tuple[float, ...]
-    dead: bool
+    zero_variance: bool
 
 
 def record_of(
     step: int, logs: Sequence[GroupLog], metrics: Sequence[LossMetrics], norm: float, rate: float
 ) -> StepRecord:
-    """Sum up a step: its groups, the metrics of the parts that moved the policy, gradient norm and learning rate."""
+    """Summarise a step from its groups, the metrics of its microbatches, the gradient norm and the learning rate."""
     outcomes = [outcome for log in logs for outcome in log.outcomes]
     known = [outcome for outcome in outcomes if outcome.reward is not None]
     rewards = [outcome.reward for outcome in known if outcome.reward is not None]
@@ -81,7 +81,7 @@ def record_of(
         success_by_category=_by_category(logs),
         well_formed=_mean([not outcome.problem for outcome in known]),
         plan_steps=_mean([len(outcome.steps) for outcome in executed]),
-        dead_groups=_mean([log.dead for log in logs]),
+        zero_variance_groups=_mean([log.zero_variance for log in logs]),
         groups=len(logs),
         entropy=over_tokens("entropy"),
         kl=over_tokens("kl_to_reference"),

@@ -1,4 +1,4 @@
-"""From tasks to plans on their way: chunks of tasks are told, sampled, and sent to the cluster at once."""
+"""Sampling of plans for a step: microbatches of tasks are sampled, and their plans sent to the cluster at once."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import torch
 
-from embomatrix.trainer.grpo.rollout import waited
+from embomatrix.trainer.cluster.gateway import result_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,27 +19,27 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from embomatrix.skills.prompt import Codec
-    from embomatrix.trainer.grpo.rollout import PlanOutcome, Submitting
-    from embomatrix.trainer.parallel.data_parallel import Crew
-    from embomatrix.trainer.parallel.learner import Sampling
-    from embomatrix.trainer.policy.prompts import Teller, Told
+    from embomatrix.trainer.cluster.gateway import PlanOutcome, PlanSubmitter
+    from embomatrix.trainer.config.settings import GrpoSettings
+    from embomatrix.trainer.data.tasks import TrainingTask
+    from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers
+    from embomatrix.trainer.grpo.learner import SamplingLearner
+    from embomatrix.trainer.policy.prompts import PromptBuilder, TaskPrompt
     from embomatrix.trainer.policy.protocol import Samples
-    from embomatrix.trainer.run.data import TrainingTask
-    from embomatrix.trainer.run.settings import GrpoSettings
 
 _SEEDS: Final = 2**62
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SampledChunk:
-    """Tasks sampled together, and the rewards to come. ``part`` numbers the chunks of a step from 0.
+    """Tasks that were sampled together, with the futures of their rewards. ``index`` counts a step's chunks from 0.
 
-    ``reference``: log-probabilities of the reference policy, (plans, tokens) as ``samples``; None where no KL is asked for.
+    ``reference``: log-probabilities (plans, tokens) of the reference policy, None without a KL term.
     """
 
-    part: int
+    index: int
     tasks: Sequence[TrainingTask]
-    told: Sequence[Told]
+    prompts: Sequence[TaskPrompt]
     samples: Samples
     futures: Sequence[Future[tuple[PlanOutcome, ...]]]
     reference: Tensor | None
@@ -53,24 +53,29 @@ class SampledChunk:
         return int(self.samples.mask.sum())
 
     @property
-    def is_back(self) -> bool:
-        """Whether every rollout has its outcome."""
+    def is_complete(self) -> bool:
+        """True if every rollout has its outcome."""
         return all(future.done() for future in self.futures)
 
     def outcomes(self) -> list[tuple[PlanOutcome, ...]]:
-        """Of every task, as soon as they are there. Raises TrainerError where the cluster failed."""
-        return [waited(future) for future in self.futures]
+        """Wait for the outcomes of every task. Raises TrainerError if the cluster failed."""
+        return [result_of(future) for future in self.futures]
 
 
 class Sampler:
-    """Samples a policy on tasks, in all processes of a crew, and has its plans executed meanwhile."""
+    """Samples plans on all data-parallel workers while the cluster executes earlier ones."""
 
     def __init__(
-        self, crew: Crew, codec: Codec, teller: Teller, gateway: Submitting, settings: GrpoSettings
+        self,
+        workers: DataParallelWorkers,
+        codec: Codec,
+        prompt_builder: PromptBuilder,
+        gateway: PlanSubmitter,
+        settings: GrpoSettings,
     ) -> None:
-        self._crew = crew
+        self._workers = workers
         self._codec = codec
-        self._teller = teller
+        self._prompt_builder = prompt_builder
         self._gateway = gateway
         self._settings = settings
 
@@ -81,62 +86,62 @@ class Sampler:
         rng: np.random.Generator,
         generator: torch.Generator,
         *,
-        first_part: int = 0,
+        first_index: int = 0,
     ) -> list[SampledChunk]:
-        """The tasks in chunks; each is under way before a process samples its next.
+        """Sample the tasks in chunks. Each chunk is submitted before its process samples the next one.
 
-        What a chunk draws depends on its number and on ``generator`` alone, whichever process samples it.
+        A chunk's samples depend only on its index and ``generator``, not on the process that draws them.
         """
         size = self._settings.chunk
         jobs = []
-        for part, at in enumerate(range(0, len(tasks), size), start=first_part):
-            told = [(task, self._teller.anew(task, rng)) for task in tasks[at : at + size]]
+        for index, at in enumerate(range(0, len(tasks), size), start=first_index):
+            prompts = [(task, self._prompt_builder.varied(task, rng)) for task in tasks[at : at + size]]
             seed = int(torch.randint(_SEEDS, (), generator=generator, device=generator.device))
-            jobs.append((part, functools.partial(self._chunk, step, part, told, seed)))
-        chunks = self._crew.spread(jobs)
+            jobs.append((index, functools.partial(self._chunk, step, index, prompts, seed)))
+        chunks = self._workers.map(jobs)
         if not self._settings.kl_coef:
             return chunks
-        # Last, while the cluster works: it needs no reward.
-        return self._crew.spread(
-            [(chunk.part, functools.partial(_with_reference, chunk)) for chunk in chunks]
+        # The reference pass needs no rewards: it runs last, while the cluster works.
+        return self._workers.map(
+            [(chunk.index, functools.partial(_with_reference, chunk)) for chunk in chunks]
         )
 
     def _chunk(
         self,
         step: int,
-        part: int,
-        told: Sequence[tuple[TrainingTask, Told]],
+        index: int,
+        prompts: Sequence[tuple[TrainingTask, TaskPrompt]],
         seed: int,
-        learner: Sampling,
+        learner: SamplingLearner,
     ) -> SampledChunk:
         group = self._settings.group
-        samples = learner.sample([each.prompt for _, each in told], seed)
+        samples = learner.sample([prompt.tokens for _, prompt in prompts], seed)
         futures = [
             self._gateway.submit(
-                f"step-{step}-{part}-{row}",
+                f"step-{step}-{index}-{row}",
                 step,
                 task,
-                each.situation,
+                prompt.situation,
                 samples.texts[row * group : (row + 1) * group],
                 self._codec,
             )
-            for row, (task, each) in enumerate(told)
+            for row, (task, prompt) in enumerate(prompts)
         ]
-        tasks, tellings = zip(*told, strict=True)
-        return SampledChunk(part, tasks, tellings, samples, futures, None)
+        tasks, task_prompts = zip(*prompts, strict=True)
+        return SampledChunk(index, tasks, task_prompts, samples, futures, None)
 
 
-def _with_reference(chunk: SampledChunk, learner: Sampling) -> SampledChunk:
-    prompts = [each.prompt for each in chunk.told]
-    scored = learner.of_reference(prompts, chunk.samples.tokens, chunk.samples.mask)
-    return replace(chunk, reference=scored)
+def _with_reference(chunk: SampledChunk, learner: SamplingLearner) -> SampledChunk:
+    prompts = [prompt.tokens for prompt in chunk.prompts]
+    logprobs = learner.reference_logprobs(prompts, chunk.samples.tokens, chunk.samples.mask)
+    return replace(chunk, reference=logprobs)
 
 
-def next_back(chunks: Sequence[SampledChunk]) -> SampledChunk:
-    """The first of the chunks whose rewards are all there; waits until there is one."""
+def wait_for_next(chunks: Sequence[SampledChunk]) -> SampledChunk:
+    """Wait until one of the chunks is complete, and return the first complete one."""
     while True:
         for chunk in chunks:
-            if chunk.is_back:
+            if chunk.is_complete:
                 return chunk
-        open_ones = [future for chunk in chunks for future in chunk.futures if not future.done()]
-        wait(open_ones, return_when=FIRST_COMPLETED)
+        pending = [future for chunk in chunks for future in chunk.futures if not future.done()]
+        wait(pending, return_when=FIRST_COMPLETED)

@@ -1,11 +1,10 @@
-"""One optimiser step of GRPO, with simulation hidden behind sampling and back-propagation.
+"""One optimiser step of GRPO that hides simulation behind sampling and back-propagation.
 
-Chunks of tasks are sampled one after the other; each chunk's plans go to the cluster at once. With ``Overlap.STREAM`` chunks
-are back-propagated as their rewards arrive, with one optimiser step at the end: the gradient is that of the whole batch,
-on-policy, summed in the order of sampling, so that it does not depend on which worker was faster. ``Overlap.AHEAD`` also
-samples the next step's plans before this step's rewards are needed, from weights that are one step old.
-
-Chunks belong to the processes of a crew; their gradients are added in the same order wherever they come from.
+Microbatches (chunks of tasks) are sampled one after the other, and each one's plans go to the cluster at once. With
+``Overlap.STREAM`` they are back-propagated as their rewards arrive, followed by one optimiser step. The gradient is
+on-policy, covers the whole batch, and is summed in sampling order, so it does not depend on which worker was faster.
+``Overlap.AHEAD`` also samples the next step's plans before this step's rewards are needed, from weights that are one step
+old.
 """
 
 from __future__ import annotations
@@ -18,14 +17,14 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from embomatrix.trainer.grpo.objective import LossKind, LossMetrics, Scale, divisor, group_advantages
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import LossKind, OnLost, Overlap
+from embomatrix.trainer.grpo.gradients import GradientSum
+from embomatrix.trainer.grpo.learner import Microbatch
+from embomatrix.trainer.grpo.objective import LossMetrics, LossTotals, group_advantages, loss_divisor
 from embomatrix.trainer.grpo.records import GroupLog, StepRecord, record_of
-from embomatrix.trainer.grpo.sampling import Sampler, next_back
-from embomatrix.trainer.parallel.gradients import GradientSum
-from embomatrix.trainer.parallel.learner import Lesson
-from embomatrix.trainer.run.errors import TrainerError
-from embomatrix.trainer.run.settings import OnLost, Overlap
-from embomatrix.trainer.run.stopwatch import Activity
+from embomatrix.trainer.grpo.sampling import Sampler, wait_for_next
+from embomatrix.trainer.lifecycle.stopwatch import Activity
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -33,28 +32,28 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.trainer.grpo.rollout import PlanOutcome, Submitting
+    from embomatrix.trainer.cluster.gateway import PlanOutcome, PlanSubmitter
+    from embomatrix.trainer.config.settings import GrpoSettings
+    from embomatrix.trainer.data.tasks import TrainingTask
+    from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers, RemoteLearner
     from embomatrix.trainer.grpo.sampling import SampledChunk
-    from embomatrix.trainer.parallel.data_parallel import Crew, RemoteLearner
-    from embomatrix.trainer.policy.prompts import Teller
+    from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
+    from embomatrix.trainer.lifecycle.stopwatch import Stopwatch
+    from embomatrix.trainer.policy.prompts import PromptBuilder
     from embomatrix.trainer.policy.protocol import Policy
-    from embomatrix.trainer.run.data import TrainingTask
-    from embomatrix.trainer.run.interrupts import Interrupts
-    from embomatrix.trainer.run.settings import GrpoSettings
-    from embomatrix.trainer.run.stopwatch import Stopwatch
 
-GRADIENTS_ASIDE = 2
-"""Chunks back-propagated before their turn, at most: each keeps a gradient of the policy's size."""
-BAD_GRADIENTS = 5
-"""Steps in a row whose gradient is not finite: the run has gone astray."""
+MAX_STORED_GRADIENTS = 2
+"""Microbatches back-propagated before their turn. Each stores a gradient as large as the policy."""
+MAX_BAD_GRADIENTS = 5
+"""Consecutive steps with a non-finite gradient before the run ends: it has diverged."""
 
 
 @dataclass(frozen=True, slots=True)
 class StepPlan:
-    """What one step works on. ``rng`` gives a step's generator for tellings; ``generator`` draws the tokens.
+    """Input of one step. ``rng`` returns a step's generator for prompt variation; ``generator`` draws the tokens.
 
-    ``upcoming`` are the next step's tasks, sampled now with ``Overlap.AHEAD``; ``reserve`` may replace groups that carry no
-    signal, in this order. ``rate_factor`` scales the learning rate, ``relevance`` the reward's second tier.
+    ``upcoming`` are the next step's tasks, sampled now with ``Overlap.AHEAD``. ``reserve`` tasks replace zero-variance
+    groups, in this order. ``rate_factor`` scales the learning rate, ``relevance`` the reward's relevance tier.
     """
 
     step: int
@@ -68,22 +67,22 @@ class StepPlan:
 
 
 class Updater:
-    """Takes steps on one policy, which is that of the crew."""
+    """Takes GRPO steps on one policy, which is the policy of the data-parallel workers."""
 
     def __init__(
         self,
         policy: Policy,
-        crew: Crew,
-        teller: Teller,
-        gateway: Submitting,
+        workers: DataParallelWorkers,
+        prompt_builder: PromptBuilder,
+        gateway: PlanSubmitter,
         settings: GrpoSettings,
         stopwatch: Stopwatch,
     ) -> None:
         self._policy = policy
         self._settings = settings
         self._stopwatch = stopwatch
-        self._crew = crew
-        self._sampler = Sampler(crew, policy.codec, teller, gateway, settings)
+        self._workers = workers
+        self._sampler = Sampler(workers, policy.codec, prompt_builder, gateway, settings)
         self._ahead: tuple[int, list[SampledChunk]] | None = None
         self._bad_gradients = 0
         self.optimiser = torch.optim.AdamW(
@@ -91,25 +90,25 @@ class Updater:
         )
 
     def take_step(
-        self, plan: StepPlan, interrupts: Interrupts | None = None
+        self, plan: StepPlan, interrupts: DeferredInterrupts | None = None
     ) -> tuple[StepRecord, list[GroupLog]]:
-        """Sample, execute and learn from one batch of tasks. Raises TrainerError where it can't go on.
+        """Sample, execute and learn from one batch of tasks. Ctrl-C is deferred while the weights change.
 
-        ``interrupts`` are put off once the policy moves.
+        Raises TrainerError if the cluster or a process failed, or the gradients stay non-finite.
         """
-        with self._stopwatch.spending(Activity.SAMPLING):
+        with self._stopwatch.track(Activity.SAMPLING):
             chunks = self._chunks(plan)
-        work = _Work(plan, self._scale(chunks), GradientSum(self._policy.parameters()))
-        self._learn_all(chunks, work)
-        self._replace_dead(len(chunks), work)
-        with self._stopwatch.spending(Activity.UPDATE):
+        state = _StepState(plan, self._totals(chunks), GradientSum(self._policy.parameters()))
+        self._learn_all(chunks, state)
+        self._replace_zero_variance(len(chunks), state)
+        with self._stopwatch.track(Activity.UPDATE):
             if interrupts is not None:
-                interrupts.put_off()
-            norm, rate = self._apply(work)
-        return record_of(plan.step, work.logs, work.metrics, norm, rate), work.logs
+                interrupts.defer()
+            norm, rate = self._apply(state)
+        return record_of(plan.step, state.logs, state.metrics, norm, rate), state.logs
 
     def _chunks(self, plan: StepPlan) -> list[SampledChunk]:
-        """This step's chunks, sampled now or a step ago; those of the next step are sent on their way too."""
+        """Return this step's chunks, sampled now or one step ago. With ``AHEAD``, also sample the next step's."""
         ready, self._ahead = self._ahead, None
         if ready is not None and ready[0] == plan.step:
             chunks = ready[1]
@@ -123,148 +122,138 @@ class Updater:
             )
         return chunks
 
-    def _scale(self, chunks: Sequence[SampledChunk]) -> Scale:
-        return Scale(
+    def _totals(self, chunks: Sequence[SampledChunk]) -> LossTotals:
+        return LossTotals(
             plans=sum(chunk.plans for chunk in chunks),
             tokens=sum(chunk.tokens for chunk in chunks),
             longest=self._settings.max_new,
-            parts=len(chunks),
+            microbatches=len(chunks),
         )
 
-    def _learn_all(self, chunks: Sequence[SampledChunk], work: _Work) -> None:
-        """Back-propagate every chunk, as its rewards arrive where that is wanted."""
+    def _learn_all(self, chunks: Sequence[SampledChunk], state: _StepState) -> None:
+        """Back-propagate every chunk, as its rewards arrive unless ``Overlap.NONE``."""
         if self._settings.overlap is Overlap.NONE:
-            with self._stopwatch.spending(Activity.WAITING):
+            with self._stopwatch.track(Activity.WAITING):
                 for chunk in chunks:
                     chunk.outcomes()
-        elsewhere = {
-            chunk.part: _Sent(chunk, helper, functools.partial(self._learn_elsewhere, chunk, work))
+        remote_chunks = {
+            chunk.index: _RemoteChunk(chunk, remote, functools.partial(self._learn_remotely, chunk, state))
             for chunk in chunks
-            if (helper := self._crew.helper(chunk.part)) is not None
+            if (remote := self._workers.remote(chunk.index)) is not None
         }
-        logs = self._learn_here([chunk for chunk in chunks if chunk.part not in elsewhere], work)
+        logs = self._learn_locally([chunk for chunk in chunks if chunk.index not in remote_chunks], state)
         for chunk in chunks:
-            if chunk.part in elsewhere:
-                with self._stopwatch.spending(Activity.WAITING):
+            if chunk.index in remote_chunks:
+                with self._stopwatch.track(Activity.WAITING):
                     chunk.outcomes()
-                with self._stopwatch.spending(Activity.UPDATE):
-                    logs[chunk.part] = self._taken_over(chunk.part, elsewhere[chunk.part].learnt(), work)
-        for part in sorted(logs):
-            work.logs += logs[part]
+                with self._stopwatch.track(Activity.UPDATE):
+                    result = remote_chunks[chunk.index].result()
+                    state.gradients.put(chunk.index, result.gradient)
+                    if result.metrics is not None:
+                        state.count(result.metrics, result.plans)
+                    logs[chunk.index] = result.logs
+        for index in sorted(logs):
+            state.logs += logs[index]
 
-    def _learn_here(self, chunks: Sequence[SampledChunk], work: _Work) -> dict[int, list[GroupLog]]:
-        """Back-propagate this process's chunks, the first that is back first."""
+    def _learn_locally(self, chunks: Sequence[SampledChunk], state: _StepState) -> dict[int, list[GroupLog]]:
+        """Back-propagate this process's chunks in the order in which their rewards arrive."""
         logs: dict[int, list[GroupLog]] = {}
         waiting = list(chunks)
         while waiting:
-            # The first in line waits alone once enough gradients are kept for later.
-            open_ones = waiting[:1] if work.gradients.aside >= GRADIENTS_ASIDE else waiting
-            with self._stopwatch.spending(Activity.WAITING):
-                chunk = next_back(open_ones)
+            # With enough gradients stored, only the next chunk in the sum may go on.
+            candidates = waiting[:1] if state.gradients.stored >= MAX_STORED_GRADIENTS else waiting
+            with self._stopwatch.track(Activity.WAITING):
+                chunk = wait_for_next(candidates)
                 outcomes = chunk.outcomes()
             waiting.remove(chunk)
-            with self._stopwatch.spending(Activity.UPDATE):
-                lesson, logs[chunk.part] = self._lesson(chunk, outcomes, work)
-                work.gradients.add(chunk.part, functools.partial(self._learn, lesson, work))
+            with self._stopwatch.track(Activity.UPDATE):
+                microbatch, logs[chunk.index] = self._microbatch(chunk, outcomes, state)
+                state.gradients.add(chunk.index, functools.partial(self._learn, microbatch, state))
         return logs
 
-    def _learn(self, lesson: Lesson | None, work: _Work) -> None:
-        if lesson is not None:
-            work.count(self._crew.own.learn(lesson), len(lesson.tokens))
+    def _learn(self, microbatch: Microbatch | None, state: _StepState) -> None:
+        if microbatch is not None:
+            state.count(self._workers.local.learn(microbatch), len(microbatch.tokens))
 
-    def _learn_elsewhere(self, chunk: SampledChunk, work: _Work, helper: RemoteLearner) -> _Elsewhere:
-        """A chunk's share, once its rewards are there, as a helper finds it."""
-        lesson, logs = self._lesson(chunk, chunk.outcomes(), work)
-        if lesson is None:
-            return _Elsewhere(logs, None, 0, None)
-        metrics, gradient = helper.learn(lesson)
-        return _Elsewhere(logs, metrics, len(lesson.tokens), gradient)
+    def _learn_remotely(self, chunk: SampledChunk, state: _StepState, remote: RemoteLearner) -> _RemoteResult:
+        microbatch, logs = self._microbatch(chunk, chunk.outcomes(), state)
+        if microbatch is None:
+            return _RemoteResult(logs, None, 0, None)
+        metrics, gradient = remote.learn(microbatch)
+        return _RemoteResult(logs, metrics, len(microbatch.tokens), gradient)
 
-    def _taken_over(self, part: int, found: _Elsewhere, work: _Work) -> list[GroupLog]:
-        work.gradients.put(part, found.gradient)
-        if found.metrics is not None:
-            work.count(found.metrics, found.plans)
-        return found.logs
-
-    def _replace_dead(self, part: int, work: _Work) -> None:
-        """Groups without signal are replaced from the reserve, round by round, and the sum is scaled to what carries one."""
-        plan, reserve = work.plan, list(work.plan.reserve)
+    def _replace_zero_variance(self, next_index: int, state: _StepState) -> None:
+        """Replace zero-variance groups from the reserve, then rescale the gradient to the groups with a signal."""
+        plan, reserve = state.plan, list(state.plan.reserve)
         if not reserve:
             return
         replaced = 0
-        while reserve and (missing := sum(log.dead for log in work.logs) - replaced) > 0:
+        while reserve and (missing := sum(log.zero_variance for log in state.logs) - replaced) > 0:
             tasks, reserve = reserve[:missing], reserve[missing:]
             replaced += len(tasks)
-            with self._stopwatch.spending(Activity.SAMPLING):
+            with self._stopwatch.track(Activity.SAMPLING):
                 chunks = self._sampler.sample(
-                    plan.step, tasks, plan.rng(plan.step), plan.generator, first_part=part
+                    plan.step, tasks, plan.rng(plan.step), plan.generator, first_index=next_index
                 )
-            part += len(chunks)
-            self._learn_all(chunks, work)
-        if work.live_plans:
+            next_index += len(chunks)
+            self._learn_all(chunks, state)
+        if state.signal_plans:
             kind = self._settings.loss
-            final = Scale(work.live_plans, work.live_tokens, self._settings.max_new, work.live_parts)
+            final = LossTotals(
+                state.signal_plans, state.signal_tokens, self._settings.max_new, state.signal_microbatches
+            )
             if kind is LossKind.BNPO:
-                work.gradients.scale(work.scale.parts / final.parts)
+                state.gradients.scale(state.totals.microbatches / final.microbatches)
             else:
-                work.gradients.scale(divisor(kind, work.scale) / divisor(kind, final))
+                state.gradients.scale(loss_divisor(kind, state.totals) / loss_divisor(kind, final))
 
-    def _lesson(
-        self, chunk: SampledChunk, outcomes: Sequence[tuple[PlanOutcome, ...]], work: _Work
-    ) -> tuple[Lesson | None, list[GroupLog]]:
-        """What the groups of a chunk that carry a signal have to teach; None where none does."""
+    def _microbatch(
+        self, chunk: SampledChunk, outcomes: Sequence[tuple[PlanOutcome, ...]], state: _StepState
+    ) -> tuple[Microbatch | None, list[GroupLog]]:
+        """Return a chunk's groups with a learning signal as a microbatch, None if there are none, and all groups' logs."""
         rewards = torch.tensor(
-            [[outcome.valued(work.plan.relevance) for outcome in each] for each in outcomes]
+            [[outcome.weighted_reward(state.plan.relevance) for outcome in group] for group in outcomes]
         )  # (tasks, G)
         if self._settings.on_lost is OnLost.GROUP:
             rewards[torch.isnan(rewards).any(dim=1)] = math.nan
         advantages = group_advantages(rewards, self._settings.spread_floor)
-        live = [row for row, dead in enumerate(advantages.dead.tolist()) if not dead]
+        zero_variance = advantages.zero_variance.tolist()
         logs = [
-            GroupLog(task, each, tuple(values), dead)
-            for task, each, values, dead in zip(
-                chunk.tasks, outcomes, advantages.values.tolist(), advantages.dead.tolist(), strict=True
+            GroupLog(task, group, tuple(values), flat)
+            for task, group, values, flat in zip(
+                chunk.tasks, outcomes, advantages.values.tolist(), zero_variance, strict=True
             )
         ]
-        if not live:
+        kept = [row for row, flat in enumerate(zero_variance) if not flat]
+        if not kept:
             return None, logs
-        return self._lesson_of(chunk, live, rewards, advantages.values, work.scale), logs
-
-    def _lesson_of(
-        self,
-        chunk: SampledChunk,
-        live: Sequence[int],
-        rewards: torch.Tensor,
-        advantages: torch.Tensor,
-        scale: Scale,
-    ) -> Lesson:
-        """The groups of the rows ``live``, in which rollouts that were lost have no word."""
         group, samples = self._settings.group, chunk.samples
         device = samples.tokens.device
-        rows = torch.tensor([row * group + sample for row in live for sample in range(group)], device=device)
-        known = ~torch.isnan(rewards[live].view(-1)).to(device)
+        rows = torch.tensor([row * group + sample for row in kept for sample in range(group)], device=device)
+        known = ~torch.isnan(rewards[kept].view(-1)).to(device)  # (plans,)
         length = int(samples.mask[rows].sum(dim=1).max())
-        mask = samples.mask[rows, :length] & known[:, None]
-        return Lesson(
-            prompts=[chunk.told[row].prompt for row in live],
+        microbatch = Microbatch(
+            prompts=[chunk.prompts[row].tokens for row in kept],
             tokens=samples.tokens[rows, :length],
-            mask=mask,
+            mask=samples.mask[rows, :length] & known[:, None],
             old_logprobs=samples.logprobs[rows, :length],
             reference=None if chunk.reference is None else chunk.reference[rows, :length],
-            advantages=advantages[live].view(-1).to(device),
-            scale=self._scale_of(chunk, scale),
+            advantages=advantages.values[kept].view(-1).to(device),
+            totals=self._totals_of(chunk, state.totals),
         )
+        return microbatch, logs
 
-    def _scale_of(self, chunk: SampledChunk, scale: Scale) -> Scale:
-        """BNPO divides by the part's own tokens, and averages over parts."""
+    def _totals_of(self, chunk: SampledChunk, totals: LossTotals) -> LossTotals:
+        """Return the denominators of a chunk. BNPO divides by the chunk's own tokens."""
         if self._settings.loss is not LossKind.BNPO:
-            return scale
-        return Scale(scale.plans, chunk.tokens * scale.parts, scale.longest, scale.parts)
+            return totals
+        tokens = chunk.tokens * totals.microbatches
+        return LossTotals(totals.plans, tokens, totals.longest, totals.microbatches)
 
-    def _apply(self, work: _Work) -> tuple[float, float]:
-        """Move the policy, unless nothing was learnt or the gradient is not finite; returns its norm and the rate."""
-        rate = self._settings.learning_rate * work.plan.rate_factor
-        if not work.metrics:
+    def _apply(self, state: _StepState) -> tuple[float, float]:
+        """Take the optimiser step unless there is no gradient or it is not finite. Return its norm and the rate."""
+        rate = self._settings.learning_rate * state.plan.rate_factor
+        if not state.metrics:
             return 0.0, rate
         for group in self.optimiser.param_groups:
             group["lr"] = rate
@@ -274,17 +263,17 @@ class Updater:
             self.optimiser.step()
             return norm, rate
         self._bad_gradients += 1
-        if self._bad_gradients >= BAD_GRADIENTS:
+        if self._bad_gradients >= MAX_BAD_GRADIENTS:
             raise TrainerError(
-                f"the gradient of step {work.plan.step} is not finite (found {norm}), the {BAD_GRADIENTS}th time in a row: the "
-                "policy was left as it is; lower grpo.learning_rate and go on with --resume"
+                f"the gradient norm of step {state.plan.step} is {norm}, not finite for the {MAX_BAD_GRADIENTS}th step in a "
+                "row; these steps left the policy unchanged: lower grpo.learning_rate and continue with --resume"
             )
         return norm, rate
 
 
 @dataclass(frozen=True, slots=True)
-class _Elsewhere:
-    """What came of a chunk in another process: its groups, and the share of ``plans`` with a signal, if there are any."""
+class _RemoteResult:
+    """Result of a chunk in another process. ``metrics`` and ``gradient`` are None for a chunk without a signal."""
 
     logs: list[GroupLog]
     metrics: LossMetrics | None
@@ -292,52 +281,55 @@ class _Elsewhere:
     gradient: Sequence[torch.Tensor | None] | None
 
 
-class _Sent:
-    """A chunk that goes to a helper as soon as its rewards are there, whoever sees that first."""
+class _RemoteChunk:
+    """Chunk that is sent to a remote learner as soon as its rewards are complete, exactly once."""
 
     def __init__(
-        self, chunk: SampledChunk, helper: RemoteLearner, job: Callable[[RemoteLearner], _Elsewhere]
+        self,
+        chunk: SampledChunk,
+        remote: RemoteLearner,
+        job: Callable[[RemoteLearner], _RemoteResult],
     ) -> None:
         self._chunk = chunk
-        self._helper = helper
+        self._remote = remote
         self._job = job
         self._lock = threading.Lock()
-        self._future: Future[_Elsewhere] | None = None
+        self._future: Future[_RemoteResult] | None = None
         for future in chunk.futures:
-            future.add_done_callback(self._heard)
+            future.add_done_callback(self._on_reward)
 
-    def _heard(self, _: Future[tuple[PlanOutcome, ...]]) -> None:
-        """In whichever thread hears of a reward; after the end of the crew nobody wants it."""
-        if self._chunk.is_back and not self._helper.closed:
-            self._begun()
+    def _on_reward(self, _: Future[tuple[PlanOutcome, ...]]) -> None:
+        """Runs on the thread that receives the reward. Rewards that arrive after shutdown are ignored."""
+        if self._chunk.is_complete and not self._remote.closed:
+            self._send()
 
-    def _begun(self) -> Future[_Elsewhere]:
+    def _send(self) -> Future[_RemoteResult]:
         with self._lock:
             if self._future is None:
-                self._future = self._helper.run(self._job)
+                self._future = self._remote.run(self._job)
             return self._future
 
-    def learnt(self) -> _Elsewhere:
-        """What came of it; its rewards are there."""
-        return self._begun().result()
+    def result(self) -> _RemoteResult:
+        """Wait for the result. The chunk's rewards must be complete."""
+        return self._send().result()
 
 
-class _Work:
-    """What a step has gathered so far."""
+class _StepState:
+    """Accumulated groups, metrics and gradients of a step. ``signal_*`` count microbatches with a learning signal."""
 
-    def __init__(self, plan: StepPlan, scale: Scale, gradients: GradientSum) -> None:
+    def __init__(self, plan: StepPlan, totals: LossTotals, gradients: GradientSum) -> None:
         self.plan = plan
-        self.scale = scale
+        self.totals = totals
         self.gradients = gradients
         self.logs: list[GroupLog] = []
         self.metrics: list[LossMetrics] = []
-        self.live_plans = 0
-        self.live_tokens = 0
-        self.live_parts = 0
+        self.signal_plans = 0
+        self.signal_tokens = 0
+        self.signal_microbatches = 0
 
     def count(self, metrics: LossMetrics, plans: int) -> None:
-        """One more part with a signal."""
+        """Count one more microbatch with a learning signal."""
         self.metrics.append(metrics)
-        self.live_plans += plans
-        self.live_tokens += metrics.weight
-        self.live_parts += 1
+        self.signal_plans += plans
+        self.signal_tokens += metrics.weight
+        self.signal_microbatches += 1

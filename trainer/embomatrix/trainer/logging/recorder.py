@@ -1,4 +1,4 @@
-"""What a run writes as it goes: metrics and samples, a JSON object a line, so that nothing is lost with a crash."""
+"""Metrics and samples of a run as JSON lines, written at once so that a crash loses nothing."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
+    from embomatrix.trainer.cluster.gateway import PlanOutcome
     from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation
     from embomatrix.trainer.grpo.records import GroupLog, StepRecord
-    from embomatrix.trainer.grpo.rollout import PlanOutcome
-    from embomatrix.trainer.imitation.imitate import ImitationProgress
+    from embomatrix.trainer.imitation.teacher_forcing import ImitationProgress
     from embomatrix.trainer.logging.trackers import Tracker
 
 METRICS = "metrics.jsonl"
@@ -28,7 +28,7 @@ IMITATION = "imitation.jsonl"
 
 
 class Recorder:
-    """Appends to the files of one run's folder, and tells ``trackers``. Raises OSError where that can't be written."""
+    """Appends to the files in a run's folder and forwards the numbers to ``trackers``. Raises OSError if a write fails."""
 
     def __init__(self, folder: Path, trackers: Sequence[Tracker] = ()) -> None:
         self._folder = folder
@@ -36,35 +36,35 @@ class Recorder:
         folder.mkdir(parents=True, exist_ok=True)
 
     def step(self, record: StepRecord, seconds: float, spent_s: Mapping[str, float]) -> None:
-        """``seconds`` is the wall clock of the step, ``spent_s`` what the run has spent so far, by activity."""
+        """Record a GRPO step. ``seconds`` is its wall-clock time, ``spent_s`` the run's time so far by activity."""
         spent = {activity: round(value, 4) for activity, value in spent_s.items()}
         row = {**asdict(record), "seconds": round(seconds, 4), "spent_s": spent}
         self._append(METRICS, row)
         self._track(GRPO_PHASE, row)
 
     def samples(self, step: int, log: GroupLog) -> None:
-        """One task's plans: text, verdict, reward by tier, what each step did."""
+        """Record one task's plans: text, reward by tier, and the result of each step."""
         for outcome, advantage in zip(log.outcomes, log.advantages, strict=True):
-            described = {
+            task = {
                 "step": step,
                 "task": log.task.task.task_id,
                 "instruction": log.task.task.instruction,
             }
-            self._append(SAMPLES, {**described, "advantage": round(advantage, 4), **_described(outcome)})
+            self._append(SAMPLES, {**task, "advantage": round(advantage, 4), **_plan_to_json(outcome)})
 
     def imitation(self, progress: ImitationProgress) -> None:
-        """One step of imitation."""
+        """Record an imitation step."""
         row = asdict(progress)
         self._append(IMITATION, row)
         self._track(IMITATION_PHASE, row)
 
     def evaluation(self, label: str, result: HeldOutEvaluation) -> None:
-        """Held-out success, which the run's own files keep in checkpoints and report."""
+        """Forward held-out success to the trackers. Checkpoints and the report store it too."""
         rates = {category: result.success(category).value for category in result.categories}
         self._track(f"success {label}", {"step": 0, "all": result.success().value, **rates})
 
     def forget_after(self, step: int, *names: str) -> None:
-        """Drop what those files hold of steps that a run will take again: it is resumed, or had no checkpoint yet."""
+        """Drop later steps from the files: a resumed run takes them again."""
         for name in names:
             path = self._folder / name
             if path.exists():
@@ -85,7 +85,7 @@ class Recorder:
 
 
 def numbers_of(row: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
-    """The numbers of a row by name; those of a table in it by ``table/name``."""
+    """Yield the numbers of a row by name. Nested numbers get the name ``table/name``."""
     for name, value in row.items():
         if isinstance(value, Mapping):
             yield from ((f"{name}/{inner}", number) for inner, number in numbers_of(value))
@@ -94,7 +94,7 @@ def numbers_of(row: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
 
 
 def _step_of(line: str) -> float:
-    """A line that a crash cut short belongs to no step that is kept."""
+    """Step of a line; infinity for a line that a crash truncated, so it is dropped."""
     try:
         return int(json.loads(line)["step"])
     except ValueError:
@@ -102,16 +102,16 @@ def _step_of(line: str) -> float:
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """Every step's record, oldest first; empty before the first step."""
+    """Read the record of every step, oldest first. Empty before the first step."""
     path = folder / METRICS
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def _described(outcome: PlanOutcome) -> dict[str, Any]:
-    described: dict[str, Any] = {"text": outcome.text}
+def _plan_to_json(outcome: PlanOutcome) -> dict[str, Any]:
+    row: dict[str, Any] = {"text": outcome.text}
     if outcome.reward is not None:
         reward = outcome.reward
-        described |= {
+        row |= {
             "reward": reward.total,
             "format": reward.format,
             "relevance": reward.relevance,
@@ -121,11 +121,11 @@ def _described(outcome: PlanOutcome) -> dict[str, Any]:
         }
     match outcome.outcome:
         case Completed(steps=steps):
-            described["steps"] = [[step.call.skill.value, step.ok, step.message] for step in steps]
+            row["steps"] = [[step.call.skill.value, step.ok, step.message] for step in steps]
         case InfraFailure(code=code, message=message):
-            described["lost"] = f"{code.value}: {message}"
+            row["lost"] = f"{code.value}: {message}"
         case Cancelled():
-            described["lost"] = "cancelled"
+            row["lost"] = "cancelled"
         case None:
-            described["unparsable"] = outcome.problem
-    return described
+            row["unparsable"] = outcome.problem
+    return row

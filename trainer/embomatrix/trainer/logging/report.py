@@ -1,13 +1,13 @@
-"""The report of a run: one HTML file with the learning curves, success before and after, and where the time went."""
+"""HTML report of a run: learning curves, success before and after GRPO, and time by activity, in one file."""
 
 from __future__ import annotations
 
 import html
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 from embomatrix.trainer.evaluation.held_out import improvement
-from embomatrix.trainer.run.outcome import RunOutcome, TaskRate
+from embomatrix.trainer.logging.outcome import RunOutcome, TaskRate
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -20,16 +20,16 @@ REPORT = "report.html"
 _WIDTH, _HEIGHT, _MARGIN = 640, 220, 44
 _CURVES = (
     ("reward", "mean reward of a step", "#1b6ca8"),
-    ("success", "share of rollouts that succeed", "#2a7f3f"),
-    ("plan_steps", "executed steps of a plan", "#8a5a00"),
+    ("success", "success rate of rollouts", "#2a7f3f"),
+    ("plan_steps", "executed steps per plan", "#8a5a00"),
     ("entropy", "entropy of a token (nats)", "#7a3b8f"),
-    ("dead_groups", "groups without signal", "#a83232"),
+    ("zero_variance_groups", "zero-variance groups", "#a83232"),
 )
 
 
 @dataclass(frozen=True)
 class TrainingSummary:
-    """What a finished run has to show. ``checkpoint`` is the newest one; ``after`` is None when nothing was held out."""
+    """Results of a finished run. ``checkpoint`` is the newest; ``before`` and ``after`` are None without held-out tasks."""
 
     model: str
     steps: int
@@ -48,15 +48,15 @@ class TrainingSummary:
 
 
 def time_rows(summary: TrainingSummary) -> list[tuple[str, float, float]]:
-    """Activity, seconds, share of the wall clock; the rest is called so."""
+    """Rows of activity, seconds and share of the wall clock, including a row for the remaining time."""
     total = max(summary.wall_s, 1e-9)
     rows = [(name, spent, spent / total) for name, spent in summary.spent_s.items()]
     rest = max(0.0, summary.wall_s - sum(summary.spent_s.values()))
-    return [*rows, ("everything else", rest, rest / total)]
+    return [*rows, ("other", rest, rest / total)]
 
 
 def success_rows(summary: TrainingSummary) -> list[tuple[str, str, str, str]]:
-    """Category, success before, after, and the paired difference, each with its interval."""
+    """Rows of category, success before, success after, and paired difference, each with its interval."""
     if summary.before is None or summary.after is None:
         return []
     rows = []
@@ -74,20 +74,9 @@ def success_rows(summary: TrainingSummary) -> list[tuple[str, str, str, str]]:
 
 
 def outcome_of(summary: TrainingSummary) -> RunOutcome:
-    """The summary's numbers, for programs."""
-    return RunOutcome(
-        model=summary.model,
-        imitation_steps=summary.imitation_steps,
-        steps=summary.steps,
-        rollouts=summary.rollouts,
-        lost=summary.lost,
-        wall_s=summary.wall_s,
-        grpo_s=summary.grpo_s,
-        spent_s=dict(summary.spent_s),
-        before=_rates(summary.before),
-        after=_rates(summary.after),
-        peak_mb=summary.peak_mb,
-    )
+    """Return the machine-readable part of the summary."""
+    numbers = {field.name: getattr(summary, field.name) for field in fields(RunOutcome)}
+    return RunOutcome(**{**numbers, "before": _rates(summary.before), "after": _rates(summary.after)})
 
 
 def _rates(evaluation: HeldOutEvaluation | None) -> tuple[TaskRate, ...]:
@@ -102,22 +91,22 @@ def _only(evaluation: HeldOutEvaluation, category: str) -> HeldOutEvaluation:
 
 
 def prewarm_share(stats: RunStats) -> float:
-    """Share of announced scenes that were warm when they were needed; 0 when none was."""
+    """Share of announced scenes that were warm when needed, 0 without any."""
     asked = stats.prewarm_hits + stats.prewarm_misses
     return stats.prewarm_hits / asked if asked else 0.0
 
 
 def write_report(summary: TrainingSummary, metrics: Sequence[Mapping[str, Any]], machine: str) -> Path:
-    """Write the report where ``summary.report`` says."""
+    """Write the report to ``summary.report``."""
     parts = [
         f"<h1>Training of {html.escape(summary.model)}</h1>",
-        f"<p>{summary.imitation_steps} steps of imitation, {summary.steps} steps of GRPO, {summary.rollouts} rollouts, "
-        f"{summary.lost} lost to the infrastructure and masked, "
+        f"<p>{summary.imitation_steps} imitation steps, {summary.steps} GRPO steps, {summary.rollouts} rollouts; "
+        f"{summary.lost} rollouts lost to the infrastructure and masked; "
         f"{prewarm_share(summary.stats):.0%} of announced scenes warm in time. Machine: {html.escape(machine)}.</p>",
         "<h2>Success on held-out tasks</h2>",
         _table(("tasks", "before GRPO", "after", "difference"), success_rows(summary))
-        or "<p>The data set holds no task out.</p>",
-        "<p>95 % intervals, bootstrap over tasks.</p>",
+        or "<p>The dataset has no held-out tasks.</p>",
+        "<p>95 % bootstrap intervals over tasks.</p>",
         "<h2>Learning curves</h2>",
         *(_curve([row[key] for row in metrics], title, colour) for key, title, colour in _CURVES),
         "<h2>Where the time went</h2>",
@@ -147,10 +136,10 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return f"<table><tr>{cells}</tr>{body}</table>"
 
 
-def _curve(told: Sequence[float | None], title: str, colour: str) -> str:
-    """Raw values thin, a moving mean bold, as inline SVG; steps without a value are passed over."""
-    places = [at for at, value in enumerate(told) if value is not None]
-    values = [value for value in told if value is not None]
+def _curve(series: Sequence[float | None], title: str, colour: str) -> str:
+    """Inline SVG with raw values (thin) and their moving average (bold). None values are skipped."""
+    steps = [at for at, value in enumerate(series) if value is not None]
+    values = [value for value in series if value is not None]
     if not values:
         return ""
     low, high = min(*values, 0.0), max(values)
@@ -159,11 +148,11 @@ def _curve(told: Sequence[float | None], title: str, colour: str) -> str:
     means = [sum(values[max(0, at - window + 1) : at + 1]) / min(at + 1, window) for at in range(len(values))]
 
     def points(line: Sequence[float]) -> str:
-        across = (_WIDTH - 2 * _MARGIN) / max(1, len(told) - 1)
+        across = (_WIDTH - 2 * _MARGIN) / max(1, len(series) - 1)
         up = (_HEIGHT - 2 * _MARGIN) / (high - low)
         return " ".join(
             f"{_MARGIN + at * across:.1f},{_HEIGHT - _MARGIN - (value - low) * up:.1f}"
-            for at, value in zip(places, line, strict=True)
+            for at, value in zip(steps, line, strict=True)
         )
 
     text = 'font-size="12" fill="#555"'
@@ -173,7 +162,7 @@ def _curve(told: Sequence[float | None], title: str, colour: str) -> str:
         f'<path d="M{_MARGIN} {_MARGIN}V{_HEIGHT - _MARGIN}H{_WIDTH - _MARGIN}" fill="none" stroke="#999"/>'
         f'<text x="4" y="{_MARGIN + 4}" {text}>{high:.3g}</text>'
         f'<text x="4" y="{_HEIGHT - _MARGIN}" {text}>{low:.3g}</text>'
-        f'<text x="{_WIDTH - _MARGIN}" y="{_HEIGHT - _MARGIN + 16}" {text} text-anchor="end">step {len(told)}</text>'
+        f'<text x="{_WIDTH - _MARGIN}" y="{_HEIGHT - _MARGIN + 16}" {text} text-anchor="end">step {len(series)}</text>'
         f'<polyline points="{points(values)}" fill="none" stroke="{colour}" stroke-opacity=".3"/>'
         f'<polyline points="{points(means)}" fill="none" stroke="{colour}" stroke-width="2"/></svg>'
     )

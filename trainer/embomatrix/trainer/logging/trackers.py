@@ -1,4 +1,4 @@
-"""Programs that draw metrics: TensorBoard, Weights & Biases, trackio. Each is imported when a run asks for it."""
+"""Experiment trackers: TensorBoard, Weights & Biases, trackio. Each is imported only if a run uses it."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import contextlib
 import secrets
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from embomatrix.trainer.run.errors import TrainerError, reason_of
-from embomatrix.trainer.run.settings import TrackerKind
+from embomatrix.trainer.config.errors import TrainerError, reason_of
+from embomatrix.trainer.config.settings import TrackerKind
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from embomatrix.trainer.run.settings import TrainSettings
+    from embomatrix.trainer.config.settings import TrainSettings
 
 PROJECT: Final = "embomatrix"
 IMITATION_PHASE: Final = "imitation"
@@ -22,7 +22,7 @@ WANDB_ID: Final = "wandb-id.txt"
 
 
 class Tracker(Protocol):
-    """Takes the numbers of a step. Each phase of a run counts its own steps."""
+    """Receiver of a step's numbers. Each phase of a run counts its own steps."""
 
     def log(self, phase: str, step: int, values: Mapping[str, float]) -> None: ...
 
@@ -30,7 +30,7 @@ class Tracker(Protocol):
 
 
 class TensorBoard:
-    """Event files in ``folder/tensorboard``: ``tensorboard --logdir FOLDER`` draws them."""
+    """Writes event files to ``folder/tensorboard``: view them with ``tensorboard --logdir FOLDER``."""
 
     def __init__(self, folder: Path, settings: TrainSettings) -> None:
         from torch.utils.tensorboard.writer import SummaryWriter
@@ -46,15 +46,17 @@ class TensorBoard:
         self._writer.close()
 
 
-class Hosted:
-    """W&B, and trackio, which speaks its language. Where values go is set as these programs say (``WANDB_MODE=offline``)."""
+class WandbLikeTracker:
+    """W&B, or trackio with the same API. Both are configured by their own settings, for example ``WANDB_MODE=offline``."""
 
-    def __init__(self, module: Any, folder: Path, settings: TrainSettings, places: Mapping[str, Any]) -> None:
+    def __init__(
+        self, module: Any, folder: Path, settings: TrainSettings, options: Mapping[str, Any]
+    ) -> None:
         self._module = module
-        module.init(project=PROJECT, name=folder.name, config=settings.model_dump(mode="json"), **places)
+        module.init(project=PROJECT, name=folder.name, config=settings.model_dump(mode="json"), **options)
 
     def log(self, phase: str, step: int, values: Mapping[str, float]) -> None:
-        # Their own step counts all calls and never goes back, but a run has two phases.
+        # Their own step counter never decreases, but each phase of a run counts from 0.
         named = {f"{phase}/{name}": value for name, value in values.items()}
         self._module.log({f"{phase}/step": step, **named})
 
@@ -63,14 +65,14 @@ class Hosted:
 
 
 def _wandb(folder: Path, settings: TrainSettings) -> Tracker:
-    """A run that goes on is drawn on under the id that its folder keeps; each phase is drawn over its own steps."""
+    """A resumed run continues the W&B run whose id is stored in its folder."""
     import wandb
 
-    kept = folder / WANDB_ID
-    if not kept.exists():
-        kept.write_text(secrets.token_hex(4), encoding="utf-8")
-    going_on = {"id": kept.read_text(encoding="utf-8"), "resume": "allow"}
-    tracker = Hosted(wandb, folder, settings, {"dir": str(folder), **going_on})
+    id_file = folder / WANDB_ID
+    if not id_file.exists():
+        id_file.write_text(secrets.token_hex(4), encoding="utf-8")
+    resume = {"id": id_file.read_text(encoding="utf-8"), "resume": "allow"}
+    tracker = WandbLikeTracker(wandb, folder, settings, {"dir": str(folder), **resume})
     for phase in (IMITATION_PHASE, GRPO_PHASE):
         wandb.define_metric(f"{phase}/*", step_metric=f"{phase}/step")
     return tracker
@@ -79,10 +81,10 @@ def _wandb(folder: Path, settings: TrainSettings) -> Tracker:
 def _trackio(folder: Path, settings: TrainSettings) -> Tracker:
     import trackio
 
-    return Hosted(trackio, folder, settings, {})
+    return WandbLikeTracker(trackio, folder, settings, {})
 
 
-_MAKERS: Final[Mapping[TrackerKind, Callable[[Path, TrainSettings], Tracker]]] = {
+_TRACKERS: Final[Mapping[TrackerKind, Callable[[Path, TrainSettings], Tracker]]] = {
     TrackerKind.TENSORBOARD: TensorBoard,
     TrackerKind.WANDB: _wandb,
     TrackerKind.TRACKIO: _trackio,
@@ -91,24 +93,25 @@ _MAKERS: Final[Mapping[TrackerKind, Callable[[Path, TrainSettings], Tracker]]] =
 
 @contextlib.contextmanager
 def trackers_of(settings: TrainSettings, folder: Path) -> Iterator[Sequence[Tracker]]:
-    """The trackers that the settings name, closed at the end. Raises TrainerError where one can't be had."""
+    """Open the trackers in the settings and close them at the end. Raises TrainerError if one can't start."""
     with contextlib.ExitStack() as open_ones:
         found = []
         for kind in dict.fromkeys(settings.track):
-            tracker = _opened(kind, settings, folder)
+            tracker = _open(kind, settings, folder)
             open_ones.callback(tracker.close)
             found.append(tracker)
         yield tuple(found)
 
 
-def _opened(kind: TrackerKind, settings: TrainSettings, folder: Path) -> Tracker:
+def _open(kind: TrackerKind, settings: TrainSettings, folder: Path) -> Tracker:
     try:
-        return _MAKERS[kind](folder, settings)
+        return _TRACKERS[kind](folder, settings)
     except ImportError as error:
         raise TrainerError(
-            f"metrics can't go to {kind} ({reason_of(error)}): `pip install {kind}`, or leave out --track {kind}"
+            f"--track {kind}: the package is missing ({reason_of(error)}): `pip install {kind}`, or leave the option out"
         ) from error
-    except Exception as error:  # each raises its own: no account, no network, no rights
+    except Exception as error:  # each raises its own errors: no account, no network, no permission
         raise TrainerError(
-            f"{kind} can't be opened ({reason_of(error)}): set it up as it says, or leave out --track {kind}"
+            f"--track {kind}: can't start it ({reason_of(error)}): configure it as its documentation says, or leave the "
+            "option out"
         ) from error

@@ -1,12 +1,13 @@
-"""A small transformer in plain torch, whose prompt is read at once and runs once for all samples of its group.
+"""Small transformer in plain torch. A group's prompt is encoded once for all of its samples.
 
-Llama-like: RMS norms, rotary positions, gated feed-forward, tied embedding; queries and keys are normed before they meet (Henry
-et al. 2020). A word comes in with a share of the word before it, so that already the first layer can look for what follows an
-equal word. The last layer may also *point*: a part of the probability goes to words of the prompt, and to those of the plan so
-far, by attention (pointer networks; See et al. 2017, eq. 9). Naming an object that the instruction names, or the one that the
-plan went to, is then a matter of looking, for words seldom met as for frequent ones.
+Llama-like: RMS norms, rotary positions, gated feed-forward, tied embedding, and normalised queries and keys (Henry et al.
+2020). The prompt is a prefix: its tokens attend to each other in both directions. Each word's embedding contains a share
+of the previous word's, so the first layer can already match repeated contexts. The output layer can also *point*: part of
+the probability goes to words of the prompt and of the plan so far by attention (pointer networks; See et al. 2017,
+eq. 9). Copying an object name is then an attention lookup, for rare and frequent words alike.
 
-Shapes: Q prompts, G samples of each, P prompt tokens, T new tokens, H heads of width D, C = H * D.
+Shapes: Q prompts, G samples of each, P prompt tokens, T new tokens, S plan tokens so far, H heads of width D, C = H * D,
+V words.
 """
 
 from __future__ import annotations
@@ -18,20 +19,20 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from embomatrix.trainer.policy.products import Product
+from embomatrix.trainer.policy.compute_dtype import MixedLinear
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-_HIDDEN_KEY = -1e9
-_LEAST = 1e-9
-_OF_BEFORE = 0.3
-"""The share of the word before a word, at first."""
+_MASKED = -1e9
+_MIN_PROBABILITY = 1e-9
+_INITIAL_PREVIOUS_SHARE = 0.3
+"""Initial share of the previous word's embedding."""
 
 
 @dataclass(frozen=True, slots=True)
 class DecoderShape:
-    """Sizes of the network. ``width`` is a multiple of ``heads``."""
+    """Sizes of the network. ``width`` must be a multiple of ``heads``."""
 
     vocabulary: int
     layers: int = 4
@@ -45,110 +46,112 @@ class DecoderShape:
 
 
 @dataclass(frozen=True, slots=True)
-class LayerMemory:
-    """What one layer keeps of tokens it has seen: keys and values, both (rows, H, tokens, D)."""
+class LayerCache:
+    """Key-value cache of one layer. Keys and values: (rows, H, tokens, D)."""
 
     keys: Tensor
     values: Tensor
 
-    def of_rows(self, rows: Tensor) -> LayerMemory:
-        return LayerMemory(self.keys[rows], self.values[rows])
+    def select(self, rows: Tensor) -> LayerCache:
+        return LayerCache(self.keys[rows], self.values[rows])
 
 
 @dataclass(frozen=True, slots=True)
-class PromptMemory:
-    """A batch of prompts, run. ``tokens`` (Q, P); ``hidden`` (Q, P) is true on padding; ``lengths`` (Q,); ``last`` (Q, 1, C),
-    the last layer's state after the last token; ``pointers`` (Q, P, C), what a word is pointed at by."""
+class PromptCache:
+    """Encoded prompts.
 
-    layers: tuple[LayerMemory, ...]
+    ``tokens`` (Q, P); ``padding`` (Q, P), true on padding; ``lengths`` (Q,); ``last`` (Q, 1, C), hidden state of the last
+    layer at the last token; ``pointer_keys`` (Q, P, C), keys of the pointer attention.
+    """
+
+    layers: tuple[LayerCache, ...]
     tokens: Tensor
-    hidden: Tensor
+    padding: Tensor
     lengths: Tensor
     last: Tensor
-    pointers: Tensor
+    pointer_keys: Tensor
 
-    def of_rows(self, prompts: Tensor) -> PromptMemory:
-        """The prompts with these indices (rows,), each as often as it is named.
+    def select(self, prompts: Tensor) -> PromptCache:
+        """Return the prompts with these indices (rows,), which may repeat.
 
-        Rows that end at different lengths can then be run apart, as groups of one, without the padding of the longest.
+        Rows of different lengths can then be scored as groups of one, without padding to the longest.
         """
-        return PromptMemory(
-            tuple(layer.of_rows(prompts) for layer in self.layers),
+        return PromptCache(
+            tuple(layer.select(prompts) for layer in self.layers),
             self.tokens[prompts],
-            self.hidden[prompts],
+            self.padding[prompts],
             self.lengths[prompts],
             self.last[prompts],
-            self.pointers[prompts],
+            self.pointer_keys[prompts],
         )
 
 
 @dataclass(frozen=True, slots=True)
-class DecoderCache:
-    """Plans as far as they are run: what each layer keeps of them; ``tokens`` (rows, S); ``pointers`` (rows, S, C), what their
-    words are pointed at by."""
+class PlanCache:
+    """Cache of the plans so far: layer caches, ``tokens`` (rows, S) and ``pointer_keys`` (rows, S, C)."""
 
-    layers: tuple[LayerMemory, ...]
+    layers: tuple[LayerCache, ...]
     tokens: Tensor
-    pointers: Tensor
+    pointer_keys: Tensor
 
-    def of_rows(self, rows: Tensor) -> DecoderCache:
-        layers = tuple(layer.of_rows(rows) for layer in self.layers)
-        return DecoderCache(layers, self.tokens[rows], self.pointers[rows])
+    def select(self, rows: Tensor) -> PlanCache:
+        layers = tuple(layer.select(rows) for layer in self.layers)
+        return PlanCache(layers, self.tokens[rows], self.pointer_keys[rows])
 
 
 class _Block(nn.Module):
-    def __init__(self, shape: DecoderShape, products: torch.dtype) -> None:
+    def __init__(self, shape: DecoderShape, compute_dtype: torch.dtype) -> None:
         super().__init__()
         self.heads = shape.heads
-        self.before_attention = nn.RMSNorm(shape.width)
-        self.qkv = Product(shape.width, 3 * shape.width, products)
-        self.of_query = nn.RMSNorm(shape.width // shape.heads)
-        self.of_key = nn.RMSNorm(shape.width // shape.heads)
-        self.out = Product(shape.width, shape.width, products)
-        self.before_inner = nn.RMSNorm(shape.width)
-        self.gate_up = Product(shape.width, 2 * shape.inner, products)
-        self.down = Product(shape.inner, shape.width, products)
+        self.attention_norm = nn.RMSNorm(shape.width)
+        self.qkv = MixedLinear(shape.width, 3 * shape.width, compute_dtype)
+        self.query_norm = nn.RMSNorm(shape.width // shape.heads)
+        self.key_norm = nn.RMSNorm(shape.width // shape.heads)
+        self.out = MixedLinear(shape.width, shape.width, compute_dtype)
+        self.mlp_norm = nn.RMSNorm(shape.width)
+        self.gate_up = MixedLinear(shape.width, 2 * shape.inner, compute_dtype)
+        self.down = MixedLinear(shape.inner, shape.width, compute_dtype)
 
     def project(self, x: Tensor, rope: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Queries, keys and values (rows, H, T, D) of x (rows, T, C)."""
         rows, length, width = x.shape
-        product = self.qkv(self.before_attention(x)).to(x.dtype)
+        product = self.qkv(self.attention_norm(x)).to(x.dtype)
         split = product.view(rows, length, 3, self.heads, width // self.heads).permute(2, 0, 3, 1, 4)
-        normed = torch.stack([self.of_query(split[0]), self.of_key(split[1])])
-        q, k = _rotated(normed, rope)  # each (rows, H, T, D)
+        normed = torch.stack([self.query_norm(split[0]), self.key_norm(split[1])])
+        q, k = _rotate(normed, rope)  # each (rows, H, T, D)
         return q, k, split[2]
 
     def finish(self, x: Tensor, attended: Tensor) -> Tensor:
-        """Add attention's result (rows, H, T, D) and the feed-forward to x (rows, T, C)."""
+        """Add the attention output (rows, H, T, D) and the feed-forward output to x (rows, T, C)."""
         x = x + self.out(attended.transpose(1, 2).reshape(x.shape))
-        gate, up = self.gate_up(self.before_inner(x)).chunk(2, dim=-1)
+        gate, up = self.gate_up(self.mlp_norm(x)).chunk(2, dim=-1)
         return x + self.down(functional.silu(gate) * up)  # type: ignore[no-any-return]
 
 
-def _rotated(x: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
+def _rotate(x: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
     cos, sin = rope
     left, right = x.chunk(2, dim=-1)
     return x * cos + torch.cat([-right, left], dim=-1) * sin
 
 
 class Decoder(nn.Module):
-    """The network. ``read`` runs prompts, ``extend`` runs samples that continue them."""
+    """Network with two passes: ``encode_prompts``, and ``extend`` for the samples that continue them."""
 
     cos: Tensor
     sin: Tensor
 
     def __init__(
-        self, shape: DecoderShape, generator: torch.Generator, products: torch.dtype = torch.float32
+        self, shape: DecoderShape, generator: torch.Generator, compute_dtype: torch.dtype = torch.float32
     ) -> None:
         super().__init__()
         self.shape = shape
         self.embedding = nn.Embedding(shape.vocabulary, shape.width)
-        self.of_before = nn.Parameter(torch.full((shape.width,), _OF_BEFORE))
-        self.blocks = nn.ModuleList(_Block(shape, products) for _ in range(shape.layers))
+        self.previous_share = nn.Parameter(torch.full((shape.width,), _INITIAL_PREVIOUS_SHARE))
+        self.blocks = nn.ModuleList(_Block(shape, compute_dtype) for _ in range(shape.layers))
         self.norm = nn.RMSNorm(shape.width)
-        self.point_from = nn.Linear(shape.width, shape.width, bias=False)
-        self.point_to = nn.Linear(shape.width, shape.width, bias=False)
-        self.point_share = nn.Linear(shape.width, 1)
+        self.pointer_query = nn.Linear(shape.width, shape.width, bias=False)
+        self.pointer_key = nn.Linear(shape.width, shape.width, bias=False)
+        self.pointer_gate = nn.Linear(shape.width, 1)
         half = shape.width // shape.heads // 2
         angles = torch.outer(torch.arange(shape.longest).float(), 10000.0 ** (-torch.arange(half) / half))
         self.register_buffer("cos", angles.cos().repeat(1, 2), persistent=False)
@@ -158,126 +161,129 @@ class Decoder(nn.Module):
                 nn.init.normal_(parameter, std=0.02, generator=generator)
             if name.endswith(("out.weight", "down.weight")):
                 parameter.data /= (2 * shape.layers) ** 0.5
-        nn.init.zeros_(self.point_share.bias)
+        nn.init.zeros_(self.pointer_gate.bias)
 
     def scores(
-        self, states: Tensor, prompt: PromptMemory, written: DecoderCache | None, barred: Tensor
+        self, states: Tensor, prompt: PromptCache, plan: PlanCache | None, token_mask: Tensor
     ) -> Tensor:
-        """Scores (Q * G, T, V), whose softmax says what comes after hidden states (Q * G, T, C); words in ``barred``, of that
-        shape, get none.
+        """Log scores (Q * G, T, V) of the next words for hidden states (Q * G, T, C). ``token_mask`` (Q * G, T, V): words "
+        "to exclude.
 
-        The states are the last T of those after the prompt and after each word that is ``written``.
+        The hidden states are the last T of those after the prompt and after each word of ``plan``.
         """
         x = self.norm(states)
-        generated = torch.softmax((x @ self.embedding.weight.t()).masked_fill(barred, _HIDDEN_KEY), dim=-1)
-        attention, words = self._pointed(x, prompt, written, barred)
+        generated = torch.softmax((x @ self.embedding.weight.t()).masked_fill(token_mask, _MASKED), dim=-1)
+        attention, words = self._point(x, prompt, plan, token_mask)
         pointed = torch.zeros_like(generated).scatter_add(2, words, attention)
-        share = torch.sigmoid(self.point_share(x))  # (Q G, T, 1)
-        mixed = torch.lerp(generated, pointed, share)
-        return mixed.clamp(min=_LEAST).log().masked_fill(barred, _HIDDEN_KEY)
+        gate = torch.sigmoid(self.pointer_gate(x))  # (Q G, T, 1)
+        mixed = torch.lerp(generated, pointed, gate)
+        return mixed.clamp(min=_MIN_PROBABILITY).log().masked_fill(token_mask, _MASKED)
 
-    def _pointed(
-        self, x: Tensor, prompt: PromptMemory, written: DecoderCache | None, barred: Tensor
+    def _point(
+        self, x: Tensor, prompt: PromptCache, plan: PlanCache | None, token_mask: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Where normed states point: probabilities of places, those of the prompt first, and the words there; both
-        (Q * G, T, P + S). Where all words are barred, nowhere."""
+        """Pointer attention of normalised states: probabilities of positions, prompt first, and their words; both (Q * G, "
+        "T, P + S).
+
+        All probabilities are 0 if every word is masked.
+        """
         rows, length, width = x.shape
         prompts, prompt_length = prompt.tokens.shape
-        asked = self.point_from(x) * width**-0.5  # (Q G, T, C)
-        looked = (asked.view(prompts, -1, width) @ prompt.pointers.transpose(1, 2)).view(rows, length, -1)
+        query = self.pointer_query(x) * width**-0.5  # (Q G, T, C)
+        logits = (query.view(prompts, -1, width) @ prompt.pointer_keys.transpose(1, 2)).view(rows, length, -1)
         group = rows // prompts
         words = prompt.tokens.repeat_interleave(group, dim=0)[:, None].expand(rows, length, prompt_length)
-        hidden = prompt.hidden.repeat_interleave(group, dim=0)[:, None].expand(rows, length, prompt_length)
-        if written:
-            count = written.tokens.shape[1]
-            later = torch.ones(length, count, dtype=torch.bool, device=x.device).triu(count - length + 1)
-            looked = torch.cat([looked, asked @ written.pointers.transpose(1, 2)], dim=2)
-            words = torch.cat([words, written.tokens[:, None].expand(rows, length, count)], dim=2)
-            hidden = torch.cat([hidden, later.expand(rows, length, count)], dim=2)
-        nowhere = hidden | barred.gather(2, words)
-        # Nothing, rather than everything alike, where no place is left: the softmax of the scores makes up for it.
-        attention = torch.softmax(looked.masked_fill(nowhere, _HIDDEN_KEY), dim=-1)
-        return attention.masked_fill(nowhere, 0.0), words
+        padding = prompt.padding.repeat_interleave(group, dim=0)[:, None].expand(rows, length, prompt_length)
+        if plan:
+            count = plan.tokens.shape[1]
+            future = torch.ones(length, count, dtype=torch.bool, device=x.device).triu(count - length + 1)
+            logits = torch.cat([logits, query @ plan.pointer_keys.transpose(1, 2)], dim=2)
+            words = torch.cat([words, plan.tokens[:, None].expand(rows, length, count)], dim=2)
+            padding = torch.cat([padding, future.expand(rows, length, count)], dim=2)
+        excluded = padding | token_mask.gather(2, words)
+        # If no position is left: zeros, not a uniform distribution. The softmax over the scores renormalises.
+        attention = torch.softmax(logits.masked_fill(excluded, _MASKED), dim=-1)
+        return attention.masked_fill(excluded, 0.0), words
 
     def _rope(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """positions: (rows, T)."""
+        """Cosines and sines for positions (rows, T)."""
         return self.cos[positions][:, None], self.sin[positions][:, None]
 
-    def _in_line(self, words: Tensor, before: Tensor) -> Tensor:
-        """What comes in (rows, T, C) of words, of that shape, where the first of each row follows ``before`` (rows, 1, C)."""
-        return words + self.of_before * torch.cat([before, words[:, :-1]], dim=1)
+    def _embed(self, words: Tensor, before: Tensor) -> Tensor:
+        """Mix each word (rows, T, C) with the previous one. ``before`` (rows, 1, C) precedes the first."""
+        return words + self.previous_share * torch.cat([before, words[:, :-1]], dim=1)
 
-    def read(self, tokens: Tensor, hidden: Tensor) -> PromptMemory:
-        """tokens (Q, P), padded on the left; hidden (Q, P) is true on the padding."""
-        lengths = (~hidden).sum(dim=1)
-        positions = ((~hidden).cumsum(dim=1) - 1).clamp(min=0)
+    def encode_prompts(self, tokens: Tensor, padding: Tensor) -> PromptCache:
+        """Encode tokens (Q, P), padded on the left. padding (Q, P) is true on the padding."""
+        lengths = (~padding).sum(dim=1)
+        positions = ((~padding).cumsum(dim=1) - 1).clamp(min=0)
         rope = self._rope(positions)
-        bias = (hidden.float() * _HIDDEN_KEY)[:, None, None]  # (Q, 1, 1, P): a token sees the whole prompt
-        words = self.embedding(tokens).masked_fill(hidden[..., None], 0.0)
-        x = self._in_line(words, torch.zeros_like(words[:, :1]))
-        memories = []
+        bias = (padding.float() * _MASKED)[
+            :, None, None
+        ]  # (Q, 1, 1, P): no causal mask, the prompt is a prefix
+        words = self.embedding(tokens).masked_fill(padding[..., None], 0.0)
+        x = self._embed(words, torch.zeros_like(words[:, :1]))
+        caches = []
         for block in self.blocks:
             q, k, v = block.project(x, rope)  # type: ignore[operator]
             attended = functional.scaled_dot_product_attention(q, k, v, attn_mask=bias)
             x = block.finish(x, attended)  # type: ignore[operator]
-            memories.append(LayerMemory(k, v))
-        pointers = self.point_to(self.norm(x))
-        return PromptMemory(tuple(memories), tokens, hidden, lengths, x[:, -1:], pointers)
+            caches.append(LayerCache(k, v))
+        pointer_keys = self.pointer_key(self.norm(x))
+        return PromptCache(tuple(caches), tokens, padding, lengths, x[:, -1:], pointer_keys)
 
-    def extend(
-        self, prompt: PromptMemory, tokens: Tensor, written: DecoderCache | None
-    ) -> tuple[Tensor, DecoderCache]:
-        """Hidden states (Q * G, T, C) of tokens (Q * G, T) that follow what is ``written`` after their prompts.
+    def extend(self, prompt: PromptCache, tokens: Tensor, plan: PlanCache | None) -> tuple[Tensor, PlanCache]:
+        """Return hidden states (Q * G, T, C) of tokens (Q * G, T) that follow ``plan``, and the extended plan cache.
 
-        ``written`` is what ``extend`` gave for the samples' own earlier tokens, None at the first.
+        ``plan`` is the cache from the previous call, None for the first tokens.
         """
         rows, length = tokens.shape
-        start = written.tokens.shape[1] if written else 0
+        start = plan.tokens.shape[1] if plan else 0
         group = rows // prompt.lengths.shape[0]
         begin = prompt.lengths.repeat_interleave(group)[:, None] + start
         rope = self._rope(begin + torch.arange(length, device=tokens.device))
-        bias = prompt.hidden[:, None, None, None, :].float() * _HIDDEN_KEY
-        later = torch.ones(length, length, dtype=torch.bool, device=tokens.device).triu(1)
-        last = written.tokens[:, -1] if written else prompt.tokens[:, -1].repeat_interleave(group)
-        x = self._in_line(self.embedding(tokens), self.embedding(last)[:, None])
-        memories = []
-        for index, (block, shared) in enumerate(zip(self.blocks, prompt.layers, strict=True)):
+        bias = prompt.padding[:, None, None, None, :].float() * _MASKED
+        future = torch.ones(length, length, dtype=torch.bool, device=tokens.device).triu(1)
+        last = plan.tokens[:, -1] if plan else prompt.tokens[:, -1].repeat_interleave(group)
+        x = self._embed(self.embedding(tokens), self.embedding(last)[:, None])
+        caches = []
+        for index, (block, prompt_cache) in enumerate(zip(self.blocks, prompt.layers, strict=True)):
             q, k, v = block.project(x, rope)  # type: ignore[operator]
-            if written:
-                own = written.layers[index]
+            if plan:
+                own = plan.layers[index]
                 k, v = torch.cat([own.keys, k], dim=2), torch.cat([own.values, v], dim=2)
-            attended = _attend(q, shared, k, v, bias, later)
+            attended = _attend(q, prompt_cache, k, v, bias, future)
             x = block.finish(x, attended)  # type: ignore[operator]
-            memories.append(LayerMemory(k, v))
-        pointers = self.point_to(self.norm(x))
-        if written:
-            tokens = torch.cat([written.tokens, tokens], dim=1)
-            pointers = torch.cat([written.pointers, pointers], dim=1)
-        return x, DecoderCache(tuple(memories), tokens, pointers)
+            caches.append(LayerCache(k, v))
+        pointer_keys = self.pointer_key(self.norm(x))
+        if plan:
+            tokens = torch.cat([plan.tokens, tokens], dim=1)
+            pointer_keys = torch.cat([plan.pointer_keys, pointer_keys], dim=1)
+        return x, PlanCache(tuple(caches), tokens, pointer_keys)
 
 
 def _attend(
-    q: Tensor, shared: LayerMemory, keys: Tensor, values: Tensor, bias: Tensor, later: Tensor
+    q: Tensor, prompt_cache: LayerCache, keys: Tensor, values: Tensor, bias: Tensor, future: Tensor
 ) -> Tensor:
-    """Attention over the group's prompt and the sample's own tokens; the prompt's keys are never repeated.
+    """Attention over the group's prompt and the sample's own tokens, without repeating the prompt's keys.
 
-    q: (Q G, H, T, D); keys, values: (Q G, H, S, D) with the T newest last; result as q.
+    q: (Q G, H, T, D); keys, values: (Q G, H, S, D) with the T newest last. Returns the shape of q.
     """
     rows, heads, length, depth = q.shape
-    prompts, _, prompt_length, _ = shared.keys.shape
+    prompts, _, prompt_length, _ = prompt_cache.keys.shape
     group = rows // prompts
-    asked = (q * depth**-0.5).view(prompts, group, heads, length, depth).transpose(1, 2)  # (Q, H, G, T, D)
-    flat = asked.reshape(prompts, heads, group * length, depth)
-    to_prompt = (flat @ shared.keys.transpose(-1, -2)).view(
+    query = (q * depth**-0.5).view(prompts, group, heads, length, depth).transpose(1, 2)  # (Q, H, G, T, D)
+    flat = query.reshape(prompts, heads, group * length, depth)
+    to_prompt = (flat @ prompt_cache.keys.transpose(-1, -2)).view(
         prompts, heads, group, length, prompt_length
     ) + bias
     own_keys = keys.view(prompts, group, heads, -1, depth).transpose(1, 2)  # (Q, H, G, S, D)
     own_values = values.view(prompts, group, heads, -1, depth).transpose(1, 2)
-    to_own = asked @ own_keys.transpose(-1, -2)  # (Q, H, G, T, S)
+    to_own = query @ own_keys.transpose(-1, -2)  # (Q, H, G, T, S)
     if length > 1:
-        to_own = to_own.masked_fill(later, _HIDDEN_KEY)
+        to_own = to_own.masked_fill(future, _MASKED)
     weights = torch.softmax(torch.cat([to_prompt, to_own], dim=-1), dim=-1)
     over_prompt = weights[..., :prompt_length].reshape(prompts, heads, group * length, prompt_length)
-    result = (over_prompt @ shared.values).view(prompts, heads, group, length, depth)
+    result = (over_prompt @ prompt_cache.values).view(prompts, heads, group, length, depth)
     result = result + weights[..., prompt_length:] @ own_values
     return result.transpose(1, 2).reshape(rows, heads, length, depth)

@@ -1,7 +1,7 @@
-"""What may follow in a plan of the ``names`` codec: a policy that is held to it calls nothing that it was not told of.
+"""Token masks that keep plans in the ``names`` codec valid: only existing skills, objects and rooms can be sampled.
 
-A grammar is bound to a vocabulary, ``Names`` to a batch of prompts. Both are tables, so that the words which may come next
-are looked up for all rows at once.
+``PlanGrammar`` belongs to a vocabulary, ``PromptNames`` to a batch of prompts. Both are lookup tables, so the masks of
+all rows are computed at once.
 
 Shapes: Q prompts of P tokens, R rows (plans), T tokens of a plan, V words, N number words (``_0`` ``_1`` ...).
 """
@@ -15,147 +15,154 @@ from typing import TYPE_CHECKING, Final
 import torch
 
 from embomatrix.skills.syntax import SIGNATURES, Arg, PlaceRelation
-from embomatrix.trainer.policy.words import BREAK, END, PAD
+from embomatrix.trainer.policy.vocabulary import BREAK, END, PAD
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from torch import Tensor
 
-    from embomatrix.trainer.policy.words import Vocabulary
+    from embomatrix.trainer.policy.vocabulary import Vocabulary
 
 
-class _Place(IntEnum):
-    """Places of a call, by what may stand there."""
+class _Expects(IntEnum):
+    """Kind of token that a call expects next."""
 
     SKILL = 0
-    THING = 1
+    OBJECT = 1
     ROOM = 2
     RELATION = 3
     QUANTITY = 4
     CALL_END = 5
 
 
-_PLACE_OF: Final[Mapping[Arg, _Place]] = {
-    Arg.OBJECT: _Place.THING,
-    Arg.SOURCE: _Place.THING,
-    Arg.RELATION: _Place.RELATION,
-    Arg.YAW: _Place.QUANTITY,
-    Arg.DISTANCE: _Place.QUANTITY,
-    Arg.ROOM: _Place.ROOM,
+_EXPECTS_OF: Final[Mapping[Arg, _Expects]] = {
+    Arg.OBJECT: _Expects.OBJECT,
+    Arg.SOURCE: _Expects.OBJECT,
+    Arg.RELATION: _Expects.RELATION,
+    Arg.YAW: _Expects.QUANTITY,
+    Arg.DISTANCE: _Expects.QUANTITY,
+    Arg.ROOM: _Expects.ROOM,
 }
-_MOST_PLACES: Final = max(map(len, SIGNATURES.values())) + 1
+_MAX_ARGUMENTS: Final = max(map(len, SIGNATURES.values())) + 1
 
 
 @dataclass(frozen=True, slots=True)
-class Names:
-    """The names that prompts tell.
+class PromptNames:
+    """Names of objects and rooms in a batch of prompts.
 
-    ``heads`` (Q, 2, V): first words of names of things and of rooms. ``bare`` (Q, V): those that are names by themselves.
-    ``numbers`` (Q, V, N): number words that may follow a first word.
+    ``stems`` (Q, 2, V): first words of object names and of room names. ``unnumbered`` (Q, V): first words that are complete
+    names. ``numbers`` (Q, V, N): number words that may follow a first word.
     """
 
-    heads: Tensor
-    bare: Tensor
+    stems: Tensor
+    unnumbered: Tensor
     numbers: Tensor
 
-    def of_rows(self, prompts: Tensor) -> Names:
-        """The prompts with these indices (R,), each as often as it is named."""
-        return Names(self.heads[prompts], self.bare[prompts], self.numbers[prompts])
+    def select(self, prompts: Tensor) -> PromptNames:
+        """Names of the prompts with these indices (R,). Indices may repeat."""
+        return PromptNames(self.stems[prompts], self.unnumbered[prompts], self.numbers[prompts])
 
 
 @dataclass(frozen=True, slots=True)
-class Cursor:
-    """Where plans stand, all (R,): the skill of the call begun (PAD: none), its places filled, and the first word of a name
-    that may still get a number (PAD: none)."""
+class GrammarState:
+    """Position in each plan, all (R,): skill of the current call (PAD: none), number of its arguments so far, and the stem of a
+    name that may still get a number (PAD: none).
+    """
 
     skill: Tensor
-    filled: Tensor
-    head: Tensor
+    arguments: Tensor
+    open_stem: Tensor
 
-    def of_rows(self, rows: Tensor) -> Cursor:
-        return Cursor(self.skill[rows], self.filled[rows], self.head[rows])
+    def select(self, rows: Tensor) -> GrammarState:
+        return GrammarState(self.skill[rows], self.arguments[rows], self.open_stem[rows])
 
 
 class PlanGrammar:
-    """Tables over one vocabulary."""
+    """Grammar tables of one vocabulary."""
 
     def __init__(self, vocabulary: Vocabulary, device: torch.device) -> None:
         size, index = len(vocabulary), vocabulary.index
         self._break, self._task = index[BREAK], index["task"]
-        self._numbers = torch.tensor(vocabulary.numbers, dtype=torch.long, device=device)  # (N,)
-        self._number_at = torch.full((size,), -1, device=device)
-        self._number_at[self._numbers] = torch.arange(len(self._numbers), device=device)
-        self._named = torch.zeros(2, size, dtype=torch.bool, device=device)
-        self._named[0, list(vocabulary.things)] = True
-        self._named[1, list(vocabulary.rooms)] = True
-        self._places = torch.full((size, _MOST_PLACES), int(_Place.SKILL), device=device)
-        self._fixed = torch.zeros(len(_Place), size, dtype=torch.bool, device=device)
+        self._numbers = torch.tensor(vocabulary.number_tokens, dtype=torch.long, device=device)  # (N,)
+        self._number_index = torch.full((size,), -1, device=device)
+        self._number_index[self._numbers] = torch.arange(len(self._numbers), device=device)
+        self._stems = torch.zeros(2, size, dtype=torch.bool, device=device)
+        self._stems[0, list(vocabulary.object_tokens)] = True
+        self._stems[1, list(vocabulary.room_tokens)] = True
+        self._arguments = torch.full((size, _MAX_ARGUMENTS), int(_Expects.SKILL), device=device)
+        self._fixed = torch.zeros(len(_Expects), size, dtype=torch.bool, device=device)
         for skill, signature in SIGNATURES.items():
             if skill.value in index:
-                places = [*(_PLACE_OF[argument] for argument in signature), _Place.CALL_END]
-                self._places[index[skill.value], : len(places)] = torch.tensor(places, device=device)
-                self._fixed[_Place.SKILL, index[skill.value]] = True
-        self._fixed[_Place.RELATION, [index[relation.value] for relation in PlaceRelation]] = True
-        self._fixed[_Place.QUANTITY, list(vocabulary.quantities)] = True
-        self._fixed[_Place.CALL_END, [self._break, END]] = True
+                arguments = [*(_EXPECTS_OF[argument] for argument in signature), _Expects.CALL_END]
+                self._arguments[index[skill.value], : len(arguments)] = torch.tensor(arguments, device=device)
+                self._fixed[_Expects.SKILL, index[skill.value]] = True
+        self._fixed[_Expects.RELATION, [index[relation.value] for relation in PlaceRelation]] = True
+        self._fixed[_Expects.QUANTITY, list(vocabulary.quantity_tokens)] = True
+        self._fixed[_Expects.CALL_END, [self._break, END]] = True
 
-    def names(self, prompts: Tensor) -> Names:
-        """The names in prompts (Q, P): those before the line that tells the task."""
-        count, size = len(prompts), len(self._number_at)
+    def prompt_names(self, prompts: Tensor) -> PromptNames:
+        """Collect the names in prompts (Q, P), up to the line with the instruction."""
+        count, size = len(prompts), len(self._number_index)
         lines = torch.roll(prompts, 1, dims=1) == self._break
-        told = ((prompts == self._task) & lines).flip(1).cumsum(dim=1).flip(1) > 0  # (Q, P): before the task
-        number = torch.roll(self._number_at[prompts], -1, dims=1)  # (Q, P): of the word after
+        in_table = ((prompts == self._task) & lines).flip(1).cumsum(dim=1).flip(
+            1
+        ) > 0  # (Q, P): before the task
+        number = torch.roll(self._number_index[prompts], -1, dims=1)  # (Q, P): of the word after
         number[:, -1] = -1
-        heads = torch.zeros(count, 2, size, dtype=torch.bool, device=prompts.device)
-        bare = torch.zeros(count, size, dtype=torch.bool, device=prompts.device)
+        stems = torch.zeros(count, 2, size, dtype=torch.bool, device=prompts.device)
+        unnumbered = torch.zeros(count, size, dtype=torch.bool, device=prompts.device)
         numbers = torch.zeros(count, size, len(self._numbers), dtype=torch.bool, device=prompts.device)
         for kind in range(2):
-            row, at = (told & self._named[kind][prompts]).nonzero(as_tuple=True)
+            row, at = (in_table & self._stems[kind][prompts]).nonzero(as_tuple=True)
             word, follows = prompts[row, at], number[row, at]
-            heads[row, kind, word] = True
-            bare[row[follows < 0], word[follows < 0]] = True
+            stems[row, kind, word] = True
+            unnumbered[row[follows < 0], word[follows < 0]] = True
             numbers[row[follows >= 0], word[follows >= 0], follows[follows >= 0]] = True
-        return Names(heads, bare, numbers)
+        return PromptNames(stems, unnumbered, numbers)
 
-    def start(self, rows: int) -> Cursor:
-        """Plans of which nothing is written."""
-        nothing = torch.full((rows,), PAD, device=self._number_at.device)
-        return Cursor(nothing, torch.zeros_like(nothing), nothing)
+    def start(self, rows: int) -> GrammarState:
+        """State of empty plans."""
+        nothing = torch.full((rows,), PAD, device=self._number_index.device)
+        return GrammarState(nothing, torch.zeros_like(nothing), nothing)
 
-    def advanced(self, cursor: Cursor, tokens: Tensor) -> Cursor:
-        """After one more token of each plan (R,)."""
-        begins = cursor.skill == PAD
+    def advance(self, state: GrammarState, tokens: Tensor) -> GrammarState:
+        """State after one more token of each plan (R,)."""
+        begins = state.skill == PAD
         ends = tokens == self._break
-        joins = self._number_at[tokens] >= 0
-        place = self._places[cursor.skill, cursor.filled]
-        named = (place == _Place.THING) | (place == _Place.ROOM)
-        fills = ~begins & ~joins & (place != _Place.CALL_END)
-        skill = torch.where(begins, tokens, cursor.skill).masked_fill(ends, PAD)
-        filled = (cursor.filled + fills).clamp(max=_MOST_PLACES - 1).masked_fill(ends, 0)
-        head = torch.where(fills & named, tokens, PAD)
-        return Cursor(skill, filled, head)
+        joins = self._number_index[tokens] >= 0
+        argument = self._arguments[state.skill, state.arguments]
+        named = (argument == _Expects.OBJECT) | (argument == _Expects.ROOM)
+        fills = ~begins & ~joins & (argument != _Expects.CALL_END)
+        skill = torch.where(begins, tokens, state.skill).masked_fill(ends, PAD)
+        arguments = (state.arguments + fills).clamp(max=_MAX_ARGUMENTS - 1).masked_fill(ends, 0)
+        open_stem = torch.where(fills & named, tokens, PAD)
+        return GrammarState(skill, arguments, open_stem)
 
-    def barred(self, cursor: Cursor, names: Names) -> Tensor:
-        """Words (R, V) that may not come next; ``names`` are those of each row's prompt. A plan may always end where
-        nothing else could follow."""
-        place = self._places[cursor.skill, cursor.filled]
-        rows = torch.arange(len(place), device=place.device)
-        allowed = self._fixed[place]
-        allowed = allowed | (names.heads[:, 0] & (place == _Place.THING)[:, None])
-        allowed = allowed | (names.heads[:, 1] & (place == _Place.ROOM)[:, None])
-        open_name = cursor.head != PAD
-        allowed = allowed & (~open_name | names.bare[rows, cursor.head])[:, None]
-        allowed[:, self._numbers] |= names.numbers[rows, cursor.head] & open_name[:, None]
+    def token_mask(self, state: GrammarState, names: PromptNames) -> Tensor:
+        """Return the words (R, V) that must not come next. ``names`` belong to each row's prompt.
+
+        The end token is allowed if nothing else is.
+        """
+        argument = self._arguments[state.skill, state.arguments]
+        rows = torch.arange(len(argument), device=argument.device)
+        allowed = self._fixed[argument]
+        allowed = allowed | (names.stems[:, 0] & (argument == _Expects.OBJECT)[:, None])
+        allowed = allowed | (names.stems[:, 1] & (argument == _Expects.ROOM)[:, None])
+        open_name = state.open_stem != PAD
+        allowed = allowed & (~open_name | names.unnumbered[rows, state.open_stem])[:, None]
+        allowed[:, self._numbers] |= names.numbers[rows, state.open_stem] & open_name[:, None]
         allowed[:, END] |= ~allowed.any(dim=1)
         return ~allowed
 
-    def barred_along(self, tokens: Tensor, names: Names) -> Tensor:
-        """Words (R, T, V) that may not stand at each place of plans (R, T). What does stand there is never barred, so that
-        a plan that breaks the grammar has a likelihood all the same."""
-        cursor = self.start(len(tokens))
+    def token_masks(self, tokens: Tensor, names: PromptNames) -> Tensor:
+        """Return the words (R, T, V) that must not stand at each position of plans (R, T).
+
+        The plans' own tokens are never masked, so a plan that breaks the grammar still has a likelihood.
+        """
+        state = self.start(len(tokens))
         masks = []
         for at in range(tokens.shape[1]):
-            masks.append(self.barred(cursor, names))
-            cursor = self.advanced(cursor, tokens[:, at])
+            masks.append(self.token_mask(state, names))
+            state = self.advance(state, tokens[:, at])
         return torch.stack(masks, dim=1).scatter(2, tokens[:, :, None], False)

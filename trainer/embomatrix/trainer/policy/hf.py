@@ -1,26 +1,27 @@
-"""Any causal language model of Hugging Face, by name or folder. transformers is imported when one is asked for.
+"""Causal language models of Hugging Face, by name or folder. transformers is imported on first use.
 
-A group's prompt runs once, in sampling and in the update: its cache is repeated for the samples inside autograd, which gives
-the gradients of the plain computation at a third of the time.
+A group's prompt runs once, in sampling and in the update. Its key-value cache is repeated for the samples inside
+autograd, which gives the gradients of the plain computation in a third of the time.
 """
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import functools
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import torch
+from torch.utils.checkpoint import checkpoint
 
 from embomatrix.skills.prompt import Codec
-from embomatrix.trainer.policy.drawing import draw
-from embomatrix.trainer.policy.lora import adapt, load_adapters, merged, save_adapters
-from embomatrix.trainer.policy.products import multiply_in, type_of, unchanged
-from embomatrix.trainer.policy.protocol import Samples, Scored
-from embomatrix.trainer.policy.recompute import recomputing
-from embomatrix.trainer.run.errors import TrainerError, reason_of
-from embomatrix.trainer.run.settings import Products
+from embomatrix.trainer.config.errors import TrainerError, reason_of
+from embomatrix.trainer.config.settings import ComputeDtype
+from embomatrix.trainer.policy.compute_dtype import frozen_weights, torch_dtype, use_compute_dtype
+from embomatrix.trainer.policy.lora import add_adapters, load_adapters, save_adapters
+from embomatrix.trainer.policy.protocol import Samples, TokenScores, draw, pad_left
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -28,10 +29,10 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from embomatrix.skills.prompt import Prompt
-    from embomatrix.trainer.policy.lora import LoraShape
+    from embomatrix.trainer.config.settings import LoraSettings
     from embomatrix.trainer.policy.protocol import Tokens
 
-LOOK_UP_S: Final = 10.0
+HUB_TIMEOUT_S: Final = 10.0
 TOKENIZERS: Final = (
     "tokenizer.json",
     "tokenizer_config.json",
@@ -40,25 +41,26 @@ TOKENIZERS: Final = (
     "vocab.json",
     "vocab.txt",
 )
-"""Files of which a folder with a tokenizer has at least one."""
+"""Tokenizer files. A model folder holds at least one of them."""
 CONFIG: Final = "config.json"
 CODEC_KEY: Final = "embomatrix_codec"
-"""What a model's configuration says of the codec that it was taught in."""
+"""Key in the model's config.json for the codec that it was trained in."""
 REMEDY: Final = "pass `tiny`, a folder with config.json, or a Hugging Face name; `embomatrix model import-gguf` makes a folder"
 
 
 class HfPolicy:
-    """``model`` and ``tokenizer`` as transformers loads them; plans are written in ``codec``.
+    """Policy over a transformers model and tokenizer.
 
-    ``recompute`` trades time for memory in the update: layers are computed twice, and the prompt once for each plan.
+    ``gradient_checkpointing`` trades time for memory in the update: each layer is computed twice, and a group's prompt once
+    per plan.
     """
 
     def __init__(
-        self, model: Any, tokenizer: Any, codec: Codec, name: str, *, recompute: bool = False
+        self, model: Any, tokenizer: Any, codec: Codec, name: str, *, gradient_checkpointing: bool = False
     ) -> None:
         self._model = model.eval()
-        self._recompute = recompute
-        self._lora: LoraShape | None = None
+        self._gradient_checkpointing = gradient_checkpointing
+        self._has_adapters = False
         self._tokenizer = tokenizer
         self._codec = codec
         self._name = name
@@ -72,45 +74,45 @@ class HfPolicy:
         codec: Codec,
         *,
         device: str = "cpu",
-        products: Products = Products.AUTO,
+        compute_dtype: ComputeDtype = ComputeDtype.AUTO,
         label: str = "",
-        recompute: bool = False,
+        gradient_checkpointing: bool = False,
     ) -> HfPolicy:
-        """Read a model by name or folder; on a processor its layers multiply in ``products``.
+        """Load a model by name or folder. On a CPU its linear layers multiply in ``compute_dtype``.
 
-        Raises TrainerError with a remedy where that fails.
+        Raises TrainerError with a remedy.
         """
         try:
-            _look_up(str(name))
+            _check_available(str(name))
             from transformers import AutoModelForCausalLM, AutoTokenizer
             from transformers.utils import logging as transformers_logging
         except ImportError as error:
-            absent = "" if Path(name).is_dir() else " is no folder here, and one by a Hugging Face name"
+            absent = "" if Path(name).is_dir() else " is not a folder, and a Hugging Face model"
             raise TrainerError(
                 f"the model {str(name)!r}{absent} needs transformers: `pip install 'embomatrix[hf]'`, or --model tiny"
             ) from error
-        # Its bars would be drawn into ours.
+        # Its progress bars would mix with ours.
         transformers_logging.disable_progress_bar()  # type: ignore[no-untyped-call]
         dtype = torch.float32 if device == "cpu" else torch.bfloat16
         try:
             tokenizer = AutoTokenizer.from_pretrained(str(name))
             model: Any = AutoModelForCausalLM.from_pretrained(str(name), dtype=dtype)
             model.to(device)
-        except Exception as error:  # the readers of weights and of tokenizers have errors of their own
+        except Exception as error:  # readers of weights and tokenizers raise their own errors
             raise TrainerError(
                 f"the model {str(name)!r} can't be loaded ({reason_of(error)}): {REMEDY}"
             ) from error
-        multiplied = type_of(products, device)
-        if multiplied is not dtype and device == "cpu":
-            multiply_in(model, multiplied, model.get_output_embeddings())
-        return cls(model, tokenizer, codec, label or str(name), recompute=recompute)
+        cast_to = torch_dtype(compute_dtype, device)
+        if cast_to is not dtype and device == "cpu":
+            use_compute_dtype(model, cast_to, model.get_output_embeddings())
+        return cls(model, tokenizer, codec, label or str(name), gradient_checkpointing=gradient_checkpointing)
 
-    def adapt(self, shape: LoraShape, *, seed: int, saved: Path | None = None) -> None:
-        """From now on adapters learn and the model does not. ``saved``: a folder to take them from. Raises TrainerError."""
-        adapt(self._model, shape, seed=seed, head=self._model.get_output_embeddings())
-        self._lora = shape
+    def adapt(self, lora: LoraSettings, *, seed: int, saved: Path | None = None) -> None:
+        """Freeze the model and train low-rank adapters, new ones or those in the folder ``saved``. Raises TrainerError."""
+        self._model = add_adapters(self._model, lora, seed=seed)
+        self._has_adapters = True
         if saved is not None:
-            load_adapters(self._model, shape, saved)
+            load_adapters(self._model, saved)
 
     @property
     def name(self) -> str:
@@ -125,12 +127,12 @@ class HfPolicy:
         return self._model  # type: ignore[no-any-return]
 
     def parameters(self) -> Iterator[nn.Parameter]:
-        """Those that learn; of a frozen copy, all."""
+        """Trainable parameters. For a frozen copy: all parameters."""
         learning = [parameter for parameter in self.module.parameters() if parameter.requires_grad]
         return iter(learning or self.module.parameters())
 
     def encode(self, prompt: Prompt) -> Tokens:
-        """The chat template's text where the model has one, else system and user text and a cue."""
+        """Apply the chat template if the model has one, else join system text, user text and "Plan:"."""
         if getattr(self._tokenizer, "chat_template", None):
             messages = [
                 {"role": "system", "content": prompt.system},
@@ -156,7 +158,7 @@ class HfPolicy:
         max_new: int,
         generator: torch.Generator,
     ) -> Samples:
-        with unchanged(self._model):
+        with frozen_weights(self._model):
             cache, mask, scores = self._read(prompts, group)
             rows = scores.shape[0]
             lengths = mask.sum(dim=1)  # (rows,)
@@ -179,16 +181,16 @@ class HfPolicy:
 
     def logprobs(
         self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor, group: int, temperature: float
-    ) -> Scored:
-        again = self._recompute and torch.is_grad_enabled()
-        scores = (self._scores_recomputed if again else self._scores)(prompts, tokens, group)
-        spread = torch.log_softmax(scores / (temperature or 1.0), dim=-1)  # (rows, T, V)
-        chosen = spread.gather(-1, tokens[..., None])[..., 0]
-        entropy = -(spread.exp() * spread).sum(dim=-1)
-        return Scored(chosen * mask, entropy * mask)
+    ) -> TokenScores:
+        recompute = self._gradient_checkpointing and torch.is_grad_enabled()
+        scores = (self._scores_recomputed if recompute else self._scores)(prompts, tokens, group)
+        distribution = torch.log_softmax(scores / (temperature or 1.0), dim=-1)  # (rows, T, V)
+        chosen = distribution.gather(-1, tokens[..., None])[..., 0]
+        entropy = -(distribution.exp() * distribution).sum(dim=-1)
+        return TokenScores(chosen * mask, entropy * mask)
 
     def _scores(self, prompts: Sequence[Tokens], tokens: Tensor, group: int) -> Tensor:
-        """Scores (rows, T, V) of each of the tokens (rows, T), a group's prompt run once."""
+        """Scores (rows, T, V) of each token (rows, T). The prompt of a group runs once."""
         cache, prompt_mask, first = self._read(prompts, group)
         scores = first[:, None]  # (rows, 1, V)
         length = tokens.shape[1]
@@ -200,12 +202,13 @@ class HfPolicy:
         return scores
 
     def _scores_recomputed(self, prompts: Sequence[Tokens], tokens: Tensor, group: int) -> Tensor:
-        """The same without a cache, in memory for each layer's input alone."""
-        ids, mask = self._padded(prompts)
+        """The same scores without a cache, storing only each layer's input."""
+        ids, padding = pad_left(prompts, self._pad, self._model.device)
+        mask = (~padding).long()
         rest = tokens[:, :-1]
         whole = torch.cat([ids.repeat_interleave(group, dim=0), rest], dim=1)  # (rows, P + T - 1)
         seen = torch.cat([mask.repeat_interleave(group, dim=0), mask.new_ones(rest.shape)], dim=1)
-        with recomputing(self._model):
+        with _checkpointed_layers(self._model):
             result = self._model(
                 whole,
                 attention_mask=seen,
@@ -215,21 +218,12 @@ class HfPolicy:
             )
         return result.logits.float()  # type: ignore[no-any-return]
 
-    def _padded(self, prompts: Sequence[Tokens]) -> tuple[Tensor, Tensor]:
-        """Prompts as rows of tokens that end together, and the mask that is 1 on them; both (prompts, P)."""
-        longest = max(len(prompt) for prompt in prompts)
-        ids = torch.full((len(prompts), longest), self._pad)
-        mask = torch.zeros(len(prompts), longest, dtype=torch.long)
-        for row, prompt in enumerate(prompts):
-            ids[row, longest - len(prompt) :] = torch.tensor(prompt)
-            mask[row, longest - len(prompt) :] = 1
-        return ids.to(self._model.device), mask.to(self._model.device)
-
     def _read(self, prompts: Sequence[Tokens], group: int) -> tuple[Any, Tensor, Tensor]:
-        """Run the prompts once; cache, mask (rows, P) and next-token scores (rows, V) are repeated for the samples."""
+        """Run the prompts once. Return cache, mask (rows, P) and next-token scores (rows, V), repeated for the samples."""
         from transformers import DynamicCache
 
-        ids, mask = self._padded(prompts)
+        ids, padding = pad_left(prompts, self._pad, self._model.device)
+        mask = (~padding).long()
         cache = DynamicCache(config=self._model.config)
         result = self._model(
             ids,
@@ -244,28 +238,28 @@ class HfPolicy:
         return cache, mask.repeat_interleave(group, dim=0), scores
 
     def _extend(self, tokens: Tensor, mask: Tensor, positions: Tensor, cache: Any) -> Tensor:
-        """Scores (rows, T, V) after tokens (rows, T) that follow what is cached."""
+        """Scores (rows, T, V) after tokens (rows, T) that continue the cache."""
         result = self._model(
             tokens, attention_mask=mask, position_ids=positions, past_key_values=cache, use_cache=True
         )
         return result.logits.float()  # type: ignore[no-any-return]
 
     def _texts(self, tokens: Tensor, mask: Tensor) -> tuple[str, ...]:
-        """Text of each sample without special tokens. The end is found by the mask: it may equal the padding."""
+        """Decode the samples without special tokens. The mask marks the end, because end and padding tokens may be equal."""
         return tuple(
             self._tokenizer.decode(row[own].tolist(), skip_special_tokens=True)
             for row, own in zip(tokens, mask, strict=True)
         )
 
     def frozen_copy(self) -> HfPolicy:
-        """What never learns is shared, not copied: beside adapters the model itself."""
+        """Return a frozen copy that shares all frozen parameters: with adapters, the whole base model."""
         twin = copy.copy(self)
         still = {id(each): each for each in self._model.parameters() if not each.requires_grad}
         twin._model = copy.deepcopy(self._model, still).requires_grad_(False)
         return twin
 
     def save(self, folder: Path) -> None:
-        """The model with its adapters merged in, which anyone can load, and the adapters beside it to go on with.
+        """Save the model with merged adapters, loadable by transformers, and the adapters in peft's format beside it.
 
         Raises OSError.
         """
@@ -274,13 +268,15 @@ class HfPolicy:
         folder.mkdir(parents=True, exist_ok=True)
         setattr(self._model.config, CODEC_KEY, self._codec.value)
         try:
-            with merged(self._model):
-                self._model.save_pretrained(folder)
+            model = self._model
+            if self._has_adapters:
+                model = copy.deepcopy(model).merge_and_unload()
+            model.save_pretrained(folder)
         except SafetensorError as error:
             raise OSError(str(error)) from error
         self._tokenizer.save_pretrained(folder)
-        if self._lora is not None:
-            save_adapters(self._model, self._lora, folder)
+        if self._has_adapters:
+            save_adapters(self._model, folder)
 
     @staticmethod
     def is_saved_in(folder: Path) -> bool:
@@ -288,12 +284,34 @@ class HfPolicy:
 
     @staticmethod
     def codec_in(folder: Path) -> Codec | None:
-        """The codec that the model of a folder was taught here; None for any other model."""
+        """Return the codec that a folder's model was trained in, None for other models."""
         try:
             config = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
             return Codec(config[CODEC_KEY])
         except (OSError, ValueError, TypeError, KeyError):
             return None
+
+
+@contextlib.contextmanager
+def _checkpointed_layers(model: nn.Module) -> Iterator[None]:
+    """Checkpoint the layers of one forward pass without a cache (gradient checkpointing, Chen et al. 2016).
+
+    transformers' own switch is not used: it works in training mode alone, which also turns on dropout.
+    """
+    stacks = [module for module in model.modules() if isinstance(module, torch.nn.ModuleList)]
+    if not stacks:
+        raise TrainerError("gradient_checkpointing: the model has no list of layers: leave the setting out")
+    layers = max(stacks, key=len)
+    try:
+        for layer in layers:
+            # No random state to preserve: policies run without dropout.
+            layer.forward = functools.partial(
+                checkpoint, layer.forward, use_reentrant=False, preserve_rng_state=False
+            )
+        yield
+    finally:
+        for layer in layers:
+            layer.__dict__.pop("forward", None)
 
 
 def _end_tokens(model: Any, tokenizer: Any) -> list[int]:
@@ -303,15 +321,15 @@ def _end_tokens(model: Any, tokenizer: Any) -> list[int]:
     found = dict.fromkeys(token for token in (tokenizer.eos_token_id, *others) if token is not None)
     if not found:
         raise TrainerError(
-            "the model has no end-of-text token: a plan could never end; set one in its tokenizer"
+            "the model has no end-of-text token, so plans would never end: set one in its tokenizer"
         )
     return [int(token) for token in found]
 
 
-def _look_up(name: str) -> None:
-    """Raise TrainerError unless the model is a folder with a tokenizer, was downloaded before, or is known to the hub.
+def _check_available(name: str) -> None:
+    """Raise TrainerError unless the model is a folder with a tokenizer, is cached, or is known to the hub.
 
-    The hub is asked once and briefly: the loaders of transformers would try for a minute.
+    The hub is asked once with a short timeout: the loaders of transformers would retry for a minute.
     """
     if Path(name).is_dir():
         if not any((Path(name) / file).is_file() for file in TOKENIZERS):
@@ -324,9 +342,9 @@ def _look_up(name: str) -> None:
     try:
         if isinstance(try_to_load_from_cache(name, "config.json"), str):
             return
-        HfApi().model_info(name, timeout=LOOK_UP_S)
-    except Exception as error:  # the hub's HTTP library, and with it its errors, differs by version
+        HfApi().model_info(name, timeout=HUB_TIMEOUT_S)
+    except Exception as error:  # the hub's HTTP library, and so its errors, differ by version
         raise TrainerError(
-            f"the model {name!r} is no folder here, and the Hugging Face hub does not give it "
+            f"the model {name!r} is not a folder, and can't be fetched from the Hugging Face hub "
             f"({reason_of(error)}): {REMEDY}"
         ) from error

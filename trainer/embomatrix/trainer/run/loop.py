@@ -1,4 +1,4 @@
-"""A training run from end to end: imitation, held-out evaluation, GRPO, held-out evaluation, report."""
+"""Training run: imitation, held-out evaluation, GRPO, held-out evaluation, report."""
 
 from __future__ import annotations
 
@@ -15,39 +15,39 @@ import numpy as np
 import torch
 
 from embomatrix.host.cores import usable_cores
+from embomatrix.trainer.data.tasks import Curriculum, Schedule
 from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation, evaluate_policy
+from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers
+from embomatrix.trainer.grpo.learner import Learner
 from embomatrix.trainer.grpo.update import StepPlan, Updater
-from embomatrix.trainer.imitation.phase import warm_up
-from embomatrix.trainer.logging.recorder import METRICS, SAMPLES, Recorder, read_metrics
-from embomatrix.trainer.logging.report import REPORT, TrainingSummary, outcome_of, write_report
-from embomatrix.trainer.logging.reporting import Reporter
-from embomatrix.trainer.parallel.data_parallel import Crew
-from embomatrix.trainer.parallel.learner import Learner
-from embomatrix.trainer.run.checkpoint import (
+from embomatrix.trainer.lifecycle.checkpoint import (
     CHECKPOINTS,
     CheckpointStore,
     TrainingProgress,
+    atomic_folder,
     restore,
-    whole_folder,
 )
-from embomatrix.trainer.run.data import Curriculum, Schedule
-from embomatrix.trainer.run.interrupts import Interrupts
-from embomatrix.trainer.run.outcome import write_outcome
-from embomatrix.trainer.run.stopwatch import Activity, Stopwatch
+from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
+from embomatrix.trainer.lifecycle.stopwatch import Activity, Stopwatch
+from embomatrix.trainer.logging.dashboard import DashboardReporter
+from embomatrix.trainer.logging.outcome import write_outcome
+from embomatrix.trainer.logging.recorder import METRICS, SAMPLES, Recorder, read_metrics
+from embomatrix.trainer.logging.report import REPORT, TrainingSummary, outcome_of, write_report
+from embomatrix.trainer.run.imitation import run_imitation
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
     from typing import Any
 
+    from embomatrix.trainer.cluster.gateway import Gateway
+    from embomatrix.trainer.config.settings import TrainSettings
+    from embomatrix.trainer.data.tasks import TaskSet
     from embomatrix.trainer.grpo.records import GroupLog, StepRecord
-    from embomatrix.trainer.grpo.rollout import Gateway
-    from embomatrix.trainer.logging.progress import Display
+    from embomatrix.trainer.logging.display import LineDisplay
     from embomatrix.trainer.logging.trackers import Tracker
-    from embomatrix.trainer.policy.prompts import Teller
+    from embomatrix.trainer.policy.prompts import PromptBuilder
     from embomatrix.trainer.policy.protocol import Policy
-    from embomatrix.trainer.run.data import TaskSet
-    from embomatrix.trainer.run.settings import TrainSettings
 
 logger = logging.getLogger(__name__)
 REFERENCE = "reference"
@@ -55,23 +55,23 @@ RESERVE_STREAM = 1
 
 
 @dataclass(frozen=True)
-class Parts:
-    """What a run works with. ``reference`` is given on resuming; otherwise the policy after imitation is copied."""
+class RunComponents:
+    """Objects that a run works with. ``reference`` is given on resume; else it is a copy of the policy after imitation."""
 
     policy: Policy
-    teller: Teller
+    prompt_builder: PromptBuilder
     tasks: TaskSet
     gateway: Gateway
-    display: Display
+    display: LineDisplay
     reference: Policy | None = None
 
 
 class TrainingRun:
-    """One run in one folder. ``progress`` is a checkpoint's when the run is resumed."""
+    """One run in one folder. ``progress`` comes from the checkpoint of a resumed run."""
 
     def __init__(
         self,
-        parts: Parts,
+        parts: RunComponents,
         settings: TrainSettings,
         out: Path,
         progress: TrainingProgress | None = None,
@@ -81,36 +81,38 @@ class TrainingRun:
         self._settings = settings
         self._out = out
         self._progress = progress or TrainingProgress()
-        self._restores = self._progress.prepared
+        self._resumed = self._progress.grpo_ready
         self._stopwatch = Stopwatch()
         self._stopwatch.spent_s.update(self._progress.spent_s)
         self._store = CheckpointStore(out / CHECKPOINTS, keep=settings.keep_checkpoints)
-        self._reporter = Reporter(parts.gateway.report)
+        self._reporter = DashboardReporter(parts.gateway.report)
         self._recorder = Recorder(out, (*trackers, self._reporter))
         device = next(iter(parts.policy.parameters())).device
         self._generator = torch.Generator(device).manual_seed(settings.seed)
 
     def run(self) -> TrainingSummary:
-        """Everything. An interrupt saves a checkpoint, from which ``--resume`` goes on, and is raised again."""
+        """Run all phases. Ctrl-C saves a checkpoint for ``--resume`` and is raised again."""
         began_s = time.monotonic()
         earlier_s = sum(self._progress.spent_s.values())
         reference = self._parts.reference or self._prepare()
-        checkpoint = self._improve(reference)
+        checkpoint = self._grpo(reference)
         after = self._evaluate("after GRPO")
         summary = self._summary(checkpoint, after, earlier_s + time.monotonic() - began_s)
-        write_report(summary, read_metrics(self._out), machine())
+        write_report(summary, read_metrics(self._out), machine_description())
         write_outcome(self._out, outcome_of(summary))
         return summary
 
-    def _improve(self, reference: Policy) -> Path:
-        """GRPO, in as many processes as are wanted; returns its last checkpoint."""
+    def _grpo(self, reference: Policy) -> Path:
+        """Run GRPO on all data-parallel workers. Return the last checkpoint."""
         parts, settings = self._parts, self._settings
-        own = Learner(parts.policy, reference, settings.grpo)
-        with Crew.of(own, parts.policy, settings, self._out / REFERENCE) as crew:
-            updater = Updater(parts.policy, crew, parts.teller, parts.gateway, settings.grpo, self._stopwatch)
-            newest = self._store.latest() if self._restores else None
+        local = Learner(parts.policy, reference, settings.grpo)
+        with DataParallelWorkers.start(local, parts.policy, settings, self._out / REFERENCE) as workers:
+            updater = Updater(
+                parts.policy, workers, parts.prompt_builder, parts.gateway, settings.grpo, self._stopwatch
+            )
+            newest = self._store.latest() if self._resumed else None
             if newest is not None:
-                restore(newest, functools.partial(self._put_back, updater))
+                restore(newest, functools.partial(self._load_tensors, updater))
             self._recorder.forget_after(self._progress.step, METRICS, SAMPLES)
             try:
                 self._optimise(updater)
@@ -118,17 +120,17 @@ class TrainingRun:
                 checkpoint = self._save(updater)
         return checkpoint
 
-    def _put_back(self, updater: Updater, tensors: Mapping[str, Any]) -> None:
+    def _load_tensors(self, updater: Updater, tensors: Mapping[str, Any]) -> None:
         updater.optimiser.load_state_dict(tensors["optimiser"])
         self._generator.set_state(tensors["generator"])
 
     def _prepare(self) -> Policy:
-        """Imitation and the first evaluation; the policy as it then is becomes the reference."""
+        """Run imitation and the first evaluation. Return the reference policy, a copy of the policy."""
         parts, progress = self._parts, self._progress
-        with self._stopwatch.spending(Activity.IMITATION):
-            warm_up(
+        with self._stopwatch.track(Activity.IMITATION):
+            run_imitation(
                 parts.policy,
-                parts.teller,
+                parts.prompt_builder,
                 parts.tasks.train,
                 self._settings,
                 self._out,
@@ -138,19 +140,19 @@ class TrainingRun:
             )
         before = self._evaluate("before GRPO")
         progress.before = before.as_json() if before else []
-        with whole_folder(self._out / REFERENCE) as folder:
+        with atomic_folder(self._out / REFERENCE) as folder:
             parts.policy.save(folder)
-        progress.prepared = True
+        progress.grpo_ready = True
         return parts.policy.frozen_copy()
 
     def _evaluate(self, label: str) -> HeldOutEvaluation | None:
         parts, settings = self._parts, self._settings
         if not parts.tasks.heldout:
             return None
-        with self._stopwatch.spending(Activity.EVALUATION):
+        with self._stopwatch.track(Activity.EVALUATION):
             result = evaluate_policy(
                 parts.policy,
-                parts.teller,
+                parts.prompt_builder,
                 parts.tasks.heldout,
                 parts.gateway,
                 settings.evaluation,
@@ -173,26 +175,26 @@ class TrainingRun:
         while (share := self._share()) < 1.0:
             began_s = time.monotonic()
             self._announce(schedule, reserve, progress.step)
-            with Interrupts() as interrupts:
-                with self._whole_step():
+            with DeferredInterrupts() as interrupts:
+                with self._rollback_on_error():
                     record, logs = updater.take_step(self._plan(schedule, reserve, share), interrupts)
                 seconds = time.monotonic() - began_s
                 progress.step = record.step
                 progress.cursor, progress.reserve_cursor = schedule.cursor, reserve.cursor
                 progress.grpo_s += seconds
-                self._note(record, logs, seconds)
+                self._record(record, logs, seconds)
             if progress.step % self._settings.checkpoint_every == 0:
                 self._save(updater)
 
     @contextlib.contextmanager
-    def _whole_step(self) -> Iterator[None]:
-        """A step that is broken off is taken again after a resume: it leaves neither draws nor seconds behind."""
-        drawn = self._generator.get_state()
+    def _rollback_on_error(self) -> Iterator[None]:
+        """Undo the random draws and seconds of an unfinished step, because a resumed run takes it again."""
+        before = self._generator.get_state()
         try:
-            with self._stopwatch.whole():
+            with self._stopwatch.discard_on_error():
                 yield
         except BaseException:
-            self._generator.set_state(drawn)
+            self._generator.set_state(before)
             raise
 
     def _plan(self, schedule: Schedule, reserve: Schedule, share: float) -> StepPlan:
@@ -214,20 +216,20 @@ class TrainingRun:
         return np.random.default_rng(np.random.SeedSequence((self._settings.seed, 2, step)))
 
     def _share(self) -> float:
-        """Share of the GRPO budget that is spent; the last step may end after the minutes do."""
+        """Used share of the GRPO budget, at most 1."""
         settings = self._settings.grpo
         if settings.steps is not None:
             return self._progress.step / settings.steps if settings.steps else 1.0
         return min(1.0, self._progress.grpo_s / (60 * settings.minutes)) if settings.minutes else 1.0
 
     def _rate_factor(self, step: int, share: float) -> float:
-        """Of the learning rate: a linear rise over the warm-up, then a linear fall with the budget."""
+        """Factor of the learning rate: linear warm-up, then linear decay over the budget."""
         settings = self._settings.grpo
         rise = min(1.0, step / (settings.warmup_steps + 1))
         return rise * (1.0 - (1.0 - settings.final_learning_rate_share) * share)
 
     def _announce(self, schedule: Schedule, reserve: Schedule, step: int) -> None:
-        """This step's tasks and those of the steps ahead, then what may replace some: the whole window, every time."""
+        """Announce the whole window: this step's tasks, those of the steps ahead, and the reserve."""
         settings = self._settings.grpo
         size = settings.tasks_per_step
         window = {
@@ -235,11 +237,11 @@ class TrainingRun:
             for ahead in range(settings.lookahead + 1)
         }
         if settings.reserve and settings.lookahead:
-            # Needed in this step, if at all: behind what is certain.
+            # A reserve may be needed in this step already, but it ranks behind the certain tasks.
             window[step + 1 + settings.lookahead] += reserve.peek(settings.reserve)
         self._parts.gateway.announce(window, settings.group)
 
-    def _note(self, record: StepRecord, logs: list[GroupLog], seconds: float) -> None:
+    def _record(self, record: StepRecord, logs: list[GroupLog], seconds: float) -> None:
         self._progress.rollouts += record.rollouts
         self._progress.lost += record.lost
         self._recorder.step(record, seconds, self._stopwatch.spent_s)
@@ -258,7 +260,7 @@ class TrainingRun:
         self._parts.display.stepped(record, self._share(), record.rollouts / max(seconds, 1e-9))
 
     def _save(self, updater: Updater) -> Path:
-        with self._stopwatch.spending(Activity.SAVING):
+        with self._stopwatch.track(Activity.SAVING):
             self._progress.spent_s = dict(self._stopwatch.spent_s)
             tensors = {
                 "optimiser": updater.optimiser.state_dict(),
@@ -286,6 +288,6 @@ class TrainingRun:
         )
 
 
-def machine() -> str:
-    """The machine in words, for reports."""
+def machine_description() -> str:
+    """Cores, architecture and versions, for reports."""
     return f"{usable_cores()} cores, {platform.machine()}, Python {platform.python_version()}, torch {torch.__version__}"

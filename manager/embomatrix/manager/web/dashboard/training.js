@@ -6,7 +6,7 @@ import {at, clock, count, h, none, put, seconds, share, signed, table} from "./d
 const CHARTS = [
   ["tiers", "Reward by tier", "mean of a step", {reward: "all", reward_goal: "goal", reward_relevance: "relevance", reward_format: "form"}],
   ["success", "Success", "share of rollouts", {success: "all"}, "success_by_category/"],
-  ["dead", "Groups and plans", "shares", {dead_groups: "dead groups", well_formed: "well formed", clipped: "clipped tokens"}],
+  ["dead", "Groups and plans", "shares", {zero_variance_groups: "zero-variance groups", well_formed: "well formed", clipped: "clipped tokens"}],
   ["spread", "Entropy and distance", "nats of a token", {entropy: "entropy", kl: "from the reference", kl_to_old: "from the sampler"}],
   ["plans", "Plan length", "executed steps", {plan_steps: "steps of a plan"}],
   ["loss", "Imitation", "loss of a token", {loss: "loss", validation: "of tasks set aside"}],
@@ -76,7 +76,7 @@ function tiles({steps, figures}) {
   };
   const fixed = (name, digits) => mean(name) === null ? "–" : mean(name).toFixed(digits);
   const part = name => mean(name) === null ? "–" : share(mean(name), 1);
-  const told = {step: steps.length ? count(steps.at(-1)) : "–", reward: fixed("reward", 2), solved: part("success"), deadnow: part("dead_groups"), entropy: fixed("entropy", 3), long: fixed("plan_steps", 1)};
+  const told = {step: steps.length ? count(steps.at(-1)) : "–", reward: fixed("reward", 2), solved: part("success"), deadnow: part("zero_variance_groups"), entropy: fixed("entropy", 3), long: fixed("plan_steps", 1)};
   for (const [id, text] of Object.entries(told)) at(id).textContent = text;
   for (const [id] of TILES.slice(1)) at(`${id}note`).textContent = `mean of ${Math.min(LATEST, steps.length)} steps`;
   at("stepnote").textContent = mean("seconds") === null ? "" : `${seconds(mean("seconds"))} each`;

@@ -1,4 +1,4 @@
-"""Which of the paper's four categories a task of EAI belongs to: nobody published it, so a rule over the goal decides.
+"""Category of an EAI task in the paper's four categories. They are not published, so a rule over the goal decides.
 
 Only literals of the goal's first ground option that are false at the start count.
 """
@@ -37,23 +37,23 @@ DRY_FOOD: Final = frozenset(["tea_bag.n.01", "flour.n.01", "cereal.n.03"])
 
 
 def category_of(package: Package, name: str) -> str:
-    """kitchen_operation, compound, appliance_use or pick_and_place."""
+    """Return kitchen_operation, compound, appliance_use or pick_and_place."""
     info = package.read(f"transition_modeling/resources/behavior_bddl_info/{name}.json")
     true_now = {fact for positive, fact in map(_literal, info["initial_condition"]) if positive}
     option = min(
         (list(map(_literal, option)) for option in info["goal_option"]),
         key=lambda literals: len(_out_of_reach(literals, true_now)),
     )
-    todo = [(positive, fact) for positive, fact in option if (fact in true_now) != positive]
-    predicates = {fact[0] for _, fact in todo}
-    moved = {fact[1] for positive, fact in todo if positive and len(fact) == 3}
+    unmet = [(positive, fact) for positive, fact in option if (fact in true_now) != positive]
+    predicates = {fact[0] for _, fact in unmet}
+    moved = {fact[1] for positive, fact in unmet if positive and len(fact) == 3}
     synset = info["name_category"]
-    eaten = [thing for thing in moved if _is_food(synset[thing], package.states[name].get(thing, ()))]
+    food = [name_ for name_ in moved if _is_food(synset[name_], package.states[name].get(name_, ()))]
     if predicates & {"cooked", "frozen", "sliced"}:
         return "kitchen_operation"
     if predicates & {"stained", "dusty", "soaked"}:
         return "compound"
-    if 2 * len(eaten) > len(moved) and _in_kitchen(package, name):
+    if 2 * len(food) > len(moved) and _in_kitchen(package, name):
         return "kitchen_operation"
     return "appliance_use" if predicates & {"open", "toggled_on"} else "pick_and_place"
 
@@ -77,5 +77,5 @@ def _is_food(synset: str, states: Any) -> bool:
 
 
 def _in_kitchen(package: Package, name: str) -> bool:
-    """Whether a fixed thing of the task stands in a kitchen."""
+    """True if a fixed object of the task stands in a kitchen."""
     return re.search(r"\(inroom\s+\S+\s+kitchen\)", package.problem(name)) is not None

@@ -1,7 +1,7 @@
-"""One task of EAI's BEHAVIOR split as its judge needs it, put together from files of the package itself.
+"""One task of EAI's BEHAVIOR split for its judge, assembled from the package's files, and the exact check of its goal.
 
-What the package does not publish is reconstructed, by rules that are the same for all tasks: boxes (three classes), states that
-nobody mentions (false), cartons (open), and furniture (on its room's floor).
+Unpublished facts are reconstructed by the same rules for all tasks: bounding boxes (three classes), unmentioned states
+(false), cartons (open), and furniture (on its room's floor).
 """
 
 from __future__ import annotations
@@ -10,9 +10,12 @@ import ast
 import json
 import re
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.trainer.eai.inside.stand_ins import BINARY, UNARY, make_object, state_class
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 PREDICATES: Final = {
     "inside": "Inside",
@@ -33,13 +36,13 @@ PREDICATES: Final = {
 }
 RELATIONS: Final = frozenset(name for name, state in PREDICATES.items() if state in BINARY)
 STARTS_OPEN: Final = frozenset({"carton.n.02"})
-"""The published human plans put things into cartons without opening them; any other thing that opens starts shut."""
+"""The published human plans put objects into cartons without opening them. All other openable objects start closed."""
 OFF_FLOOR: Final = ("top_cabinet", "sink", "window", "door", "microwave", "room_floor")
-"""Beginnings of the names of fixed things that do not stand on the floor."""
+"""Name prefixes of fixed objects that do not stand on the floor."""
 FURNITURE_M: Final = (1.0, 1.0, 1.0)
 CONTAINER_M: Final = (0.4, 0.4, 0.3125)
 SMALL_M: Final = (0.1, 0.1, 0.1)
-"""Boxes of the three classes. The judge compares volumes only, to say that something is too big."""
+"""Boxes of the three classes. The judge only compares volumes, to reject objects that are too big."""
 _TOOLS: Final = {"slicer": "Slicer", "cleaningTool": "CleaningTool"}
 _ARTICULATED: Final = ("igibson.objects.articulated_object", "URDFObject")
 _FLOOR: Final = ("igibson.object_states.on_floor", "RoomFloor")
@@ -47,7 +50,7 @@ _WRAPPERS: Final = "igibson.objects.multi_object_wrappers"
 
 
 class Package:
-    """The files of the installed package, read once. ``published``: use what it says of the real simulator's first state."""
+    """Files of the installed package, read once. ``published``: use the published initial state of the real simulator."""
 
     def __init__(self, *, published: bool = True) -> None:
         import behavior_eval
@@ -78,7 +81,7 @@ class Package:
         return path.read_text()
 
     def abilities(self, synset: str, name: str) -> set[str]:
-        """Of the synset, and of the model's own category, from which iGibson takes them."""
+        """Abilities of the synset and of the model's own category, from which iGibson derives them."""
         found = (
             dict(self.taxonomy.get_abilities(synset) or {}) if self.taxonomy.is_valid_class(synset) else {}
         )
@@ -91,23 +94,21 @@ class Package:
 
 
 def flat(value: Any) -> list[str]:
-    """The tokens of a nested list."""
+    """Tokens of a nested list."""
     return [token for entry in value for token in (flat(entry) if isinstance(entry, list) else [entry])]
 
 
 def simulator_names(prompt: str) -> list[dict[str, Any]]:
-    """Objects of a prompt, in its order, which is that of the BDDL instances."""
+    """Objects of a prompt in its order, which is the order of the BDDL instances."""
     block = prompt[prompt.index("Your task:") :].split("interactable objects:")[1].split("Please output")[0]
     return [ast.literal_eval(line) for line in block.strip().splitlines()]
 
 
 class Demo:
-    """What iGibson's BehaviorTask offers the judge. ``graph`` is the state that it judges, set by whoever runs it."""
+    """Stand-in for iGibson's BehaviorTask. ``graph`` is the state to judge, set by the caller."""
 
     def __init__(self, package: Package, name: str) -> None:
         from bddl.activity import Conditions, get_goal_conditions, get_initial_conditions, get_object_scope
-
-        from embomatrix.trainer.eai.inside.goals import backend
 
         self.name = name
         self._package = package
@@ -134,7 +135,7 @@ class Demo:
         self.graph: Any = None
 
     def check_success(self) -> tuple[bool, dict[str, list[int]]]:
-        """The published check of the graph, in the form in which the judge asks the simulator."""
+        """Published check of the graph, in the format in which the judge queries the simulator."""
         result = self.graph.check_success(self)
         truths = result["subgoal_success"]
         return result["success"], {
@@ -145,10 +146,10 @@ class Demo:
     def _make_objects(self) -> None:
         names = simulator_names(self._package.prompts[self.name])
         containers = self._containers()
-        for instance, told in zip(self.instances, names, strict=True):
-            if told["category"] != self.synset[instance]:
-                raise ValueError(f"{self.name}: {told} stands where {instance} should")
-            name, unary = told["name"], self._states_of(instance, told["name"])
+        for instance, entry in zip(self.instances, names, strict=True):
+            if entry["category"] != self.synset[instance]:
+                raise ValueError(f"{self.name}: found {entry}, expected {instance}")
+            name, unary = entry["name"], self._states_of(instance, entry["name"])
             box = list(self._box(instance, containers))
             if name.startswith("room_floor"):
                 thing = self.object_scope[instance] = make_object(*_FLOOR, name, box, unary)
@@ -160,7 +161,7 @@ class Demo:
             self.things[instance] = thing
 
     def _sliceable(self, whole: Any, name: str, box: list[float], unary: set[str]) -> Any:
-        """iGibson's switch between a whole and its two halves."""
+        """Stand-in for iGibson's switch between an object and its two halves."""
         import sys
 
         module = sys.modules[_WRAPPERS]
@@ -183,7 +184,7 @@ class Demo:
         return found & {*BINARY, *UNARY}
 
     def _containers(self) -> set[str]:
-        """Synsets of what something is, or is to be, inside of."""
+        """Synsets of objects that contain another one, initially or in the goal."""
         found = set()
         for condition in (*self._init, *self._conditions.parsed_goal_conditions):
             tokens = flat(condition)
@@ -239,3 +240,78 @@ class Demo:
             if thing.name.startswith("room_floor"):
                 # The published graph stops on a scene without any edge; this one is about nothing that a goal names.
                 thing.states[on_floor].related.add(thing.name)
+
+
+_truths: list[Callable[..., bool]] = []
+"""Truth function of the formulas under evaluation, as bddl passes no argument to its atoms."""
+
+
+def backend() -> Any:
+    """bddl backend whose atoms query ``_truths``."""
+    from bddl.backend_abc import BDDLBackend
+    from bddl.logic_base import BinaryAtomicFormula, UnaryAtomicFormula
+
+    def binary(self: Any) -> bool:
+        return _truths[-1](self.STATE_NAME, self.input1, self.input2)
+
+    def unary(self: Any) -> bool:
+        return _truths[-1](self.STATE_NAME, self.input)
+
+    def unasked(self: Any, *args: Any) -> bool:
+        """bddl wants both methods of an atom. ``evaluate`` above never comes to the one, and a judge samples no state."""
+        raise NotImplementedError(f"{self.STATE_NAME} is only judged here: no state is sampled")
+
+    class Backend(BDDLBackend):  # type: ignore[misc]
+        def get_predicate_class(self, predicate_name: str) -> type:
+            base, evaluate = (
+                (BinaryAtomicFormula, binary) if predicate_name in RELATIONS else (UnaryAtomicFormula, unary)
+            )
+            body = {
+                "STATE_NAME": predicate_name,
+                "evaluate": evaluate,
+                "_evaluate": unasked,
+                "_sample": unasked,
+            }
+            return type(predicate_name, (base,), body)
+
+    return Backend()
+
+
+def exact_truths(demo: Demo) -> list[bool]:
+    """Truth of each goal conjunct in ``demo.graph``. Containment is transitive, as in the simulator.
+
+    The published check compares with a truncated list instead.
+    """
+    state = demo.graph.get_state_dict(demo)
+    name = {instance: thing.name for instance, thing in demo.things.items()}
+    unary = {node: set(value["states"]) for node, value in state["nodes"].items()}
+    relations = {(edge["relation"], edge["from_name"], edge["to_name"]) for edge in state["edges"]}
+    above = {one: other for relation, one, other in relations if relation in ("inside", "ontop")}
+
+    def truth(predicate: str, *instances: str) -> bool:
+        names = [name[instance] for instance in instances]
+        if len(names) == 1:
+            return {"toggled_on": "toggledon"}.get(predicate, predicate) in unary.get(names[0], ())
+        if (predicate, *names) in relations:
+            return True
+        return predicate == "inside" and _is_within(names[0], names[1], above, relations)
+
+    _truths.append(truth)
+    try:
+        return [bool(goal.evaluate()) for goal in demo.goal_conditions]
+    finally:
+        _truths.pop()
+
+
+def _is_within(
+    thing: str, container: str, above: dict[str, str], relations: set[tuple[str, str, str]]
+) -> bool:
+    seen: set[str] = set()
+    entered = False
+    while thing in above and thing not in seen:
+        seen.add(thing)
+        entered = entered or ("inside", thing, above[thing]) in relations
+        thing = above[thing]
+        if thing == container:
+            return entered
+    return False

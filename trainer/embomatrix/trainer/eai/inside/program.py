@@ -1,7 +1,6 @@
-"""EAI's published judge on answers, one JSON line each; runs in an interpreter of its own, and is told nothing else.
+"""EAI's published judge as a program in its own interpreter: one JSON order per input line, one JSON result per output line.
 
-Orders come on standard input, results leave on standard output, line by line: whoever reads them knows at which answer the
-program ended, should it end.
+The line protocol shows the caller at which answer the program crashed.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ FORBIDDEN: Final = (
     "ctypes",
     "shutil",
 )
-"""Beginnings of audit events that no judging needs."""
+"""Prefixes of audit events that judging does not need."""
 
 
 def main() -> None:
@@ -39,8 +38,8 @@ def main() -> None:
     from embomatrix.trainer.eai.inside.demo import Package
 
     package = Package(published="--withhold-published" not in sys.argv)
-    judge = EaiEvaluator(package)
-    sys.addaudithook(_refuse)
+    judge = PublishedJudge(package)
+    sys.addaudithook(_audit)
     for line in sys.stdin:
         order = json.loads(line)
         with contextlib.redirect_stdout(io.StringIO()):
@@ -49,16 +48,16 @@ def main() -> None:
         results.flush()
 
 
-def _refuse(event: str, args: tuple[Any, ...]) -> None:
-    """The published parser calls eval on what a model wrote: nothing of it may reach beyond this process."""
+def _audit(event: str, args: tuple[Any, ...]) -> None:
+    """Sandbox: the published parser calls eval on a model's text, which must not reach beyond this process."""
     writes = event == "open" and isinstance(args[1], str) and set(args[1]) & set("wax+")
-    # It silences its own prints by way of the null device.
+    # The judge silences its own output by writing to the null device.
     if (writes and args[0] != os.devnull) or event.startswith(FORBIDDEN):
         raise PermissionError(f"the judge's sandbox refuses {event}")
 
 
-class EaiEvaluator:
-    """Answers orders with the published evaluator over stand-ins."""
+class PublishedJudge:
+    """Answers orders with the published evaluator over stand-ins for iGibson."""
 
     def __init__(self, package: Package) -> None:
         import behavior_eval.evaluation.action_sequencing.action_sequence_evaluator as published
@@ -101,14 +100,14 @@ class EaiEvaluator:
         ]
 
     def _judged(self, name: str, text: str) -> dict[str, Any]:
-        from embomatrix.trainer.eai.inside.goals import exact_truths
+        from embomatrix.trainer.eai.inside.demo import exact_truths
 
         evaluator = self._evaluator(name)
         demo: Demo = evaluator.task
         result = evaluator.evaluate_all(text)
         demo.graph = evaluator.evolving_graph.action_env.cur_state
         errors, exact = dict(result["error_type"]), exact_truths(demo)
-        # No handler for the action: the published judge keeps its own exception there.
+        # Action without a handler: the published judge stores its exception here.
         errors["unknown_execution"] = result.get("unknown_execution_error")
         return {
             "executed": bool(errors["execution_success"]),
@@ -121,7 +120,7 @@ class EaiEvaluator:
         }
 
     def _start(self, name: str) -> dict[str, Any]:
-        """The published goals that the reconstruction holds true at the start, and those that the real simulator did."""
+        """Published goals that hold initially, in the reconstruction and in the real simulator."""
         demo: Demo = self._evaluator(name).task
         return {
             "here": demo.check_success()[1]["satisfied"],

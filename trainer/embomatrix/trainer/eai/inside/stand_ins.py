@@ -1,7 +1,7 @@
-"""Stands in for iGibson, so that EAI's published judge can be imported without it. Runs in the judge's own interpreter.
+"""Stand-ins for iGibson, so that EAI's judge can be imported without it. Runs in the judge's own interpreter.
 
-The judge asks iGibson for names, states, boxes and first relations of objects only. Its parser, its checks, its graph and its
-goal check are the published code.
+The judge only asks iGibson for names, states, boxes and initial relations of objects. Parser, checks, graph and goal check
+are the published code.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SIMULATOR: Final = (
     "igibson.utils.ig_logging",
 )
 UNUSED: Final = ("pybullet", "gym", "IPython", "pyquaternion", "fire")
-"""Packages that the judge imports beside it and does not use."""
+"""Packages that the judge imports and does not use."""
 BINARY: Final = ("Inside", "OnFloor", "OnTop", "Under", "NextTo", "Touching")
 UNARY: Final = (
     "Cooked",
@@ -53,7 +53,7 @@ UNARY: Final = (
 
 
 class _Blank(types.ModuleType):
-    """A module in which every name is an empty class, the same one each time."""
+    """Module in which every name is an empty class, cached by name."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -64,7 +64,7 @@ class _Blank(types.ModuleType):
 
 
 def install() -> None:
-    """Put the stand-ins where imports look. Packages that are there stay."""
+    """Register the stand-ins in sys.modules. Installed packages are kept."""
     for name in (*SIMULATOR, *UNUSED):
         if name in UNUSED and _is_there(name):
             continue
@@ -85,13 +85,13 @@ def _is_there(name: str) -> bool:
 
 
 def state_class(name: str) -> type:
-    """The class by which the judge asks for a state: its name is all that counts."""
+    """Class by which the judge identifies a state. Only its name matters."""
     found: type = getattr(sys.modules["igibson.object_states"], name)
     return found
 
 
 class StandInState:
-    """One state of an object: a value of its own, or names of the objects that it is related to."""
+    """State of one object: a boolean, or the names of related objects."""
 
     def __init__(self) -> None:
         self.holds = False
@@ -102,7 +102,7 @@ class StandInState:
 
 
 def make_object(module: str, kind: str, name: str, box_m: list[float], unary: set[str]) -> Any:
-    """An object of one of iGibson's classes, with every relation and these states of its own, all false."""
+    """Object of an iGibson class with all relations and the given unary states, all false."""
     made = getattr(sys.modules[module], kind)()
     made.name, made.bounding_box = name, box_m
     made.states = {state_class(state): StandInState() for state in (*BINARY, *sorted(unary))}

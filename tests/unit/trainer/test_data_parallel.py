@@ -1,0 +1,136 @@
+"""Several processes learn what one learns, to the bit; one that dies ends the run, and the checkpoints stay."""
+
+import asyncio
+import os
+import signal
+
+import pytest
+import torch
+from rich.console import Console
+from tests.fakes.symbolic_household import SymbolicCluster
+from tests.unit.trainer.test_loop import TASKS, run, weights
+
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import read_settings
+from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers, SharedTensors
+from embomatrix.trainer.grpo.learner import Learner
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore
+from embomatrix.trainer.logging.display import LineDisplay
+from embomatrix.trainer.logging.recorder import read_metrics
+from embomatrix.trainer.policy.loading import new_policy
+
+FAST = {"imitation__steps": 20, "grpo__steps": 4, "checkpoint_every": 2}
+
+
+@pytest.fixture
+def remotes(monkeypatch):
+    """The processes of every workers that is made."""
+    made = []
+    real = DataParallelWorkers.__init__
+
+    def noted(self, local, remotes=()):
+        made.extend(remote._process for remote in remotes)
+        real(self, local, remotes)
+
+    monkeypatch.setattr(DataParallelWorkers, "__init__", noted)
+    return made
+
+
+def learnt(folder, **changes):
+    return weights(run(folder, **FAST, **changes)[1])
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"grpo__reserve": 4, "grpo__overlap": "ahead"}], ids=["plain", "all"]
+)
+def test_two_processes_learn_what_one_learns_to_the_bit(tmp_path, remotes, changes):
+    one = learnt(tmp_path / "one", **changes)
+    two = learnt(tmp_path / "two", processes=2, **changes)
+    assert len(remotes) == 1
+    assert torch.equal(one, two)
+    told = [
+        [{**row, "seconds": 0, "spent_s": {}} for row in read_metrics(tmp_path / name)]
+        for name in ("one", "two")
+    ]
+    assert told[0] == told[1]
+
+
+def test_more_processes_than_a_step_has_chunks_change_nothing(tmp_path, remotes):
+    assert torch.equal(learnt(tmp_path / "one"), learnt(tmp_path / "three", processes=3))
+    assert len(remotes) == 2
+    assert not any(process.is_alive() for process in remotes)
+
+
+def test_a_process_that_is_killed_ends_the_run_and_one_alone_goes_on_to_the_same_end(tmp_path, remotes):
+    whole, _ = run(tmp_path / "whole", **FAST)
+
+    class Killer(LineDisplay):
+        def stepped(self, record, share, rollouts_per_s):
+            if record.step == 3:
+                os.kill(remotes[0].pid, signal.SIGKILL)
+
+    with pytest.raises(TrainerError, match=r"the process trainer-1 ended during a step \(exit code -9"):
+        run(tmp_path / "cut", display=Killer(Console(quiet=True)), processes=2, **FAST)
+    newest = CheckpointStore(tmp_path / "cut" / CHECKPOINTS, keep=9).latest()
+    assert newest.name == "step-000003"
+    gone_on, _ = run(tmp_path / "cut", resume=True)
+    assert gone_on.after == whole.after
+
+
+@pytest.fixture
+def interruptible():
+    """Interrupts are heard, also where the tests were begun in the background: a shell has those ignored there."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_waits_neither_for_rewards_nor_for_processes(tmp_path, remotes, interruptible):
+    class Silent(SymbolicCluster):
+        """Gives no reward in the third step of GRPO, and has the trainer interrupted."""
+
+        async def execute(self, batch):
+            if batch.batch_id == "step-3-0-0":
+                asyncio.get_running_loop().call_later(0.3, os.kill, os.getpid(), signal.SIGINT)
+            if batch.batch_id.startswith("step-3-"):
+                await asyncio.Event().wait()
+            async for result in super().execute(batch):
+                yield result
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, Silent(TASKS), processes=2, **FAST)
+    assert not remotes[0].is_alive()
+    assert CheckpointStore(tmp_path / CHECKPOINTS, keep=9).latest().name == "step-000002"
+
+
+def test_a_gradient_that_no_process_can_make_is_told(tmp_path, monkeypatch):
+    settings = read_settings(None, {"processes": 2})
+    policy = new_policy(settings, TASKS)
+    policy.save(tmp_path)
+    with DataParallelWorkers.start(
+        Learner(policy, policy, settings.grpo), policy, settings, tmp_path
+    ) as workers:
+        asked = workers.remote(1).run(lambda remote: remote.sample([(1, 2, 10**9)], 0))
+        with pytest.raises(TrainerError, match=r"trainer-1 failed \(IndexError.*continue with --resume"):
+            asked.result(timeout=60)
+
+
+def test_a_policy_on_another_device_has_no_remotes(tmp_path):
+    settings = read_settings(None, {"processes": 2})
+    policy = new_policy(settings, TASKS)
+    elsewhere = settings.model_copy(update={"device": "cuda"})
+    with pytest.raises(TrainerError, match=r"processes = 2 .* the device is cuda: pass --processes=1"):
+        DataParallelWorkers.start(Learner(policy, policy, settings.grpo), policy, elsewhere, tmp_path)
+
+
+def test_what_one_side_writes_the_other_reads():
+    like = [torch.zeros(3, 5), torch.zeros((), dtype=torch.float64), torch.zeros(7, dtype=torch.bfloat16)]
+    ours = SharedTensors(like)
+    theirs = SharedTensors(like, os.dup(ours.fd))
+    ours.close()
+    for at, each in enumerate(ours.tensors):
+        assert each.data_ptr() % 64 == 0
+        each.fill_(at + 1)
+    assert [each.shape for each in theirs.tensors] == [each.shape for each in like]
+    assert [each.dtype for each in theirs.tensors] == [each.dtype for each in like]
+    assert all(torch.equal(one, other) for one, other in zip(ours.tensors, theirs.tensors, strict=True))

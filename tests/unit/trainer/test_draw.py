@@ -1,0 +1,38 @@
+"""Tokens are drawn as likely as their scores say, and never one that is barred."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from embomatrix.trainer.policy.protocol import draw
+
+BARRED = -1e9
+
+
+@pytest.mark.parametrize("temperature", [0.5, 1.0, 1.7])
+def test_tokens_come_as_often_as_the_softmax_says(temperature):
+    scores = torch.tensor([2.0, BARRED, 0.0, 1.0, -1.0, BARRED])
+    count = 40_000
+    choice, logprob = draw(scores.repeat(count, 1), temperature, torch.Generator().manual_seed(0))
+    expected = torch.softmax(scores / temperature, dim=0)
+    assert torch.allclose(torch.bincount(choice, minlength=6) / count, expected, atol=0.01)
+    assert torch.allclose(logprob, expected.log()[choice])
+
+
+@given(
+    barred=st.lists(st.booleans(), min_size=2, max_size=40).filter(lambda marks: not all(marks)),
+    seed=st.integers(0, 2**32),
+)
+def test_a_barred_token_is_never_drawn(barred, seed):
+    generator = torch.Generator().manual_seed(seed)
+    marks = torch.tensor(barred)
+    scores = torch.randn(len(barred), generator=generator).masked_fill(marks, BARRED)
+    choice, _ = draw(scores.repeat(50, 1), 1.0, generator)
+    assert not marks[choice].any()
+
+
+def test_temperature_zero_takes_the_likeliest_token():
+    scores = torch.tensor([[0.1, 0.3, 0.2], [5.0, BARRED, 1.0]])
+    choice, _ = draw(scores, 0.0, torch.Generator())
+    assert choice.tolist() == [1, 0]

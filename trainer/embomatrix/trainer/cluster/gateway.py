@@ -1,0 +1,315 @@
+"""Gateway of a trainer to the cluster: plan texts in, rewards out, while the trainer computes.
+
+The gRPC client runs on an event loop in its own thread. A group is submitted as soon as its plans are sampled, and the
+trainer waits only when it needs the rewards.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import threading
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Protocol, Self, TypeVar
+
+from embomatrix.reward.hierarchy import unparsable
+from embomatrix.rpc.logs import bind
+from embomatrix.rpc.status import ClusterError, DeadlineError, PreconditionError, UnavailableError
+from embomatrix.rpc.wire.values import Batch, Completed, LookaheadEntry, Rollout, RunStats, RunTerms
+from embomatrix.skills.parse import PlanError, parse_plan
+from embomatrix.skills.prompt import Codec, with_indices
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.data.tasks import group_seed
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Mapping, Sequence
+    from concurrent.futures import Future
+    from contextlib import AbstractAsyncContextManager
+    from typing import Any
+
+    from embomatrix.reward.breakdown import RewardBreakdown
+    from embomatrix.reward.settings import RewardSettings
+    from embomatrix.rpc.client import ClusterClient
+    from embomatrix.rpc.training import TrainingReport
+    from embomatrix.rpc.wire.values import Outcome
+    from embomatrix.skills.prompt import Situation
+    from embomatrix.skills.syntax import Plan
+    from embomatrix.trainer.data.tasks import TrainingTask
+
+logger = logging.getLogger(__name__)
+T = TypeVar("T")
+DEFAULT_TERMS: Final = RunTerms()
+MAX_QUEUED_REPORTS: Final = 64
+"""Reports kept while the manager is unreachable. Older ones are dropped."""
+RETRY_BUNDLE_S: Final = 600.0
+"""Seconds to retry a bundle upload while the manager is unreachable: equal to the batch timeout."""
+FIRST_RETRY_S: Final = 0.1
+MAX_RETRY_S: Final = 5.0
+"""The wait between two attempts doubles from ``FIRST_RETRY_S`` up to this value."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlanOutcome:
+    """One sampled plan and its result.
+
+    ``reward`` is None if the infrastructure lost the rollout, which says nothing about the plan. ``outcome`` is None for text
+    that can't be parsed: it is scored here and never executed, and ``problem`` gives the reason.
+    """
+
+    text: str
+    reward: RewardBreakdown | None
+    outcome: Outcome | None = None
+    problem: str = ""
+
+    @property
+    def value(self) -> float:
+        """Total reward, NaN if there is none."""
+        return math.nan if self.reward is None else self.reward.total
+
+    def weighted_reward(self, relevance: float) -> float:
+        """Reward with a weight on its relevance tier, NaN if there is none."""
+        reward = self.reward
+        return math.nan if reward is None else reward.format + relevance * reward.relevance + reward.goal
+
+    @property
+    def success(self) -> bool:
+        return self.reward is not None and self.reward.success
+
+
+class PlanSubmitter(Protocol):
+    """Part of the gateway that a GRPO step uses."""
+
+    def submit(
+        self,
+        batch_id: str,
+        step: int,
+        task: TrainingTask,
+        situation: Situation,
+        texts: Sequence[str],
+        codec: Codec,
+    ) -> Future[tuple[PlanOutcome, ...]]:
+        """Execute one task's plans. Outcomes keep the order of ``texts``."""
+        ...
+
+
+def parse_policy_text(text: str, situation: Situation, codec: Codec) -> Plan:
+    """Parse a policy's text. Raises PlanError if it holds no plan."""
+    return parse_plan(with_indices(text, situation) if codec is Codec.NAMES else text, situation.profile)
+
+
+class Gateway:
+    """Context manager over one run of the cluster. Call ``submit`` from any thread, all other methods from the trainer's.
+
+    ``terms`` set the policy for groups that lost a rollout, and the reward's coefficients.
+    """
+
+    def __init__(
+        self,
+        open_cluster: Callable[[], AbstractAsyncContextManager[ClusterClient]],
+        bundle_bytes: Callable[[str], bytes],
+        *,
+        run_name: str,
+        run_seed: int,
+        terms: RunTerms = DEFAULT_TERMS,
+    ) -> None:
+        self._open_cluster = open_cluster
+        self._bundle_bytes = bundle_bytes
+        self._run_name = run_name
+        self._run_seed = run_seed
+        self._terms = terms
+        self._announced = 0
+        self._uploads: dict[str, asyncio.Task[None]] = {}
+        self._reports: deque[TrainingReport] = deque(maxlen=MAX_QUEUED_REPORTS)
+        self._reporting = asyncio.Lock()
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="gateway", daemon=True)
+        self._stats: RunStats | None = None
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        try:
+            self._run_on_loop(self._open())
+        except BaseException:
+            self._stop_thread()
+            raise
+        bind("run", self.run_id)
+        return self
+
+    async def _open(self) -> None:
+        self._context = self._open_cluster()
+        self._cluster = await self._context.__aenter__()
+        try:
+            self.run_id = await self._cluster.open_run(self._run_name, terms=self._terms)
+        except BaseException:
+            await self._context.__aexit__(None, None, None)
+            raise
+
+    def __exit__(self, *_: object) -> None:
+        try:
+            self.close_run()
+        except TrainerError as error:
+            logger.warning("run not closed at the manager: %s", error)
+        finally:
+            self._run_on_loop(self._disconnect())
+            self._stop_thread()
+
+    def close_run(self) -> RunStats:
+        """Cancel pending work, end the run at the manager, and return its counters. Later calls return the same counters."""
+        if self._stats is None:
+            self._stats = self._run_on_loop(self._close())
+        return self._stats
+
+    async def _disconnect(self) -> None:
+        await self._context.__aexit__(None, None, None)
+
+    async def _close(self) -> RunStats:
+        own = asyncio.current_task()
+        pending = [task for task in asyncio.all_tasks() if task is not own]
+        for task in pending:
+            task.cancel()
+        await asyncio.gather(*pending, return_exceptions=True)
+        await self._send_reports()
+        return await self._cluster.close_run(self.run_id)
+
+    def _stop_thread(self) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    def _run_on_loop(self, work: Coroutine[Any, Any, T]) -> T:
+        return result_of(asyncio.run_coroutine_threadsafe(work, self._loop))
+
+    def announce(self, steps: Mapping[int, Sequence[TrainingTask]], group: int) -> None:
+        """Replace the look-ahead: the tasks of the coming steps. A rejection is only logged, because look-ahead is advice."""
+        entries = [
+            LookaheadEntry(step, task.bundle_digest, group) for step, tasks in steps.items() for task in tasks
+        ]
+        self._announced += 1
+        asyncio.run_coroutine_threadsafe(self._announce(self._announced, entries), self._loop)
+
+    async def _announce(self, version: int, entries: list[LookaheadEntry]) -> None:
+        try:
+            for entry in entries:
+                if version != self._announced:
+                    return  # superseded by a newer window
+                await self._upload_once(entry.bundle_digest)
+            if version == self._announced:
+                await self._cluster.announce_lookahead(self.run_id, version, entries)
+        except ClusterError as error:
+            logger.warning("look-ahead rejected: %s", error)
+
+    async def _upload_once(self, digest: str) -> None:
+        """Upload a bundle once per run. After a failure, the next caller retries."""
+        task = self._uploads.get(digest)
+        if task is None or (task.done() and (task.cancelled() or task.exception() is not None)):
+            task = self._uploads[digest] = asyncio.create_task(self._upload(digest))
+        await asyncio.shield(task)
+
+    async def _upload(self, digest: str) -> None:
+        bundle = {digest: self._bundle_bytes(digest)}
+        deadline_s, wait_s = self._loop.time() + RETRY_BUNDLE_S, FIRST_RETRY_S
+        while True:
+            try:
+                await self._cluster.put_bundles(bundle)
+            except (UnavailableError, DeadlineError) as error:
+                if self._loop.time() + wait_s > deadline_s:
+                    raise
+                logger.warning("bundle upload failed, retrying digest=%s: %s", digest, error)
+            else:
+                return
+            await asyncio.sleep(wait_s)
+            wait_s = min(2 * wait_s, MAX_RETRY_S)
+
+    def report(self, report: TrainingReport) -> None:
+        """Queue a report for the dashboard without waiting. Rejected reports are logged and dropped."""
+        self._reports.append(report)
+        asyncio.run_coroutine_threadsafe(self._send_reports(), self._loop)
+
+    async def _send_reports(self) -> None:
+        async with self._reporting:
+            while self._reports:
+                report = self._reports[0]
+                try:
+                    await self._cluster.report_training(self.run_id, report)
+                except (UnavailableError, DeadlineError):
+                    return  # the next report retries the queue
+                except PreconditionError as error:
+                    logger.warning("training reports disabled, the manager rejects them: %s", error)
+                    self._reports = deque(maxlen=0)
+                except ClusterError as error:
+                    logger.warning("training report rejected: %s", error)
+                # A newer report may have evicted this one from the full queue.
+                if self._reports and self._reports[0] is report:
+                    self._reports.popleft()
+
+    def submit(
+        self,
+        batch_id: str,
+        step: int,
+        task: TrainingTask,
+        situation: Situation,
+        texts: Sequence[str],
+        codec: Codec,
+    ) -> Future[tuple[PlanOutcome, ...]]:
+        """Start the rollouts of one task's plans. Outcomes keep the order of ``texts``.
+
+        ``situation`` is the varied situation of the prompt, which resolves the object names in the texts.
+        """
+        plans: list[Plan | PlanOutcome] = [
+            _plan_or_failure(text, situation, codec, self._terms.reward) for text in texts
+        ]
+        rollouts = tuple(
+            Rollout(
+                rollout_id=f"{self.run_id}/{batch_id}/{index}",
+                group_id=f"{self.run_id}/{batch_id}",
+                bundle_digest=task.bundle_digest,
+                task_id=task.task.task_id,
+                plan=plan,
+                seed=group_seed(self._run_seed, task.task.task_id),
+            )
+            for index, plan in enumerate(plans)
+            if not isinstance(plan, PlanOutcome)
+        )
+        batch = Batch(self.run_id, batch_id, step, rollouts)
+        work = self._execute(batch, texts, plans)
+        return asyncio.run_coroutine_threadsafe(work, self._loop)
+
+    async def _execute(
+        self, batch: Batch, texts: Sequence[str], plans: Sequence[Plan | PlanOutcome]
+    ) -> tuple[PlanOutcome, ...]:
+        outcomes: dict[str, Outcome] = {}
+        if batch.rollouts:
+            await self._upload_once(batch.rollouts[0].bundle_digest)
+            async for result in self._cluster.execute(batch):
+                outcomes[result.rollout_id] = result.outcome
+        return tuple(
+            plan
+            if isinstance(plan, PlanOutcome)
+            else _plan_outcome(text, outcomes.get(f"{self.run_id}/{batch.batch_id}/{index}"))
+            for index, (text, plan) in enumerate(zip(texts, plans, strict=True))
+        )
+
+
+def _plan_or_failure(
+    text: str, situation: Situation, codec: Codec, reward: RewardSettings
+) -> Plan | PlanOutcome:
+    try:
+        return parse_policy_text(text, situation, codec)
+    except PlanError as error:
+        return PlanOutcome(text, unparsable(reward), problem=str(error))
+
+
+def _plan_outcome(text: str, outcome: Outcome | None) -> PlanOutcome:
+    if isinstance(outcome, Completed):
+        return PlanOutcome(text, outcome.reward, outcome)
+    return PlanOutcome(text, None, outcome)
+
+
+def result_of(future: Future[T]) -> T:
+    """Wait for the future's value. A ClusterError becomes a TrainerError."""
+    try:
+        return future.result()
+    except ClusterError as error:
+        raise TrainerError(str(error)) from error

@@ -1,0 +1,334 @@
+"""Settings of a training run, parsed once from the command line, a TOML file or a checkpoint."""
+
+from __future__ import annotations
+
+import tomllib
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from embomatrix.reward.settings import PAPER, RewardSettings
+from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.config.errors import TrainerError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+
+class LossKind(StrEnum):
+    """Denominator of the loss."""
+
+    PAPER = "paper"  # sum over a plan's tokens, mean over plans: the formula of the paper
+    GRPO = "grpo"  # mean over a plan's tokens, then over plans: DeepSeekMath
+    BNPO = "bnpo"  # mean over the tokens of each microbatch, then over microbatches
+    DAPO = "dapo"  # mean over all tokens of the step: a plan's weight grows with its length
+    DR_GRPO = "dr_grpo"  # sum over tokens / (plans * longest allowed plan): length has no influence
+    GSPO = "gspo"  # like GRPO, with the geometric mean of a plan's token ratios in place of each ratio
+
+
+class RatioLevel(StrEnum):
+    """Level of the importance ratio (new probability / old probability)."""
+
+    TOKEN = "token"
+    SEQUENCE = "sequence"  # product over a plan's tokens: the formula of the paper
+    MEAN = "mean"  # geometric mean over a plan's tokens: GSPO
+
+
+class Overlap(StrEnum):
+    """Work of the trainer while the cluster simulates."""
+
+    NONE = "none"  # none: wait for all rewards of a step, then update
+    STREAM = "stream"  # sample and back-propagate groups while others are simulated
+    AHEAD = "ahead"  # also sample the next step's batch, from weights that are one step old
+
+
+class TrackerKind(StrEnum):
+    """Experiment trackers."""
+
+    TENSORBOARD = "tensorboard"
+    WANDB = "wandb"
+    TRACKIO = "trackio"
+
+
+class OptimiserKind(StrEnum):
+    """Optimiser of imitation."""
+
+    ADAMW = "adamw"
+    MUON = "muon"  # for the matrices of linear layers; AdamW for all other parameters
+
+
+class ComputeDtype(StrEnum):
+    """Data type of the matrix products in linear layers on a CPU. Weights, sums and attention stay in float32."""
+
+    AUTO = "auto"  # bfloat16 if the CPU has instructions for it, else float32
+    BFLOAT16 = "bfloat16"
+    FLOAT32 = "float32"
+
+
+class OnLost(StrEnum):
+    """Treatment of a group that lost a rollout to the infrastructure."""
+
+    GROUP = "group"  # leave out the whole group
+    PARTIAL = "partial"  # leave out the lost rollout only
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class TinySettings(_Frozen):
+    """Shape of the word-level policy that is trained from scratch."""
+
+    layers: int = Field(default=4, ge=1)
+    width: int = Field(default=128, ge=16)
+    heads: int = Field(default=4, ge=1)
+    inner: int = Field(default=384, ge=16)
+
+
+class LoraSettings(_Frozen):
+    """Low-rank adapters for a Hugging Face model. The model's own weights stay frozen."""
+
+    rank: int = Field(default=0, ge=0)
+    """0: no adapters, all weights learn."""
+    alpha: float = Field(default=32.0, gt=0)
+    """The adapters' output is scaled by alpha / rank."""
+    targets: tuple[str, ...] = ()
+    """Last parts of the names of the linear layers to adapt. Empty: all except the output layer."""
+
+
+class PromptSettings(_Frozen):
+    """Contents of prompts, and their variation during training."""
+
+    rows: int = Field(default=16, ge=1)
+    """Maximum rows of the object table. Rows that the instruction names come first."""
+    rename_share: float = Field(default=0.8, ge=0, le=1)
+    """Share of imitation examples with renamed object categories (word-level policy only)."""
+    practice_rename_share: float = Field(default=0.0, ge=0, le=1)
+    """The same share in GRPO. The default keeps the tasks' own words."""
+    drop_share: float = Field(default=0.7, ge=0, le=1)
+    """Imitation leaves out up to this share of the rows that the oracle plan does not use."""
+
+
+class ImitationSettings(_Frozen):
+    """Teacher forcing on the oracle plans, before GRPO."""
+
+    seconds: float = Field(default=150.0, ge=0)
+    steps: int | None = Field(default=None, ge=0)
+    """Number of steps. Overrides ``seconds``."""
+    batch: int = Field(default=32, ge=1)
+    """Plans per step."""
+    chunk: int | None = Field(default=None, ge=1)
+    """Plans per forward pass. Gradients accumulate over chunks, which bounds memory. None: the whole batch."""
+    optimiser: OptimiserKind = OptimiserKind.MUON
+    learning_rate: float = Field(default=2e-3, gt=0)
+    """Learning rate of AdamW."""
+    matrix_learning_rate: float = Field(default=0.02, gt=0)
+    """Learning rate of Muon."""
+    warmup_steps: int = Field(default=20, ge=0)
+    weight_decay: float = Field(default=0.01, ge=0)
+    patience: int = Field(default=0, ge=0)
+    """Early stopping: evaluations without a lower validation loss before imitation ends and the best weights are restored.
+
+    The mean loss over the last ``patience`` evaluations must also not be below the mean over the ``patience`` before
+    them. 0: no early stopping, and no task is held back.
+    """
+    validation_share: float = Field(default=0.05, gt=0, lt=1)
+    """Share of the training tasks that is held back for validation."""
+    validate_every: int = Field(default=100, ge=1)
+    """Steps between two evaluations."""
+    checkpoint_seconds: float = Field(default=60.0, gt=0)
+    """Seconds between two checkpoints."""
+
+
+class GrpoSettings(_Frozen):
+    """Group relative policy optimisation. The paper publishes no values for these constants."""
+
+    minutes: float = Field(default=5.0, ge=0)
+    steps: int | None = Field(default=None, ge=0)
+    """Number of steps. Overrides ``minutes``."""
+    tasks_per_step: int = Field(default=16, ge=1)
+    group: int = Field(default=8, ge=2)
+    """Plans per task: G."""
+    chunk: int = Field(default=8, ge=1)
+    """Tasks per microbatch. Its plans go to the cluster while the next microbatch is sampled."""
+    learning_rate: float = Field(default=4e-4, gt=0)
+    warmup_steps: int = Field(default=20, ge=0)
+    """Steps of linear warm-up. Adam's first steps have full length for any gradient: without warm-up, the first small batches
+    undo imitation.
+    """
+    final_learning_rate_share: float = Field(default=0.2, gt=0, le=1)
+    """The learning rate decays linearly to this share of itself."""
+    temperature: float = Field(default=1.0, gt=0)
+    max_new: int = Field(default=72, ge=1)
+    """Maximum tokens of a plan."""
+    loss: LossKind = LossKind.DAPO
+    ratio: RatioLevel = RatioLevel.TOKEN
+    clip_low: float = Field(default=0.2, gt=0, lt=1)
+    clip_high: float = Field(default=0.28, gt=0)
+    """Upper clip. Above ``clip_low`` it lets the probability of rare tokens grow (DAPO)."""
+    kl_coef: float = Field(default=0.02, ge=0)
+    """Weight of the KL divergence to the policy after imitation: the paper's beta."""
+    entropy_coef: float = Field(default=0.0, ge=0)
+    spread_floor: float = Field(default=1.0, gt=0)
+    """Reward units added to a group's standard deviation before the division by it.
+
+    At 1, a group that differs only by a touched object weighs a tenth of a group in which some plans reach the goal.
+    Near 0, as in the paper, both weigh the same.
+    """
+    max_grad_norm: float = Field(default=1.0, gt=0)
+    lookahead: int = Field(default=3, ge=0)
+    """Steps that are announced to the cluster ahead of time."""
+    on_lost: OnLost = OnLost.GROUP
+    overlap: Overlap = Overlap.STREAM
+    reserve: int = Field(default=0, ge=0)
+    """Dynamic sampling: maximum tasks per step that replace zero-variance groups."""
+    curriculum_tasks: int = Field(default=0, ge=0)
+    """Number of draws over which the task pool grows from the shortest plans to all tasks. 0: no curriculum."""
+    curriculum_start: float = Field(default=0.25, gt=0, le=1)
+    """Initial share of the tasks in the pool."""
+    relevance: float = Field(default=1.0, ge=0)
+    """Weight of the reward's relevance tier in the advantage. 0 leaves the tier out."""
+    relevance_final: float | None = Field(default=None, ge=0)
+    """Weight at the end of the budget, reached linearly. None: constant."""
+
+    @property
+    def ratio_level(self) -> RatioLevel:
+        """Level of the importance ratio. GSPO is defined with the geometric mean."""
+        return RatioLevel.MEAN if self.loss is LossKind.GSPO else self.ratio
+
+
+class RewardTable(_Frozen):
+    """Coefficients of the reward's tiers, which the cluster applies to this run's plans. 0 leaves a tier out."""
+
+    unparsable: float = PAPER.unparsable
+    format: float = PAPER.format
+    relevance_per_object: float = PAPER.relevance_per_object
+    relevance_limit: float = PAPER.relevance_limit
+    goal: float = PAPER.goal
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        self.settings()
+        return self
+
+    def settings(self) -> RewardSettings:
+        return RewardSettings(**self.model_dump())
+
+
+class EvaluationSettings(_Frozen):
+    """Evaluation on held-out tasks."""
+
+    samples: int = Field(default=10, ge=1)
+    temperature: float = Field(default=1.0, ge=0)
+    chunk: int = Field(default=8, ge=1)
+
+
+class TrainSettings(_Frozen):
+    """Settings of one training run."""
+
+    model: str = "tiny"
+    """``tiny``, or a Hugging Face model by name or folder."""
+    codec: Codec = Codec.LINES
+    """Plan format of a Hugging Face model: ``lines`` or ``json``. The word-level policy always uses ``names``."""
+    seed: int = 0
+    threads: int = Field(default=1, ge=1)
+    """Torch threads per process."""
+    processes: int = Field(default=1, ge=1)
+    """Data-parallel processes for GRPO, on a CPU. The result is bit-identical for any number.
+
+    Processes beyond the number of microbatches of a step stay idle.
+    """
+    device: str = "cpu"
+    checkpoint_every: int = Field(default=50, ge=1)
+    keep_checkpoints: int = Field(default=2, ge=1)
+    track: tuple[TrackerKind, ...] = ()
+    """Experiment trackers that also receive the metrics."""
+    samples_every: int = Field(default=10, ge=1)
+    """Steps between two groups in the sample log."""
+    gradient_checkpointing: bool = False
+    """Hugging Face models: keep only the layers' inputs for the backward pass and recompute the rest."""
+    compute_dtype: ComputeDtype = ComputeDtype.AUTO
+    tiny: TinySettings = TinySettings()
+    lora: LoraSettings = LoraSettings()
+    prompt: PromptSettings = PromptSettings()
+    imitation: ImitationSettings = ImitationSettings()
+    grpo: GrpoSettings = GrpoSettings()
+    reward: RewardTable = RewardTable()
+    evaluation: EvaluationSettings = EvaluationSettings()
+
+
+LANGUAGE_MODEL_DEFAULTS: Final[Mapping[str, Any]] = {
+    "prompt.rows": 28,
+    "prompt.rename_share": 0.0,
+    "imitation.batch": 4,
+    "imitation.chunk": 1,
+    "imitation.optimiser": "adamw",
+    "imitation.learning_rate": 5e-5,
+    "grpo.tasks_per_step": 4,
+    "grpo.chunk": 1,
+    "grpo.learning_rate": 1e-5,
+    "grpo.max_new": 96,
+}
+"""Defaults that differ for a pretrained model: it already knows words, and it needs more memory."""
+
+
+def read_settings(
+    path: Path | None, changes: Mapping[str, Any], defaults: Mapping[str, Any] | None = None
+) -> TrainSettings:
+    """Merge ``defaults``, then a TOML file, then ``changes`` (dotted keys; None: not given). Raises TrainerError."""
+    values: dict[str, Any] = {}
+    _set_all(values, defaults or {})
+    if path is not None:
+        try:
+            _merge(values, tomllib.loads(path.read_text(encoding="utf-8")))
+        except OSError as error:
+            raise TrainerError(
+                f"the settings file {path} can't be read ({error.strerror}): expected a TOML file"
+            ) from error
+        except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise TrainerError(
+                f"the settings file {path} is not valid TOML ({error}): fix the file"
+            ) from error
+    return with_changes(values, changes)
+
+
+def with_changes(values: dict[str, Any], changes: Mapping[str, Any]) -> TrainSettings:
+    """Apply ``changes`` to nested ``values``. Raises TrainerError that names the field."""
+    _set_all(values, changes)
+    return checked_settings(values)
+
+
+def checked_settings(values: Mapping[str, Any]) -> TrainSettings:
+    """Validate nested ``values``. Raises TrainerError that names the field."""
+    try:
+        return TrainSettings.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        if first["type"] == "extra_forbidden":
+            raise TrainerError(f"unknown setting {where!r}: correct its name or remove it") from error
+        expected = first["msg"].removeprefix("Value error, ")
+        expected = expected[:1].lower() + expected[1:]
+        raise TrainerError(f"setting {where!r}: {expected} (found {first.get('input')!r})") from error
+
+
+def _set_all(values: dict[str, Any], changes: Mapping[str, Any]) -> None:
+    for key, value in changes.items():
+        if value is not None:
+            *parents, leaf = key.split(".")
+            level = values
+            for parent in parents:
+                level = level.setdefault(parent, {})
+                if not isinstance(level, dict):
+                    raise TrainerError(f"setting {parent!r}: expected a table of settings (found {level!r})")
+            level[leaf] = value
+
+
+def _merge(values: dict[str, Any], more: Mapping[str, Any]) -> None:
+    for key, value in more.items():
+        if isinstance(value, dict) and isinstance(values.get(key), dict):
+            _merge(values[key], value)
+        else:
+            values[key] = value

@@ -1,0 +1,236 @@
+"""Data-parallel workers: processes that sample and back-propagate GRPO's microbatches side by side.
+
+Microbatch ``n`` of a step belongs to process ``n`` modulo the number of processes. Process 0 is the trainer itself.
+All processes see the same weights in shared memory.
+"""
+
+from __future__ import annotations
+
+import mmap
+import multiprocessing
+import os
+import pickle
+import signal
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.reduction import DupFd
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
+
+import torch
+
+from embomatrix.rpc.nameless import nameless_file
+from embomatrix.trainer.config.errors import DAMAGE, TrainerError
+from embomatrix.trainer.config.settings import TrainSettings
+from embomatrix.trainer.grpo.learner import Learner
+from embomatrix.trainer.policy.loading import saved_policy
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from concurrent.futures import Future
+    from multiprocessing.connection import Connection
+    from pathlib import Path
+
+    from torch import Tensor
+
+    from embomatrix.trainer.grpo.learner import Microbatch, SamplingLearner
+    from embomatrix.trainer.grpo.objective import LossMetrics
+    from embomatrix.trainer.policy.protocol import Policy, Samples, Tokens
+
+T = TypeVar("T")
+_ALIGNMENT_BYTES: Final = 64
+"""Alignment of each tensor: the width of the widest vector instructions."""
+
+
+class SharedTensors:
+    """Tensors with the shapes and dtypes of ``like`` in one anonymous shared-memory file.
+
+    Without ``fd`` the memory is new and zero. torch's own sharing is not used: it needs /dev/shm, 64 MB in a container.
+    """
+
+    def __init__(self, like: Sequence[Tensor], fd: int | None = None) -> None:
+        sizes = [each.numel() * each.element_size() for each in like]
+        offsets = [0]
+        for size in sizes:
+            offsets.append(offsets[-1] + -(-size // _ALIGNMENT_BYTES) * _ALIGNMENT_BYTES)
+        self.fd = nameless_file("embomatrix-trainer", offsets[-1]) if fd is None else fd
+        memory = mmap.mmap(self.fd, offsets[-1])
+        self.tensors = tuple(
+            torch.frombuffer(memory, dtype=each.dtype, count=each.numel(), offset=offset).view(each.shape)
+            for each, offset in zip(like, offsets, strict=False)
+        )
+
+    def close(self) -> None:
+        """Close the descriptor. The memory lives as long as one of its tensors."""
+        os.close(self.fd)
+
+
+class RemoteLearner:
+    """Learner in another process. Its requests are executed one after the other."""
+
+    def __init__(self, number: int, settings: TrainSettings, reference: Path, weights: SharedTensors) -> None:
+        spawn = multiprocessing.get_context("spawn")
+        self._gradient = SharedTensors(weights.tensors)
+        self._connection, remote_end = spawn.Pipe()
+        self._name = f"trainer-{number}"
+        memory = (DupFd(weights.fd), DupFd(self._gradient.fd))
+        self._process = spawn.Process(
+            target=_serve,
+            args=(remote_end, settings.model_dump(mode="json"), reference, *memory),
+            name=self._name,
+            daemon=True,
+        )
+        self._process.start()
+        remote_end.close()
+        self._gradient.close()
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix=self._name)
+        self.closed = False
+
+    def run(self, job: Callable[[RemoteLearner], T]) -> Future[T]:
+        """Queue ``job`` on this learner's thread. The job must not wait for other jobs, or Ctrl-C would wait too."""
+        return self._thread.submit(job, self)
+
+    def sample(self, prompts: Sequence[Tokens], seed: int) -> Samples:
+        samples: Samples = self._request("sample", tuple(prompts), seed)
+        return samples
+
+    def reference_logprobs(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:
+        logprobs: Tensor = self._request("reference_logprobs", tuple(prompts), tokens, mask)
+        return logprobs
+
+    def learn(self, microbatch: Microbatch) -> tuple[LossMetrics, list[Tensor | None]]:
+        """Return the metrics of a microbatch, and its gradient by parameter."""
+        metrics, has_gradient = self._request("learn", microbatch)
+        shared = self._gradient.tensors
+        return metrics, [
+            each.clone() if present else None for each, present in zip(shared, has_gradient, strict=True)
+        ]
+
+    def _request(self, name: str, *arguments: object) -> Any:
+        try:
+            self._connection.send_bytes(pickle.dumps((name, arguments)))
+            succeeded, reply = pickle.loads(self._connection.recv_bytes())
+        except (EOFError, OSError) as error:
+            self._process.join(timeout=5)
+            raise TrainerError(
+                f"the process {self._name} ended during a step (exit code {self._process.exitcode}; -9 usually means out of "
+                "memory): continue with --resume, and lower `processes` if memory is short"
+            ) from error
+        if not succeeded:
+            raise TrainerError(f"the process {self._name} failed ({reply}): continue with --resume")
+        return reply
+
+    def close(self) -> None:
+        """Kill the process, even in the middle of a request."""
+        self.closed = True
+        self._process.kill()
+        self._process.join()
+        self._thread.shutdown(wait=True, cancel_futures=True)
+        self._connection.close()
+
+
+class _Requests:
+    """Methods that ``RemoteLearner`` calls by name in the other process."""
+
+    def __init__(self, settings: TrainSettings, reference: Path, weights_fd: int, gradient_fd: int) -> None:
+        torch.set_num_threads(settings.threads)
+        policy = saved_policy(reference, settings)
+        self._weights = list(policy.parameters())
+        shared = SharedTensors(self._weights, weights_fd)
+        for parameter, tensor in zip(self._weights, shared.tensors, strict=True):
+            parameter.data = tensor
+        shared.close()
+        self._gradient = SharedTensors(self._weights, gradient_fd)
+        self._gradient.close()
+        self._learner = Learner(policy, saved_policy(reference, settings).frozen_copy(), settings.grpo)
+        self.sample = self._learner.sample
+        self.reference_logprobs = self._learner.reference_logprobs
+
+    def learn(self, microbatch: Microbatch) -> tuple[LossMetrics, list[bool]]:
+        """Write the microbatch's gradient to shared memory. The list tells which parameters have a gradient."""
+        for parameter in self._weights:
+            parameter.grad = None
+        metrics = self._learner.learn(microbatch)
+        for parameter, shared in zip(self._weights, self._gradient.tensors, strict=True):
+            if parameter.grad is not None:
+                shared.copy_(parameter.grad)
+        return metrics, [parameter.grad is not None for parameter in self._weights]
+
+
+def _serve(
+    connection: Connection, settings: dict[str, Any], reference: Path, weights: Any, gradient: Any
+) -> None:
+    """Answer requests until the trainer closes the connection. The trainer handles Ctrl-C for all processes.
+
+    ``reference`` is the folder of the policy after imitation; ``weights`` and ``gradient`` are descriptors from DupFd.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    requests: _Requests | None = None
+    while True:
+        try:
+            name, arguments = pickle.loads(connection.recv_bytes())
+        except EOFError:
+            return
+        try:
+            if requests is None:
+                parsed = TrainSettings.model_validate(settings)
+                requests = _Requests(parsed, reference, weights.detach(), gradient.detach())
+            reply = (True, getattr(requests, name)(*arguments))
+        except (TrainerError, MemoryError, *DAMAGE) as error:
+            reply = (False, f"{type(error).__name__}: {error}")
+        try:
+            connection.send_bytes(pickle.dumps(reply))
+        except BrokenPipeError:
+            return
+
+
+class DataParallelWorkers:
+    """The trainer's own learner and its remote learners. Weight updates are visible to all of them at once."""
+
+    def __init__(self, local: Learner, remotes: Sequence[RemoteLearner] = ()) -> None:
+        self.local = local
+        self._remotes = tuple(remotes)
+
+    @classmethod
+    def start(cls, local: Learner, policy: Policy, settings: TrainSettings, reference: Path) -> Self:
+        """Start ``settings.processes - 1`` remote learners. ``reference`` is the reference policy's folder.
+
+        Raises TrainerError if several processes are asked for and the policy is not on the CPU.
+        """
+        if settings.processes == 1:
+            return cls(local)
+        if settings.device != "cpu":
+            raise TrainerError(
+                f"processes = {settings.processes} needs a policy on the CPU, but the device is {settings.device}: pass "
+                "--processes=1"
+            )
+        learning = list(policy.parameters())
+        weights = SharedTensors([parameter.data for parameter in learning])
+        for parameter, shared in zip(learning, weights.tensors, strict=True):
+            shared.copy_(parameter.data)
+            parameter.data = shared
+        remotes = [
+            RemoteLearner(number, settings, reference, weights) for number in range(1, settings.processes)
+        ]
+        weights.close()
+        return cls(local, remotes)
+
+    def remote(self, index: int) -> RemoteLearner | None:
+        """Return the owner of the microbatch with this index. None: this process."""
+        owner = index % (len(self._remotes) + 1)
+        return self._remotes[owner - 1] if owner else None
+
+    def map(self, jobs: Sequence[tuple[int, Callable[[SamplingLearner], T]]]) -> list[T]:
+        """Run (microbatch index, job) pairs on the learners that own them. Results keep the order of the jobs."""
+        futures = {
+            at: remote.run(job)
+            for at, (index, job) in enumerate(jobs)
+            if (remote := self.remote(index)) is not None
+        }
+        local = {at: job(self.local) for at, (_, job) in enumerate(jobs) if at not in futures}
+        return [local[at] if at in local else futures[at].result() for at in range(len(jobs))]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for remote in self._remotes:
+            remote.close()

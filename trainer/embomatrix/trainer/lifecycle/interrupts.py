@@ -1,0 +1,44 @@
+"""Deferred Ctrl-C: a policy that was updated by half can't be resumed."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from typing import TYPE_CHECKING, Any, Self
+
+if TYPE_CHECKING:
+    from types import FrameType, TracebackType
+
+
+class DeferredInterrupts:
+    """Context manager that holds back SIGINT from ``defer`` until its end. A second SIGINT takes effect at once.
+
+    Has no effect outside the main thread, which alone receives signals.
+    """
+
+    def __init__(self) -> None:
+        self._previous_handler: Any = None
+        self._received = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def defer(self) -> None:
+        """Hold back SIGINT from now until the context ends."""
+        if self._previous_handler is None and threading.current_thread() is threading.main_thread():
+            self._previous_handler = signal.getsignal(signal.SIGINT)
+            if self._previous_handler is not None:  # None: not a Python handler, so it could not be restored
+                signal.signal(signal.SIGINT, self._on_interrupt)
+
+    def _on_interrupt(self, number: int, frame: FrameType | None) -> None:
+        self._received = True
+        signal.signal(signal.SIGINT, self._previous_handler)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._previous_handler is not None:
+            signal.signal(signal.SIGINT, self._previous_handler)
+            self._previous_handler = None
+        if self._received and error is None:
+            signal.raise_signal(signal.SIGINT)

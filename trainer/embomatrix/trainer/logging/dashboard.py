@@ -1,0 +1,85 @@
+"""Training reports to the manager, for its dashboard."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.rpc.training import (
+    FIGURES,
+    NAME_CHARS,
+    RewardTiers,
+    SampledPlan,
+    SampledStep,
+    TrainingReport,
+)
+from embomatrix.rpc.wire.values import Cancelled, Completed, InfraFailure
+from embomatrix.trainer.logging.trackers import GRPO_PHASE
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from embomatrix.trainer.cluster.gateway import PlanOutcome
+    from embomatrix.trainer.grpo.records import GroupLog
+
+PLANS_SHOWN: Final = 4
+"""Plans per step: from the group with the widest spread of rewards, from the best to the worst."""
+
+
+class DashboardReporter:
+    """Tracker that reports to the manager. ``send`` queues a report and never blocks."""
+
+    def __init__(self, send: Callable[[TrainingReport], None]) -> None:
+        self._send = send
+
+    def log(self, phase: str, step: int, values: Mapping[str, float]) -> None:
+        """Report a step's finite numbers."""
+        finite = [(name[:NAME_CHARS], value) for name, value in values.items() if math.isfinite(value)]
+        self._send(TrainingReport(phase, step, dict(finite[:FIGURES])))
+
+    def close(self) -> None:
+        """No-op: the gateway sends the remaining reports."""
+
+    def sampled(self, step: int, logs: Sequence[GroupLog]) -> None:
+        """Report some plans of a GRPO step."""
+        widest = max(logs, key=_spread, default=None)
+        self._send(TrainingReport(GRPO_PHASE, step, {}, () if widest is None else _plans(widest)))
+
+
+def _spread(log: GroupLog) -> float:
+    known = [outcome.value for outcome in log.outcomes if outcome.reward is not None]
+    return max(known) - min(known) if known else -1.0
+
+
+def _plans(log: GroupLog) -> tuple[SampledPlan, ...]:
+    """Pick plans evenly by reward rank, including the best and the worst. Lost ones rank last."""
+    ranked = sorted(
+        zip(log.outcomes, log.advantages, strict=True),
+        key=lambda pair: -math.inf if pair[0].reward is None else pair[0].value,
+        reverse=True,
+    )
+    last = min(PLANS_SHOWN, len(ranked)) - 1
+    chosen = [round(rank * (len(ranked) - 1) / max(last, 1)) for rank in range(last + 1)]
+    return tuple(_plan(log, *ranked[rank]) for rank in chosen)
+
+
+def _plan(log: GroupLog, outcome: PlanOutcome, advantage: float) -> SampledPlan:
+    task, reward = log.task.task, outcome.reward
+    tiers = None
+    if reward is not None:
+        tiers = RewardTiers(reward.format, reward.relevance, reward.goal, reward.success)
+    problem = outcome.problem
+    steps: tuple[SampledStep, ...] = ()
+    match outcome.outcome:
+        case Completed():
+            steps = tuple(
+                SampledStep(step.call.skill.value, step.ok, step.message) for step in outcome.outcome.steps
+            )
+        case InfraFailure(code=code, message=message):
+            problem = f"{code.value}: {message}"
+        case Cancelled():
+            problem = "cancelled"
+        case None:
+            pass
+    finite = advantage if math.isfinite(advantage) else 0.0
+    return SampledPlan(task.task_id, task.instruction, outcome.text, tiers, finite, problem, steps)

@@ -1,0 +1,102 @@
+"""Progress of a training run in the terminal: a live panel, or plain lines for logs and pipes."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Final, Self
+
+from rich.console import Group
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rich.console import Console
+
+    from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation
+    from embomatrix.trainer.grpo.records import StepRecord
+    from embomatrix.trainer.imitation.teacher_forcing import ImitationProgress
+
+_LINE_INTERVAL_S: Final = 10.0
+
+
+class LineDisplay:
+    """Context manager that prints at most one line per ``_LINE_INTERVAL_S``."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._printed_s = -_LINE_INTERVAL_S
+        self._validation = ""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def imitation(self, progress: ImitationProgress) -> None:
+        figures = {"step": f"{progress.step}", "loss": f"{progress.loss:.3f}"}
+        if progress.validation is not None:
+            self._validation = f"{progress.validation:.3f}"
+        if self._validation:
+            figures["validation loss"] = self._validation
+        self._show("imitation", progress.share, figures)
+
+    def evaluating(self, label: str, done: int, total: int) -> None:
+        self._show(f"held-out evaluation {label}", done / total, {"tasks": f"{done} of {total}"})
+
+    def evaluated(self, label: str, result: HeldOutEvaluation) -> None:
+        self._print(f"held-out success {label}: {result.success().as_percent()}")
+
+    def stepped(self, record: StepRecord, share: float, rollouts_per_s: float) -> None:
+        figures = {
+            "step": f"{record.step}",
+            "reward": f"{record.reward:.2f}",
+            "success": f"{record.success:.0%}",
+            "rollouts/s": f"{rollouts_per_s:.0f}",
+            "warm starts": f"{record.warm:.0%}",
+            "entropy": "–" if record.entropy is None else f"{record.entropy:.2f}",
+            "zero-variance groups": f"{record.zero_variance_groups:.0%}",
+        }
+        self._show("GRPO", share, figures)
+
+    def _show(self, title: str, share: float, figures: Mapping[str, str]) -> None:
+        now_s = time.monotonic()
+        if now_s - self._printed_s >= _LINE_INTERVAL_S:
+            self._printed_s = now_s
+            self._print(
+                f"{title} {share:.0%}: {', '.join(f'{name} {value}' for name, value in figures.items())}"
+            )
+
+    def _print(self, text: str) -> None:
+        self._console.print(text, highlight=False, markup=False)
+
+
+class LiveDisplay(LineDisplay):
+    """Panel that is redrawn in place."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__(console)
+        self._live = Live(Text("starting"), console=console, refresh_per_second=4)
+
+    def __enter__(self) -> Self:
+        self._live.__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._live.__exit__(None, None, None)
+
+    def _show(self, title: str, share: float, figures: Mapping[str, str]) -> None:
+        table = Table.grid(padding=(0, 2))
+        table.add_row(*(Text(name, style="dim") for name in figures))
+        table.add_row(*figures.values())
+        share = min(1.0, share)
+        bar = ProgressBar(total=1.0, completed=share, width=60)
+        self._live.update(Group(Text(f"{title}  {share:.0%}", style="bold"), bar, table))
+
+
+def display_on(console: Console) -> LineDisplay:
+    """Return a live panel on a terminal, else plain lines."""
+    return LiveDisplay(console) if console.is_terminal else LineDisplay(console)

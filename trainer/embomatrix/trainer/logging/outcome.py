@@ -1,0 +1,82 @@
+"""Machine-readable result of a finished run: one JSON file, written last, so its presence marks a finished run."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from embomatrix.trainer.config.errors import TrainerError, reason_of
+from embomatrix.trainer.lifecycle.stopwatch import TimeShares
+from embomatrix.world.whole_file import write_whole
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+OUTCOME: Final = "outcome.json"
+SCHEMA: Final = 1
+
+
+@dataclass(frozen=True, slots=True)
+class TaskRate:
+    """Success rate of one held-out task, None if all of its rollouts were lost."""
+
+    task_id: str
+    category: str
+    rate: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class RunOutcome:
+    """Numbers of one run. ``before`` and ``after`` GRPO are empty without held-out tasks.
+
+    ``spent_s`` are seconds of the whole run by activity, ``grpo_s`` seconds of the GRPO steps. ``peak_mb`` is the peak memory
+    of the trainer process since the last resume in MB, 0 if unknown.
+    """
+
+    model: str
+    imitation_steps: int
+    steps: int
+    rollouts: int
+    lost: int
+    wall_s: float
+    grpo_s: float
+    spent_s: Mapping[str, float]
+    before: tuple[TaskRate, ...]
+    after: tuple[TaskRate, ...]
+    peak_mb: float = 0.0
+
+    @property
+    def wait_share(self) -> float:
+        """Share of the GRPO steps in which the trainer waited for simulation; NaN without steps."""
+        return TimeShares(self.grpo_s, self.spent_s).waiting
+
+    @property
+    def overhead(self) -> float:
+        """Share of the GRPO steps outside of sampling and updates; NaN without steps."""
+        return TimeShares(self.grpo_s, self.spent_s).overhead
+
+
+def write_outcome(folder: Path, outcome: RunOutcome) -> Path:
+    """Write the outcome into a run's folder. Raises OSError."""
+    path = folder / OUTCOME
+    value = {"schema": SCHEMA, **asdict(outcome)}
+    write_whole(path, (json.dumps(value, indent=1) + "\n").encode("utf-8"))
+    return path
+
+
+def read_outcome(folder: Path) -> RunOutcome:
+    """Read an outcome. Raises TrainerError if it is missing or damaged."""
+    path = folder / OUTCOME
+    try:
+        value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        if value.pop("schema") != SCHEMA:
+            raise TrainerError(f"{path} has another version than {SCHEMA}: train again with another --out")
+        for name in ("before", "after"):
+            value[name] = tuple(TaskRate(**item) for item in value[name])
+        return RunOutcome(**value)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise TrainerError(
+            f"{path} is not the outcome of a finished run ({reason_of(error)}): finish the run with `embomatrix train --resume`"
+        ) from error

@@ -1,0 +1,88 @@
+"""Creation and loading of policies by model name or folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.trainer.config.errors import DAMAGE, TrainerError, reason_of
+from embomatrix.trainer.policy.compute_dtype import torch_dtype
+from embomatrix.trainer.policy.decoder import DecoderShape
+from embomatrix.trainer.policy.hf import HfPolicy
+from embomatrix.trainer.policy.lora import has_adapters
+from embomatrix.trainer.policy.tiny import TinyPolicy
+from embomatrix.trainer.policy.vocabulary import build_vocabulary
+
+if TYPE_CHECKING:
+    from embomatrix.trainer.config.settings import TrainSettings
+    from embomatrix.trainer.data.tasks import TaskSet
+    from embomatrix.trainer.policy.protocol import Policy
+
+TINY: Final = "tiny"
+
+
+def is_word_level(model: str) -> bool:
+    """True for the word-level policy, new (``tiny``) or saved in a folder."""
+    return model == TINY or TinyPolicy.is_saved_in(Path(model))
+
+
+def new_policy(settings: TrainSettings, tasks: TaskSet) -> Policy:
+    """Create the initial policy of a run. Raises TrainerError if the model is unknown or can't be loaded."""
+    if not is_word_level(settings.model):
+        return _language_model(settings.model, settings)
+    if settings.lora.rank or settings.gradient_checkpointing:
+        raise TrainerError(
+            "lora and gradient_checkpointing are for Hugging Face models, not for the word-level policy: leave them out"
+        )
+    if settings.model != TINY:
+        return saved_policy(Path(settings.model), settings)
+    situations = [task.situation for task in (*tasks.train, *tasks.heldout)]
+    vocabulary = build_vocabulary(situations, [task.task.instruction for task in tasks.train])
+    shape = DecoderShape(len(vocabulary), **settings.tiny.model_dump())
+    return TinyPolicy(
+        vocabulary,
+        shape,
+        seed=settings.seed,
+        device=settings.device,
+        compute_dtype=torch_dtype(settings.compute_dtype, settings.device),
+    )
+
+
+def saved_policy(folder: Path, settings: TrainSettings) -> Policy:
+    """Load a policy from a folder. Raises TrainerError if there is none, or it is damaged."""
+    try:
+        if TinyPolicy.is_saved_in(folder):
+            compute_dtype = torch_dtype(settings.compute_dtype, settings.device)
+            return TinyPolicy.load(folder, device=settings.device, compute_dtype=compute_dtype)
+    except DAMAGE as error:
+        raise TrainerError(
+            f"the policy in {folder} is damaged ({reason_of(error)}): use another checkpoint"
+        ) from error
+    if settings.lora.rank and has_adapters(folder):
+        return _language_model(settings.model, settings, folder)
+    if HfPolicy.is_saved_in(folder):
+        return HfPolicy.load(
+            folder,
+            settings.codec,
+            device=settings.device,
+            compute_dtype=settings.compute_dtype,
+            label=settings.model,
+            gradient_checkpointing=settings.gradient_checkpointing,
+        )
+    raise TrainerError(
+        f"no policy found in {folder}: pass a checkpoint folder such as runs/NAME/checkpoints/step-000050"
+    )
+
+
+def _language_model(named: str, settings: TrainSettings, adapters: Path | None = None) -> HfPolicy:
+    """Load a Hugging Face model, with new or saved adapters if the settings ask for them."""
+    policy = HfPolicy.load(
+        named,
+        settings.codec,
+        device=settings.device,
+        compute_dtype=settings.compute_dtype,
+        gradient_checkpointing=settings.gradient_checkpointing,
+    )
+    if settings.lora.rank:
+        policy.adapt(settings.lora, seed=settings.seed, saved=adapters)
+    return policy

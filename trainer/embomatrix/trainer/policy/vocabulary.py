@@ -1,0 +1,151 @@
+"""Word-level vocabulary. Small policies learn to copy words in minutes, subword tokens in hours.
+
+It holds skills, relations, states, the category words of the object tables, room types, small numbers, and the frequent
+words of the *training* instructions. ``apple_12`` is two tokens, ``apple`` and ``_12``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.skills.syntax import PROFILES, PlaceRelation
+from embomatrix.world.state import State
+from embomatrix.world.task import Profile
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from embomatrix.skills.prompt import Situation
+
+PAD: Final = 0
+END: Final = 1
+GO: Final = 2
+UNKNOWN: Final = 3
+SPECIAL: Final = ("<pad>", "<end>", "<go>", "<unknown>")
+BREAK: Final = "\n"
+_NUMBERED: Final = re.compile(r"(.+?)(_\d+)")
+_WORD: Final = re.compile(r"\n|-?\d+\.\d+|[a-z0-9_]+(?:-[a-z][a-z0-9_]*)*|-\d+")
+_NUMBER: Final = re.compile(r"_\d+")
+_QUANTITY: Final = re.compile(r"-?\d+(?:\.\d+)?")
+_LONGEST_PHRASE: Final = 4
+_FIXED_WORDS: Final = (
+    BREAK,
+    *(skill.value for skill in PROFILES[Profile.PAPER]),
+    *(relation.value for relation in PlaceRelation),
+    *(state.value for state in State),
+    *("room", "robot", "task", "in", "on", "under", "off", "open", "closed", "and", "then", "the", "it"),
+    *("0", "0.5", "1", "1.57", "-1.57", "2", "3.14"),
+)
+
+
+def build_vocabulary(
+    situations: Iterable[Situation], instructions: Iterable[str], *, min_count: int = 2
+) -> Vocabulary:
+    """Build the vocabulary of tasks from the object tables in ``situations`` and the training ``instructions``."""
+    words: dict[str, None] = dict.fromkeys(_FIXED_WORDS)
+    object_stems: dict[str, None] = {}
+    room_stems: dict[str, None] = {}
+    numbers = {0}
+    for situation in situations:
+        words |= dict.fromkeys(skill.value for skill in PROFILES[situation.profile])
+        words |= dict.fromkeys(state for row in situation.rows for state in row.states)
+        object_stems |= dict.fromkeys(row.category for row in situation.rows)
+        for stems, names in (
+            (object_stems, [row.name for row in situation.rows]),
+            (room_stems, situation.rooms),
+        ):
+            for name in names:
+                stem, number = _split_number(name)
+                stems.setdefault(stem)
+                numbers |= {int(number[1:])} if number else set()
+    counts = Counter(word for text in instructions for word in _WORD.findall(text.lower()))
+    frequent = sorted(word for word, count in counts.items() if count >= min_count)
+    named = object_stems | room_stems
+    # living_room_0 in an instruction must get the same tokens as in the table: a stem and a number.
+    words |= dict.fromkeys(word for word in frequent if _split_number(word)[0] not in named)
+    words |= named
+    words |= dict.fromkeys(f"_{number}" for number in range(max(numbers) + 1))
+    return Vocabulary((*SPECIAL, *words), tuple(object_stems), tuple(room_stems))
+
+
+def _split_number(name: str) -> tuple[str, str]:
+    match = _NUMBERED.fullmatch(name)
+    return (match[1], match[2]) if match else (name, "")
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """Words by token id. Unknown words become ``<unknown>``; decoding never fails.
+
+    ``object_words`` and ``room_words`` are the first words of names in the object table and of rooms.
+    """
+
+    words: tuple[str, ...]
+    object_words: tuple[str, ...]
+    room_words: tuple[str, ...]
+    index: Mapping[str, int] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "index", {word: token for token, word in enumerate(self.words)})
+
+    @property
+    def object_tokens(self) -> tuple[int, ...]:
+        return tuple(self.index[word] for word in self.object_words)
+
+    @property
+    def room_tokens(self) -> tuple[int, ...]:
+        return tuple(self.index[word] for word in self.room_words)
+
+    @property
+    def number_tokens(self) -> tuple[int, ...]:
+        """Words that end a name: ``_0``, ``_1`` and so on."""
+        return tuple(token for token, word in enumerate(self.words) if _NUMBER.fullmatch(word))
+
+    @property
+    def quantity_tokens(self) -> tuple[int, ...]:
+        """Words for angles and distances."""
+        return tuple(token for token, word in enumerate(self.words) if _QUANTITY.fullmatch(word))
+
+    def __len__(self) -> int:
+        return len(self.words)
+
+    def encode(self, text: str) -> list[int]:
+        """Encode a text. The longest known phrase of up to four words wins, so "chicken leg" is one token."""
+        words = _WORD.findall(text.lower())
+        tokens: list[int] = []
+        at = 0
+        while at < len(words):
+            length, found = self._longest(words[at : at + _LONGEST_PHRASE])
+            tokens += found
+            at += length
+        return tokens
+
+    def _longest(self, words: Sequence[str]) -> tuple[int, list[int]]:
+        for size in range(len(words), 1, -1):
+            phrase = "_".join(words[:size])
+            if BREAK not in words[:size] and phrase in self.index:
+                return size, [self.index[phrase]]
+        return 1, self._word(words[0])
+
+    def _word(self, word: str) -> list[int]:
+        if word in self.index:
+            return [self.index[word]]
+        stem, number = _split_number(word)
+        if number and stem in self.index and number in self.index:
+            return [self.index[stem], self.index[number]]
+        singular = word.removesuffix("s")
+        return [self.index.get(singular, UNKNOWN)]
+
+    def decode(self, tokens: Iterable[int]) -> str:
+        """Decode up to the end token. Numbers join the word before: ``apple`` ``_2`` becomes ``apple_2``."""
+        parts: list[str] = []
+        for token in tokens:
+            if token == END:
+                break
+            word = self.words[token]
+            no_space = word == BREAK or word.startswith("_") or not parts or parts[-1] == BREAK
+            parts += [word] if no_space else [" ", word]
+        return "".join(parts)
