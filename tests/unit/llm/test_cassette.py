@@ -57,7 +57,7 @@ async def test_a_damaged_line_is_named(tmp_path, line):
     await recorded(path, QUESTION)
     with path.open("a") as file:
         file.write(f"{line}\n")
-    with pytest.raises(CassetteError, match="line 2, is no recorded answer"):
+    with pytest.raises(CassetteError, match="line 2, is not a recorded answer"):
         Cassette(path, CassetteMode.REPLAY)
 
 

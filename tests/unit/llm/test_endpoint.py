@@ -67,7 +67,7 @@ async def test_what_may_pass_is_tried_again(trouble):
             (500, {}, "out of memory", 0.0),
             r"cast: the endpoint http.*answered 500 \(out of memory\), 3 times",
         ),
-        ((200, {}, "[]", 0.0), r"what is no chat completion \(\[\]\), 3 times"),
+        ((200, {}, "[]", 0.0), r"its answer is not a chat completion \(\[\]\), 3 times"),
     ],
 )
 async def test_patience_ends(trouble, sentence):

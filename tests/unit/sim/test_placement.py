@@ -1,4 +1,4 @@
-"""PlacementQuery: the first verified pose that is free and in reach, or a reason."""
+"""Placing: the first verified pose that is free and in reach, or a reason."""
 
 from dataclasses import replace
 

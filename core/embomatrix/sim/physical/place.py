@@ -1,4 +1,4 @@
-"""PlacementQuery: poses for the held object, regrasping if the hand can't reach them, and a check that the object stays."""
+"""Placing: poses for the held object, regrasping if the hand can't reach them, and a check that the object stays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PlacementQuery groups in a room: the best of their candidates that is free and leaves everything within the robot's reach."""
+"""Placing groups in a room: the best of their candidates that is free and leaves everything within the robot's reach."""
 
 from __future__ import annotations
 
