@@ -1,4 +1,4 @@
-"""How the hand presses: nothing else of the arm may meet what it presses, or it would keep the hand off."""
+"""Pressing: only the hand touches the pressed object."""
 
 import contextlib
 import itertools
@@ -35,7 +35,7 @@ def stage():
 
 
 @pytest.mark.parametrize("name", PRESSED)
-def test_no_way_to_press_a_thing_leads_the_arm_through_it(stage, name):
+def test_press_paths_keep_the_arm_out_of_the_pressed_object(stage, name):
     boxes = stage.boxes_within(np.full(3, -9.0), np.full(3, 20.0))
     own = boxes.only(name)
     for stand in stage.world.navigator.stands(name, stage.world.navigator.start)[:4]:
@@ -47,7 +47,7 @@ def test_no_way_to_press_a_thing_leads_the_arm_through_it(stage, name):
 
 
 @pytest.mark.parametrize("name", PRESSED)
-def test_the_hand_gets_at_a_switch_from_the_first_place_to_stand(stage, name):
+def test_switch_is_pressed_from_the_first_standing_pose(stage, name):
     stage.world.robot = stage.world.navigator.stands(name, stage.world.navigator.start)[0]
     stage.begin()
     assert press(stage, name) is None
