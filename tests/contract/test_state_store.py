@@ -11,7 +11,7 @@ import pytest
 from tests.fakes.redis_server import RedisServer
 
 from embomatrix.cli.local_cluster import free_port
-from embomatrix.manager.store.memory import MemoryState, MemoryStore
+from embomatrix.manager.store.opening import open_store
 from embomatrix.manager.store.protocol import (
     BatchResults,
     BatchRow,
@@ -28,7 +28,6 @@ from embomatrix.manager.store.protocol import (
 )
 from embomatrix.manager.store.redis import RedisStore
 from embomatrix.manager.store.sqlite import CHECKPOINT_BYTES, SqliteStore
-from embomatrix.manager.store.url import open_store
 
 
 @pytest.fixture(scope="module")
@@ -44,13 +43,12 @@ _prefixes = itertools.count()
 async def openings(request, tmp_path):
     """A function that opens the same state once more, as another process of the manager would."""
     opened = []
-    memory = MemoryState()
     prefix = f"test-{next(_prefixes)}"
 
     def open_again():
         match request.param:
             case "memory":
-                store = MemoryStore(memory)
+                store = SqliteStore(f"file:{prefix}?mode=memory&cache=shared")
             case "sqlite":
                 store = SqliteStore(tmp_path / "state.sqlite")
             case _:
@@ -207,16 +205,6 @@ async def test_what_is_kept_by_name_is_known_to_whoever_opens_the_state_and_the_
     found = await again.rows(shelf)
     assert sorted(found, key=lambda row: row.key) == [ShelfRow("a", b"second\xff"), ShelfRow("b", b"of b")]
     assert not any([await again.rows(other) for other in Shelf if other is not shelf])
-
-
-async def test_credentials_in_the_file_of_an_older_manager_are_taken_up(tmp_path):
-    with contextlib.closing(sqlite3.connect(tmp_path / "state.sqlite")) as older:
-        older.execute("CREATE TABLE credential (token_id TEXT PRIMARY KEY, payload BLOB NOT NULL)")
-        older.execute("INSERT INTO credential VALUES ('a', x'00ff')")
-        older.commit()
-    store = SqliteStore(tmp_path / "state.sqlite")
-    assert await store.rows(Shelf.CREDENTIALS) == [ShelfRow("a", b"\x00\xff")]
-    await store.close()
 
 
 async def test_only_one_of_two_managers_leads_and_the_other_learns_its_address(store, openings):

@@ -21,7 +21,7 @@ from embomatrix.world.dataset import Dataset
 
 NOWHERE = "127.0.0.1:1"
 UNREACHABLE = f"no manager answers at {NOWHERE}: start one with `embomatrix manager serve`, or pass --manager"
-REFUSED = "no token, or a wrong one: pass --token, or set EMBOMATRIX_TOKEN to the token of this manager"
+REFUSED = "missing or unknown token: pass --token, or set EMBOMATRIX_TOKEN to a token of this manager"
 SECRET = "the-secret-of-this-test"
 
 

@@ -10,7 +10,7 @@ from tests.fakes.commands import background
 from tests.integration.test_manager_service import manager
 
 from embomatrix.rpc.client import ClusterClient
-from embomatrix.rpc.training import RewardTiers, SampledPlan, SampledStep, TrainingReport
+from embomatrix.rpc.wire.training import RewardTiers, SampledPlan, SampledStep, TrainingReport
 from embomatrix.rpc.wire.values import Batch, Completed, LookaheadEntry, Rollout
 from embomatrix.skills.parse import plan_from_json
 from embomatrix.world.dataset import Dataset

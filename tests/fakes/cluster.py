@@ -15,8 +15,8 @@ from embomatrix.proto.v1 import (
 from embomatrix.rpc.channel import SERVER_OPTIONS, TOKEN_KEY
 from embomatrix.rpc.status import NotFoundError, NotSignedInError, translate
 from embomatrix.rpc.versions import PROTOCOL_VERSION
-from embomatrix.rpc.wire.batch import batch_from_proto
 from embomatrix.rpc.wire.outcome import rollout_result_to_proto
+from embomatrix.rpc.wire.rollout import batch_from_proto
 from embomatrix.rpc.wire.values import Cancelled, RolloutResult
 
 

@@ -27,7 +27,7 @@ IMPORTED = (
     "embomatrix.trainer.run.loop",
     "embomatrix.trainer.commands.train",
     "embomatrix.manager.commands.app",
-    "embomatrix.manager.runtime.app",
+    "embomatrix.manager.services.app",
     "embomatrix.worker.commands.app",
     "embomatrix.worker.commands.run",
     "embomatrix.cli.cluster.app",

@@ -9,11 +9,11 @@ from pathlib import Path
 from tests.fakes.worker import FakeWorker
 
 from embomatrix.manager.access.folder import AccessFolder, prepare
-from embomatrix.manager.runtime.app import running
+from embomatrix.manager.services.app import running
 from embomatrix.manager.settings import ManagerSettings
+from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.client import ClusterClient
-from embomatrix.rpc.roles import AccessRole
-from embomatrix.rpc.token_client import TokenClient
+from embomatrix.rpc.wire.tokens import AccessRole
 from embomatrix.rpc.wire.values import Batch, Rollout
 from embomatrix.world.inflation import bundle_digest
 
@@ -31,11 +31,11 @@ class Guarded:
         return self.folder.token(role).read_text().strip()
 
     def operator(self):
-        return TokenClient(self.address, self.token(AccessRole.ADMIN), ca=self.ca)
+        return AdminClient(self.address, self.token(AccessRole.ADMIN), ca=self.ca)
 
     async def issue(self, role, **options):
         async with self.operator() as operator:
-            return (await operator.issue(role, **options))[0]
+            return (await operator.issue_token(role, **options))[0]
 
 
 @contextlib.asynccontextmanager

@@ -5,16 +5,16 @@ import contextlib
 from dataclasses import dataclass, field
 
 import grpc
+from tests.fakes.leases import lease_to_proto
 
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.rpc.channel import SERVER_OPTIONS, chunks_of
-from embomatrix.rpc.leases import Lease, LeaseRef
 from embomatrix.rpc.status import NotFoundError, SupersededError, translate
+from embomatrix.rpc.wire.leases import Lease, LeaseRef
 from embomatrix.rpc.wire.session import (
     lease_ref_to_proto,
     lease_result_from_proto,
-    lease_to_proto,
     resources_from_proto,
     worker_state_from_proto,
 )

@@ -4,7 +4,7 @@ import asyncio
 import logging
 import sys
 
-from embomatrix.manager.runtime.app import serve
+from embomatrix.manager.services.app import serve
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.manager.store.protocol import StateError
 

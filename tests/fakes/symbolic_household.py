@@ -33,7 +33,7 @@ from embomatrix.world.task import Task, TaskCategory
 
 if TYPE_CHECKING:
     from embomatrix.reward.breakdown import RewardBreakdown
-    from embomatrix.rpc.training import TrainingReport
+    from embomatrix.rpc.wire.training import TrainingReport
 
 CONTAINERS = ("fridge", "microwave", "oven", "cabinet", "dishwasher", "drawer", "wardrobe", "washer")
 SURFACES = ("countertop", "table", "desk", "shelf", "sofa", "bed", "stool", "bench")

@@ -12,8 +12,8 @@ from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.channel import open_channel
-from embomatrix.rpc.leases import LeaseResult, WorkerState
 from embomatrix.rpc.versions import PROTOCOL_VERSION
+from embomatrix.rpc.wire.leases import LeaseResult, WorkerState
 from embomatrix.rpc.wire.session import (
     lease_from_proto,
     lease_ref_from_proto,

@@ -10,8 +10,7 @@ import pytest
 import uvicorn
 
 from embomatrix.manager.access.folder import prepare
-from embomatrix.manager.web.door import BoundedListener
-from embomatrix.manager.web.http_connections import BoundedConnections, connections_through
+from embomatrix.manager.web.connections import BoundedConnections, BoundedListener, connections_through
 
 pytestmark = pytest.mark.timeout(120)
 MOST = 8

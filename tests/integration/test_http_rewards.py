@@ -11,7 +11,7 @@ from tests.integration.test_rest import http_at
 
 from embomatrix.manager.web.rewards import REWARDS, RUN_ID
 from embomatrix.rpc.reward_label import RewardLabel
-from embomatrix.rpc.roles import AccessRole
+from embomatrix.rpc.wire.tokens import AccessRole
 from embomatrix.world.task import Profile
 
 pytestmark = pytest.mark.timeout(60)
@@ -71,7 +71,7 @@ async def test_a_lost_rollout_is_an_answer_to_try_again_and_no_number(tmp_path):
         http_at(at) as http,
     ):
         answer = await http.post(REWARDS, json=asked("move 3"))
-    assert (answer.status_code, "lost an answer's rollout" in answer.json()["detail"]) == (503, True)
+    assert (answer.status_code, "infrastructure failure" in answer.json()["detail"]) == (503, True)
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ from tests.fakes.guarded import (
 )
 
 from embomatrix.rpc.client import ClusterClient
-from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.trust import Invitation, fingerprint_of
+from embomatrix.rpc.wire.tokens import AccessRole
 from embomatrix.rpc.wire.values import Resources
 from embomatrix.worker.host.settings import WorkerSettings
 from embomatrix.worker.link.daemon import Daemon

@@ -12,12 +12,12 @@ import httpx
 import pytest
 from tests.fakes.worker import FakeWorker, completed
 
-from embomatrix.manager.runtime.app import running
+from embomatrix.manager.services.app import running
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.manager.store.protocol import Candidate, FencedError
 from embomatrix.manager.store.sqlite import SqliteStore
 from embomatrix.proto.v1 import scene_service_pb2, scene_service_pb2_grpc
-from embomatrix.rpc.admin import AdminClient
+from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import (

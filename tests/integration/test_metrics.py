@@ -9,7 +9,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import KITCHEN, batch, manager, open_run, outcomes, until
 
-from embomatrix.rpc.run_log import RolloutPhase
+from embomatrix.rpc.wire.run_log import RolloutPhase
 from embomatrix.rpc.wire.values import Batch, LookaheadEntry, Warmth
 
 pytestmark = pytest.mark.timeout(60)

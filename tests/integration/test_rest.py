@@ -12,9 +12,9 @@ from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import BEDROOM, KITCHEN, batch, manager, open_run, outcomes
 
 from embomatrix.manager.web.rest import PREFIX, VIEWERS
-from embomatrix.rpc.admin import AdminClient
+from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.status import NotFoundError
-from embomatrix.rpc.training import RewardTiers, SampledPlan, TrainingReport
+from embomatrix.rpc.wire.training import RewardTiers, SampledPlan, TrainingReport
 from embomatrix.rpc.wire.values import LookaheadEntry
 
 pytestmark = pytest.mark.timeout(60)
@@ -63,7 +63,10 @@ async def test_a_scene_that_no_worker_can_hold_is_told_with_its_reason(tmp_path)
             "r1", 1, [LookaheadEntry(5, KITCHEN, 8), LookaheadEntry(6, BEDROOM, 4)]
         )
         seen = await seen_until(http, lambda seen: seen["overview"]["unplaceable"])
-    assert seen["health"]["sentence"] == "No worker can hold 1 announced scene: the look-ahead page says why."
+    assert (
+        seen["health"]["sentence"]
+        == "1 announced scene fits on no worker: the look-ahead page shows the reason."
+    )
     (fine,), (stuck,) = [step["cells"] for step in seen["lookahead"]]
     assert (fine["problem"], stuck["warmth"]) == ("", "unplaceable")
     assert stuck["problem"] == f"scene {BEDROOM} fails to load: the mesh has no triangles"

@@ -4,9 +4,9 @@ import pytest
 from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import KITCHEN, batch, manager, open_run, outcomes, until
 
-from embomatrix.rpc.admin import AdminClient
-from embomatrix.rpc.run_log import EventKind, RolloutPhase
+from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.status import NotFoundError
+from embomatrix.rpc.wire.run_log import EventKind, RolloutPhase
 from embomatrix.rpc.wire.values import Batch, LookaheadEntry
 
 pytestmark = pytest.mark.timeout(60)

@@ -8,7 +8,7 @@ from tests.integration.test_manager_service import BUNDLES, batch, manager, outc
 
 from embomatrix.proto.v1 import rollout_service_pb2, rollout_service_pb2_grpc, types_pb2
 from embomatrix.reward.settings import PAPER, RewardSettings
-from embomatrix.rpc.admin import AdminClient
+from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import ConflictError, InvalidRequestError, cluster_errors

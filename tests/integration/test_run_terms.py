@@ -7,10 +7,10 @@ import pytest
 from tests.fakes.guarded import packed
 from tests.fakes.worker import FakeWorker
 
-from embomatrix.manager.runtime.app import running
+from embomatrix.manager.services.app import running
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.proto.v1 import rollout_service_pb2 as pb
-from embomatrix.rpc.admin import AdminClient
+from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import NotFoundError
 from embomatrix.rpc.wire.values import (

@@ -22,8 +22,6 @@ from tests.fakes.worker import completed
 
 from embomatrix.proto.v1 import admin_service_pb2, rollout_service_pb2, types_pb2, worker_service_pb2
 from embomatrix.rpc.client import ClientLimits, ClusterClient
-from embomatrix.rpc.leases import LeaseRef, LeaseResult
-from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.status import (
     ERROR_KEY,
     InvalidRequestError,
@@ -32,7 +30,9 @@ from embomatrix.rpc.status import (
 )
 from embomatrix.rpc.trust import Invitation, fetch_ca, fingerprint_of
 from embomatrix.rpc.versions import PROTOCOL_VERSION
+from embomatrix.rpc.wire.leases import LeaseRef, LeaseResult
 from embomatrix.rpc.wire.session import lease_result_to_proto
+from embomatrix.rpc.wire.tokens import AccessRole
 from embomatrix.rpc.wire.values import Batch, Completed
 from embomatrix.world.inflation import bundle_digest
 
@@ -104,7 +104,7 @@ async def grpc_cases(at, victim, other):
     late_join = await at.issue(AccessRole.JOIN, valid_s=0.05)
     revoked = await at.issue(AccessRole.TRAINER)
     async with at.operator() as operator:
-        await operator.revoke(revoked.partition(".")[0])
+        await operator.revoke_token(revoked.partition(".")[0])
     await asyncio.sleep(0.06)
     session = {"session_id": victim.session[0], "session_epoch": victim.session[1]}
     state = worker_service_pb2.WorkerState()
@@ -338,7 +338,7 @@ async def test_an_invitation_leads_to_its_own_manager_and_to_no_other(tmp_path):
     async with guarded(tmp_path / "one") as at, guarded(tmp_path / "two") as elsewhere:
         pinned = fingerprint_of(at.ca.decode())
         assert await fetch_ca(Invitation(at.address, "a.b", pinned)) == at.ca
-        with pytest.raises(NotAllowedError, match="not the manager that this invitation is from"):
+        with pytest.raises(NotAllowedError, match="not the manager of this invitation"):
             await fetch_ca(Invitation(elsewhere.address, "a.b", pinned))
         with pytest.raises(ManagerUnreachableError, match="no manager answers"):
             await fetch_ca(Invitation("127.0.0.1:1", "a.b", pinned))

@@ -15,7 +15,7 @@ from tests.fakes.plans import plan_of
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
 from embomatrix.reward.settings import PAPER, RewardSettings
-from embomatrix.rpc.leases import Lease, LeaseRef
+from embomatrix.rpc.wire.leases import Lease, LeaseRef
 from embomatrix.rpc.wire.values import (
     Completed,
     InfraCode,

@@ -20,17 +20,17 @@ from tests.fakes.guarded import (
 from tests.fakes.redis_server import RedisServer
 
 from embomatrix.cli.local_cluster import free_port
-from embomatrix.manager.runtime.app import running
+from embomatrix.manager.services.app import running
 from embomatrix.manager.settings import ManagerSettings
+from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.client import ClusterClient
-from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.status import (
     NotFoundError,
     NotSignedInError,
     PreconditionError,
     StandbyError,
 )
-from embomatrix.rpc.token_client import TokenClient
+from embomatrix.rpc.wire.tokens import AccessRole
 from embomatrix.rpc.wire.values import Batch, Completed
 
 pytestmark = pytest.mark.timeout(120)
@@ -73,9 +73,9 @@ async def test_a_worker_whose_token_is_revoked_ends_as_well(tmp_path):
         fleet = await at.issue(AccessRole.WORKER, label="the lab")
         async with worker(at, "pod-1", token=fleet) as pod:
             async with at.operator() as operator:
-                known = {info.token_id: info for info in await operator.listed()}
+                known = {info.token_id: info for info in await operator.list_tokens()}
                 assert known[fleet.partition(".")[0]].label == "the lab"
-                await operator.revoke(fleet.partition(".")[0])
+                await operator.revoke_token(fleet.partition(".")[0])
             await until(lambda: not pod._tasks)
 
 
@@ -86,7 +86,7 @@ async def test_a_trainer_whose_token_is_revoked_reads_no_further(tmp_path):
             stream = revoked.execute(Batch("r1", "b1", 1, rollouts(40)), deadline_s=30)
             await anext(stream)
             async with at.operator() as operator:
-                await operator.revoke(token.partition(".")[0])
+                await operator.revoke_token(token.partition(".")[0])
             with pytest.raises(NotSignedInError, match="revoked"):
                 async for _ in stream:
                     pass
@@ -100,7 +100,7 @@ async def test_tokens_and_credentials_outlive_the_manager_and_what_was_revoked_s
         async with first:
             await asyncio.sleep(0.05)
         async with at.operator() as operator:
-            await operator.revoke(at.token(AccessRole.VIEWER).partition(".")[0])
+            await operator.revoke_token(at.token(AccessRole.VIEWER).partition(".")[0])
     async with guarded(tmp_path) as at:
         async with worker(at, "w1", token=first.token) as again:
             await asyncio.sleep(0.05)
@@ -136,7 +136,7 @@ async def test_who_takes_a_cluster_over_knows_its_tokens(tmp_path):
         async with guarded(tmp_path / "data", **options) as at:
             given, taken = await at.issue(AccessRole.TRAINER), await at.issue(AccessRole.TRAINER)
             async with at.operator() as operator:
-                await operator.revoke(taken.partition(".")[0])
+                await operator.revoke_token(taken.partition(".")[0])
             async with await joined(at, "w1") as first:
                 await asyncio.sleep(0.05)
             waiting = asyncio.create_task(take_over())
@@ -167,6 +167,6 @@ async def test_one_shared_token_is_an_admins_for_everybody_beside_the_others(tmp
 
 async def test_an_open_manager_has_no_tokens_to_hand_out(tmp_path):
     settings = ManagerSettings(port=0, http_port=0, data_dir=tmp_path, state="memory:")
-    async with running(settings) as at, TokenClient(at.address) as operator:
+    async with running(settings) as at, AdminClient(at.address) as operator:
         with pytest.raises(PreconditionError, match="embomatrix manager init"):
-            await operator.issue(AccessRole.TRAINER)
+            await operator.issue_token(AccessRole.TRAINER)

@@ -11,11 +11,10 @@ from embomatrix.proto.v1 import (
     rollout_service_pb2,
     rollout_service_pb2_grpc,
 )
-from embomatrix.rpc.capabilities import capabilities_of
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import PreconditionError, cluster_errors
-from embomatrix.rpc.versions import SPOKEN, VersionRange, agree
+from embomatrix.rpc.versions import SPOKEN, VersionRange, agree, capabilities_of
 from embomatrix.rpc.wire.values import Batch, Completed, Rollout
 
 pytestmark = pytest.mark.timeout(60)
@@ -56,9 +55,7 @@ async def collected(client, submitted):
 
 async def test_a_manager_tells_what_it_speaks_before_it_asks_for_anything(tmp_path):
     async with manager(tmp_path, token="secret") as at, open_channel(at.address) as channel:
-        found = await capabilities_of(
-            rollout_service_pb2_grpc.RolloutServiceStub(channel), at.address, timeout_s=5
-        )
+        found = await capabilities_of(rollout_service_pb2_grpc.RolloutServiceStub(channel), timeout_s=5)
     assert found.protocol == SPOKEN
     assert (found.batch_rollouts, found.bundle_bytes) == (65_536, 8 * 1024 * 1024)
 

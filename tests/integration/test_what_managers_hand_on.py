@@ -9,8 +9,8 @@ from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import BUNDLES, batch, manager, outcomes, until
 
 from embomatrix.cli.local_cluster import free_port
-from embomatrix.manager.store.url import open_store
-from embomatrix.rpc.admin import AdminClient
+from embomatrix.manager.store.opening import open_store
+from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import UnavailableError
 from embomatrix.rpc.wire.values import Completed, GroupPolicy, Resources, RunTerms

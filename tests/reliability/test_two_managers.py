@@ -11,7 +11,7 @@ from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, o
 from tests.fakes.redis_server import RedisServer
 
 from embomatrix.cli.local_cluster import free_port
-from embomatrix.rpc.admin import AdminClient
+from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import StandbyError
 

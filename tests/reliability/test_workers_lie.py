@@ -56,7 +56,7 @@ async def test_one_worker_alone_is_not_audited_and_the_manager_says_so_once(tmp_
             stats = await client.close_run("run")
         assert tally(batch, results).clean
         assert stats.audited == 0
-        said = "results are not audited: that takes a second worker"
+        said = "results are not audited: auditing needs a second worker"
         async with asyncio.timeout(20):
             while said not in cluster.log("manager"):  # noqa: ASYNC110  # a file tells nobody
                 await asyncio.sleep(0.05)

@@ -23,7 +23,7 @@ def test_manager_and_trainer_import_without_a_physics_engine():
         "        if name.split('.')[0] == 'pybullet' or name.startswith('embomatrix.sim'):\n"
         "            raise ModuleNotFoundError(name, name=name)\n"
         "sys.meta_path.insert(0, Bar())\n"
-        "import embomatrix.manager.commands.app, embomatrix.manager.runtime.app\n"
+        "import embomatrix.manager.commands.app, embomatrix.manager.services.app\n"
         "import embomatrix.trainer.commands.train, embomatrix.trainer.run.loop\n"
     )
     subprocess.run([sys.executable, "-c", program], check=True, timeout=120)

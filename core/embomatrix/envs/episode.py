@@ -1,4 +1,4 @@
-"""One task call by call, in this process: a simulator with the reward beside it. No cluster, and no other library."""
+"""Episodes in this process: a simulator and the reward, without a cluster."""
 
 from __future__ import annotations
 
@@ -29,25 +29,25 @@ if TYPE_CHECKING:
     from embomatrix.world.task import Task
 
 SCENES_KEPT: Final = 4
-"""Simulators that wait for the next task of their scene: some 100 MB each."""
+"""Simulators kept for the next task of their scene, about 100 MB each."""
 
 
 @dataclass(frozen=True, slots=True)
 class EpisodeStep:
-    """What one call came to. ``gain`` is what it added to the reward; ``reward`` is that of the state reached."""
+    """Outcome of one call. ``gain`` is the change of the reward; ``reward`` is that of the state reached."""
 
     step: Step
     reward: RewardBreakdown
     gain: float
     over: bool
-    """The plan is as long as a plan may be."""
+    """True if the plan has reached its maximum length."""
 
 
 class Episode:
-    """A task in its scene. ``run`` executes a whole plan as a cluster does; ``reset`` and ``act`` go call by call.
+    """Task in its scene. ``run`` executes a whole plan as a cluster does; ``reset`` and ``act`` go call by call.
 
-    A call that fails changes nothing, and the next may be tried: a plan on the cluster would end there. The gains of an
-    episode without failed calls add up to the reward of its calls as one plan.
+    A failed call changes nothing and the episode continues; on the cluster the plan would end. In an episode without failed
+    calls, the gains add up to the reward of the same plan.
     """
 
     def __init__(
@@ -61,12 +61,12 @@ class Episode:
         self._total = 0.0
 
     def run(self, plan: Plan, seed: int = 0) -> tuple[Trace, RewardBreakdown]:
-        """Execute a plan from the start to its end or its first failed step; its trace and its reward."""
+        """Execute a plan from the start to its end or first failed step. Return its trace and its reward."""
         trace = self._simulator.execute(self.task, plan, seed)
         return trace, self._score()
 
     def reset(self, seed: int = 0) -> None:
-        """Back to the scene's start."""
+        """Return to the scene's start."""
         self._simulator.reset(self.task, seed)
         self._calls = 0
         self._total = 0.0
@@ -80,11 +80,11 @@ class Episode:
         return EpisodeStep(step, reward, gain, over=self._calls >= MAX_STEPS)
 
     def prompt(self, codec: Codec = Codec.JSON) -> Prompt:
-        """What a language model is told of the task at its start."""
+        """Prompt of the task for a language model."""
         return prompt_for(self.situation, codec)
 
     def state(self) -> tuple[str, ...]:
-        """The state reached, a line for each object of the table."""
+        """State reached, one line per object of the table."""
         return self._simulator.survey(self.task)
 
     def _score(self) -> RewardBreakdown:
@@ -92,9 +92,9 @@ class Episode:
 
 
 class Household:
-    """Context manager over a dataset's tasks. Scenes are loaded when they are first needed; a few are kept.
+    """Context manager over a dataset's tasks. Scenes are loaded on demand and a few are kept.
 
-    Raises DatasetError for a folder that holds no dataset, EngineError for a scene that can't be loaded.
+    Raises DatasetError for a folder without a dataset, EngineError for a scene that can't be loaded.
     """
 
     def __init__(
@@ -116,11 +116,11 @@ class Household:
 
     @property
     def records(self) -> tuple[TaskRecord, ...]:
-        """The tasks, in the dataset's order."""
+        """Tasks in the dataset's order."""
         return self._dataset.records
 
     def episode(self, task_id: str) -> Episode:
-        """A task, ready at its start. Episodes of one scene share its simulator: use one at a time."""
+        """Task at its start. Episodes of one scene share a simulator: use one at a time."""
         record = self._dataset.find(task_id)
         bundle, simulator = self._scene(record.bundle_digest)
         task = bundle.tasks[task_id]

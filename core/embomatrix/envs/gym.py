@@ -1,6 +1,6 @@
-"""A Gymnasium environment: an action is one skill call, an observation is text, the rewards of an episode add up to its plan's.
+"""Gymnasium environment: an action is one skill call, an observation is text, and an episode's rewards add up to its plan's.
 
-Needs ``gymnasium``, which nothing else here does.
+Needs ``gymnasium``, which no other module needs.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ LONGEST_TEXT: Final = 32_768
 
 
 class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
-    """Tasks of a dataset, one an episode: ``reset(seed=…)`` draws one, ``options={"task_id": …}`` names it.
+    """Tasks of a dataset, one per episode: ``reset(seed=…)`` draws one, ``options={"task_id": …}`` names it.
 
-    *Action*, a dict: ``skill`` (in the order of ``SKILLS``), ``object`` and ``source`` (rows of the object table), ``relation``
-    (in the order of ``RELATIONS``), ``room`` (in the order of ``info["rooms"]``), ``yaw`` (rad), ``distance`` (m). What the
-    skill does not take is left alone.
+    *Action*, a dict: ``skill`` (in the order of ``SKILLS``), ``object`` and ``source`` (rows of the object table),
+    ``relation`` (in the order of ``RELATIONS``), ``room`` (in the order of ``info["rooms"]``), ``yaw`` (rad), ``distance``
+    (m). Arguments that the skill does not take are ignored.
 
-    *Observation*, a dict of texts: ``task`` (the prompt, the same all along), ``state`` (a line for each object),
-    ``message`` (what became of the last call).
+    *Observation*, a dict of texts: ``task`` (the prompt, constant), ``state`` (one line per object), ``message`` (the outcome
+    of the last call).
 
-    The reward of a step is what it added to the plan's. An episode terminates at the goal and is truncated after 64 calls; a
-    failed call changes nothing.
+    The reward of a step is its gain. An episode terminates at the goal and is truncated after 64 calls; a failed call changes
+    nothing.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["ansi"], "render_fps": 1}  # noqa: RUF012  # declared so by gymnasium
@@ -74,7 +74,7 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin an episode. Raises DatasetError for an unknown task."""
+        """Start an episode. Raises DatasetError for an unknown task."""
         super().reset(seed=seed)
         drawn = self._task_ids[int(self.np_random.integers(len(self._task_ids)))]
         self._episode = self._household.episode(str((options or {}).get("task_id", drawn)))
@@ -98,7 +98,7 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         return self._observed(self._episode), turn.gain, success, turn.over and not success, told(turn)
 
     def render(self) -> str | None:
-        """The state in words, with ``render_mode="ansi"``."""
+        """State in words, with ``render_mode="ansi"``."""
         if self.render_mode != "ansi" or self._episode is None:
             return None
         return "\n".join([*self._episode.state(), self._message])
@@ -117,7 +117,7 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
 
 
 def call_of(action: dict[str, Any], rooms: tuple[str, ...]) -> SkillCall:
-    """The skill call of an action. A room beyond those there are is a name that no room has."""
+    """Skill call of an action. A room index out of range gives an unknown room's name."""
     skill = SKILLS[int(action["skill"])]
     room = int(action["room"])
     values: dict[Arg, Any] = {
@@ -132,7 +132,7 @@ def call_of(action: dict[str, Any], rooms: tuple[str, ...]) -> SkillCall:
 
 
 def action_of(call: SkillCall, rooms: tuple[str, ...]) -> dict[str, Any]:
-    """The inverse of ``call_of``: oracle plans as actions. ValueError for a room that is not among them."""
+    """Inverse of ``call_of``, for oracle plans. Raises ValueError for an unknown room."""
     return {
         "skill": SKILLS.index(call.skill),
         "object": call.object_index or 0,
@@ -145,7 +145,7 @@ def action_of(call: SkillCall, rooms: tuple[str, ...]) -> dict[str, Any]:
 
 
 def told(turn: EpisodeStep) -> dict[str, Any]:
-    """What ``info`` says of a step."""
+    """Entries of ``info`` for a step."""
     reward = turn.reward
     return {
         "success": reward.success,
@@ -157,5 +157,5 @@ def told(turn: EpisodeStep) -> dict[str, Any]:
 
 
 def _plain(text: str) -> str:
-    """In the characters of the observation space, no longer than it allows."""
+    """Restrict text to the characters and the length of the observation space."""
     return "".join(letter if letter in CHARACTERS else "?" for letter in text[:LONGEST_TEXT])

@@ -1,6 +1,6 @@
-"""An OpenEnv environment and its server: an action is the text of a call or of a whole plan, each episode is one task.
+"""OpenEnv environment and server: an action is the text of a call or of a whole plan; each episode is one task.
 
-Needs ``openenv``, which nothing else here does. ``uvicorn.run(server("build/dataset"))`` serves it.
+Needs ``openenv``, which no other module needs. ``uvicorn.run(server("build/dataset"))`` serves it.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ if TYPE_CHECKING:
     from embomatrix.envs.episode import Episode
 
 SESSIONS: Final = 4
-"""Episodes at a time. Each has simulators of its own: some 100 MB a scene."""
+"""Concurrent episodes. Each has its own simulators, about 100 MB per scene."""
 
 
 class PlanAction(Action):
-    """``text``: calls as a plan writes them, ``move 3`` or JSON. They are executed up to the first that fails."""
+    """Calls in a plan's syntax, ``move 3`` or JSON, executed up to the first failure."""
 
     text: str
 
 
 class HouseholdObservation(Observation):
-    """``task`` is the prompt, ``state`` a line for each object, ``messages`` what became of each call."""
+    """Prompt (``task``), one line per object (``state``) and the outcome of each call (``messages``)."""
 
     task: str
     state: list[str]
@@ -42,7 +42,7 @@ class HouseholdObservation(Observation):
 
 
 class HouseholdState(State):
-    """Which task it is, and how the reward is made up so far."""
+    """Task id and the tiers of the reward so far."""
 
     task_id: str = ""
     success: bool = False
@@ -54,7 +54,7 @@ class HouseholdState(State):
 class HouseholdEnvironment(Environment[PlanAction, HouseholdObservation, HouseholdState]):
     """Tasks of a dataset. ``reset(seed=…)`` draws one, ``reset(task_id=…)`` names it.
 
-    The reward of a step is what its calls added to the plan's; a text that is no plan changes nothing and gets −1. Done at
+    The reward of a step is the gain of its calls; text that is not a plan changes nothing and gets −1. An episode is done at
     the goal or after 64 calls.
     """
 
@@ -75,7 +75,7 @@ class HouseholdEnvironment(Environment[PlanAction, HouseholdObservation, Househo
         task_id: str = "",
         **_: Any,
     ) -> HouseholdObservation:
-        """Begin an episode. Raises DatasetError for an unknown task."""
+        """Start an episode. Raises DatasetError for an unknown task."""
         draw = np.random.default_rng(seed)
         named = task_id or self._task_ids[int(draw.integers(len(self._task_ids)))]
         self._episode = self._household.episode(named)
@@ -113,7 +113,7 @@ class HouseholdEnvironment(Environment[PlanAction, HouseholdObservation, Househo
 
     @property
     def state(self) -> HouseholdState:
-        """Of the episode under way."""
+        """State of the current episode."""
         return self._state
 
     def close(self) -> None:
@@ -134,7 +134,7 @@ class HouseholdEnvironment(Environment[PlanAction, HouseholdObservation, Househo
 
 
 def server(dataset: str | Path, split: str = "train", sessions: int = SESSIONS) -> Any:
-    """The ASGI application, with so many sessions at a time at most."""
+    """ASGI application with at most this many concurrent sessions."""
     environment = functools.partial(HouseholdEnvironment, dataset, split)
     return create_app(
         environment, PlanAction, HouseholdObservation, env_name="embomatrix", max_concurrent_envs=sessions

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import httpx
 
+from embomatrix.host.backoff import Backoff
 from embomatrix.llm.values import EndpointError, Reply, Usage
 
 if TYPE_CHECKING:
@@ -76,13 +77,18 @@ class Endpoint:
     async def complete(self, request: ChatRequest) -> Reply:
         """Ask, and retry where that may help. Raises EndpointError."""
         body = self._body(request)
+        backoff = Backoff(
+            self._limits.first_wait_s, self._limits.longest_wait_s, lambda: self._jitter.uniform(0.5, 1.0)
+        )
         async with self._gate:
             began_s = time.monotonic()
             for attempt in range(self._limits.attempts):
                 failure = await self._attempt(body)
                 if isinstance(failure, _Answer):
                     return _reply(failure.value, self.model, time.monotonic() - began_s, attempt)
-                wait_s = self._wait_s(attempt, failure)
+                wait_s = backoff.next_s()
+                if failure.retry_after_s is not None:
+                    wait_s = min(failure.retry_after_s, MAX_RETRY_AFTER_S)
                 elapsed_s = time.monotonic() - began_s
                 last = attempt + 1 == self._limits.attempts or elapsed_s + wait_s > self._limits.deadline_s
                 if not failure.transient or last:
@@ -121,12 +127,6 @@ class Endpoint:
         except httpx.InvalidURL as error:
             return _Failure(f"this is not a valid address ({error})", transient=False)
         return _judged(response, bytes(data))
-
-    def _wait_s(self, attempt: int, failure: _Failure) -> float:
-        if failure.retry_after_s is not None:
-            return min(failure.retry_after_s, MAX_RETRY_AFTER_S)
-        wait_s = min(self._limits.first_wait_s * 2.0**attempt, self._limits.longest_wait_s)
-        return wait_s * self._jitter.uniform(0.5, 1.0)
 
     def _sentence(self, request: ChatRequest, failure: _Failure, attempts: int) -> str:
         tries = "" if attempts == 1 else f", {attempts} times"

@@ -1,4 +1,4 @@
-"""The trainer's side of the cluster: submit plans, get outcomes, whatever happens to the connection."""
+"""Client of the trainer: submits plans and receives every outcome once, across reconnects and manager fail-over."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Final
 
 import grpc
 
+from embomatrix.host.backoff import Backoff
 from embomatrix.proto.v1 import (
     rollout_service_pb2,
     rollout_service_pb2_grpc,
     scene_service_pb2,
     scene_service_pb2_grpc,
 )
-from embomatrix.rpc.capabilities import version_with
+from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.channel import DEFAULT_ADDRESS, chunks_of
-from embomatrix.rpc.fleet_client import FleetClient
-from embomatrix.rpc.managers import PATIENCE_S, of_the_leader
+from embomatrix.rpc.managers import FAILOVER_S, of_the_leader
 from embomatrix.rpc.status import (
     DeadlineError,
     InternalError,
@@ -30,9 +30,10 @@ from embomatrix.rpc.status import (
     cluster_error,
     cluster_errors,
 )
-from embomatrix.rpc.wire.batch import batch_to_proto
+from embomatrix.rpc.versions import SPOKEN, agree, capabilities_of
+from embomatrix.rpc.wire.codec import each, inside
 from embomatrix.rpc.wire.outcome import rollout_result_from_proto
-from embomatrix.rpc.wire.rollout import each, inside
+from embomatrix.rpc.wire.rollout import batch_to_proto
 from embomatrix.rpc.wire.run import (
     group_done_from_proto,
     lookahead_answer_from_proto,
@@ -47,7 +48,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping, Sequence
 
     from embomatrix.rpc.status import ClusterError
-    from embomatrix.rpc.training import TrainingReport
+    from embomatrix.rpc.wire.training import TrainingReport
     from embomatrix.rpc.wire.values import (
         Batch,
         GroupDone,
@@ -62,33 +63,29 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class ClientLimits:
-    """How long a client waits, in seconds."""
+    """Time limits of a client, in seconds."""
 
     call_s: float = 10.0
-    """For the answer to a short call."""
+    """Answer to a short call."""
     bundle_s: float = 60.0
-    """For a whole bundle to be taken."""
+    """Upload of one bundle."""
     batch_s: float = 600.0
-    """For every rollout of a batch to have its outcome."""
+    """Outcome of every rollout of a batch."""
     retry_first_s: float = 0.1
+    """First wait before a broken stream is attached again. It doubles with each attempt without progress."""
     retry_longest_s: float = 2.0
-    failover_s: float = PATIENCE_S
-    """For another manager to take over, where several were told."""
-    """Wait before a broken stream is attached again: doubled from the first to the longest."""
+    failover_s: float = FAILOVER_S
+    """Take-over by another manager, where several addresses are known."""
 
 
 DEFAULT_LIMITS: Final = ClientLimits()
 DEFAULT_TERMS: Final = RunTerms()
 _TRANSIENT: Final = (UnavailableError, InternalError, OverloadedError)
-"""Errors after which the same batch is attached again rather than given up."""
+"""Errors after which the same batch is attached again."""
 
 
-class ClusterClient(FleetClient):
-    """Async context manager over channels to the manager, or to several (``A:PORT,B:PORT``) of which one leads; by TLS if
-    ``ca`` (PEM) names whom to trust.
-
-    Every failure is a ``ClusterError``.
-    """
+class ClusterClient(AdminClient):
+    """Opens runs, announces scenes, and executes batches."""
 
     def __init__(
         self,
@@ -98,7 +95,7 @@ class ClusterClient(FleetClient):
         ca: bytes = b"",
         limits: ClientLimits = DEFAULT_LIMITS,
     ) -> None:
-        super().__init__(address, token, ca=ca, call_s=limits.call_s, patience_s=limits.failover_s)
+        super().__init__(address, token, ca=ca, call_s=limits.call_s, failover_s=limits.failover_s)
         self._limits = limits
 
     @property
@@ -114,17 +111,21 @@ class ClusterClient(FleetClient):
         """Open a run and return its id. An open run of the same id is attached to and keeps its terms."""
         request = run_terms_to_proto(terms)
         request.name, request.run_id = name, run_id
-        request.protocol_version = await version_with(
-            self._rollouts, self._address, timeout_s=self._limits.call_s
+        found = await capabilities_of(self._rollouts, timeout_s=self._call_s)
+        request.protocol_version = agree(
+            SPOKEN,
+            found.protocol,
+            us="this trainer",
+            them=f"the manager at {self._address}",
+            their_release=found.release,
         )
-        with cluster_errors(self._address):
-            answer = await self._rollouts.OpenRun(request, timeout=self._limits.call_s)
+        answer = await self._rollouts.OpenRun(request, timeout=self._call_s)
         return str(answer.run_id)
 
     async def announce_lookahead(
         self, run_id: str, version: int, entries: Iterable[LookaheadEntry]
     ) -> dict[str, Warmth]:
-        """Replace the run's window of coming scenes; tells by bundle digest how warm each is."""
+        """Replace the run's look-ahead window. Return the warmth of each scene by bundle digest."""
         answers = await self.announce_window(run_id, version, entries)
         return {answer.bundle_digest: answer.warmth for answer in answers}
 
@@ -132,30 +133,28 @@ class ClusterClient(FleetClient):
     async def announce_window(
         self, run_id: str, version: int, entries: Iterable[LookaheadEntry]
     ) -> tuple[LookaheadAnswer, ...]:
-        """The same; tells of each scene as well when it will be warm, or why it can't be."""
+        """Replace the run's look-ahead window. Return the warmth and readiness forecast of each scene."""
         request = rollout_service_pb2.AnnounceLookaheadRequest(
-            run_id=run_id, version=version, entries=[lookahead_entry_to_proto(entry) for entry in entries]
+            run_id=run_id, version=version, entries=map(lookahead_entry_to_proto, entries)
         )
-        with cluster_errors(self._address):
-            answer = await self._rollouts.AnnounceLookahead(request, timeout=self._limits.call_s)
-            return each("answers", lookahead_answer_from_proto, answer.answers)
+        answer = await self._rollouts.AnnounceLookahead(request, timeout=self._call_s)
+        return each("answers", lookahead_answer_from_proto, answer.answers)
 
     @of_the_leader
     async def put_bundles(self, bundles: Mapping[str, bytes]) -> tuple[str, ...]:
-        """Give the manager the bundles (by digest) that it lacks; returns the digests that were sent."""
+        """Upload the bundles (by digest) that the manager lacks. Return the uploaded digests."""
         request = scene_service_pb2.MissingBundlesRequest(bundle_digests=list(bundles))
-        with cluster_errors(self._address):
-            answer = await self._scenes.MissingBundles(request, timeout=self._limits.call_s)
-            missing = tuple(digest for digest in answer.bundle_digests if digest in bundles)
-            for digest in missing:
-                chunks = _bundle_chunks(digest, bundles[digest])
-                await self._scenes.PutBundle(chunks, timeout=self._limits.bundle_s)
+        answer = await self._scenes.MissingBundles(request, timeout=self._call_s)
+        missing = tuple(digest for digest in answer.bundle_digests if digest in bundles)
+        for digest in missing:
+            chunks = _bundle_chunks(digest, bundles[digest])
+            await self._scenes.PutBundle(chunks, timeout=self._limits.bundle_s)
         return missing
 
     async def execute(
         self, batch: Batch, *, deadline_s: float | None = None
     ) -> AsyncGenerator[RolloutResult]:
-        """Execute the batch; yields each rollout's one outcome as it comes, as ``events`` does."""
+        """Execute the batch. Yield the one outcome of each rollout as it arrives, as ``events`` does."""
         async with contextlib.aclosing(self.events(batch, deadline_s=deadline_s)) as events:
             async for event in events:
                 if isinstance(event, RolloutResult):
@@ -172,7 +171,7 @@ class ClusterClient(FleetClient):
         """
         within_s = self._limits.batch_s if deadline_s is None else deadline_s
         attached = _AttachedBatch(batch, time.monotonic() + within_s)
-        wait_s = self._limits.retry_first_s
+        backoff = Backoff(self._limits.retry_first_s, self._limits.retry_longest_s)
         while attached.missing:
             before, cursor = len(attached.missing), attached.cursor
             try:
@@ -184,27 +183,27 @@ class ClusterClient(FleetClient):
                             yield group
                 attached.submitted = True
                 if attached.cursor == cursor:
-                    # The batch ended without what is missing: a store that lost its last second had delivered other
-                    # rollouts under the cursors that were read.
+                    # The batch ended although results are missing: a store that lost its last second has reused the
+                    # cursors that were read before.
                     attached.read_again()
             except _TRANSIENT as error:
                 logger.info("batch %s: attaching again after: %s", batch.batch_id, error)
                 if isinstance(error, UnavailableError):
-                    self._managers.move(error)
+                    self.managers.move(error)
             except NotFoundError:
-                # The manager lost the batch, or never got it: the same id and content may be submitted again.
+                # The manager lost or never received the batch: submit the same id and content again.
                 if not attached.submitted:
                     raise
                 attached.forget_cursor()
-            wait_s = self._limits.retry_first_s if len(attached.missing) < before else wait_s * 2
-            wait_s = min(wait_s, self._limits.retry_longest_s)
+            if len(attached.missing) < before:
+                backoff.reset()
             if attached.missing:
-                await asyncio.sleep(min(wait_s, attached.time_left(within_s)))
+                await asyncio.sleep(min(backoff.next_s(), attached.time_left(within_s)))
 
     async def _stream(
         self, attached: _AttachedBatch
     ) -> AsyncGenerator[tuple[Sequence[RolloutResult], Sequence[GroupDone]]]:
-        """One stream of the batch: the first submits it, later ones continue after the cursor."""
+        """Read one stream of the batch. The first stream submits the batch, later ones continue after the cursor."""
         timeout_s = attached.time_left(self._limits.batch_s)
         call: grpc.aio.UnaryStreamCall
         if attached.submitted:
@@ -219,7 +218,7 @@ class ClusterClient(FleetClient):
                     groups = each("groups", group_done_from_proto, response.groups)
                 yield results, groups
                 if not attached.missing:
-                    return  # what is still to come says only that the stream ends
+                    return  # the rest of the stream carries no results
         except grpc.aio.AioRpcError as error:
             raise attached.explain(cluster_error(error, self._address)) from error
         finally:
@@ -227,29 +226,25 @@ class ClusterClient(FleetClient):
 
     @of_the_leader
     async def cancel(self, run_id: str, batch_id: str) -> None:
-        """Call a batch off: its rollouts that have no outcome yet end as ``Cancelled``."""
+        """Cancel a batch: its rollouts without an outcome end as ``Cancelled``."""
         request = rollout_service_pb2.CancelBatchRequest(run_id=run_id, batch_id=batch_id)
-        with cluster_errors(self._address):
-            await self._rollouts.CancelBatch(request, timeout=self._limits.call_s)
+        await self._rollouts.CancelBatch(request, timeout=self._call_s)
 
     @of_the_leader
     async def report_training(self, run_id: str, report: TrainingReport) -> None:
-        """Tell people who watch how training goes. PreconditionError where the manager is too old to listen."""
-        request = training_report_to_proto(run_id, report)
-        with cluster_errors(self._address):
-            await self._rollouts.ReportTraining(request, timeout=self._limits.call_s)
+        """Send a training report, which the dashboard shows."""
+        await self._rollouts.ReportTraining(training_report_to_proto(run_id, report), timeout=self._call_s)
 
     @of_the_leader
     async def close_run(self, run_id: str) -> RunStats:
-        """End a run; the manager drops its results and look-ahead."""
+        """Close a run and return its counters. The manager drops its results and look-ahead window."""
         request = rollout_service_pb2.CloseRunRequest(run_id=run_id)
-        with cluster_errors(self._address):
-            answer = await self._rollouts.CloseRun(request, timeout=self._limits.call_s)
-            return inside("stats", run_stats_from_proto, answer.stats)
+        answer = await self._rollouts.CloseRun(request, timeout=self._call_s)
+        return inside("stats", run_stats_from_proto, answer.stats)
 
 
 class _AttachedBatch:
-    """What a client remembers of a batch between two streams."""
+    """State of a batch between two streams."""
 
     def __init__(self, batch: Batch, ends_s: float) -> None:
         self.batch = batch
@@ -260,7 +255,7 @@ class _AttachedBatch:
         self._ends_s = ends_s
 
     def new(self, results: Sequence[RolloutResult]) -> Iterable[RolloutResult]:
-        """Those results that were not seen before; a repeated one is not delivered twice."""
+        """Yield the results that were not seen before."""
         for result in results:
             self.cursor = max(self.cursor, result.cursor)
             if result.rollout_id in self.missing:
@@ -268,14 +263,14 @@ class _AttachedBatch:
                 yield result
 
     def ended(self, groups: Sequence[GroupDone]) -> Iterable[GroupDone]:
-        """Those groups whose end was not told before."""
+        """Yield the groups whose end was not reported before."""
         for group in groups:
             if group.group_id not in self._groups:
                 self._groups.add(group.group_id)
                 yield group
 
     def read_again(self) -> None:
-        """Read the results from the first one on."""
+        """Read all results again from the first."""
         self.cursor = 0
 
     def forget_cursor(self) -> None:
@@ -288,14 +283,14 @@ class _AttachedBatch:
         )
 
     def time_left(self, within_s: float) -> float:
-        """Seconds until the caller's deadline; past it, ``DeadlineError``."""
+        """Return the seconds until the caller's deadline. Raise DeadlineError after it."""
         left_s = self._ends_s - time.monotonic()
         if left_s <= 0:
             raise self._late(within_s)
         return left_s
 
     def explain(self, error: ClusterError) -> ClusterError:
-        """The error of a stream; when it is the caller's own deadline, say what is missing."""
+        """Return the error of a stream. For the caller's own deadline, list what is missing."""
         if isinstance(error, DeadlineError) and time.monotonic() >= self._ends_s - 0.05:
             return self._late(None)
         return error

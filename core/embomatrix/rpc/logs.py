@@ -1,7 +1,7 @@
-"""Log lines of the daemons: sentences for people, or JSON for programs, with the ids that they are about, and without secrets.
+"""Log lines of the daemons, as text or JSON, with the ids they concern and without secrets.
 
-A message names what it is about as ``name=%s`` ("lease expired rollout=%s worker=%s"): in JSON each of these is a field. What a
-task is about from some point on, ``bind`` adds to all of its lines.
+A message names its ids as ``name=%s`` ("lease expired rollout=%s worker=%s"); in JSON each becomes a field. ``bind``
+adds an id to all later lines of a task.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 Id = Literal["run", "batch", "rollout", "lease", "worker", "session", "scene"]
-"""What lines are about."""
+"""Names of ids in log lines."""
 
 SHORTEST_SECRET: Final = 4
-"""A word shorter than this is hidden nowhere: it would be found inside of others."""
+"""Shorter words are not masked, since they occur inside other words."""
 MASK: Final = "***"
 _NAMED: Final = re.compile(r"(?:(\w+)=)?(%%|%[-+#0 ]*\d*(?:\.\d+)?[sdrfgixe])")
 _BEARER: Final = re.compile(r"(Bearer\s+)\S+", re.IGNORECASE)
@@ -36,45 +36,45 @@ _hidden: set[str] = set()
 
 
 class LogFormat(StrEnum):
-    """How lines are written."""
+    """Format of log lines."""
 
     HUMAN = "human"
     JSON = "json"
 
 
 def log_to_stderr(level: str, log_format: LogFormat) -> None:
-    """Write log lines of this process to standard error from now on. ValueError for a level that there is none of."""
+    """Write the log lines of this process to standard error. Raises ValueError for an unknown level."""
     known = logging.getLevelNamesMapping()
     if level.upper() not in known:
         raise ValueError("expected debug, info, warning or error")
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter() if log_format is LogFormat.JSON else HumanFormatter())
-    # Libraries speak up when something is wrong; what we do ourselves is told as finely as was asked for.
+    # Libraries log warnings and errors only; our own loggers use the requested level.
     logging.basicConfig(level=max(logging.WARNING, known[level.upper()]), handlers=[handler], force=True)
     logging.getLogger("embomatrix").setLevel(level.upper())
 
 
 def bind(name: Id, value: str) -> None:
-    """Every further line of this task, and of those that it starts, carries the id; an empty value takes it away."""
+    """Add the id to all later log lines of this task and of the tasks it starts. An empty value removes it."""
     ids = {**_bound.get(), name: value}
     _bound.set({key: kept for key, kept in ids.items() if kept})
 
 
 def hide(secret: str) -> None:
-    """The word is written as ``***`` from now on, wherever it stands."""
+    """Mask the word as ``***`` in all later log lines."""
     if len(secret) >= SHORTEST_SECRET:
         _hidden.add(secret)
 
 
 def without_secrets(text: str) -> str:
-    """The text without words that are hidden, tokens of calls, and passwords in addresses."""
+    """Return the text with hidden words, bearer tokens, and passwords in URLs masked."""
     for secret in _hidden:
         text = text.replace(secret, MASK)
     return _PASSWORD.sub(rf"\1{MASK}@", _BEARER.sub(rf"\1{MASK}", text))
 
 
 class HumanFormatter(logging.Formatter):
-    """One line: time, level, and the sentence. Ids that the sentence does not name follow it."""
+    """Text line: time, level, and message, then bound ids that the message lacks."""
 
     def __init__(self) -> None:
         super().__init__("%(asctime)s %(levelname)-7s %(message)s")
@@ -89,7 +89,7 @@ class HumanFormatter(logging.Formatter):
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object a line: time in UTC, level, logger, message, and a field for everything that the message names."""
+    """JSON line: UTC time, level, logger, message, and a field for each id that the message names."""
 
     def format(self, record: logging.LogRecord) -> str:
         second = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
@@ -107,7 +107,7 @@ class JsonFormatter(logging.Formatter):
 
 
 def _fields(record: logging.LogRecord) -> dict[str, Any]:
-    """What the message names as ``name=%s``, with numbers as numbers."""
+    """Return the values that the message names as ``name=%s``; numbers stay numbers."""
     args = record.args if isinstance(record.args, tuple) else ()
     names = _names(record.msg) if isinstance(record.msg, str) else ()
     if len(names) != len(args):
@@ -121,5 +121,5 @@ def _fields(record: logging.LogRecord) -> dict[str, Any]:
 
 @functools.lru_cache(maxsize=1024)
 def _names(message: str) -> tuple[str, ...]:
-    """The name before each place of a message; empty where there is none."""
+    """Return the name before each placeholder of a message; empty where there is none."""
     return tuple(found[1] or "" for found in _NAMED.finditer(message) if found[2] != "%%")

@@ -1,14 +1,14 @@
-"""Several managers of one cluster, of which one leads: where to turn to, and where next."""
+"""Connections to the managers of one cluster, of which one leads and the others stand by."""
 
 from __future__ import annotations
 
 import asyncio
 import functools
 import time
-from typing import TYPE_CHECKING, Any, Concatenate, Final, ParamSpec, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, Final, ParamSpec, Self, TypeVar
 
-from embomatrix.rpc.channel import DEFAULT_ADDRESS, is_address
-from embomatrix.rpc.status import InvalidRequestError, StandbyError, UnavailableError
+from embomatrix.rpc.channel import DEFAULT_ADDRESS, is_address, open_channel
+from embomatrix.rpc.status import InvalidRequestError, StandbyError, UnavailableError, cluster_errors
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine
@@ -18,94 +18,102 @@ if TYPE_CHECKING:
     from embomatrix.rpc.status import ClusterError
 
 PAUSE_S: Final = 0.2
-"""Between two calls of different managers."""
-PATIENCE_S: Final = 20.0
-"""For another manager to take over, where several were told."""
+"""Pause between calls to two managers."""
+FAILOVER_S: Final = 20.0
+"""Default time to wait for another manager to take over, where several addresses are known."""
 P = ParamSpec("P")
 T = TypeVar("T")
-C = TypeVar("C", bound="ManagerClient")
+C = TypeVar("C", bound="LeaderClient")
 
 
-def addresses_of(text: str) -> tuple[str, ...]:
-    """The managers in ``HOST:PORT,HOST:PORT``. Raises InvalidRequestError."""
-    addresses = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
-    for address in addresses:
-        if not is_address(address):
-            raise InvalidRequestError(
-                f"{address!r} is no address of a manager: expected HOST:PORT, as in {DEFAULT_ADDRESS}, or several with "
-                "commas between them"
-            )
-    return addresses
+class Managers:
+    """Manager addresses of a worker or trainer, and the one in use.
+
+    ``text`` is ``HOST:PORT``, or several with commas between them. Raises InvalidRequestError.
+    """
+
+    def __init__(self, text: str) -> None:
+        self.addresses = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
+        for address in self.addresses:
+            if not is_address(address):
+                raise InvalidRequestError(
+                    f"{address!r} is no manager address: expected HOST:PORT, as in {DEFAULT_ADDRESS}, or several with "
+                    "commas between them"
+                )
+        self.current = self.addresses[0]
+
+    @property
+    def count(self) -> int:
+        return len(self.addresses)
+
+    def move(self, error: ClusterError) -> None:
+        """Switch to another manager after a failed call: to the leader that a standby named, else to the next address.
+
+        A leader outside the configured addresses is ignored, since calls carry a token.
+        """
+        if isinstance(error, StandbyError) and error.leader in self.addresses:
+            self.current = error.leader
+            return
+        turn = self.addresses.index(self.current) + 1
+        self.current = self.addresses[turn % len(self.addresses)]
 
 
-class Channels:
-    """A channel to each manager that was turned to. Those that were left stay open: other calls may still be on them."""
+class LeaderClient:
+    """Async context manager over channels to the leading manager of a cluster.
 
-    def __init__(self, managers: Managers, open_to: Callable[[str], grpc.aio.Channel]) -> None:
-        self._managers = managers
-        self._open_to = open_to
-        self._open: dict[str, grpc.aio.Channel] = {}
+    ``address`` is HOST:PORT, or several with commas between them. ``ca`` (PEM) turns TLS on. Every failure is a ClusterError.
+    """
 
-    def present(self) -> grpc.aio.Channel:
-        """That to the present manager."""
-        address = self._managers.current
-        if address not in self._open:
-            self._open[address] = self._open_to(address)
-        return self._open[address]
+    def __init__(
+        self,
+        address: str = DEFAULT_ADDRESS,
+        token: str = "",
+        *,
+        ca: bytes = b"",
+        failover_s: float = FAILOVER_S,
+    ) -> None:
+        self.managers = Managers(address)
+        self.failover_s = failover_s
+        self._token = token
+        self._ca = ca
+        self._channels: dict[str, grpc.aio.Channel] = {}
 
-    async def close(self) -> None:
-        for channel in self._open.values():
+    async def __aenter__(self) -> Self:
+        _ = self._channel  # a token that cannot be sent is refused here, not at the first call
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        for channel in self._channels.values():
             await channel.close()
 
-
-class ManagerClient(Protocol):
-    """A client of several managers."""
+    @property
+    def _address(self) -> str:
+        return self.managers.current
 
     @property
-    def managers(self) -> Managers: ...
-
-    @property
-    def patience_s(self) -> float: ...
+    def _channel(self) -> grpc.aio.Channel:
+        """Channel to the current manager. Earlier channels stay open, since calls may still use them."""
+        if self._address not in self._channels:
+            self._channels[self._address] = open_channel(self._address, self._token, self._ca)
+        return self._channels[self._address]
 
 
 def of_the_leader(
     method: Callable[Concatenate[C, P], Awaitable[T]],
 ) -> Callable[Concatenate[C, P], Coroutine[Any, Any, T]]:
-    """A call that is made anew, of the next manager, while the present one can't serve and there are several."""
+    """Translate the errors of a client's call, and repeat it at the next manager while the current one is unavailable."""
 
     @functools.wraps(method)
-    async def ask(self: C, /, *args: P.args, **options: P.kwargs) -> T:
-        ends_s = time.monotonic() + self.patience_s
+    async def call(self: C, /, *args: P.args, **options: P.kwargs) -> T:
+        ends_s = time.monotonic() + self.failover_s
         while True:
             try:
-                return await method(self, *args, **options)
+                with cluster_errors(self._address):
+                    return await method(self, *args, **options)
             except UnavailableError as error:
                 if self.managers.count == 1 or time.monotonic() >= ends_s:
                     raise
                 self.managers.move(error)
             await asyncio.sleep(PAUSE_S)
 
-    return ask
-
-
-class Managers:
-    """The addresses that a worker or trainer was told, one of them the present one."""
-
-    def __init__(self, text: str) -> None:
-        self._addresses = addresses_of(text)
-        self.current = self._addresses[0]
-
-    @property
-    def count(self) -> int:
-        return len(self._addresses)
-
-    def move(self, error: ClusterError) -> None:
-        """After a failed call: to the leader that the present manager named, else to the next in turn.
-
-        Only addresses that were told from the start count: nobody is led elsewhere with a token in the hand.
-        """
-        if isinstance(error, StandbyError) and error.leader in self._addresses:
-            self.current = error.leader
-            return
-        turn = self._addresses.index(self.current) + 1
-        self.current = self._addresses[turn % len(self._addresses)]
+    return call

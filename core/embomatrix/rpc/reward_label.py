@@ -1,4 +1,4 @@
-"""What a trainer that asks for rewards over HTTP carries beside each prompt: all that makes a rollout of an answer."""
+"""Label that a trainer sends beside each prompt when it requests rewards over HTTP."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LARGEST_SEED = 2**31 - 1
 
 @dataclass(frozen=True, slots=True)
 class RewardLabel:
-    """A task in its scene, the skills that plans for it may use, and the seed that its rollouts share."""
+    """Task, bundle, skill profile and seed of a rollout."""
 
     task_id: str
     bundle_digest: str
@@ -22,12 +22,12 @@ class RewardLabel:
     seed: int
 
     def text(self) -> str:
-        """As JSON in one line, for the label column of a trainer's dataset."""
+        """Return the label as one line of JSON, for the label column of a dataset."""
         return json.dumps(asdict(self))
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """The inverse of ``text``. Raises InvalidRequestError."""
+        """Parse the JSON of ``text``. Raises InvalidRequestError."""
         try:
             value = json.loads(text)
             label = cls(
@@ -47,9 +47,9 @@ class RewardLabel:
 
 
 def answer_in(query: str, prompt: str) -> str:
-    """What was written after the prompt; tokenizers may have put a mark before it. Raises InvalidRequestError.
+    """Return the text after the prompt; tokenizers may have inserted text before it. Raises InvalidRequestError.
 
-    The prompt shows a plan as an example, which must not be taken for an answer.
+    The prompt shows an example plan, which must not be parsed as the answer.
     """
     _, found, answer = query.partition(prompt)
     if not found:

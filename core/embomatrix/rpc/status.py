@@ -1,4 +1,4 @@
-"""Our errors and gRPC status codes: one table, read by the services one way and by the clients the other."""
+"""Cluster errors and their gRPC status codes, in one table for services and clients."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import grpc
 
-from embomatrix.rpc.wire.rollout import ConvertError
+from embomatrix.rpc.wire.codec import ConvertError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator, Mapping
@@ -17,49 +17,49 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 ERROR_KEY: Final = "embomatrix-error"
-"""Trailing metadata of a status that our service set: a dead manager is not taken for a busy one."""
+"""Trailing metadata key of every status that our services set. It tells an overloaded manager from a dead one."""
 LEADER_KEY: Final = "embomatrix-leader"
-"""Trailing metadata of a manager that stands by: where the leader is."""
+"""Trailing metadata key with the leader's address, set by a standby manager."""
 
 
 class ClusterError(Exception):
-    """What went wrong between a client and the cluster, as one sentence for a person."""
+    """Error between a client and the cluster. The message is one sentence for the user."""
 
 
 class InvalidRequestError(ClusterError):
-    """The request can't be understood: a defect of the sender."""
+    """Request that cannot be understood: a bug of the sender."""
 
 
 class NotSignedInError(ClusterError):
-    """No token, or one that is not known."""
+    """Missing or unknown token."""
 
 
 class NotAllowedError(ClusterError):
-    """The token's role may not do this."""
+    """Call that the token's role does not allow."""
 
 
 class NotFoundError(ClusterError):
-    """The run, batch, bundle or worker is not (or no longer) known. A batch may be submitted again."""
+    """Unknown or forgotten run, batch, bundle or worker. A batch may be submitted again."""
 
 
 class ConflictError(ClusterError):
-    """The same id was used before with other content."""
+    """Id that was used before with other content."""
 
 
 class PreconditionError(ClusterError):
-    """Something must come first: a bundle is missing, or the versions don't fit."""
+    """Missing precondition, such as a bundle or a common protocol version."""
 
 
 class OverloadedError(ClusterError):
-    """A queue is full: try again later."""
+    """Full queue: try again later."""
 
 
 class UnavailableError(ClusterError):
-    """The manager can't serve now, or can't be reached; the same call may be tried again."""
+    """Manager that is unreachable or cannot serve now. The same call may be repeated."""
 
 
 class StandbyError(UnavailableError):
-    """This manager stands by; ``leader`` is the address (HOST:PORT) of the one that leads."""
+    """Call to a standby manager; ``leader`` is the HOST:PORT of the leader."""
 
     def __init__(self, sentence: str, leader: str = "") -> None:
         super().__init__(sentence)
@@ -67,27 +67,27 @@ class StandbyError(UnavailableError):
 
 
 class ManagerUnreachableError(UnavailableError):
-    """Nobody answers at the manager's address."""
+    """No answer at the manager's address."""
 
 
 class SupersededError(ClusterError):
-    """Another session of the same worker id took over, or the epoch is stale: this side must stop."""
+    """Stale session epoch, or a newer session of the same worker id: this side must stop."""
 
 
 class UnknownSessionError(SupersededError):
-    """The session was opened by a former manager: register again, and say what is held; this manager may take it up."""
+    """Session of a former manager: register again and report all leases, which this manager may adopt."""
 
 
 class TrimmedError(ClusterError):
-    """The results at this cursor are no longer kept."""
+    """Results that are no longer kept at this cursor."""
 
 
 class DeadlineError(ClusterError):
-    """No answer within the time given."""
+    """No answer within the time limit."""
 
 
 class InternalError(ClusterError):
-    """A defect of the other side; its log has the details."""
+    """Bug of the other side; its log has the details."""
 
 
 STATUS: Final[Mapping[type[ClusterError], grpc.StatusCode]] = {
@@ -107,31 +107,31 @@ STATUS: Final[Mapping[type[ClusterError], grpc.StatusCode]] = {
 _ERRORS: Final = {code: error for error, code in STATUS.items()}
 _PLAIN: Final = "1"
 _NAMED: Final[Mapping[str, type[ClusterError]]] = {"unknown-session": UnknownSessionError}
-"""Errors that share a status with others, by the value of ``ERROR_KEY`` that tells them apart."""
+"""Errors that share a status with others, by the value of ``ERROR_KEY`` that identifies them."""
 _NAMES: Final = {error: name for name, error in _NAMED.items()}
 
 _TLS_TROUBLES: Final[Mapping[str, str]] = {
-    "WRONG_VERSION_NUMBER": "what answers at {address} does not speak TLS: leave --ca out, or check the port",
+    "WRONG_VERSION_NUMBER": "the server at {address} does not speak TLS: leave --ca out, or check the port",
     "[Hh]andshake failed": (
         "the certificate at {address} is not signed by the authority in --ca, or has expired: pass the ca.pem of that manager, "
         "or renew it with `embomatrix manager init`"
     ),
     "Hostname Verification": (
-        "the certificate at {address} is for other names: call the manager by one of them, or add this one with "
+        "the certificate at {address} is for other names: use one of them, or add this one with "
         "`embomatrix manager init --san NAME`"
     ),
-    # Only of an attempt to connect: a manager that dies closes its connections too.
+    # Only while connecting: a manager that dies closes its connections too.
     "failed to connect .*Socket closed": (
-        "what answers at {address} closed the connection: if it speaks TLS, pass --ca, or set EMBOMATRIX_CA, to the ca.pem "
+        "the server at {address} closed the connection: if it speaks TLS, pass --ca, or set EMBOMATRIX_CA, to the ca.pem "
         "of that manager"
     ),
 }
-"""What gRPC says of a handshake, as a pattern, and what it means; the first that fits counts."""
+"""Patterns of gRPC's handshake errors and their explanations. The first match counts."""
 
 
 @contextlib.asynccontextmanager
 async def translate(context: grpc.aio.ServicerContext) -> AsyncIterator[None]:
-    """Around a servicer's body: our errors become their status; any other is logged, and ``INTERNAL``."""
+    """Turn errors of a servicer's body into gRPC status codes. Unexpected errors are logged and become ``INTERNAL``."""
     try:
         yield
     except ClusterError as error:
@@ -141,7 +141,7 @@ async def translate(context: grpc.aio.ServicerContext) -> AsyncIterator[None]:
     except grpc.aio.AbortError:
         raise
     except Exception:
-        logger.exception("defect while serving a call")
+        logger.exception("unexpected error while serving a call")
         await _abort(
             context, grpc.StatusCode.INTERNAL, "the manager failed on this call: its log has the details"
         )
@@ -169,7 +169,7 @@ def _status_of(error: ClusterError) -> grpc.StatusCode:
 
 
 def cluster_error(error: grpc.aio.AioRpcError, address: str) -> ClusterError:
-    """The error of ours for a failed call to ``address`` (HOST:PORT)."""
+    """Return the ClusterError of a failed call to ``address`` (HOST:PORT)."""
     code = error.code()
     details = error.details() or ""
     told = {key: str(value) for key, value in error.trailing_metadata() or ()}
@@ -191,7 +191,7 @@ def cluster_error(error: grpc.aio.AioRpcError, address: str) -> ClusterError:
             )
         case grpc.StatusCode.UNIMPLEMENTED:
             return PreconditionError(
-                f"what listens at {address} is no manager of this version ({details}): "
+                f"the server at {address} is no manager of this version ({details}): "
                 "check --manager and update both"
             )
         case _:
@@ -201,13 +201,13 @@ def cluster_error(error: grpc.aio.AioRpcError, address: str) -> ClusterError:
 
 
 def _tls_trouble(details: str) -> str:
-    """What gRPC's words of a failed handshake mean; empty when it did not come to one."""
+    """Return the explanation of a failed TLS handshake; empty for other failures."""
     return next((sentence for sign, sentence in _TLS_TROUBLES.items() if re.search(sign, details)), "")
 
 
 @contextlib.contextmanager
 def cluster_errors(address: str) -> Iterator[None]:
-    """Around a client's calls: what gRPC raises becomes a ``ClusterError``."""
+    """Raise gRPC errors of a client's calls as ClusterError."""
     try:
         yield
     except grpc.aio.AioRpcError as error:

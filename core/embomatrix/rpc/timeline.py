@@ -1,4 +1,4 @@
-"""When each slot was at work, as far as the manager can tell from when results came and how long they took."""
+"""Work intervals of each slot, reconstructed from the arrival times and durations of results."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
-from embomatrix.rpc.run_log import EventKind
+from embomatrix.rpc.wire.run_log import EventKind
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from embomatrix.rpc.run_log import RunEvent
+    from embomatrix.rpc.wire.run_log import RunEvent
 
 
 class SlotKey(NamedTuple):
-    """A slot in the cluster; slots of a worker count from 1."""
+    """Slot in the cluster; the slots of a worker count from 1."""
 
     worker_id: str
     slot: int
@@ -24,7 +24,7 @@ class SlotKey(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A slot worked on a lease from ``begin_s`` to ``end_s``, in seconds since the epoch on the manager's clock."""
+    """Work of a slot on a lease from ``begin_s`` to ``end_s``, in seconds since the epoch on the manager's clock."""
 
     event: RunEvent
     begin_s: float
@@ -32,15 +32,15 @@ class Span:
 
     @property
     def load_s(self) -> float:
-        """How long before it the lease waited for its scene."""
+        """Time that the lease waited for its scene, before the span."""
         return self.event.timings.load_s if self.event.timings is not None else 0.0
 
 
 def slot_spans(events: Iterable[RunEvent]) -> dict[SlotKey, list[Span]]:
-    """The work of each slot in order; no two spans of a slot overlap.
+    """Return the work of each slot in order; spans of a slot do not overlap.
 
-    Only durations come from a worker, and results may come many at a time, so an end is known by two bounds: not after the
-    result's arrival, and not after the beginning of what the slot did next. The latest time within both is taken.
+    Workers report durations only, and results may arrive in bulk. The end of a span is therefore the earlier of the
+    result's arrival and the begin of the slot's next span.
     """
     by_slot: dict[SlotKey, list[RunEvent]] = {}
     for event in events:
@@ -52,7 +52,7 @@ def slot_spans(events: Iterable[RunEvent]) -> dict[SlotKey, list[Span]]:
 def busy_share(
     spans: Mapping[SlotKey, Sequence[Span]], first_s: float, step_s: float, steps: int
 ) -> list[float]:
-    """The share of these slots that worked in each step, 0 to 1."""
+    """Return the share of these slots that worked in each step, 0 to 1."""
     busy_s = [0.0] * steps
     for span in itertools.chain.from_iterable(spans.values()):
         begin, end = (span.begin_s - first_s) / step_s, (span.end_s - first_s) / step_s

@@ -1,4 +1,4 @@
-"""Whom a client trusts: the authority that signed the manager's certificate, and how one string carries it to a new worker."""
+"""Certificate authority that a client trusts, and invitations that carry its fingerprint to a new worker."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from embomatrix.rpc.status import (
 )
 
 FIRST_CONTACT_S: Final = 10.0
-"""Limit for the handshake and the answer of a manager whose certificate is not known yet."""
+"""Time limit for the handshake and the first answer of a manager with an unknown certificate."""
 _TOKEN: Final = re.compile(r"([0-9A-Za-z_-]+\.[0-9A-Za-z_-]+)(?:\.([0-9a-f]{64}))?")
 _CERTIFICATE: Final = re.compile(
     r"-----BEGIN CERTIFICATE-----\s.+?\s-----END CERTIFICATE-----", re.DOTALL | re.ASCII
@@ -31,7 +31,7 @@ _CERTIFICATE: Final = re.compile(
 
 
 def read_token(text: str) -> str:
-    """The token itself, or what the file holds that ``@FILE`` names. Raises InvalidRequestError."""
+    """Return the token, or the content of FILE for ``@FILE``. Raises InvalidRequestError."""
     if not text.startswith("@"):
         return text
     try:
@@ -42,7 +42,7 @@ def read_token(text: str) -> str:
 
 
 def read_ca(path: Path | None) -> bytes:
-    """The authority's certificate (PEM) in a file; nothing for no file. Raises InvalidRequestError."""
+    """Return the authority's certificate (PEM) in a file; empty for no file. Raises InvalidRequestError."""
     if path is None:
         return b""
     try:
@@ -58,7 +58,7 @@ def read_ca(path: Path | None) -> bytes:
 
 
 def fingerprint_of(pem: str) -> str:
-    """SHA-256 of the first certificate in the text, in hexadecimal digits. ValueError for text without one."""
+    """Return the SHA-256 of the first certificate in the text, as hexadecimal digits. Raises ValueError without one."""
     found = _CERTIFICATE.search(pem)
     if found is None:
         raise ValueError("there is no certificate in it")
@@ -67,7 +67,7 @@ def fingerprint_of(pem: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Invitation:
-    """All that a spare PC needs to join: ``TOKEN@HOST:PORT``; with TLS, TOKEN ends in the authority's fingerprint."""
+    """Invitation of a worker, ``TOKEN@HOST:PORT``. With TLS, TOKEN ends in the authority's fingerprint."""
 
     address: str
     """HOST:PORT, or several with commas between them."""
@@ -76,7 +76,7 @@ class Invitation:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Raises InvalidRequestError, which shows nothing of the token."""
+        """Parse an invitation. Raises InvalidRequestError without showing the token."""
         token, _, address = text.partition("@")
         found = _TOKEN.fullmatch(token)
         if found is None or not all(is_address(part) for part in address.split(",")):
@@ -90,21 +90,22 @@ class Invitation:
 
     @property
     def token_id(self) -> str:
-        """Names the token without betraying it."""
+        """Public id of the token."""
         return self.token.partition(".")[0]
 
 
 async def fetch_ca(invitation: Invitation) -> bytes:
-    """The authority's certificate (PEM) from the manager itself; nothing for an invitation without a fingerprint.
+    """Return the authority's certificate (PEM), fetched from the manager; empty for an invitation without a
+    fingerprint.
 
-    The first connection trusts whatever certificate it meets; nothing secret is said on it, and what it answers must have the
-    invitation's fingerprint. Raises NotAllowedError when it has another.
+    The first connection accepts any certificate and carries no secret. Its answer must match the invitation's
+    fingerprint. Raises NotAllowedError for another fingerprint.
     """
     if not invitation.fingerprint:
         return b""
     *first, last = invitation.address.split(",")
     for address in first:
-        # One that stands by, or is away, can't tell.
+        # A manager that stands by, or is unreachable, cannot answer.
         with contextlib.suppress(UnavailableError):
             return await _fetch_from(address, invitation.fingerprint)
     return await _fetch_from(last, invitation.fingerprint)
@@ -121,13 +122,13 @@ async def _fetch_from(address: str, fingerprint: str) -> bytes:
         if fingerprint_of(answer.ca_certificate) == fingerprint:
             return str(answer.ca_certificate).encode("ascii")
     raise NotAllowedError(
-        f"who answers at {address} is not the manager that this invitation is from: its authority has another "
-        "fingerprint. Ask the operator for a new invitation, and how the network lets another machine answer"
+        f"the server at {address} is not the manager of this invitation: its authority has another "
+        "fingerprint. Ask the operator for a new invitation, and why another machine answers at this address"
     )
 
 
 def _certificate_at(address: str) -> bytes:
-    """The certificate (PEM) that is shown at HOST:PORT, whoever signed it."""
+    """Return the certificate (PEM) that HOST:PORT shows, without verification."""
     host, _, port = address.rpartition(":")
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
@@ -141,7 +142,7 @@ def _certificate_at(address: str) -> bytes:
             shown = tls.getpeercert(binary_form=True)
     except ssl.SSLError as error:
         raise ManagerUnreachableError(
-            f"what answers at {address} does not speak TLS, and the invitation says that the manager does: check its port"
+            f"the server at {address} does not speak TLS, but the invitation requires it: check the port"
         ) from error
     except OSError as error:
         raise ManagerUnreachableError(

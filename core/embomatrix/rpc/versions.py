@@ -8,16 +8,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
+from embomatrix.proto.v1 import rollout_service_pb2 as pb
 from embomatrix.rpc.status import PreconditionError
+
+if TYPE_CHECKING:
+    from embomatrix.proto.v1.rollout_service_pb2_grpc import RolloutServiceAsyncStub
 
 PROTOCOL_VERSION: Final = 2
 
 
 @dataclass(frozen=True, slots=True)
 class VersionRange:
-    """Versions that a side speaks, both ends included."""
+    """Range of protocol versions, both ends included."""
 
     oldest: int
     newest: int
@@ -32,10 +36,10 @@ SPOKEN: Final = VersionRange(PROTOCOL_VERSION, PROTOCOL_VERSION)
 
 
 def agree(ours: VersionRange, theirs: VersionRange, *, us: str, them: str, their_release: str = "") -> int:
-    """The newest version that both sides speak; PreconditionError, with the command that mends it, when there is none.
+    """Return the newest version that both sides speak. Raise PreconditionError with an upgrade command if there is none.
 
-    ``us`` and ``them`` name the sides as its sentence does: ``this manager``, ``worker w1``. ``their_release`` is that of
-    their software, if they told it.
+    ``us`` and ``them`` name the two sides in the message, as in ``this manager`` and ``worker w1``. ``their_release`` is the
+    software release of the other side, if known.
     """
     agreed = min(ours.newest, theirs.newest)
     if agreed >= max(ours.oldest, theirs.oldest):
@@ -51,8 +55,32 @@ def agree(ours: VersionRange, theirs: VersionRange, *, us: str, them: str, their
 
 
 def software_version() -> str:
-    """Of the installed package; empty when it runs from a source tree that nobody installed."""
+    """Return the version of the installed package; empty in a source tree that is not installed."""
     try:
         return version("embomatrix")
     except PackageNotFoundError:
         return ""
+
+
+@dataclass(frozen=True, slots=True)
+class Capabilities:
+    """Versions, limits and certificate authority of a manager."""
+
+    protocol: VersionRange
+    release: str = ""
+    batch_rollouts: int = 0
+    bundle_bytes: int = 0
+    ca_certificate: str = ""
+    """PEM; empty without TLS."""
+
+
+async def capabilities_of(stub: RolloutServiceAsyncStub, *, timeout_s: float) -> Capabilities:
+    """Ask the manager behind the stub. Raises AioRpcError."""
+    answer = await stub.GetCapabilities(pb.GetCapabilitiesRequest(), timeout=timeout_s)
+    return Capabilities(
+        VersionRange(answer.protocol_low, answer.protocol_high),
+        answer.version,
+        answer.batch_rollouts,
+        answer.bundle_bytes,
+        answer.ca_certificate,
+    )

@@ -1,4 +1,7 @@
-"""What each skill does in cached mode once its preconditions hold: pick an outcome and instantiate it, without stepping."""
+"""Actions of cached mode: each skill instantiates a verified outcome without stepping physics.
+
+The executor checks the preconditions beforehand.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,9 @@ import itertools
 import math
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.blockers import no_way_for_arm, no_way_into, no_way_to, no_way_to_place
+from embomatrix.sim.blockers import arm_refusal, path_refusal, placing_refusal, room_refusal
 from embomatrix.sim.household import clean, cut, soak
-from embomatrix.sim.joints.panels import Leaves
+from embomatrix.sim.joints.panels import DoorPanels
 from embomatrix.sim.joints.swings import SWING
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Skill
@@ -30,32 +33,32 @@ if TYPE_CHECKING:
 
 OTHER_STANDS: Final = 2
 APART_M: Final = 0.4
-"""A crowded support is served from up to two other standing poses, this far or further from the first."""
+"""Largest number and smallest distance of other standing poses that serve a crowded support."""
 
 
 class CachedActor:
-    """The language-physics interface: outcomes found before are instantiated. Holds nothing of its own."""
+    """Cached execution mode. Stateless: outcomes found offline are instantiated in the world."""
 
     drawing = frozenset({Skill.PLACE, Skill.SLICE})
 
     def reset(self, world: LiveWorld) -> None:
-        """Nothing to do: all there is, is in the world."""
+        """Do nothing: the world holds all state."""
 
     def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-        """Carry out a call whose preconditions hold. A refusal leaves the world as it was."""
+        """Carry out a call whose preconditions hold. A refusal leaves the world unchanged."""
         handling = HANDLINGS.get(call.skill)
-        refusal = no_way_for_arm(world, handling, target_of(world, call)) if handling is not None else None
+        refusal = arm_refusal(world, handling, target_of(world, call)) if handling is not None else None
         return refusal or ACTIONS[call.skill](world, call, rng)
 
     def close(self) -> None:
-        """Nothing to free."""
+        """Do nothing."""
 
 
 def _move(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     target = target_of(world, call)
     stand = world.navigator.nearest_stand(target, world.robot)
     if stand is None:
-        return no_way_to(world, target)
+        return path_refusal(world, target)
     world.robot = stand
     return None
 
@@ -78,7 +81,7 @@ def _move_forward(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -
 
 
 def _heading(world: LiveWorld, call: SkillCall) -> float:
-    """The present heading and the call's angle, in [-pi, pi]."""
+    """Heading after the call's turn, in [-pi, pi]."""
     return math.remainder(world.robot.yaw + math.remainder(call.yaw or 0.0, math.tau), math.tau)
 
 
@@ -86,7 +89,7 @@ def _go_to_room(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> 
     room = call.room_name or ""
     entry = world.navigator.room_entry(room, world.robot)
     if entry is None:
-        return no_way_into(world, room)
+        return room_refusal(world, room)
     world.robot = entry
     return None
 
@@ -101,7 +104,7 @@ def _place(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Skill
     assert call.relation is not None
     target, held = target_of(world, call), world.carried[0]
     relation = Relation(call.relation.value)
-    refusal = no_way_to_place(world, held, target, relation)
+    refusal = placing_refusal(world, held, target, relation)
     if refusal is not None:
         return refusal
     fails = FailureReason.NO_FREE_POSE
@@ -120,7 +123,7 @@ def _place(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Skill
 
 
 def other_stands(world: LiveWorld, target: str) -> Iterator[StandPose]:
-    """Where else the robot may stand to place something, apart from where it stands: from there it reaches other spots."""
+    """Other standing poses from which the robot reaches other places on the target."""
     here = world.robot
     stands = world.navigator.stands(target, here)
     away = [stand for stand in stands if math.hypot(stand.x_m - here.x_m, stand.y_m - here.y_m) >= APART_M]
@@ -133,20 +136,20 @@ def _open(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillR
     if other:
         return refuse(FailureReason.DOOR_BLOCKED, target=target, other=other)
     world.navigator.refresh()
-    world.robot = world.navigator.aside(target, world.robot)
+    world.robot = world.navigator.step_aside(target, world.robot)
     return None
 
 
 def _close(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     target = target_of(world, call)
     before = world.engine.joints(target)
-    leaves = Leaves(world.engine, world.relations, target)
+    panels = DoorPanels(world.engine, world.relations, target)
     shares = (*reversed(SWING), 0.0)
-    _, other = leaves.swing([min(share, fraction) for fraction in before] for share in shares)
+    _, other = panels.swing([min(share, fraction) for fraction in before] for share in shares)
     if not other:
         world.navigator.refresh()
         return None
-    leaves.put_back()
+    panels.restore()
     return refuse(FailureReason.DOOR_BLOCKED, target=target, other=other)
 
 
@@ -161,7 +164,7 @@ def _toggle_off(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> 
 
 
 def _wait(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-    """The source acts by itself as soon as its conditions hold: waiting changes nothing more."""
+    """Do nothing: a source acts as soon as its conditions hold."""
     return None
 
 
@@ -183,7 +186,7 @@ ACTIONS: Final[Mapping[Skill, Action]] = {
     Skill.CLEAN: clean,
     Skill.SOAK: soak,
 }
-"""One action for each skill."""
+"""Action of each skill."""
 
 HANDLINGS: Final[Mapping[Skill, Handling]] = {
     Skill.PICK_UP: Handling.TAKE,
@@ -192,4 +195,4 @@ HANDLINGS: Final[Mapping[Skill, Handling]] = {
     Skill.TOGGLE_ON: Handling.PRESS,
     Skill.TOGGLE_OFF: Handling.PRESS,
 }
-"""Skills of which the scene's analysis knows where the arm finds no way."""
+"""Skills that the scene's analysis may report as unreachable for the arm."""

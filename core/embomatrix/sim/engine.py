@@ -1,7 +1,7 @@
-"""What the rest of the simulator asks of a physics engine: one loaded scene, queried and changed by name.
+"""Interface of a physics engine: one loaded scene, queried and changed by object name.
 
-All poses are those of the object's asset frame in the world, in metres. An engine never lets the world run: objects move
-only when they are told to, and ``settle`` simulates a copy of the neighbourhood. So a state is what was set, exactly.
+Poses are those of the object's asset frame in the world, in metres. An engine never steps its scene: objects move only by
+explicit calls, and ``settle`` simulates a copy of the object's surroundings. The state is exactly what was set.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
 
 WALL: Final = "wall"
 FLOOR: Final = "floor"
-"""Names under which ``penetrates`` reports the walls and the floor: no scene object bears them."""
+"""Names that ``penetrates`` returns for walls and floor; no scene object has them."""
 TOLERANCE_M: Final = 0.001
-"""Bodies that share less depth than this touch; more than this is penetration."""
+"""Bodies that overlap by less than this touch; beyond it they penetrate."""
 SETTLE_STEPS: Final = 48
 """Steps of 1/240 s after which an object that is not at rest counts as unstable."""
 MAX_MOVED_M: Final = 0.01
 MAX_TILT_RAD: Final = 0.1745
-"""A placement is stable when the object settles within 1 cm and 10 degrees of where it was put."""
+"""A placement is stable if the object settles within 1 cm and 10 degrees of its start."""
 NOTHING: Final[frozenset[str]] = frozenset()
 
 
 class EngineError(Exception):
-    """A scene that can't be loaded, an unknown name or a value that physics can't take. The sentence names the remedy."""
+    """Invalid scene, unknown name or value that physics can't take. The message names the remedy."""
 
 
 class EngineMissingError(EngineError):
@@ -38,9 +38,9 @@ class EngineMissingError(EngineError):
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """Where an object ends up when it is let go.
+    """Final pose of an object after it was let go.
 
-    ``moved_m`` and ``tilt_rad`` compare ``pose`` with the pose it was put at; ``at_rest`` tells whether it stopped in time.
+    ``moved_m`` and ``tilt_rad`` compare ``pose`` with the start; ``at_rest`` is False if the object still moved at the end.
     """
 
     pose: Pose
@@ -54,13 +54,13 @@ class Settled:
 
 
 class Journal:
-    """What changed in an engine since it was loaded or reset: for those who keep answers that depend on its state."""
+    """Changes in an engine since it was loaded or reset, for caches that depend on its state."""
 
     def __init__(self) -> None:
         self.rounds = 0
-        """How often the engine was reset: with every round the entries begin anew."""
+        """Number of resets; each one clears the entries."""
         self.entries: list[tuple[str, Aabb | None]] = []
-        """Objects that were moved, parked or brought back, and the box that each had before; None: it was parked."""
+        """Objects that were moved, parked or brought back, each with its box before the change; None if it was parked."""
 
     def begin_round(self) -> None:
         self.rounds += 1
@@ -80,55 +80,55 @@ class PhysicsEngine(Protocol):
     def reset(self) -> None:
         """Undo every change since loading: poses, joints and parking are bit-equal to the scene's.
 
-        What the scene calls absent is parked.
+        Objects that the scene marks absent are parked.
         """
 
     def pose(self, name: str) -> Pose:
-        """Pose of the object's asset frame in the world; of a parked object the last one that it had."""
+        """Pose of the object's asset frame in the world; the last one for a parked object."""
 
     def set_pose(self, name: str, pose: Pose) -> None:
-        """Teleport the object. One that was parked is back in the world."""
+        """Teleport the object; a parked object returns to the world."""
 
     def aabb(self, name: str) -> Aabb:
-        """Bounding box in the world, with the joints as they are now."""
+        """Bounding box in the world at the current joint positions."""
 
     def joints(self, name: str) -> tuple[float, ...]:
         """Joint positions as shares of their travel: 0 closed, 1 open, in the order of the asset's joints."""
 
     def set_joints(self, name: str, fractions: Sequence[float]) -> None:
-        """Set every joint of the object. Raises EngineError for a wrong number of them or one outside 0..1."""
+        """Set every joint of the object. Raises EngineError for a wrong count or a value outside 0..1."""
 
     def park(self, name: str) -> None:
-        """Take the object out of the world: it collides with nothing and stands in no relation, as in the robot's hand."""
+        """Take the object out of the world, as in the robot's hand: it collides with nothing and has no relations."""
 
     def is_parked(self, name: str) -> bool: ...
 
     def penetrates(self, name: str, margin_m: float = 0.0, ignore: frozenset[str] = NOTHING) -> str:
-        """Name of one body that the object, grown by ``margin_m``, penetrates by more than 1 mm; "" when there is none.
+        """Name of one body that the object, grown by ``margin_m``, penetrates by more than 1 mm; "" for none.
 
-        The floor and the walls answer by ``FLOOR`` and ``WALL``; then objects in scene order.
+        ``FLOOR`` and ``WALL`` come first, then objects in scene order.
         """
 
     def near(self, box: Aabb, ignore: frozenset[str] = NOTHING) -> tuple[str, ...]:
-        """Objects whose bounding boxes overlap the box, in scene order, without the parked ones."""
+        """Objects whose bounding boxes overlap the box, in scene order; parked ones are left out."""
 
     def is_at_wall(self, box: Aabb) -> bool:
-        """Whether the bounding box of a wall overlaps the box."""
+        """Return True if the bounding box of a wall overlaps the box."""
 
     def gap(self, a: str, b: str, limit_m: float) -> float | None:
-        """Smallest signed distance between two objects (negative: depth), None when it is more than ``limit_m``.
+        """Smallest signed distance between two objects (negative: depth); None beyond ``limit_m``.
 
-        Raises EngineError when either is parked.
+        Raises EngineError for a parked object.
         """
 
     def settle(self, name: str, steps: int = SETTLE_STEPS, ignore: frozenset[str] = NOTHING) -> Settled:
-        """Let go of the object where it is, in a copy of its neighbourhood in which all else stands still.
+        """Simulate the fall of an object in a copy of its surroundings, in which all else is static.
 
-        Changes nothing here. Depends on the present state only, not on what was simulated before.
+        The engine's state does not change. The result depends on the present state only.
         """
 
     def state_bytes(self) -> bytes:
-        """Poses, joints and parking of all objects in which they differ from the scene's, for the digest of a trace."""
+        """Poses, joints and parking of all objects that differ from the scene, for the digest of a trace."""
 
     def close(self) -> None:
-        """Free the physics client. The engine can't be used afterwards."""
+        """Free the physics client and end the engine's use."""

@@ -1,4 +1,4 @@
-"""Execute plans in a scene: preconditions, actions, effects of heat and water, and the trace of it all."""
+"""Execution of plans in a scene: preconditions, actions, effects of heat and water, and the trace."""
 
 from __future__ import annotations
 
@@ -40,41 +40,44 @@ CHANGING = frozenset(
         Skill.SOAK,
     }
 )
-"""Skills after which a source may act on something that it did not act on before, or by which substances come and go."""
+"""Skills after which a source may act on new objects, or which add and remove substances."""
 
 
 class Actor(Protocol):
-    """Carries out calls: the one thing in which the execution modes differ."""
+    """Execution mode: carries out calls whose preconditions hold."""
 
     @property
     def drawing(self) -> Set[Skill]:
-        """Skills in which it draws random numbers. For the others it must not use those that it is given."""
+        """Skills that draw random numbers. The actor must not use ``rng`` for the others."""
 
     def reset(self, world: LiveWorld) -> None:
-        """A rollout begins: ``world`` is at the scene's start."""
+        """Start a rollout: ``world`` is at the scene's start."""
 
     def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-        """Carry out a call whose preconditions hold and leave in ``world`` what became of it.
+        """Carry out a call and leave its outcome in ``world``.
 
-        None for a success, else why it failed. ``rng`` decides between outcomes that are equally good.
+        Returns None for a success, else the refusal. ``rng`` decides between equally good outcomes.
         """
 
     def close(self) -> None:
-        """Free what the actor holds. It can't be used afterwards."""
+        """Free the actor's resources and end its use."""
 
 
-class Draws:
-    """One generator for all steps. What it gives at a step depends on the seed and the step only."""
+class StepRandom:
+    """Random generator of the steps; its output at a step depends on the seed and the step only.
+
+    One generator is reseeded, because making a new one costs more than a skill does.
+    """
 
     def __init__(self) -> None:
         self._bits = np.random.PCG64(0)
         self.generator = np.random.Generator(self._bits)
 
     def go_to(self, seed: int, step: int) -> None:
-        """Put the generator at the start of a step's stream.
+        """Move the generator to the start of a step's stream.
 
-        State and increment of PCG64 (O'Neill 2014) are the two halves of a hash; any state and any odd increment give a
-        full period.
+        State and increment of PCG64 (O'Neill 2014) are the two halves of a hash; any state and any odd increment give a full
+        period.
         """
         digest = hashlib.sha256(f"{seed}:{step}".encode()).digest()
         state, increment = (int.from_bytes(half, "little") for half in (digest[:16], digest[16:]))
@@ -87,7 +90,7 @@ class Draws:
 
 
 class Simulator:
-    """A bundle's scene, loaded once and executed in many times. Not for use by several threads.
+    """Scene of a bundle, loaded once for many executions. Not thread-safe.
 
     ``execute`` runs a whole plan; ``reset`` and ``run_step`` run one call at a time.
     """
@@ -100,7 +103,7 @@ class Simulator:
         self._world = LiveWorld(bundle, engine)
         self._tables = [task.table for task in bundle.tasks.values()]
         self._actor: Actor = actor if actor is not None else CachedActor()
-        self._draws = Draws()
+        self._draws = StepRandom()
         self._seed = 0
         self._count = 0
         self._hash = hashlib.sha256()
@@ -108,12 +111,12 @@ class Simulator:
 
     @property
     def facts(self) -> EngineFacts:
-        """Facts of the state reached, live until the next reset."""
+        """Facts of the current state, live until the next reset."""
         return self._world.facts
 
     @property
     def world(self) -> LiveWorld:
-        """The state reached, live until the next reset. For reading only."""
+        """Current state, live until the next reset. Read-only."""
         return self._world
 
     @property
@@ -122,7 +125,7 @@ class Simulator:
         return frozenset(self._touched)
 
     def reset(self, task: Task, seed: int) -> None:
-        """Back to the scene's start. ``seed`` decides between outcomes that are equally good; it is not negative."""
+        """Return to the scene's start. ``seed`` (not negative) decides between equally good outcomes."""
         self._world.reset(task)
         self._actor.reset(self._world)
         self._seed = seed
@@ -132,9 +135,9 @@ class Simulator:
         self._hash.update(self._world.state_bytes())
 
     def run_step(self, call: SkillCall) -> Step:
-        """Execute one call in the state reached; the caller decides whether to go on after a failure.
+        """Execute one call in the current state; the caller decides whether to continue after a failure.
 
-        A call that is refused by its preconditions changes nothing, nor does a cached one that fails.
+        A call that its preconditions refuse changes nothing, nor does a failed call in cached mode.
         """
         world = self._world
         self._count += 1
@@ -142,7 +145,7 @@ class Simulator:
         refusal = check(world, call)
         if refusal is None:
             if call.skill in self._actor.drawing:
-                # Equal prefixes of plans meet equal numbers: the stream depends on the step, not on what was drawn before.
+                # Equal plan prefixes see equal numbers: the stream depends on the step, not on earlier draws.
                 self._draws.go_to(self._seed, self._count)
             refusal = self._actor.act(world, call, self._draws.generator)
         if refusal is not None:
@@ -156,7 +159,7 @@ class Simulator:
     def execute(
         self, task: Task, plan: Plan, seed: int, on_step: Callable[[int], None] = lambda _: None
     ) -> Trace:
-        """Reset and run the plan up to its end or its first failed step. ``on_step`` is told how many are done."""
+        """Reset and run the plan to its end or first failed step. ``on_step`` receives the number of finished steps."""
         self.reset(task, seed)
         steps: list[Step] = []
         for call in plan:
@@ -173,30 +176,30 @@ class Simulator:
         )
 
     def describe(self, task: Task) -> tuple[str, ...]:
-        """State of the goal's objects and of those that a call succeeded on, in the table's order, in words."""
+        """State in words of the goal's objects and of those that a call succeeded on, in the table's order."""
         told = task.goal_objects | self._touched
         names = [name for name in task.table if name in told]
         return final_lines([self._sight(name) for name in names])
 
     def survey(self, task: Task) -> tuple[str, ...]:
-        """State of every object of the task's table, in its order, in words: it tells nothing of the goal."""
+        """State in words of every object in the task's table, in its order; it reveals nothing about the goal."""
         return final_lines([self._sight(name) for name in task.table])
 
-    def complete(self) -> Iterator[None]:
-        """Make what executions would make when they first need it, a little at a step. Changes no answer.
+    def warm_up(self) -> Iterator[None]:
+        """Compute cached values ahead of their first use, a little per step. Changes no answer.
 
-        For a process that waits, and whose forks execute: what it makes they share.
+        An idle process runs this before it forks slots, which then share the values.
         """
         world = self._world
-        yield from world.relations.footings.complete()
-        yield from world.placer.complete()
-        yield from world.navigator.complete()
-        yield from world.swings.complete()
-        # Last: a slot that is forked before it is all done misses this the least.
+        yield from world.relations.supports.warm_up()
+        yield from world.placer.warm_up()
+        yield from world.navigator.warm_up()
+        yield from world.swings.warm_up()
+        # Least useful, so last: a slot that is forked early misses it the least.
         yield from world.placer.look_up(self._tables)
 
     def close(self) -> None:
-        """Free the engine and the actor. The simulator can't be used afterwards."""
+        """Close the engine and the actor and end the simulator's use."""
         self._actor.close()
         self._world.engine.close()
 

@@ -1,7 +1,7 @@
-"""Films: what happened to a scene while a plan was executed, moment by moment, as data for whoever draws it.
+"""Films: frames of a scene during a plan, as data for a renderer.
 
-In cached mode nothing moves between two states: the film leads from one to the next as a person would imagine it, the robot
-along its path, what it holds before its chest. It shows outcomes, not motions; motions are the physical mode's.
+Cached mode has no motion between two states, so the film interpolates: the robot follows its path and carries objects before
+its chest. The frames show outcomes; real motions come from physical mode.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ DRIVE_M_S: Final = 1.2
 TURN_RAD_S: Final = 2.5
 REACH_FRAMES: Final = 5
 REST_FRAMES: Final = 3
-"""Frames for a hand's movement, and for the look at what it brought."""
+"""Frames of a hand's movement, and of the pause after it."""
 HAND_AHEAD_M: Final = 0.45
 HAND_HIGH_M: Final = 0.95
-"""Where a carried thing is shown, from the robot's base."""
+"""Position of a carried object relative to the robot's base."""
 
 
 @dataclass(frozen=True, slots=True)
 class FilmFrame:
-    """One moment of a film.
+    """Frame of a film.
 
-    ``poses`` and ``joints`` hold every object that is not as the scene has it at the start, ``hidden`` those out of the world.
-    ``robot`` is the base on the floor, ``posture`` all of the robot's joints, None where the film knows none of its
-    arm. ``step`` counts the plan's calls from 1, 0 before the first.
+    ``poses`` and ``joints`` hold every object that differs from the scene's start, ``hidden`` those outside the world.
+    ``robot`` is the base on the floor; ``posture`` all joints of the robot, None in cached mode. ``step`` counts the plan's
+    calls from 1; 0 precedes the first.
     """
 
     robot: StandPose
@@ -55,7 +55,7 @@ class FilmFrame:
 
 @dataclass(frozen=True, slots=True)
 class Film:
-    """The frames of a plan at ``FRAMES_PER_S``, and the steps that they show."""
+    """Frames of a plan at ``FRAMES_PER_S``, and its steps."""
 
     scene: Scene
     task: Task
@@ -65,7 +65,7 @@ class Film:
 
 
 def film_cached(simulator: Simulator, task: Task, plan: Plan, seed: int) -> Film:
-    """Execute a plan in cached mode up to its end or its first failed step, and show it."""
+    """Execute a plan in cached mode to its end or first failed step, and film it."""
     simulator.reset(task, seed)
     world = simulator.world
     shown = snapshot(world, 0)
@@ -84,7 +84,7 @@ def film_cached(simulator: Simulator, task: Task, plan: Plan, seed: int) -> Film
 
 
 def snapshot(world: LiveWorld, step: int) -> FilmFrame:
-    """The state of a world as a frame. What the robot holds is shown before its chest."""
+    """Frame of a world's state, with the carried objects before the robot's chest."""
     engine = world.engine
     poses: dict[str, Pose] = {}
     joints: dict[str, tuple[float, ...]] = {}
@@ -105,14 +105,14 @@ def snapshot(world: LiveWorld, step: int) -> FilmFrame:
 
 
 def hand_pose(robot: StandPose) -> Pose:
-    """Where a film shows what the robot carries."""
+    """Pose of a carried object in a film."""
     x = robot.x_m + HAND_AHEAD_M * math.cos(robot.yaw)
     y = robot.y_m + HAND_AHEAD_M * math.sin(robot.yaw)
     return Pose.from_xyz_yaw(x, y, HAND_HIGH_M, robot.yaw)
 
 
 def _between(world: LiveWorld, before: FilmFrame, after: FilmFrame) -> Iterator[FilmFrame]:
-    """Frames that lead from one state to the next, without both ends."""
+    """Frames between two states, both excluded."""
     if before.robot != after.robot:
         yield from _driving(world, before, after)
         return
@@ -122,7 +122,7 @@ def _between(world: LiveWorld, before: FilmFrame, after: FilmFrame) -> Iterator[
 
 
 def _driving(world: LiveWorld, before: FilmFrame, after: FilmFrame) -> Iterator[FilmFrame]:
-    """The robot on its way. What it carries keeps its place before it."""
+    """Frames of a drive. Carried objects stay before the robot."""
     held = {name: hand_pose(before.robot).inverse() @ before.poses[name] for name in world.carried}
     for robot in along(world.navigator.path(before.robot, after.robot), before.robot, after.robot):
         poses = dict(after.poses)
@@ -132,7 +132,7 @@ def _driving(world: LiveWorld, before: FilmFrame, after: FilmFrame) -> Iterator[
 
 
 def along(points: Sequence[tuple[float, float]], start: StandPose, end: StandPose) -> Iterator[StandPose]:
-    """Poses at ``FRAMES_PER_S`` along a path: turn to it, follow it, turn to the end's heading. Without both ends."""
+    """Poses at ``FRAMES_PER_S`` along a path: turn, drive, turn to the final heading. Both ends are excluded."""
     heading = start.yaw
     corners = [(start.x_m, start.y_m), *points, (end.x_m, end.y_m)]
     for (ax, ay), (bx, by) in itertools.pairwise(corners):
@@ -157,7 +157,7 @@ def _turning(x: float, y: float, before: float, after: float) -> Iterator[StandP
 
 
 def _mixed(scene: Scene, before: FilmFrame, after: FilmFrame, share: float) -> FilmFrame:
-    """A frame between two: joints and positions in proportion, headings of the latter."""
+    """Interpolated frame: joints and positions are mixed, headings are those of ``after``."""
     poses: dict[str, Pose] = {}
     for name in {*before.poses, *after.poses} - after.hidden:
         start, end = (_pose_in(scene, frame, name) for frame in (before, after))

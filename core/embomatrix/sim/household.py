@@ -1,7 +1,7 @@
-"""What slicing, cleaning and soaking do to the state of a rollout. Both execution modes call these.
+"""Effects of slicing, cleaning and soaking, shared by both execution modes.
 
-The pieces of a thing that is cut come in where it lay: side by side along its longer axis first, then further apart and
-turned, then anywhere on what it lay on. Each is let go and must come to rest without penetrating anything.
+Pieces of a sliced object appear in its place: in a row along its longer axis, then further apart and turned, then anywhere on
+its host. Each piece must come to rest without penetrating anything.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import Aabb
 
 CLEARANCE_M: Final = 0.002
-"""Pieces are put down this far from one another and above what the whole lay on."""
+"""Gap between pieces, and above the host, when they are put down."""
 SPREADS: Final = (1.0, 1.25, 1.6, 2.0)
-"""Multiples of the pieces' own extent by which they are put apart."""
+"""Spacing of the pieces in multiples of their extent."""
 MAX_ROLL_M: Final = 0.15
-"""A piece that comes to rest further away than this has rolled off."""
+"""A piece that comes to rest further away has rolled off."""
 INHERITED: Final = frozenset({State.HOT, State.COOKED, State.FROZEN})
-"""States that the pieces of a thing take over from it, beside what it is covered and soaked with."""
+"""States that pieces inherit from the whole, besides its substances."""
 
 
 def cut(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-    """Slice the call's target. Changes nothing when there is no room for its pieces."""
+    """Slice the call's target. Changes nothing if its pieces have no room."""
     target = target_of(world, call)
     pieces = world.scene.by_name[target].pieces
     if pieces:
@@ -50,7 +50,7 @@ def cut(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRef
 
 
 def clean(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-    """Take off what the tool in the hand takes off. A sink or a machine has done it already."""
+    """Remove the substances that the tool in the hand removes. Sinks and machines act by themselves."""
     target, tool = target_of(world, call), source_of(world, call)
     if tool in world.carried:
         covering = coverings(world.substances[target])
@@ -60,7 +60,7 @@ def clean(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillR
 
 
 def soak(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-    """Let what the source gives run over the target."""
+    """Wet the target with the source's liquids."""
     target, source = target_of(world, call), source_of(world, call)
     given = liquids_given(world.asset(source), world.substances[source], on=world.is_on(source))
     world.water.wet(target, given)
@@ -91,7 +91,7 @@ def _break_up(
 
 
 def _side_by_side(world: LiveWorld, pieces: tuple[str, ...], box: Aabb, base: Pose) -> bool:
-    """Whether all pieces found a place in a row through the middle of the whole's box. Parks them where not."""
+    """Return True if all pieces fit in a row through the middle of the whole's box; park them otherwise."""
     return any(
         all(
             _rests(world, piece, pose)
@@ -104,13 +104,13 @@ def _side_by_side(world: LiveWorld, pieces: tuple[str, ...], box: Aabb, base: Po
 
 
 def _courses(box: Aabb, base: Pose) -> tuple[float, ...]:
-    """Directions of a row of pieces: along the longer side of the whole as it lies, then across, then in between."""
+    """Directions of a row of pieces: along the longer side of the whole, then across, then diagonal."""
     along = base.yaw if box.size_m[0] >= box.size_m[1] else base.yaw + math.pi / 2
     return (along, along + math.pi / 2, along + math.pi / 4, along - math.pi / 4)
 
 
 def _row(world: LiveWorld, pieces: tuple[str, ...], box: Aabb, yaw: float, spread: float) -> Iterator[Pose]:
-    """Poses of the pieces in a row along ``yaw``, their undersides at the whole's."""
+    """Poses of the pieces in a row along ``yaw``, their undersides level with the whole's."""
     x, y, _ = box.center_m
     widths = [world.asset(piece).size_m[0] * spread + CLEARANCE_M for piece in pieces]
     start = -sum(widths) / 2
@@ -122,7 +122,7 @@ def _row(world: LiveWorld, pieces: tuple[str, ...], box: Aabb, yaw: float, sprea
 
 
 def _rests(world: LiveWorld, piece: str, pose: Pose) -> bool:
-    """Put the piece at the pose, let it go, and tell whether it stays near."""
+    """Let the piece settle at the pose. Return True if it stays near and penetrates nothing."""
     engine = world.engine
     engine.set_pose(piece, pose)
     if engine.penetrates(piece):
@@ -133,14 +133,14 @@ def _rests(world: LiveWorld, piece: str, pose: Pose) -> bool:
 
 
 def _parked(world: LiveWorld, pieces: tuple[str, ...]) -> bool:
-    """Take the pieces out of the world again. Always False: the row was no place for them."""
+    """Take the pieces out of the world. Always returns False."""
     for piece in pieces:
         world.engine.park(piece)
     return False
 
 
 def _on_host(world: LiveWorld, pieces: tuple[str, ...], host: Host | None, rng: np.random.Generator) -> bool:
-    """Whether all pieces found a place on or in what the whole lay on. Parks them where not."""
+    """Return True if all pieces find a place on or in the whole's host; park them otherwise."""
     if host is None:
         return False
     for piece in pieces:

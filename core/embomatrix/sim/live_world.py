@@ -1,4 +1,4 @@
-"""The state of a rollout: the engine's scene, the symbolic states, the robot's base and what its hand holds."""
+"""State of a rollout: the engine's scene, the symbolic states, the robot's base and its hand."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.floor.prepared import PreparedScene, prepared_arrays
 from embomatrix.sim.joints.swings import Swings
 from embomatrix.sim.placing.placement import Placer
-from embomatrix.sim.state.facts import EngineFacts, Symbols
+from embomatrix.sim.state.facts import EngineFacts, TrackedSets
 from embomatrix.sim.state.relations import Relations
-from embomatrix.sim.state.sources import News, Thermal, Water
+from embomatrix.sim.state.sources import ChangeReader, Thermal, Water
 from embomatrix.skills.appliances import cold_source, heat_source
 from embomatrix.skills.view import ObjectReach
 from embomatrix.world.state import State
@@ -33,36 +33,36 @@ SYMBOLIC = frozenset(State) - {State.OPEN} - MEANINGS.keys()
 
 
 class Hand:
-    """Holds one object, with its contents at rest in it. Empty at first."""
+    """Hand of the robot: holds one object with its contents. Empty at first."""
 
     def __init__(self, engine: PhysicsEngine) -> None:
         self._engine = engine
         self._pose_held_item: Mapping[str, Pose] = {}
         self.carried: tuple[str, ...] = ()
-        """What the hand holds, then what lies in it; empty for an empty hand."""
+        """Held object, then its contents; empty for an empty hand."""
 
     @property
     def offsets(self) -> Mapping[str, Pose]:
-        """Poses of what the hand holds, and of what lies in it, in the frame of what it holds."""
+        """Poses of the held object and its contents in the frame of the held object."""
         return self._pose_held_item
 
     def forget(self) -> None:
-        """Be empty again, without putting anything anywhere: for a world that was reset."""
+        """Empty the hand without placing anything, after a reset of the world."""
         self._hold({})
 
     def take(self, group: Sequence[str]) -> None:
-        """Take the first object of the group, with the others in it."""
+        """Take the first object of the group, with the others as its contents."""
         back = self._engine.pose(group[0]).inverse()
         self._hold({item: back @ self._engine.pose(item) for item in group})
         for item in group:
             self._engine.park(item)
 
     def let_go(self, pose: Pose) -> bool:
-        """Stand what is held at a pose, with what lies in it. False, and nothing changed, when the contents do not fit."""
+        """Place the held object with its contents. Return False and change nothing if the contents do not fit."""
         held, *contents = self.carried
         for item in contents:
             self._engine.set_pose(item, pose @ self._pose_held_item[item])
-        # Set as it was found, not multiplied by its own identity: the placer's pose holds to the last bit.
+        # Set directly instead of multiplied by the identity: the placer's pose stays exact to the last bit.
         self._engine.set_pose(held, pose)
         group = frozenset(self.carried)
         if any(self._engine.penetrates(item, ignore=group) for item in contents):
@@ -77,10 +77,10 @@ class Hand:
 
 
 class LiveWorld:
-    """Answers what preconditions ask, and carries the robot, the hand and the states along. One rollout at a time."""
+    """World of one rollout at a time: answers preconditions, and holds the robot, the hand and the states."""
 
     def __init__(self, bundle: Bundle, engine: PhysicsEngine) -> None:
-        """``engine`` must hold the bundle's scene as it was loaded."""
+        """``engine`` must hold the bundle's scene as loaded."""
         self.scene = bundle.scene
         self.engine = engine
         self.relations = Relations(engine)
@@ -88,14 +88,14 @@ class LiveWorld:
         self.swings = Swings(engine, self.relations)
         self.placer = Placer(engine, self.relations, bundle.poses, self.navigator)
         self.barred = bundle.poses.barred
-        """What the arm finds no way to in the scene as it was loaded."""
+        """Blockers of the arm in the scene as loaded, by handling and target."""
         self.barred_places = bundle.poses.barred_places
-        """To which places it finds none with what."""
-        self.states: Symbols[State] = Symbols()
-        self.substances: Symbols[SubstanceFact] = Symbols()
+        """Blockers of placing in the scene as loaded, by relation, held object and target."""
+        self.states: TrackedSets[State] = TrackedSets()
+        self.substances: TrackedSets[SubstanceFact] = TrackedSets()
         self._future = frozenset(item.name for item in self.scene.objects if item.absent)
         self.absent: set[str] = set()
-        self._news = News(engine)
+        self._changes_since = ChangeReader(engine)
         self.thermal = Thermal(engine, self.relations, self.states)
         self.water = Water(engine, self.relations, self.states, self.substances)
         self.facts = EngineFacts(self.relations, self.states, self.substances, self.absent, self._future)
@@ -106,11 +106,11 @@ class LiveWorld:
         self._take_states_from_scene()
         self.absent |= self._future
         self.let_sources_act()
-        self.states.keep()
-        self.substances.keep()
+        self.states.snapshot()
+        self.substances.snapshot()
 
     def reset(self, task: Task) -> None:
-        """Back to the scene's beginning, where the sources have long acted on what lies at them."""
+        """Return to the scene's start, after the sources have acted on the objects at them."""
         self.engine.reset()
         self.states.restore()
         self.substances.restore()
@@ -122,13 +122,13 @@ class LiveWorld:
         self.table = task.table
 
     def let_sources_act(self) -> tuple[Change, ...]:
-        """Let heat, cold and water act on what lies at their sources. Returns what changed."""
-        self._news.read()
-        return (*self.thermal.apply(self._news), *self.water.apply(self._news))
+        """Let heat, cold and water act on the objects at their sources. Return the changes."""
+        self._changes_since.read()
+        return (*self.thermal.apply(self._changes_since), *self.water.apply(self._changes_since))
 
     @property
     def carried(self) -> tuple[str, ...]:
-        """What the hand holds, then what lies in it; empty for an empty hand."""
+        """Held object, then its contents; empty for an empty hand."""
         return self.hand.carried
 
     def asset(self, name: str) -> Asset:
@@ -144,20 +144,20 @@ class LiveWorld:
         return State.TOGGLED_ON in self.states.get(name, ())
 
     def cargo(self, name: str) -> tuple[str, ...]:
-        """The object and what lies in it, and what rests on that: all that is lifted with it."""
+        """Objects that are lifted together: the object, its contents and what rests on those."""
         return self.relations.group_of(name)
 
     def burden(self, name: str) -> str:
-        """The first object that rests on this one without lying in it, "" when there is none."""
+        """First object that rests on this one without lying in it; "" for none."""
         cargo = set(self.cargo(name))
         return next((item for item in self.relations.resting_on(name) if item not in cargo), "")
 
     def closed_around(self, name: str) -> str:
-        """The innermost closed container that the object is in, "" when there is none."""
+        """Innermost closed container around the object; "" for none."""
         return next((item.name for item in self.relations.enclosing(name) if item.closed), "")
 
     def reach(self, name: str) -> ObjectReach:
-        """How the robot, where it stands, reaches the object's box with doors shut. What is in the hand is at hand."""
+        """Reach from the robot's position to the object's box with doors shut; zero distance for a carried object."""
         box = self.relations.body(name)
         if name in self.carried:
             return ObjectReach(0.0, box.center_m[2])
@@ -166,11 +166,11 @@ class LiveWorld:
         return ObjectReach(math.hypot(dx, dy), box.center_m[2])
 
     def is_approachable(self, name: str) -> bool:
-        """Whether no wall and nothing much taller than the object stands between the robot and it."""
+        """Return True if no wall and nothing much taller than the object stands between it and the robot."""
         return name in self.carried or self.navigator.line_is_clear(self.robot, name)
 
     def is_at(self, name: str, source: str) -> bool:
-        """Whether the object lies where the source acts, be it as heat or as cold source."""
+        """Return True if the object lies where the heat or cold source acts."""
         asset = self.asset(source)
         found = heat_source(asset) or cold_source(asset)
         return found is not None and self.thermal.is_at(name, source, found)
@@ -188,16 +188,16 @@ class LiveWorld:
         return self.substances[name]
 
     def room_of(self, name: str) -> str:
-        """Room that the object is in; of a carried one, the robot's."""
+        """Room of the object; for a carried one, the robot's."""
         return self.robot_room if name in self.carried else self.relations.room_of(name)
 
     @property
     def robot_room(self) -> str:
-        """Room in which the robot stands."""
+        """Room of the robot."""
         return self.scene.room_at((self.robot.x_m, self.robot.y_m))
 
     def state_bytes(self) -> bytes:
-        """All in which the engine's state and the symbolic states differ from the scene's start, the robot and the hand."""
+        """Differences of the engine's and the symbolic state from the scene's start, plus the robot and the hand."""
         robot, carried = self.robot, " ".join(self.hand.carried)
         lines = [f"{robot.x_m.hex()} {robot.y_m.hex()} {robot.yaw.hex()}\n{carried}"]
         for name, states in self.states.changed():

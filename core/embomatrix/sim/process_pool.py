@@ -1,4 +1,4 @@
-"""Processes that share work, and end with the one that started them."""
+"""Pools of worker processes that end with their parent."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ R = TypeVar("R")
 def process_pool(
     count: int, begin: Callable[..., None] | None = None, *arguments: Any
 ) -> Iterator[ProcessPoolExecutor]:
-    """So many processes at most, for as long as this is held; what nobody took up by then is dropped.
+    """Process pool of at most ``count`` processes; leaving the context drops queued work.
 
-    Each calls ``begin(*arguments)`` first. They inherit nothing that this process's libraries hold, leave an interrupt to it,
-    and don't outlive it when it is killed, on Linux.
+    Each process first calls ``begin(*arguments)``. Processes are spawned, ignore Ctrl-C (the parent handles it) and, on Linux,
+    die with the parent.
     """
     spawn = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(count, spawn, _begin, (os.getpid(), begin, arguments))
@@ -47,10 +47,10 @@ def process_pool(
 def shared_work(
     jobs: int, begin: Callable[..., M], work: Callable[[M, T], R], *arguments: Any, died: Exception
 ) -> Iterator[Callable[[Iterable[T]], Iterator[R]]]:
-    """For as long as this is held, what does work on items, in their order: in this process, or in several.
+    """Context with an ordered map over items, in this process or in ``jobs`` processes.
 
-    Each process calls ``begin(*arguments)`` once, then ``work`` with what that gave and one item after the other; what it gave
-    in this process is closed in the end. Results raise ``died`` once one of several processes has.
+    Each process calls ``begin(*arguments)`` once, then ``work(resource, item)`` per item. In this process the resource is
+    closed at the end. Reading results raises ``died`` if a process of the pool dies.
     """
     if jobs == 1:
         with contextlib.closing(begin(*arguments)) as maker:
@@ -70,7 +70,7 @@ def _results(
 
 
 _maker: Any
-"""What this process works with, when it is one of several."""
+"""Resource of this pool process."""
 
 
 def _take_up(begin: Callable[..., Any], arguments: tuple[Any, ...]) -> None:

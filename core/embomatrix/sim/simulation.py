@@ -1,4 +1,4 @@
-"""Simulators on PyBullet: the place that joins the executor with a concrete physics engine."""
+"""Simulators on PyBullet: joins the executor with a concrete physics engine."""
 
 from __future__ import annotations
 

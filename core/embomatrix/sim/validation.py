@@ -1,4 +1,4 @@
-"""What a scene must fulfil before physics sees it: Bullet takes NaN, unknown ids and a 17th part without a word."""
+"""Checks of a scene before physics loads it: Bullet silently accepts NaN, unknown ids and a 17th part."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ UNIT_TOLERANCE: Final = 1e-4
 
 
 def check_scene(scene: Scene) -> None:
-    """Raise EngineError at the first thing in the scene that physics can't take."""
+    """Raise EngineError for the first element of the scene that physics can't take."""
     seen = {WALL, FLOOR}
     for wall in scene.walls:
         _check_part(wall, f"a wall of scene {scene.scene_id!r}")
@@ -47,7 +47,7 @@ def check_scene(scene: Scene) -> None:
 
 
 def check_asset(asset: Asset) -> None:
-    """Raise EngineError when physics can't hold the asset."""
+    """Raise EngineError if physics can't hold the asset."""
     what = f"asset {asset.asset_id!r}"
     pieces = sum(1 + sum(part.shape is Shape.HULL for part in link.parts) for link in asset.links)
     if not asset.links or not asset.links[0].parts or asset.links[0].joint is not None:
@@ -63,7 +63,7 @@ def check_asset(asset: Asset) -> None:
 
 
 def check_pose(pose: Pose, what: str) -> None:
-    """Raise EngineError unless the position is finite and within the world, and the quaternion a rotation."""
+    """Raise EngineError unless the position is finite and within the world, and the quaternion has length 1."""
     x, y, z = pose.position_m
     limit = WORLD_LIMIT_M
     if not (-limit <= x <= limit and -limit <= y <= limit and -limit <= z <= limit):
@@ -78,7 +78,7 @@ def check_pose(pose: Pose, what: str) -> None:
 
 
 def check_fractions(item: SceneObject, asset: Asset, fractions: Sequence[float]) -> None:
-    """Raise EngineError unless there is one number in 0..1 for each joint of the asset."""
+    """Raise EngineError unless each joint of the asset has one number in 0..1."""
     if len(fractions) != len(asset.joints):
         raise EngineError(
             f"{item.name!r} has {len(fractions)} joint positions: expected {len(asset.joints)}, one for each joint of "

@@ -1,8 +1,8 @@
-"""Processes that fork ready children on request, and the frames they are spoken to in.
+"""Zygotes: processes that fork ready children on request, and the frames of their protocol.
 
-A zygote has one thread and loaded everything before it is asked for the first child: a fork of it starts within a
-millisecond and shares its memory. Whoever asks passes the child's own end of a socket pair along, so it speaks to the
-child directly and learns of its death by the end of that stream.
+A zygote has one thread and loads everything before the first request: a fork starts within a millisecond and shares its
+memory. A requester passes the child's end of a socket pair, talks to the child directly and sees its death as the end of the
+stream.
 """
 
 from __future__ import annotations
@@ -31,32 +31,32 @@ _written: Final = json.JSONEncoder(separators=(",", ":")).encode
 PREFIX_BYTES: Final = _PREFIX.size
 MAX_FRAME_BYTES: Final = 64 * 1024 * 1024
 STATM_BYTES: Final = 256
-"""More than the seven numbers of Linux's ``statm`` take."""
+"""Buffer for Linux's ``statm``: seven numbers and spare room."""
 _PR_SET_THP_DISABLE: Final = 41
 
 
 class FrameError(Exception):
-    """Bytes that are no frame: the other side is not what it should be."""
+    """Bytes that are not a frame of this protocol."""
 
 
 @dataclass(frozen=True, slots=True)
 class PipeMessage:
-    """One message between processes: a JSON header, and bytes that the header says how to read."""
+    """Message between processes: a JSON header and a body that the header describes."""
 
     header: Mapping[str, Any]
     body: bytes = b""
     fds: tuple[int, ...] = field(default=(), compare=False)
-    """File descriptors that came along; the receiver owns them."""
+    """File descriptors sent along; the receiver owns them."""
 
 
 def pack(frame: PipeMessage) -> bytes:
-    """The frame as bytes: two lengths, header, body. File descriptors travel beside it, with its first byte."""
+    """Encode a frame as two lengths, header and body. File descriptors travel beside its first byte."""
     header = _written(frame.header).encode()
     return _PREFIX.pack(len(header), len(frame.body)) + header + frame.body
 
 
 def frame_lengths(prefix: bytes) -> tuple[int, int]:
-    """Lengths of header and body that a prefix announces; more than 64 MiB is a ``FrameError``."""
+    """Lengths of header and body from a prefix. Raises FrameError above 64 MiB."""
     header_bytes, body_bytes = _PREFIX.unpack(prefix)
     if header_bytes + body_bytes > MAX_FRAME_BYTES:
         raise FrameError(f"a frame of {header_bytes + body_bytes} bytes: at most {MAX_FRAME_BYTES} are taken")
@@ -64,7 +64,7 @@ def frame_lengths(prefix: bytes) -> tuple[int, int]:
 
 
 def unpack(content: bytes, header_bytes: int, fds: tuple[int, ...] = ()) -> PipeMessage:
-    """The frame whose header is the first ``header_bytes`` of the content."""
+    """Decode a frame; the first ``header_bytes`` of the content are its header."""
     try:
         header = json.loads(content[:header_bytes])
     except ValueError as error:
@@ -80,7 +80,7 @@ def send(connection: socket.socket, frame: PipeMessage) -> None:
 
 
 def receive(connection: socket.socket) -> PipeMessage | None:
-    """The next frame, blocking, with the descriptors that came with it; None at the end of the stream."""
+    """Receive the next frame with its descriptors, blocking; None at the end of the stream."""
     prefix, fds, _, _ = socket.recv_fds(connection, PREFIX_BYTES, 4)
     if not prefix:
         return None
@@ -102,11 +102,11 @@ def _receive_exactly(connection: socket.socket, count: int) -> bytes:
 def serve_forks(
     control: socket.socket, child: Callable[[socket.socket], None], spare: Iterator[None] | None = None
 ) -> None:
-    """Fork children on request until the control stream ends. Steps of ``spare`` are taken while no request waits.
+    """Fork children on request until the control stream ends; take steps of ``spare`` while idle.
 
-    ``{"op": "fork"}`` with one descriptor forks a child that runs ``child`` on it and is answered by its process id;
-    ``{"op": "reap", "pid": …}`` waits for a child that has ended and is answered by its wait status. A child stays a
-    zombie until then, so its id is never another process's when the asker kills it.
+    ``{"op": "fork"}`` with one descriptor forks a child that runs ``child`` on it; the answer is its process id. ``{"op":
+    "reap", "pid": …}`` waits for an ended child; the answer is its wait status. A child stays a zombie until it is reaped, so
+    the requester never kills another process with a reused id.
     """
     while (request := _next_request(control, spare)) is not None:
         match request.header.get("op"):
@@ -130,7 +130,7 @@ def _next_request(control: socket.socket, spare: Iterator[None] | None) -> PipeM
 
 
 def _fork(control: socket.socket, fd: int, child: Callable[[socket.socket], None]) -> int:
-    # Objects that exist now are never collected: a collection in a child would copy the pages they lie in.
+    # Freeze existing objects: a collection in a child would copy their memory pages.
     gc.freeze()
     parent = os.getpid()
     pid = os.fork()
@@ -151,31 +151,31 @@ def _fork(control: socket.socket, fd: int, child: Callable[[socket.socket], None
 
 
 def take_small_pages() -> None:
-    """Have what this process allocates from now on come in pages of 4 kB: a huge one would be its own for the first byte.
+    """Disable huge pages for further allocations: a huge page becomes private with its first write.
 
-    Huge pages that it shares with the process that it was forked from stay as they are.
+    Huge pages shared with the parent stay as they are.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_THP_DISABLE, 1, 0, 0, 0)
 
 
 def limit_memory(more_mb: int) -> None:
-    """Let this process map at most ``more_mb`` MiB beyond what it has: past that, allocation fails."""
+    """Limit further memory mappings of this process to ``more_mb`` MiB; beyond it, allocation fails."""
     mapped_pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = mapped_pages * resource.getpagesize() + more_mb * MIB
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 
 
 def give_back_memory() -> None:
-    """Hand the heap's free pages back to the system: what a slot needed once shall not count as its own for good."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # the GNU C library has it
+    """Return free heap pages to the system, so that a peak does not count as the slot's memory for good."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # GNU C library only
     if trim is not None:
         trim(0)
 
 
 def resident_mb() -> float:
-    """Memory of this process that lies in RAM, shared pages included, in MiB."""
-    # Asked after every rollout: through a file object it takes five times as long.
+    """Resident memory of this process in MiB, shared pages included."""
+    # Called after every rollout: os.read takes a fifth of the time of a file object.
     statm = os.open("/proc/self/statm", os.O_RDONLY)
     try:
         pages = int(os.read(statm, STATM_BYTES).split()[1])
@@ -185,7 +185,7 @@ def resident_mb() -> float:
 
 
 def private_mb(pid: int | None = None) -> float:
-    """Memory that only this process, or the one of that id, holds, in MiB: what its end would free."""
+    """Private memory of this process, or of the given one, in MiB: the amount that its end frees."""
     total_kb = 0
     for line in Path(f"/proc/{pid or 'self'}/smaps_rollup").read_text().splitlines():
         if line.startswith(("Private_Dirty:", "Private_Clean:")):

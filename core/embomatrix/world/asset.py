@@ -1,7 +1,7 @@
-"""Assets: the geometry and the abilities of one object model, shared by all its instances.
+"""Assets: geometry and abilities of one object model, shared by all its instances.
 
-The asset frame has its origin at the centre of the model's bounding box, x along the depth with the *front at +x*, y along
-the width, z up. Parts, joints, supports and interiors are all given in that frame with every joint at zero (closed).
+The origin of the asset frame is the centre of the model's bounding box. x runs along the depth with the *front at +x*, y along
+the width, z up. Parts, joints, supports and interiors are given in this frame with every joint at zero (closed).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
 
 FLOOR_CATEGORY: Final = "floors"
-"""Category of a room's floor, where it is an object that plans and goals can name."""
+"""Category of a room's floor if the floor is an object that plans and goals can name."""
 
 
 class JointKind(StrEnum):
@@ -26,7 +26,7 @@ class JointKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """How a link moves against the base. Position 0 is closed, ``upper`` is fully open (rad or m)."""
+    """Motion of a link against the base. Position 0 is closed, ``upper`` is fully open (rad or m)."""
 
     kind: JointKind
     origin_m: Vec3
@@ -45,11 +45,11 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class SupportSurface:
-    """Horizontal rectangle that things can stand on.
+    """Horizontal rectangle that objects can stand on.
 
-    ``center_m`` lies on the surface; ``size_m`` is its extent along the asset's x and y; ``clearance_m`` is the free
-    height above it. ``interior`` names the cavity that the surface is the floor of, or is empty in the open. ``link`` names
-    the moving link that the surface rides on, as a drawer's floor does; empty for the base.
+    ``center_m`` lies on the surface; ``size_m`` is its extent along the asset's x and y; ``clearance_m`` is the free height
+    above it. ``interior`` names the cavity whose floor the surface is; empty in the open. ``link`` names the moving link that
+    carries the surface, such as a drawer; empty for the base.
     """
 
     name: str
@@ -62,10 +62,10 @@ class SupportSurface:
 
 @dataclass(frozen=True, slots=True)
 class Interior:
-    """Box-shaped cavity that things can be inside of.
+    """Box-shaped cavity that objects can be inside of.
 
-    ``closed_by`` names the links whose joints bar the way in while they are shut; empty means that it is always open.
-    ``link`` names the moving link that the cavity rides on, as a drawer's does; empty for the base.
+    ``closed_by`` names the links that close the cavity while their joints are shut; empty for a cavity that is always open.
+    ``link`` names the moving link that carries the cavity, such as a drawer; empty for the base.
     """
 
     name: str
@@ -77,7 +77,7 @@ class Interior:
 
 @dataclass(frozen=True, slots=True)
 class Credit:
-    """Whose work an imported model is, and on which terms it may be used."""
+    """Author, licence and source of an imported model."""
 
     creator: str
     licence: str
@@ -89,7 +89,7 @@ class Asset:
     """One object model: ``asset_id`` is ``category-model``, as in the scene inventories.
 
     ``abilities`` maps an ability of the catalog ("openable", "heatSource", ...) to its parameters. ``credit`` is None for
-    what this project generated itself.
+    models that this project generates.
     """
 
     asset_id: str
@@ -103,7 +103,7 @@ class Asset:
     abilities: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     credit: Credit | None = None
     joints: tuple[tuple[str, Joint], ...] = field(init=False, repr=False, compare=False)
-    """(link name, joint) of every moving link, in link order: the order of an object's joint positions."""
+    """Link name and joint of every moving link, in link order: the order of an object's joint positions."""
 
     def __post_init__(self) -> None:
         joints = tuple((link.name, link.joint) for link in self.links if link.joint is not None)

@@ -1,10 +1,11 @@
-"""Parser of BDDL problems, in the dialects of BEHAVIOR-1K and of the paper's factory.
+"""Parser of BDDL problems in the dialects of BEHAVIOR-1K and of the paper's factory.
 
-``?`` before an object of the problem is optional, text is lower-cased but for the problem's name, ``;`` starts a comment.
-A *wildcard* (``sink.n.01_*``) stands for the further objects of its type in the room that ``:init`` names; it is spelt out
-when the rooms are known. A substance may be called by its synset, without being declared: goals over scenes do.
-Three habits of published problems are accepted: a stray backslash at a line's end, an object declared again with the same
-type, and a room instance (``closet_0``) where an object should stand. Every error names the line and the column, from 1.
+``?`` before an object is optional; text is lower-cased except for the problem's name; ``;`` starts a comment. A *wildcard*
+(``sink.n.01_*``) stands for the further objects of its type in the room that ``:init`` names; it is expanded when the rooms
+are known. Goals over scenes may name a substance by its synset without declaring it.
+
+The parser accepts three habits of published problems: a stray backslash at a line's end, an object declared again with the
+same type, and a room instance (``closet_0``) as an argument. Every error names the line and the column, from 1.
 """
 
 from __future__ import annotations
@@ -44,9 +45,9 @@ _BINARY: Final = (
 ARITIES: Final[Mapping[str, tuple[int, ...]]] = {
     **dict.fromkeys(_UNARY, (1,)),
     **dict.fromkeys(_BINARY, (2,)),
-    "grasped": (1, 2),  # the paper's tasks leave the agent out
+    "grasped": (1, 2),  # the paper's tasks omit the agent
 }
-"""Predicates of both dialects, with the numbers of arguments that each takes."""
+"""Predicates of both dialects with the argument counts that each accepts."""
 ROOM_TYPES: Final = frozenset(
     (
         "bar", "bathroom", "bedroom", "biology_lab", "break_room", "chemistry_lab", "childs_room",
@@ -59,13 +60,13 @@ ROOM_TYPES: Final = frozenset(
 )  # fmt: skip
 """Room types of the 51 base scenes; a room instance is a type and a number: ``kitchen_0``."""
 WILDCARD: Final = "_*"
-"""How the name of a wildcard ends."""
+"""Suffix of a wildcard's name."""
 MAX_DEPTH: Final = 64
-"""Deeper nesting is no goal that anyone wrote."""
+"""Nesting limit: no published goal comes near it."""
 
 
 class BddlError(ValueError):
-    """A BDDL text can't be read. ``line`` and ``column`` count from 1."""
+    """Unreadable BDDL text. ``line`` and ``column`` count from 1."""
 
     def __init__(self, message: str, line: int, column: int) -> None:
         super().__init__(f"line {line}, column {column}: {message}")
@@ -75,7 +76,7 @@ class BddlError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class InitLiteral:
-    """An atom of ``:init``; ``positive`` is False under ``not``."""
+    """Atom of ``:init``; ``positive`` is False under ``not``."""
 
     atom: Atom
     positive: bool = True
@@ -83,7 +84,7 @@ class InitLiteral:
 
 @dataclass(frozen=True, slots=True)
 class BddlProblem:
-    """One BDDL problem. ``objects`` maps the name of an object to its type, in the order of the text."""
+    """BDDL problem. ``objects`` maps the name of an object to its type, in the order of the text."""
 
     name: str
     objects: Mapping[str, str]
@@ -92,7 +93,7 @@ class BddlProblem:
 
     @property
     def types(self) -> Mapping[str, tuple[str, ...]]:
-        """Type to object names, without wildcards: what quantifiers range over."""
+        """Object names by type, without wildcards: the range of quantifiers."""
         members: dict[str, tuple[str, ...]] = dict.fromkeys(self.objects.values(), ())
         for name, type_name in self.objects.items():
             if not name.endswith(WILDCARD):
@@ -101,13 +102,13 @@ class BddlProblem:
 
     @property
     def wildcards(self) -> Mapping[str, str]:
-        """Wildcards of the problem, and the words for the rooms that they are about."""
+        """Wildcards of the problem with the rooms that ``:init`` gives them."""
         return {
             item.atom.args[0]: item.atom.args[1] for item in self.init if item.atom.args[0].endswith(WILDCARD)
         }
 
     def spelt_out(self, members: Mapping[str, tuple[str, ...]]) -> BddlProblem:
-        """The problem with each wildcard replaced by objects of these names, which may be none."""
+        """Replace each wildcard by objects of these names, which may be none."""
         objects: dict[str, str] = {}
         for name, type_name in self.objects.items():
             objects |= dict.fromkeys(members.get(name, (name,)), type_name)
@@ -121,7 +122,7 @@ class BddlProblem:
 
 @dataclass(frozen=True, slots=True)
 class _Node:
-    """A word, or a list when ``word`` is empty."""
+    """Word, or a list if ``word`` is empty."""
 
     word: str
     items: tuple[_Node, ...]
@@ -175,7 +176,7 @@ def parse_formula(text: str, objects: Mapping[str, str]) -> Formula:
 
 
 def render_problem(problem: BddlProblem) -> str:
-    """BDDL text that ``parse_problem`` reads back to an equal problem."""
+    """BDDL text that ``parse_problem`` parses to an equal problem."""
     grouped: dict[str, list[str]] = {}
     for name, type_name in problem.objects.items():
         grouped.setdefault(type_name, []).append(name)
@@ -202,7 +203,7 @@ def _tokens(text: str) -> Iterator[tuple[str, int, int]]:
 
 
 def _read(text: str) -> _Node:
-    """The one expression of the text. A section that opens too deep shows where a parenthesis is missing."""
+    """Parse the single expression of the text. A section nested too deep shows the place of a missing parenthesis."""
     open_lists: list[tuple[list[_Node], int, int]] = []
     root: _Node | None = None
     for token, line, column in _tokens(text):
@@ -353,7 +354,7 @@ class _Reader:
             node.fail("expected a name, found a list")
         word = node.word.lower()
         bare = word.removeprefix("?")
-        for name in (word, f"?{bare}"):  # both dialects leave the mark out now and then
+        for name in (word, f"?{bare}"):  # both dialects omit the mark now and then
             if name in scope:
                 return name
         if bare.endswith(WILDCARD) and predicate != "inroom":

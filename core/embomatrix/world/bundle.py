@@ -1,8 +1,8 @@
 """Bundles: a scene, its tasks and its pose cache as one compressed, content-addressed file.
 
-The digest is taken of the compressed bytes, so a receiver checks it before it decompresses anything; the size and the
-ratio of decompression are bounded, so a hostile bundle costs nothing but its transfer. Compressed is a head, JSON that says
-how everything hangs together, and arrays that hold the numbers: see ``tables``.
+The digest covers the compressed bytes: a receiver checks it before it decompresses anything. Size and compression ratio are
+bounded, so a hostile bundle costs only its transfer. The content is a JSON head that describes the structure, followed by
+arrays with the numbers: see ``tables``.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 FORMAT: Final = 3
 MAGIC: Final = b"EMBX"
 _HEAD: Final = struct.Struct("<4sII")
-"""Magic, format, bytes of JSON."""
+"""Magic, format, number of bytes of JSON."""
 _ALIGNMENT: Final = 8
 _DTYPES: Final[Mapping[str, np.dtype[Any]]] = {name: np.dtype(name) for name in ("<f8", "<i4", "|u1")}
 _PREPARED: Final = "prepared."
@@ -53,10 +53,10 @@ _PREPARED: Final = "prepared."
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """What a worker needs to execute plans in a scene. ``tasks`` maps a task's id to the task.
+    """Scene, tasks by id and pose cache: all that a worker needs to execute plans.
 
-    ``prepared`` are arrays that the simulator derived from the scene beforehand, by name. They are its own affair: what it
-    does not know it leaves alone, and what is missing it derives again.
+    ``prepared`` holds arrays by name that the simulator derived from the scene beforehand. The simulator ignores unknown names
+    and derives missing arrays again.
     """
 
     scene: Scene
@@ -75,7 +75,7 @@ class BundleJson(Record):
 
 
 def encode_bundle(bundle: Bundle) -> bytes:
-    """Compressed bytes: equal bundles give equal bytes. Raises BundleError for a task of another scene."""
+    """Encode a bundle; equal bundles give equal bytes. Raises BundleError for a task of another scene."""
     _check_tasks(bundle)
     tables = TableWriter()
     value: dict[str, Any] = {
@@ -96,14 +96,14 @@ def encode_bundle(bundle: Bundle) -> bytes:
 
 
 def read_bundle(path: Path, *, digest: str = "", limits: BundleLimits = DEFAULT_LIMITS) -> Bundle:
-    """The bundle in a file, whose size is looked at before it is read. Raises BundleError, or OSError."""
+    """Read a bundle file whose size is checked first. Raises BundleError or OSError."""
     with path.open("rb") as file:
         data = file.read(limits.compressed_bytes + 1)
     return decode_bundle(data, digest=digest, limits=limits)
 
 
 def decode_bundle(data: bytes, *, digest: str = "", limits: BundleLimits = DEFAULT_LIMITS) -> Bundle:
-    """The bundle, checked in every part. ``digest`` is compared first unless it is empty. Raises BundleError."""
+    """Decode and check a bundle. ``digest`` is compared first unless it is empty. Raises BundleError."""
     if len(data) > limits.compressed_bytes:
         raise too_large(limits)
     found = bundle_digest(data)
@@ -120,7 +120,7 @@ def decode_bundle(data: bytes, *, digest: str = "", limits: BundleLimits = DEFAU
 
 
 def _from_content(content: bytes) -> Bundle:
-    """Raises ValueError for what is no bundle, SceneInvalidError for one that breaks a rule."""
+    """Decode decompressed content. Raises ValueError for other data and SceneInvalidError for a broken rule."""
     if len(content) < _HEAD.size or content[:4] != MAGIC:
         raise ValueError(
             f"it begins with {content[:4]!r}, expected {MAGIC!r}: build the dataset anew with this version"
@@ -172,7 +172,7 @@ def _arrays(described: Mapping[str, list[str | int]], data: memoryview) -> dict[
 
 
 def _plain(name: str, array: NDArray[np.generic]) -> NDArray[np.generic]:
-    """The array in a layout that every machine reads. Raises BundleError for one of another type."""
+    """Convert an array to the portable layout. Raises BundleError for an unsupported dtype."""
     kinds = {"f": "<f8", "i": "<i4", "u": "|u1", "b": "|u1"}
     kind = kinds.get(array.dtype.kind, "")
     if not kind or array.dtype.itemsize > _DTYPES[kind].itemsize or not array.ndim:

@@ -1,9 +1,8 @@
-"""The catalog: categories, object models, abilities and scene inventories of BEHAVIOR-1K, from package data.
+"""Catalog of BEHAVIOR-1K from package data: categories, object models, abilities and scene inventories.
 
-A category is a kind of solid thing; substances (water, salt, diced apple) are synsets with the ability "substance". The
-tables beside this module (``data/``, with their NOTICE) are derived from the ``bddl`` package; nothing is fetched or
-computed at run time but the few corrections written down here. Sizes are metres, (depth x, width y, height z), masses
-kilograms, temperatures degrees Celsius.
+A category is a kind of solid object; substances (water, salt, diced apple) are synsets with the ability "substance". The
+tables in ``data/`` (see their NOTICE) are derived from the ``bddl`` package. The only run-time changes are the corrections in
+this module. Sizes are metres (depth x, width y, height z), masses kilograms, temperatures degrees Celsius.
 """
 
 from __future__ import annotations
@@ -26,25 +25,25 @@ if TYPE_CHECKING:
 
 Json = Any
 Count = tuple[str, str, int]
-"""(category, model, how many)."""
+"""Category, model and number of copies."""
 
 MIN_EXTENT_M: Final = 0.003
-"""Thinner boxes (paper, glue) are grown to this: contact margins of physics engines are of the same order."""
+"""Smallest extent: thinner boxes (paper, glue) grow to it, since contact margins of physics engines are of this order."""
 SHARE_MARK: Final = "@"
 LEAST_SHARE, MOST_SHARE = 0.5, 2.0
-"""Shares of its size at which a model is made at all."""
+"""Scale factors that a model may be made at."""
 
 WITH_A_SWITCH: Final = frozenset({"fairy_light.n.01", "icicle_lights.n.01"})
-"""Strings of lights: people switch them on and off, and tasks ask for it; the table behind the catalog leaves that out."""
+"""Strings of lights, which tasks switch on and off; the derived table lacks this ability."""
 
 
 class CatalogError(LookupError):
-    """A scene, category, model or synset that the catalog does not hold; the message names close matches."""
+    """Unknown scene, category, model or synset; the message names close matches."""
 
 
 @dataclass(frozen=True, slots=True)
 class Category:
-    """A kind of object. ``abilities`` maps e.g. "heatSource" to its numeric parameters."""
+    """Kind of object. ``abilities`` maps e.g. "heatSource" to its numeric parameters."""
 
     name: str
     synset: str
@@ -54,9 +53,9 @@ class Category:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """One model of a category; ``meta_links`` say what it has: "joint", "togglebutton", "fillable", "heatsource" ...
+    """Model of a category; ``meta_links`` lists its features: "joint", "togglebutton", "fillable", "heatsource" ...
 
-    A ``model_id`` that ends with ``@`` and a number, ``kfeuep@0.8``, is that of a model made at this share of its size.
+    A ``model_id`` that ends with ``@`` and a number, ``kfeuep@0.8``, denotes the model scaled by this factor.
     """
 
     category: str
@@ -70,26 +69,26 @@ class Model:
 
     @property
     def share(self) -> float:
-        """Its extents over those of the catalog's model; its mass goes with the cube."""
+        """Scale against the catalog's model; the mass scales with its cube."""
         return share_of(self.model_id)
 
     @property
     def listed_id(self) -> str:
-        """Id of the model as the catalog lists it, at its own size."""
+        """Model id in the catalog, without the scale."""
         return self.model_id.partition(SHARE_MARK)[0]
 
     def at(self, share: float) -> Model:
-        """A model of the catalog's own size made at a share of it. Raises CatalogError."""
+        """Scale a model of the catalog's size. Raises CatalogError."""
         return _at_share(self, str(share))
 
 
 @dataclass(frozen=True, slots=True)
 class RoomInventory:
-    """What one room of a scene holds.
+    """Inventory of one room.
 
-    ``floor_m`` is (depth x, width y) of the largest floor, ``more_floors_m`` those of the others. ``floor_estimated``
-    marks the few rooms whose inventory has no floor: they take the median floor of their room type. A door is
-    listed in each of the rooms that it joins.
+    ``floor_m`` is (depth x, width y) of the largest floor, ``more_floors_m`` those of the others. ``floor_estimated`` marks
+    the few rooms without a floor in their inventory; these take the median floor of their room type. A door is listed in each
+    of the rooms that it joins.
     """
 
     name: str
@@ -114,7 +113,7 @@ class SceneInventory:
 
 @dataclass(frozen=True, slots=True)
 class SizeRule:
-    """Bounds on the extents of a category's models; an extent outside them is moved to the bound."""
+    """Bounds on the extents of a category's models; an extent outside them moves to the bound."""
 
     reason: str
     low_m: Vec3 = (0.0, 0.0, 0.0)
@@ -140,7 +139,7 @@ SIZE_RULES: Final[Mapping[str, SizeRule]] = MappingProxyType(
         "dishwasher": SizeRule("native scale: 0.44 m deep", low_m=(0.55, 0.52, 0.65)),
     }
 )  # fmt: skip
-"""Native scales of BEHAVIOR-1K's models that are wrong in a house (its scenes rescale those instances)."""
+"""Corrections of native scales in BEHAVIOR-1K that are wrong in a house (its scenes rescale those instances)."""
 
 
 class Catalog:
@@ -155,7 +154,7 @@ class Catalog:
     @staticmethod
     @functools.cache
     def load() -> Catalog:
-        """The catalog of the installed package; the first call of a process reads it (about 0.1 s)."""
+        """Return the catalog of the installed package; the first call of a process reads it (about 0.1 s)."""
         return Catalog(_read("catalog.json.gz"), _read("scenes.json.gz"))
 
     @property
@@ -168,7 +167,7 @@ class Catalog:
 
     @functools.cached_property
     def used_categories(self) -> tuple[str, ...]:
-        """Categories that an inventory lists, or that an object of one of BEHAVIOR-1K's activities may be; sorted."""
+        """Categories that an inventory or an activity of BEHAVIOR-1K mentions, sorted."""
         found = {name for synset in self._activity_synsets for name in self.categories_of(synset)}
         for scene in self._scenes.values():
             for room in scene["rooms"].values():
@@ -177,7 +176,7 @@ class Catalog:
         return tuple(sorted(found))
 
     def inventory(self, scene_id: str) -> SceneInventory:
-        """Rooms and models of a scene. Raises CatalogError when there is none of this name."""
+        """Rooms and models of a scene. Raises CatalogError for an unknown scene."""
         entry = _look_up(self._scenes, scene_id, "scene")
         rooms = tuple(_room(name, room) for name, room in sorted(entry["rooms"].items()))
         panels = tuple((x, y, z) for x, y, z in entry["walls"])
@@ -196,7 +195,7 @@ class Catalog:
 
     @functools.cache  # noqa: B019
     def model(self, category: str, model_id: str) -> Model:
-        """Size and features of one model, corrected by `SIZE_RULES`, at the share that its id tells. Raises CatalogError."""
+        """Size and features of a model after `SIZE_RULES` and the scale in its id. Raises CatalogError."""
         models = _look_up(self._categories, category, "category")["models"]
         listed, _, share = model_id.partition(SHARE_MARK)
         x, y, z, *links = _look_up(models, listed, f"model of {category}")
@@ -231,8 +230,8 @@ class Catalog:
     def abilities_of(self, synset: str) -> Mapping[str, Mapping[str, float]]:
         """Abilities and numeric parameters of a synset; empty for inner nodes. Raises CatalogError.
 
-        Left out are the twelve that every solid thing has (it can become dusty, stained, wet ...). Substances are told by
-        the ability "substance".
+        The twelve abilities of every solid object (it can become dusty, stained, wet ...) are left out. Substances have the
+        ability "substance".
         """
         raw = _look_up(self._synsets, synset, "synset").get("abilities", {})
         if synset in WITH_A_SWITCH:
@@ -287,7 +286,7 @@ def _room(name: str, entry: Json) -> RoomInventory:
 
 
 def share_of(name: str) -> float:
-    """Share of its size at which the model of an id, or the asset of one, is made."""
+    """Scale factor in a model id or an asset id; 1 without one."""
     _, mark, share = name.partition(SHARE_MARK)
     return float(share) if mark else 1.0
 
@@ -317,7 +316,7 @@ def _split(asset_id: str) -> tuple[str, str]:
 
 
 def _description(scene_id: str, rooms: tuple[RoomInventory, ...]) -> str:
-    """One sentence from the inventory: ``Rs_int: 5 rooms (bathroom, bedroom ...), 55 objects, 71 m2 of floor.``"""
+    """Describe an inventory: ``Rs_int: 5 rooms (bathroom, bedroom ...), 55 objects, 71 m2 of floor.``"""
     types = Counter(room.type.replace("_", " ") for room in rooms)
     listed = ", ".join(name if n == 1 else f"{n} {name}s" for name, n in sorted(types.items()))
     things = sum(count for room in rooms for _, _, count in room.items)

@@ -43,7 +43,7 @@ _RELATIONS: Final = {"": None, **{relation.value: relation for relation in Relat
 
 
 def scene_to_json(scene: Scene, tables: TableWriter | None = None) -> Json:
-    """Scene and the assets of its objects as JSON values in a fixed order; with ``tables``, poses and parts become rows."""
+    """Encode a scene with its assets in a fixed order; with ``tables``, poses and parts become rows."""
     value: Json = {
         "scene_id": scene.scene_id,
         "base": scene.base,
@@ -62,7 +62,7 @@ def scene_to_json(scene: Scene, tables: TableWriter | None = None) -> Json:
 
 
 def asset_to_json(asset: Asset, tables: TableWriter | None = None) -> Json:
-    """Asset as JSON values; with ``tables``, parts become rows."""
+    """Encode an asset; with ``tables``, parts become rows."""
     value: Json = {
         "asset_id": asset.asset_id,
         "category": asset.category,
@@ -84,17 +84,17 @@ def asset_to_json(asset: Asset, tables: TableWriter | None = None) -> Json:
 
 
 def scene_from_json(value: object) -> Scene:
-    """Valid scene. Raises SceneInvalidError with the path of the wrong value."""
+    """Decode a scene. Raises SceneInvalidError with the path of the wrong value."""
     return scene_of(convert(value, SceneJson, "scene"))
 
 
 def asset_from_json(value: object) -> Asset:
-    """Valid asset. Raises SceneInvalidError with the path of the wrong value."""
+    """Decode an asset. Raises SceneInvalidError with the path of the wrong value."""
     return _each("asset", [convert(value, AssetJson, "asset")], lambda record: _asset(record, None))[0]
 
 
 def scene_of(record: SceneJson, tables: Tables | None = None) -> Scene:
-    """Scene of a record; ``tables`` hold the rows that it was written with. Raises SceneInvalidError."""
+    """Scene of a record; ``tables`` hold the rows that it refers to. Raises SceneInvalidError."""
     assets: dict[str, Asset] = {}
     for key, asset in record.assets.items():
         try:

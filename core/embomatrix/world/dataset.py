@@ -1,7 +1,7 @@
-"""Datasets: a folder with the records of the tasks and the bundles that they run in.
+"""Datasets: a folder with task records and the bundles that the tasks run in.
 
-``tasks.jsonl`` holds a record a line, ``bundles/`` a file for each digest. Records carry the whole task, so that a trainer
-can write prompts without decoding a scene.
+``tasks.jsonl`` holds one record per line, ``bundles/`` one file per digest. A record contains the whole task: a trainer writes
+prompts without decoding scenes.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ _REMEDY: Final = "copy the dataset again, or build one with `embomatrix factory 
 
 
 class DatasetError(ValueError):
-    """A dataset can't be read. The message names the file, the line where there is one, and the remedy."""
+    """Unreadable dataset. The message names the file, the line if there is one, and the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class TaskRecord:
-    """One admitted task. ``oracle`` is a plan that reaches the goal, as JSON; ``signature`` names the kind of goal."""
+    """Admitted task. ``oracle`` is a plan that reaches the goal, as JSON; ``signature`` names the kind of goal."""
 
     task: Task
     bundle_digest: str
@@ -48,7 +48,7 @@ class TaskRecord:
 
 @dataclass(frozen=True)
 class Dataset:
-    """Records in the order of the file. Bundles are read when they are asked for."""
+    """Records in the order of the file. Bundles are read on demand."""
 
     folder: Path
     records: tuple[TaskRecord, ...]
@@ -56,12 +56,12 @@ class Dataset:
 
     @staticmethod
     def load(folder: Path | str) -> Dataset:
-        """Read the records. Raises DatasetError when the folder holds no dataset, or a record is wrong."""
+        """Read the records of a folder. Raises DatasetError if it holds no dataset or a wrong record."""
         return Dataset.load_file(Path(folder) / TASKS_FILE)
 
     @staticmethod
     def load_file(path: Path) -> Dataset:
-        """Read the records of a file of any name, with its bundles beside it. Raises DatasetError as ``load``."""
+        """Read the records of a file of any name; its bundles lie beside it. Raises DatasetError."""
         folder = path.parent
         try:
             lines = path.read_text(encoding="utf-8").splitlines()
@@ -88,7 +88,7 @@ class Dataset:
         return tuple(record for record in self.records if record.split == "heldout")
 
     def bundle_bytes(self, digest: str) -> bytes:
-        """Compressed bundle. Raises DatasetError when the folder lacks it, or it is larger than any."""
+        """Compressed bundle. Raises DatasetError if the folder lacks it or it exceeds the size limit."""
         path = self.folder / BUNDLES_FOLDER / bundle_file(digest)
         try:
             return read_whole(path, at_most=DEFAULT_LIMITS.compressed_bytes)
@@ -98,17 +98,17 @@ class Dataset:
             ) from error
 
     def has_bundle(self, digest: str) -> bool:
-        """Whether the folder holds the bundle. Raises DatasetError for anything but a digest."""
+        """Return True if the folder holds the bundle. Raises DatasetError for anything but a digest."""
         return (self.folder / BUNDLES_FOLDER / bundle_file(digest)).is_file()
 
     def bundle(self, digest: str) -> Bundle:
-        """Decoded bundle, kept for the next call. Raises DatasetError."""
+        """Decoded bundle, cached in memory. Raises DatasetError."""
         if digest not in self._decoded:
             self._decoded[digest] = self.read_bundle(digest)
         return self._decoded[digest]
 
     def read_bundle(self, digest: str) -> Bundle:
-        """Decoded bundle, for who needs it once: many of them fill the memory. Raises DatasetError."""
+        """Decoded bundle, not cached: many bundles would fill the memory. Raises DatasetError."""
         data = self.bundle_bytes(digest)
         try:
             return decode_bundle(data, digest=digest)
@@ -117,7 +117,7 @@ class Dataset:
             raise DatasetError(f"the bundle {path} of the dataset is damaged ({error}): {_REMEDY}") from error
 
     def find(self, task_id: str) -> TaskRecord:
-        """The record of a task. Raises DatasetError that names close matches."""
+        """Record of a task. Raises DatasetError that names close matches."""
         for record in self.records:
             if record.task.task_id == task_id:
                 return record
@@ -136,13 +136,13 @@ def bundle_file(digest: str) -> str:
 
 
 def is_digest(text: str) -> bool:
-    """Whether the text can be a bundle's digest."""
+    """Return True if the text has the form of a bundle's digest."""
     algorithm, _, hexdigits = text.partition(":")
     return algorithm == "sha256" and len(hexdigits) == 64 and set(hexdigits) <= set("0123456789abcdef")
 
 
 def write_dataset(folder: Path | str, records: Sequence[TaskRecord], bundles: Mapping[str, bytes]) -> None:
-    """Write bundles first and the records last, so that a folder with records is whole."""
+    """Write the bundles first and the records last: a folder with records is complete."""
     root = Path(folder)
     (root / BUNDLES_FOLDER).mkdir(parents=True, exist_ok=True)
     for digest, data in bundles.items():
@@ -172,7 +172,7 @@ class TaskRecordJson(Record):
 
 
 def record_from_json(value: object) -> TaskRecord:
-    """Record of parsed JSON. Raises SceneInvalidError."""
+    """Decode a record. Raises SceneInvalidError."""
     record = convert(value, TaskRecordJson, "record")
     if not is_digest(record.bundle):
         raise SceneInvalidError(

@@ -1,7 +1,7 @@
-"""What formulas mean: evaluation against facts, the atoms that are scored, and BDDL text.
+"""Evaluation of formulas against facts, the atoms that are scored, and BDDL text.
 
-Quantifiers range over ``types``: synset to object names, by exact name. The readings are those of the ``bddl`` package,
-whose evaluator the tests compare with.
+Quantifiers range over ``types``: object names by synset, matched exactly. The semantics are those of the ``bddl`` package;
+tests compare with its evaluator.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
 
 
 class GoalError(ValueError):
-    """A formula can't be evaluated: it names a type or a variable that nothing stands for."""
+    """Formula that can't be evaluated: it names an unknown type or an unbound variable."""
 
 
 def evaluate(formula: Formula, facts: Facts, types: Types) -> bool:
-    """True when the closed formula holds. Asks only for the facts that decide it. Raises GoalError for unknown types."""
+    """Return True if the closed formula holds; queries only deciding facts. Raises GoalError for unknown types."""
     return _holds(formula, facts, types, {})
 
 
@@ -74,8 +74,10 @@ def _holds_quantified(
 
 
 def _holds_pairs(formula: ForPairs | ForNPairs, facts: Facts, types: Types, scope: Mapping[str, str]) -> bool:
-    """Rows are the objects of the first type. A pair of an object with itself has no cell, as in ``bddl``: the columns
-    of a table over one type are the places left in a row, so there is one fewer of them than rows.
+    """Evaluate a pair quantifier; rows are the objects of the first type.
+
+    A pair of an object with itself has no cell, as in ``bddl``. The columns of a table over one type are the places left in a
+    row: one fewer than rows.
     """
     rows = _members(formula.type_a, types)
     columns = _members(formula.type_b, types)
@@ -111,7 +113,7 @@ def _members(type_name: str, types: Types) -> tuple[str, ...]:
 
 
 def scored_atoms(formula: Formula, types: Types) -> tuple[Formula, ...]:
-    """Sub-goals that are scored: the conjuncts after grounding ``forall``; any other operator is one of them."""
+    """Scored sub-goals: the conjuncts after grounding ``forall``; any other operator is one of them."""
     match formula:
         case And(parts):
             return tuple(atom for part in parts for atom in scored_atoms(part, types))
@@ -126,7 +128,7 @@ def scored_atoms(formula: Formula, types: Types) -> tuple[Formula, ...]:
 
 
 def substitute(formula: Formula, names: Mapping[str, str]) -> Formula:
-    """The formula with free arguments replaced: variables and objects alike. Quantifiers shadow their variables."""
+    """Replace free arguments, variables and objects alike. Quantifiers shadow their variables."""
 
     def inner(body: Formula, *bound: str) -> Formula:
         return substitute(body, {arg: name for arg, name in names.items() if arg not in bound})
@@ -155,7 +157,7 @@ def substitute(formula: Formula, names: Mapping[str, str]) -> Formula:
 
 
 def map_atoms(formula: Formula, change: Callable[[Atom], Formula]) -> Formula:
-    """The formula with each of its atoms replaced by what ``change`` makes of it."""
+    """Replace each atom by the result of ``change``."""
     match formula:
         case Atom():
             return change(formula)
@@ -170,7 +172,7 @@ def map_atoms(formula: Formula, change: Callable[[Atom], Formula]) -> Formula:
 
 
 def subformulas(formula: Formula) -> Iterator[Formula]:
-    """The formula and all that it is made of, outermost first."""
+    """Yield the formula and all its subformulas, outermost first."""
     yield formula
     match formula:
         case Atom():
@@ -186,7 +188,7 @@ def subformulas(formula: Formula) -> Iterator[Formula]:
 
 
 def atoms_of(formula: Formula) -> tuple[Atom, ...]:
-    """Every atom in the order of the text, variables as they stand."""
+    """Every atom in the order of the text; variables stay as they are."""
     return tuple(part for part in subformulas(formula) if isinstance(part, Atom))
 
 
@@ -202,9 +204,9 @@ def types_of(formula: Formula) -> frozenset[str]:
 
 
 def objects_of(formula: Formula, types: Types) -> frozenset[str]:
-    """Objects that the goal is about: those it names, and the members of the types it quantifies over.
+    """Objects that the goal names, and the members of the types it quantifies over.
 
-    The room in ``inroom(object, room)`` is no object, nor is a substance that is called by its synset.
+    Rooms in ``inroom(object, room)`` and substances named by their synset are left out.
     """
     named = {
         arg
@@ -217,7 +219,7 @@ def objects_of(formula: Formula, types: Types) -> frozenset[str]:
 
 
 def render(formula: Formula) -> str:
-    """BDDL text on one line; ``bddl.parse_formula`` reads it back."""
+    """BDDL text on one line; ``bddl.parse_formula`` parses it."""
     match formula:
         case Atom(predicate, args):
             return f"({' '.join((predicate, *args))})"

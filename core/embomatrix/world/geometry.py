@@ -1,7 +1,7 @@
-"""Frames, boxes and convex parts: the metric vocabulary of a scene.
+"""Poses, boxes and convex parts of a scene.
 
-Units are metres and radians. Frames are right-handed with z up. A pose named ``pose_a_b`` is the pose of frame b in
-frame a, so products chain where the inner names meet: ``pose_world_b = pose_world_a @ pose_a_b``.
+Units are metres and radians. Frames are right-handed with z up. A pose named ``pose_a_b`` is the pose of frame b in frame a,
+so neighbouring names match in a product: ``pose_world_b = pose_world_a @ pose_a_b``.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class Pose:
 
 
 def _writer(owner: type, field: str) -> Callable[[object, object], None]:
-    """What writes a slot of a frozen class, for its ``__init__``: in a third of the time that a dataclass's own takes.
+    """Setter of a slot in a frozen class, three times as fast as a dataclass's own ``__init__``.
 
     A rollout makes many hundreds of poses and boxes.
     """
@@ -153,19 +153,19 @@ class Aabb:
         return (d - a, e - b, f - c)
 
     def contains(self, point: Vec3, margin_m: float = 0.0) -> bool:
-        """True when the point lies inside, grown by ``margin_m`` on every side."""
+        """Return True if the point lies inside the box grown by ``margin_m``."""
         return all(
             lo - margin_m <= p <= hi + margin_m
             for lo, p, hi in zip(self.low_m, point, self.high_m, strict=True)
         )
 
     def grown(self, margin_m: float) -> Aabb:
-        """The box with ``margin_m`` added on every side."""
+        """Box with ``margin_m`` added on every side."""
         (a, b, c), (d, e, f) = self.low_m, self.high_m
         return Aabb((a - margin_m, b - margin_m, c - margin_m), (d + margin_m, e + margin_m, f + margin_m))
 
     def overlaps(self, other: Aabb, margin_m: float = 0.0) -> bool:
-        """True when the boxes, ``margin_m`` apart or less, share volume or a face."""
+        """Return True if the boxes, ``margin_m`` apart or less, share volume or a face."""
         (a, b, c), (d, e, f) = self.low_m, self.high_m
         (x, y, z), (u, v, w) = other.low_m, other.high_m
         return (
@@ -179,7 +179,7 @@ class Aabb:
 
     @staticmethod
     def around(boxes: Iterable[Aabb]) -> Aabb:
-        """Smallest box that holds all of them. Raises ValueError when there are none."""
+        """Smallest box around all of them. Raises ValueError for no boxes."""
         items = list(boxes)
         if not items:
             raise ValueError("no boxes to enclose: expected at least one")
@@ -207,10 +207,10 @@ class Shape(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ConvexPart:
-    """One convex piece of a link, in the asset's frame with every joint at zero.
+    """Convex piece of a link, in the asset's frame with every joint at zero.
 
-    ``size_m`` is the full extent: (x, y, z) of a box, (d, d, height) of a cylinder, (d, d, d) of a sphere and the
-    bounding box of a hull. ``vertices_m`` are given in the part's own frame, for hulls only.
+    ``size_m`` is the full extent: (x, y, z) of a box, (d, d, height) of a cylinder, (d, d, d) of a sphere and the bounding box
+    of a hull. Only hulls have ``vertices_m``, in the part's own frame.
     """
 
     shape: Shape
@@ -219,7 +219,7 @@ class ConvexPart:
     vertices_m: tuple[Vec3, ...] = ()
 
     def aabb(self, pose_world_asset: Pose) -> Aabb:
-        """Bounding box in the world: exact for boxes and hulls, that of the enclosing box for the round shapes."""
+        """World bounding box: exact for boxes and hulls; that of the enclosing box for round shapes."""
         placed = pose_world_asset @ self.pose
         corners = np.asarray(self.vertices_m) if self.vertices_m else _corners(self.size_m)
         world = placed.apply_all(corners)  # (n, 3)

@@ -7,7 +7,7 @@ from typing import Protocol
 
 
 class Facts(Protocol):
-    """Whatever can tell whether an atom holds: the engine's state, or a table in a test."""
+    """Source of facts: the engine's state, or a table in a test."""
 
     def holds(self, predicate: str, args: tuple[str, ...]) -> bool: ...
 
@@ -78,7 +78,7 @@ class ForPairs:
 
 @dataclass(frozen=True, slots=True)
 class ForNPairs:
-    """As ``ForPairs``, with ``count`` in place of the smaller number of objects."""
+    """Variant of ``ForPairs`` with ``count`` in place of the smaller number of objects."""
 
     count: int
     variable_a: str

@@ -1,6 +1,6 @@
-"""What a bundle may cost before it is known to be sound: its address, its size, and how far it may grow.
+"""Limits on a bundle before it is trusted: its digest, its size and its growth in decompression.
 
-Whoever passes bundles on needs no more than this, and no numpy.
+Services that only relay bundles need this module alone, without numpy.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 _CHUNK: Final = 1 << 20
-"""What a bundle may grow by beyond its ratio: the smallest ones compress best."""
+"""Growth allowed beyond the ratio: small bundles compress best."""
 _PIECE: Final = 1 << 16
 
 
 class BundleError(ValueError):
-    """A bundle can't be accepted. The message tells what was found and what was expected."""
+    """Unacceptable bundle. The message says what was found and what was expected."""
 
 
 @dataclass(frozen=True, slots=True)
 class BundleLimits:
-    """What a bundle may cost before it is known to be sound."""
+    """Limits on the size of a bundle and on its growth."""
 
     compressed_bytes: int = 8 * 1024 * 1024
     ratio: float = 100.0
-    """Decompressed bytes for each compressed byte; scenes need about ten."""
+    """Decompressed bytes per compressed byte; scenes need about ten."""
 
 
 DEFAULT_LIMITS: Final = BundleLimits()
@@ -40,9 +40,9 @@ def bundle_digest(data: bytes) -> str:
 
 
 class Inflation:
-    """Decompresses a bundle while it comes, and refuses it at the first piece that breaks a limit.
+    """Streaming decompression that refuses a bundle at the first piece that breaks a limit.
 
-    Whoever takes bundles in uses this: what one side accepts, every other accepts.
+    All receivers of bundles use this class and so accept the same bundles.
     """
 
     def __init__(self, limits: BundleLimits = DEFAULT_LIMITS) -> None:
@@ -52,12 +52,12 @@ class Inflation:
         self._grown = 0
 
     def feed(self, data: bytes) -> Iterator[bytes]:
-        """What the next bytes of the bundle hold, in pieces that fit in memory. Raises BundleError."""
+        """Decompress the next bytes of a bundle in pieces that fit in memory. Raises BundleError."""
         for start in range(0, len(data), _PIECE):
             yield self._inflate(data[start : start + _PIECE])
 
     def finish(self) -> None:
-        """Raises BundleError unless the bundle ended where its bytes ended."""
+        """Raise BundleError unless the compressed stream ended with the last byte."""
         if not self._decoder.eof or self._decoder.unused_data:
             raise BundleError("the bundle is cut short, or bytes follow its end: fetch it again")
 
@@ -80,14 +80,14 @@ class Inflation:
 
 
 def too_large(limits: BundleLimits) -> BundleError:
-    """The error about a bundle with more bytes than the limits allow."""
+    """Error for a bundle with more bytes than the limits allow."""
     return BundleError(
         f"the bundle has over {limits.compressed_bytes:,} bytes: expected at most {limits.compressed_bytes:,}"
     )
 
 
 def decompress(data: bytes, limits: BundleLimits) -> bytes:
-    """What a whole bundle holds. Raises BundleError."""
+    """Content of a whole bundle. Raises BundleError."""
     inflation = Inflation(limits)
     content = b"".join(inflation.feed(data))
     inflation.finish()

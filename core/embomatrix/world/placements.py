@@ -1,6 +1,6 @@
-"""Verified placements and standing poses of a bundle as flat arrays, made into poses when one asks for them.
+"""Verified placements and standing poses of a bundle as flat arrays, converted to poses on demand.
 
-An analysis knows thousands of poses and a rollout uses a few: a worker that loads a bundle makes none of them.
+An analysis finds thousands of poses and a rollout uses a few: loading a bundle converts none of them.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ if TYPE_CHECKING:
 RELATIONS: Final = tuple(Relation)
 SET_NUMBERS: Final = 5
 MAX_POSES: Final = 1024
-"""Poses of one set."""
+"""Largest number of poses in a set."""
 
 
 class Placements(Mapping[PlacementKey, tuple[Pose, ...]]):
     """Sets of poses by key.
 
-    ``names`` are the assets; ``sets``, shape (m, 5), holds for each set the index of its asset, of its support and of its
-    relation in ``RELATIONS``, its first row in ``spots`` and the number of its rows; ``spots``, shape (n, 7), are poses.
+    ``names`` are the assets. Each row of ``sets``, shape (m, 5), holds the index of the asset, of its support and of the
+    relation in ``RELATIONS``, then the first row in ``spots`` and the number of rows. ``spots``, shape (n, 7), are poses.
     """
 
     def __init__(self, names: Sequence[str], sets: NDArray[np.int32], spots: FloatArray) -> None:
-        """Raises SceneInvalidError for rows and indices that are not there, and for a set that stands there twice."""
+        """Raise SceneInvalidError for rows and indices out of range and for a duplicate set."""
         self._names = tuple(names)
         self._numbers = {name: number for number, name in enumerate(self._names)}
         self._spots = spots
@@ -75,12 +75,12 @@ class Placements(Mapping[PlacementKey, tuple[Pose, ...]]):
         return len(self._spans)
 
     def rows(self, key: PlacementKey) -> FloatArray:
-        """Poses of one set, shape (n, 7): position and quaternion. Empty where there is no such set."""
+        """Poses of one set, shape (n, 7): position and quaternion. Empty for an unknown set."""
         first, count = self._spans.get(self._index(key), (0, 0))
         return self._spots[first : first + count]
 
     def _index(self, key: PlacementKey) -> tuple[int, int, int]:
-        """The set's numbers; -1 stands for what is not there."""
+        """Index numbers of a set; -1 for unknown names."""
         numbers = self._numbers
         return (
             numbers.get(key.asset_id, -1),
@@ -92,8 +92,8 @@ class Placements(Mapping[PlacementKey, tuple[Pose, ...]]):
 class Stands(Mapping[str, tuple[StandPose, ...]]):
     """Standing poses by object name.
 
-    ``spans`` hold for each name its first row in ``rows`` and the number of its rows, which must be there; ``rows``, shape
-    (n, 3), are x, y and yaw.
+    ``spans`` map a name to its first row in ``rows`` and the number of its rows, which must exist. ``rows``, shape (n, 3), are
+    x, y and yaw.
     """
 
     def __init__(self, spans: Mapping[str, tuple[int, int]], rows: FloatArray) -> None:
@@ -116,7 +116,7 @@ class Stands(Mapping[str, tuple[StandPose, ...]]):
 
 
 def rows_of(placements: Mapping[PlacementKey, tuple[Pose, ...]], key: PlacementKey) -> FloatArray:
-    """Poses of one set, shape (n, 7): position and quaternion. Empty where there is no such set."""
+    """Poses of one set, shape (n, 7): position and quaternion. Empty for an unknown set."""
     if isinstance(placements, Placements):
         return placements.rows(key)
     return pose_rows(placements.get(key, ()))

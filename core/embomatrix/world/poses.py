@@ -1,4 +1,4 @@
-"""The pre-cached language-physics interface as data: verified terminal poses, found offline, carried in the bundle."""
+"""Pose cache: verified terminal poses of skills, found offline and carried in the bundle."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class StandPose:
-    """Where the robot's base may stand to work on an object: world x, y, heading."""
+    """Pose of the robot's base to work on an object: world x, y, heading."""
 
     x_m: float
     y_m: float
@@ -24,7 +24,7 @@ class StandPose:
 
 @dataclass(frozen=True, slots=True)
 class PlacementKey:
-    """A set of poses serves every object of the asset, on every support of that asset, by that relation."""
+    """Key of a set of poses, which serves every object of the asset on every support of that asset, by that relation."""
 
     asset_id: str
     support_asset_id: str
@@ -32,7 +32,7 @@ class PlacementKey:
 
 
 class Handling(StrEnum):
-    """What the hand does to an object where it stands."""
+    """Action of the hand on an object that stays in its place."""
 
     TAKE = "take"
     OPEN = "open"
@@ -42,11 +42,13 @@ class Handling(StrEnum):
 
 @dataclass(frozen=True)
 class PoseCache:
-    """``placements``: poses of the placed asset in the *support's* asset frame, each verified by settling in physics.
-    ``stands``: standing poses per object name, in the world, best first.
-    ``barred``: by object name what bars the arm's way where there is none, in the scene as it was loaded.
-    ``reached``: by relation, by what is held and by its target, the number of a pose that the arm was seen to get at, of the
-    set of ``placements`` that is looked at first. ``barred_places``: in the same way what bars the arm's way to all of them.
+    """Result of the offline analysis of a scene.
+
+    ``placements``: poses of the placed asset in the *support's* asset frame, each verified by settling in physics. ``stands``:
+    standing poses by object name, in the world, best first. ``barred``: the object that blocks the arm, by handling and
+    target, for targets that the arm can't reach in the scene as loaded. ``reached``: by relation, held object and target, the
+    index of a pose that the arm reached, in the first set of ``placements``. ``barred_places``: by the same keys, the object
+    that blocks the arm from all poses.
     """
 
     placements: Mapping[PlacementKey, tuple[Pose, ...]] = field(default_factory=dict)

@@ -1,8 +1,8 @@
-"""JSON records of scenes, assets, tasks and pose caches: the shape of each value and the rules it must keep.
+"""JSON records of scenes, assets, tasks and pose caches: the shape of each value and its rules.
 
-Decoding trusts nothing: physics drops the 17th part of a link without a word and crashes on NaN. msgspec checks types and
-bounds while it parses; ``SceneInvalidError`` names the path of the value that breaks a rule. Every number is finite, since
-NaN fails any bound.
+Decoding trusts nothing, since physics silently drops the 17th part of a link and crashes on NaN. msgspec checks types and
+bounds while it parses. ``SceneInvalidError`` names the path of the value that breaks a rule. Every number has bounds and is
+therefore finite: NaN fails any bound.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ MAX_ROOMS: Final = 1_000
 MAX_WALLS: Final = 10_000
 MAX_OBJECTS: Final = 5_000
 MAX_KEYS_SEARCHED: Final = 1_000
-"""Keys of a mapping that are tried to name the one with the invalid value."""
+"""Limit on the search for the key of an invalid value in a mapping."""
 
 _SPACES: Final = r"\x00-\x1f\x7f-\xa0\xad\u1680\u2000-\u200f\u2028-\u202f\u205f-\u206f\u3000"
 _UNPRINTABLE: Final = rf"{_SPACES}\ud800-\uf8ff\ufeff\ufff0-\ufffb"
@@ -46,7 +46,7 @@ Extent = Annotated[float, Meta(gt=MIN_EXTENT_M, le=MAX_COORDINATE_M)]
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 Row = Annotated[int, Meta(ge=0)]
 Name = Annotated[str, Meta(min_length=1, max_length=MAX_NAME, pattern=rf"^[^/\\{_UNPRINTABLE}]*\Z")]
-"""Printable text without a slash: a name never leads to a file."""
+"""Printable text without a slash, safe as a part of a file name."""
 Point = tuple[Number, Number, Number]
 Extents = tuple[Extent, Extent, Extent]
 # A row has no bound here: msgspec 0.22 crashes on the union of a fixed tuple and an int with bounds. ``tables`` checks it.
@@ -65,7 +65,7 @@ class SceneInvalidError(ValueError):
         self.message = message
 
     def below(self, path: str) -> SceneInvalidError:
-        """The same error for a field that lies below ``path``."""
+        """Prefix the error's path with ``path``."""
         return SceneInvalidError(f"{path}.{self.field}" if self.field else path, self.message)
 
 
@@ -263,7 +263,10 @@ def decode(text: bytes, kind: type[T], root: str) -> T:
 
 
 def _located(error: msgspec.ValidationError, value: Any, kind: type, root: str) -> SceneInvalidError:
-    """Error with the full path. msgspec writes ``[...]`` for the key of a mapping; trying the entries one by one finds it."""
+    """Error with the full path.
+
+    msgspec writes ``[...]`` for the key of a mapping; trying the entries one by one finds it.
+    """
     message, _, tail = str(error).partition(" - at `$")
     path, found = root, value
     for key, index in re.findall(r"\.(\w+)|\[(\d+|\.\.\.)\]", tail):
@@ -282,7 +285,7 @@ def _located(error: msgspec.ValidationError, value: Any, kind: type, root: str) 
 
 
 def _failing_key(mapping: dict[str, Any], whole: Any, kind: type, message: str) -> str | None:
-    """Key of a mapping inside ``whole`` whose value alone causes the message. The mapping is left as it was."""
+    """Key of a mapping inside ``whole`` whose value alone causes the message. The mapping is left unchanged."""
     entries = dict(mapping)
     try:
         for key in list(entries)[:MAX_KEYS_SEARCHED]:

@@ -1,4 +1,4 @@
-"""Scenes: rooms and placed objects, frozen, with a content key."""
+"""Scenes: rooms and placed objects, frozen."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ class Room:
 
 @dataclass(frozen=True, slots=True)
 class Doorway:
-    """Opening in a wall between two rooms; ``rooms[1]`` is empty where it leads outside.
+    """Opening in a wall between two rooms; ``rooms[1]`` is empty for a door to the outside.
 
-    ``center_m`` lies on the floor; ``along`` is "x" or "y": the axis that the wall runs along.
+    ``center_m`` lies on the floor; ``along`` is "x" or "y", the axis of the wall.
     """
 
     rooms: tuple[str, str]
@@ -59,10 +59,10 @@ class Doorway:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Opening in a wall, closed by a pane; ``rooms[1]`` is empty where it looks outside.
+    """Opening in a wall, closed by a pane; ``rooms[1]`` is empty for a view to the outside.
 
-    ``center_m`` lies on the floor below it; the opening reaches from ``sill_m`` to ``head_m`` above the floor; ``along`` is "x"
-    or "y": the axis that the wall runs along.
+    ``center_m`` lies on the floor below the window; the opening reaches from ``sill_m`` to ``head_m`` above the floor;
+    ``along`` is "x" or "y", the axis of the wall.
     """
 
     rooms: tuple[str, str]
@@ -76,12 +76,12 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class SceneObject:
-    """One placed object. ``name`` is unique in the scene: category and number, ``apple_1``.
+    """Placed object. ``name`` is unique in the scene: category and number, ``apple_1``.
 
-    ``joints`` are the positions of the asset's joints in their order, as a share of the travel: 0 closed, 1 open.
-    ``host`` is the object that it rests on or in by ``relation``; empty: it stands on the floor or hangs on a wall.
-    ``fixed`` objects never move: furniture, appliances, wall-mounted things. ``absent`` objects are not in the world at the
-    start: slicing another object, whose ``pieces`` name them, brings them in where that one was.
+    ``joints`` are shares of the travel, 0 closed and 1 open, in the order of the asset's joints. ``host`` is the object that
+    it rests on or in by ``relation``; empty on the floor and on walls. ``fixed`` objects never move: furniture, appliances,
+    wall-mounted objects. ``absent`` objects are outside the world at the start: slicing an object replaces it by its
+    ``pieces``.
     """
 
     name: str
@@ -110,9 +110,9 @@ class RobotStart:
 
 @dataclass(frozen=True)
 class Scene:
-    """Rooms, walls, doorways, windows and objects. Order of ``objects`` is part of the content: it is the solver's order.
+    """Rooms, walls, doorways, windows and objects. The order of ``objects`` is part of the content.
 
-    ``walls`` holds all that bars the way: panels, lintels, sills, panes and the leaves of doors that lead outside.
+    ``walls`` holds all fixed panels: walls, lintels, sills, panes and the doors that lead outside.
     """
 
     scene_id: str
@@ -133,11 +133,11 @@ class Scene:
         return {item.name: item for item in self.objects}
 
     def asset_of(self, name: str) -> Asset:
-        """Asset of the object with this name; KeyError when there is none."""
+        """Asset of an object. Raises KeyError for an unknown name."""
         return self.assets[self.by_name[name].asset_id]
 
     def box_of(self, name: str) -> Aabb:
-        """World box around the object as it is placed, with its doors shut; KeyError when there is none of this name."""
+        """World box of an object with its doors shut. Raises KeyError for an unknown name."""
         pose = self.by_name[name].pose_world_asset
         reach = np.abs(pose.rotation) @ (np.asarray(self.asset_of(name).size_m) / 2)  # (3,)
         center = np.asarray(pose.position_m)
@@ -145,7 +145,7 @@ class Scene:
         return Aabb((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 
     def room_at(self, point: Vec3 | Vec2) -> str:
-        """Name of the room under a point; in a wall, of the first room within 15 cm; empty when outside all rooms."""
+        """Name of the room under a point; in a wall, the first room within 15 cm; empty outside all rooms."""
         for margin in (0.0, 0.15):
             for room in self.rooms:
                 if room.contains(point[0], point[1], margin):

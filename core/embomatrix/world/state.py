@@ -1,4 +1,4 @@
-"""Closed sets of relations and states: what a goal can say of an object."""
+"""Relations and states that a goal can name."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Relation(StrEnum):
 
 
 class State(StrEnum):
-    """Unary states. OPEN is metric (a joint past 5 % of its travel), the others are symbolic."""
+    """Unary states. OPEN is metric (a joint beyond 5 % of its travel); the others are symbolic."""
 
     OPEN = "open"
     TOGGLED_ON = "toggled_on"
@@ -42,7 +42,7 @@ class SubstanceRelation(StrEnum):
 
 @dataclass(frozen=True, slots=True, order=True)
 class SubstanceFact:
-    """What an object has of a substance; ``substance`` is a synset of the catalog, such as ``water.n.06``."""
+    """Fact about an object and a substance; ``substance`` is a synset of the catalog, such as ``water.n.06``."""
 
     relation: SubstanceRelation
     substance: str
@@ -51,6 +51,6 @@ class SubstanceFact:
 HOT_C = 40.0
 COOK_C = 70.0
 FREEZE_C = 0.0
-"""Temperatures in degrees Celsius at which the states of the same name set in: BEHAVIOR-1K's defaults."""
+"""Temperatures in degrees Celsius at which the states of the same name begin: BEHAVIOR-1K's defaults."""
 OPEN_FRACTION = 0.05
 """A joint is open beyond this share of its travel: OmniGibson's definition."""

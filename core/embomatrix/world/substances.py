@@ -1,8 +1,7 @@
-"""Substances: symbolic films, liquids and grains that things are covered, filled or soaked with.
+"""Substances: symbolic films, liquids and grains that cover, fill or soak objects.
 
-A substance is called by its synset, ``water.n.06``, wherever an object could be called by its name; it has no place and no
-amount. What takes a substance off is BEHAVIOR-1K's knowledge (``data/substances.json.gz``), with one rule of the paper's
-added here: plain water takes stains off.
+A substance is named by its synset, ``water.n.06``, in the place of an object's name; it has no position and no amount. The
+rules of removal are BEHAVIOR-1K's (``data/substances.json.gz``), with one rule of the paper: plain water removes stains.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ WATER: Final = "water.n.06"
 DUST: Final = "dust.n.01"
 STAIN: Final = "stain.n.01"
 RUNNING: Final = "on"
-"""Stands in a need where the tool must be switched on, rather than soaked."""
+"""Member of a need: the tool must be switched on."""
 
 MEANINGS: Final[Mapping[State, SubstanceFact]] = {
     State.DUSTY: SubstanceFact(SubstanceRelation.COVERED, DUST),
     State.STAINED: SubstanceFact(SubstanceRelation.COVERED, STAIN),
     State.SOAKED: SubstanceFact(SubstanceRelation.SATURATED, WATER),
 }
-"""States of the paper's dialect that are facts about substances: the two are one, whichever a scene or a goal speaks of."""
+"""States of the paper's dialect that are facts about substances."""
 WORDS: Final[Mapping[SubstanceRelation, str]] = {
     SubstanceRelation.COVERED: "covered with",
     SubstanceRelation.FILLED: "filled with",
@@ -51,58 +50,58 @@ class SubstanceKind(StrEnum):
 
 
 Need = frozenset[str]
-"""What a tool must be for a removal: soaked with one of these substances, or `RUNNING`; empty for neither."""
+"""Requirement on a tool: soaked with one of these substances, or `RUNNING`; empty for no requirement."""
 
 
 def is_substance(name: str) -> bool:
-    """Whether the name is the synset of a substance that the catalog knows."""
+    """Return True if the name is the synset of a substance in the catalog."""
     return name in _table()["kinds"]
 
 
 def kind_of(substance: str) -> SubstanceKind:
-    """Kind of a substance; of one that the catalog does not know, SOLID."""
+    """Kind of a substance; SOLID for unknown ones."""
     return SubstanceKind(_table()["kinds"].get(substance, SubstanceKind.SOLID))
 
 
 def facts_of(states: Iterable[State], substances: Iterable[SubstanceFact]) -> frozenset[SubstanceFact]:
-    """Facts about substances, with those that ``states`` tell of in the paper's words."""
+    """Facts about substances, including those that ``states`` imply."""
     return frozenset(substances) | {MEANINGS[state] for state in states if state in MEANINGS}
 
 
 def fact_holds(relation: SubstanceRelation, substance: str, facts: Set[SubstanceFact]) -> bool:
-    """Whether the facts say so. What is filled with a substance contains it."""
+    """Return True if the facts imply the relation; a filled object also contains the substance."""
     if relation is SubstanceRelation.CONTAINS and SubstanceFact(SubstanceRelation.FILLED, substance) in facts:
         return True
     return SubstanceFact(relation, substance) in facts
 
 
 def liquids_in(facts: Iterable[SubstanceFact]) -> tuple[str, ...]:
-    """Liquids that a thing with these facts holds, sorted: what can be poured on something from it."""
+    """Liquids that an object with these facts holds and can be poured from it, sorted."""
     holding = (SubstanceRelation.FILLED, SubstanceRelation.CONTAINS)
     found = {fact.substance for fact in facts if fact.relation in holding}
     return tuple(sorted(name for name in found if kind_of(name) is SubstanceKind.LIQUID))
 
 
 def flows_from(synset: str) -> tuple[str, ...]:
-    """Substances that flow out of a thing of this kind while it is on: water out of a sink."""
+    """Substances that flow out of an object of this kind while it is on: water out of a sink."""
     return tuple(_table()["sources"].get(synset, ()))
 
 
 def is_remover(synset: str) -> bool:
-    """Whether a thing of this kind takes any substance off another one."""
+    """Return True if an object of this kind removes any substance from another one."""
     return synset in _table()["removers"]
 
 
 def removal_need(tool: str, substance: str) -> Need | None:
-    """What a tool of this synset must be to take the substance off; None when it never does."""
+    """Requirement on a tool of this synset to remove the substance; None if it never does."""
     rules = _table()["removers"].get(tool, {})
     return _need(substance, rules.get(substance, rules.get(kind_of(substance))))
 
 
 def washed_off(substance: str, *, with_detergent: bool) -> bool:
-    """Whether running water takes the substance off, by itself or with the detergent of a washing machine.
+    """Return True if running water removes the substance, alone or with the detergent of a washing machine.
 
-    What the rules do not name is rinsed off, be it a film, a liquid or grains.
+    Substances without a rule rinse off.
     """
     rules = _table()["washer"]
     if substance not in rules:
@@ -112,7 +111,7 @@ def washed_off(substance: str, *, with_detergent: bool) -> bool:
 
 
 def comes_off(substance: str) -> bool:
-    """Whether any tool, sink or machine takes the substance off."""
+    """Return True if any tool, sink or machine removes the substance."""
     tools = _table()["removers"]
     return washed_off(substance, with_detergent=True) or any(
         removal_need(tool, substance) is not None for tool in tools
@@ -120,12 +119,12 @@ def comes_off(substance: str) -> bool:
 
 
 def half_of(synset: str) -> str:
-    """Kind of the two things that slicing makes of one of this kind, "" where the catalog knows none."""
+    """Kind of the two halves of a sliced object of this kind; "" if the catalog has none."""
     return str(_table()["halves"].get(synset, ""))
 
 
 def in_words(fact: SubstanceFact) -> str:
-    """A fact as a person says it: ``dusty``, ``covered with mud``."""
+    """Fact in words: ``dusty``, ``covered with mud``."""
     state = _STATE_OF.get(fact)
     return state.value if state is not None else f"{WORDS[fact.relation]} {word_of(fact.substance)}"
 

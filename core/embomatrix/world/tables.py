@@ -1,7 +1,6 @@
-"""Tables of numbers beside JSON: poses and convex parts as flat arrays, checked all at once.
+"""Numeric tables of a bundle: poses and convex parts as flat arrays, checked as whole columns.
 
-A bundle's scene is JSON in which each pose and each part is a row's number. Reading arrays costs a tenth of reading the
-same numbers as text, and a rule about a column is one comparison.
+The JSON of a bundle refers to poses and parts by row number. Reading arrays costs a tenth of reading the same numbers as text.
 """
 
 from __future__ import annotations
@@ -41,14 +40,14 @@ FLAT_HULL: Final = (
 SHAPES: Final = tuple(Shape)
 POSE_NUMBERS: Final = 7
 COLUMNS: Final = ("poses", "parts", "kinds", "vertices", "stands", "sets", "spots")
-"""``poses``: rows of x, y, z, qx, qy, qz, qw. ``parts``: rows of a pose and three extents. ``kinds``: for each part the index
-of its shape in ``SHAPES`` and the number of its vertices, which follow one another in ``vertices``. ``stands``: rows of x, y
+"""``poses``: rows of x, y, z, qx, qy, qz, qw. ``parts``: rows of a pose and three extents. ``kinds``: per part, the index of
+its shape in ``SHAPES`` and the number of its vertices, which follow one another in ``vertices``. ``stands``: rows of x, y
 and yaw. ``sets`` and ``spots``: those of ``Placements``."""
 
 
 @dataclass(frozen=True, slots=True)
 class TableWriter:
-    """Collects rows while a scene is put into JSON. Equal poses and equal parts share a row."""
+    """Collects rows while a scene is encoded. Equal poses and equal parts share a row."""
 
     _poses: dict[bytes, int] = field(default_factory=dict)
     _parts: dict[bytes, tuple[int, ConvexPart]] = field(default_factory=dict)
@@ -56,7 +55,7 @@ class TableWriter:
     _placements: dict[str, NDArray[np.generic]] = field(default_factory=dict)
 
     def pose(self, pose: Pose) -> int:
-        # By their bits: zero and minus zero are equal, but not the same.
+        # Compared by their bits: 0.0 and -0.0 are equal but encode differently.
         row = struct.pack("<7d", *pose.position_m, *pose.quat_xyzw)
         return self._poses.setdefault(row, len(self._poses))
 
@@ -67,16 +66,16 @@ class TableWriter:
         return self._parts.setdefault(key, (len(self._parts), part))[0]
 
     def stands(self, rows: Sequence[Vec3]) -> int:
-        """Append rows of x, y and yaw; the number of the first."""
+        """Append rows of x, y and yaw; return the number of the first."""
         self._stands.extend(rows)
         return len(self._stands) - len(rows)
 
     def placements(self, sets: NDArray[np.int32], spots: FloatArray) -> None:
-        """Take the arrays of ``Placements``."""
+        """Set the arrays of ``Placements``."""
         self._placements.update(sets=sets, spots=spots)
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """The arrays of ``COLUMNS``, float64 but for ``kinds`` and ``sets``, which are int32."""
+        """Arrays of ``COLUMNS``: int32 for ``kinds`` and ``sets``, float64 for the others."""
         parts = [part for _, part in self._parts.values()]
         rows = [(*part.pose.position_m, *part.pose.quat_xyzw, *part.size_m) for part in parts]
         vertices = [vertex for part in parts for vertex in part.vertices_m]
@@ -149,16 +148,16 @@ def check_unit(field: str, quat: Sequence[float]) -> None:
 
 
 def has_volume(vertices: FloatArray) -> bool:
-    """Whether points, shape (n, 3), span a body that is thicker than a tenth of a millimetre and within the world."""
+    """Return True if points, shape (n, 3), span a body thicker than 0.1 mm and within the world."""
     return bool(_have_volume(vertices, np.array([len(vertices)]))[0])
 
 
 def _have_volume(vertices: FloatArray, counts: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """The same for several bodies whose points, ``counts`` of them each, follow one another. At least one point each."""
+    """Apply ``has_volume`` to several bodies; each has ``counts`` consecutive points, at least one."""
     starts = np.concatenate(([0], np.cumsum(counts)[:-1]))
     within = np.maximum.reduceat(np.abs(vertices).max(axis=1), starts) <= MAX_COORDINATE_M
     means = np.add.reduceat(vertices, starts) / counts[:, None]  # (k, 3)
-    with np.errstate(over="ignore", invalid="ignore"):  # what lies outside is told apart by ``within``
+    with np.errstate(over="ignore", invalid="ignore"):  # ``within`` excludes these bodies
         offsets = vertices - np.repeat(means, counts, axis=0)
         squares = np.add.reduceat(offsets[:, :, None] * offsets[:, None, :], starts)  # (k, 3, 3)
     covariances = np.where(within[:, None, None], squares, 0.0) / counts[:, None, None]
@@ -175,7 +174,7 @@ def _check_hulls(kinds: list[tuple[int, int]], vertices: FloatArray) -> None:
 
 
 def _floats(arrays: Arrays, name: str, columns: int) -> FloatArray:
-    """A float array of that many columns, all finite."""
+    """Float array with this number of columns, all finite."""
     array = arrays.get(name)
     if array is None or array.dtype != np.float64 or array.ndim != 2 or array.shape[1] != columns:
         found = "nothing" if array is None else f"{array.dtype} of shape {array.shape}"
@@ -188,7 +187,7 @@ def _floats(arrays: Arrays, name: str, columns: int) -> FloatArray:
 
 def _check_poses(name: str, rows: FloatArray) -> None:
     x, y, z, w = rows[:, 3:].T
-    with np.errstate(over="ignore"):  # too long is too long
+    with np.errstate(over="ignore"):  # an overflow fails the check
         off: FloatArray = np.abs(np.sqrt(x * x + y * y + z * z + w * w) - 1.0)  # (n,)
     _check_rows(name, rows, off <= UNIT_TOLERANCE, "a quaternion whose length is not 1")
     x, y, z = np.abs(rows[:, :3]).T

@@ -1,4 +1,4 @@
-"""Tasks: an instruction and a goal in a scene, with the table of objects that a plan may name."""
+"""Tasks: an instruction and a goal in a scene, and the table of objects that a plan may name."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from embomatrix.world.goal import Formula
 
 MAX_TABLE: Final = 60
-"""Rows of a task's object table at most: more do not fit a prompt."""
+"""Largest number of rows in a task's object table: more do not fit a prompt."""
 
 
 class TaskCategory(StrEnum):
@@ -28,7 +28,7 @@ class TaskCategory(StrEnum):
 
 
 class Profile(StrEnum):
-    """Which skills the plans of a task may use: the paper's thirteen, or three more for cutting, cleaning and wetting."""
+    """Skills that a task's plans may use: the paper's thirteen, or three more for cutting, cleaning and wetting."""
 
     PAPER = "paper"
     HOUSEHOLD = "household"
@@ -36,12 +36,11 @@ class Profile(StrEnum):
 
 @dataclass(frozen=True)
 class Task:
-    """What the robot must do in a scene. All names are names of scene objects or rooms.
+    """Goal for the robot in a scene. All names are names of scene objects or rooms.
 
-    ``goal`` is ground but for its quantifiers, which range over ``types``: synset to object names. ``table`` is the object
-    table: a plan's ``object_index`` is a row of it; the order betrays nothing of the goal. ``goal_bddl`` is the same goal
-    as text. ``source`` says where the task came from ("writer", "behavior-1k", "embomatrix", "file"). ``profile`` says
-    which skills a plan may use.
+    ``goal`` is ground except for its quantifiers, which range over ``types``: object names by synset. ``table`` is the object
+    table: a plan's ``object_index`` is a row of it, and its order reveals nothing about the goal. ``goal_bddl`` is the same
+    goal as text. ``source`` is the task's origin ("writer", "behavior-1k", "embomatrix", "file").
     """
 
     task_id: str
@@ -61,10 +60,10 @@ class Task:
 
     @cached_property
     def goal_objects(self) -> frozenset[str]:
-        """Objects that the goal is about. Raises GoalError when it quantifies over a type that the task does not list."""
+        """Objects that the goal is about. Raises GoalError for a quantifier over an unknown type."""
         return objects_of(self.goal, self.types)
 
     @cached_property
     def goal_atoms(self) -> tuple[tuple[Formula, str], ...]:
-        """Sub-goals that are scored, each with its text. Raises GoalError as ``goal_objects`` does."""
+        """Scored sub-goals, each with its text. Raises GoalError as ``goal_objects`` does."""
         return tuple((atom, render(atom)) for atom in scored_atoms(self.goal, self.types))

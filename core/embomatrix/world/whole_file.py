@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and are read whole or not at all."""
+"""Atomic writes and bounded reads of files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write beside and rename: a reader never sees half a file, and a failure leaves what was there. Raises OSError."""
+    """Write beside the target and rename: readers see the old file or the new one. Raises OSError."""
     part = path.with_name(f"{path.name}.part")
     try:
         part.write_bytes(data)
@@ -22,7 +22,7 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 def read_whole(path: Path, *, at_most: int) -> bytes:
-    """A file's bytes, of which no more than ``at_most`` are ever in memory. Raises OSError, EFBIG for a larger file."""
+    """Read a file; at most ``at_most`` bytes are ever in memory. Raises OSError, with EFBIG for a larger file."""
     with path.open("rb") as file:
         data = file.read(at_most + 1)
     if len(data) > at_most:
@@ -31,7 +31,7 @@ def read_whole(path: Path, *, at_most: int) -> bytes:
 
 
 def check_writable(path: Path) -> None:
-    """Ask before long work whether ``write_whole`` will find its folder; nothing is left there. Raises OSError."""
+    """Check before long work that ``write_whole`` can write here; leaves no file. Raises OSError."""
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     part = path.with_name(f"{path.name}.part")

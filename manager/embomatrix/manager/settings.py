@@ -1,4 +1,4 @@
-"""Settings of the manager: parsed once, at the edge; an unknown key is an error."""
+"""Settings of the manager, parsed once at the command line. Unknown keys are errors."""
 
 from __future__ import annotations
 
@@ -16,79 +16,81 @@ DEFAULT_HTTP_PORT = 8070
 
 
 class ManagerSettings(BaseModel):
-    """How a manager serves. Outside loopback it needs certificates and tokens: see ``access.protection``."""
+    """Settings of a manager. Outside loopback it needs certificates and tokens: see ``access.protection``."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     host: str = "127.0.0.1"
-    """Address on which workers and trainers are served."""
+    """Address of the gRPC services."""
     port: int = Field(DEFAULT_PORT, ge=0, le=65535)
     """TCP port of the gRPC services; 0 takes a free one."""
     advertise: str = ""
-    """HOST:PORT under which workers and trainers reach this manager, told by another that stands by. Empty: where it serves."""
+    """HOST:PORT under which workers and trainers reach this manager, as a standby reports it. Empty: the serving
+    address."""
     http_host: str = "127.0.0.1"
-    """Address of the status page."""
+    """Address of the dashboard."""
     http_port: int = Field(DEFAULT_HTTP_PORT, ge=0, le=65535)
-    """TCP port of the status page; 0 takes a free one."""
+    """TCP port of the dashboard; 0 takes a free one."""
     data_dir: Path = Field(
         default_factory=lambda: Path.home() / ".local" / "share" / "embomatrix" / "manager"
     )
-    """Folder of bundles and of the embedded state."""
+    """Folder of bundles and of the state file."""
     dataset: Path | None = None
-    """Folder of a dataset whose tasks the dashboard shows. It is read, never written."""
+    """Dataset whose tasks the dashboard shows. It is never written."""
     state: str = ""
     """``memory:``, ``sqlite:PATH`` or ``redis://HOST:PORT/DB``. Empty: a file in the data folder."""
     token: str = Field("", repr=False, pattern=TOKEN_PATTERN)
-    """One secret that is an admin's for everybody, beside the tokens of roles; empty: there is none."""
+    """Shared secret with the role of an admin, in addition to issued tokens. Empty: none."""
     tls_cert: Path | None = None
-    """Certificate of the manager (PEM), the authority's after it. None: that of ``manager init``, if it is there."""
+    """Certificate chain of the manager (PEM). None: that of ``manager init``, if present."""
     tls_key: Path | None = None
-    """Its private key."""
+    """Private key of the certificate."""
     tls_ca: Path | None = None
-    """Certificate of the authority that signed it; what invitations of workers are pinned to."""
+    """Certificate of the signing authority; invitations carry its fingerprint."""
     insecure_bind: bool = False
     """Serve outside loopback without certificates and tokens."""
     bundle_total_mb: int = Field(16_384, ge=1)
-    """Largest size of all bundles, in MB."""
+    """Total size of all bundles, in MB."""
     heartbeat_s: float = Field(1.0, gt=0)
-    """Seconds between two heartbeats of a worker; grows with the cluster."""
+    """Seconds between two heartbeats of a worker; the interval grows with the cluster."""
     lost_after_s: float = Field(10.0, gt=0)
-    """A worker that was silent for this long is given up."""
+    """A worker is lost after this many seconds of silence."""
     stream_grace_s: float = Field(1.0, ge=0)
-    """A worker whose connection broke may come back within this time."""
+    """Seconds in which a worker may reconnect after its stream broke."""
     lease_ttl_s: float = Field(30.0, gt=0)
-    """A lease that no heartbeat renews for this long is void."""
+    """A lease expires after this many seconds without a heartbeat."""
     lease_limit_s: float = Field(180.0, gt=0)
-    """A lease that is not answered after this long is void."""
+    """A lease expires after this many seconds without a result."""
     execute_deadline_s: float = Field(60.0, gt=0)
-    """A worker kills a slot that executes one plan for longer."""
+    """A worker kills a slot that executes one plan for longer (seconds)."""
     rollout_deadline_s: float = Field(600.0, gt=0)
-    """From submission to outcome."""
+    """Seconds from submission to outcome."""
     no_capacity_s: float = Field(60.0, gt=0)
-    """How long rollouts wait while no worker could take them."""
+    """Seconds that rollouts wait while no worker can take them."""
     affinity_wait_s: float = Field(0.5, ge=0)
-    """How long rollouts wait for workers that have their scene before idle ones load it, while its load time isn't known."""
+    """Seconds that rollouts wait for workers with their scene before idle workers load it, while its load time is
+    unknown."""
     hedge_after_s: float = Field(1.0, gt=0)
-    """No rollout is late, and started a second time elsewhere, before it has run for this long."""
+    """A rollout must run for this many seconds before it can be hedged."""
     hedge_share: float = Field(0.05, ge=0, le=1)
-    """Largest share of a run's rollouts that are started a second time; 0: none."""
+    """Largest share of a run's rollouts that are hedged; 0: none."""
     stall_after_s: float = Field(10.0, gt=0)
-    """No lease has stalled before it has done no step for this long."""
+    """A lease can stall only after this many seconds without a step."""
     max_attempts: int = Field(3, ge=1)
-    """Started leases of one rollout before it ends as an infrastructure failure."""
+    """Started leases of one rollout before it ends in an infrastructure failure."""
     restart_grace_s: float = Field(5.0, ge=0)
-    """How long a manager that took over waits for workers to say what they run, before it gives the same to others."""
+    """Seconds that a new leader waits for workers to report their leases before it re-dispatches them."""
     leader_ttl_s: float = Field(6.0, gt=0)
-    """A manager that did not renew its lead for this long may be replaced by one that stands by."""
+    """A standby may take over after the leader has not renewed its lease for this many seconds."""
     audit: bool | None = None
-    """Have other workers execute a part of the results once more, and compare. None: unless all workers are on this
-    machine. Runs that ask for verified results have it done in any case."""
+    """Execute a share of the results again on other workers and compare. None: only if workers on other machines may
+    join. Runs with verified results are always audited."""
     audit_probation: int = Field(50, ge=0)
-    """So many executions of a new worker are compared, all of them."""
+    """Number of first executions of a new worker that are all audited."""
     audit_share: float = Field(0.05, ge=0, le=1)
-    """Of its later results."""
+    """Audited share of later results."""
     results_ttl_s: float = Field(3600.0, gt=0)
-    """How long results are kept after their batch ended."""
+    """Seconds that results are kept after their batch ended."""
 
     @property
     def state_url(self) -> str:
@@ -96,14 +98,14 @@ class ManagerSettings(BaseModel):
 
     @property
     def address(self) -> str:
-        """HOST:PORT as others should use it."""
-        everywhere = self.host in ("0.0.0.0", "::")  # it is asked for, not chosen
+        """HOST:PORT under which others reach this manager."""
+        everywhere = self.host in ("0.0.0.0", "::")  # compares a configured value, binds nothing
         host = socket.gethostname() if everywhere else self.host
         return self.advertise or f"{f'[{host}]' if ':' in host else host}:{self.port}"
 
     @property
     def audits_all_runs(self) -> bool:
-        """Whether results of runs that did not ask for it are audited as well."""
+        """True if results of all runs are audited, even without a request."""
         return not is_loopback(self.host) if self.audit is None else self.audit
 
     @field_validator("advertise")
@@ -121,7 +123,7 @@ class ManagerSettings(BaseModel):
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach the address."""
+    """Return True if only this machine can reach the address."""
     if host == "localhost":
         return True
     try:
@@ -131,7 +133,7 @@ def is_loopback(host: str) -> bool:
 
 
 def is_every_address(host: str) -> bool:
-    """Whether it stands for all addresses of this machine, and so is none that a browser could open."""
+    """Return True for a wildcard address, which no browser can open."""
     try:
         return ipaddress.ip_address(host).is_unspecified
     except ValueError:

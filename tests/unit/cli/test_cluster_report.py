@@ -4,7 +4,7 @@ import re
 from html.parser import HTMLParser
 
 from embomatrix.cli.cluster.report import report_page, seconds_text
-from embomatrix.rpc.run_log import (
+from embomatrix.rpc.wire.run_log import (
     EventKind,
     PhaseSummary,
     RolloutPhase,

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from embomatrix.cli.cluster.trace import chrome_trace
-from embomatrix.rpc.run_log import EventKind, RunEvent
 from embomatrix.rpc.timeline import SlotKey, busy_share, slot_spans
+from embomatrix.rpc.wire.run_log import EventKind, RunEvent
 from embomatrix.rpc.wire.values import Timings
 
 ROUNDING_US = 0.002

@@ -18,9 +18,8 @@ from embomatrix.cli.doctor.manager import (
     versions,
 )
 from embomatrix.manager.access.folder import prepare
-from embomatrix.rpc.admin import AdminClient
-from embomatrix.rpc.capabilities import Capabilities
-from embomatrix.rpc.versions import PROTOCOL_VERSION, VersionRange
+from embomatrix.rpc.admin_client import AdminClient
+from embomatrix.rpc.versions import PROTOCOL_VERSION, Capabilities, VersionRange
 from embomatrix.rpc.wire.values import FleetStatus
 
 

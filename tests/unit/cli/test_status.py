@@ -12,7 +12,7 @@ from tests.integration.test_manager_service import manager
 from embomatrix.cli.status.app import status, top
 from embomatrix.cli.status.live import Glance, earliest, rate, screen
 from embomatrix.cli.status.words import sentences
-from embomatrix.rpc.admin import AdminClient
+from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.wire.values import (
     FleetStatus,
     PlanCell,

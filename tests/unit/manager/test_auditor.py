@@ -5,7 +5,7 @@ from dataclasses import replace
 from tests.fakes.worker import completed
 
 from embomatrix.manager.control.reputation import Auditor, AuditRules, Reputation, Ruling, judge, opinion_of
-from embomatrix.manager.runtime.records import repute_of, repute_row
+from embomatrix.manager.runtime.serialization import repute_of, repute_row
 from embomatrix.reward.breakdown import AtomResult
 
 SAME = {"platform": "a1", "pybullet": "3.2.7"}

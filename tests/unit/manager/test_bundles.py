@@ -84,7 +84,7 @@ async def test_what_somebody_needs_stays_however_long_it_was_not_used(full):
 
 async def test_a_folder_full_of_what_is_needed_refuses_and_keeps_everything(full):
     full.needed = set("abc")
-    with pytest.raises(OverloadedError, match="needed or were used lately"):
+    with pytest.raises(OverloadedError, match="needed or were used recently"):
         await full.put("d")
     assert full.there() == "abc"
     full.needed = set()

@@ -23,7 +23,7 @@ from embomatrix.manager.control.events import (
     WorkerSuspected,
 )
 from embomatrix.manager.control.schedule.placement import RunShare, in_turns, quotas
-from embomatrix.rpc.leases import LeaseProgress
+from embomatrix.rpc.wire.leases import LeaseProgress
 from embomatrix.rpc.wire.values import (
     Batch,
     Cancelled,

@@ -19,7 +19,7 @@ from embomatrix.manager.control.events import (
     WorkerRecovered,
     WorkerSuspected,
 )
-from embomatrix.rpc.leases import LeaseRef
+from embomatrix.rpc.wire.leases import LeaseRef
 from embomatrix.rpc.wire.values import (
     Batch,
     Cancelled,

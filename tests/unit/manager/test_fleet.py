@@ -4,7 +4,7 @@ import pytest
 
 from embomatrix.manager.control.dispatch.records import LeaseRecord, RolloutKey, RolloutRecord
 from embomatrix.manager.control.workers import AHEAD_S, BEHIND, CANDIDATES, SEEKERS, WorkerPool
-from embomatrix.rpc.leases import LeaseRef
+from embomatrix.rpc.wire.leases import LeaseRef
 from embomatrix.rpc.wire.values import Resources, Rollout
 
 MANY = 3 * CANDIDATES

@@ -4,12 +4,14 @@ import json
 from dataclasses import replace
 
 import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
 from embomatrix.manager.web.floor_plan import floor_plan, played, small_things
 from embomatrix.manager.web.gallery import Gallery
 from embomatrix.manager.web.gallery_values import SceneName
-from embomatrix.manager.web.no_gallery import NO_DATASET, NoGallery
+from embomatrix.manager.web.rest_tasks import NO_DATASET, task_routes
 from embomatrix.rpc.status import NotFoundError, UnavailableError
 from embomatrix.skills.parse import parse_plan, plan_to_json
 from embomatrix.world.bundle import Bundle, encode_bundle
@@ -59,7 +61,15 @@ async def test_bundles_are_called_by_their_scenes_where_there_is_a_dataset(folde
     gallery = Gallery(folder)
     assert await gallery.scenes(offset=0, limit=9) == [SceneName(digest_of(folder), SCENE.scene_id)]
     assert await gallery.scenes(offset=1, limit=9) == []
-    assert await NoGallery().scenes(offset=0, limit=9) == []
+
+
+def test_manager_without_a_dataset_shows_no_tasks():
+    app = FastAPI()
+    app.include_router(task_routes(None))
+    http = TestClient(app)
+    assert http.get("/api/v1/tasks").json()["notice"] == NO_DATASET
+    assert http.get("/api/v1/scenes").json() == []
+    assert http.get("/api/v1/tasks/tidy").status_code == 404
 
 
 async def test_a_task_is_shown_with_its_objects_what_was_said_and_its_tree(folder):
@@ -105,7 +115,6 @@ async def test_a_picture_is_a_jpeg_or_none(folder):
 
 
 async def test_a_dataset_that_is_not_there_or_damaged_is_told_in_a_sentence(folder, tmp_path):
-    assert (await NoGallery().page(**EVERY)).notice == NO_DATASET
     with pytest.raises(UnavailableError, match="--dataset"):
         await Gallery(tmp_path / "nowhere").page(**EVERY)
     gallery = Gallery(folder)

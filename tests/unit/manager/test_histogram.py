@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from embomatrix.manager.observe.histogram import BOUNDS_S, Histogram, merged
+from embomatrix.manager.histogram import BOUNDS_S, Histogram, merged
 from embomatrix.manager.observe.run_figures import FIRST_STEP_S, STEPS, Series
 
 between_bounds = st.floats(1e-4, 500.0).filter(

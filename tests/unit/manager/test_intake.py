@@ -8,8 +8,8 @@ from embomatrix.manager.control.commands import CancelLease, GiveLease
 from embomatrix.manager.control.events import BatchSubmitted
 from embomatrix.manager.runtime.intake import Heartbeat, Intake
 from embomatrix.manager.runtime.registry import LivenessLimits, Registry
-from embomatrix.rpc.leases import LeaseResult, WorkerState
 from embomatrix.rpc.status import SupersededError
+from embomatrix.rpc.wire.leases import LeaseResult, WorkerState
 from embomatrix.rpc.wire.values import (
     Batch,
     Resident,

@@ -14,10 +14,10 @@ from tests.fakes.worker import completed
 from typer.testing import CliRunner
 
 from embomatrix.manager.commands.app import app
-from embomatrix.manager.observe.meter import Meter, quantile
+from embomatrix.manager.observe.metrics import Meter, quantile
 from embomatrix.manager.runtime.bundles import BundleStore
-from embomatrix.manager.runtime.records import group_and_kind, result_row, timed_row
 from embomatrix.manager.runtime.results import PER_MESSAGE, BatchLog, ResultLogs
+from embomatrix.manager.runtime.serialization import group_and_kind, result_row, timed_row
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.manager.store.protocol import ResultRow
 from embomatrix.proto.v1.types_pb2 import RolloutResult as RolloutResultMessage
@@ -207,7 +207,7 @@ async def test_a_folder_that_is_gone_is_named(tmp_path):
 
 async def test_a_bundle_that_was_never_put_is_not_found(tmp_path):
     store = BundleStore(tmp_path, total_bytes=1000)
-    with pytest.raises(NotFoundError, match="put it first"):
+    with pytest.raises(NotFoundError, match="upload it first"):
         await anext(store.get(digest_of(b"nothing")))
 
 

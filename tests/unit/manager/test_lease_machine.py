@@ -41,7 +41,7 @@ from embomatrix.manager.control.events import (
     WorkerResumed,
     WorkerSuspected,
 )
-from embomatrix.rpc.leases import LeaseProgress
+from embomatrix.rpc.wire.leases import LeaseProgress
 from embomatrix.rpc.wire.values import (
     Batch,
     Cancelled,

@@ -7,7 +7,7 @@ from tests.unit.manager.test_lease_machine import LIMITS, WORKERS, LeaseMachine
 
 from embomatrix.manager.control.cluster_state import ClusterState
 from embomatrix.manager.control.events import BatchRestored, WorkerJoined, WorkerReported, WorkersExpected
-from embomatrix.rpc.leases import LeaseClaim
+from embomatrix.rpc.wire.leases import LeaseClaim
 from embomatrix.rpc.wire.values import Resources
 
 

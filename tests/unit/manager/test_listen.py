@@ -4,8 +4,8 @@ import socket
 
 import pytest
 
-from embomatrix.manager.runtime.listen import PortInUseError, bound_socket
-from embomatrix.manager.store.url import without_password
+from embomatrix.manager.services.listen import PortInUseError, bound_socket
+from embomatrix.rpc.logs import without_secrets
 
 
 def test_free_port_is_bound_and_given_back():
@@ -43,4 +43,4 @@ def test_address_of_another_machine_is_told_to_change_the_host():
     ],
 )
 def test_password_of_a_state_url_is_not_shown(url, shown):
-    assert without_password(url) == shown
+    assert without_secrets(url) == shown

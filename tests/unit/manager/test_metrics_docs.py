@@ -6,14 +6,13 @@ from pathlib import Path
 import pytest
 
 from embomatrix.manager.control.cluster_state import ClusterState
-from embomatrix.manager.observe.archive import RunArchive
-from embomatrix.manager.observe.effort import Effort
+from embomatrix.manager.observe.metrics import ManagerLoad
+from embomatrix.manager.observe.run_archive import RunArchive
 from embomatrix.manager.runtime.bundles import BundleStore
 from embomatrix.manager.runtime.event_loop import ManagerRuntime
 from embomatrix.manager.runtime.registry import LivenessLimits, Registry
-from embomatrix.manager.store.memory import MemoryStore
+from embomatrix.manager.store.opening import open_store, timed_store
 from embomatrix.manager.store.protocol import Shelf
-from embomatrix.manager.store.timed import timed_store
 from embomatrix.manager.web.prometheus import metrics_page
 
 GUIDE = Path(__file__).parents[3] / "docs" / "operations.md"
@@ -24,7 +23,7 @@ OWN = re.compile(r"# (?:HELP|TYPE) (embo_\w+)")
 async def page(tmp_path):
     bundles = BundleStore(tmp_path / "bundles", total_bytes=1)
     cluster, registry = ClusterState(boot_id="boot"), Registry(LivenessLimits())
-    runtime = ManagerRuntime(cluster, registry, MemoryStore(), bundles, RunArchive(tmp_path / "runs"))
+    runtime = ManagerRuntime(cluster, registry, open_store("memory:"), bundles, RunArchive(tmp_path / "runs"))
     await runtime.start()
     return metrics_page(runtime)
 
@@ -47,7 +46,7 @@ async def test_every_state_and_outcome_is_told_before_it_first_happens(page):
 
 
 def test_overhead_is_of_the_last_minute():
-    effort = Effort()
+    effort = ManagerLoad()
     effort.sample(0.0, 0.0, 0.0)
     assert effort.overhead() == 0.0
     effort.sample(10.0, 9.0, 1.0)
@@ -59,7 +58,7 @@ def test_overhead_is_of_the_last_minute():
 
 async def test_a_store_is_timed_by_operation_and_otherwise_the_same():
     took = []
-    store = timed_store(MemoryStore(), lambda name, seconds: took.append((name, seconds >= 0.0)))
+    store = timed_store(open_store("memory:"), lambda name, seconds: took.append((name, seconds >= 0.0)))
     assert await store.runs() == []
     assert await store.rows(Shelf.CREDENTIALS) == []
     assert took == [("runs", True), ("rows", True)]

@@ -25,7 +25,7 @@ from embomatrix.manager.control.events import (
     WorkerReported,
     WorkersExpected,
 )
-from embomatrix.rpc.leases import LeaseClaim, LeaseOrigin, LeaseRef
+from embomatrix.rpc.wire.leases import LeaseClaim, LeaseOrigin, LeaseRef
 from embomatrix.rpc.wire.values import (
     Batch,
     Resident,

@@ -69,7 +69,7 @@ def test_ten_silent_seconds_lose_a_worker(registry):
     registry.tick(now_s=5.0)
     (lost,) = registry.tick(now_s=10.0)
     assert isinstance(lost, WorkerLost)
-    with pytest.raises(SupersededError, match="given up"):
+    with pytest.raises(SupersededError, match="is lost"):
         registry.find(session.session_id, session.epoch)
 
 
@@ -130,7 +130,7 @@ def test_a_worker_that_leaves_in_order_is_not_counted_as_lost(registry):
     assert {session.standing for session in registry.sessions.values()} == {WorkerStanding.LEFT}
     with pytest.raises(SupersededError, match="it left"):
         registry.find(said.session_id, said.epoch)
-    with pytest.raises(NotFoundError, match=r"'said' is gone .it left.: start it again"):
+    with pytest.raises(NotFoundError, match=r"'said' is gone .it left.: restart it"):
         registry.resume("said")
     with pytest.raises(NotFoundError, match="no worker 'nobody': connected are none"):
         registry.resume("nobody")

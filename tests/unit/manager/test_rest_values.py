@@ -2,14 +2,11 @@
 
 from dataclasses import replace
 
-from embomatrix.manager.observe.meter import FAILURES_KEPT, FailureNote
-from embomatrix.manager.web.health import Mood, health
-from embomatrix.manager.web.rest_values import run_page, worker_page
-from embomatrix.manager.web.slot_tracks import TRACKS, timeline
-from embomatrix.manager.web.snapshot import Snapshot
-from embomatrix.manager.web.views import Overview, RunView, WorkerView
-from embomatrix.rpc.run_log import EventKind, EventPage, RunEvent
-from embomatrix.rpc.wire.values import RunStats, Timings
+from embomatrix.manager.observe.metrics import FAILURES_KEPT, FailureNote
+from embomatrix.manager.web.cluster_view import Mood, Overview, Snapshot, WorkerView, health
+from embomatrix.manager.web.rest_values import TRACKS, run_page, timeline, worker_page
+from embomatrix.rpc.wire.run_log import EventKind, EventPage, RunEvent
+from embomatrix.rpc.wire.values import RunInfo, RunStats, Timings
 
 CALM = Overview(
     uptime_s=60.0,
@@ -44,32 +41,32 @@ def test_health_says_first_what_matters_most():
     assert mood(runs=0, queued=0) == (Mood.IDLE, "Ready: 2 workers wait for a run.")
     assert mood(workers={}, queued=0) == (Mood.IDLE, "No worker has joined yet.")
     assert mood(workers={"left": 4}, queued=0) == (Mood.IDLE, "Every worker has left.")
-    assert mood(workers={"left": 4}) == (Mood.BAD, "3 rollouts wait, and no worker is there.")
+    assert mood(workers={"left": 4}) == (Mood.BAD, "3 rollouts are queued and no worker is connected.")
     assert mood(workers={"ready": 1, "left": 9}) == (Mood.GOOD, "All is well.")
-    assert mood(workers={"lost": 2, "paused": 1, "left": 1}) == (Mood.BAD, "None of 3 workers works.")
+    assert mood(workers={"lost": 2, "paused": 1, "left": 1}) == (Mood.BAD, "None of 3 workers is working.")
     assert mood(workers={"ready": 1, "quarantined": 1})[0] is Mood.BAD
-    assert mood(workers={"ready": 1, "lost": 1})[1].startswith("1 worker lost a moment ago")
-    assert mood(workers={"ready": 1, "lost": 2})[1].endswith("what they held went to others.")
+    assert mood(workers={"ready": 1, "lost": 1})[1].startswith("1 worker lost recently")
+    assert mood(workers={"ready": 1, "lost": 2})[1].endswith("all leases were re-dispatched.")
     assert mood(unplaceable=1, workers={"ready": 1, "lost": 1}) == (
         Mood.WARNING,
-        "No worker can hold 1 announced scene: the look-ahead page says why.",
+        "1 announced scene fits on no worker: the look-ahead page shows the reason.",
     )
     assert mood(workers={"ready": 7, "lost": 3}, failures=[NOTE]) == (
         Mood.BAD,
-        "3 of 10 workers were lost a moment ago; what they held went to others.",
+        "3 of 10 workers were lost recently; their leases were re-dispatched.",
     )
     assert "slot_crashed" in mood(workers={"ready": 12, "lost": 3}, failures=[NOTE])[1]
-    assert mood(leased=0)[1] == "3 rollouts wait and none runs: no scene is warm yet."
+    assert mood(leased=0)[1] == "3 rollouts are queued and none runs: no scene is warm yet."
     full = "the state file can't be written: make room on its disk"
     assert mood(store=full, paused=True) == (
         Mood.BAD,
-        f"Nothing can be written down, so nothing goes on: {full}.",
+        f"The state store cannot be written, so dispatch has stopped: {full}.",
     )
     assert mood(paused=True, workers={})[1].startswith("Dispatch is paused")
 
 
 def test_failures_are_news_for_five_minutes():
-    assert mood(failures=[NOTE])[1] == "1 rollout was given up in the last 5 minutes, for slot_crashed."
+    assert mood(failures=[NOTE])[1] == "1 rollout failed in the last 5 minutes, with slot_crashed."
     assert mood(failures=[NOTE] * FAILURES_KEPT)[1].startswith(f"{FAILURES_KEPT} or more rollouts")
     assert mood(failures=[NOTE], now_s=2000.0) == (Mood.GOOD, "All is well.")
 
@@ -88,7 +85,7 @@ SEEN = Snapshot(
         worker("Zoe", "lost"),
         worker("ann", "paused"),
     ],
-    [RunView(f"r{number}", "", 0, RunStats()) for number in range(5)],
+    [RunInfo(f"r{number}", "", RunStats(), 0) for number in range(5)],
     [],
     training=[],
 )

@@ -24,7 +24,7 @@ from embomatrix.manager.control.events import (
 from embomatrix.manager.control.schedule.placement import Need, Site, needs_of, place
 from embomatrix.manager.control.schedule.scheduler import ScheduleLimits, Scheduler
 from embomatrix.manager.control.workers import WorkerPool
-from embomatrix.rpc.leases import LeaseRef
+from embomatrix.rpc.wire.leases import LeaseRef
 from embomatrix.rpc.wire.values import (
     Batch,
     LookaheadEntry,

@@ -14,7 +14,7 @@ from embomatrix.manager.simulation.line import Line
 from embomatrix.manager.simulation.run import simulate
 from embomatrix.manager.simulation.scenario import LOCAL, MIXED, Faults, Scenes, SimulationScenario, Trainer
 from embomatrix.reward.breakdown import RewardBreakdown
-from embomatrix.rpc.leases import LeaseOrigin, LeaseRef, WorkerState
+from embomatrix.rpc.wire.leases import LeaseOrigin, LeaseRef, WorkerState
 from embomatrix.rpc.wire.values import (
     Batch,
     Completed,

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 
 from embomatrix.manager.control.events import BatchContinued, BatchSubmitted
-from embomatrix.manager.runtime.submissions import PIECE, Submissions
+from embomatrix.manager.runtime.runs import PIECE, Submissions
 from embomatrix.rpc.wire.values import Batch, Rollout
 
 

@@ -12,7 +12,7 @@ from embomatrix.manager.observe.training_reports import (
     TrainingBook,
 )
 from embomatrix.rpc.status import NotFoundError
-from embomatrix.rpc.training import FIGURES, SampledPlan, TrainingReport
+from embomatrix.rpc.wire.training import FIGURES, SampledPlan, TrainingReport
 
 PLAN = SampledPlan("task-1", "tidy up", "move 3", None, 0.0)
 

@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
-from embomatrix.rpc.wire import batch as convert_batch
 from embomatrix.rpc.wire import outcome as convert_outcome
 from embomatrix.rpc.wire import rollout as convert
 from embomatrix.rpc.wire import run as convert_run
 from embomatrix.rpc.wire import session as convert_session
-from embomatrix.rpc.wire.rollout import ConvertError
+from embomatrix.rpc.wire.codec import ConvertError
 from embomatrix.rpc.wire.values import (
     Batch,
     Cancelled,
@@ -120,7 +119,7 @@ def test_every_skill_call_comes_back_equal(call):
 @given(st.lists(ROLLOUTS, max_size=4, unique_by=lambda rollout: rollout.rollout_id).map(tuple), NAMES, UINT64)
 def test_a_batch_comes_back_equal(rollouts, name, step):
     batch = Batch("run-1", name, step, rollouts)
-    assert convert_batch.batch_from_proto(_over_the_wire(convert_batch.batch_to_proto(batch))) == batch
+    assert convert.batch_from_proto(_over_the_wire(convert.batch_to_proto(batch))) == batch
 
 
 @given(RESULTS)
@@ -243,7 +242,9 @@ def test_an_answer_to_the_look_ahead_comes_back_equal(answer):
 
 @pytest.mark.parametrize("warmth", Warmth)
 def test_every_warmth_comes_back_equal(warmth):
-    assert convert_run.warmth_from_proto(convert_run.warmth_to_proto(warmth)) is warmth
+    answer = LookaheadAnswer("sha256:0", warmth)
+    message = _over_the_wire(convert_run.lookahead_answer_to_proto(answer))
+    assert convert_run.lookahead_answer_from_proto(message) == answer
 
 
 def test_every_enum_value_of_the_wire_has_a_meaning_here():
@@ -281,7 +282,7 @@ def test_a_malformed_plan_names_the_field(calls, field):
     rollout = types_pb2.Rollout(rollout_id="r", group_id="g", bundle_digest="d", task_id="t", plan=calls)
     request = rollout_service_pb2.ExecuteRequest(run_id="run", batch_id="b", rollouts=[rollout])
     with pytest.raises(ConvertError) as caught:
-        convert_batch.batch_from_proto(request)
+        convert.batch_from_proto(request)
     assert caught.value.field == field
     assert str(caught.value).startswith(f"{field}: ")
 
@@ -289,8 +290,8 @@ def test_a_malformed_plan_names_the_field(calls, field):
 def test_two_rollouts_of_one_id_are_refused():
     rollout = types_pb2.Rollout(rollout_id="r", group_id="g", bundle_digest="d", task_id="t")
     request = rollout_service_pb2.ExecuteRequest(run_id="run", batch_id="b", rollouts=[rollout, rollout])
-    with pytest.raises(ConvertError, match=r"rollouts\[1\].rollout_id: 'r' stands twice"):
-        convert_batch.batch_from_proto(request)
+    with pytest.raises(ConvertError, match=r"rollouts\[1\].rollout_id: 'r' occurs twice"):
+        convert.batch_from_proto(request)
 
 
 def test_a_result_without_an_outcome_is_refused():

@@ -3,10 +3,13 @@
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.fakes.leases import lease_to_proto
 
 from embomatrix.proto.v1 import worker_service_pb2
 from embomatrix.reward.breakdown import RewardBreakdown
-from embomatrix.rpc.leases import (
+from embomatrix.rpc.wire import session as convert
+from embomatrix.rpc.wire.codec import ConvertError
+from embomatrix.rpc.wire.leases import (
     Lease,
     LeaseClaim,
     LeaseOrigin,
@@ -15,8 +18,6 @@ from embomatrix.rpc.leases import (
     LeaseResult,
     WorkerState,
 )
-from embomatrix.rpc.wire import session as convert
-from embomatrix.rpc.wire.rollout import ConvertError
 from embomatrix.rpc.wire.values import (
     Completed,
     InfraCode,
@@ -98,7 +99,7 @@ def test_a_cell_of_the_look_ahead_grid_comes_back_equal(cell):
     st.builds(Lease, REFS, st.builds(Rollout, NAMES, NAMES, NAMES, NAMES, st.just(PLAN), st.just(7)), SECONDS)
 )
 def test_a_lease_comes_back_equal(lease):
-    assert convert.lease_from_proto(_over_the_wire(convert.lease_to_proto(lease))) == lease
+    assert convert.lease_from_proto(_over_the_wire(lease_to_proto(lease))) == lease
 
 
 @given(st.lists(RESIDENTS, max_size=2).map(tuple), SECONDS)

@@ -3,7 +3,8 @@
 import pytest
 
 from embomatrix.proto.v1 import rollout_service_pb2 as pb
-from embomatrix.rpc.training import (
+from embomatrix.rpc.wire.codec import ConvertError
+from embomatrix.rpc.wire.training import (
     FIGURES,
     PLANS,
     TEXT_CHARS,
@@ -11,9 +12,9 @@ from embomatrix.rpc.training import (
     SampledPlan,
     SampledStep,
     TrainingReport,
+    training_report_from_proto,
+    training_report_to_proto,
 )
-from embomatrix.rpc.wire.rollout import ConvertError
-from embomatrix.rpc.wire.training import training_report_from_proto, training_report_to_proto
 
 STEPS = (SampledStep("move", True, "went to the table"), SampledStep("open", False, "no free hand"))
 SOLVED = SampledPlan("t1", "tidy up", "move 3", RewardTiers(0.5, 0.4, 15.0, False), -0.7, "", STEPS)

@@ -61,7 +61,7 @@ def test_traces_do_not_depend_on_what_a_waiting_process_made(bundle) -> None:
     order = [(plan, seed) for plan in range(len(PLANS)) for seed in SEEDS]
     engine = BulletEngine(bundle.scene)
     simulator = Simulator(bundle, engine)
-    steps = sum(1 for _ in (*engine.complete(), *simulator.complete()))
+    steps = sum(1 for _ in (*engine.warm_up(), *simulator.warm_up()))
     assert steps > 3 * len(bundle.scene.objects)
     task = task_over(bundle.scene)
     found = {}

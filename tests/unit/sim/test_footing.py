@@ -9,7 +9,7 @@ from tests.fakes.scenes import kitchen_scene
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.state.relations import Relations
-from embomatrix.sim.state.supports import NOWHERE, Footings
+from embomatrix.sim.state.supports import UNSUPPORTED, SupportTracker
 from embomatrix.world.geometry import Pose
 from embomatrix.world.state import Relation
 
@@ -62,12 +62,12 @@ def change(engine, kind, name, seed) -> None:
 @given(st.lists(CHANGE, max_size=12))
 def test_kept_footings_are_those_of_a_fresh_look(engine, changes) -> None:
     engine.reset()
-    kept = Footings(engine)
+    kept = SupportTracker(engine)
     for kind, name, seed in changes:
         change(engine, kind, name, seed)
         if kind == "ask":
             kept.of(name)
-    fresh, pairs = Footings(engine), Footings(engine)
+    fresh, pairs = SupportTracker(engine), SupportTracker(engine)
     for name in engine.scene.by_name:
         for other in ("bowl_1", "fridge_1", "breakfast_table_1", "countertop_1"):
             if name != other and not engine.is_parked(name) and not engine.is_parked(other):
@@ -110,4 +110,4 @@ def test_nothing_is_inside_and_on_top_of_one_closable_cavity(engine, changes) ->
 def test_what_is_parked_stands_nowhere(engine) -> None:
     engine.reset()
     engine.park("bowl_1")
-    assert Footings(engine).of("bowl_1") == NOWHERE
+    assert SupportTracker(engine).of("bowl_1") == UNSUPPORTED

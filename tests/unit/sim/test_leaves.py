@@ -11,7 +11,7 @@ from tests.fakes.furniture import box
 from tests.fakes.plans import executed, plan_of, task_over, with_objects
 from tests.fakes.scenes import NORTH, kitchen_scene, placed, upright
 
-from embomatrix.sim.joints.panels import Leaves
+from embomatrix.sim.joints.panels import DoorPanels
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.limits import ROBOT
@@ -62,7 +62,7 @@ def test_robot_steps_out_of_the_place_that_a_drawer_takes_and_still_reaches_it(f
     world = flat.world
     ground, robot = world.navigator.ground, world.robot
     assert ground.grid.is_free(robot.x_m, robot.y_m)
-    assert world.navigator.aside("bottom_cabinet_1", robot) == robot
+    assert world.navigator.step_aside("bottom_cabinet_1", robot) == robot
     assert (ground.grid.free < ground.shut.free).any(), "the drawers take floor"
     assert world.reach("bottom_cabinet_1").distance_m <= ROBOT.reach_m
     assert not executed(flat, f"{OPENED}; pick_up mug_2").failure
@@ -146,12 +146,12 @@ def test_a_drawer_that_something_stops_comes_out_up_to_it():
     scene = dataclasses.replace(drawer_scene(), walls=(*drawer_scene().walls, wall))
     simulator = load_simulator(Bundle(scene, {}))
     try:
-        leaves = Leaves(simulator.world.engine, simulator.world.relations, "bottom_cabinet_1")
+        panels = DoorPanels(simulator.world.engine, simulator.world.relations, "bottom_cabinet_1")
         course = [(share, share) for share in (0.25, 0.5, 0.75, 1.0)]
-        reached, other = leaves.swing(course)
+        reached, other = panels.swing(course)
         assert reached < len(course)
         assert other
-        leaves.go_on(course[reached - 1], course[reached])
+        panels.advance(course[reached - 1], course[reached])
         front = simulator.world.engine.aabb("bottom_cabinet_1").high_m[1]
         assert front == pytest.approx(0.75, abs=0.003)
     finally:
@@ -182,11 +182,11 @@ def test_what_stands_before_a_drawer_keeps_it_from_opening(flat):
     engine = flat.world.engine
     bowl = flat.world.asset("bowl_1")
     engine.set_pose("bowl_1", upright(4.0, 0.26 + 0.25 + 0.13, 0.0, bowl))
-    leaves = Leaves(engine, flat.world.relations, "bottom_cabinet_1")
+    panels = DoorPanels(engine, flat.world.relations, "bottom_cabinet_1")
     before = engine.state_bytes()
-    reached, other = leaves.swing([(share, share) for share in (0.25, 0.5, 0.75, 1.0)])
+    reached, other = panels.swing([(share, share) for share in (0.25, 0.5, 0.75, 1.0)])
     assert (reached, other) == (0, "bowl_1")
-    leaves.put_back()
+    panels.restore()
     assert engine.state_bytes() == before
 
 
@@ -196,8 +196,8 @@ def test_what_rests_on_a_rider_rides_along(flat):
     engine = flat.world.engine
     x, y, z = engine.pose("book_1").position_m
     engine.set_pose("apple_1", upright(x, y, z + 0.02, flat.world.asset("apple_1")))
-    leaves = Leaves(engine, flat.world.relations, "bottom_cabinet_1")
-    assert set(leaves.riders) == {"mug_2", "book_1", "apple_1"}
+    panels = DoorPanels(engine, flat.world.relations, "bottom_cabinet_1")
+    assert set(panels.carried) == {"mug_2", "book_1", "apple_1"}
 
 
 # Whatever is done, a reset brings the start back to the bit, and a failed call changes nothing.

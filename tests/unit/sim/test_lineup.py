@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from embomatrix.sim.geometry.batch_poses import Lineup, Neighbours, PoseSet
+from embomatrix.sim.geometry.batch_poses import Neighbours, PoseBoxes, PoseSet
 from embomatrix.sim.geometry.bounds import bounds_of, square_box
 from embomatrix.sim.placing.trial import in_reach
 from embomatrix.world.asset import Asset, Joint, JointKind, Link
@@ -41,8 +41,8 @@ BOX = st.builds(
 )
 
 
-def lineup_of(boxes: list[Aabb]) -> Lineup:
-    return Lineup(np.array([box.low_m for box in boxes]), np.array([box.high_m for box in boxes]))
+def lineup_of(boxes: list[Aabb]) -> PoseBoxes:
+    return PoseBoxes(np.array([box.low_m for box in boxes]), np.array([box.high_m for box in boxes]))
 
 
 @given(st.lists(st.tuples(POSE, st.sampled_from(("", "drawer"))), min_size=1, max_size=5), POSE, POSE, POSE)
@@ -50,11 +50,11 @@ def test_boxes_of_many_poses_are_those_of_each(spots, frame, drawer, then) -> No
     poses, links = [pose for pose, _ in spots], [link for _, link in spots]
     frames = {"": frame, "drawer": drawer}
     bounds = bounds_of(LAMP)
-    lineup = PoseSet.of(pose_rows(poses), links, then).lineup(bounds, (0.5,), frames)
+    boxes = PoseSet.of(pose_rows(poses), links, then).world_boxes(bounds, (0.5,), frames)
     for row, (pose, link) in enumerate(spots):
         box = bounds.box(frames[link] @ (pose @ then), (0.5,))
-        assert lineup.lows_m[row].tolist() == pytest.approx(box.low_m, abs=1e-9)
-        assert lineup.highs_m[row].tolist() == pytest.approx(box.high_m, abs=1e-9)
+        assert boxes.lows_m[row].tolist() == pytest.approx(box.low_m, abs=1e-9)
+        assert boxes.highs_m[row].tolist() == pytest.approx(box.high_m, abs=1e-9)
 
 
 SQUARE_POSE = st.builds(
@@ -74,8 +74,8 @@ SQUARE_POSE = st.builds(
 def test_boxes_kept_in_a_supports_frame_are_those_in_the_world_where_it_stands_square(spots, frame, drawer):
     places = PoseSet.of(pose_rows([pose for pose, _ in spots]), [link for _, link in spots])
     frames = {"": frame, "drawer": drawer}
-    expected = places.lineup(bounds_of(LAMP), (0.0,), frames)
-    found = places.boxes(bounds_of(LAMP)).lineup(frames)
+    expected = places.world_boxes(bounds_of(LAMP), (0.0,), frames)
+    found = places.boxes(bounds_of(LAMP)).world_boxes(frames)
     assert found is not None
     assert found.lows_m == pytest.approx(expected.lows_m, abs=1e-9)
     assert found.highs_m == pytest.approx(expected.highs_m, abs=1e-9)
@@ -86,7 +86,7 @@ def test_boxes_kept_in_a_supports_frame_are_those_in_the_world_where_it_stands_s
 )
 def test_boxes_kept_in_a_supports_frame_tell_nothing_of_one_that_stands_askew(askew) -> None:
     places = PoseSet.of(pose_rows([Pose((0.0, 0.0, 0.5))]), [""])
-    assert places.boxes(bounds_of(LAMP)).lineup({"": askew}) is None
+    assert places.boxes(bounds_of(LAMP)).world_boxes({"": askew}) is None
 
 
 def test_boxes_that_are_moved_keep_their_links_and_sizes() -> None:
@@ -128,10 +128,10 @@ def test_what_has_a_hollow_is_taken_only_on_its_own_level() -> None:
 
 
 def test_a_pose_on_a_link_without_a_frame_is_in_nobodys_reach() -> None:
-    lineup = PoseSet.of(pose_rows([Pose((0.0, 0.0, 0.5))]), ["drawer"]).lineup(
+    boxes = PoseSet.of(pose_rows([Pose((0.0, 0.0, 0.5))]), ["drawer"]).world_boxes(
         bounds_of(LAMP), (0.0,), {"": Pose((0.0, 0.0, 0.0))}
     )
-    assert not lineup.reached_from(StandPose(0.0, 0.0, 0.0)).any()
+    assert not boxes.reached_from(StandPose(0.0, 0.0, 0.0)).any()
 
 
 def test_poses_taken_in_turn_keep_their_rotations() -> None:

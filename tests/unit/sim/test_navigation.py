@@ -184,7 +184,7 @@ def test_thing_put_on_the_floor_bars_the_way_until_it_is_taken_up(engine, naviga
 def test_floors_with_one_thing_open_are_the_same_when_they_were_found_ahead(engine, navigator) -> None:
     jointed = [item for item in engine.scene.objects if item.fixed and item.joints]
     ahead = Navigator(engine, Relations(engine))
-    assert len(list(ahead.ground.complete())) == len(jointed) > 0
+    assert len(list(ahead.ground.warm_up())) == len(jointed) > 0
     for item in jointed:
         engine.set_joints(item.name, (1.0,) * len(item.joints))
         for each in (ahead, navigator):

@@ -3,7 +3,7 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from embomatrix.sim.geometry.spatial_hash import Neighbourhood
+from embomatrix.sim.geometry.spatial_hash import SpatialHash
 from embomatrix.world.geometry import Aabb
 
 PLACE = st.tuples(*[st.floats(-40.0, 40.0)] * 3)
@@ -20,7 +20,7 @@ BOX = st.builds(box_at, PLACE, SIZE)
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 8), st.none() | BOX), max_size=30), BOX, st.floats(0.0, 1.0))
 def test_near_boxes_are_those_that_a_comparison_of_all_finds(changes, asked, reach_m) -> None:
-    around, boxes = Neighbourhood(), {}
+    around, boxes = SpatialHash(), {}
     for number, box in changes:
         if box is None:
             around.take_out(number)

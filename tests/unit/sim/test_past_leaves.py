@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.fakes.furniture import cupboard
 
-from embomatrix.sim.geometry.batch_poses import Lineup
-from embomatrix.sim.joints.behind_panels import behind_leaves
+from embomatrix.sim.geometry.batch_poses import PoseBoxes
+from embomatrix.sim.joints.behind_panels import behind_panels
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose
 
@@ -28,8 +28,8 @@ def is_behind(
 ) -> bool:
     middle = np.array([pose.apply(point)])
     x, y, _ = pose.apply((*stand, 0.0))
-    boxes = Lineup(middle - 0.03, middle + 0.03)
-    (answer,) = behind_leaves(boxes, FRIDGE, pose, (fraction,), StandPose(x, y, 0.0)).tolist()
+    boxes = PoseBoxes(middle - 0.03, middle + 0.03)
+    (answer,) = behind_panels(boxes, FRIDGE, pose, (fraction,), StandPose(x, y, 0.0)).tolist()
     return bool(answer)
 
 

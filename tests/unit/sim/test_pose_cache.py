@@ -9,7 +9,7 @@ from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.bullet.mini_world import MiniWorld, Still
+from embomatrix.sim.bullet.mini_world import MiniWorld, StaticObject
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.candidates import beside, candidates, stands_in
 from embomatrix.sim.placing.pose_cache import POSES, PlacementLibrary, build_pose_cache
@@ -62,7 +62,7 @@ def test_every_cached_pose_is_in_its_relation_and_stays_put(cache, pool) -> None
     for key, poses in cache.placements.items():
         held, support = assets[key.asset_id], assets[key.support_asset_id]
         base = Pose((0.0, 0.0, support.size_m[2] / 2))
-        mini.stage(held, base @ poses[0], (), [Still(support, base, (0.0,) * len(support.joints))])
+        mini.stage(held, base @ poses[0], (), [StaticObject(support, base, (0.0,) * len(support.joints))])
         for pose in poses[::5]:
             assert stands_in(held, pose, support, key.relation)
             assert mini.drop(base @ pose, steps=240).moved_m < 0.01, key

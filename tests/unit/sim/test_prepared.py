@@ -50,7 +50,7 @@ def test_boxes_obstacles_and_floor_are_those_that_loading_would_derive(bundle):
     assert boxes == found.object_boxes
     assert np.array_equal(grid.covered, other.covered)
     assert np.array_equal(grid.free, other.free)
-    for column in ("boxes", "owners", "leaves"):
+    for column in ("boxes", "owners", "is_panel"):
         assert np.array_equal(getattr(obstacles, column), getattr(others, column))
 
 

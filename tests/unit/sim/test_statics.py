@@ -7,7 +7,7 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from embomatrix.sim.bullet.client import ClientPool
-from embomatrix.sim.bullet.mini_world import MiniWorld, Still
+from embomatrix.sim.bullet.mini_world import MiniWorld, StaticObject
 from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of
 from embomatrix.sim.geometry.statics import base_of, is_level, rest_pose
 from embomatrix.world.asset import Asset, Link
@@ -108,7 +108,7 @@ def test_proved_object_settles_at_its_rest_pose(
     rest = proved(held, support, pose)
     assume(rest is not None)
     stands = Pose((0.0, 0.0, other_size[2] / 2))
-    mini.stage(held, stands @ pose, (), [Still(support, stands)])
+    mini.stage(held, stands @ pose, (), [StaticObject(support, stands)])
     settled = mini.drop(stands @ pose)
     assert settled.stable
     assert settled.pose.position_m == pytest.approx((stands @ rest).position_m, abs=3e-4)

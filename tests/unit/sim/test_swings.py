@@ -1,4 +1,4 @@
-"""How leaves open that nothing was moved near to is found out ahead: the answers are those of looking at it then."""
+"""How panels open that nothing was moved near to is found out ahead: the answers are those of looking at it then."""
 
 import pytest
 from tests.fakes.plans import plan_of, task_over
@@ -24,7 +24,7 @@ PLANS = (
 def both():
     """One simulator that found out ahead, and one that did not."""
     ahead, then = load_simulator(Bundle(drawer_scene(), {})), load_simulator(Bundle(drawer_scene(), {}))
-    for _ in ahead.complete():
+    for _ in ahead.warm_up():
         pass
     yield ahead, then
     ahead.close()
@@ -45,7 +45,7 @@ def test_plans_go_the_same_whether_doors_were_looked_at_ahead_or_not(both, plan)
 
 
 @pytest.mark.parametrize("y_m", [0.6, 0.64, 0.75, 0.9, 1.2, 3.0])
-def test_what_came_before_a_drawer_stops_it_as_if_nothing_had_been_foreseen(both, y_m) -> None:
+def test_what_came_before_a_drawer_stops_it_as_if_nothing_had_been_predicted(both, y_m) -> None:
     task = task_over(both[0].world.scene)
     outcomes = []
     for simulator in both:
@@ -60,7 +60,7 @@ def test_looking_ahead_leaves_the_scene_as_it_was(both) -> None:
     task = task_over(ahead.world.scene)
     for simulator in both:
         simulator.reset(task, 0)
-    for _ in ahead.world.swings.complete():
+    for _ in ahead.world.swings.warm_up():
         assert ahead.world.engine.state_bytes() == then.world.engine.state_bytes()
 
 
@@ -69,7 +69,7 @@ def test_nothing_is_foreseen_in_a_scene_from_which_something_is_gone(both) -> No
     simulator = load_simulator(Bundle(drawer_scene(), {}))
     try:
         simulator.world.engine.park("mug_2")
-        for _ in simulator.complete():
+        for _ in simulator.warm_up():
             pass
         plan = plan_of(task_over(then.world.scene), PLANS[0])
         first, second = (item.execute(task_over(then.world.scene), plan, 0) for item in (simulator, then))

@@ -7,7 +7,7 @@ from tests.unit.trainer.test_loop import TASKS, run
 from tests.unit.trainer.test_rollout import outcomes
 
 from embomatrix.rpc.status import PreconditionError, UnavailableError
-from embomatrix.rpc.training import TrainingReport
+from embomatrix.rpc.wire.training import TrainingReport
 from embomatrix.trainer.cluster.gateway import MAX_QUEUED_REPORTS, Gateway
 from embomatrix.trainer.grpo.records import GroupLog
 from embomatrix.trainer.logging.dashboard import PLANS_SHOWN, DashboardReporter

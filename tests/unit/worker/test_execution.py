@@ -8,10 +8,11 @@ import time
 from collections import Counter
 
 import pytest
+from tests.fakes.leases import lease_to_proto
 from tests.unit.worker.test_slots import running
 
-from embomatrix.rpc.leases import Lease, LeaseRef
-from embomatrix.rpc.wire.session import lease_from_proto, lease_to_proto
+from embomatrix.rpc.wire.leases import Lease, LeaseRef
+from embomatrix.rpc.wire.session import lease_from_proto
 from embomatrix.rpc.wire.values import (
     Completed,
     InfraCode,

@@ -4,10 +4,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.random import default_rng
 
-from embomatrix.rpc.leases import LeaseRef, LeaseResult
+from embomatrix.host.backoff import Backoff
+from embomatrix.rpc.wire.leases import LeaseRef, LeaseResult
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure
 from embomatrix.worker.link import outbox as module
-from embomatrix.worker.link.backoff import Backoff
 from embomatrix.worker.link.outbox import ResultOutbox
 
 
@@ -72,7 +72,8 @@ def test_no_result_is_lost_before_it_is_acknowledged(actions):
 
 
 def test_waits_double_up_to_the_longest_and_start_over_after_a_success():
-    backoff = Backoff(default_rng(0), longest_s=3.0)
+    rng = default_rng(0)
+    backoff = Backoff(0.2, 3.0, jitter=lambda: rng.uniform(0.8, 1.2))
     waits = [backoff.next_s() for _ in range(12)]
     assert all(0.8 <= wait / min(3.0, 0.2 * 2**n) <= 1.2 for n, wait in enumerate(waits))
     backoff.reset()

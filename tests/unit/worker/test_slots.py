@@ -13,7 +13,7 @@ import psutil
 import pytest
 from tests.fakes.simulation import PROGRAM
 
-from embomatrix.rpc.leases import Lease, LeaseRef
+from embomatrix.rpc.wire.leases import Lease, LeaseRef
 from embomatrix.rpc.wire.values import (
     Completed,
     InfraCode,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from embomatrix.rpc.leases import Lease, LeaseRef
+from embomatrix.rpc.wire.leases import Lease, LeaseRef
 from embomatrix.rpc.wire.values import ResidentState, Rollout
 from embomatrix.worker.slots.execution import Ticket
 from embomatrix.worker.slots.residents import ResidentScene

@@ -15,7 +15,7 @@ from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
 from embomatrix.rpc.channel import open_channel
-from embomatrix.rpc.leases import LeaseRef, LeaseResult, WorkerState
+from embomatrix.rpc.wire.leases import LeaseRef, LeaseResult, WorkerState
 from embomatrix.rpc.wire.outcome import completed_from_proto, completed_to_proto
 from embomatrix.rpc.wire.session import (
     lease_ref_from_proto,

@@ -140,7 +140,7 @@ def _measure_scene(scene: SceneWork, data: bytes, samples: EngineSamples) -> Non
             # A worker does this, too, before it forks slots.
             simulator.execute(task, (), 0)
             score(task, frozenset(), simulator.facts)
-            for _ in (*engine.complete(), *simulator.complete()):
+            for _ in (*engine.warm_up(), *simulator.warm_up()):
                 pass
             for execution in scene.executions:
                 task = bundle.tasks[execution.task_id]

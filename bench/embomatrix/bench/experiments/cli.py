@@ -51,7 +51,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Run the paper's experiments over several seeds: figures, and a section for docs/experiments.md.",
+    help="Run the paper's experiments over several seeds: figures, and a section for docs/experiments/training.md.",
 )
 console = Console(highlight=False, markup=False, soft_wrap=True)
 
@@ -89,7 +89,7 @@ COMPARE: Final = Preset("settings compared")
 
 _Json = Annotated[Path | None, typer.Option("--json", help="File for the figures.")]
 _Page = Annotated[
-    Path | None, typer.Option(help="Page to append the section to, such as docs/experiments.md.")
+    Path | None, typer.Option(help="Page to append the section to, such as docs/experiments/training.md.")
 ]
 _Manager = Annotated[str, typer.Option(help="HOST:PORT of a manager; by default a cluster on this machine.")]
 _Arm = Annotated[

@@ -23,16 +23,15 @@ from embomatrix.cli.cluster.tables import (
 from embomatrix.cli.cluster.trace import chrome_trace
 from embomatrix.cli.connection import Ca, Manager, Token  # noqa: TC001  typer reads the annotations when a command runs
 from embomatrix.cli.failure import fail
-from embomatrix.rpc.admin import AdminClient
+from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.status import ClusterError
-from embomatrix.rpc.token_client import TokenClient
 from embomatrix.rpc.trust import read_ca, read_token
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
 
-    from embomatrix.rpc.run_log import RunEvent, RunSummary
+    from embomatrix.rpc.wire.run_log import RunEvent, RunSummary
 
 T = TypeVar("T")
 
@@ -144,7 +143,7 @@ def revoke(
     """Send a worker away for good: its credential is void, and what it held goes to others."""
 
     async def ask() -> None:
-        async with TokenClient(manager, read_token(token), ca=read_ca(ca)) as client:
+        async with AdminClient(manager, read_token(token), ca=read_ca(ca)) as client:
             await client.revoke_worker(name, reason)
         _done(as_json, worker=name, state="revoked")
 
@@ -223,7 +222,7 @@ def events(
         console, after = Console(soft_wrap=True, highlight=False), 0
         async with _client(manager, token, ca) as client:
             while True:
-                page = await client.events(run, after=after)
+                page = await client.read_events(run, after=after)
                 for event in page.events:
                     if as_json:
                         show_json(event_plain(event))

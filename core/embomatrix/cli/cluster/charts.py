@@ -10,14 +10,14 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from embomatrix.rpc.run_log import RolloutPhase
+from embomatrix.rpc.wire.run_log import RolloutPhase
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from matplotlib.axes import Axes
 
-    from embomatrix.rpc.run_log import PhaseSummary, RunSeries
+    from embomatrix.rpc.wire.run_log import PhaseSummary, RunSeries
 
 SIZE_IN: Final = (6.2, 2.5)
 MOST_POINTS: Final = 300

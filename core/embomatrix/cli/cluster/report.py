@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.cli.cluster.charts import busy_chart, phase_chart, throughput_chart
 from embomatrix.pages.head import page_head
 from embomatrix.reward.settings import PAPER
-from embomatrix.rpc.run_log import EventKind, RolloutPhase
 from embomatrix.rpc.timeline import busy_share, slot_spans
+from embomatrix.rpc.wire.run_log import EventKind, RolloutPhase
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from embomatrix.reward.settings import RewardSettings
-    from embomatrix.rpc.run_log import PhaseSummary, RunEvent, RunSummary
+    from embomatrix.rpc.wire.run_log import PhaseSummary, RunEvent, RunSummary
 
 STEPS: Final = 240
 """Points in time at which the share of slots at work is told."""

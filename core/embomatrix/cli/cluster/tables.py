@@ -12,7 +12,7 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from embomatrix.rpc.run_log import EventKind, RunEvent
+from embomatrix.rpc.wire.run_log import EventKind, RunEvent
 from embomatrix.rpc.wire.values import ResidentState, Warmth
 
 if TYPE_CHECKING:

@@ -9,14 +9,14 @@ from __future__ import annotations
 import itertools
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.rpc.run_log import EventKind
 from embomatrix.rpc.timeline import slot_spans
+from embomatrix.rpc.wire.run_log import EventKind
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from embomatrix.rpc.run_log import RunEvent
     from embomatrix.rpc.timeline import SlotKey, Span
+    from embomatrix.rpc.wire.run_log import RunEvent
 
 MANAGER: Final = 1
 """Process id of the manager's track; workers come after it."""

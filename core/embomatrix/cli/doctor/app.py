@@ -18,7 +18,7 @@ from embomatrix.cli.doctor.machine import machine
 from embomatrix.cli.doctor.manager import Visit, manager, ports_held
 from embomatrix.cli.failure import MENDABLE, fail
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
-from embomatrix.rpc.managers import addresses_of
+from embomatrix.rpc.managers import Managers
 from embomatrix.rpc.status import ClusterError
 from embomatrix.rpc.trust import read_ca, read_token
 
@@ -52,7 +52,7 @@ def doctor(
 ) -> None:
     """Check Python, packages, ports, memory, disk and the way to the manager, and say what to do. Status 2: all is not well."""
     try:
-        addresses = addresses_of(manager or DEFAULT_ADDRESS)
+        addresses = Managers(manager or DEFAULT_ADDRESS).addresses
         secret, trusted = read_token(token), read_ca(ca)
     except ClusterError as error:
         fail("doctor", str(error))

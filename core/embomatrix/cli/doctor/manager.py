@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.cli.doctor.findings import Finding, Level
 from embomatrix.proto.v1 import rollout_service_pb2_grpc
-from embomatrix.rpc.admin import AdminClient
-from embomatrix.rpc.capabilities import Capabilities, capabilities_of
+from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.channel import open_channel
-from embomatrix.rpc.status import ClusterError, NotAllowedError, PreconditionError
-from embomatrix.rpc.versions import SPOKEN, agree, software_version
+from embomatrix.rpc.status import ClusterError, NotAllowedError, PreconditionError, cluster_errors
+from embomatrix.rpc.versions import SPOKEN, Capabilities, agree, capabilities_of, software_version
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -183,7 +182,8 @@ async def _versions(visit: Visit) -> Finding:
     try:
         async with open_channel(visit.address, ca=visit.ca) as channel:
             stub = rollout_service_pb2_grpc.RolloutServiceStub(channel)
-            return versions(await capabilities_of(stub, visit.address, timeout_s=KNOCK_S))
+            with cluster_errors(visit.address):
+                return versions(await capabilities_of(stub, timeout_s=KNOCK_S))
     except ClusterError as error:
         return Finding("versions", Level.WRONG, str(error), "is this the port of a manager's gRPC services?")
 
@@ -192,7 +192,7 @@ async def _token(visit: Visit) -> list[Finding]:
     """What becomes of who shows it, and what the manager says of the cluster then."""
     try:
         async with AdminClient(
-            visit.address, visit.token, ca=visit.ca, call_s=KNOCK_S, patience_s=0
+            visit.address, visit.token, ca=visit.ca, call_s=KNOCK_S, failover_s=0
         ) as client:
             fleet = await client.fleet()
     except NotAllowedError as error:

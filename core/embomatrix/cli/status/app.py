@@ -17,7 +17,7 @@ from embomatrix.cli.connection import Ca, Manager, Token  # noqa: TC001  typer r
 from embomatrix.cli.failure import fail
 from embomatrix.cli.status.live import Glance, earliest, screen
 from embomatrix.cli.status.words import sentences
-from embomatrix.rpc.admin import AdminClient
+from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.status import ClusterError, UnavailableError
 from embomatrix.rpc.trust import read_ca, read_token
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 REFRESH_S: Final = 1.0
 RATE_S: Final = 5.0
 """Throughput is that of so many seconds."""
-PATIENCE_S: Final = 2.0
+FAILOVER_S: Final = 2.0
 """For a manager that is away: who looks on wants to know."""
 
 
@@ -92,7 +92,7 @@ async def _look(client: AdminClient) -> Glance:
 
 
 def _client(manager: str, token: str, ca: Path | None) -> AdminClient:
-    return AdminClient(manager, read_token(token), ca=read_ca(ca), patience_s=PATIENCE_S)
+    return AdminClient(manager, read_token(token), ca=read_ca(ca), failover_s=FAILOVER_S)
 
 
 def _ask(command: str, question: Coroutine[None, None, None]) -> None:

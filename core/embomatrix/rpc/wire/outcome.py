@@ -1,23 +1,23 @@
-"""Outcomes of rollouts to wire messages and back, as ``convert`` does plans."""
+"""Conversion of rollout outcomes to and from protobuf."""
 
 from __future__ import annotations
 
 import functools
 import math
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
-from embomatrix.rpc.wire.rollout import (
-    KNOWN,
+from embomatrix.rpc.wire.codec import (
     ConvertError,
+    converters,
     each_known,
+    enum_numbers,
     finite,
     inside,
     required,
-    skill_call_from_proto,
-    skill_call_to_proto,
 )
+from embomatrix.rpc.wire.rollout import KNOWN, skill_call_from_proto, skill_call_to_proto
 from embomatrix.rpc.wire.values import (
     Cancelled,
     Completed,
@@ -34,31 +34,16 @@ if TYPE_CHECKING:
 
     from embomatrix.rpc.wire.values import Outcome
 
-_INFRA_CODES: Final[Mapping[InfraCode, types_pb2.InfraCode.ValueType]] = {
-    code: types_pb2.InfraCode.Value(f"INFRA_CODE_{code.name}") for code in InfraCode
-}
-_INFRA_VALUES: Final = {number: code for code, number in _INFRA_CODES.items()}
-
-
-def reward_to_proto(reward: RewardBreakdown) -> types_pb2.Reward:
-    return types_pb2.Reward(
-        format=reward.format,
-        relevance=reward.relevance,
-        goal=reward.goal,
-        atoms=[types_pb2.AtomResult(text=atom.text, holds=atom.holds) for atom in reward.atoms],
-        success=reward.success,
-    )
-
-
-def reward_from_proto(message: types_pb2.Reward) -> RewardBreakdown:
-    _check_reward(message)
-    return RewardBreakdown(
-        format=message.format,
-        relevance=message.relevance,
-        goal=message.goal,
-        atoms=tuple(AtomResult(atom.text, atom.holds) for atom in message.atoms),
-        success=message.success,
-    )
+reward_to_proto, reward_from_proto = converters(
+    RewardBreakdown,
+    types_pb2.Reward,
+    parts={"atoms": converters(AtomResult, types_pb2.AtomResult)},
+)
+infra_failure_to_proto, infra_failure_from_proto = converters(
+    InfraFailure,
+    types_pb2.InfraFailure,
+    enums={"code": enum_numbers(InfraCode, types_pb2.InfraCode, "INFRA_CODE")},
+)
 
 
 def _check_reward(message: types_pb2.Reward) -> None:
@@ -97,17 +82,17 @@ def timings_to_proto(timings: Timings) -> types_pb2.Timings:
 
 
 def _write_timings(timings: Timings, message: types_pb2.Timings) -> None:
-    """Replace what the message told."""
+    """Overwrite all timings of the message."""
     message.queued_s, message.load_s, message.execute_s = timings.queued_s, timings.load_s, timings.execute_s
     message.lease_s, message.deliver_s = timings.lease_s, timings.deliver_s
 
 
 def timings_from_proto(message: types_pb2.Timings) -> Timings:
-    told = (message.queued_s, message.load_s, message.execute_s, message.lease_s, message.deliver_s)
-    if not math.isfinite(sum(told)):
-        for name, seconds in zip(Timings.__slots__, told, strict=True):
+    durations_s = (message.queued_s, message.load_s, message.execute_s, message.lease_s, message.deliver_s)
+    if not math.isfinite(sum(durations_s)):
+        for name, seconds in zip(Timings.__slots__, durations_s, strict=True):
             finite(name, seconds)
-    return Timings(*told)
+    return Timings(*durations_s)
 
 
 def completed_to_proto(completed: Completed) -> types_pb2.Completed:
@@ -117,7 +102,7 @@ def completed_to_proto(completed: Completed) -> types_pb2.Completed:
 
 
 def write_completed(completed: Completed, message: types_pb2.Completed) -> None:
-    """Fill an empty message. What came as a message is passed on as it came, but for what was noted on its way."""
+    """Fill an empty message. A received result is written with its original bytes plus the ``noted`` fields."""
     if completed.wire:
         message.MergeFromString(completed.wire)
     else:
@@ -132,7 +117,7 @@ def write_completed(completed: Completed, message: types_pb2.Completed) -> None:
 
 
 def completed_from_proto(message: types_pb2.Completed) -> Completed:
-    """The result. A missing reward is a ``ConvertError``, for it is no reward of 0."""
+    """Return the result. Raise ConvertError for a missing reward, which is not a reward of 0."""
     wire = message.SerializeToString()
     completed = Completed(
         reward=inside("reward", reward_from_proto, _reward_in(message)),
@@ -148,7 +133,7 @@ def completed_from_proto(message: types_pb2.Completed) -> Completed:
 
 
 def checked_completed(message: types_pb2.Completed) -> Completed:
-    """The same for whoever only passes it on: what would be refused is refused, but values are made when they are asked for."""
+    """Return the result after the same checks, without its values. The first access to a value parses it."""
     inside("reward", _check_reward, _reward_in(message))
     wire = message.SerializeToString()
     _steps_in(wire)
@@ -172,26 +157,13 @@ def _reward_in(message: types_pb2.Completed) -> types_pb2.Reward:
 
 
 def unread_completed(wire: bytes, *, timings: Timings, warm: bool) -> Completed:
-    """The result in this message for whoever only passes it on: what else it says is found when it is read."""
+    """Return the result in these bytes unchecked. The first access to a value parses it."""
     return Completed.unread(wire, _completed_fields, timings=timings, warm=warm)
 
 
 def _completed_fields(wire: bytes) -> Mapping[str, object]:
     completed = completed_from_proto(types_pb2.Completed.FromString(wire))
     return {name: getattr(completed, name) for name in ("reward", "steps", "final", "trace_digest")}
-
-
-def infra_failure_to_proto(failure: InfraFailure) -> types_pb2.InfraFailure:
-    return types_pb2.InfraFailure(
-        code=_INFRA_CODES[failure.code], message=failure.message, worker_id=failure.worker_id
-    )
-
-
-def infra_failure_from_proto(message: types_pb2.InfraFailure) -> InfraFailure:
-    code = _INFRA_VALUES.get(message.code)
-    if code is None:
-        raise ConvertError("code", f"{message.code} is no known code: is the sender newer than this side?")
-    return InfraFailure(code, message.message, message.worker_id)
 
 
 def rollout_result_to_proto(result: RolloutResult) -> types_pb2.RolloutResult:

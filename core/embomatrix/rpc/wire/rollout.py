@@ -1,13 +1,13 @@
-"""Plans and rollouts to wire messages and back. A malformed message is a ``ConvertError`` that names the field."""
+"""Conversion of plans, rollouts and batches to and from protobuf."""
 
 from __future__ import annotations
 
 import functools
-import math
-from typing import TYPE_CHECKING, Final, Literal, TypeVar
+from typing import TYPE_CHECKING, Final, Literal
 
-from embomatrix.proto.v1 import types_pb2
-from embomatrix.rpc.wire.values import Rollout
+from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
+from embomatrix.rpc.wire.codec import ConvertError, each, each_known, finite, required
+from embomatrix.rpc.wire.values import Batch, Rollout
 from embomatrix.skills.syntax import (
     MAX_PLAN_BYTES,
     MAX_ROOM_NAME,
@@ -21,11 +21,9 @@ from embomatrix.skills.syntax import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
 ArgField = Literal["object_index", "source_index", "relation", "yaw", "distance", "room_name"]
-WireT = TypeVar("WireT")
-ValueT = TypeVar("ValueT")
 
 SKILL_KINDS: Final[Mapping[Skill, types_pb2.SkillKind.ValueType]] = {
     Skill.MOVE: types_pb2.SKILL_KIND_MOVE,
@@ -46,70 +44,14 @@ SKILL_KINDS: Final[Mapping[Skill, types_pb2.SkillKind.ValueType]] = {
     Skill.SOAK: types_pb2.SKILL_KIND_SOAK,
 }
 MAX_ROLLOUT_BYTES: Final = MAX_PLAN_BYTES + 4096
-"""On the wire: the largest plan, and its names."""
+"""Largest serialized rollout: the largest plan plus its names."""
 KNOWN: Final = 65_536
-"""Calls and steps that a process remembers by their bytes: plans of one model repeat them, and so do the results."""
+"""Capacity of the cache from serialized calls and steps to values. Plans of one model repeat most calls."""
 _SKILLS: Final = {kind: skill for skill, kind in SKILL_KINDS.items()}
 _FIELDS: Final[Mapping[Skill, tuple[tuple[ArgField, bool], ...]]] = {
     skill: tuple((arg.value, arg in taken) for arg in Arg) for skill, taken in SIGNATURES.items()
 }
-"""For each skill the fields of a call, in order, and whether the skill takes them."""
-
-
-class ConvertError(ValueError):
-    """A message that can't be a value. ``field`` is the culprit's path: ``rollouts[3].plan[0].yaw``."""
-
-    def __init__(self, field: str, problem: str) -> None:
-        super().__init__(f"{field}: {problem}")
-        self.field = field
-        self.problem = problem
-
-    def under(self, parent: str) -> ConvertError:
-        """The same error, seen from the message that holds this one."""
-        return ConvertError(f"{parent}.{self.field}", self.problem)
-
-
-def each(
-    field: str, convert: Callable[[WireT], ValueT], messages: Iterable[WireT], *, first: int = 0
-) -> tuple[ValueT, ...]:
-    """Convert a repeated field, or its part from the element ``first`` on; an error tells which element it stands in."""
-    values: list[ValueT] = []
-    for index, message in enumerate(messages, start=first):
-        try:
-            values.append(convert(message))
-        except ConvertError as error:
-            raise error.under(f"{field}[{index}]") from None
-    return tuple(values)
-
-
-def each_known(field: str, known: Callable[[bytes], ValueT], messages: Sequence[bytes]) -> tuple[ValueT, ...]:
-    """``each`` for messages that are looked up by their bytes: no line of Python for any of them, unless one is wrong."""
-    try:
-        return tuple(map(known, messages))
-    except ConvertError:
-        return each(field, known, messages)
-
-
-def inside(field: str, convert: Callable[[WireT], ValueT], message: WireT) -> ValueT:
-    """Convert a message field; an error tells in which field it stands."""
-    try:
-        return convert(message)
-    except ConvertError as error:
-        raise error.under(field) from None
-
-
-def required(field: str, text: str) -> str:
-    """The text, which may not be empty."""
-    if not text:
-        raise ConvertError(field, "is empty: it must be set")
-    return text
-
-
-def finite(field: str, number: float) -> float:
-    """The number, which may be neither NaN nor infinite."""
-    if not math.isfinite(number):
-        raise ConvertError(field, f"is {number}: it must be a finite number")
-    return number
+"""Fields of a call, in order, and whether the skill takes each."""
 
 
 def skill_call_to_proto(call: SkillCall) -> types_pb2.SkillCall:
@@ -125,7 +67,7 @@ def skill_call_to_proto(call: SkillCall) -> types_pb2.SkillCall:
 
 
 def skill_call_from_proto(message: types_pb2.SkillCall) -> SkillCall:
-    """The call, with exactly the arguments that its skill takes; any other set is a ``ConvertError``."""
+    """Return the call. Raise ConvertError unless it has exactly the arguments of its skill."""
     return _call_of(message.SerializeToString())
 
 
@@ -164,14 +106,6 @@ def _relation(text: str) -> PlaceRelation:
         raise ConvertError("relation", f"{text!r} is none of {', '.join(PlaceRelation)}") from None
 
 
-def plan_to_proto(plan: Plan) -> list[types_pb2.SkillCall]:
-    return [skill_call_to_proto(call) for call in plan]
-
-
-def plan_from_proto(messages: Iterable[types_pb2.SkillCall]) -> Plan:
-    return _plan_from([message.SerializeToString() for message in messages])
-
-
 def _plan_from(calls: Sequence[bytes]) -> Plan:
     if len(calls) > MAX_STEPS:
         raise ConvertError("plan", f"has {len(calls)} steps: at most {MAX_STEPS} are executed")
@@ -185,7 +119,7 @@ def rollout_to_proto(rollout: Rollout) -> types_pb2.Rollout:
 
 
 def write_rollout(rollout: Rollout, message: types_pb2.Rollout) -> None:
-    """Fill an empty message. What came as a message is passed on as it came."""
+    """Fill an empty message. A rollout that was received is written with its original bytes."""
     if rollout.wire:
         message.MergeFromString(rollout.wire)
         return
@@ -193,17 +127,17 @@ def write_rollout(rollout: Rollout, message: types_pb2.Rollout) -> None:
     message.group_id = rollout.group_id
     message.bundle_digest = rollout.bundle_digest
     message.task_id = rollout.task_id
-    message.plan.extend(plan_to_proto(rollout.plan))
+    message.plan.extend(map(skill_call_to_proto, rollout.plan))
     message.seed = rollout.seed
     message.render = rollout.render
 
 
 def rollout_from_proto(message: types_pb2.Rollout) -> Rollout:
-    """The rollout, which keeps its bytes; more of them than the largest plan takes are refused before they are looked at."""
+    """Return the rollout with its bytes. Raise ConvertError for more than ``MAX_ROLLOUT_BYTES`` before parsing the plan."""
     wire = message.SerializeToString()
     if len(wire) > MAX_ROLLOUT_BYTES:
         raise ConvertError(
-            "plan", f"makes a rollout of {len(wire)} bytes: at most {MAX_ROLLOUT_BYTES} are taken"
+            "plan", f"makes a rollout of {len(wire)} bytes: at most {MAX_ROLLOUT_BYTES} are accepted"
         )
     rollout = Rollout(
         rollout_id=required("rollout_id", message.rollout_id),
@@ -219,7 +153,7 @@ def rollout_from_proto(message: types_pb2.Rollout) -> Rollout:
 
 
 def unread_rollout(message: types_pb2.Rollout) -> Rollout:
-    """The rollout for whoever only passes it on: whether its plan is one is found when it is read."""
+    """Return the rollout without parsing its plan. The first access to the plan parses it."""
     return Rollout.unread(
         message.SerializeToString(),
         _rollout_fields,
@@ -233,3 +167,33 @@ def _rollout_fields(wire: bytes) -> Mapping[str, object]:
         name: getattr(rollout, name)
         for name in ("rollout_id", "group_id", "task_id", "plan", "seed", "render")
     }
+
+
+def batch_to_proto(batch: Batch) -> rollout_service_pb2.ExecuteRequest:
+    message = rollout_service_pb2.ExecuteRequest(
+        run_id=batch.run_id, batch_id=batch.batch_id, step=batch.step
+    )
+    for rollout in batch.rollouts:
+        write_rollout(rollout, message.rollouts.add())
+    return message
+
+
+def batch_from_proto(message: rollout_service_pb2.ExecuteRequest) -> Batch:
+    """Return the batch. Raise ConvertError for a repeated rollout id, since each rollout gets exactly one outcome."""
+    return batch_with(message, each("rollouts", rollout_from_proto, message.rollouts))
+
+
+def batch_with(message: rollout_service_pb2.ExecuteRequest, rollouts: tuple[Rollout, ...]) -> Batch:
+    """Return the batch of a message whose rollouts are converted already."""
+    seen: set[str] = set()
+    for index, rollout in enumerate(rollouts):
+        if rollout.rollout_id in seen:
+            raise ConvertError(
+                f"rollouts[{index}].rollout_id", f"{rollout.rollout_id!r} occurs twice in the batch"
+            )
+        seen.add(rollout.rollout_id)
+    batch = Batch(
+        required("run_id", message.run_id), required("batch_id", message.batch_id), message.step, rollouts
+    )
+    object.__setattr__(batch, "wire", message.SerializeToString(deterministic=True))
+    return batch

@@ -1,4 +1,4 @@
-"""What a run asks and is told: terms, look-ahead, groups and counters, to wire messages and back."""
+"""Conversion of run terms, look-ahead, groups and counters to and from protobuf."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.reward.settings import PAPER, RewardSettings, RewardSettingsError
-from embomatrix.rpc.wire.rollout import ConvertError, finite, required
+from embomatrix.rpc.wire.codec import ConvertError, converters, enum_member, enum_numbers, finite, inside
 from embomatrix.rpc.wire.values import (
     GroupDone,
     GroupPolicy,
@@ -21,60 +21,28 @@ from embomatrix.rpc.wire.values import (
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from embomatrix.proto.v1 import admin_service_pb2, worker_service_pb2
 
-    _Scored = rollout_service_pb2.OpenRunRequest | worker_service_pb2.Lease | admin_service_pb2.RunInfo
-
-_WARMTHS: Final[Mapping[Warmth, types_pb2.Warmth.ValueType]] = {
-    warmth: types_pb2.Warmth.Value(f"WARMTH_{warmth.name}") for warmth in Warmth
-}
-_WARMTH_VALUES: Final = {number: warmth for warmth, number in _WARMTHS.items()}
-_POLICIES: Final[Mapping[GroupPolicy, rollout_service_pb2.GroupPolicy.ValueType]] = {
-    policy: rollout_service_pb2.GroupPolicy.Value(f"GROUP_POLICY_{policy.name}") for policy in GroupPolicy
-}
-_POLICY_VALUES: Final = {
+WARMTHS: Final = enum_numbers(Warmth, types_pb2.Warmth, "WARMTH")
+_POLICIES: Final = enum_numbers(GroupPolicy, rollout_service_pb2.GroupPolicy, "GROUP_POLICY")
+_POLICY_VALUES: Final[Mapping[int, GroupPolicy]] = {
     rollout_service_pb2.GROUP_POLICY_UNSPECIFIED: RunTerms().group_policy,
     **{number: policy for policy, number in _POLICIES.items()},
 }
 
-
-def lookahead_entry_to_proto(entry: LookaheadEntry) -> rollout_service_pb2.LookaheadEntry:
-    return rollout_service_pb2.LookaheadEntry(
-        step=entry.step, bundle_digest=entry.bundle_digest, count=entry.count, render=entry.render
-    )
-
-
-def lookahead_entry_from_proto(message: rollout_service_pb2.LookaheadEntry) -> LookaheadEntry:
-    digest = required("bundle_digest", message.bundle_digest)
-    return LookaheadEntry(message.step, digest, message.count, message.render)
-
-
-def lookahead_answer_to_proto(answer: LookaheadAnswer) -> rollout_service_pb2.LookaheadAnswer:
-    return rollout_service_pb2.LookaheadAnswer(
-        bundle_digest=answer.bundle_digest,
-        warmth=warmth_to_proto(answer.warmth),
-        eta_s=answer.eta_s,
-        reason=answer.reason,
-    )
-
-
-def lookahead_answer_from_proto(message: rollout_service_pb2.LookaheadAnswer) -> LookaheadAnswer:
-    warmth = warmth_from_proto(message.warmth)
-    return LookaheadAnswer(message.bundle_digest, warmth, finite("eta_s", message.eta_s), message.reason)
-
-
-def group_done_to_proto(done: GroupDone) -> rollout_service_pb2.GroupDone:
-    return rollout_service_pb2.GroupDone(**{name: getattr(done, name) for name in GroupDone.__slots__})
-
-
-def group_done_from_proto(message: rollout_service_pb2.GroupDone) -> GroupDone:
-    return GroupDone(
-        required("group_id", message.group_id), message.completed, message.infra_failures, message.cancelled
-    )
+lookahead_entry_to_proto, lookahead_entry_from_proto = converters(
+    LookaheadEntry, rollout_service_pb2.LookaheadEntry, required_names=("bundle_digest",)
+)
+lookahead_answer_to_proto, lookahead_answer_from_proto = converters(
+    LookaheadAnswer, rollout_service_pb2.LookaheadAnswer, enums={"warmth": WARMTHS}
+)
+group_done_to_proto, group_done_from_proto = converters(
+    GroupDone, rollout_service_pb2.GroupDone, required_names=("group_id",)
+)
+run_stats_to_proto, run_stats_from_proto = converters(RunStats, rollout_service_pb2.RunStats)
 
 
 def run_terms_to_proto(terms: RunTerms) -> rollout_service_pb2.OpenRunRequest:
-    """The part of a request to open a run that says what the run asks for."""
+    """Return an OpenRun request with the terms alone."""
     return rollout_service_pb2.OpenRunRequest(
         group_policy=_POLICIES[terms.group_policy],
         weight=terms.weight,
@@ -86,57 +54,37 @@ def run_terms_to_proto(terms: RunTerms) -> rollout_service_pb2.OpenRunRequest:
 
 
 def run_terms_from_proto(message: rollout_service_pb2.OpenRunRequest) -> RunTerms:
-    policy = _POLICY_VALUES.get(message.group_policy)
-    if policy is None:
-        raise ConvertError("group_policy", f"{message.group_policy} is no known policy: leave it out")
+    policy = enum_member("group_policy", _POLICY_VALUES, message.group_policy)
     for field in ("weight", "rollout_deadline_s"):
         if finite(field, getattr(message, field)) < 0:
             raise ConvertError(field, f"is {getattr(message, field)}: it can't be below 0")
-    # A message without a weight has 0 there.
+    # An unset weight reads as 0.
     return RunTerms(
         policy,
         message.weight or 1.0,
         message.priority,
         message.rollout_deadline_s,
         message.verified,
-        reward_settings_of(message),
+        inside("reward", reward_settings_from_proto, message.reward) if message.HasField("reward") else PAPER,
     )
 
 
 def reward_settings_to_proto(reward: RewardSettings) -> types_pb2.RewardSettings | None:
-    """None for the paper's, which are every worker's defaults: the field stays away."""
+    """Return None for the paper's coefficients: an absent field stands for them."""
     return (
         None if reward is PAPER or reward == PAPER else types_pb2.RewardSettings(**dataclasses.asdict(reward))
     )
 
 
-def reward_settings_of(message: _Scored) -> RewardSettings:
-    """What the message's field ``reward`` asks for; the paper's where it is absent. ConvertError for what is no reward."""
-    if not message.HasField("reward"):
-        return PAPER
-    told = message.reward
+def reward_settings_from_proto(message: types_pb2.RewardSettings) -> RewardSettings:
+    """Return the coefficients. Raise ConvertError for values that make no reward."""
     try:
         return RewardSettings(
-            told.unparsable, told.format, told.relevance_per_object, told.relevance_limit, told.goal
+            message.unparsable,
+            message.format,
+            message.relevance_per_object,
+            message.relevance_limit,
+            message.goal,
         )
     except RewardSettingsError as error:
-        raise ConvertError(f"reward.{error.field}", error.problem) from error
-
-
-def warmth_to_proto(warmth: Warmth) -> types_pb2.Warmth.ValueType:
-    return _WARMTHS[warmth]
-
-
-def warmth_from_proto(number: types_pb2.Warmth.ValueType) -> Warmth:
-    warmth = _WARMTH_VALUES.get(number)
-    if warmth is None:
-        raise ConvertError("warmth", f"{number} is no known value: is the sender newer than this side?")
-    return warmth
-
-
-def run_stats_to_proto(stats: RunStats) -> rollout_service_pb2.RunStats:
-    return rollout_service_pb2.RunStats(**{name: getattr(stats, name) for name in RunStats.__slots__})
-
-
-def run_stats_from_proto(message: rollout_service_pb2.RunStats) -> RunStats:
-    return RunStats(**{name: getattr(message, name) for name in RunStats.__slots__})
+        raise ConvertError(error.field, error.problem) from error

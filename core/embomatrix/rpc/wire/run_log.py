@@ -1,77 +1,158 @@
-"""A run's log and summary to wire messages and back."""
+"""Run log: events in the order in which the manager saw them, their summary, and their conversion to and from protobuf.
+
+Times are seconds since the epoch on the manager's clock. Durations are measured by the side that spends them.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, NamedTuple
 
 from embomatrix.proto.v1 import admin_service_pb2 as pb
-from embomatrix.rpc.run_log import (
-    EventKind,
-    EventPage,
-    PhaseSummary,
-    RolloutPhase,
-    RunEvent,
-    RunSeries,
-    RunSummary,
-    RunWorker,
-)
+from embomatrix.rpc.wire.codec import ConvertError, converters, each, enum_numbers, finite, inside
 from embomatrix.rpc.wire.outcome import timings_from_proto, timings_to_proto
-from embomatrix.rpc.wire.rollout import ConvertError, each, finite, inside
 from embomatrix.rpc.wire.session import run_info_from_proto, run_info_to_proto
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-_KINDS: Final[Mapping[EventKind, pb.EventKind.ValueType]] = {
-    kind: pb.EventKind.Value(f"EVENT_KIND_{kind.name}") for kind in EventKind
-}
-_KIND_VALUES: Final = {number: kind for kind, number in _KINDS.items()}
-_PLAIN: Final = tuple(name for name in RunEvent._fields if name not in ("kind", "timings"))
+    from embomatrix.rpc.wire.values import RunInfo, Timings
 
 
-def run_event_to_proto(event: RunEvent) -> pb.RunEvent:
-    message = pb.RunEvent(kind=_KINDS[event.kind], **{name: getattr(event, name) for name in _PLAIN})
-    if event.timings is not None:
-        message.timings.CopyFrom(timings_to_proto(event.timings))
-    return message
+class RolloutPhase(StrEnum):
+    """Phases of a rollout, in order."""
+
+    QUEUE = "queue"
+    LEASE = "lease"
+    LOAD = "load"
+    EXECUTE = "execute"
+    DELIVER = "deliver"
 
 
-def run_event_from_proto(message: pb.RunEvent) -> RunEvent:
-    kind = _KIND_VALUES.get(message.kind)
-    if kind is None:
-        raise ConvertError("kind", f"{message.kind} is no known kind: is the sender newer than this side?")
-    finite("at_s", message.at_s)
-    finite("held_s", message.held_s)
-    timings = inside("timings", timings_from_proto, message.timings) if message.HasField("timings") else None
-    return RunEvent(kind=kind, timings=timings, **{name: getattr(message, name) for name in _PLAIN})
+class EventKind(StrEnum):
+    """Kind of an event."""
+
+    RUN_OPENED = "run_opened"
+    RUN_CLOSED = "run_closed"
+    SUBMITTED = "submitted"
+    LEASED = "leased"
+    COMPLETED = "completed"
+    FAILED = "failed"
+    ENDED = "ended"
+    WORKER_JOINED = "worker_joined"
+    WORKER_LOST = "worker_lost"
+    SCENE_WARM = "scene_warm"
+    SCENE_EVICTED = "scene_evicted"
+    SCENE_FAILED = "scene_failed"
 
 
-def event_page_to_proto(page: EventPage) -> pb.ReadEventsResponse:
-    return pb.ReadEventsResponse(events=map(run_event_to_proto, page.events), dropped=page.dropped)
+class RunEvent(NamedTuple):
+    """One event. Fields that do not apply are empty; ``proto/admin_service`` lists the fields of each kind."""
+
+    sequence: int
+    at_s: float
+    kind: EventKind
+    run_id: str = ""
+    batch_id: str = ""
+    rollout_id: str = ""
+    worker_id: str = ""
+    bundle_digest: str = ""
+    slot: int = 0
+    attempt: int = 0
+    code: str = ""
+    message: str = ""
+    timings: Timings | None = None
+    held_s: float = 0.0
+    size: int = 0
 
 
-def event_page_from_proto(message: pb.ReadEventsResponse) -> EventPage:
-    return EventPage(each("events", run_event_from_proto, message.events), message.dropped)
+@dataclass(frozen=True, slots=True)
+class PhaseSummary:
+    """Durations of one phase. Quantiles have an error of at most 4 %."""
+
+    count: int = 0
+    sum_s: float = 0.0
+    p50_s: float = 0.0
+    p95_s: float = 0.0
+    p99_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class RunWorker:
+    """Work of one worker for a run: completed and failed leases, and the seconds spent on them."""
+
+    worker_id: str
+    completed: int = 0
+    failed: int = 0
+    execute_s: float = 0.0
+    load_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class RunSeries:
+    """Rollouts by outcome in each interval of ``step_s`` seconds since the run was opened."""
+
+    step_s: float
+    completed: tuple[int, ...]
+    failed: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class RunSummary:
+    """Totals of a run. ``manager_cpu_s`` is the manager's CPU time during the run, spent on all runs."""
+
+    run: RunInfo
+    phases: Mapping[RolloutPhase, PhaseSummary]
+    workers: tuple[RunWorker, ...]
+    series: RunSeries
+    failures: tuple[RunEvent, ...]
+    """Latest failures, oldest first."""
+    manager_cpu_s: float
+    prewarm_lead: PhaseSummary
+    scene_load: PhaseSummary
+    events_dropped: int
+    version: str
+
+
+@dataclass(frozen=True, slots=True)
+class EventPage:
+    """Events in order. ``dropped`` counts the log's events that were discarded for later ones."""
+
+    events: tuple[RunEvent, ...]
+    dropped: int
+
+
+run_event_to_proto, run_event_from_proto = converters(
+    RunEvent,
+    pb.RunEvent,
+    enums={"kind": enum_numbers(EventKind, pb.EventKind, "EVENT_KIND")},
+    parts={"timings": (timings_to_proto, timings_from_proto)},
+    absent={"timings": None},
+)
+event_page_to_proto, event_page_from_proto = converters(
+    EventPage, pb.ReadEventsResponse, parts={"events": (run_event_to_proto, run_event_from_proto)}
+)
+_phase_to_proto, _phase_from_proto = converters(PhaseSummary, pb.PhaseSummary)
+_worker_to_proto, _worker_from_proto = converters(RunWorker, pb.RunWorker)
+_series_to_proto, _read_series = converters(RunSeries, pb.RunSeries)
 
 
 def run_summary_to_proto(summary: RunSummary) -> pb.GetRunResponse:
-    return pb.GetRunResponse(
+    message = pb.GetRunResponse(
         run=run_info_to_proto(summary.run),
-        phases=[_phase_to_proto(phase.value, found) for phase, found in summary.phases.items()],
-        workers=[
-            pb.RunWorker(**{name: getattr(worker, name) for name in RunWorker.__slots__})
-            for worker in summary.workers
-        ],
-        series=pb.RunSeries(
-            step_s=summary.series.step_s, completed=summary.series.completed, failed=summary.series.failed
-        ),
+        workers=map(_worker_to_proto, summary.workers),
+        series=_series_to_proto(summary.series),
         failures=map(run_event_to_proto, summary.failures),
         manager_cpu_s=summary.manager_cpu_s,
-        prewarm_lead=_phase_to_proto("", summary.prewarm_lead),
-        scene_load=_phase_to_proto("", summary.scene_load),
+        prewarm_lead=_phase_to_proto(summary.prewarm_lead),
+        scene_load=_phase_to_proto(summary.scene_load),
         events_dropped=summary.events_dropped,
         version=summary.version,
     )
+    for phase, found in summary.phases.items():
+        message.phases.add(phase=phase.value).MergeFrom(_phase_to_proto(found))
+    return message
 
 
 def run_summary_from_proto(message: pb.GetRunResponse) -> RunSummary:
@@ -89,20 +170,6 @@ def run_summary_from_proto(message: pb.GetRunResponse) -> RunSummary:
     )
 
 
-def _phase_to_proto(phase: str, found: PhaseSummary) -> pb.PhaseSummary:
-    return pb.PhaseSummary(phase=phase, **{name: getattr(found, name) for name in PhaseSummary.__slots__})
-
-
-def _phase_from_proto(message: pb.PhaseSummary) -> PhaseSummary:
-    return PhaseSummary(
-        message.count,
-        finite("sum_s", message.sum_s),
-        finite("p50_s", message.p50_s),
-        finite("p95_s", message.p95_s),
-        finite("p99_s", message.p99_s),
-    )
-
-
 def _named_phase_from_proto(message: pb.PhaseSummary) -> tuple[RolloutPhase, PhaseSummary]:
     if message.phase not in list(RolloutPhase):
         raise ConvertError(
@@ -111,17 +178,7 @@ def _named_phase_from_proto(message: pb.PhaseSummary) -> tuple[RolloutPhase, Pha
     return RolloutPhase(message.phase), _phase_from_proto(message)
 
 
-def _worker_from_proto(message: pb.RunWorker) -> RunWorker:
-    return RunWorker(
-        message.worker_id,
-        message.completed,
-        message.failed,
-        finite("execute_s", message.execute_s),
-        finite("load_s", message.load_s),
-    )
-
-
 def _series_from_proto(message: pb.RunSeries) -> RunSeries:
     if finite("step_s", message.step_s) <= 0:
         raise ConvertError("step_s", f"is {message.step_s}: it must be above 0")
-    return RunSeries(message.step_s, tuple(message.completed), tuple(message.failed))
+    return _read_series(message)

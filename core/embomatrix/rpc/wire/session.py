@@ -1,11 +1,13 @@
-"""Values of the worker's session and of the operator's view, to wire messages and back."""
+"""Conversion of worker sessions, and of the operator's lists, to and from protobuf."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.proto.v1 import admin_service_pb2, types_pb2, worker_service_pb2
-from embomatrix.rpc.leases import (
+from embomatrix.reward.settings import PAPER
+from embomatrix.rpc.wire.codec import ConvertError, converters, enum_numbers, finite, inside, required
+from embomatrix.rpc.wire.leases import (
     Lease,
     LeaseClaim,
     LeaseOrigin,
@@ -20,22 +22,13 @@ from embomatrix.rpc.wire.outcome import (
     infra_failure_to_proto,
     write_completed,
 )
-from embomatrix.rpc.wire.rollout import (
-    ConvertError,
-    each,
-    finite,
-    inside,
-    required,
-    unread_rollout,
-    write_rollout,
-)
+from embomatrix.rpc.wire.rollout import unread_rollout, write_rollout
 from embomatrix.rpc.wire.run import (
-    reward_settings_of,
+    WARMTHS,
+    reward_settings_from_proto,
     reward_settings_to_proto,
     run_stats_from_proto,
     run_stats_to_proto,
-    warmth_from_proto,
-    warmth_to_proto,
 )
 from embomatrix.rpc.wire.values import (
     Completed,
@@ -48,30 +41,32 @@ from embomatrix.rpc.wire.values import (
     WorkerInfo,
 )
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-_STATES: Final[Mapping[ResidentState, worker_service_pb2.ResidentState.ValueType]] = {
-    state: worker_service_pb2.ResidentState.Value(f"RESIDENT_STATE_{state.name}") for state in ResidentState
-}
-_STATE_VALUES: Final = {number: state for state, number in _STATES.items()}
 MAX_LABELS: Final = 32
-"""Labels of one worker: more are a mistake, and every listing would carry them."""
+"""Labels of one worker at most, since every listing carries them."""
 
-
-def resources_to_proto(resources: Resources) -> types_pb2.Resources:
-    return types_pb2.Resources(
-        slots=resources.slots,
-        cores=resources.cores,
-        memory_mb=resources.memory_mb,
-        score=resources.score,
-        gpu=resources.gpu,
-        vram_mb=resources.vram_mb,
-        versions=dict(resources.versions),
-        render_slots=resources.render_slots,
-        disk_mb=resources.disk_mb,
-        labels=dict(resources.labels),
-    )
+resources_to_proto, _resources_from_proto = converters(Resources, types_pb2.Resources)
+resident_to_proto, resident_from_proto = converters(
+    Resident,
+    worker_service_pb2.Resident,
+    required_names=("bundle_digest",),
+    enums={"state": enum_numbers(ResidentState, worker_service_pb2.ResidentState, "RESIDENT_STATE")},
+)
+plan_cell_to_proto, plan_cell_from_proto = converters(
+    PlanCell,
+    admin_service_pb2.PlanCell,
+    required_names=("run_id", "bundle_digest"),
+    enums={"warmth": WARMTHS},
+)
+run_info_to_proto, run_info_from_proto = converters(
+    RunInfo,
+    admin_service_pb2.RunInfo,
+    required_names=("run_id",),
+    parts={
+        "stats": (run_stats_to_proto, run_stats_from_proto),
+        "reward": (reward_settings_to_proto, reward_settings_from_proto),
+    },
+    absent={"reward": PAPER},
+)
 
 
 def resources_from_proto(message: types_pb2.Resources) -> Resources:
@@ -79,41 +74,18 @@ def resources_from_proto(message: types_pb2.Resources) -> Resources:
         raise ConvertError("slots", "is 0: a worker offers at least one slot")
     if len(message.labels) > MAX_LABELS:
         raise ConvertError("labels", f"are {len(message.labels)}: a worker has at most {MAX_LABELS}")
-    return Resources(
-        slots=message.slots,
-        cores=message.cores,
-        memory_mb=message.memory_mb,
-        score=finite("score", message.score),
-        gpu=message.gpu,
-        vram_mb=message.vram_mb,
-        versions=dict(message.versions),
-        render_slots=message.render_slots,
-        disk_mb=message.disk_mb,
-        labels=dict(message.labels),
-    )
+    return _resources_from_proto(message)
 
 
-def resident_to_proto(resident: Resident) -> worker_service_pb2.Resident:
-    return worker_service_pb2.Resident(
-        bundle_digest=resident.bundle_digest,
-        state=_STATES[resident.state],
-        load_s=resident.load_s,
-        memory_mb=resident.memory_mb,
-        error=resident.error,
-    )
-
-
-def resident_from_proto(message: worker_service_pb2.Resident) -> Resident:
-    state = _STATE_VALUES.get(message.state)
-    if state is None:
-        raise ConvertError("state", f"{message.state} is no known state: is the sender newer than this side?")
-    return Resident(
-        bundle_digest=required("bundle_digest", message.bundle_digest),
-        state=state,
-        load_s=finite("load_s", message.load_s),
-        memory_mb=finite("memory_mb", message.memory_mb),
-        error=message.error,
-    )
+worker_info_to_proto, worker_info_from_proto = converters(
+    WorkerInfo,
+    admin_service_pb2.WorkerInfo,
+    required_names=("worker_id",),
+    parts={
+        "resources": (resources_to_proto, resources_from_proto),
+        "residents": (resident_to_proto, resident_from_proto),
+    },
+)
 
 
 def lease_ref_to_proto(ref: LeaseRef) -> worker_service_pb2.LeaseRef:
@@ -123,20 +95,12 @@ def lease_ref_to_proto(ref: LeaseRef) -> worker_service_pb2.LeaseRef:
 
 
 def write_lease_ref(ref: LeaseRef, message: worker_service_pb2.LeaseRef) -> None:
-    """Fill an empty message, such as one that was just added to a longer one: that spares a copy."""
+    """Fill an empty message in place, which saves a copy."""
     message.lease_id, message.lease_epoch = ref.lease_id, ref.lease_epoch
 
 
 def lease_ref_from_proto(message: worker_service_pb2.LeaseRef) -> LeaseRef:
     return LeaseRef(required("lease_id", message.lease_id), message.lease_epoch)
-
-
-def lease_progress_to_proto(progress: LeaseProgress) -> worker_service_pb2.LeaseProgress:
-    return worker_service_pb2.LeaseProgress(ref=lease_ref_to_proto(progress.ref), steps=progress.steps)
-
-
-def lease_progress_from_proto(message: worker_service_pb2.LeaseProgress) -> LeaseProgress:
-    return LeaseProgress(inside("ref", lease_ref_from_proto, message.ref), message.steps)
 
 
 def lease_origin_to_proto(origin: LeaseOrigin) -> worker_service_pb2.LeaseOrigin:
@@ -146,7 +110,7 @@ def lease_origin_to_proto(origin: LeaseOrigin) -> worker_service_pb2.LeaseOrigin
 
 
 def write_lease_origin(origin: LeaseOrigin, message: worker_service_pb2.LeaseOrigin) -> None:
-    """Fill an empty message, as ``write_lease_ref`` does."""
+    """Fill an empty message in place."""
     message.run_id, message.batch_id = origin.run_id, origin.batch_id
     message.rollout_id, message.attempt = origin.rollout_id, origin.attempt
 
@@ -160,39 +124,20 @@ def lease_origin_from_proto(message: worker_service_pb2.LeaseOrigin) -> LeaseOri
     )
 
 
-def lease_claim_to_proto(claim: LeaseClaim) -> worker_service_pb2.LeaseClaim:
-    return worker_service_pb2.LeaseClaim(
-        ref=lease_ref_to_proto(claim.ref), origin=lease_origin_to_proto(claim.origin)
-    )
-
-
-def lease_claim_from_proto(message: worker_service_pb2.LeaseClaim) -> LeaseClaim:
-    return LeaseClaim(
-        inside("ref", lease_ref_from_proto, message.ref),
-        inside("origin", lease_origin_from_proto, message.origin),
-    )
-
-
-def lease_to_proto(lease: Lease) -> worker_service_pb2.Lease:
-    message = worker_service_pb2.Lease()
-    write_lease(lease, message)
-    return message
-
-
 def write_lease(lease: Lease, message: worker_service_pb2.Lease) -> None:
-    """Fill an empty message, as ``write_lease_ref`` does."""
+    """Fill an empty message in place."""
     write_lease_ref(lease.ref, message.ref)
     write_rollout(lease.rollout, message.rollout)
     message.deadline_s = lease.deadline_s
     if lease.origin is not None:
         write_lease_origin(lease.origin, message.origin)
-    own = reward_settings_to_proto(lease.reward)
-    if own is not None:
-        message.reward.CopyFrom(own)
+    reward = reward_settings_to_proto(lease.reward)
+    if reward is not None:
+        message.reward.CopyFrom(reward)
 
 
 def lease_from_proto(message: worker_service_pb2.Lease) -> Lease:
-    """The lease, with its rollout unread: the slot that executes it reads it."""
+    """Return the lease with its rollout unparsed: the slot that executes it parses it."""
     ref = inside("ref", lease_ref_from_proto, message.ref)
     if finite("deadline_s", message.deadline_s) <= 0:
         raise ConvertError("deadline_s", f"is {message.deadline_s}: it must be above 0")
@@ -204,7 +149,7 @@ def lease_from_proto(message: worker_service_pb2.Lease) -> Lease:
         inside("rollout", unread_rollout, message.rollout),
         message.deadline_s,
         origin,
-        reward_settings_of(message),
+        inside("reward", reward_settings_from_proto, message.reward) if message.HasField("reward") else PAPER,
     )
 
 
@@ -215,7 +160,7 @@ def lease_result_to_proto(result: LeaseResult) -> worker_service_pb2.LeaseResult
 
 
 def write_lease_result(result: LeaseResult, message: worker_service_pb2.LeaseResult) -> None:
-    """Fill an empty message, as ``write_lease_ref`` does."""
+    """Fill an empty message in place."""
     write_lease_ref(result.ref, message.lease)
     message.slot, message.held_s = result.slot, result.held_s
     match result.outcome:
@@ -238,101 +183,21 @@ def lease_result_from_proto(message: worker_service_pb2.LeaseResult) -> LeaseRes
     return LeaseResult(ref, outcome, slot=message.slot, held_s=finite("held_s", message.held_s))
 
 
-def worker_state_to_proto(state: WorkerState) -> worker_service_pb2.WorkerState:
-    return worker_service_pb2.WorkerState(
-        residents=[resident_to_proto(resident) for resident in state.residents],
-        running=[lease_ref_to_proto(ref) for ref in state.running],
-        finished=[lease_result_to_proto(result) for result in state.finished],
-        draining=state.draining,
-        paused=state.paused,
-        claims=[lease_claim_to_proto(claim) for claim in state.claims],
-    )
-
-
-def worker_state_from_proto(message: worker_service_pb2.WorkerState) -> WorkerState:
-    return WorkerState(
-        residents=each("residents", resident_from_proto, message.residents),
-        running=each("running", lease_ref_from_proto, message.running),
-        finished=each("finished", lease_result_from_proto, message.finished),
-        draining=message.draining,
-        paused=message.paused,
-        claims=each("claims", lease_claim_from_proto, message.claims),
-    )
-
-
-def worker_info_to_proto(info: WorkerInfo) -> admin_service_pb2.WorkerInfo:
-    return admin_service_pb2.WorkerInfo(
-        worker_id=info.worker_id,
-        state=info.state,
-        resources=resources_to_proto(info.resources),
-        residents=[resident_to_proto(resident) for resident in info.residents],
-        running=info.running,
-        completed=info.completed,
-        last_seen_s=info.last_seen_s,
-        reason=info.reason,
-        audited=info.audited,
-        audit_mismatches=info.audit_mismatches,
-    )
-
-
-def worker_info_from_proto(message: admin_service_pb2.WorkerInfo) -> WorkerInfo:
-    return WorkerInfo(
-        worker_id=required("worker_id", message.worker_id),
-        state=message.state,
-        resources=inside("resources", resources_from_proto, message.resources),
-        residents=each("residents", resident_from_proto, message.residents),
-        running=message.running,
-        completed=message.completed,
-        last_seen_s=finite("last_seen_s", message.last_seen_s),
-        reason=message.reason,
-        audited=message.audited,
-        audit_mismatches=message.audit_mismatches,
-    )
-
-
-def run_info_to_proto(info: RunInfo) -> admin_service_pb2.RunInfo:
-    return admin_service_pb2.RunInfo(
-        run_id=info.run_id,
-        name=info.name,
-        stats=run_stats_to_proto(info.stats),
-        pending=info.pending,
-        opened_s=info.opened_s,
-        closed_s=info.closed_s,
-        reward=reward_settings_to_proto(info.reward),
-        waits_for=info.waits_for,
-    )
-
-
-def run_info_from_proto(message: admin_service_pb2.RunInfo) -> RunInfo:
-    return RunInfo(
-        required("run_id", message.run_id),
-        message.name,
-        run_stats_from_proto(message.stats),
-        message.pending,
-        finite("opened_s", message.opened_s),
-        finite("closed_s", message.closed_s),
-        reward_settings_of(message),
-        message.waits_for,
-    )
-
-
-def plan_cell_to_proto(cell: PlanCell) -> admin_service_pb2.PlanCell:
-    return admin_service_pb2.PlanCell(
-        run_id=cell.run_id,
-        step=cell.step,
-        bundle_digest=cell.bundle_digest,
-        count=cell.count,
-        warmth=warmth_to_proto(cell.warmth),
-        worker_ids=cell.worker_ids,
-    )
-
-
-def plan_cell_from_proto(message: admin_service_pb2.PlanCell) -> PlanCell:
-    return PlanCell(
-        run_id=required("run_id", message.run_id),
-        step=message.step,
-        bundle_digest=required("bundle_digest", message.bundle_digest),
-        count=message.count,
-        warmth=warmth_from_proto(message.warmth),
-        worker_ids=tuple(message.worker_ids),
-    )
+_LEASE_REF = (lease_ref_to_proto, lease_ref_from_proto)
+lease_progress_to_proto, lease_progress_from_proto = converters(
+    LeaseProgress, worker_service_pb2.LeaseProgress, parts={"ref": _LEASE_REF}
+)
+worker_state_to_proto, worker_state_from_proto = converters(
+    WorkerState,
+    worker_service_pb2.WorkerState,
+    parts={
+        "residents": (resident_to_proto, resident_from_proto),
+        "running": _LEASE_REF,
+        "finished": (lease_result_to_proto, lease_result_from_proto),
+        "claims": converters(
+            LeaseClaim,
+            worker_service_pb2.LeaseClaim,
+            parts={"ref": _LEASE_REF, "origin": (lease_origin_to_proto, lease_origin_from_proto)},
+        ),
+    },
+)

@@ -1,37 +1,106 @@
-"""Reports of training to wire messages and back; whatever is larger than a report may be is refused by its field."""
+"""Training reports of a trainer, and their conversion to and from protobuf.
+
+A report beyond its size limits is rejected with the name of the field.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from embomatrix.proto.v1 import rollout_service_pb2 as pb
-from embomatrix.rpc.training import (
-    FIGURES,
-    MESSAGE_CHARS,
-    NAME_CHARS,
-    PLANS,
-    TEXT_CHARS,
-    RewardTiers,
-    SampledPlan,
-    SampledStep,
-    TrainingReport,
-)
-from embomatrix.rpc.wire.rollout import ConvertError, each, finite, inside, required
+from embomatrix.rpc.wire.codec import ConvertError, converters, each, finite, required
 from embomatrix.skills.syntax import MAX_STEPS
 
 if TYPE_CHECKING:
-    from collections.abc import Sized
+    from collections.abc import Mapping, Sized
 
 T = TypeVar("T", bound="Sized")
 
+FIGURES: Final = 64
+"""Figures of one report, and of one phase, at most."""
+PLANS: Final = 8
+"""Sampled plans of one report at most."""
+NAME_CHARS: Final = 64
+"""Characters of a phase's or figure's name at most."""
+TEXT_CHARS: Final = 4000
+"""Characters of a plan or an instruction; the sender cuts longer ones."""
+MESSAGE_CHARS: Final = 500
+
+
+@dataclass(frozen=True, slots=True)
+class SampledStep:
+    """Executed skill call of a plan, with its outcome in words."""
+
+    skill: str
+    ok: bool
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class RewardTiers:
+    """Reward of a plan by tier: format, relevance and goal."""
+
+    format: float
+    relevance: float
+    goal: float
+    success: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SampledPlan:
+    """Plan that a policy wrote. ``reward`` is None if the rollout ended in an infrastructure failure.
+
+    ``advantage`` is relative to the group, in standard deviations. ``problem`` says why there was nothing to execute, or why
+    there is no result.
+    """
+
+    task_id: str
+    instruction: str
+    text: str
+    reward: RewardTiers | None
+    advantage: float
+    problem: str = ""
+    steps: tuple[SampledStep, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingReport:
+    """Figures of one step of a phase, ``grpo`` or ``imitation``, by name. A figure of a table is named ``table/name``."""
+
+    phase: str
+    step: int
+    figures: Mapping[str, float] = field(default_factory=dict)
+    plans: tuple[SampledPlan, ...] = ()
+
+
+_step_to_proto, _step_from_proto = converters(SampledStep, pb.SampledStep)
+_plan_to_proto, _plan_from_proto = converters(
+    SampledPlan,
+    pb.SampledPlan,
+    parts={
+        "reward": converters(RewardTiers, pb.RewardTiers),
+        "steps": (_step_to_proto, _step_from_proto),
+    },
+    absent={"reward": None},
+)
+_PLAN_CHARS: Final = {
+    "task_id": MESSAGE_CHARS,
+    "instruction": TEXT_CHARS,
+    "text": TEXT_CHARS,
+    "problem": MESSAGE_CHARS,
+}
+_STEP_CHARS: Final = {"skill": NAME_CHARS, "message": MESSAGE_CHARS}
+
 
 def training_report_to_proto(run_id: str, report: TrainingReport) -> pb.ReportTrainingRequest:
+    """Return the request. Texts and steps of sampled plans beyond their limits are cut off."""
     return pb.ReportTrainingRequest(
         run_id=run_id,
         phase=report.phase,
         step=report.step,
         figures=report.figures,
-        plans=[_plan_to_proto(plan) for plan in report.plans],
+        plans=[_plan_to_proto(_cut_plan(plan)) for plan in report.plans],
     )
 
 
@@ -43,64 +112,38 @@ def training_report_from_proto(message: pb.ReportTrainingRequest) -> TrainingRep
         finite(f"figures[{name!r}]", value)
     phase = _bounded("phase", required("phase", message.phase), NAME_CHARS)
     return TrainingReport(
-        phase, message.step, dict(message.figures), each("plans", _plan_from_proto, message.plans)
+        phase, message.step, dict(message.figures), each("plans", _checked_plan, message.plans)
     )
 
 
-def _plan_to_proto(plan: SampledPlan) -> pb.SampledPlan:
-    told, reward = None, plan.reward
-    if reward is not None:
-        told = pb.RewardTiers(
-            format=reward.format, relevance=reward.relevance, goal=reward.goal, success=reward.success
-        )
-    return pb.SampledPlan(
-        task_id=_cut(plan.task_id, MESSAGE_CHARS),
-        instruction=_cut(plan.instruction, TEXT_CHARS),
-        text=_cut(plan.text, TEXT_CHARS),
-        reward=told,
-        advantage=plan.advantage,
-        problem=_cut(plan.problem, MESSAGE_CHARS),
-        steps=[
-            pb.SampledStep(
-                skill=_cut(step.skill, NAME_CHARS), ok=step.ok, message=_cut(step.message, MESSAGE_CHARS)
-            )
-            for step in plan.steps[:MAX_STEPS]
-        ],
-    )
+def _cut_plan(plan: SampledPlan) -> SampledPlan:
+    steps = tuple(replace(step, **_cut(step, _STEP_CHARS)) for step in plan.steps[:MAX_STEPS])
+    return replace(plan, steps=steps, **_cut(plan, _PLAN_CHARS))
 
 
-def _cut(text: str, at_most: int) -> str:
-    """The text's beginning, as the wire takes it: a model may write half a character."""
-    return text[:at_most].encode("utf-8", "replace").decode("utf-8")
+def _cut(value: SampledPlan | SampledStep, limits: Mapping[str, int]) -> dict[str, Any]:
+    """Return the texts within their limits. A model may emit half a surrogate pair, which becomes ``?``."""
+    return {
+        name: getattr(value, name)[:limit].encode("utf-8", "replace").decode("utf-8")
+        for name, limit in limits.items()
+    }
 
 
-def _plan_from_proto(message: pb.SampledPlan) -> SampledPlan:
+def _checked_plan(message: pb.SampledPlan) -> SampledPlan:
     _bounded("steps", message.steps, MAX_STEPS)
-    return SampledPlan(
-        task_id=_bounded("task_id", message.task_id, MESSAGE_CHARS),
-        instruction=_bounded("instruction", message.instruction, TEXT_CHARS),
-        text=_bounded("text", message.text, TEXT_CHARS),
-        reward=inside("reward", _reward_from_proto, message.reward) if message.HasField("reward") else None,
-        advantage=finite("advantage", message.advantage),
-        problem=_bounded("problem", message.problem, MESSAGE_CHARS),
-        steps=each("steps", _step_from_proto, message.steps),
-    )
+    for name, limit in _PLAN_CHARS.items():
+        _bounded(name, getattr(message, name), limit)
+    return replace(_plan_from_proto(message), steps=each("steps", _checked_step, message.steps))
 
 
-def _reward_from_proto(message: pb.RewardTiers) -> RewardTiers:
-    format_, relevance, goal = (
-        finite(name, getattr(message, name)) for name in ("format", "relevance", "goal")
-    )
-    return RewardTiers(format_, relevance, goal, message.success)
-
-
-def _step_from_proto(message: pb.SampledStep) -> SampledStep:
-    skill = _bounded("skill", message.skill, NAME_CHARS)
-    return SampledStep(skill, message.ok, _bounded("message", message.message, MESSAGE_CHARS))
+def _checked_step(message: pb.SampledStep) -> SampledStep:
+    for name, limit in _STEP_CHARS.items():
+        _bounded(name, getattr(message, name), limit)
+    return _step_from_proto(message)
 
 
 def _bounded(field: str, value: T, at_most: int) -> T:
-    """The value, unless it is longer than it may be."""
+    """Return the value. Raise ConvertError if its length exceeds the limit."""
     if len(value) > at_most:
-        raise ConvertError(field, f"has a length of {len(value)}: at most {at_most}, tell less of it")
+        raise ConvertError(field, f"has a length of {len(value)}: at most {at_most} are accepted, send less")
     return value

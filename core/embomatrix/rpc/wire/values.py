@@ -1,6 +1,6 @@
-"""What trainer, manager and workers tell one another, as values; ``rpc.convert`` maps them to the wire.
+"""Values that trainer, manager and workers exchange.
 
-An outcome is a union: a failure of the infrastructure is a type without a reward, so it is never a 0.
+An outcome is a union: an infrastructure failure is a type without a reward, so it never counts as a reward of 0.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 
 
 class _ReadWhenAsked:
-    """A value that is passed on more often than it is looked at: some of its slots stay empty until one of them is asked for.
+    """Value that is parsed from its message on first access, because most processes only pass it on.
 
-    Then all of them are read from its message, by the function that it was made with.
+    The first access to an empty slot fills all empty slots.
     """
 
     __slots__ = ()
     _left: ClassVar[frozenset[str]]
-    """The slots that may be empty."""
+    """Slots that may be empty."""
 
     @classmethod
     def _unread(cls, read: Reader, **known: object) -> Self:
@@ -38,10 +38,9 @@ class _ReadWhenAsked:
             object.__setattr__(value, name, content)
         return value
 
-    if not TYPE_CHECKING:  # else a type checker would believe that there are attributes of any name
+    if not TYPE_CHECKING:  # Otherwise a type checker would accept attributes of any name.
 
         def __getattr__(self, name: str) -> object:
-            """Called for what is in no slot."""
             if name not in self._left:
                 raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
             for field_name, content in self.read(self.wire).items():
@@ -62,49 +61,49 @@ class Rollout(_ReadWhenAsked):
     plan: Plan
     seed: int
     render: bool = False
-    """It needs a slot that renders on a GPU."""
+    """Needs a slot that renders on a GPU."""
     wire: bytes = field(default=b"", init=False, compare=False, repr=False)
-    """The message that it came in, which is passed on instead of written anew; a changed copy has none."""
+    """Original message, which is passed on unchanged; a modified copy has none."""
     read: Reader | None = field(default=None, init=False, compare=False, repr=False)
-    """Reads the rest from ``wire`` when it is first asked for; None where it was read at once."""
+    """Parser of ``wire`` for the empty slots; None once everything is parsed."""
 
     @classmethod
     def unread(cls, wire: bytes, read: Reader, *, bundle_digest: str) -> Rollout:
-        """A rollout of which only the scene is known, until somebody asks ``read`` for the rest."""
+        """Return a rollout of which only the scene is parsed."""
         return cls._unread(read, wire=wire, bundle_digest=bundle_digest)
 
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """What a trainer submits at once. The same id and content attaches again instead of executing twice."""
+    """Rollouts that a trainer submits at once. Submitting the same id and content again attaches to the batch."""
 
     run_id: str
     batch_id: str
     step: int
     rollouts: tuple[Rollout, ...]
     wire: bytes = field(default=b"", init=False, compare=False, repr=False)
-    """The message that it came in, as for a rollout."""
+    """Original message, as for a rollout."""
 
 
 @dataclass(frozen=True, slots=True)
 class Timings:
-    """Where the seconds of a rollout went. Durations only: clocks of two machines are never compared."""
+    """Durations of a rollout. Clocks of two machines are never compared."""
 
     queued_s: float = 0.0
     """From submission to the lease that delivered, on the manager's clock."""
     load_s: float = 0.0
-    """Waiting for the scene, on the worker's clock; 0 when it was warm."""
+    """Wait for the scene, on the worker's clock; 0 if it was warm."""
     execute_s: float = 0.0
-    """In the slot, on the worker's clock."""
+    """Time in the slot, on the worker's clock."""
     lease_s: float = 0.0
-    """The lease's life less loading and executing: the network and the wait for a slot, on the manager's clock."""
+    """Life of the lease minus loading and executing: network and wait for a slot, on the manager's clock."""
     deliver_s: float = 0.0
     """From the result's arrival to its row in the result log, on the manager's clock."""
 
 
 @dataclass(frozen=True, slots=True)
 class Completed(_ReadWhenAsked):
-    """The plan was executed and scored: evidence about the policy, whatever the reward."""
+    """Executed and scored plan: evidence about the policy, whatever the reward."""
 
     _left = frozenset({"reward", "steps", "final", "trace_digest"})
 
@@ -116,22 +115,21 @@ class Completed(_ReadWhenAsked):
     timings: Timings
     warm: bool
     wire: bytes = field(default=b"", init=False, compare=False, repr=False)
-    """The message that it came in, which is passed on instead of written anew, but for what was ``noted``; a copy that was
-    changed otherwise has none."""
+    """Original message, which is passed on with the ``noted`` fields replaced; a copy with other changes has none."""
     read: Reader | None = field(default=None, init=False, compare=False, repr=False)
-    """Reads from ``wire`` what is not noted, when it is first asked for; None where it was read at once."""
+    """Parser of ``wire`` for the empty slots; None once everything is parsed."""
 
     @classmethod
     def unread(
         cls, wire: bytes, read: Reader, *, timings: Timings, warm: bool, worker_id: str = ""
     ) -> Completed:
-        """A result of which only what is noted on its way is known, until somebody asks ``read`` for the rest."""
+        """Return a result of which only the fields that may be ``noted`` are parsed."""
         return cls._unread(read, wire=wire, timings=timings, warm=warm, worker_id=worker_id)
 
     def noted(
         self, *, timings: Timings | None = None, worker_id: str | None = None, warm: bool | None = None
     ) -> Completed:
-        """The same result with what is noted on its way."""
+        """Return the same result with these fields replaced."""
         timings = self.timings if timings is None else timings
         worker_id = self.worker_id if worker_id is None else worker_id
         warm = self.warm if warm is None else warm
@@ -143,7 +141,7 @@ class Completed(_ReadWhenAsked):
 
 
 class InfraCode(StrEnum):
-    """Why the infrastructure could not execute a rollout. None of these says anything about the plan."""
+    """Reason why the infrastructure could not execute a rollout. It says nothing about the plan."""
 
     WORKER_LOST = "worker_lost"
     LEASE_EXPIRED = "lease_expired"
@@ -162,7 +160,7 @@ class InfraCode(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class InfraFailure:
-    """The rollout has no result and no reward. ``message`` is the worker's or manager's own text."""
+    """Infrastructure failure: no result and no reward. ``message`` comes from the worker or the manager."""
 
     code: InfraCode
     message: str
@@ -171,7 +169,7 @@ class InfraFailure:
 
 @dataclass(frozen=True, slots=True)
 class Cancelled:
-    """Called off before it ended: by the trainer, or because its group or batch can't be completed any more."""
+    """Rollout that was cancelled by the trainer, or because its group or batch cannot be completed."""
 
     reason: str = ""
 
@@ -181,7 +179,7 @@ Outcome = Completed | InfraFailure | Cancelled
 
 @dataclass(frozen=True, slots=True)
 class RolloutResult:
-    """The one terminal outcome of a rollout. ``cursor`` orders the results of a batch from 1."""
+    """Terminal outcome of a rollout. ``cursor`` orders the results of a batch from 1."""
 
     rollout_id: str
     group_id: str
@@ -192,7 +190,7 @@ class RolloutResult:
 
 @dataclass(frozen=True, slots=True)
 class GroupDone:
-    """Every member of a group has its outcome: how many of each kind."""
+    """Number of outcomes of each kind in a finished group."""
 
     group_id: str
     completed: int = 0
@@ -201,33 +199,34 @@ class GroupDone:
 
 
 class GroupPolicy(StrEnum):
-    """What becomes of a group when one of its rollouts ends as a failure of the infrastructure."""
+    """Treatment of a group after one of its rollouts ends in an infrastructure failure."""
 
     RETRY_THEN_FAIL_GROUP = "retry_then_fail_group"
-    """After the retries the others are cancelled: the group is left out of the update as a whole."""
+    """Retry, then cancel the rest of the group, which is left out of the update."""
     PARTIAL = "partial"
-    """The others go on."""
+    """The rest of the group continues."""
     FAIL_FAST = "fail_fast"
     """No retries: the first failure cancels the whole batch."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunTerms:
-    """What a run asks of the cluster. A higher ``priority`` is served first, equal ones share by ``weight``."""
+    """Terms of a run. Runs of higher ``priority`` are served first; runs of equal priority share by ``weight``."""
 
     group_policy: GroupPolicy = GroupPolicy.RETRY_THEN_FAIL_GROUP
     weight: float = 1.0
     priority: int = 0
     rollout_deadline_s: float = 0.0
-    """From submission to outcome; 0 for the manager's default."""
+    """Time limit from submission to outcome; 0 for the manager's default."""
     verified: bool = False
-    """Results of workers on probation, and some of the others, are delivered when a second worker came to the same."""
+    """Results of workers on probation, and a sample of others, are delivered after a second worker has reproduced
+    them."""
     reward: RewardSettings = PAPER
-    """Coefficients of the reward's tiers, for all rollouts of the run."""
+    """Reward coefficients of all rollouts of the run."""
 
 
 class Warmth(StrEnum):
-    """How far the manager is with a scene that was announced."""
+    """Loading state of an announced scene."""
 
     WARM = "warm"
     WARMING = "warming"
@@ -237,29 +236,29 @@ class Warmth(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LookaheadEntry:
-    """One scene that a coming step needs: ``count`` rollouts of it at ``step``."""
+    """Scene that a coming step needs, for ``count`` rollouts."""
 
     step: int
     bundle_digest: str
     count: int
     render: bool = False
-    """They need slots that render on a GPU."""
+    """Needs slots that render on a GPU."""
 
 
 @dataclass(frozen=True, slots=True)
 class LookaheadAnswer:
-    """How far a scene is. ``eta_s`` are the seconds until it is warm: 0 when it is, or when nobody can tell."""
+    """Loading state of a scene. ``eta_s`` is the forecast seconds until it is warm; 0 if it is warm or unknown."""
 
     bundle_digest: str
     warmth: Warmth
     eta_s: float = 0.0
     reason: str = ""
-    """Why no worker can hold it."""
+    """Reason why the scene fits on no worker."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanCell:
-    """One cell of the look-ahead grid. ``worker_ids`` hold the scene or load it."""
+    """Cell of the look-ahead grid. Workers in ``worker_ids`` hold or load the scene."""
 
     run_id: str
     step: int
@@ -271,7 +270,7 @@ class PlanCell:
 
 @dataclass(frozen=True, slots=True)
 class Resources:
-    """What a worker offers. ``memory_mb`` is for all residents together; ``score`` is its measured speed."""
+    """Resources of a worker. ``memory_mb`` is for all residents together; ``score`` is its measured speed."""
 
     slots: int
     cores: int
@@ -280,18 +279,18 @@ class Resources:
     gpu: str = ""
     vram_mb: int = 0
     versions: Mapping[str, str] = field(default_factory=dict)
-    """Of the package, Python, the engine's wheel, and the platform fingerprint."""
+    """Versions of the package, Python, the engine's wheel, and the platform fingerprint."""
     render_slots: int = 0
-    """Slots of them that render on the GPU."""
+    """Number of slots that render on the GPU."""
     disk_mb: int = 0
     """Free space for bundles."""
     labels: Mapping[str, str] = field(default_factory=dict)
-    """What the operator calls this machine by: room=lab, owner=ann."""
+    """Labels that the operator gave this machine, such as room=lab."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunStats:
-    """Counters of a run, as the manager keeps them."""
+    """Counters of a run."""
 
     delivered: int = 0
     infra_failures: int = 0
@@ -305,13 +304,13 @@ class RunStats:
     hedged: int = 0
     groups_failed: int = 0
     audited: int = 0
-    """Results that were compared with those of another worker."""
+    """Results that were compared with another worker's."""
     audit_mismatches: int = 0
-    """Of these: where the two were not the same."""
+    """Audited results that differed from another worker's."""
 
 
 class ResidentState(StrEnum):
-    """How far a worker is with a scene that it should hold."""
+    """Loading state of a scene on a worker."""
 
     LOADING = "loading"
     WARM = "warm"
@@ -320,7 +319,7 @@ class ResidentState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Resident:
-    """A scene on a worker. ``error`` says why loading it failed; ``memory_mb`` is what it holds alone."""
+    """Scene on a worker. ``error`` says why loading failed; ``memory_mb`` is its own memory."""
 
     bundle_digest: str
     state: ResidentState
@@ -331,7 +330,9 @@ class Resident:
 
 @dataclass(frozen=True, slots=True)
 class WorkerInfo:
-    """A worker as the manager sees it. ``state`` is "ready", "paused", "suspect", "lost", "draining", "quarantined", "left"."""
+    """Worker as the manager sees it. ``state`` is "ready", "paused", "suspect", "lost", "draining", "quarantined" or
+    "left".
+    """
 
     worker_id: str
     state: str
@@ -341,18 +342,18 @@ class WorkerInfo:
     completed: int
     last_seen_s: float
     reason: str = ""
-    """Why it is paused, draining, lost or in quarantine."""
+    """Reason why it is paused, draining, lost or in quarantine."""
     audited: int = 0
-    """Executions that were compared with others'."""
+    """Executions that were compared with other workers'."""
     audit_mismatches: int = 0
-    """Of these: in which a majority contradicted it."""
+    """Audited executions that a majority contradicted."""
 
 
 @dataclass(frozen=True, slots=True)
 class FleetStatus:
-    """The workers, and how the cluster does, in the manager's own sentence; a manager of an earlier release says nothing.
+    """Workers, and the health of the cluster in a sentence.
 
-    ``mood`` is how much somebody should care: good, idle, warning or bad.
+    ``mood`` is its severity: good, idle, warning or bad.
     """
 
     workers: tuple[WorkerInfo, ...]
@@ -362,7 +363,7 @@ class FleetStatus:
 
 @dataclass(frozen=True, slots=True)
 class RunInfo:
-    """A run: its counters so far, and how many of its rollouts have no outcome yet.
+    """Run with its counters; ``pending`` rollouts have no outcome yet.
 
     Times are seconds since the epoch on the manager's clock; ``closed_s`` is 0 while it is open.
     """
@@ -375,4 +376,4 @@ class RunInfo:
     closed_s: float = 0.0
     reward: RewardSettings = PAPER
     waits_for: str = ""
-    """Why rollouts of it can't be executed by any worker that is there; empty while they can."""
+    """Reason why no connected worker can execute its rollouts; empty while one can."""

@@ -1,7 +1,7 @@
 """Bodies of assets in one Bullet client: shapes made once per asset, bodies in batches.
 
-The frame of a body is its asset's frame: inertial frames lie at the asset's origin, and a link's at its joint. Bullet holds no
-hull within a compound that comes from memory, so hulls beside other parts ride on links of their own, with a fixed joint.
+A body's frame is its asset's frame: inertial frames lie at the asset's origin, a link's at its joint. Bullet loses hulls in
+compounds from memory, so hulls beside other parts get their own links with a fixed joint.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import ConvexPart
 
 HULL_MARGIN_M = 0.001
-"""Bullet rounds hulls outwards by this much; their vertices are drawn in by the same."""
+"""Bullet rounds hulls outwards by this much; their vertices are drawn in to compensate."""
 PART_LIMIT = 16
-"""Parts of a compound: Bullet drops the rest silently."""
+"""Parts of a compound: Bullet silently drops the rest."""
 ROLLING_FRICTION: Final = 2e-3
-"""Round food is not a ball bearing: a little resistance to rolling lets an apple come to rest."""
+"""Slight rolling resistance, with which round food comes to rest."""
 NO_SHAPE = -1
 LEAST_LEAF_KG = 0.2
-"""No door weighs less: the solver wants masses of one order."""
+"""Least mass of a door panel: the solver needs masses of one order of magnitude."""
 
 
 @dataclass(frozen=True, slots=True)
 class CollisionPiece:
-    """One collision shape of an asset, in the frame of its link. ``parent`` is a piece's index; -1 marks the base."""
+    """Collision shape of an asset in the frame of its link. ``parent`` is a piece's index; -1 marks the base."""
 
     shape: int
     origin_m: Vec3
@@ -43,11 +43,11 @@ class CollisionPiece:
 
 
 _ROWS: Final[list[list[float]]] = []
-"""What vertices are handed over in. pybullet never lets go of a vertex that it was given: these it is given again and again."""
+"""Reused vertex lists: pybullet never frees a list that it was given."""
 
 
 def _rows(vertices: Sequence[Sequence[float]]) -> list[list[float]]:
-    """The vertices, in lists that are good until the next call."""
+    """Copy the vertices into lists that are valid until the next call."""
     _ROWS.extend([] for _ in range(len(vertices) - len(_ROWS)))
     for row, vertex in zip(_ROWS, vertices, strict=False):
         row[:] = vertex
@@ -55,13 +55,13 @@ def _rows(vertices: Sequence[Sequence[float]]) -> list[list[float]]:
 
 
 class BodyFactory:
-    """Makes bodies in one client. Shapes are shared by the bodies of an asset and live until the client is reset."""
+    """Makes bodies in one client. An asset's bodies share shapes, which live until the client is reset."""
 
     def __init__(self, client: int, flags: int = 0, *, plain: bool = False) -> None:
-        """``flags`` are Bullet's, for every body that is made.
+        """``flags`` are Bullet's, for every body.
 
-        With ``plain``, bodies of one piece are rigid bodies instead of multi-bodies: they step three times as fast, but
-        Bullet restores no saved state of them exactly.
+        With ``plain``, single-piece bodies are rigid bodies instead of multi-bodies: they step three times as fast, but Bullet
+        does not restore their saved states exactly.
         """
         self._bullet = pybullet()
         self._client = client
@@ -70,7 +70,7 @@ class BodyFactory:
         self._pieces: dict[int, tuple[Asset, tuple[CollisionPiece, ...]]] = {}
 
     def forget_shapes(self) -> None:
-        """Drop the shapes' ids: resetting a client frees the shapes themselves."""
+        """Drop the shapes' ids after a reset of the client, which frees the shapes."""
         self._pieces.clear()
 
     def jointed(self, asset: Asset, poses: Sequence[Pose]) -> tuple[int, ...]:
@@ -88,7 +88,7 @@ class BodyFactory:
         return (ids,) if isinstance(ids, int) else tuple(ids)
 
     def rigid(self, asset: Asset, pose: Pose, fractions: Sequence[float], mass_kg: float) -> int:
-        """One body without joints: the links are fixed where ``fractions`` puts them. A mass of 0 makes it immovable."""
+        """Body without joints, whose links are fixed at ``fractions``. A mass of 0 makes it immovable."""
         pieces = self._pieces_of(asset)
         motions = [
             joint_motion(joint, fraction)
@@ -97,7 +97,7 @@ class BodyFactory:
         return self._create([mass_kg / len(pieces)] * len(pieces), pieces, pose, motions)
 
     def brake(self, body: int) -> None:
-        """Give a body a little resistance to rolling and to spinning."""
+        """Give a body slight resistance to rolling and spinning."""
         self._bullet.changeDynamics(
             body,
             -1,
@@ -107,9 +107,9 @@ class BodyFactory:
         )
 
     def hinged(self, asset: Asset, pose: Pose) -> int:
-        """One body whose base is immovable and whose leaves have mass and free joints: physics moves them.
+        """Body with an immovable base whose panels have mass and free joints.
 
-        A leaf has its share of the asset's mass by the volume of its parts.
+        A panel's share of the asset's mass is proportional to the volume of its parts.
         """
         pieces = self._pieces_of(asset)
         volumes = [sum(math.prod(part.size_m) for part in link.parts) for link in asset.links]
@@ -139,7 +139,7 @@ class BodyFactory:
         return tuple(i - 1 for i, piece in enumerate(pieces) if piece.joint is not None)
 
     def _pieces_of(self, asset: Asset) -> tuple[CollisionPiece, ...]:
-        """Shapes of an asset. It is kept beside them, so that its id can't pass to another one."""
+        """Shapes of an asset. Holding the asset keeps its id from being reused."""
         if id(asset) not in self._pieces:
             pieces: list[CollisionPiece] = []
             for link in asset.links:
@@ -151,7 +151,7 @@ class BodyFactory:
     def _link_pieces(
         self, parts: Sequence[ConvexPart], origin: Vec3, joint: Joint | None, first: int
     ) -> tuple[CollisionPiece, ...]:
-        """Pieces of one link, the first of which takes index ``first`` and bears the joint."""
+        """Pieces of one link; the first takes index ``first`` and bears the joint."""
         ox, oy, oz = origin
         frame = Pose((-ox, -oy, -oz))
         plain = [part for part in parts if part.shape is not Shape.HULL]
@@ -202,7 +202,7 @@ class BodyFactory:
         pose: Pose,
         motions: Sequence[Pose] | None = None,
     ) -> int:
-        """One body of these pieces, each with its mass. With ``motions``, one per joint, the joints are fixed there."""
+        """Body of these pieces with their masses. With ``motions``, one per joint, the joints are fixed there."""
         return int(
             self._bullet.createMultiBody(
                 masses_kg[0],

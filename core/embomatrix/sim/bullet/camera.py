@@ -1,4 +1,4 @@
-"""Pictures of a scene by Bullet's software renderer: the whole of it from above and aside, and what the robot sees."""
+"""Pictures of a scene by Bullet's software renderer: oblique from above, and from the robot's camera."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 CUT_M: Final = 0.45
 """Walls between the camera and the rooms are shown up to this height."""
 CEILING_M: Final = 2.3
-"""What hangs this high is left out: it would hide the rooms."""
+"""Objects that hang this high are left out: they would hide the rooms."""
 ELEVATION: Final = math.radians(52.0)
 AZIMUTH: Final = math.radians(-60.0)
 """The camera looks from the south-south-east."""
@@ -34,15 +34,15 @@ EYE_M: Final = 1.35
 """Height of the robot's camera over the floor, above the middle of its base."""
 EYE_PITCH: Final = math.radians(-22.0)
 EYE_FIELD_OF_VIEW: Final = 75.0
-"""The robot's camera looks a little down, so that it sees the tops of tables it stands at."""
+"""The robot's camera looks slightly down, to see the tops of nearby tables."""
 EYE_NEAR_M: Final = 0.05
 EYE_FAR_M: Final = 30.0
 
 
 def render_oblique(scene: Scene, *, width_px: int = 1280, height_px: int = 960) -> NDArray[np.uint8]:
-    """The whole scene from above and aside, near walls cut low, without a ceiling.
+    """Render the whole scene obliquely from above, with low near walls and without ceiling objects.
 
-    Returns RGB values, shape (height, width, 3). Raises EngineError where pybullet is missing.
+    Returns RGB values, shape (height, width, 3). Raises EngineError if pybullet is missing.
     """
     with VisualScene(scene) as stage:
         furnish_cutaway(stage)
@@ -53,9 +53,9 @@ def render_oblique(scene: Scene, *, width_px: int = 1280, height_px: int = 960) 
 def render_egocentric(
     scene: Scene, stand: StandPose | None = None, *, width_px: int = 320, height_px: int = 240
 ) -> NDArray[np.uint8]:
-    """What the robot sees as it turns round at ``stand``, or where it starts: ahead, to its left, behind, to its right.
+    """Render four views of the robot at ``stand``, or at its start: ahead, left, behind, right.
 
-    Returns RGB values, shape (4, height, width, 3). Raises EngineError where pybullet is missing.
+    Returns RGB values, shape (4, height, width, 3). Raises EngineError if pybullet is missing.
     """
     start = stand or _start(scene)
     with VisualScene(scene) as stage:
@@ -65,14 +65,14 @@ def render_egocentric(
 
 
 def furnish_cutaway(stage: VisualScene) -> None:
-    """Fill a stage for pictures from above and aside: no ceiling, near walls cut low."""
+    """Fill a stage for oblique pictures: no ceiling objects, near walls cut low."""
     stage.add_floors()
     stage.add_walls(lambda wall: _cut(stage.scene, wall))
     stage.add_objects(lambda item: not _hangs_at_ceiling(stage.scene, item))
 
 
 def furnish_whole(stage: VisualScene) -> None:
-    """Fill a stage for pictures from within: all walls in full, and what hangs at the ceiling."""
+    """Fill a stage for inside pictures: full walls and ceiling objects."""
     stage.add_floors()
     stage.add_walls(lambda wall: wall)
     stage.add_objects()
@@ -81,7 +81,7 @@ def furnish_whole(stage: VisualScene) -> None:
 def shoot_oblique(
     stage: VisualScene, rooms: tuple[Room, ...], width_px: int, height_px: int
 ) -> NDArray[np.uint8]:
-    """These rooms from above and aside, filling the picture."""
+    """Render these rooms obliquely, filling the picture."""
     low = np.min([room.low_m for room in rooms], axis=0)
     high = np.max([room.high_m for room in rooms], axis=0)
     aspect = width_px / height_px
@@ -94,7 +94,7 @@ def shoot_oblique(
 def shoot_egocentric(
     stage: VisualScene, stand: StandPose, width_px: int, height_px: int
 ) -> NDArray[np.uint8]:
-    """The view of the robot's camera at a standing pose."""
+    """Render the view of the robot's camera at a standing pose."""
     flat = math.cos(EYE_PITCH)
     eye = (stand.x_m, stand.y_m, EYE_M)
     ahead = (flat * math.cos(stand.yaw), flat * math.sin(stand.yaw), math.sin(EYE_PITCH))
@@ -113,7 +113,7 @@ def _hangs_at_ceiling(scene: Scene, item: SceneObject) -> bool:
 
 
 def _cut(scene: Scene, wall: ConvexPart) -> ConvexPart | None:
-    """Walls with a room behind them, seen from the camera, are cut low; the others stand in full."""
+    """Cut walls that hide a room from the camera; leave the others whole."""
     if not _hides(scene, wall):
         return wall
     low_m = wall.aabb(IDENTITY).low_m[2]
@@ -126,7 +126,7 @@ def _cut(scene: Scene, wall: ConvexPart) -> ConvexPart | None:
 
 
 def _hides(scene: Scene, wall: ConvexPart) -> bool:
-    """Whether a room lies right behind any stretch of the wall."""
+    """Return True if a room lies right behind any stretch of the wall."""
     look = _direction()
     length = max(wall.size_m[:2])
     along = np.array([1.0, 0.0]) if wall.size_m[0] > wall.size_m[1] else np.array([0.0, 1.0])
@@ -146,7 +146,7 @@ def _direction() -> FloatArray:
 
 
 def _framing(low: FloatArray, high: FloatArray, aspect: float) -> tuple[FloatArray, float]:
-    """The point to look at and the distance from it at which all corners of the rooms just fit into the picture."""
+    """Target and distance at which all corners of the rooms just fit into the picture."""
     look = _direction()
     right = np.cross([0.0, 0.0, 1.0], look)
     right /= np.linalg.norm(right)
@@ -155,7 +155,7 @@ def _framing(low: FloatArray, high: FloatArray, aspect: float) -> tuple[FloatArr
     tangent = math.tan(math.radians(FIELD_OF_VIEW / 2))
     target = corners.mean(axis=0)
     distance = 1.0
-    # A few rounds: moving the target changes the perspective, and that the extent.
+    # Iterates: moving the target changes the perspective and with it the extent.
     for _ in range(8):
         local = corners - target
         distance = float(

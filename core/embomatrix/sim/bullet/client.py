@@ -1,4 +1,4 @@
-"""Connections to Bullet: silent, without the renderer, or a clear error."""
+"""Connections to Bullet: silent and without the renderer."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 TINY_RENDERER: Final = 2
-"""Index of the plugin that draws pictures on the CPU. With it every body costs ten times as much to create."""
+"""Index of the CPU renderer plugin. With it every body costs ten times as much to create."""
 
 
 NEAR_M: Final = 0.005
 _USUAL_M: Final = 0.02
-"""Bullet's own: made for crates and cars. Boxes around bodies are larger by as much, and whose boxes meet wake one another."""
+"""Bullet's default contact distance. It enlarges body boxes, and bodies with touching boxes wake one another."""
 
 
 @contextlib.contextmanager
 def _stderr_closed() -> Iterator[None]:
-    """Discard what C code writes to stderr: pybullet prints its build date when it is imported."""
+    """Discard stderr of C code: pybullet prints its build date on import."""
     sys.stderr.flush()
     kept = os.dup(2)
     null = os.open(os.devnull, os.O_WRONLY)
@@ -39,7 +39,7 @@ def _stderr_closed() -> Iterator[None]:
 
 @functools.cache
 def pybullet() -> Any:
-    """The module, imported at the first call. Raises EngineMissingError where it is not installed."""
+    """Return the module, imported at the first call. Raises EngineMissingError if it is not installed."""
     try:
         with _stderr_closed():
             import pybullet as module
@@ -52,9 +52,9 @@ def pybullet() -> Any:
 
 
 class ClientPool:
-    """Connected clients, kept for reuse: the memory of a fresh one costs more time than loading a scene does.
+    """Pool of connected clients: the memory of a new one costs more time than loading a scene.
 
-    A process that forks simulators fills the pool first: its children find the clients connected.
+    A process that forks simulators fills the pool first, so that its children inherit connected clients.
     """
 
     def __init__(self, spare: int = 0) -> None:
@@ -62,11 +62,11 @@ class ClientPool:
         self._spare = [connect() for _ in range(spare)]
 
     def take(self) -> int:
-        """An empty client. Raises EngineError when Bullet has none left."""
+        """Take an empty client. Raises EngineError if Bullet has none left."""
         return self._spare.pop() if self._spare else connect()
 
     def give_back(self, client: int) -> None:
-        """Empty a client and keep it for the next who asks."""
+        """Empty a client and keep it for reuse."""
         pybullet().resetSimulation(physicsClientId=client)
         self._spare.append(client)
 
@@ -78,7 +78,7 @@ class ClientPool:
 
 
 def connect() -> int:
-    """Open a client without a renderer and return its id. Raises EngineError when Bullet has none left."""
+    """Open a client without a renderer and return its id. Raises EngineError if Bullet has none left."""
     bullet = pybullet()
     client = int(bullet.connect(bullet.DIRECT))
     if client < 0:
@@ -95,7 +95,7 @@ def connect() -> int:
 
 
 def _renders(client: int) -> bool:
-    """Whether the renderer answers still: without it Bullet knows nothing of visual shapes and raises."""
+    """Return True if the renderer still answers: without it Bullet raises on queries about visual shapes."""
     bullet = pybullet()
     shape = bullet.createCollisionShape(bullet.GEOM_SPHERE, radius=0.1, physicsClientId=client)
     body = bullet.createMultiBody(0, shape, physicsClientId=client)
@@ -110,7 +110,10 @@ def _renders(client: int) -> bool:
 
 @contextlib.contextmanager
 def near_contacts(client: int) -> Iterator[None]:
-    """Look at bodies from 5 mm on: of the things on a crowded table, one that is taken wakes only those that it is close to."""
+    """Reduce the contact distance to 5 mm: an object taken from a crowded table then wakes only close neighbours.
+
+    Bullet has one such number for all clients of a process, so the default returns afterwards.
+    """
     bullet = pybullet()
     bullet.setPhysicsEngineParameter(contactBreakingThreshold=NEAR_M, physicsClientId=client)
     try:

@@ -1,9 +1,8 @@
-"""The dynamic world: a scene in which time passes, with the robot in it.
+"""Dynamic world: a stepped scene with the robot in it.
 
-Movable things are dynamic bodies, furniture stands and its doors swing freely against a little friction. What rests is put
-to sleep, which costs nearly nothing and keeps it where it is; what comes into contact with anything awake wakes up by
-itself, and what loses its support is woken by name. The world is built anew for every rollout: so it depends on nothing
-that was simulated before.
+Movable objects are dynamic bodies; furniture is fixed, and its doors swing against slight friction. Resting bodies sleep,
+which costs almost nothing and keeps them in place. Contact with an awake body wakes them; a body that loses its support is
+woken by name. The world is rebuilt for every rollout and so does not depend on earlier ones.
 """
 
 from __future__ import annotations
@@ -26,19 +25,19 @@ if TYPE_CHECKING:
 
 STEP_S: Final = 1 / 240
 TIP_M: Final = 0.1122
-"""From the hand's frame to the fingertips' end."""
+"""Distance from the hand's frame to the fingertips' end."""
 CONVERGED: Final = 1e-5
-"""Square of the change of speed, in m/s or rad/s, below which the solver stops before its fifty rounds: 3 mm/s."""
+"""Squared change of speed, in (m/s)^2 or (rad/s)^2, below which the solver stops before its 50 iterations: 3 mm/s."""
 GLIDE: Final = 2
 ROLL: Final = 4
-"""How many steps one step lasts where nothing is to be touched: with something in the hand, and with nothing."""
+"""Step length multipliers in free space: with an object in the hand (GLIDE) and with an empty hand (ROLL)."""
 
 
 class DynamicWorld:
-    """One scene and the robot in one client that is stepped. Objects are called by their names."""
+    """Scene and robot in one stepped client. Objects are addressed by name."""
 
     def __init__(self, scene: Scene, pool: ClientPool | None = None) -> None:
-        """Take a client; ``build`` fills it."""
+        """Take a client from the pool; ``build`` fills it."""
         self._bullet = pybullet()
         self._owns_pool = pool is None
         self._pool = pool or ClientPool()
@@ -53,7 +52,7 @@ class DynamicWorld:
     def build(
         self, poses: Mapping[str, Pose], joints: Mapping[str, tuple[float, ...]], posture: Posture
     ) -> None:
-        """Fill the client: objects at these poses and joint positions, asleep; those without a pose are out of the world."""
+        """Fill the client: objects asleep at these poses and joint positions; objects without a pose are outside the world."""
         bullet, client = self._bullet, self._client
         bullet.resetSimulation(physicsClientId=client)
         bullet.setGravity(0, 0, GRAVITY_M_S2, physicsClientId=client)
@@ -62,7 +61,7 @@ class DynamicWorld:
         with near_contacts(client):
             self.bodies.fill(poses, joints)
             self.robot = RobotBody(client, posture)
-        # What is put to sleep falls for one step, until its contacts are known.
+        # Sleeping bodies fall for one step until their contacts are known.
         self.rest()
         self.step(1)
         self.rest()
@@ -71,23 +70,23 @@ class DynamicWorld:
         self._known = {name: self.bodies.state(name) for name in self.bodies.moving}
 
     def step(self, steps: int) -> None:
-        """Let time pass."""
+        """Step the simulation."""
         with near_contacts(self._client):
             for _ in range(steps):
                 self._bullet.stepSimulation(physicsClientId=self._client)
         self.steps += steps
 
     def go(self, posture: Posture, steps: int) -> None:
-        """Let time pass while the motors pursue a posture."""
+        """Step while the motors drive towards a posture."""
         self.robot.steer(posture)
         self.step(steps)
 
     def glide(self, posture: Posture, steps: int) -> None:
-        """The same in longer steps, for where nothing is to be touched: longer yet with an empty hand."""
+        """Step in longer increments for free space: longest with an empty hand."""
         each = GLIDE if self._held else ROLL
         bullet, client = self._bullet, self._client
         bullet.setTimeStep(each * STEP_S, physicsClientId=client)
-        # A motor's force becomes an impulse by the length that a step has when it is steered.
+        # Bullet converts a motor's force to an impulse with the step length at the time of the command.
         self.robot.steer(posture)
         with near_contacts(client):
             for _ in range(0, steps, each):
@@ -96,13 +95,13 @@ class DynamicWorld:
         self.steps += steps
 
     def passage(self) -> Passage | None:
-        """A motion from where the robot is; None while anything moves of itself, as time must pass for that."""
+        """Free-space motion from the robot's posture; None while anything else moves, since time must pass for that."""
         if self._stirs(self.bodies.moving):
             return None
         return Passage(self._client, self.robot, self.bodies, self._held)
 
     def disturbed(self) -> tuple[str, ...]:
-        """Objects that moved, or whose joints did, since the last call, in scene order. What the hand holds is left out."""
+        """Objects that moved, or whose joints did, since the last call, in scene order; without the held object."""
         found = []
         for name in self.bodies.moving:
             now = self.bodies.state(name)
@@ -112,7 +111,7 @@ class DynamicWorld:
         return tuple(found)
 
     def settle(self, limit: int, chunk: int = 12) -> bool:
-        """Let time pass until nothing moves or ``limit`` steps are over; True when all is at rest. Then all sleep."""
+        """Step until nothing moves or ``limit`` steps are over; then all sleep. Return True if all is at rest."""
         quiet = False
         for _ in range(limit // chunk):
             self.step(chunk)
@@ -123,17 +122,17 @@ class DynamicWorld:
         return quiet
 
     def _stirs(self, names: Iterable[str]) -> bool:
-        """Whether any of some objects is in motion but what the hand holds."""
+        """Return True if any of these objects but the held one moves."""
         return any(name != self._held and self.bodies.is_in_motion(name) for name in names)
 
     def rest(self) -> None:
-        """Put everything to sleep but the robot and what it holds."""
+        """Put everything but the robot and the held object to sleep."""
         for name in self.bodies.moving:
             if name != self._held:
                 self.bodies.sleep(name)
 
     def touched_by(self, held: str, ignore: frozenset[str]) -> str:
-        """What an object touches but those in ``ignore``; "" for nothing."""
+        """Body in contact with an object, apart from those in ``ignore``; "" for none."""
         contacts = self._bullet.getContactPoints(bodyA=self.bodies.body(held), physicsClientId=self._client)
         for contact in contacts:
             other = self.bodies.name(contact[2])
@@ -142,7 +141,7 @@ class DynamicWorld:
         return ""
 
     def hindrance(self, ignore: frozenset[str] = frozenset()) -> str:
-        """What the robot, or what it holds, presses against most at this step; "" for nothing."""
+        """Body that the robot or its held object presses against most in this step; "" for none."""
         bodies = [self.robot.body] + ([self.bodies.body(self._held)] if self._held else [])
         pressed: dict[str, float] = {}
         for body in bodies:
@@ -153,7 +152,7 @@ class DynamicWorld:
         return max(pressed, key=lambda name: (pressed[name], name)) if pressed else ""
 
     def gap(self, name: str) -> float:
-        """Distance between the hand and an object, infinite from 5 cm on."""
+        """Distance between the hand and an object; infinite beyond 5 cm."""
         return min(
             (
                 contact[8]
@@ -170,7 +169,7 @@ class DynamicWorld:
         )
 
     def grasp(self, name: str) -> None:
-        """Hold an object as it is in the hand now."""
+        """Attach an object to the hand at its current pose."""
         body = self.bodies.body(name)
         self.bodies.wake((name,))
         self.robot.hold(body, -1, self.robot.hand_pose().inverse() @ self.bodies.pose(name))
@@ -178,18 +177,18 @@ class DynamicWorld:
         self._held = name
 
     def loosen(self) -> None:
-        """Let go of what the hand holds. The hand passes through it until ``part_from``: fingers do not drag it along."""
+        """Release the held object. The hand passes through it until ``part_from``: fingers must not drag it along."""
         self.robot.let_go()
         if self._held:
             self.bodies.wake((self._held,))
             self._held = ""
 
     def part_from(self, name: str) -> None:
-        """The hand has left an object that it held, and meets it again."""
+        """Restore collisions with a released object after the hand has left it."""
         self.robot.collide(self.bodies.body(name), self.bodies.links(name), on=True)
 
     def hook(self, name: str, joint: int) -> None:
-        """Hold the leaf that a joint of the object moves by the point that the hand is at."""
+        """Attach the hand's point to the panel that a joint of the object moves."""
         link = self.bodies.leaf(name, joint)
         tool = self.robot.hand_pose()
         point = tool.apply((0.0, 0.0, TIP_M))
@@ -203,16 +202,16 @@ class DynamicWorld:
         self._hooked = (name, link)
 
     def unhook(self) -> None:
-        """Let go of a leaf. The hand passes through it until ``part``: fingers in it do not drag it along."""
+        """Release a panel. The hand passes through it until ``part``: fingers must not drag it along."""
         self.robot.let_go()
 
     def part(self) -> None:
-        """The hand has left the leaf, and meets it again."""
+        """Restore collisions with the panel after the hand has left it."""
         name, link = self._hooked
         self.robot.brush(self.bodies.body(name), link, on=True)
 
     def close(self) -> None:
-        """Give the client back. The world can't be used afterwards."""
+        """Return the client and end the world's use."""
         self._pool.give_back(self._client)
         if self._owns_pool:
             self._pool.close()

@@ -1,7 +1,4 @@
-"""The bodies of a scene in which time passes: put in, moved, put to sleep and woken, each called by its object's name.
-
-What rests is put to sleep, which costs nearly nothing and keeps it where it is.
-"""
+"""Bodies of a stepped scene, addressed by object name: placed, moved, put to sleep and woken."""
 
 from __future__ import annotations
 
@@ -26,16 +23,16 @@ if TYPE_CHECKING:
 FLOOR_HALF_M: Final = 200.0
 HINGE_NM: Final = 0.4
 RUNNER_N: Final = 2.0
-"""Friction of doors and of drawers."""
+"""Friction of hinged doors and of drawers."""
 SLOW_M_S: Final = 0.01
 SLOW_RAD_S: Final = 0.1
 MOVED_M: Final = 5e-4
 TURNED: Final = 2e-3
-"""Less than this is the solver's sagging, not motion."""
+"""Smallest motion; less is sagging of the solver."""
 ALONG: Final = 0.999
-"""Cosine from which on two directions are one."""
+"""Cosine above which two directions count as parallel."""
 AWAY_M: Final = -50.0
-"""Depth at which things that are not in the world are kept."""
+"""Depth at which objects outside the world are kept."""
 
 
 class DynamicBodies:
@@ -53,10 +50,13 @@ class DynamicBodies:
         self._still: list[int] = []
         self.movable = tuple(item.name for item in scene.objects if not item.fixed)
         self.moving = (*self.movable, *(item.name for item in scene.objects if item.fixed and item.joints))
-        """What can move: movable things, then furniture with joints."""
+        """Movable objects, then furniture with joints."""
 
     def fill(self, poses: Mapping[str, Pose], joints: Mapping[str, tuple[float, ...]]) -> None:
-        """Fill an empty client: floor, walls, and objects at these poses and joint positions; those without a pose are away."""
+        """Fill an empty client.
+
+        Floor, walls, and objects at these poses and joint positions; objects without a pose stay outside.
+        """
         self._factory.forget_shapes()
         floor = self._factory.floor(0.0, 0.0, FLOOR_HALF_M)
         walls = self._factory.walls(self._scene.walls)
@@ -67,19 +67,19 @@ class DynamicBodies:
             self._add(item.name, pose, joints[item.name])
 
     def body(self, name: str) -> int:
-        """The number of an object's body."""
+        """Body id of an object."""
         return self._bodies[name]
 
     def links(self, name: str) -> range:
-        """The numbers of a body's links, its base first."""
+        """Link numbers of a body, its base first."""
         return range(-1, int(self._bullet.getNumJoints(self._bodies[name], physicsClientId=self._client)))
 
     def leaf(self, name: str, joint: int) -> int:
-        """The link that a joint of an object moves."""
+        """Link that a joint of an object moves."""
         return self._joints[name][joint]
 
     def name(self, body: int) -> str:
-        """What a body is called, "" for one that is not of the scene."""
+        """Name of a body; "" for one outside the scene."""
         return self._names.get(body, "")
 
     def pose(self, name: str) -> Pose:
@@ -98,15 +98,15 @@ class DynamicBodies:
         )
 
     def has_leaves(self, name: str) -> bool:
-        """Whether an object's joints move: what can be carried, as a laptop, is one rigid body with its lid as it is."""
+        """Return True if an object's joints move. A portable object, such as a laptop, is one rigid body."""
         return name in self._joints
 
     def is_in(self, name: str) -> bool:
-        """Whether the object is in the world, be it in the hand."""
+        """Return True if the object is in the world, also in the hand."""
         return self.pose(name).position_m[2] > AWAY_M / 2
 
     def put(self, name: str, pose: Pose) -> None:
-        """Bring in an object that was out of the world, or take it out: what is cut becomes its pieces."""
+        """Bring in an object from outside the world, such as the piece of a sliced one."""
         self._bullet.resetBasePositionAndOrientation(
             self._bodies[name], pose.position_m, pose.quat_xyzw, physicsClientId=self._client
         )
@@ -123,7 +123,7 @@ class DynamicBodies:
         self.sleep(name)
 
     def wake(self, names: Iterable[str]) -> None:
-        """Wake objects whose support may have gone."""
+        """Wake objects whose support may be gone."""
         for name in names:
             self._bullet.changeDynamics(
                 self._bodies[name],
@@ -133,14 +133,14 @@ class DynamicBodies:
             )
 
     def state(self, name: str) -> BodyState:
-        """Where something that can move is."""
+        """State of a movable object or of furniture with joints."""
         if name in self._joints:
             return (0.0, 0.0, 0.0), tuple(self._angle(name, index) for index in self._joints[name])
         pose = self.pose(name)
         return pose.position_m, pose.quat_xyzw
 
     def is_in_motion(self, name: str) -> bool:
-        """Whether a movable object, or any leaf of furniture, moves faster than what rests."""
+        """Return True if an object, or any of its panels, moves faster than a resting one."""
         bullet, client, body = self._bullet, self._client, self._bodies[name]
         if name in self._joints:
             states = bullet.getJointStates(body, self._joints[name], physicsClientId=client)
@@ -149,17 +149,17 @@ class DynamicBodies:
         return math.hypot(*linear) > SLOW_M_S or math.hypot(*angular) > SLOW_RAD_S
 
     def still_sleep(self) -> None:
-        """Put to sleep what never moves: else Bullet compares it in every step with all that lies on it, asleep or not."""
+        """Put immovable bodies to sleep; otherwise Bullet compares them in every step with everything on them."""
         bullet = self._bullet
         asleep = bullet.ACTIVATION_STATE_ENABLE_SLEEPING | bullet.ACTIVATION_STATE_SLEEP
         for body in self._still:
             bullet.changeDynamics(body, -1, activationState=asleep, physicsClientId=self._client)
 
     def spare_idle_contacts(self) -> None:
-        """Let leaves pass what they lie against where neither can ever push the other: what stands beside a leaf's way.
+        """Disable contacts between panels and touching bodies if neither can push the other.
 
-        A force along its hinge, or across its runners, moves no leaf. Bullet divides by how much a force moves: one such
-        contact makes it stop solving after an iteration, for the robot too once that comes near, and its lift sinks.
+        A force along a hinge, or across runners, moves no panel. Bullet divides by the mobility along the force: such a
+        contact stops the solver after one iteration, also for a robot that comes near, and its lift sinks.
         """
         bullet, client = self._bullet, self._client
         for name in self._joints:
@@ -170,7 +170,7 @@ class DynamicBodies:
                     bullet.setCollisionFilterPair(body, other, link, other_link, 0, physicsClientId=client)
 
     def _gives(self, body: int, link: int, normal: Vec3) -> bool:
-        """Whether a force along a normal moves a link of a body; what is not of the scene, as the robot, moves."""
+        """Return True if a force along a normal moves a link of a body. Bodies outside the scene, such as the robot, move."""
         name = self.name(body)
         if name not in self._joints:
             return not name or name in self.movable
@@ -183,7 +183,7 @@ class DynamicBodies:
         return along < ALONG if joint.kind is JointKind.REVOLUTE else along > 1.0 - ALONG
 
     def sleep(self, name: str) -> None:
-        """Put an object to sleep where it is."""
+        """Put an object to sleep in place."""
         bullet, client, body = self._bullet, self._client, self._bodies[name]
         if name in self._joints:
             for index in self._joints[name]:
@@ -210,7 +210,7 @@ class DynamicBodies:
         self._bodies[name], self._names[body] = body, name
 
     def _swing(self, body: int, name: str, joints: tuple[float, ...]) -> None:
-        """Give the joints their limits and friction, and set them."""
+        """Set limits, friction and positions of the joints."""
         bullet, client = self._bullet, self._client
         asset = self._scene.asset_of(name)
         for index, (_, joint), fraction in zip(self._joints[name], asset.joints, joints, strict=True):
@@ -229,6 +229,6 @@ class DynamicBodies:
 
 
 def differ(now: BodyState, before: BodyState) -> bool:
-    """Whether something moved between two states."""
+    """Return True if something moved between two states."""
     turned = max((abs(a - b) for a, b in zip(now[1], before[1], strict=True)), default=0.0)
     return math.dist(now[0], before[0]) > MOVED_M or turned > TURNED

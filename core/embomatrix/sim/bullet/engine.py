@@ -1,7 +1,7 @@
 """``PhysicsEngine`` on PyBullet: teleports and narrow-phase queries in one client, settling in another.
 
-The truth about poses and joints is kept here, in Python; Bullet's copy only answers questions of distance. So a reset is
-bit-exact, whatever Bullet rounds. The main client is never stepped and no body is ever removed from it.
+Poses and joints are stored in Python; Bullet's copy only answers distance queries. A reset is therefore bit-exact in spite of
+Bullet's rounding. The main client is never stepped, and no body is ever removed from it.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.bullet.bodies import PART_LIMIT
 from embomatrix.sim.bullet.client import ClientPool, pybullet
-from embomatrix.sim.bullet.mini_world import MiniWorld, Still
+from embomatrix.sim.bullet.mini_world import MiniWorld, StaticObject
 from embomatrix.sim.bullet.scene_bodies import SceneBodies
 from embomatrix.sim.engine import (
     FLOOR,
@@ -25,7 +25,7 @@ from embomatrix.sim.engine import (
     Settled,
 )
 from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of, forget
-from embomatrix.sim.geometry.spatial_hash import Neighbourhood
+from embomatrix.sim.geometry.spatial_hash import SpatialHash
 from embomatrix.sim.validation import check_fractions, check_pose, check_scene
 
 if TYPE_CHECKING:
@@ -37,21 +37,21 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 BOX_SLACK_M: Final = 0.01
-"""Boxes this far apart are still compared part by part: boxes of tilted cylinders may be a little too small."""
+"""Boxes this far apart are still compared part by part: boxes of tilted cylinders may be slightly too small."""
 SETTLE_RADIUS_M: Final = 0.02
-"""Parts whose boxes come this near take part in a settle: nothing that is stable moves more than half as far."""
+"""Parts with boxes in this range take part in a settle; a stable object moves at most half as far."""
 
 
 class BulletEngine:
-    """One scene in one Bullet client, with a second one to settle objects in. Not for use by several threads."""
+    """Scene in one Bullet client, with a second one for settling. Not thread-safe."""
 
     def __init__(
         self, scene: Scene, pool: ClientPool | None = None, prepared: PreparedScene | None = None
     ) -> None:
-        """Load the scene into clients of the pool, or into new ones that are closed with the engine.
+        """Load the scene into clients of the pool, or into new ones that close with the engine.
 
-        A scene with ``prepared`` boxes was decoded from a bundle: it was checked there. Raises EngineError when the scene is
-        not valid or pybullet is missing.
+        A scene with ``prepared`` boxes comes from a bundle and was checked there. Raises EngineError for an invalid scene or
+        if pybullet is missing.
         """
         if prepared is None:
             check_scene(scene)
@@ -71,7 +71,7 @@ class BulletEngine:
         boxes = prepared.object_boxes if prepared else map(self._box, range(len(self._names)))
         self._boxes = list(boxes)
         self._boxes_at_start = tuple(self._boxes)
-        self._around = Neighbourhood()
+        self._around = SpatialHash()
         for number, box in enumerate(self._boxes):
             if self._present[number]:
                 self._around.put(number, box)
@@ -81,9 +81,9 @@ class BulletEngine:
         self._journal = Journal()
         self._changed: set[int] = set()
         self._chunks: dict[int, bytes] = {}
-        """What ``state_bytes`` says of objects that changed, for as long as it is so."""
+        """Entries of ``state_bytes`` for changed objects, valid until their next change."""
         self._all_chunks: bytes | None = b""
-        """These together, for as long as nothing changes: half of the calls only move the robot."""
+        """Concatenated entries, valid until the next change: half of the calls only move the robot."""
         self._bodies = SceneBodies(self._client, scene)
 
     @property
@@ -92,14 +92,9 @@ class BulletEngine:
 
     @property
     def journal(self) -> Journal:
-        """Every change since the last reset, in order. For reading only."""
         return self._journal
 
     def reset(self) -> None:
-        """Undo every change since loading: poses, joints and parking are bit-equal to the scene's.
-
-        What the scene calls absent is parked.
-        """
         for number in sorted(self._changed):
             item = self._scene.objects[number]
             self._present[number] = not item.absent
@@ -113,14 +108,12 @@ class BulletEngine:
         self._journal.begin_round()
 
     def pose(self, name: str) -> Pose:
-        """Pose of the object's asset frame in the world; of a parked object the last one that it had."""
         try:
             return self._poses[self._index[name]]
         except KeyError:
             raise self._unknown(name) from None
 
     def set_pose(self, name: str, pose: Pose) -> None:
-        """Teleport the object. One that was parked is back in the world."""
         number = self._number(name)
         if pose == self._poses[number] and self._present[number]:
             return
@@ -130,28 +123,24 @@ class BulletEngine:
         self._put(number, pose)
 
     def aabb(self, name: str) -> Aabb:
-        """Bounding box in the world, with the joints as they are now."""
         try:
             return self._boxes[self._index[name]]
         except KeyError:
             raise self._unknown(name) from None
 
     def joints(self, name: str) -> tuple[float, ...]:
-        """Joint positions as shares of their travel: 0 closed, 1 open, in the order of the asset's joints."""
         try:
             return self._fractions[self._index[name]]
         except KeyError:
             raise self._unknown(name) from None
 
     def set_joints(self, name: str, fractions: Sequence[float]) -> None:
-        """Set every joint of the object. Raises EngineError for a wrong number of them or one outside 0..1."""
         number = self._number(name)
         check_fractions(self._scene.objects[number], self._assets[number], fractions)
         self._note(number)
         self._put_joints(number, tuple(map(float, fractions)))
 
     def park(self, name: str) -> None:
-        """Take the object out of the world: it collides with nothing and stands in no relation, as in the robot's hand."""
         number = self._number(name)
         if not self._present[number]:
             return
@@ -166,10 +155,6 @@ class BulletEngine:
             raise self._unknown(name) from None
 
     def penetrates(self, name: str, margin_m: float = 0.0, ignore: frozenset[str] = NOTHING) -> str:
-        """Name of one body that the object, grown by ``margin_m``, penetrates by more than 1 mm; "" when there is none.
-
-        The floor and the walls answer by ``FLOOR`` and ``WALL``; then objects in scene order.
-        """
         number = self._number(name)
         limit = margin_m - TOLERANCE_M
         box = self._boxes[number]
@@ -189,21 +174,15 @@ class BulletEngine:
         return ""
 
     def near(self, box: Aabb, ignore: frozenset[str] = NOTHING) -> tuple[str, ...]:
-        """Objects whose bounding boxes overlap the box, in scene order, without the parked ones."""
         names = self._names
         return tuple(
             names[number] for number in self._around.near(box) if not ignore or names[number] not in ignore
         )
 
     def is_at_wall(self, box: Aabb) -> bool:
-        """Whether the bounding box of a wall overlaps the box."""
         return bool(self._walls_around.near(box))
 
     def gap(self, a: str, b: str, limit_m: float) -> float | None:
-        """Smallest signed distance between two objects (negative: depth), None when it is more than ``limit_m``.
-
-        Raises EngineError when either is parked.
-        """
         first, second = self._number(a), self._number(b)
         for name, number in ((a, first), (b, second)):
             if not self._present[number]:
@@ -216,14 +195,10 @@ class BulletEngine:
         return distance if distance <= limit_m else None
 
     def settle(self, name: str, steps: int = SETTLE_STEPS, ignore: frozenset[str] = NOTHING) -> Settled:
-        """Let go of the object where it is, in a copy of its neighbourhood in which all else stands still.
-
-        Changes nothing here. Depends on the present state only, not on what was simulated before.
-        """
         number = self._number(name)
         box = self._boxes[number]
         stills = [
-            Still(self._assets[other], self._poses[other], self._fractions[other])
+            StaticObject(self._assets[other], self._poses[other], self._fractions[other])
             for other in self._around.near(box, SETTLE_RADIUS_M)
             if other != number and self._names[other] not in ignore
         ]
@@ -234,7 +209,6 @@ class BulletEngine:
         return self._mini.drop(pose, steps)
 
     def state_bytes(self) -> bytes:
-        """Poses, joints and parking of all objects in which they differ from the scene's, for the digest of a trace."""
         if self._all_chunks is None:
             chunks = self._chunks
             for number in self._changed - chunks.keys():
@@ -243,7 +217,7 @@ class BulletEngine:
         return self._all_chunks
 
     def _chunk(self, number: int) -> bytes:
-        """What ``state_bytes`` says of an object: nothing when it is as the scene has it."""
+        """Entry of an object in ``state_bytes``; empty if it is as in the scene."""
         item, pose = self._scene.objects[number], self._poses[number]
         fractions, present = self._fractions[number], self._present[number]
         if (pose, fractions, present) == (item.pose_world_asset, tuple(item.joints), not item.absent):
@@ -251,11 +225,8 @@ class BulletEngine:
         values = (*pose.position_m, *pose.quat_xyzw, *fractions)
         return struct.pack(f"<i?{len(values)}d", number, present, *values)
 
-    def complete(self) -> Iterator[None]:
-        """Make the bodies of objects and walls that nobody asked for yet, one at a step, changing no answer.
-
-        Work for a process that waits.
-        """
+    def warm_up(self) -> Iterator[None]:
+        """Make missing bodies of objects and walls, one per step. Changes no answer."""
         for number in self._bodies.missing():
             self._body(number)
             yield
@@ -264,7 +235,6 @@ class BulletEngine:
             yield
 
     def close(self) -> None:
-        """Free the physics clients. The engine can't be used afterwards."""
         self._mini.close()
         forget(self._scene.assets.values())
         self._pool.give_back(self._client)
@@ -272,7 +242,7 @@ class BulletEngine:
             self._pool.close()
 
     def _note(self, number: int) -> None:
-        """Enter a change that is about to be made into the journal and the list of what a reset undoes."""
+        """Record an upcoming change in the journal and for the next reset."""
         self._changed.add(number)
         self._chunks.pop(number, None)
         self._all_chunks = None
@@ -304,7 +274,7 @@ class BulletEngine:
         self._bound(number, self._box(number))
 
     def _bound(self, number: int, box: Aabb) -> None:
-        """Keep the object's box, and its place among its neighbours."""
+        """Update the object's box and its entry in the spatial hash."""
         self._boxes[number] = box
         if self._present[number]:
             self._around.put(number, box)
@@ -321,13 +291,13 @@ class BulletEngine:
         return self._bodies.object(number, self._poses[number], self._fractions[number])
 
     def _closest(self, body: int, other: int, limit_m: float) -> float:
-        """Smallest signed distance between two bodies, infinity when it is more than ``limit_m`` (at least 0)."""
+        """Smallest signed distance between two bodies; infinity beyond ``limit_m`` (at least 0)."""
         contacts = self._bullet.getClosestPoints(body, other, max(limit_m, 0.0), physicsClientId=self._client)
         return min([contact[8] for contact in contacts]) if contacts else math.inf
 
 
-def _neighbourhood(boxes: Iterable[Aabb]) -> Neighbourhood:
-    around = Neighbourhood()
+def _neighbourhood(boxes: Iterable[Aabb]) -> SpatialHash:
+    around = SpatialHash()
     for number, box in enumerate(boxes):
         around.put(number, box)
     return around

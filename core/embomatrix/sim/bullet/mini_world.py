@@ -1,4 +1,4 @@
-"""A few bodies in a client of their own, in which one object is let go: the only place where time passes."""
+"""Small settling world: a client with a few bodies in which one object is let go."""
 
 from __future__ import annotations
 
@@ -20,33 +20,32 @@ if TYPE_CHECKING:
 GRAVITY_M_S2: Final = -9.81
 CHUNK_STEPS: Final = 12
 EARLIEST_STEPS: Final = 36
-"""Nobody stops in fewer steps: a thing that hangs 5 mm over its support needs 0.03 s before it moves visibly."""
+"""Fewest steps of a settle: an object 5 mm over its support needs 0.03 s before it moves visibly."""
 SLOW_M_S: Final = 4e-3
 SLOW_RAD_S: Final = 2e-2
-"""Below both speeds the simulation stops early."""
+"""The simulation stops early below both speeds."""
 REST_M_S: Final = 2e-2
 REST_RAD_S: Final = 0.2
-"""Above either speed the object is not at rest when time is up."""
+"""Above either speed at the end, the object is not at rest."""
 ROUND: Final = frozenset((Shape.CYLINDER, Shape.SPHERE, Shape.HULL))
-"""Shapes that may roll. Boxes go without: with it the solver uses all its iterations, and a step costs five times as much."""
+"""Shapes that may roll and so get rolling friction. With it the solver uses all its iterations: a step costs five times as
+much."""
 FLOOR_M: Final = 6.0
 AWAY_M: Final = 100.0
 FLOOR_THICKNESS_M: Final = 0.5
 LEVEL_M: Final = 0.002
 PROBE_M: Final = 0.01
 PROBED: Final = (0.04, 0.5, 0.96)
-"""Where a box's underside is probed, as shares of its sides."""
+"""Probed points of a box's underside, as shares of its sides."""
 STAGES_KEPT: Final = 1024
-"""Stages between two resets. A stage leaves 5 to 10 kB behind; a reset takes 7 MB for a forked process that it had shared.
-
-A slot is replaced before it has settled so many things.
-"""
+"""Stages between two resets. A stage leaks 5 to 10 kB; a reset costs a forked process 7 MB of shared memory. A slot is
+replaced before it has settled so often."""
 EVERYWHERE: Final = Aabb((-math.inf,) * 3, (math.inf,) * 3)
 
 
 @dataclass(frozen=True, slots=True)
-class Still:
-    """An object that stands still in the mini world."""
+class StaticObject:
+    """Static object in the settling world."""
 
     asset: Asset
     pose: Pose
@@ -54,11 +53,10 @@ class Still:
 
 
 class MiniWorld:
-    """One client in which one object moves and nothing else does. What it simulates does not depend on what it did before.
+    """Client in which one object moves and nothing else does. Results do not depend on earlier ones.
 
-    All that stands still is one body of boxes, or a few: a step costs what the object touches, not what furniture consists
-    of. Each stage makes its bodies anew and removes those of the last; the shapes that this leaves behind are freed, by a
-    reset of the client, once in many stages.
+    All static parts form one body, or a few: a step costs what the object touches, not the size of the furniture. Each stage
+    builds new bodies and removes the last ones; an occasional reset of the client frees the leaked shapes.
     """
 
     def __init__(self, pool: ClientPool) -> None:
@@ -70,7 +68,7 @@ class MiniWorld:
         self._still: tuple[int, ...] = ()
         self._stages = 0
         self._set_rules()
-        # What Bullet allocates at its first step is allocated here: processes that are forked later share it.
+        # Triggers Bullet's first-step allocations here, which processes forked later then share.
         self._bullet.stepSimulation(physicsClientId=self._client)
 
     def stage(
@@ -78,13 +76,13 @@ class MiniWorld:
         asset: Asset,
         pose: Pose,
         fractions: Sequence[float],
-        stills: Sequence[Still],
+        stills: Sequence[StaticObject],
         walls: Sequence[ConvexPart] = (),
         region: Aabb | None = None,
     ) -> None:
-        """Build a world of one object that moves, others that do not, some walls and the floor.
+        """Build a world of one moving object, static ones, walls and the floor.
 
-        Of what does not move only those parts are there that reach into ``region``, when one is given.
+        With a ``region``, only static parts that reach into it are built.
         """
         self._clear()
         x, y, _ = pose.position_m
@@ -109,24 +107,24 @@ class MiniWorld:
                 self._bullet.removeBody(body, physicsClientId=self._client)
 
     def _renew(self) -> None:
-        """Free what the stages left behind."""
+        """Free the leaked shapes of earlier stages."""
         self._bullet.resetSimulation(physicsClientId=self._client)
         self._factory.forget_shapes()
         self._set_rules()
 
     def _set_rules(self) -> None:
-        """What a client that was emptied has to be told again."""
+        """Configure an empty client."""
         bullet, client = self._bullet, self._client
         bullet.setGravity(0, 0, GRAVITY_M_S2, physicsClientId=client)
-        # Contacts are solved in the order in which bodies were made, whatever the tree of boxes went through before.
+        # Contacts are solved in the order of body creation, independent of the broad phase's history.
         bullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
 
     def lift(self) -> None:
-        """Take the object out of the way, for questions about what stands still."""
+        """Move the object out of the way, for queries about static bodies."""
         self._put(Pose((0.0, 0.0, AWAY_M)))
 
     def depth_m(self, pose: Pose) -> float:
-        """How deep the object, put at a pose, reaches into the bodies that stand still; 0 when it is free."""
+        """Penetration depth of the object, put at a pose, into static bodies; 0 for none."""
         self._put(pose)
         deepest = 0.0
         for other in self._still:
@@ -137,7 +135,7 @@ class MiniWorld:
         return deepest
 
     def is_level_under(self, box: Aabb) -> bool:
-        """Whether something that stands still is level, to 2 mm, under nine points of a box's underside."""
+        """Return True if static bodies are level, to 2 mm, under nine points of a box's underside."""
         (low_x, low_y, z), (high_x, high_y, _) = box.low_m, box.high_m
         starts = [
             (low_x + u * (high_x - low_x), low_y + v * (high_y - low_y), z + PROBE_M)
@@ -149,9 +147,9 @@ class MiniWorld:
         return all(hit[0] in self._still and abs(hit[3][2] - z) <= LEVEL_M for hit in hits)
 
     def drop(self, pose: Pose, steps: int = SETTLE_STEPS, least: int = EARLIEST_STEPS) -> Settled:
-        """Put the object at a pose, let go, and tell where it is when it rests or ``steps`` of 1/240 s have passed.
+        """Put the object at the pose, let go, and return its pose at rest or after ``steps`` of 1/240 s.
 
-        It is not taken to rest before ``least`` steps.
+        It does not count as at rest before ``least`` steps.
         """
         bullet, client = self._bullet, self._client
         self._put(pose)
@@ -172,7 +170,7 @@ class MiniWorld:
         return Settled(settled, math.dist(position, pose.position_m), tilt_between(pose, settled), at_rest)
 
     def close(self) -> None:
-        """Give the client back to the pool. The world can't be used afterwards."""
+        """Return the client and end the world's use."""
         self._pool.give_back(self._client)
 
     def _put(self, pose: Pose) -> None:
@@ -188,6 +186,6 @@ class MiniWorld:
 
 
 def tilt_between(before: Pose, after: Pose) -> float:
-    """Angle between the upward axes of two poses, in radians: turning about the vertical is no tilt."""
+    """Angle in radians between the upward axes of two poses; rotation about the vertical does not count."""
     cosine = float(before.rotation[:, 2] @ after.rotation[:, 2])
     return math.acos(max(-1.0, min(1.0, cosine)))

@@ -1,8 +1,7 @@
-"""Passages: motions of the robot through free space, made without letting time pass.
+"""Passages: instant motions of the robot through free space.
 
-Who drives or folds an arm where nothing is near, with motors that are strong enough, is in the end where the motion ends, and
-nothing else has moved. Whether nothing is near is asked of Bullet itself, with every link of the robot and what it holds at
-one posture after another; wherever something is, the motion is made in time.
+If nothing is near, a stepped motion with strong enough motors ends where it should and moves nothing else, so no steps are
+needed. Bullet checks every link of the robot and the held object at each posture; a motion near anything is stepped instead.
 """
 
 from __future__ import annotations
@@ -19,13 +18,13 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import Pose
 
 CLEAR_M: Final = 0.005
-"""Nothing may be nearer: so far a motion that is made in time strays from its way. Bullet tells of contacts up to 2 cm off."""
+"""Required clearance: a stepped motion deviates this far from its path. Bullet reports contacts up to 2 cm away."""
 DISTANCE: Final = 8
-"""Where a contact has its distance."""
+"""Index of the distance in a contact."""
 
 
 class Passage:
-    """One motion of a robot with what its hand holds, ``""`` for nothing, from where both are now."""
+    """Motion of a robot with its held object (``""`` for none) from their current state."""
 
     def __init__(self, client: int, robot: RobotBody, bodies: DynamicBodies, held: str) -> None:
         self._bullet = pybullet()
@@ -39,13 +38,13 @@ class Passage:
 
     @property
     def is_loaded(self) -> bool:
-        """Whether the hand holds something."""
+        """True if the hand holds something."""
         return bool(self._held)
 
     def is_clear(self, postures: Iterable[Posture]) -> bool:
-        """Whether nothing comes near where the motion starts or at any of some postures, all of which the joints' limits allow.
+        """Return True if nothing is near at the start or at any of the postures, and joint limits allow all of them.
 
-        All is left as it was.
+        The state is restored.
         """
         clear = self._nothing_near() and all(self._nothing_near_at(posture) for posture in postures)
         self._robot.stand(self._start)
@@ -54,13 +53,13 @@ class Passage:
         return clear
 
     def stand(self, posture: Posture) -> None:
-        """Be in a posture at once, at rest, with what the hand holds."""
+        """Move to a posture at once, at rest, with the held object."""
         self._robot.stand(posture)
         if self._pose_hand_load is not None:
             self._carry(self._robot.hand_pose() @ self._pose_hand_load)
 
     def _carry(self, pose: Pose) -> None:
-        """Have the load at a pose, at rest."""
+        """Put the held object at a pose, at rest."""
         bullet, client, body = self._bullet, self._client, self._bodies.body(self._held)
         bullet.resetBasePositionAndOrientation(body, pose.position_m, pose.quat_xyzw, physicsClientId=client)
         bullet.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0), physicsClientId=client)
@@ -72,7 +71,7 @@ class Passage:
         return self._nothing_near()
 
     def _nothing_near(self) -> bool:
-        """Contacts that Bullet tells of are new after each detection, whatever was near before."""
+        """Each detection refreshes the contacts that Bullet reports."""
         self._bullet.performCollisionDetection(physicsClientId=self._client)
         moved = [self._robot.body, *([self._bodies.body(self._held)] if self._held else [])]
         return not any(

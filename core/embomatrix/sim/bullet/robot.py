@@ -1,4 +1,4 @@
-"""The robot in a Bullet client: motors with limits, what its links touch, and what its hand holds."""
+"""Robot in a Bullet client: limited motors, contacts of its links, and the hold of its hand."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ BASE_NM: Final = 200.0
 LIFT_N: Final = 1500.0
 FINGER_N: Final = 30.0
 GRIP_N: Final = 400.0
-"""What the hand's hold on a thing can bear."""
+"""Largest force of the hand's hold."""
 GAIN: Final = 0.3
-"""Share of the way to its target that a motor takes in a step, as far as its force lets it."""
+"""Share of the distance to its target that a motor covers per step, as far as its force allows."""
 FINGERS_OPEN_M: Final = 0.02
 TUCKED_ARM: Final = (-1.57, 1.57, 0.0, -0.4, 0.0, 2.6, 0.785)
 """Joint angles of the empty arm while the robot drives: upright over the base, within its disc, below what it drives under."""
 TUCKED_LIFT_M: Final = 0.0
 SAG: Final = 1e-3
-"""Metres, or radians, by which loads bend joints over their limits."""
+"""Metres or radians by which loads bend joints beyond their limits."""
 
 
 @dataclass(frozen=True, slots=True)
 class Posture:
-    """Where the robot's joints are: base in the world, height of the lift, the arm's seven angles."""
+    """Joint positions of the robot: base in the world, height of the lift, the arm's seven angles."""
 
     x_m: float
     y_m: float
@@ -68,7 +68,7 @@ def tucked(at: StandPose) -> Posture:
 
 
 class RobotBody:
-    """A robot that was loaded into a client. It lives until the client is reset."""
+    """Robot loaded into a client, until the client is reset."""
 
     def __init__(self, client: int, posture: Posture) -> None:
         """Load the robot with its joints at a posture."""
@@ -96,12 +96,12 @@ class RobotBody:
         self.appear(posture)
 
     def appear(self, posture: Posture) -> None:
-        """Be in a posture at once, whatever is there, and stay."""
+        """Move to a posture at once and hold it, regardless of obstacles."""
         self.stand(posture)
         self.steer(posture)
 
     def stand(self, posture: Posture) -> None:
-        """Be in a posture at once, at rest. The motors keep their targets."""
+        """Move to a posture at once, at rest. The motors keep their targets."""
         values = spread(posture)
         self._bullet.resetJointStatesMultiDof(
             self.body,
@@ -112,7 +112,7 @@ class RobotBody:
         )
 
     def can_stand(self, posture: Posture) -> bool:
-        """Whether every joint is within its limits in a posture, or not measurably beyond. What turns freely has none."""
+        """Return True if every joint of a posture is within its limits, with a small tolerance. Free joints have none."""
         return all(
             low > high or low - SAG <= value <= high + SAG
             for (low, high), value in zip(self._limits, spread(posture), strict=True)
@@ -120,13 +120,13 @@ class RobotBody:
 
     @property
     def posture(self) -> Posture:
-        """Where the joints are now."""
+        """Current joint positions."""
         states = self._bullet.getJointStates(self.body, self._driven, physicsClientId=self._client)
         values = [state[0] for state in states]
         return Posture.of((*values[:3], values[3] + values[4], *values[5:12]))
 
     def steer(self, posture: Posture) -> None:
-        """Give the motors their targets. They pursue them within their forces as time passes."""
+        """Set the motors' targets, which they approach within their forces as time passes."""
         bullet = self._bullet
         bullet.setJointMotorControlArray(
             self.body,
@@ -139,7 +139,7 @@ class RobotBody:
         )
 
     def hold(self, body: int, link: int, pose_hand_body: Pose, force_n: float = GRIP_N) -> None:
-        """Hold a body's link as it is in the hand now, up to a force."""
+        """Attach a body's link to the hand at its current pose, up to a force."""
         centre = self._inertial.inverse() @ pose_hand_body
         self._hold = self._bullet.createConstraint(
             self.body,
@@ -157,7 +157,7 @@ class RobotBody:
         self._bullet.changeConstraint(self._hold, maxForce=force_n, physicsClientId=self._client)
 
     def hook(self, body: int, link: int, in_hand: Sequence[float], in_link: Sequence[float]) -> None:
-        """Hold one point of a body's link by a point of the hand: it may turn about it."""
+        """Attach one point of a body's link to a point of the hand; the link may turn about it."""
         point = self._inertial.inverse().apply((in_hand[0], in_hand[1], in_hand[2]))
         self._hold = self._bullet.createConstraint(
             self.body,
@@ -173,7 +173,7 @@ class RobotBody:
         self._bullet.changeConstraint(self._hold, maxForce=GRIP_N, physicsClientId=self._client)
 
     def let_go(self) -> None:
-        """End the hold, if there is one."""
+        """End the hold if there is one."""
         if self._hold >= 0:
             self._bullet.removeConstraint(self._hold, physicsClientId=self._client)
             self._hold = -1
@@ -186,12 +186,12 @@ class RobotBody:
         return Pose(tuple(state[4]), tuple(state[5]))
 
     def collide(self, body: int, links: Sequence[int], *, on: bool) -> None:
-        """Let the robot collide with a body's links, or not: what the hand holds does not push against it."""
+        """Switch collisions between the robot and a body's links: the held object must not push against it."""
         every = range(-1, self._bullet.getNumJoints(self.body, physicsClientId=self._client))
         self._filter(body, links, every, on=on)
 
     def brush(self, body: int, link: int, *, on: bool) -> None:
-        """Let the hand alone collide with one link of a body, or not."""
+        """Switch collisions between the hand and one link of a body."""
         self._filter(body, (link,), sorted(self.tips), on=on)
 
     def _filter(self, body: int, links: Sequence[int], own: Iterable[int], *, on: bool) -> None:
@@ -203,7 +203,7 @@ class RobotBody:
 
 
 def spread(posture: Posture) -> list[float]:
-    """Values of the driven joints, base first, fingers last: the mast's inner stage rises with the carriage."""
+    """Values of the driven joints, base first, fingers last; the mast's inner stage rises with the carriage."""
     stage = posture.lift_m * STAGE_SHARE
     return [
         posture.x_m,

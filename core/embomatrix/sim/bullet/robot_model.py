@@ -1,6 +1,6 @@
-"""The robot as URDF text: a holonomic base, a mast and a carriage under the arm of the installed ``pybullet_data`` package.
+"""Robot as URDF text: holonomic base, mast and carriage under the arm of the installed ``pybullet_data`` package.
 
-The arm's links, meshes and inertias are read from the package's ``panda.urdf`` when a robot is made; nothing of it is copied.
+The arm's links, meshes and inertias come from the package's ``panda.urdf`` at run time; nothing of it is copied.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ FINGER_JOINTS: Final = ("panda_finger_joint1", "panda_finger_joint2")
 HAND: Final = "panda_hand"
 SHOULDER_EFFORT_NM: Final = 87.0
 WRIST_EFFORT_NM: Final = 40.0
-"""A Panda's own at the shoulder, three times that at the wrist: the table of limits lets the robot lift 8 kg."""
+"""Efforts of a Panda: its own at the shoulder, three times its own at the wrist. The robot then lifts the specified 8 kg."""
 
 
 @functools.cache
 def package_folder() -> Path:
-    """Folder of the arm's description. Raises EngineMissingError where it is not installed."""
+    """Folder of the arm's description. Raises EngineMissingError if it is not installed."""
     spec = importlib.util.find_spec("pybullet_data")
     folder = Path(spec.origin).parent / "franka_panda" if spec is not None and spec.origin else None
     if folder is None or not (folder / "panda.urdf").is_file():
@@ -56,7 +56,7 @@ def package_folder() -> Path:
 
 @functools.cache
 def robot_urdf(*, visuals: bool = False) -> str:
-    """The whole robot as URDF text; mesh files are named by their paths in the installed package."""
+    """URDF text of the whole robot; mesh files are named by their paths in the installed package."""
     folder = package_folder()
     arm = ET.parse(folder / "panda.urdf").getroot()
     for mesh in arm.iter("mesh"):
@@ -77,7 +77,7 @@ def robot_urdf(*, visuals: bool = False) -> str:
 
 
 def _below_the_arm() -> list[ET.Element]:
-    """Base, mast and carriage, down to the joint by which the arm is bolted on."""
+    """Base, mast and carriage, down to the joint that mounts the arm."""
     high = MAST_TOP_M - BASE_TOP_M
     low = (0.0, 0.0, SHOULDER_LOW_M)
     inner = MAST_SIZE_M[0] * 0.9
@@ -105,17 +105,17 @@ def _below_the_arm() -> list[ET.Element]:
 
 
 def _cylinder(radius_m: float, length_m: float, at: Vec3) -> tuple[ET.Element, Vec3]:
-    """An upright cylinder and where its middle is in its link."""
+    """Upright cylinder and its middle in its link."""
     return ET.Element("cylinder", radius=str(radius_m), length=str(length_m)), at
 
 
 def _box(size_m: Vec3, at: Vec3) -> tuple[ET.Element, Vec3]:
-    """A box and where its middle is in its link."""
+    """Box and its middle in its link."""
     return ET.Element("box", size=_row(size_m)), at
 
 
 def _link(name: str, mass: float, *shapes: tuple[ET.Element, Vec3]) -> ET.Element:
-    """A link that looks as what it collides with."""
+    """Link whose visual shapes are its collision shapes."""
     link = ET.Element("link", name=name)
     inertial = ET.SubElement(link, "inertial")
     ET.SubElement(inertial, "mass", value=str(mass))

@@ -1,7 +1,7 @@
-"""Bodies of a scene's objects and walls in one client, each made when it is first asked for.
+"""Bodies of a scene's objects and walls in one client, each made on demand.
 
-To make a body costs fifteen times as much as to ask how far two of them are apart, and a rollout asks after a tenth of its
-scene. Nothing depends on which bodies there are: they are never stepped, only compared in pairs.
+Making a body costs fifteen times as much as a distance query, and a rollout queries a tenth of its scene. Results do not
+depend on which bodies exist: they are never stepped, only compared in pairs.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class SceneBodies:
         self._walls: dict[int, int] = {}
 
     def object(self, number: int, pose: Pose, fractions: Sequence[float]) -> int:
-        """Body of an object, at the pose, with its joints at these shares of their travel."""
+        """Body of an object at the pose, with its joints at these shares of their travel."""
         body = self._objects.get(number)
         if body is not None and number not in self._behind:
             return body
@@ -46,15 +46,15 @@ class SceneBodies:
         return body
 
     def leave_behind(self, number: int) -> None:
-        """The object moves: its body follows when it is next asked for. Most moves are undone before anybody asks."""
+        """Mark an object as moved; its body follows on demand. Most moves are undone before a query."""
         self._behind.add(number)
 
     def missing(self) -> Iterator[int]:
-        """Numbers of the objects that have no body yet."""
+        """Numbers of the objects without a body."""
         return (number for number in range(len(self._scene.objects)) if number not in self._objects)
 
     def wall(self, chunk: int) -> int:
-        """Body of the walls whose numbers are from ``16 * chunk`` to below ``16 * (chunk + 1)``."""
+        """Body of walls number ``16 * chunk`` up to ``16 * (chunk + 1)``, exclusive."""
         if chunk not in self._walls:
             parts = self._scene.walls[chunk * PART_LIMIT : (chunk + 1) * PART_LIMIT]
             [self._walls[chunk]] = self._factory.walls(parts)

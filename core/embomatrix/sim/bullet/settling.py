@@ -1,4 +1,4 @@
-"""A whole scene let go at once: everything that can move falls for a while, in a client that is thrown away."""
+"""Settling of a whole scene: all movable objects fall at once in a temporary client."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 
 LEAST_STEPS: Final = 120
 MOST_STEPS: Final = 480
-"""Steps of 1/240 s: half a second at least, two where something still moves."""
+"""Steps of 1/240 s: at least half a second, two if something still moves."""
 MARGIN_M: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class SettledScene:
-    """Where the movable objects end up, and who then overlaps whom by more than a millimetre, with the depth in metres."""
+    """Final poses of the movable objects, and pairs that then overlap by more than 1 mm, with the depth in metres."""
 
     objects: Mapping[str, Settled]
     overlaps: Mapping[tuple[str, str], float]
@@ -47,9 +47,9 @@ class SettledScene:
 
 
 def settle_scene(scene: Scene) -> SettledScene:
-    """Let go of all movable objects at once until they rest or two seconds have passed; furniture stands still and shut.
+    """Let all movable objects fall until they rest or two seconds have passed; furniture stays fixed and shut.
 
-    Raises EngineError where the engine is missing or can't take the scene.
+    Raises EngineError if the engine is missing or refuses the scene.
     """
     check_scene(scene)
     pool = ClientPool()
@@ -61,7 +61,7 @@ def settle_scene(scene: Scene) -> SettledScene:
 
 
 class _Fall:
-    """One scene in one client, with mass on what can move."""
+    """Scene in one client, with mass on movable objects."""
 
     def __init__(self, scene: Scene, client: int) -> None:
         self._bullet = pybullet()
@@ -113,7 +113,7 @@ class _Fall:
         return Settled(pose, math.dist(position, start.position_m), tilt_between(start, pose), at_rest)
 
     def _overlaps(self) -> dict[tuple[str, str], float]:
-        """Pairs in contact deeper than the tolerance. Bodies that can't move are not compared with one another."""
+        """Pairs in contact deeper than the tolerance; pairs of immovable bodies are left out."""
         deepest: dict[tuple[str, str], float] = {}
         for contact in self._bullet.getContactPoints(physicsClientId=self._client):
             pair = (self._names[contact[1]], self._names[contact[2]])

@@ -1,4 +1,4 @@
-"""Visual bodies of a scene in a client of their own, for pictures: the simulation carries no visuals.
+"""Visual bodies of a scene in a separate client, for pictures: the simulation has no visuals.
 
 Every solid is a body without a collision shape. Shapes are shared; objects can be moved, opened and hidden between pictures.
 """
@@ -59,7 +59,7 @@ _PLANTS: Final = frozenset(
 _CLOTH: Final = frozenset({"bed", "sofa", "armchair", "ottoman", "carpet", "booth", "bench", "pillow"})
 _LEAF_M: Final = 0.1
 _PANE_M: Final = 0.03
-"""Walls thinner than the first are leaves of doors, thinner than the second panes of windows."""
+"""Thinner walls are door panels (first) and window panes (second)."""
 
 
 _CHASSIS: Final = (0.78, 0.16, 0.14, 1.0)
@@ -67,10 +67,10 @@ _OWN_LINKS: Final = frozenset({"base", "stage", "carriage"})
 
 
 class VisualScene:
-    """Visual bodies of one scene in one client. Use as a context manager: leaving it frees the client."""
+    """Visual bodies of one scene in one client. A context manager that frees the client."""
 
     def __init__(self, scene: Scene) -> None:
-        """Connect an empty client. Raises EngineError where pybullet is missing."""
+        """Connect an empty client. Raises EngineError if pybullet is missing."""
         self.scene = scene
         self._bullet = pybullet()
         self._client = int(self._bullet.connect(self._bullet.DIRECT))
@@ -88,26 +88,26 @@ class VisualScene:
         self._bullet.disconnect(physicsClientId=self._client)
 
     def add_floors(self) -> None:
-        """A slab for each room, in colours that tell neighbours apart."""
+        """Add a slab for each room, in alternating colours."""
         for number, room in enumerate(self.scene.rooms):
             size = (room.size_m[0] + 0.12, room.size_m[1] + 0.12, 0.04)
             self.add_solid(Shape.BOX, size, Pose((*room.center_m, -0.02)), _FLOORS[number % len(_FLOORS)])
 
     def add_walls(self, seen_as: Callable[[ConvexPart], ConvexPart | None]) -> None:
-        """The walls, each as ``seen_as`` wants to see it; None leaves it out."""
+        """Add the walls as ``seen_as`` returns them; None leaves a wall out."""
         for wall in self.scene.walls:
             seen = seen_as(wall)
             if seen is not None:
                 self._add_part(seen, IDENTITY, _material(wall))
 
     def add_objects(self, visible: Callable[[SceneObject], bool] = lambda item: True) -> None:
-        """The objects at their places at the start; absent ones are out of sight."""
+        """Add the objects at their initial places; absent ones are out of sight."""
         for item in self.scene.objects:
             if not visible(item):
                 continue
             asset = self.scene.assets[item.asset_id]
             color = color_of(asset)
-            # Leaves and drawers stand out from the body that they close.
+            # Panels and drawers stand out from the body that they close.
             self._solids[item.name] = [
                 (self._add_part(part, OUT_OF_SIGHT, color if number == 0 else _lighter(color)), part)
                 for number, link in enumerate(asset.links)
@@ -117,7 +117,7 @@ class VisualScene:
                 self.put(item.name, item.pose_world_asset, item.joints)
 
     def put(self, name: str, pose: Pose, fractions: Sequence[float] = ()) -> None:
-        """Show an object at a pose in the world, its joints at shares of their travel; one without solids stays unseen."""
+        """Show an object at a pose in the world, its joints at shares of their travel; unknown solids stay unseen."""
         solids = iter(self._solids.get(name, ()))
         asset = self.scene.asset_of(name)
         shares = iter(fractions or (0.0,) * len(asset.joints))
@@ -132,13 +132,13 @@ class VisualScene:
             self._place(body, OUT_OF_SIGHT)
 
     def add_robot(self) -> RobotFigure:
-        """The robot, out of sight at first."""
+        """Add the robot, out of sight at first."""
         return RobotFigure(self._client)
 
     def add_solid(
         self, shape: Shape, size_m: Vec3, pose: Pose, color: Rgba, vertices_m: tuple[Vec3, ...] = ()
     ) -> int:
-        """One visual body; its id."""
+        """Add one visual body and return its id."""
         key = (shape, size_m, vertices_m, color)
         if key not in self._shapes:
             self._shapes[key] = self._visual(shape, size_m, color, vertices_m)
@@ -155,7 +155,7 @@ class VisualScene:
     def shoot(
         self, view: Sequence[float], lens: Sequence[float], width_px: int, height_px: int
     ) -> NDArray[np.uint8]:
-        """A picture through a view and a projection matrix: RGB values, shape (height, width, 3)."""
+        """Render through a view and a projection matrix: RGB values, shape (height, width, 3)."""
         image = self._bullet.getCameraImage(
             width_px,
             height_px,
@@ -230,7 +230,7 @@ def _faces(points: FloatArray) -> dict[str, list[Any]]:
 
 
 def _material(wall: ConvexPart) -> Rgba:
-    """Colour of a wall's part by what its thickness makes it."""
+    """Colour of a wall's part by its thickness."""
     thickness = min(wall.size_m[:2])
     if thickness < _PANE_M:
         return _GLASS
@@ -238,7 +238,7 @@ def _material(wall: ConvexPart) -> Rgba:
 
 
 def color_of(asset: Asset) -> Rgba:
-    """Colour by what the object is for; small things get a lively one that their category decides."""
+    """Colour by function; small objects get a vivid colour from their category."""
     if max(asset.size_m) < 0.6 and asset.mass_kg <= ROBOT.mass_kg:
         return _hue(zlib.crc32(asset.category.encode()) / 2**32)
     if asset.category in _CLOTH:
@@ -261,10 +261,10 @@ def _lighter(color: Rgba) -> Rgba:
 
 
 class RobotFigure:
-    """One robot in a client that has Bullet's renderer. It lives as long as the client."""
+    """Robot in a client with Bullet's renderer, for the client's lifetime."""
 
     def __init__(self, client: int) -> None:
-        """Load the robot, out of sight. Raises EngineMissingError where its description is not installed."""
+        """Load the robot, out of sight. Raises EngineMissingError if its description is not installed."""
         self._bullet = bullet = pybullet()
         self._client = client
         with tempfile.TemporaryDirectory() as folder:
@@ -287,7 +287,7 @@ class RobotFigure:
             self._bullet.resetJointState(self._body, joint, value, physicsClientId=self._client)
 
     def leave(self) -> None:
-        """Take it out of sight: the robot does not see itself."""
+        """Hide the robot: its own camera does not see it."""
         self._put(-100.0)
 
     def _put(self, height_m: float) -> None:

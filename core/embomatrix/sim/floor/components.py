@@ -1,4 +1,4 @@
-"""Which cells of a floor hang together."""
+"""Connected components of a floor's free cells."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ Window = tuple[slice, slice]
 
 @dataclass(frozen=True, slots=True)
 class FloorParts:
-    """The number of the part that each free cell belongs to, 0 for the others.
+    """Component number of each free cell, 0 for the others.
 
-    A change on the floor renumbers a window of it: the rest of the numbers is shared with the floor before it.
+    A change on the floor renumbers a window; the other numbers are shared with the previous floor.
     """
 
     whole: IntArray
     """Numbers of all cells, shape (rows, columns), before the window was renumbered."""
     count: int
-    """No part's number is higher."""
+    """Upper bound of the numbers."""
     window: Window = (slice(0, 0), slice(0, 0))
     inner: IntArray | None = None
     """Numbers of the window's cells."""
 
     @staticmethod
     def of(free: BoolArray) -> FloorParts:
-        """Parts of the free cells, which hang together by their sides: fewer than a scene may have objects."""
+        """Components of the free cells, connected by their sides."""
         return FloorParts(*_numbered(free))
 
     @property
     def numbers(self) -> IntArray:
-        """Numbers of all cells, shape (rows, columns). For reading only."""
+        """Numbers of all cells, shape (rows, columns). Read-only."""
         if self.inner is None:
             return self.whole
         numbers = self.whole.copy()
@@ -54,7 +54,7 @@ class FloorParts:
         return int(self.whole[cell])
 
     def within(self, window: Window) -> IntArray:
-        """Numbers of a window's cells. For reading only."""
+        """Numbers of a window's cells. Read-only."""
         numbers = self.whole[window]
         if self.inner is None:
             return numbers
@@ -64,11 +64,11 @@ class FloorParts:
         return numbers
 
     def largest_in(self, before: FloorParts, number: int) -> int:
-        """The largest of these parts in the one that bore a number before the last changes; 0 when nothing of it is left."""
+        """Largest component within the one that had this number before the last changes; 0 if nothing of it is left."""
         if self.inner is None or self.whole is not before.whole:
             sizes = np.bincount(self.numbers[before.numbers == number], minlength=1)
         else:
-            # Beyond the window nothing has changed: a house with a garden has half a million cells.
+            # Nothing has changed beyond the window: a house with a garden has half a million cells.
             window = self.window if before.inner is None else _around(self.window, before.window)
             was = before.within(window) == number
             sizes = np.bincount(self.within(window)[was], minlength=number + 1)
@@ -77,7 +77,7 @@ class FloorParts:
         return int(sizes.argmax())
 
     def _count_of(self, number: int) -> int:
-        """Cells of a part."""
+        """Number of cells of a component."""
         count = np.count_nonzero(self.whole == number)
         if self.inner is not None:
             before = np.count_nonzero(self.whole[self.window] == number)
@@ -85,9 +85,9 @@ class FloorParts:
         return int(count)
 
     def changed(self, free: BoolArray, window: Window) -> FloorParts:
-        """Parts after cells of a window were taken or freed: ``free`` are the window's. At its edge nothing has changed.
+        """Components after cells of a window changed: ``free`` are the window's; its edge is unchanged.
 
-        Where the cells of the edge hang together within the window as they did before, so do all cells beyond it.
+        If the edge cells connect within the window as before, so do all cells beyond it.
         """
         old = self.within(window)
         before, _ = _numbered(old > 0)
@@ -99,7 +99,7 @@ class FloorParts:
             everywhere = self.numbers > 0
             everywhere[window] = free
             return FloorParts.of(everywhere)
-        # A part that does not come to the edge is an island of its own.
+        # A component away from the edge is separate from all others.
         names = np.arange(self.count, self.count + found + 1, dtype=np.int16)
         names[0] = 0
         names[after[edge]] = old[edge]
@@ -117,14 +117,14 @@ def _numbered(free: NDArray[Any]) -> tuple[IntArray, int]:
 
 
 def overlap(first: Window, second: Window) -> tuple[Window, Window]:
-    """The cells that two windows share, as counted from each one's corner; empty slices when there are none."""
+    """Cells that two windows share, relative to each one's corner; empty slices for none."""
     low = [max(a.start, b.start) for a, b in zip(first, second, strict=True)]
     high = [max(start, min(a.stop, b.stop)) for start, a, b in zip(low, first, second, strict=True)]
     return _seen_from(first, low, high), _seen_from(second, low, high)
 
 
 def _around(first: Window, second: Window) -> Window:
-    """The smallest window that holds both."""
+    """Smallest window around both."""
     rows, columns = (
         slice(min(a.start, b.start), max(a.stop, b.stop)) for a, b in zip(first, second, strict=True)
     )

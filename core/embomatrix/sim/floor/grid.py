@@ -1,4 +1,4 @@
-"""Where a round robot's centre may be: an occupancy grid of the floor, its components and distances along it."""
+"""Occupancy grid of the floor for the centre of a round robot, with components and distances."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from scipy import ndimage
 
 from embomatrix.sim.floor.components import FloorParts, overlap
-from embomatrix.sim.floor.paths import RecentDistances, cheapest_way
+from embomatrix.sim.floor.paths import RecentDistances, cheapest_path
 from embomatrix.skills.limits import ROBOT
 
 if TYPE_CHECKING:
@@ -30,16 +30,15 @@ if TYPE_CHECKING:
 
 CELL_M: Final = 0.05
 SNAP_CELLS: Final = 6
-"""A robot that stands within 30 cm of a free cell counts as standing on it."""
+"""A robot within 30 cm of a free cell counts as standing on it."""
 DOORWAY_DEPTH_M: Final = 0.4
-"""How far the floor of a doorway reaches, centred on the wall: more than any wall's thickness."""
+"""Depth of a doorway's floor, centred on the wall: more than any wall's thickness."""
 
 
 class FloorGrid:
-    """Cells of 5 cm over the bounding rectangle of the rooms. What is not room or doorway is no floor.
+    """Cells of 5 cm over the bounding rectangle of the rooms. Only rooms and doorways are floor.
 
-    Made once for a scene; when something on the floor moves, ``changed`` makes the next one from it, at the cost of the
-    place where it moved.
+    A scene's grid is built once; ``changed`` derives the next grid at the cost of the changed region.
     """
 
     def __init__(self, scene: Scene, boxes: FloatArray) -> None:
@@ -55,7 +54,7 @@ class FloorGrid:
 
     @classmethod
     def restored(cls, scene: Scene, covered: NDArray[np.int16], free: BoolArray) -> FloorGrid:
-        """The grid of the scene that once had these arrays, of shape ``grid_shape``."""
+        """Grid of the scene from stored arrays, of shape ``grid_shape``."""
         grid = cls.__new__(cls)
         grid._lay_out(scene)
         grid._covered, grid._free = covered, free
@@ -70,11 +69,11 @@ class FloorGrid:
 
     @property
     def covered(self) -> NDArray[np.int16]:
-        """How many obstacles cover each cell, and one more where there is no floor."""
+        """Number of obstacles over each cell, plus one outside the floor."""
         return self._covered_in((slice(0, self._shape[0]), slice(0, self._shape[1])), self._changes)
 
     def _covered_in(self, window: Window, changes: Changes) -> NDArray[np.int16]:
-        """The same for a window's cells, after changes to the grid that was made first."""
+        """Number of obstacles over a window's cells, after changes to the first grid."""
         covered = self._covered[window].copy()
         for boxes, step in changes:
             for box in boxes.tolist():
@@ -83,7 +82,7 @@ class FloorGrid:
         return covered
 
     def changed(self, gone: FloatArray, come: FloatArray) -> FloorGrid:
-        """This grid without some of its obstacles and with others, each of shape (n, 6)."""
+        """Grid without some obstacles and with others, each of shape (n, 6)."""
         boxes = np.concatenate([gone, come])  # (n, 6)
         if not len(boxes):
             return self
@@ -93,7 +92,7 @@ class FloorGrid:
         window = self._window(low.tolist(), high.tolist())
         free = self.parts.within(window) > 0
         changes = (*self._changes, (gone, -1), (come, 1))
-        for a, b, c, d in _lots(boxes, reach):
+        for a, b, c, d in _clusters(boxes, reach):
             here = self._window((a - reach, b - reach), (c + reach, d + reach))
             around = self._window((a - 2 * reach, b - 2 * reach), (c + 2 * reach, d + 2 * reach))
             _, inner = overlap(here, around)
@@ -103,9 +102,9 @@ class FloorGrid:
         return grid
 
     def narrowed(self, boxes: FloatArray) -> FloorGrid:
-        """This grid with more obstacles, shape (n, 6), which a ``changed`` grid forgets: for what comes and goes often.
+        """Grid with temporary obstacles, shape (n, 6), which a later ``changed`` forgets.
 
-        It is the same grid where they leave as much floor. It costs less than ``changed``, which measures distances anew.
+        Returns the same grid if the free floor is the same. Costs less than ``changed``, which measures distances anew.
         """
         taken: list[tuple[Window, BoolArray]] = []
         for around, blocked in self._blocked_by(boxes):
@@ -122,13 +121,13 @@ class FloorGrid:
         return self._with_parts(self.parts.changed(free, window))
 
     def _blocked_by(self, boxes: FloatArray) -> list[tuple[Window, BoolArray]]:
-        """For each lot of cells that boxes cover, the window in which the robot may touch them, and where in it it does."""
+        """Window and blocked cells around each distinct cell rectangle under the boxes."""
         windows = (self._window(box[:2], box[2:4]) for box in boxes.tolist())
-        lots = sorted({(rows.start, rows.stop, cols.start, cols.stop) for rows, cols in windows})
-        return [_blocked(slice(*lot[:2]), slice(*lot[2:]), self._shape) for lot in lots]
+        clusters = sorted({(rows.start, rows.stop, cols.start, cols.stop) for rows, cols in windows})
+        return [_blocked(slice(*cluster[:2]), slice(*cluster[2:]), self._shape) for cluster in clusters]
 
     def _with_parts(self, parts: FloorParts) -> FloorGrid:
-        """This grid with other free cells. It shares all it can: there are dozens of such grids in memory."""
+        """Grid with other free cells that shares the rest: dozens of such grids are in memory."""
         grid = copy.copy(self)
         vars(grid)["parts"] = parts
         grid._free, grid._own = None, object()
@@ -136,21 +135,21 @@ class FloorGrid:
 
     @functools.cached_property
     def parts(self) -> FloorParts:
-        """Which of the free cells hang together: of a changed grid this is all that is known of them."""
+        """Components of the free cells; a changed grid knows nothing else of them."""
         return FloorParts.of(self.free)
 
     @property
     def free(self) -> BoolArray:
-        """Where the robot may be, shape (rows, columns). For reading only."""
+        """Free cells, shape (rows, columns). Read-only."""
         return self._free if self._free is not None else self.parts.numbers > 0
 
     @property
     def labels(self) -> IntArray:
-        """Number of the component of each free cell, 0 for the others. For reading only."""
+        """Component number of each free cell, 0 for the others. Read-only."""
         return self.parts.numbers
 
     def cell(self, x_m: float, y_m: float) -> Cell | None:
-        """The free cell at a point, or the nearest one within 30 cm; None when there is none."""
+        """Free cell at a point, or the nearest one within 30 cm; None for none."""
         if not (math.isfinite(x_m) and math.isfinite(y_m)):
             return None
         i, j = self._cell_at(x_m, y_m)
@@ -170,27 +169,27 @@ class FloorGrid:
         return (int(near[best, 0]) + first_i, int(near[best, 1]) + first_j)
 
     def center(self, cell: Cell) -> Vec2:
-        """World coordinates of the middle of a cell."""
+        """World coordinates of a cell's middle."""
         return (
             self._origin_m[0] + (cell[0] + 0.5) * CELL_M,
             self._origin_m[1] + (cell[1] + 0.5) * CELL_M,
         )
 
     def is_free(self, x_m: float, y_m: float) -> bool:
-        """Whether the robot fits at a point."""
+        """Return True if the robot fits at a point."""
         return self.label_at(x_m, y_m) > 0
 
     def label(self, cell: Cell) -> int:
-        """Number of the component that a free cell belongs to; 0 for a blocked one."""
+        """Component number of a cell; 0 for a blocked one."""
         return self.parts.at(cell)
 
     def label_at(self, x_m: float, y_m: float) -> int:
-        """Number of the component at a point, 0 where the robot does not fit."""
+        """Component number at a point; 0 if the robot does not fit."""
         i, j = self._cell_at(x_m, y_m)
         return self.parts.at((i, j)) if 0 <= i < self._shape[0] and 0 <= j < self._shape[1] else 0
 
     def may_differ_at(self, wider: FloorGrid, x_m: float, y_m: float) -> bool:
-        """Whether a point may be taken, or cut off as it was not on the grid that this one was narrowed from."""
+        """Return True if a point may be blocked or cut off here but not on the wider grid."""
         if self is wider:
             return False
         renumbered = self.parts.whole is not wider.parts.whole
@@ -198,40 +197,40 @@ class FloorGrid:
         return renumbered or not label or label != wider.label_at(x_m, y_m)
 
     def is_like(self, other: FloorGrid, low_m: Vec2, high_m: Vec2) -> bool:
-        """Whether this grid and the one that it came from have the same components in a rectangle, by the same numbers."""
+        """Return True if this grid and its origin have the same components, with the same numbers, in a rectangle."""
         here, _ = overlap(self._window(low_m, high_m), self.parts.window)
         untouched = any(side.start == side.stop for side in here)
         return self.parts.whole is other.parts.whole and other.parts.inner is None and untouched
 
     def main_part_of(self, wider: FloorGrid, x_m: float, y_m: float) -> int:
-        """The largest component of this grid in the one that a point belongs to on the grid that it was narrowed from."""
+        """Largest component of this grid within the component of a point on the wider grid."""
         cell = wider.cell(x_m, y_m)
         return self.parts.largest_in(wider.parts, wider.label(cell)) if cell is not None else 0
 
     def free_centers(self, low_m: Vec2, high_m: Vec2, label: int) -> FloatArray:
-        """Middles of the component's cells in a rectangle, shape (n, 2), in the world."""
+        """World coordinates of the component's cells in a rectangle, shape (n, 2)."""
         window = self._window(low_m, high_m)
         inside = np.argwhere((self.parts.within(window) == label) & (label > 0))
         corner = np.array([window[0].start, window[1].start])
         return np.asarray(self._origin + (inside + corner + 0.5) * CELL_M, dtype=np.float64)
 
     def all_free_centers(self, low_m: Vec2, high_m: Vec2) -> FloatArray:
-        """Middles of the free cells in a rectangle, whatever their component, shape (n, 2), in the world."""
+        """World coordinates of all free cells in a rectangle, shape (n, 2)."""
         window = self._window(low_m, high_m)
         corner = np.array([window[0].start, window[1].start])
         inside = np.argwhere(self.parts.within(window) > 0)
         return np.asarray(self._origin + (inside + corner + 0.5) * CELL_M, dtype=np.float64)
 
     def distance(self, start: Cell, end: Cell) -> float | None:
-        """Length in metres of the shortest path over free cells, None when there is none."""
+        """Length in metres of the shortest path over free cells; None for no path."""
         if not self.label(start) or self.label(start) != self.label(end):
             return None
         return float(self._distances.to(end)[start])
 
     def path(self, start: Cell, end: Cell) -> tuple[Vec2, ...] | None:
-        """Corners of a short way over free cells, both ends included, in the world; None when there is none.
+        """Corners of a short path over free cells in the world, both ends included; None for no path.
 
-        Steepest descent of the distance to the end, of which the corners are kept that no straight drive can cut.
+        Steepest descent of the distance to the end, without the corners that a straight drive can cut.
         """
         if self.distance(start, end) is None:
             return None
@@ -243,16 +242,16 @@ class FloorGrid:
         return (*corners, self.center(cells[-1]))
 
     def crossing(self, start: Cell, low_m: Vec2, high_m: Vec2, floor: BoolArray) -> FloatArray:
-        """Cells that are not free on the way from a cell into a rectangle that has the fewest of them, shape (n, 2).
+        """Blocked cells on the path from a cell into a rectangle that crosses the fewest of them, shape (n, 2).
 
-        The way leads over ``floor`` only, of the grid's shape. Empty when there is none.
+        The path stays on ``floor``, which has the grid's shape. Empty for no path.
         """
         free, goal = self.free, self._window(low_m, high_m)
-        way = cheapest_way(free, floor, start, goal)
+        way = cheapest_path(free, floor, start, goal)
         return np.array([self.center(cell) for cell in way if not free[cell]]).reshape(-1, 2)
 
     def drives_straight(self, start: Vec2, end: Vec2) -> bool:
-        """Whether the robot fits everywhere on the straight line between two points."""
+        """Return True if the robot fits everywhere on the line between two points."""
         count = max(1, math.ceil(math.dist(start, end) / (CELL_M / 2)))
         shares = np.linspace(0.0, 1.0, count + 1)[:, None]
         points = np.asarray(start) + shares * (np.asarray(end) - np.asarray(start))  # (n, 2)
@@ -284,7 +283,7 @@ class FloorGrid:
 def _floor_of(
     scene: Scene, shape: tuple[int, int], window: Callable[[Sequence[float], Sequence[float]], Window]
 ) -> BoolArray:
-    """Which cells are of a room or of a doorway between two; ``window`` gives the cells of a rectangle."""
+    """Cells of rooms and inner doorways; ``window`` maps a rectangle to cells."""
     floor = np.zeros(shape, dtype=np.bool_)
     for room in scene.rooms:
         floor[window(room.low_m, room.high_m)] = True
@@ -297,37 +296,37 @@ def _floor_of(
     return floor
 
 
-def _lots(boxes: FloatArray, apart_m: float) -> list[list[float]]:
-    """Rectangles that hold all boxes, shape (n, 6), those that are near to one another together: parts of one thing are."""
-    lots: list[list[float]] = []
+def _clusters(boxes: FloatArray, apart_m: float) -> list[list[float]]:
+    """Rectangles around all boxes, shape (n, 6); nearby boxes, such as the parts of one object, share one."""
+    clusters: list[list[float]] = []
     for a, b, c, d in boxes[:, :4].tolist():
-        for lot in lots:
-            e, f, g, h = lot
+        for cluster in clusters:
+            e, f, g, h = cluster
             if a <= g + apart_m and e <= c + apart_m and b <= h + apart_m and f <= d + apart_m:
-                lot[:] = min(a, e), min(b, f), max(c, g), max(d, h)
+                cluster[:] = min(a, e), min(b, f), max(c, g), max(d, h)
                 break
         else:
-            lots.append([a, b, c, d])
-    return lots
+            clusters.append([a, b, c, d])
+    return clusters
 
 
 def _cells_between(low_m: float, high_m: float, origin_m: float, count: int) -> tuple[int, int]:
-    """First cell of those that a stretch touches along one axis, and the one after the last. Plain: arrays of two are slow."""
+    """Range of cells that an interval touches along one axis. Plain Python: arrays of two are slow."""
     first = min(max(math.floor((low_m - origin_m) / CELL_M + 1e-9), 0), count)
     last = min(max(math.ceil((high_m - origin_m) / CELL_M - 1e-9), first), count)
     return first, last
 
 
 def _clear(covered: NDArray[np.int16]) -> BoolArray:
-    """Which cells are a robot's radius or more from every covered one; shapes are equal."""
+    """Cells at least a robot's radius from every covered one, in the same shape."""
     clear = covered == 0
-    if clear.all():  # there is nothing to measure the distance from
+    if clear.all():  # no covered cell
         return np.asarray(clear)
     return np.asarray(np.asarray(ndimage.distance_transform_edt(clear)) * CELL_M >= ROBOT.radius_m)
 
 
 def _blocked(rows: slice, columns: slice, shape: tuple[int, int]) -> tuple[Window, BoolArray]:
-    """The window around a rectangle of cells in which the robot may touch it, and where in it it does."""
+    """Window around a rectangle of cells in which the robot may touch it, and the blocked cells in it."""
     reach = math.ceil(ROBOT.radius_m / CELL_M)
     around_i = slice(max(0, rows.start - reach), min(shape[0], rows.stop + reach))
     around_j = slice(max(0, columns.start - reach), min(shape[1], columns.stop + reach))
@@ -339,7 +338,7 @@ def _blocked(rows: slice, columns: slice, shape: tuple[int, int]) -> tuple[Windo
 
 
 def grid_shape(scene: Scene) -> tuple[int, int]:
-    """Cells along x and y: over the bounding rectangle of the scene's rooms, and two more on each side."""
+    """Number of cells along x and y: the bounding rectangle of the rooms plus two on each side."""
     highs = np.array([room.high_m for room in scene.rooms])
     span = highs.max(axis=0) + 2 * CELL_M - _origin_of(scene)
     return math.ceil(span[0] / CELL_M), math.ceil(span[1] / CELL_M)

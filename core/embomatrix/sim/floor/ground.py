@@ -1,4 +1,4 @@
-"""What stands on the floor, and where the robot fits between it: as the scene was loaded, and as it is now."""
+"""Obstacles on the floor and the free space between them, in the scene as loaded and now."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.floor.grid import FloorGrid
 from embomatrix.sim.floor.obstacles import WALLS, Obstacles
-from embomatrix.sim.floor.open_panels import OpenLeaves
+from embomatrix.sim.floor.open_panels import OpenPanels
 from embomatrix.sim.geometry.bounds import AssetParts
 from embomatrix.world.geometry import Pose
 
@@ -16,144 +16,144 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.floor.open_panels import Ajar
+    from embomatrix.sim.floor.open_panels import OpenJoints
     from embomatrix.sim.floor.prepared import PreparedScene
 
 ON_FLOOR_M: Final = 0.05
-"""A movable object whose underside is lower than this stands on the floor."""
+"""A movable object with a lower underside stands on the floor."""
 GRIDS_KEPT: Final = 2
-"""Floors in memory besides that of the start: a plan comes back to few, and each takes a megabyte in a house with a garden."""
+"""Floor layouts in memory besides the first: a plan returns to few; each takes 1 MB in a house with a garden."""
 LEAVES_KEPT: Final = 12
-"""Floors with doors and drawers open in memory, for each of these: they share most with one another."""
+"""Grids with open doors and drawers in memory per layout; most of their data is shared."""
 
 Floor = tuple[tuple[int, Pose | None], ...]
-"""Movable objects that stand on the floor otherwise than at the start: number and pose, None for what stands there no more."""
+"""Movable objects whose place on the floor differs from the start: number and pose, None if no longer there."""
 
 
 @dataclass(slots=True)
-class Laid:
-    """A floor with its leaves shut: what bars the way, where the robot fits, and where it does with leaves open."""
+class FloorLayout:
+    """Floor with all panels shut: obstacles, grid, and the grids with open panels."""
 
     obstacles: Obstacles
     grid: FloorGrid
-    narrowed: OrderedDict[Ajar, FloorGrid]
+    narrowed: OrderedDict[OpenJoints, FloorGrid]
 
 
 class Ground:
-    """The floor in an engine's present state. Call ``refresh`` after anything on it has moved, or a leaf."""
+    """Floor in an engine's present state. Call ``refresh`` after objects or panels on it have moved."""
 
     def __init__(self, engine: PhysicsEngine, prepared: PreparedScene | None = None) -> None:
-        """``prepared`` was found before, in this scene as it was loaded."""
+        """``prepared`` was derived from this scene as loaded."""
         self._engine = engine
         self._scene = engine.scene
         self.numbers = {item.name: number for number, item in enumerate(self._scene.objects)}
-        """Of the scene's objects, by their names."""
+        """Numbers of the scene's objects by name."""
         self._parts: dict[str, AssetParts] = {}
-        bars = [item for item in self._scene.objects if item.fixed or self._on_floor(item.name)]
-        self._on_floor_at_start = {self.numbers[item.name] for item in bars if not item.fixed}
+        blocking = [item for item in self._scene.objects if item.fixed or self._on_floor(item.name)]
+        self._on_floor_at_start = {self.numbers[item.name] for item in blocking if not item.fixed}
         if prepared is not None:
             obstacles = prepared.obstacles
             grid = FloorGrid.restored(self._scene, prepared.covered, prepared.free)
         else:
             obstacles = Obstacles.joined(
-                [self._walls(), *(self._parts_of(item.name, engine.pose(item.name)) for item in bars)]
+                [self._walls(), *(self._parts_of(item.name, engine.pose(item.name)) for item in blocking)]
             )
-            grid = FloorGrid(self._scene, obstacles.barring)
-        self._at_start = Laid(obstacles, grid, OrderedDict())
-        self._kept: OrderedDict[Floor, Laid] = OrderedDict()
+            grid = FloorGrid(self._scene, obstacles.blocking)
+        self._at_start = FloorLayout(obstacles, grid, OrderedDict())
+        self._kept: OrderedDict[Floor, FloorLayout] = OrderedDict()
         self._moved: dict[int, Pose | None] = {}
-        """As ``floor`` has them, in any order."""
-        self._leaves = OpenLeaves(engine)
-        self._one_open: dict[Ajar, FloorGrid] = {}
-        """Where the robot fits on the floor of the start with the leaves of one more object wide open."""
+        """Unsorted entries of ``floor``."""
+        self._open_panels = OpenPanels(engine)
+        self._with_one_open: dict[OpenJoints, FloorGrid] = {}
+        """Grids of the initial floor with the panels of one more object wide open."""
         self._round, self._read = -1, 0
-        self._current: Laid | None = None
+        self._current: FloorLayout | None = None
         self._now: FloorGrid | None = None
         self.refresh()
 
     def refresh(self) -> None:
-        """Bring the floor up to date. States seen before cost a look-up."""
+        """Update the floor. States seen before cost a look-up."""
         journal = self._engine.journal
         if journal.rounds != self._round:
             self._moved.clear()
-            self._leaves.forget()
+            self._open_panels.forget()
             self._round, self._read = journal.rounds, 0
         for name in dict.fromkeys([name for name, _ in journal.entries[self._read :]]):
             number = self.numbers[name]
             if self._scene.objects[number].fixed:
-                self._leaves.note(number)
+                self._open_panels.note(number)
             else:
                 self._compare(number)
         self._read = len(journal.entries)
         self.floor: Floor = tuple(sorted(self._moved.items())) if self._moved else ()
-        """What stands on the floor otherwise than at the start."""
-        self.ajar: Ajar = self._leaves.ajar()
-        """Whose leaves stand open."""
+        """Movable objects whose place on the floor differs from the start."""
+        self.open_joints: OpenJoints = self._open_panels.open_now()
+        """Fixed objects with open panels, and their joint positions."""
         self._current = self._now = None
 
     @property
-    def _laid(self) -> Laid:
-        """The floor as it is, made when it is asked for: after what is put down last, nobody drives."""
+    def _layout(self) -> FloorLayout:
+        """Current layout, built on demand: after the last placement of a plan nobody drives."""
         if self._current is None:
-            self._current = self._lay_or_recall(self.floor) if self.floor else self._at_start
+            self._current = self._layout_of(self.floor) if self.floor else self._at_start
         return self._current
 
     @property
     def obstacles(self) -> Obstacles:
-        """What stands in the way, all leaves shut. For reading only."""
-        return self._laid.obstacles
+        """Obstacles with all panels shut. Read-only."""
+        return self._layout.obstacles
 
     @property
-    def leaves(self) -> Obstacles:
-        """Doors and drawers that stand open."""
-        return self._leaves.obstacles(self.ajar)
+    def open_panels(self) -> Obstacles:
+        """Doors and drawers that are open."""
+        return self._open_panels.obstacles(self.open_joints)
 
     @property
     def shut(self) -> FloorGrid:
-        """Where the robot would fit if all leaves were shut."""
-        return self._laid.grid
+        """Grid with all panels shut."""
+        return self._layout.grid
 
     @property
     def grid(self) -> FloorGrid:
-        """Where the robot fits, made when it is asked for: many doors are shut again before it drives."""
-        if self._now is None and not self.ajar:
-            self._now = self._laid.grid
+        """Grid now, built on demand: many doors are shut again before the robot drives."""
+        if self._now is None and not self.open_joints:
+            self._now = self._layout.grid
         if self._now is None:
-            foreseen = self._one_open.get(self.ajar) if self._laid is self._at_start else None
-            self._now = foreseen or self._narrowed()
+            known = self._with_one_open.get(self.open_joints) if self._layout is self._at_start else None
+            self._now = known or self._narrowed()
         return self._now
 
-    def complete(self) -> Iterator[None]:
-        """Find out where the robot fits with the leaves of each object wide open, one object at a step.
+    def warm_up(self) -> Iterator[None]:
+        """Build the grid with each object's panels wide open, one object per step. Changes no answer.
 
-        Work for a process that waits. Changes no answer: most plans open one thing, and most of these are opened again.
+        Most plans open one object, and mostly the same ones.
         """
-        for ajar in self._leaves.each_open():
-            leaves = self._leaves.obstacles(ajar)
-            self._one_open[ajar] = self._at_start.grid.narrowed(leaves.barring)
+        for joints in self._open_panels.each_open():
+            panels = self._open_panels.obstacles(joints)
+            self._with_one_open[joints] = self._at_start.grid.narrowed(panels.blocking)
             yield
 
     def _narrowed(self) -> FloorGrid:
-        """The floor with the leaves that stand open now."""
-        kept = self._laid.narrowed
-        if self.ajar not in kept:
-            kept[self.ajar] = self.shut.narrowed(self.leaves.barring)
+        """Grid with the panels that are open now."""
+        kept = self._layout.narrowed
+        if self.open_joints not in kept:
+            kept[self.open_joints] = self.shut.narrowed(self.open_panels.blocking)
             if len(kept) > LEAVES_KEPT:
                 kept.popitem(last=False)
-        kept.move_to_end(self.ajar)
-        return kept[self.ajar]
+        kept.move_to_end(self.open_joints)
+        return kept[self.open_joints]
 
     @property
     def at_start(self) -> tuple[Obstacles, FloorGrid]:
-        """``obstacles`` and ``shut`` in the scene as it was loaded. For reading only."""
+        """``obstacles`` and ``shut`` in the scene as loaded. Read-only."""
         return self._at_start.obstacles, self._at_start.grid
 
     def with_shut(self, number: int) -> FloorGrid:
-        """Where the robot would fit if the leaves of one object were shut."""
-        return self.shut.narrowed(self.leaves.without([number]).barring)
+        """Grid if one object's panels were shut."""
+        return self.shut.narrowed(self.open_panels.without([number]).blocking)
 
     def _compare(self, number: int) -> None:
-        """Note whether a movable object stands on the floor otherwise than at the start."""
+        """Record a movable object whose place on the floor differs from the start."""
         item = self._scene.objects[number]
         pose = self._engine.pose(item.name) if self._on_floor(item.name) else None
         before = item.pose_world_asset if number in self._on_floor_at_start else None
@@ -162,15 +162,15 @@ class Ground:
         else:
             self._moved[number] = pose
 
-    def _lay_or_recall(self, floor: Floor) -> Laid:
+    def _layout_of(self, floor: Floor) -> FloorLayout:
         if floor not in self._kept:
-            self._kept[floor] = self._lay(floor)
+            self._kept[floor] = self._make_layout(floor)
             if len(self._kept) > GRIDS_KEPT:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(floor)
         return self._kept[floor]
 
-    def _lay(self, floor: Floor) -> Laid:
+    def _make_layout(self, floor: Floor) -> FloorLayout:
         moved = [number for number, _ in floor]
         parts = [
             self._parts_of(self._scene.objects[number].name, pose)
@@ -180,7 +180,7 @@ class Ground:
         come = Obstacles.joined([Obstacles.of([], WALLS, []), *parts])
         obstacles, grid = self.at_start
         now = Obstacles.joined([obstacles.without(moved), come])
-        return Laid(now, grid.changed(obstacles.only(moved).barring, come.barring), OrderedDict())
+        return FloorLayout(now, grid.changed(obstacles.only(moved).blocking, come.blocking), OrderedDict())
 
     def _on_floor(self, name: str) -> bool:
         return not self._engine.is_parked(name) and self._engine.aabb(name).low_m[2] < ON_FLOOR_M
@@ -197,5 +197,5 @@ class Ground:
             self._parts[asset.asset_id] = AssetParts(asset)
         shut = (0.0,) * len(asset.joints)
         boxes = self._parts[asset.asset_id].boxes(pose, shut)
-        leaves = [link.joint is not None for link in asset.links for _ in link.parts]
-        return Obstacles.of(boxes, self.numbers[name], leaves)
+        panels = [link.joint is not None for link in asset.links for _ in link.parts]
+        return Obstacles.of(boxes, self.numbers[name], panels)

@@ -1,7 +1,7 @@
-"""Where the robot can go, and where it stands to work on a thing.
+"""Paths and standing poses of the robot.
 
-Obstacles are walls, fixed objects, what stands on the floor, and doors and drawers that stand open, up to the robot's
-height. Room doors have no leaves.
+Obstacles are walls, fixed objects, objects on the floor, and open doors and drawers, up to the robot's height. Room doors have
+no panels.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from embomatrix.sim.floor.grid import CELL_M, FloorGrid
 from embomatrix.sim.floor.ground import Ground
 from embomatrix.sim.floor.obstacles import WALLS, crosses
-from embomatrix.sim.floor.standing import Service
+from embomatrix.sim.floor.standing import StandingArea
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.poses import StandPose
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
     from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.floor.open_panels import Ajar
+    from embomatrix.sim.floor.open_panels import OpenJoints
     from embomatrix.sim.floor.paths import Cell
     from embomatrix.sim.floor.prepared import PreparedScene
     from embomatrix.sim.state.relations import Relations
@@ -32,12 +32,12 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Room, Scene
 
 ROOFED_M: Final = 1.5
-"""A cavity whose floor has less free height than this can't be reached from above."""
+"""A cavity with less free height above its floor can't be reached from above."""
 ANSWERS_KEPT: Final = 4096
-"""Standing poses and rectangles in memory, a few KB each."""
+"""Standing poses and rectangles in memory, a few kB each."""
 ENTRY_M: Final = 0.4
-ASIDE_M: Final = (0.45, 0.9, 1.6)
-"""When a leaf takes the place where the robot stands, one this near does, or else one that near."""
+STEP_ASIDE_M: Final = (0.45, 0.9, 1.6)
+"""Distances within which the robot steps aside from an opened panel, tried in this order."""
 STEP_M: Final = CELL_M / 2
 
 
@@ -51,37 +51,37 @@ class Navigator:
         stands: Mapping[str, tuple[StandPose, ...]] | None = None,
         prepared: PreparedScene | None = None,
     ) -> None:
-        """``stands`` and ``prepared`` were found before, in this scene as it was loaded."""
+        """``stands`` and ``prepared`` were derived from this scene as loaded."""
         self._engine = engine
         self._relations = relations
         self._scene = engine.scene
         self.ground = Ground(engine, prepared)
-        """What bars the way now. For reading only."""
+        """Current obstacles. Read-only."""
         self._stands: dict[tuple[object, ...], tuple[StandPose, ...]] = {}
         self._asides: dict[tuple[object, ...], StandPose] = {}
         self._blockers: dict[tuple[object, ...], FloatArray] = {}
         self._found_before = stands if stands is not None else {}
 
     def refresh(self) -> None:
-        """Bring the ground up to date with what stands on the floor and the open leaves."""
+        """Update the ground after objects on the floor or panels have moved."""
         self.ground.refresh()
 
     def crossing(self, origin: StandPose, low_m: Vec2, high_m: Vec2) -> FloatArray:
-        """Where the way into a rectangle that crosses the least of what stands on the floor crosses it, shape (n, 2)."""
+        """Blocked points on the path into a rectangle that crosses the fewest obstacles, shape (n, 2)."""
         start = self._cell(origin)
         if start is None:
             return np.zeros((0, 2))
-        floor = FloorGrid(self._scene, self.ground.obstacles.only([WALLS]).barring).free
+        floor = FloorGrid(self._scene, self.ground.obstacles.only([WALLS]).blocking).free
         return self.ground.grid.crossing(start, low_m, high_m, floor)
 
     @property
     def start(self) -> StandPose:
-        """Where the scene says that the robot starts."""
+        """Start of the robot in the scene."""
         robot = self._scene.robot
         return StandPose(robot.x_m, robot.y_m, robot.yaw)
 
     def reachable(self, origin: StandPose, target: StandPose) -> bool:
-        """Whether a free path leads from one pose to the other."""
+        """Return True if a free path leads from one pose to the other."""
         first, last = self._cell(origin), self._cell(target)
         return (
             first is not None
@@ -90,21 +90,21 @@ class Navigator:
         )
 
     def path_length(self, origin: StandPose, target: StandPose) -> float | None:
-        """Metres of the shortest path, None when there is none. Fields are kept by target: ask for few of them."""
+        """Length in metres of the shortest path; None for no path. Distance fields are cached by target: use few targets."""
         first, last = self._cell(origin), self._cell(target)
         if first is None or last is None:
             return None
         return self.ground.grid.distance(first, last)
 
     def path(self, origin: StandPose, target: StandPose) -> tuple[Vec2, ...]:
-        """Corners of a short free path from one pose to the other, without both ends; empty where none leads there."""
+        """Corners of a short free path between two poses, both excluded; empty for no path."""
         first, last = self._cell(origin), self._cell(target)
         if first is None or last is None:
             return ()
         return (self.ground.grid.path(first, last) or ())[1:-1]
 
     def forward(self, origin: StandPose, yaw: float, distance_m: float) -> float:
-        """How far of ``distance_m`` the robot gets from ``origin`` along the heading ``yaw`` before it meets something."""
+        """Distance, up to ``distance_m``, that the robot can drive from ``origin`` along the heading ``yaw``."""
         dx, dy = math.cos(yaw), math.sin(yaw)
         steps = max(1, math.ceil(distance_m / STEP_M))
         reached = 0.0
@@ -116,9 +116,9 @@ class Navigator:
         return reached
 
     def room_entry(self, room: str, origin: StandPose) -> StandPose | None:
-        """A free pose just inside the room, facing its middle, that a path from ``origin`` leads to; None without one.
+        """Free pose just inside the room, facing its middle and reachable from ``origin``; None for none.
 
-        From within the room it is ``origin`` itself. Raises KeyError for an unknown room.
+        Returns ``origin`` if it is inside the room. Raises KeyError for an unknown room.
         """
         target = {item.name: item for item in self._scene.rooms}[room]
         if target.contains(origin.x_m, origin.y_m):
@@ -140,18 +140,18 @@ class Navigator:
     def stands(self, name: str, origin: StandPose) -> tuple[StandPose, ...]:
         """Up to eight poses from which the robot reaches the object, the nearest and most frontal first.
 
-        Each is free, connected to ``origin``, between the shoulder's and the arm's reach from the object's box, faces it, and
-        no wall nor anything much taller than the object stands between; nor, for things in furniture, its sides or back.
-        What has doors or roofed cavities is served from its front.
+        Each pose is free, connected to ``origin``, faces the object, and is between the shoulder's and the arm's reach from
+        its box. No wall nor anything much taller than the object stands between, nor the sides or back of its furniture.
+        Objects with doors or roofed cavities are served from their front.
         """
         return tuple(self._stands_from(name, origin))
 
     def nearest_stand(self, name: str, origin: StandPose) -> StandPose | None:
-        """The first of ``stands``; None when there is none."""
+        """First of ``stands``; None for none."""
         return next(self._stands_from(name, origin), None)
 
     def _stands_from(self, name: str, origin: StandPose) -> Iterator[StandPose]:
-        """``stands``, one after another: to drive somewhere takes the first only."""
+        """Yield ``stands`` lazily: driving to an object takes the first only."""
         start = self._cell(origin)
         if start is None or self._engine.is_parked(name):
             return
@@ -167,17 +167,17 @@ class Navigator:
                 found = True
                 yield stand
         if not found:
-            yield from self._stands_on(grid, (self._key(name), self.ground.ajar, label), name)
+            yield from self._stands_on(grid, (self._key(name), self.ground.open_joints, label), name)
 
     def stands_past_shut(self, name: str, origin: StandPose) -> tuple[StandPose, ...]:
-        """As ``stands``, as if all doors and drawers of furniture were shut: few leaves stand in any of these places."""
+        """Evaluate ``stands`` as if all doors and drawers were shut: few panels stand in any of these places."""
         start = self.ground.shut.cell(origin.x_m, origin.y_m)
         if start is None or self._engine.is_parked(name):
             return ()
         return self._stands_on_shut(name, start)
 
     def _stands_on_shut(self, name: str, start: Cell) -> tuple[StandPose, ...]:
-        """``stands_past_shut`` for an object that is in the world, from a free cell."""
+        """Evaluate ``stands_past_shut`` for an object in the world, from a free cell."""
         label = self.ground.shut.label(start)
         found = self._found_before.get(name) if label == self._part_of_start else None
         if found is not None and self.is_as_loaded(name) and self._is_untouched(name):
@@ -185,92 +185,89 @@ class Navigator:
         return self._stands_on(self.ground.shut, (self._key(name), (), label), name)
 
     def _is_untouched(self, name: str) -> bool:
-        """Whether what changed on the floor left the places from which an object is served, and the arm's way, as they were."""
+        """Return True if changes on the floor left the object's standing area and the arm's access unchanged."""
         if self.ground.floor == ():
             return True
         before, grid = self.ground.at_start
-        service = self.service(name)
-        if not self.ground.shut.is_like(grid, *service.window):
+        area = self.standing_area(name)
+        if not self.ground.shut.is_like(grid, *area.window):
             return False
         own = [self.ground.numbers[item] for item in (name, *self._relations.hosts_of(name))]
-        return np.array_equal(_within_reach(before.blockers(service.box, own), service.box), service.blockers)
+        return np.array_equal(_within_reach(before.blockers(area.box, own), area.box), area.blockers)
 
     def _stands_on(
-        self, grid: FloorGrid, key: tuple[tuple[object, ...], Ajar, int], name: str
+        self, grid: FloorGrid, key: tuple[tuple[object, ...], OpenJoints, int], name: str
     ) -> tuple[StandPose, ...]:
-        """Standing poses on the component of a grid that the key ends with. Found once for each key."""
+        """Standing poses on the component at the end of the key, cached by key."""
         if key not in self._stands:
             if len(self._stands) == ANSWERS_KEPT:
                 self._stands.clear()
-            service = self.service(name)
-            self._stands[key] = service.stands(grid.free_centers(*service.window, key[2]))
+            area = self.standing_area(name)
+            self._stands[key] = area.stands(grid.free_centers(*area.window, key[2]))
         return self._stands[key]
 
-    def aside(self, name: str, origin: StandPose) -> StandPose:
-        """Where the robot serves an object, as near to ``origin`` as there is room: there, unless a leaf takes the place.
+    def step_aside(self, name: str, origin: StandPose) -> StandPose:
+        """Pose to serve an object near ``origin``: ``origin`` itself unless a panel takes its place or cuts it off.
 
-        Nor does it stay in a corner that a leaf cuts off from most of the floor. ``origin`` where there is no such place.
+        Returns ``origin`` if no other place exists.
         """
         if not self.ground.grid.may_differ_at(self.ground.shut, origin.x_m, origin.y_m):
             return origin
-        key = self.ground.floor, name, self._engine.pose(name), self.ground.ajar, origin
+        key = self.ground.floor, name, self._engine.pose(name), self.ground.open_joints, origin
         if key not in self._asides:
             if len(self._asides) == ANSWERS_KEPT:
                 self._asides.clear()
-            self._asides[key] = self._find_aside(self.service(name), origin)
+            self._asides[key] = self._find_aside(self.standing_area(name), origin)
         return self._asides[key]
 
-    def _find_aside(self, service: Service, origin: StandPose) -> StandPose:
+    def _find_aside(self, area: StandingArea, origin: StandPose) -> StandPose:
         grid = self.ground.grid
         main = grid.main_part_of(self.ground.shut, origin.x_m, origin.y_m)
         if grid.label_at(origin.x_m, origin.y_m) == main:
             return origin
-        for away in ASIDE_M:
+        for away in STEP_ASIDE_M:
             low, high = (origin.x_m - away, origin.y_m - away), (origin.x_m + away, origin.y_m + away)
-            found = service.nearest(grid.free_centers(low, high, main), origin)
+            found = area.nearest(grid.free_centers(low, high, main), origin)
             if found is not None and math.hypot(found.x_m - origin.x_m, found.y_m - origin.y_m) <= away:
                 return found
         return origin
 
-    def complete(self) -> Iterator[None]:
-        """Find out what bars the arm's way to each object, and the robot's where a door stands open, one object at a step.
-
-        Work for a process that waits. Changes no answer.
-        """
+    def warm_up(self) -> Iterator[None]:
+        """Compute the obstacles of the arm to each object, and the grids with open doors, one per step. Changes no answer."""
         for item in self._scene.objects:
             self._blockers_of(item.name)
             yield
-        yield from self.ground.complete()
+        yield from self.ground.warm_up()
 
-    def service(self, name: str) -> Service:
-        """What a place must offer from which the robot works on the object."""
-        # The front is that of the fixed furniture which the object stands in or on, or its own.
+    def standing_area(self, name: str) -> StandingArea:
+        """Area from which the robot works on the object."""
+        # The front is that of the fixed furniture that holds the object, or its own.
         fixed = [host for host in self._relations.hosts_of(name) if self._scene.by_name[host].fixed]
         yaw = self._engine.pose(fixed[0] if fixed else name).yaw
         from_front = has_front(self._scene.asset_of(name))
-        return Service(self._relations.body(name), yaw, from_front, self._blockers_of(name))
+        return StandingArea(self._relations.body(name), yaw, from_front, self._blockers_of(name))
 
     def line_is_clear(self, origin: StandPose, name: str) -> bool:
-        """Whether no wall nor anything much taller than the object stands between the robot and the object's box."""
+        """Return True if no wall nor anything much taller than the object stands between it and the robot."""
         box = self._relations.body(name)
         here, nearest = _line(origin, box)
         near = math.dist(here, nearest) <= ROBOT.reach_m
         return not crosses(here, nearest, self._blockers_of(name) if near else self._all_blockers_of(name))
 
     def line_would_be_clear(self, origin: StandPose, box: Aabb, own: Iterable[str]) -> bool:
-        """As ``line_is_clear``, of an object that is not there yet: ``own`` are its name and those of what would bear it."""
+        """Evaluate ``line_is_clear`` for an object that is not there yet: ``own`` are its name and its would-be hosts."""
         numbers = [self.ground.numbers[name] for name in own]
         return not crosses(*_line(origin, box), self.ground.obstacles.blockers(box, numbers))
 
     def is_as_loaded(self, name: str) -> bool:
-        """Whether the object and what it stands on or in are where the scene has them."""
+        """Return True if the object and its hosts are where the scene has them."""
         return all(
             self._engine.pose(item) == self._scene.by_name[item].pose_world_asset
             for item in (name, *self._relations.hosts_of(name))
         )
 
     def _blockers_of(self, name: str) -> FloatArray:
-        """Those rectangles within reach of the object that the arm can't pass on its way to it, shape (4, n)."""
+        """Rectangles within reach of the object that block the arm on its way to it, shape (4, n)."""
         key = self._key(name)
         if key not in self._blockers:
             if len(self._blockers) == ANSWERS_KEPT:
@@ -283,13 +280,13 @@ class Navigator:
         return self.ground.obstacles.blockers(self._relations.body(name), own)
 
     def _key(self, name: str) -> tuple[object, ...]:
-        """All that standing poses and lines of approach depend on, but for where the robot is."""
+        """Cache key of standing poses and lines of approach, without the robot's position."""
         hosts = tuple(self._relations.hosts_of(name))
         return self.ground.floor, name, self._engine.pose(name), hosts
 
     @functools.cached_property
     def _part_of_start(self) -> int:
-        """Number of the part of the floor, as it was loaded, where the scene has the robot start; 0 when it is on none."""
+        """Component of the initial floor at the robot's start; 0 for none."""
         _, grid = self.ground.at_start
         start = grid.cell(self.start.x_m, self.start.y_m)
         return grid.label(start) if start is not None else 0
@@ -299,20 +296,20 @@ class Navigator:
 
 
 def _doors_of(scene: Scene, room: Room) -> list[tuple[float, float]]:
-    """Middles of the doorways between a room and others; its own middle where there are none."""
+    """Middles of a room's inner doorways; the room's own middle for none."""
     doors = [item.center_m for item in scene.doorways if room.name in item.rooms and all(item.rooms)]
     return doors or [room.center_m]
 
 
 def _line(origin: StandPose, box: Aabb) -> tuple[Vec2, Vec2]:
-    """Where the robot stands, and the box's nearest point to that, in the plane."""
+    """Robot position and the box's nearest point to it, in the plane."""
     (low_x, low_y, _), (high_x, high_y, _) = box.low_m, box.high_m
     x, y = origin.x_m, origin.y_m
     return (x, y), (min(max(x, low_x), high_x), min(max(y, low_y), high_y))
 
 
 def _within_reach(rectangles: FloatArray, box: Aabb) -> FloatArray:
-    """Those of some rectangles, shape (4, n), that come within the arm's reach of a box."""
+    """Rectangles, shape (4, n), within the arm's reach of a box."""
     around = box.grown(ROBOT.reach_m)
     near = (rectangles[0] <= around.high_m[0]) & (rectangles[2] >= around.low_m[0])
     near &= (rectangles[1] <= around.high_m[1]) & (rectangles[3] >= around.low_m[1])
@@ -320,6 +317,6 @@ def _within_reach(rectangles: FloatArray, box: Aabb) -> FloatArray:
 
 
 def has_front(asset: Asset) -> bool:
-    """Whether a thing is served from its front only: it has doors, or cavities with a roof."""
+    """Return True if an object is served from its front only: it has doors, or cavities with a roof."""
     roofed = any(surface.interior and surface.clearance_m < ROOFED_M for surface in asset.supports)
     return bool(asset.joints) or roofed

@@ -1,4 +1,4 @@
-"""What stands in the robot's way and in its arm's: rectangles of the plane with the heights between which they stand."""
+"""Obstacles of the robot's base and arm: rectangles of the plane with their height range."""
 
 from __future__ import annotations
 
@@ -19,61 +19,61 @@ if TYPE_CHECKING:
     IntArray = NDArray[np.int32]
 
 FLAT_M: Final = 0.03
-"""The robot drives over what is lower than this: rugs."""
+"""The robot drives over lower objects, such as rugs."""
 OVER_M: Final = 0.1
-"""The arm passes over what is no more than this much higher than the thing it reaches for."""
+"""The arm passes over obstacles up to this much higher than its target."""
 SLACK_M: Final = 0.005
 WALLS: Final = -1
-"""Owner of the walls."""
+"""Owner number of the walls."""
 
 
 class Obstacles:
-    """Boxes of parts, shape (n, 6), and whose they are.
+    """Boxes of parts, shape (n, 6), and their owners.
 
     Columns: x low, y low, x high, y high, z low, z high. ``owners`` holds the number of the scene object, -1 for walls;
-    ``leaves`` marks doors and drawers.
+    ``is_panel`` marks doors and drawers.
     """
 
-    def __init__(self, boxes: FloatArray, owners: IntArray, leaves: BoolArray) -> None:
+    def __init__(self, boxes: FloatArray, owners: IntArray, is_panel: BoolArray) -> None:
         self.boxes = boxes
         self.owners = owners
-        self.leaves = leaves
+        self.is_panel = is_panel
 
     @staticmethod
-    def of(boxes: Sequence[Aabb], owner: int, leaves: Sequence[bool]) -> Obstacles:
+    def of(boxes: Sequence[Aabb], owner: int, is_panel: Sequence[bool]) -> Obstacles:
         """Boxes of one owner."""
         rows = [(*box.low_m[:2], *box.high_m[:2], box.low_m[2], box.high_m[2]) for box in boxes]
         return Obstacles(
             np.array(rows, dtype=np.float64).reshape(-1, 6),
             np.full(len(rows), owner, dtype=np.int32),
-            np.array(leaves, dtype=np.bool_),
+            np.array(is_panel, dtype=np.bool_),
         )
 
     @staticmethod
     def joined(parts: Sequence[Obstacles]) -> Obstacles:
-        """All of them, in this order."""
+        """Concatenation in this order."""
         return Obstacles(
             np.concatenate([item.boxes for item in parts]),
             np.concatenate([item.owners for item in parts]),
-            np.concatenate([item.leaves for item in parts]),
+            np.concatenate([item.is_panel for item in parts]),
         )
 
     def only(self, owners: Sequence[int]) -> Obstacles:
-        """Those that belong to one of these."""
+        """Boxes of these owners."""
         return self._chosen(np.isin(self.owners, owners))
 
     def without(self, owners: Sequence[int]) -> Obstacles:
-        """Those that belong to none of these."""
+        """Boxes of all other owners."""
         return self._chosen(~np.isin(self.owners, owners))
 
     @property
-    def barring(self) -> FloatArray:
-        """Those that the robot's base can't drive through, shape (m, 6)."""
-        return self.boxes[self._bars_base()]
+    def blocking(self) -> FloatArray:
+        """Boxes that block the robot's base, shape (m, 6)."""
+        return self.boxes[self._blocks_base()]
 
     def owners_near(self, points: FloatArray) -> dict[int, int]:
-        """For how many of some points of the plane, shape (n, 2), each owner keeps the robot from standing there."""
-        bars = self._bars_base()
+        """Number of points, shape (n, 2), at which each owner keeps the robot from standing."""
+        bars = self._blocks_base()
         boxes, owners = self.boxes[bars], self.owners[bars]
         counts: dict[int, int] = {}
         for owner in dict.fromkeys(owners.tolist()):
@@ -84,40 +84,40 @@ class Obstacles:
         return counts
 
     def blockers(self, box: Aabb, own: Sequence[int]) -> FloatArray:
-        """Rectangles, shape (4, m), that the arm can't pass on its way to a box: x low, y low, x high, y high.
+        """Rectangles, shape (4, m), that block the arm on its way to a box: x low, y low, x high, y high.
 
-        Walls and what is much taller than the box. ``own`` are the numbers of the object in the box and of its hosts: they
-        don't bar the way, unless a host roofs the object over; then the host's own sides do.
+        These are walls and parts much taller than the box. ``own`` are the numbers of the object in the box and of its hosts.
+        Hosts do not block, unless one roofs the object over; then its sides do.
         """
         rows, owners = self.boxes, self.owners
         low, top = box.low_m[2], box.high_m[2]
         x, y, _ = box.center_m
-        barring = (rows[:, 5] > top + OVER_M) & (rows[:, 4] < max(top, ROBOT.shoulder_m))
+        blocking = (rows[:, 5] > top + OVER_M) & (rows[:, 4] < max(top, ROBOT.shoulder_m))
         for place, number in enumerate(own):
             mine = np.flatnonzero(owners == number)
-            barring[mine] = False
+            blocking[mine] = False
             if place == 0:
                 continue
             parts = rows[mine]
             over = (parts[:, 0] <= x) & (x <= parts[:, 2]) & (parts[:, 1] <= y) & (y <= parts[:, 3])
-            # Under a lid the arm reaches from above; shut, it is in the way otherwise.
-            stiff = ~self.leaves[mine]
+            # A lid is no roof: the arm reaches in from above while it is open, and a shut lid is refused elsewhere.
+            stiff = ~self.is_panel[mine]
             if (over & stiff & (parts[:, 4] >= top)).any():
                 beside = (parts[:, 4] < top - SLACK_M) & (parts[:, 5] > low + SLACK_M)
-                barring[mine] = beside & stiff
-        return np.ascontiguousarray(rows[barring, :4].T)
+                blocking[mine] = beside & stiff
+        return np.ascontiguousarray(rows[blocking, :4].T)
 
     def _chosen(self, rows: BoolArray) -> Obstacles:
-        return Obstacles(self.boxes[rows], self.owners[rows], self.leaves[rows])
+        return Obstacles(self.boxes[rows], self.owners[rows], self.is_panel[rows])
 
-    def _bars_base(self) -> BoolArray:
+    def _blocks_base(self) -> BoolArray:
         return np.asarray((self.boxes[:, 4] < ROBOT.height_m) & (self.boxes[:, 5] > FLAT_M))
 
 
 def crosses(start: Vec2, end: Vec2, rectangles: FloatArray) -> bool:
-    """Whether the segment between two points of the plane passes through any rectangle, shape (4, n): slab test.
+    """Slab test: return True if the segment between two points of the plane crosses a rectangle, shape (4, n).
 
-    One by one: there are three of them in the median, fewer than comparing whole arrays pays for.
+    A plain loop: the median is three rectangles, too few for whole arrays to pay off.
     """
     (x, y), (to_x, to_y) = start, end
     low_x, high_x = min(x, to_x), max(x, to_x)

@@ -1,6 +1,6 @@
-"""Doors, drawers and lids of furniture that stand open: which of them do, and the room that they take.
+"""Open doors, drawers and lids of furniture, and the floor that they take.
 
-One that is ajar by no more than what counts as shut takes none.
+Panels open by no more than ``OPEN_FRACTION`` take none.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
     from embomatrix.sim.engine import PhysicsEngine
 
-Ajar = tuple[tuple[int, tuple[float, ...]], ...]
-"""Fixed objects of which a leaf stands open, by their numbers in the scene, and their joint positions."""
+OpenJoints = tuple[tuple[int, tuple[float, ...]], ...]
+"""Fixed objects with an open panel: number in the scene and joint positions."""
 
 
-class OpenLeaves:
-    """The leaves of one engine's fixed objects. Which objects were moved, it must be told."""
+class OpenPanels:
+    """Panels of an engine's fixed objects. The caller reports the changed objects."""
 
     def __init__(self, engine: PhysicsEngine) -> None:
         self._engine = engine
@@ -29,26 +29,26 @@ class OpenLeaves:
         jointed = [number for number, item in enumerate(self._objects) if item.fixed and item.joints]
         self._jointed = frozenset(jointed)
         self._at_start = frozenset(number for number in jointed if any(self._objects[number].joints))
-        self._swung = set(self._at_start)
+        self._moved = set(self._at_start)
 
     def forget(self) -> None:
-        """The engine was reset."""
-        self._swung = set(self._at_start)
+        """Forget all changes after a reset of the engine."""
+        self._moved = set(self._at_start)
 
     def note(self, number: int) -> None:
-        """Something about the object of this number has changed."""
+        """Record that the object of this number has changed."""
         if number in self._jointed:
-            self._swung.add(number)
+            self._moved.add(number)
 
-    def ajar(self) -> Ajar:
-        """What stands open now, in scene order."""
-        if not self._swung:
+    def open_now(self) -> OpenJoints:
+        """Objects that are open now, in scene order."""
+        if not self._moved:
             return ()
-        joints = [(number, self._engine.joints(self._objects[number].name)) for number in sorted(self._swung)]
+        joints = [(number, self._engine.joints(self._objects[number].name)) for number in sorted(self._moved)]
         return tuple((number, fractions) for number, fractions in joints if max(fractions) > OPEN_FRACTION)
 
-    def each_open(self) -> Iterator[Ajar]:
-        """What stands open at the start, and one object more with all its joints wide open: for each object in turn."""
+    def each_open(self) -> Iterator[OpenJoints]:
+        """Initially open objects plus one more with all its joints wide open, for each object in turn."""
         at_start = {number: tuple(self._objects[number].joints) for number in self._at_start}
         for number in sorted(self._jointed):
             joints = at_start | {number: (1.0,) * len(self._objects[number].joints)}
@@ -58,10 +58,10 @@ class OpenLeaves:
                 if max(fractions) > OPEN_FRACTION
             )
 
-    def obstacles(self, ajar: Ajar) -> Obstacles:
-        """Boxes of the parts of leaves that stand open so."""
+    def obstacles(self, joints: OpenJoints) -> Obstacles:
+        """Boxes of the panels that are open at these joint positions."""
         found = [Obstacles.of([], WALLS, [])]
-        for number, fractions in ajar:
+        for number, fractions in joints:
             item = self._objects[number]
             asset = self._engine.scene.asset_of(item.name)
             boxes = parts_of(asset).boxes(self._engine.pose(item.name), fractions)
@@ -70,7 +70,7 @@ class OpenLeaves:
         return Obstacles.joined(found)
 
     def _are_out(self, number: int, fractions: tuple[float, ...]) -> Iterator[bool]:
-        """For each part of an object, in the order of its links, whether it belongs to a leaf that stands open."""
+        """Tell for each part of an object, in the order of its links, if it belongs to an open panel."""
         moving = iter(fractions)
         for link in self._engine.scene.asset_of(self._objects[number].name).links:
             is_out = link.joint is not None and next(moving, 0.0) > OPEN_FRACTION

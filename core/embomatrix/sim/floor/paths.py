@@ -1,4 +1,4 @@
-"""Ways over the free cells of a floor."""
+"""Shortest paths over the free cells of a floor."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ Cell = tuple[int, int]
 
 FLOORS_KEPT: Final = 3
 CROSSING_COST: Final = 100.0
-"""To drive through a thing is as bad as a detour of this many cells for each of its own."""
+"""Cost of a blocked cell in free cells: driving through an object is as bad as a detour of this many per cell."""
 FIELDS_KEPT: Final = 64
 """Distance fields in memory, 0.2 MB each in a flat of 120 m2."""
 
 
 class Distances:
-    """Metres along the free cells of one floor, none of them at its border, to one cell or another."""
+    """Distances in metres along the free cells of one floor, whose border is blocked."""
 
     def __init__(self, free: BoolArray, cell_m: float) -> None:
         self._free = free
@@ -40,7 +40,7 @@ class Distances:
         self._fields: dict[Cell, FloatArray] = {}
 
     def to(self, cell: Cell) -> FloatArray:
-        """Metres from every cell to this one, of the floor's shape; infinity where no way leads."""
+        """Metres from every cell to this one, in the floor's shape; infinity for no path."""
         field = self._fields.get(cell)
         if field is None:
             if len(self._fields) == FIELDS_KEPT:
@@ -51,7 +51,7 @@ class Distances:
         return field
 
     def descent(self, start: Cell, end: Cell) -> list[Cell]:
-        """The cells of a shortest way between two that hang together, both included."""
+        """Cells of a shortest path between two connected cells, both included."""
         field = self.to(end)
         cells = [start]
         while cells[-1] != end:
@@ -59,7 +59,7 @@ class Distances:
         return cells
 
     def _neighbours(self, i: int, j: int) -> list[Cell]:
-        """Free cells next to a cell; those across a corner only where both cells beside it are free."""
+        """Free neighbours of a cell; a diagonal one only if both cells beside it are free."""
         free = self._free
         return [
             (i + di, j + dj)
@@ -72,7 +72,7 @@ class Distances:
 
     @functools.cached_property
     def _graph(self) -> sparse.csr_matrix:
-        """Eight-neighbour graph of the free cells. Diagonals cut no corners: both cells beside them must be free."""
+        """Eight-neighbour graph of the free cells. A diagonal exists only if both cells beside it are free."""
         free, (rows, columns) = self._free, self._free.shape
         number = np.arange(rows * columns).reshape(free.shape)
         starts, ends, lengths = [], [], []
@@ -92,14 +92,14 @@ class Distances:
 
 
 class RecentDistances:
-    """Distances over the floors that were asked for last, of many that are in memory: a house with a garden takes 20 MB."""
+    """Distances over the most recently used floors: a house with a garden takes 20 MB."""
 
     def __init__(self, cell_m: float) -> None:
         self._cell_m = cell_m
         self._kept: OrderedDict[object, Distances] = OrderedDict()
 
     def over(self, floor: object, free: Callable[[], BoolArray]) -> Distances:
-        """Those over a floor, whose free cells are asked for when it is not known any more."""
+        """Distances over a floor; ``free`` returns its free cells if they are needed."""
         if floor not in self._kept:
             if len(self._kept) == FLOORS_KEPT:
                 self._kept.popitem(last=False)
@@ -108,10 +108,10 @@ class RecentDistances:
         return self._kept[floor]
 
 
-def cheapest_way(free: BoolArray, floor: BoolArray, start: Cell, goal: Window) -> list[Cell]:
-    """The cells back from a free one in the goal to the start, by a way over ``floor`` that has few that are not free.
+def cheapest_path(free: BoolArray, floor: BoolArray, start: Cell, goal: Window) -> list[Cell]:
+    """Cells of the path from the start to a free cell in the goal with the fewest blocked cells, in reverse.
 
-    Empty when there is none.
+    The path stays on ``floor``. Empty for no path.
     """
     cost = np.where(free, 1.0, CROSSING_COST)
     seen = np.full(free.shape, np.inf)

@@ -1,7 +1,7 @@
-"""What the simulator derives from a scene before anything happens in it, found once and carried in the bundle.
+"""Arrays derived from a scene in its initial state, computed once and carried in the bundle.
 
-A worker that finds it there measures no box and rasterises no floor when it loads the scene. Without it, or from another
-version of the code that derives it, the same is derived when the scene is loaded.
+With them a worker measures no box and rasterises no floor when it loads the scene. Without them, or after a change of
+``VERSION``, loading derives them.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 VERSION: Final = 1
-"""Counts up with every change of a box's, an obstacle's or the floor grid's definition."""
+"""Incremented with every change in the definition of a box, an obstacle or the floor grid."""
 MOST_COVERED: Final = 255
 
 
 class PreparedScene:
-    """Arrays of one scene in its initial state, as a decoded bundle carries them."""
+    """Arrays of one scene in its initial state, from a decoded bundle."""
 
     def __init__(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """``arrays`` must be sound: ``of`` sees to that."""
+        """``arrays`` must have passed the checks of ``of``."""
         self._arrays = arrays
 
     @staticmethod
     def of(bundle: Bundle) -> PreparedScene | None:
-        """What a decoded bundle carries, None when it carries nothing that this version can use."""
+        """Arrays of a decoded bundle; None if this version can't use them."""
         found = {name: bundle.prepared[_key(name)] for name in _KINDS if _key(name) in bundle.prepared}
         if found.keys() != _KINDS.keys():
             return None
@@ -49,7 +49,7 @@ class PreparedScene:
 
     @property
     def object_boxes(self) -> tuple[Aabb, ...]:
-        """In the order of the scene's objects."""
+        """Boxes in the order of the scene's objects."""
         return _aabbs(self._arrays["objects"])
 
     @property
@@ -58,18 +58,18 @@ class PreparedScene:
 
     @property
     def obstacles(self) -> Obstacles:
-        """What stands in the robot's way."""
-        leaves = self._arrays["leaves"].astype(np.bool_)
-        return Obstacles(self._arrays["obstacles"], self._arrays["owners"], leaves)
+        """Obstacles of the robot."""
+        is_panel = self._arrays["leaves"].astype(np.bool_)
+        return Obstacles(self._arrays["obstacles"], self._arrays["owners"], is_panel)
 
     @property
     def covered(self) -> NDArray[np.int16]:
-        """How many obstacles cover each cell of the floor grid, shape (rows, columns)."""
+        """Number of obstacles over each cell of the floor grid, shape (rows, columns)."""
         return self._arrays["covered"].astype(np.int16)
 
     @property
     def free(self) -> NDArray[np.bool_]:
-        """Where the robot may be: the cells of the floor grid, shape (rows, columns)."""
+        """Free cells of the floor grid, shape (rows, columns)."""
         covered = self._arrays["covered"]
         bits = np.unpackbits(self._arrays["free"], count=covered.size)
         return bits.reshape(covered.shape).astype(np.bool_)
@@ -100,7 +100,7 @@ def prepared_arrays(engine: PhysicsEngine, obstacles: Obstacles, grid: FloorGrid
         "walls": _rows([wall.aabb(IDENTITY) for wall in scene.walls]),
         "obstacles": obstacles.boxes,
         "owners": obstacles.owners,
-        "leaves": obstacles.leaves.astype(np.uint8),
+        "leaves": obstacles.is_panel.astype(np.uint8),
         "covered": covered.astype(np.uint8),
         "free": np.packbits(grid.free),
     }
@@ -120,7 +120,7 @@ def _aabbs(rows: FloatArray) -> tuple[Aabb, ...]:
 
 
 def _are_sound(arrays: Mapping[str, NDArray[Any]], scene: Scene) -> bool:
-    """Whether the arrays have the shapes that belong to one another and to the scene. What they say is not checked."""
+    """Return True if the arrays' shapes match one another and the scene. Values are not checked."""
     obstacles, owners, covered = arrays["obstacles"], arrays["owners"], arrays["covered"]
     count = len(scene.objects)
     return (

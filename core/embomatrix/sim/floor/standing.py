@@ -1,4 +1,4 @@
-"""Where the robot stands to work on a thing: near enough, in front of it, with nothing in the arm's way."""
+"""Standing poses from which the robot works on an object: near, in front of it, with a free line for the arm."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import Aabb, FloatArray, Vec2
 
 REACH_SLACK_M: Final = 0.05
-"""Standing poses are this much nearer than the arm reaches, so that a thing may be a little off its box's edge."""
+"""Standing poses are this much nearer than the arm reaches, as slack for objects off their box's edge."""
 FRONT_COSINE: Final = math.cos(math.radians(65.0))
-"""What has a front is served from within 65 degrees of it."""
+"""Objects with a front are served from within 65 degrees of it."""
 STANDS: Final = 8
 APART_M: Final = 0.25
-"""Standing poses of one thing are at least this far from one another."""
+"""Smallest distance between standing poses of one object."""
 TRIED: Final = 96
 SIDE_WEIGHT_M: Final = 0.4
-"""Standing abeam of the front is as bad as standing this much farther away."""
+"""Cost of standing at the side, as a distance from the front."""
 
 
 @dataclass(frozen=True, slots=True)
-class Service:
-    """What a place must offer that serves a thing: ``blockers``, shape (4, n), are rectangles that the arm can't pass.
+class StandingArea:
+    """Conditions on a place that serves an object: ``blockers``, shape (4, n), are rectangles that the arm can't pass.
 
-    ``front_yaw`` is where the thing, or the furniture that it is in, looks; ``from_front`` when it can't be served otherwise.
+    ``front_yaw`` is the front of the object, or of the furniture that holds it; ``from_front`` restricts the robot to it.
     """
 
     box: Aabb
@@ -41,13 +41,13 @@ class Service:
 
     @property
     def window(self) -> tuple[Vec2, Vec2]:
-        """Corners of the rectangle in which such places lie."""
+        """Corners of the rectangle that contains all such places."""
         reach = ROBOT.reach_m - REACH_SLACK_M
         (low_x, low_y, _), (high_x, high_y, _) = self.box.low_m, self.box.high_m
         return (low_x - reach, low_y - reach), (high_x + reach, high_y + reach)
 
     def stands(self, centers: FloatArray) -> tuple[StandPose, ...]:
-        """Up to eight poses at these points, shape (n, 2): the cheapest with a clear line, apart from one another."""
+        """Up to eight poses at these points, shape (n, 2): the cheapest with a clear line, spaced apart."""
         nearest, cost = self._weigh(centers)
         chosen: list[StandPose] = []
         tried = 0
@@ -64,7 +64,7 @@ class Service:
         return tuple(chosen)
 
     def nearest(self, centers: FloatArray, place: StandPose) -> StandPose | None:
-        """The pose at one of these points, shape (n, 2), that serves the thing and is nearest to a place; None without one."""
+        """Serving pose among these points, shape (n, 2), nearest to a place; None for none."""
         nearest, cost = self._weigh(centers)
         away = np.hypot(centers[:, 0] - place.x_m, centers[:, 1] - place.y_m)
         for index in np.argsort(away, kind="stable").tolist():
@@ -75,7 +75,7 @@ class Service:
         return None
 
     def serving(self, centers: FloatArray) -> FloatArray:
-        """Those of some points, shape (n, 2), that serve the thing, were they free."""
+        """Points, shape (n, 2), that would serve the object if they were free."""
         nearest, cost = self._weigh(centers)
         good = [
             index
@@ -85,7 +85,7 @@ class Service:
         return np.asarray(centers[good], dtype=np.float64)
 
     def _weigh(self, centers: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Nearest point of the box to each centre, shape (n, 2), and what standing there costs, shape (n,); infinite: no."""
+        """Nearest point of the box to each centre, shape (n, 2), and its cost, shape (n,); infinite for unsuitable centres."""
         middle = np.array(self.box.center_m[:2])
         nearest = np.clip(centers, np.array(self.box.low_m[:2]), np.array(self.box.high_m[:2]))
         away = np.linalg.norm(centers - nearest, axis=1)
@@ -95,7 +95,7 @@ class Service:
         cosines = (to_robot / np.maximum(far, 1e-9)[:, None]) @ front
         fits = away <= ROBOT.reach_m - REACH_SLACK_M
         if self.box.high_m[2] <= FLAT_M:
-            away = away + far  # it stands on rugs and floors, in their middle rather than at their edge
+            away = away + far  # the robot stands on rugs and floors, near their middle
         else:
             fits &= away >= ROBOT.shoulder_m
         if self.from_front:

@@ -1,6 +1,6 @@
-"""Many poses of one thing at once: which of them are in reach, and which have room around them, as whole arrays.
+"""Batch tests of many poses of one object: reach and free space around them, with whole arrays.
 
-Boxes decide, so the answers are cheap and coarse. What is really free is looked at later, one pose at a time.
+The tests use boxes and are cheap and coarse. Exact collision tests follow, one pose at a time.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     BoolArray = NDArray[np.bool_]
 
 TAKEN_SHARE: Final = 0.16
-"""Boxes of two upright cylinders that overlap by this share of their extents along both axes are of cylinders that do."""
+"""If boxes of two upright cylinders overlap by this share of their extents along both axes, the cylinders overlap."""
 HANDY_M: Final = 0.75
 HANDY_HEIGHTS_M: Final = (0.35, 1.5)
-"""So near to the base's centre, and with its middle between these heights, a place is reached with ease."""
+"""Distance from the base's centre and heights of a place that is easy to reach."""
 SAME_LEVEL_M: Final = 0.02
 
 
@@ -37,7 +37,7 @@ SAME_LEVEL_M: Final = 0.02
 class Neighbours:
     """Boxes of k objects, shape (k, 3) each corner.
 
-    ``one_part`` tells which are a single convex part, ``movable`` which are not fixed; shape (k,).
+    ``one_part`` marks single convex parts, ``movable`` objects that are not fixed; shape (k,).
     """
 
     lows_m: FloatArray
@@ -53,39 +53,39 @@ class Neighbours:
 
 
 @dataclass(frozen=True, slots=True)
-class Lineup:
-    """Boxes in the world that one thing has at n poses, shape (n, 3) each corner. A pose that is none is at infinity."""
+class PoseBoxes:
+    """World boxes of one object at n poses, shape (n, 3) each corner. Invalid poses are at infinity."""
 
     lows_m: FloatArray
     highs_m: FloatArray
 
     def around(self) -> Aabb:
-        """Smallest box that holds all of them; there must be one."""
+        """Smallest box around all of them; there must be one."""
         (a, b, c), (d, e, f) = self.lows_m.min(axis=0).tolist(), self.highs_m.max(axis=0).tolist()
         return Aabb((a, b, c), (d, e, f))
 
     def crowded(self, others: Sequence[Aabb], margin_m: float) -> Iterator[bool]:
-        """Whether each box, grown by a margin, overlaps any of some others, one by one: most askers take the first few."""
+        """Tell box by box if it overlaps any other one within a margin. Lazy: most callers take the first few."""
         for (a, b, c), (d, e, f) in zip(self.lows_m.tolist(), self.highs_m.tolist(), strict=True):
             box = Aabb((a, b, c), (d, e, f)).grown(margin_m)
             yield any(box.overlaps(other) for other in others)
 
-    def at(self, rows: Sequence[int]) -> Lineup:
+    def at(self, rows: Sequence[int]) -> PoseBoxes:
         """Some of the poses, in the order of ``rows``."""
-        return Lineup(self.lows_m[rows], self.highs_m[rows])
+        return PoseBoxes(self.lows_m[rows], self.highs_m[rows])
 
-    def raised_over(self, height_m: float) -> Lineup:
-        """The boxes as high up as they must come on their way, those that begin lower over a height."""
+    def raised_over(self, height_m: float) -> PoseBoxes:
+        """Boxes lifted over a height, as on their way over a rim."""
         rise = np.zeros_like(self.lows_m)
         rise[:, 2] = np.maximum(height_m - self.lows_m[:, 2], 0.0)
-        return Lineup(self.lows_m + rise, self.highs_m + rise)
+        return PoseBoxes(self.lows_m + rise, self.highs_m + rise)
 
     def reached_from(self, stand: StandPose) -> BoolArray:
-        """Whether the arm reaches the nearest point of each box in the plane, and its middle's height; shape (n,)."""
+        """Tell for each box, shape (n,), if the arm reaches its nearest point in the plane and the height of its middle."""
         return self._within(stand, ROBOT.reach_m, ROBOT.reach_low_m, ROBOT.reach_high_m)
 
     def handy_from(self, stand: StandPose) -> BoolArray:
-        """Whether the arm gets at each box with ease: neither far out nor near the floor or overhead; shape (n,)."""
+        """Tell for each box, shape (n,), if it is easy to reach: neither far out nor near the floor or overhead."""
         return self._within(stand, HANDY_M, *HANDY_HEIGHTS_M)
 
     def _within(self, stand: StandPose, away_m: float, low_m: float, high_m: float) -> BoolArray:
@@ -93,17 +93,17 @@ class Lineup:
         away = np.maximum(self.lows_m[:, :2] - base, base - self.highs_m[:, :2])  # (n, 2)
         np.maximum(away, 0.0, out=away)
         reached = np.hypot(away[:, 0], away[:, 1]) <= away_m
-        # Of lowest and highest: twice the height of the middle.
+        # The sum of lowest and highest is twice the height of the middle.
         sums = self.lows_m[:, 2] + self.highs_m[:, 2]
         reached &= sums >= 2 * low_m
         reached &= sums <= 2 * high_m
         return np.asarray(reached)
 
     def overlaps(self, others: Neighbours) -> tuple[BoolArray, IntArray]:
-        """Whether the thing would surely meet a neighbour at each pose, and the one whose box it shares the most with.
+        """Tell for each pose if the object certainly meets a neighbour, and give the neighbour with the largest shared box.
 
-        Surely is: the boxes overlap by much, and the other is one convex body, or a vessel or the like that stands on the
-        same level. Both answers have the shape (n,).
+        Certain means: the boxes overlap by much, and the other is one convex body, or a movable object on the same level. Both
+        answers have shape (n,).
         """
         lows, highs = self.lows_m[:, None], self.highs_m[:, None]
         shared = np.minimum(highs, others.highs_m) - np.maximum(lows, others.lows_m)  # (n, k, 3)
@@ -119,19 +119,19 @@ _COLUMNS: Final = tuple(
     np.array(columns)
     for columns in ((0, 1, 2, 3, 4, 5), (4, 0, 2, 1, 3, 5), (3, 4, 2, 0, 1, 5), (1, 3, 2, 4, 0, 5))
 )
-"""From which column of a box's corners each one comes after 0 to 3 quarter turns about z."""
+"""Source column of each of a box's corners after 0 to 3 quarter turns about z."""
 _SIGNS: Final = tuple(
     np.array(signs, dtype=np.float64)
     for signs in ((1, 1, 1, 1, 1, 1), (-1, 1, 1, -1, 1, 1), (-1, -1, 1, -1, -1, 1), (1, -1, 1, 1, -1, 1))
 )
-"""And with which sign."""
+"""Signs of these columns."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkBoxes:
-    """Boxes of one thing at n poses, each in the frame of the support's link that it rides on.
+    """Boxes of one object at n poses, each in the frame of the support's link that carries it.
 
-    ``corners_m`` has shape (n, 6), the low corner first; ``link_of``, shape (n,), tells where in ``links`` each one rides.
+    ``corners_m`` has shape (n, 6), the low corner first; ``link_of``, shape (n,), holds indices into ``links``.
     """
 
     corners_m: FloatArray
@@ -139,11 +139,11 @@ class LinkBoxes:
     link_of: IntArray
 
     def moved(self, rows: IntArray, by_m: FloatArray) -> LinkBoxes:
-        """The boxes of these rows, shape (m,), each moved on its link by its own way, shape (m, 3)."""
+        """Boxes of these rows, shape (m,), each moved on its link by its own vector, shape (m, 3)."""
         return LinkBoxes(self.corners_m[rows] + np.tile(by_m, 2), self.links, self.link_of[rows])
 
-    def lineup(self, frames: Mapping[str, Pose]) -> Lineup | None:
-        """The boxes in the world; at infinity on links without a frame, None when a frame is not square to the world."""
+    def world_boxes(self, frames: Mapping[str, Pose]) -> PoseBoxes | None:
+        """Boxes in the world; at infinity on links without a frame. None if a frame is not square to the world."""
         turns = {link: quarter_turns(frames[link]) for link in self.links if link in frames}
         if -1 in turns.values():
             return None
@@ -159,23 +159,23 @@ class LinkBoxes:
 
 
 def _turned(corners_m: FloatArray, turns: int, frame: Pose) -> FloatArray:
-    """Boxes of a frame, shape (n, 6), in the world, where the frame is turned by so many quarter turns about z."""
+    """World boxes, shape (n, 6), of a frame that is turned by quarter turns about z."""
     placed = corners_m[:, _COLUMNS[turns]]
     placed *= _SIGNS[turns]
     placed += np.array(frame.position_m * 2)
     return placed
 
 
-def _split(corners_m: FloatArray) -> Lineup:
-    return Lineup(corners_m[:, :3], corners_m[:, 3:])
+def _split(corners_m: FloatArray) -> PoseBoxes:
+    return PoseBoxes(corners_m[:, :3], corners_m[:, 3:])
 
 
 @dataclass(frozen=True, slots=True)
 class PoseSet:
-    """n poses of a thing in the frames of a support's links, as arrays.
+    """Poses of an object in the frames of a support's links, as arrays over n.
 
-    ``positions_m`` has shape (n, 3), ``rotations`` (k, 3, 3); ``turn_of``, shape (n,), tells which of these each pose has,
-    and ``link_of``, shape (n,), where in ``links`` it rides.
+    ``positions_m`` has shape (n, 3), ``rotations`` (k, 3, 3); ``turn_of`` and ``link_of``, shape (n,), hold indices into
+    ``rotations`` and ``links``.
     """
 
     positions_m: FloatArray
@@ -186,7 +186,7 @@ class PoseSet:
 
     @staticmethod
     def of(rows: FloatArray, links: Sequence[str], then: Pose = IDENTITY) -> PoseSet:
-        """Poses that ride on ``links``, one for each; ``then`` is the thing's pose in each of their frames.
+        """Poses on ``links``, one link each; ``then`` is the object's pose in each of their frames.
 
         ``rows``, shape (n, 7), are positions and quaternions.
         """
@@ -204,32 +204,34 @@ class PoseSet:
         return PoseSet(positions, rotations, np.arange(len(rows)), names, link_of)
 
     def repeated_at(self, positions_m: FloatArray) -> PoseSet:
-        """The poses in turn, again and again, moved to positions on their links, shape (m, 3)."""
+        """Poses repeated in turn at other positions on their links, shape (m, 3)."""
         rows = np.arange(len(positions_m)) % max(len(self.link_of), 1)
         return PoseSet(positions_m, self.rotations, self.turn_of[rows], self.links, self.link_of[rows])
 
     def boxes(self, bounds: AssetBounds) -> LinkBoxes:
-        """Boxes of a thing with these bounds, its joints shut, in the frames of the links."""
-        found = self.lineup(bounds, (), dict.fromkeys(self.links, IDENTITY))
+        """Boxes of an object with these bounds, its joints shut, in the frames of the links."""
+        found = self.world_boxes(bounds, (), dict.fromkeys(self.links, IDENTITY))
         return LinkBoxes(np.concatenate([found.lows_m, found.highs_m], axis=1), self.links, self.link_of)
 
-    def lineup(self, bounds: AssetBounds, fractions: Sequence[float], frames: Mapping[str, Pose]) -> Lineup:
-        """Boxes of a thing with these bounds and joint positions, where the links are; at infinity on links without frame."""
+    def world_boxes(
+        self, bounds: AssetBounds, fractions: Sequence[float], frames: Mapping[str, Pose]
+    ) -> PoseBoxes:
+        """World boxes of an object with these bounds and joint positions; at infinity on links without a frame."""
         if not self.links:
-            return Lineup(np.zeros((0, 3)), np.zeros((0, 3)))
+            return PoseBoxes(np.zeros((0, 3)), np.zeros((0, 3)))
         if len(self.links) == 1 and self.links[0] in frames:
-            return Lineup(*self._extents(bounds, fractions, frames[self.links[0]], np.s_[:]))
+            return PoseBoxes(*self._extents(bounds, fractions, frames[self.links[0]], np.s_[:]))
         lows, highs = np.full_like(self.positions_m, np.inf), np.full_like(self.positions_m, np.inf)
         for number, link in enumerate(self.links):
             if link in frames:
                 rows = self.link_of == number
                 lows[rows], highs[rows] = self._extents(bounds, fractions, frames[link], rows)
-        return Lineup(lows, highs)
+        return PoseBoxes(lows, highs)
 
     def _extents(
         self, bounds: AssetBounds, fractions: Sequence[float], frame: Pose, rows: slice | BoolArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Corners of the boxes at some of the poses, shape (m, 3) each, where the link that they ride on is at ``frame``."""
+        """Corners of the boxes at some of the poses, shape (m, 3) each, with their link at ``frame``."""
         turn = frame.rotation
         below, above = bounds.extents(turn @ self.rotations, fractions)  # (k, 3) each
         origins = self.positions_m[rows] @ turn.T + frame.position_m

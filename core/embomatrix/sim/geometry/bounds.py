@@ -1,6 +1,6 @@
-"""Bounding boxes of assets at any pose and joint position, exact but for the rims of tilted cylinders.
+"""Bounding boxes of assets at any pose and joint position, exact except for the rims of tilted cylinders.
 
-Read from the parts, not from the physics engine: its boxes carry collision margins and swell as compounds turn.
+They derive from the parts: the physics engine's boxes include collision margins and grow as compounds turn.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     IntArray = NDArray[np.int64]
 
 RIM_POINTS: Final = 24
-"""Points on each rim of a cylinder: a box is then at most 0.9 % of the radius too small."""
+"""Points on each rim of a cylinder: a box is at most 0.9 % of the radius too small."""
 EXTENTS_KEPT: Final = 512
-"""Answers in memory for each asset, about 300 bytes each; for its parts as much for each of them."""
+"""Cached answers per asset, about 300 bytes each; for its parts as many each."""
 CORNERS: Final = 8
 SQUARE: Final = 5e-7
 """Half the angle, in radians, up to which frames count as square to one another."""
 ASSETS_KEPT: Final = 512
-"""Of this many assets the points are kept: more than a scene has, few enough for a process that loads many scenes."""
+"""Assets with cached points: more than a scene has, and few enough for a process that loads many scenes."""
 IDENTITY: Final = Pose((0.0, 0.0, 0.0), IDENTITY_QUAT)
 
 
@@ -50,7 +50,7 @@ def joint_motion(joint: Joint, fraction: float) -> Pose:
 
 
 def quarter_turns(frame: Pose) -> int:
-    """By how many quarter turns about z, 0 to 3, a frame is turned, to a microradian; -1 when it is turned otherwise."""
+    """Number of quarter turns about z, 0 to 3, to within a microradian; -1 for any other rotation."""
     x, y, z, w = frame.quat_xyzw
     if abs(x) > SQUARE or abs(y) > SQUARE:
         return -1
@@ -64,7 +64,7 @@ def quarter_turns(frame: Pose) -> int:
 
 
 def square_box(box: Aabb, frame: Pose) -> Aabb | None:
-    """A box in the frame that ``frame`` leads to; None when its sides are not along that frame's axes, to a microradian."""
+    """Box in the target of ``frame``; None if its sides are not along that frame's axes to within a microradian."""
     x, y, z, w = (abs(value) for value in frame.quat_xyzw)
     if x > SQUARE or y > SQUARE:
         return None
@@ -79,7 +79,7 @@ def square_box(box: Aabb, frame: Pose) -> Aabb | None:
 
 
 class AssetBounds:
-    """Points whose hull encloses each link of an asset, made once and shared by all objects of the asset."""
+    """Points whose hull encloses each link of an asset, shared by all objects of the asset."""
 
     def __init__(self, asset: Asset) -> None:
         self._links = [(link.parts, link.joint) for link in asset.links if link.parts]
@@ -87,7 +87,7 @@ class AssetBounds:
         self._clouds_at: dict[tuple[float, ...], tuple[FloatArray, FloatArray | None]] = {}
 
     def box(self, pose: Pose, fractions: Sequence[float] = ()) -> Aabb:
-        """Bounding box in the frame that ``pose`` leads to, with the joints at these shares of their travel."""
+        """Bounding box in the target of ``pose``, with the joints at these shares of their travel."""
         (a, b, c), (d, e, f) = self._extents_at(pose.quat_xyzw, tuple(fractions))
         x, y, z = pose.position_m
         return Aabb((x + a, y + b, z + c), (x + d, y + e, z + f))
@@ -95,7 +95,7 @@ class AssetBounds:
     def extents(
         self, rotations: FloatArray, fractions: Sequence[float] = ()
     ) -> tuple[FloatArray, FloatArray]:
-        """Corners of the boxes relative to the origin at many rotations, shape (n, 3, 3); each of shape (n, 3)."""
+        """Corners of the boxes relative to the origin at rotations of shape (n, 3, 3); each of shape (n, 3)."""
         points, radii = self._placed(tuple(fractions))
         turned = rotations @ points  # (n, 3, m)
         if radii is None:
@@ -103,7 +103,7 @@ class AssetBounds:
         return (turned - radii).min(axis=2), (turned + radii).max(axis=2)
 
     def _placed(self, fractions: tuple[float, ...]) -> tuple[FloatArray, FloatArray | None]:
-        """Points of all links in the asset's frame, shape (3, m), and radii of the balls around them; None: no balls."""
+        """Points of all links in the asset's frame, shape (3, m), and the radii of balls around them; None for no balls."""
         known = self._clouds_at.get(fractions)
         if known is None:
             if len(self._clouds_at) >= EXTENTS_KEPT:
@@ -123,7 +123,7 @@ class AssetBounds:
         return [(_cloud(parts), joint) for parts, joint in self._links]
 
     def _extents_at(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> tuple[Vec3, Vec3]:
-        """Corners relative to the origin. Things stand at few angles: answers are kept."""
+        """Corners relative to the origin, cached: objects stand at few angles."""
         key = (quat_xyzw, fractions)
         known = self._extents.get(key)
         if known is None:
@@ -136,23 +136,23 @@ class AssetBounds:
         points, radii = self._placed(fractions)
         turned = pose.rotation @ points  # (3, m)
         lows, highs = (turned, turned) if radii is None else (turned - radii, turned + radii)
-        # The reductions of the ufuncs: those of arrays go through Python, which costs as much again.
+        # ufunc.reduce directly: the array methods go through Python, which doubles the cost.
         a, b, c = np.minimum.reduce(lows, 1).tolist()
         d, e, f = np.maximum.reduce(highs, 1).tolist()
         return (a, b, c), (d, e, f)
 
 
 class AssetParts:
-    """The parts of an asset one by one, made once and shared by all objects of the asset."""
+    """Boxes of an asset's parts one by one, shared by all objects of the asset."""
 
     def __init__(self, asset: Asset) -> None:
         self._links = [(link.joint, link.parts) for link in asset.links if link.parts]
         self._of_base = len(asset.links[0].parts)
         self._extents: dict[tuple[Quat, tuple[float, ...]], list[tuple[Vec3, Vec3]]] = {}
-        self._leaves: dict[tuple[Quat, tuple[float, ...]], list[tuple[Vec3, Vec3]]] = {}
+        self._panels: dict[tuple[Quat, tuple[float, ...]], list[tuple[Vec3, Vec3]]] = {}
 
     def boxes(self, pose: Pose, fractions: Sequence[float]) -> list[Aabb]:
-        """Box of every part in the world, in the order of the links, as ``ConvexPart.aabb`` has it."""
+        """World box of every part, in the order of the links; equal to ``ConvexPart.aabb``."""
         x, y, z = pose.position_m
         return [
             Aabb((x + a, y + b, z + c), (x + d, y + e, z + f))
@@ -160,22 +160,22 @@ class AssetParts:
         ]
 
     def base_boxes(self, pose: Pose) -> list[Aabb]:
-        """Box of every part of the base in the world."""
+        """World box of every part of the base."""
         return self.boxes(pose, ())[: self._of_base]
 
-    def leaves(self, pose: Pose, fractions: Sequence[float]) -> list[Aabb]:
-        """Box of every link that moves, in the world."""
+    def panels(self, pose: Pose, fractions: Sequence[float]) -> list[Aabb]:
+        """World box of every moving link."""
         x, y, z = pose.position_m
         key = (pose.quat_xyzw, tuple(fractions))
-        known = self._leaves.get(key)
+        known = self._panels.get(key)
         if known is None:
-            if len(self._leaves) >= EXTENTS_KEPT:
-                self._leaves.clear()
-            known = self._leaves[key] = self._reckon_leaves(*key)
+            if len(self._panels) >= EXTENTS_KEPT:
+                self._panels.clear()
+            known = self._panels[key] = self._reckon_panels(*key)
         return [Aabb((x + a, y + b, z + c), (x + d, y + e, z + f)) for (a, b, c), (d, e, f) in known]
 
     def within(self, pose: Pose, fractions: Sequence[float], box: Aabb) -> list[ConvexPart]:
-        """Parts whose boxes overlap a box of the world, each at its pose in the world."""
+        """Parts whose boxes overlap a world box, each at its world pose."""
         x, y, z = pose.position_m
         (low_x, low_y, low_z), (high_x, high_y, high_z) = box.low_m, box.high_m
         extents = iter(self._extents_at(pose.quat_xyzw, tuple(fractions)))
@@ -194,7 +194,7 @@ class AssetParts:
         return found
 
     def _extents_at(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> list[tuple[Vec3, Vec3]]:
-        """Corners of each part's box relative to the asset's origin. Things stand at few angles: answers are kept."""
+        """Corners of each part's box relative to the asset's origin, cached: objects stand at few angles."""
         key = (quat_xyzw, fractions)
         known = self._extents.get(key)
         if known is None:
@@ -203,7 +203,7 @@ class AssetParts:
             known = self._extents[key] = self._reckon(Pose((0.0, 0.0, 0.0), quat_xyzw), fractions)
         return known
 
-    def _reckon_leaves(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> list[tuple[Vec3, Vec3]]:
+    def _reckon_panels(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> list[tuple[Vec3, Vec3]]:
         extents = iter(self._extents_at(quat_xyzw, fractions))
         found: list[tuple[Vec3, Vec3]] = []
         for joint, parts in self._links:
@@ -215,7 +215,7 @@ class AssetParts:
 
     @functools.cached_property
     def _points(self) -> tuple[FloatArray, IntArray]:
-        """Points whose hull encloses each part, shape (n, 3), and where each part's begin."""
+        """Points whose hull encloses each part, shape (n, 3), and the index of each part's first point."""
         corners = [part.pose.apply_all(_enclosing_points(part)) for _, parts in self._links for part in parts]
         return np.concatenate(corners), np.cumsum([0, *map(len, corners)])[:-1]
 
@@ -234,7 +234,7 @@ class AssetParts:
     def _frames(
         self, pose: Pose, fractions: Sequence[float]
     ) -> Iterator[tuple[Pose, tuple[ConvexPart, ...]]]:
-        """Frame of each link that has parts, and those."""
+        """Frame of each link that has parts, and these parts."""
         moving = iter(fractions)
         for joint, parts in self._links:
             fraction = next(moving, 0.0) if joint is not None else 0.0
@@ -243,23 +243,23 @@ class AssetParts:
 
 
 def bounds_of(asset: Asset) -> AssetBounds:
-    """Bounds of an asset, made at the first call for it."""
+    """Bounds of an asset, made at the first call."""
     return _known(asset)[0]
 
 
 def parts_of(asset: Asset) -> AssetParts:
-    """Parts of an asset, made at the first call for it."""
+    """Parts of an asset, made at the first call."""
     return _known(asset)[1]
 
 
 def forget(assets: Iterable[Asset]) -> None:
-    """Drop what was made for these assets: a process that loads scene after scene would fill up with it."""
+    """Drop the caches of these assets: a process that loads many scenes would fill up with them."""
     for asset in assets:
         _KNOWN.pop(id(asset), None)
 
 
 _KNOWN: dict[int, tuple[Asset, AssetBounds, AssetParts]] = {}
-"""By the asset's id. The asset is kept beside them, so that its id can't pass to another one."""
+"""Caches by the asset's id. Holding the asset keeps its id from being reused."""
 
 
 def _known(asset: Asset) -> tuple[AssetBounds, AssetParts]:
@@ -282,7 +282,7 @@ def _cloud(parts: Sequence[ConvexPart]) -> tuple[FloatArray, FloatArray]:
 
 
 def _enclosing_points(part: ConvexPart) -> FloatArray:
-    """Vertices of a hull, corners of the box around the other shapes; in the part's frame."""
+    """Vertices of a hull, or box corners of other shapes, in the part's frame."""
     if part.vertices_m:
         return np.asarray(part.vertices_m, dtype=np.float64)
     return np.asarray(_signs(part.size_m), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Poses at which one asset might stand on, in or under another: spread evenly, by geometry alone."""
+"""Candidate poses of one asset on, in or under another, spread evenly by geometry alone."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import FloatArray, Vec2, Vec3
 
 GOLDEN: Final = (0.7548776662466927, 0.5698402909980532)
-"""Steps of the R2 sequence: its first n points are spread over the square about as well as Poisson discs."""
+"""Steps of the R2 sequence: its first n points cover the square about as evenly as Poisson discs."""
 LIFT_M: Final = 0.0005
-"""Objects start this high over their surface, so that none begins in contact."""
+"""Initial height over the surface, which avoids initial contact."""
 EDGE_M: Final = 0.005
 """Free strip between an object and the edge of its surface, and below the ceiling of its space."""
 SUPPORTED_SHARE: Final = 0.6
-"""A thing wider than its surface needs at least this share of its width on it."""
+"""An object wider than its surface needs at least this share of its width on it."""
 BESIDE_M: Final = 0.02
-"""Gap to what a thing is put beside: less than half of what ``nextto`` allows the smallest, more than contact."""
+"""Gap beside a neighbour: less than half of what ``nextto`` allows the smallest object, more than contact."""
 YAWS: Final = (0.0, math.pi / 2, math.pi, -math.pi / 2)
-"""Things stand square to what they stand on."""
+"""Objects stand square to their support."""
 
 
 def surfaces_for(asset: Asset, relation: Relation) -> tuple[SupportSurface, ...]:
-    """Where ``relation`` to the asset puts a thing, in the asset's frame; empty when it can't.
+    """Surfaces for an object with this relation to the asset, in the asset's frame; empty for none.
 
-    On top: supports that no door shuts off, or the top of the box of an asset without any. Inside: supports within
-    cavities, and the floors of cavities without. Under: the floor that the asset stands on.
+    On top: supports outside closable cavities, or the top of the box of an asset without supports. Inside: supports within
+    cavities, and the floors of the other cavities. Under: the floor below the asset.
     """
     doored = {interior.name for interior in asset.interiors if interior.closed_by}
     x, y, z = asset.size_m
@@ -72,10 +72,10 @@ def surfaces_for(asset: Asset, relation: Relation) -> tuple[SupportSurface, ...]
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """Where an asset may stand on one surface, turned by one yaw.
+    """Range of poses of an asset on one surface at one yaw.
 
-    ``center_m`` is that of the poses, in the frame of the support's ``link``; they lie up to ``room_m`` from it along x
-    and y.
+    ``center_m`` is the middle of the poses in the frame of the support's ``link``; they extend up to ``room_m`` from it along
+    x and y.
     """
 
     center_m: Vec3
@@ -85,7 +85,7 @@ class Patch:
 
 
 def patches(bounds: AssetBounds, support: Asset, relation: Relation) -> tuple[Patch, ...]:
-    """Where something with these bounds fits in the relation to a support. Yaws turn slowest: each visits every surface."""
+    """Patches for an object with these bounds in the relation to a support. Yaws vary slowest: each visits every surface."""
     found: list[Patch] = []
     for yaw in YAWS:
         box = bounds.box(Pose.from_xyz_yaw(0.0, 0.0, 0.0, yaw))
@@ -100,10 +100,9 @@ def patches(bounds: AssetBounds, support: Asset, relation: Relation) -> tuple[Pa
 
 
 def proposals(found: Sequence[Patch], shift: Vec2, tries: int) -> Iterator[tuple[Patch, Pose]]:
-    """At most ``tries`` poses in the frame of a support's link, the patches taken in turn.
+    """Yield up to ``tries`` poses in the frame of a support's link, the patches taken in turn.
 
-    ``shift`` in the unit square moves the whole pattern: equal shifts give equal poses. Whether the relation holds there is
-    not looked at.
+    ``shift`` in the unit square moves the whole pattern: equal shifts give equal poses. The relation is not checked.
     """
     for patch, (x, y, z) in zip(
         itertools.cycle(found), proposed_places(found, shift, tries).tolist(), strict=False
@@ -112,7 +111,7 @@ def proposals(found: Sequence[Patch], shift: Vec2, tries: int) -> Iterator[tuple
 
 
 def proposed_places(found: Sequence[Patch], shift: Vec2, tries: int) -> FloatArray:
-    """Positions of ``proposals``, shape (n, 3): of all tries, unless there is no patch."""
+    """Positions of ``proposals``, shape (n, 3); empty without a patch."""
     if not found:
         return np.zeros((0, 3))
     rows = np.arange(tries) % len(found)
@@ -124,7 +123,7 @@ def proposed_places(found: Sequence[Patch], shift: Vec2, tries: int) -> FloatArr
 
 
 def candidates(held: Asset, support: Asset, relation: Relation, shift: Vec2, tries: int) -> Iterator[Pose]:
-    """Those of ``proposals`` at which the relation holds."""
+    """Proposals at which the relation holds."""
     bounds = bounds_of(held)
     for _, pose in proposals(patches(bounds, support, relation), shift, tries):
         if _stands(bounds.box(pose), support, relation):
@@ -132,12 +131,12 @@ def candidates(held: Asset, support: Asset, relation: Relation, shift: Vec2, tri
 
 
 def beside(held: Asset, support: Asset, relation: Relation, neighbour: Aabb) -> Iterator[Pose]:
-    """Poses at which the relation holds and the thing's box is a little off a box in the support's frame, along each side."""
+    """Poses with the relation right beside a box in the support's frame, along each of its sides."""
     bounds = bounds_of(held)
     middle = neighbour.center_m
     for patch in patches(bounds, support, relation):
         if patch.link:
-            continue  # what a drawer carries moves away from what stands still
+            continue  # a drawer's contents move away from static neighbours
         box = bounds.box(Pose.from_xyz_yaw(0.0, 0.0, 0.0, patch.yaw))
         for axis, sign in itertools.product((0, 1), (1, -1)):
             off = (neighbour.size_m[axis] + box.size_m[axis]) / 2 + BESIDE_M
@@ -151,7 +150,7 @@ def beside(held: Asset, support: Asset, relation: Relation, neighbour: Aabb) -> 
 
 
 def _along(side_m: float, extent_m: float) -> list[float]:
-    """Offsets along a side at which several things of one extent stand in a row, the middle one first."""
+    """Offsets along a side at which several objects of one extent stand in a row, the middle one first."""
     step = extent_m + BESIDE_M
     reach = int(side_m / 2 / step)
     return sorted((number * step for number in range(-reach, reach + 1)), key=abs)
@@ -165,7 +164,7 @@ def _within(patch: Patch, place: Sequence[float]) -> bool:
 
 
 def stands_in(held: Asset, pose_support_held: Pose, support: Asset, relation: Relation) -> bool:
-    """Whether the relation holds between two assets, joints shut, by the definitions of ``relations``."""
+    """Return True if the relation holds between two assets with joints shut, as defined in ``relations``."""
     return _stands(bounds_of(held).box(pose_support_held), support, relation)
 
 
@@ -182,9 +181,9 @@ def _stands(box: Aabb, support: Asset, relation: Relation) -> bool:
 
 
 def _room_for(box: Aabb, surface: SupportSurface) -> Vec2 | None:
-    """How far the box's centre may be from the surface's along x and y; None when it does not fit.
+    """Largest offset of the box's centre from the surface's along x and y; None if the box does not fit.
 
-    In a cavity the whole footprint must fit; in the open a wide thing may stand over both edges, in the middle.
+    In a cavity the whole footprint must fit; in the open a wide object may extend over both edges.
     """
     width, depth, height = box.size_m
     if height + EDGE_M > surface.clearance_m:

@@ -1,7 +1,7 @@
-"""Footprint classes: a solid box that stands for every object which stands firmly within it.
+"""Footprint classes: a solid box that represents every object which stands firmly within it.
 
-Most pairs of a thing and a support are met in no analysis. What can be verified for all of them is where a box of the thing's
-size stands level and free, and, once for each thing, that it stands by itself on a level floor. Both together make a pose.
+Most pairs of an object and a support appear in no analysis. Two facts together give a pose for any pair: a box of the object's
+size stands level and free there, and the object stands by itself on a level floor.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from embomatrix.world.asset import Asset, Link, SupportSurface
 from embomatrix.world.geometry import ConvexPart, Pose, Shape
 
 SIDES_M: Final = (0.06, 0.09, 0.13, 0.19, 0.27, 0.38, 0.54)
-"""Sides of footprints are rounded up to these: 40 % from one to the next."""
+"""Sides of footprints round up to these; each is about 40 % larger than the one before."""
 HEIGHTS_M: Final = (0.06, 0.12, 0.24, 0.48)
 DENSITY_KG_M3: Final = 300.0
-"""That of the boxes: how heavy they are makes no difference to where they stand."""
+"""Density of the boxes; weight has no influence on stability."""
 FLOOR_SIZE_M: Final = (4.0, 4.0, 0.1)
 
 
@@ -32,13 +32,13 @@ class Footprint:
 
     @property
     def name(self) -> str:
-        """Name under which a pose cache has the poses of the class, in centimetres."""
+        """Name of the class in a pose cache, in centimetres."""
         sides = "x".join(f"{value * 100:.0f}" for value in (self.long_m, self.short_m, self.height_m))
         return f"footprint-{sides}cm"
 
 
 def footprint_of(asset: Asset, pose_floor_asset: Pose) -> Footprint | None:
-    """Smallest class that the asset fits in as it stands at a pose on a level floor; None for what is too large."""
+    """Smallest class for the asset standing at a pose on a level floor; None if it is too large."""
     x, y, z = bounds_of(asset).box(pose_floor_asset).size_m
     sides = [_rounded_up(extent, SIDES_M) for extent in (max(x, y), min(x, y))]
     height = _rounded_up(z, HEIGHTS_M)
@@ -52,7 +52,7 @@ def _rounded_up(value: float, steps: tuple[float, ...]) -> float | None:
 
 
 def box_of(footprint: Footprint) -> Asset:
-    """The box of a class: its long side along x, its origin in the middle."""
+    """Box of a class: its long side along x, its origin in the middle."""
     size = (footprint.long_m, footprint.short_m, footprint.height_m)
     box = ConvexPart(Shape.BOX, Pose((0.0, 0.0, 0.0)), size)
     mass_kg = DENSITY_KG_M3 * math.prod(size)
@@ -60,7 +60,7 @@ def box_of(footprint: Footprint) -> Asset:
 
 
 def pose_box_asset(footprint: Footprint, asset: Asset, pose_floor_asset: Pose) -> Pose:
-    """Pose of an asset in the frame of its class's box: standing as on the floor, amid the footprint, long side along it."""
+    """Pose of an asset in the frame of its class's box: centred as on the floor, long side along the box's."""
     box = bounds_of(asset).box(pose_floor_asset)
     width, depth, _ = box.size_m
     turn = Pose.from_xyz_yaw(0.0, 0.0, -footprint.height_m / 2, 0.0 if width >= depth else math.pi / 2)
@@ -69,7 +69,7 @@ def pose_box_asset(footprint: Footprint, asset: Asset, pose_floor_asset: Pose) -
 
 
 def level_floor() -> Asset:
-    """A slab to stand on: its name in a pose cache is that of the poses in which things stand by themselves."""
+    """Slab whose name in a pose cache marks the poses in which objects stand by themselves."""
     size = FLOOR_SIZE_M
     slab = ConvexPart(Shape.BOX, Pose((0.0, 0.0, 0.0)), size)
     top = SupportSurface("top", (0.0, 0.0, size[2] / 2), (size[0], size[1]), math.inf)

@@ -1,6 +1,6 @@
-"""Which boxes lie near a place: a hash of square cells in the plane, in plain Python.
+"""Spatial hash of boxes over square cells of the plane, in plain Python.
 
-A household query meets a dozen boxes. Whole-array comparisons of three hundred cost more than looking at those few.
+A query in a household meets a dozen boxes. Checking them costs less than whole-array comparisons of three hundred.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 CELL_M: Final = 1.0
 WIDE_CELLS: Final = 32
-"""A box over more cells than this is looked at in every query instead: a carpet, or a thing thrown far away."""
+"""Boxes over more cells, such as a carpet, are checked in every query instead."""
 SPANS_KEPT: Final = 1024
 
 Cell = tuple[int, int]
@@ -22,15 +22,15 @@ Span = tuple[int, int, int, int]
 Extent = tuple[float, float, float, float, float, float]
 
 
-class Neighbourhood:
-    """Numbered boxes that can be moved, taken out and asked for by place."""
+class SpatialHash:
+    """Numbered boxes that can be moved, removed and queried by place."""
 
     def __init__(self) -> None:
         self._cells: dict[Cell, dict[int, Extent]] = {}
-        """The boxes over each cell. Those over very many are in one place of their own."""
+        """Boxes over each cell; wide ones are kept separately."""
         self._wide: dict[int, Extent] = {}
         self._seen: dict[Span, list[dict[int, Extent]]] = {}
-        """Places over spans that were asked for, good until there is another cell."""
+        """Buckets by queried span, valid until a new cell appears."""
         self._homes: dict[int, list[dict[int, Extent]]] = {}
         self._spans: dict[int, Span] = {}
 
@@ -52,13 +52,13 @@ class Neighbourhood:
             home[number] = extent
 
     def take_out(self, number: int) -> None:
-        """Remove a box. One that is not there is left so."""
+        """Remove a box if it is there."""
         self._spans.pop(number, None)
         for home in self._homes.pop(number, ()):
             del home[number]
 
     def near(self, box: Aabb, reach_m: float = 0.0) -> list[int]:
-        """Numbers of the boxes that overlap this one or come as near on every axis as ``reach_m``, in rising order."""
+        """Numbers of the boxes within ``reach_m`` of this one on every axis, in ascending order."""
         (low_x, low_y, low_z), (high_x, high_y, high_z) = box.low_m, box.high_m
         low_x, low_y, low_z = low_x - reach_m, low_y - reach_m, low_z - reach_m
         high_x, high_y, high_z = high_x + reach_m, high_y + reach_m, high_z + reach_m
@@ -76,7 +76,7 @@ class Neighbourhood:
         return sorted(set(found)) if len(found) > 1 else found
 
     def _find_places(self, span: Span) -> list[dict[int, Extent]]:
-        """Where the boxes over a span are kept; some may be in several places."""
+        """Buckets of a span; a box may be in several."""
         if len(self._seen) >= SPANS_KEPT:
             self._seen.clear()
         self._seen[span] = [self._wide, *self._cells_of(span)]

@@ -1,7 +1,7 @@
-"""Where a thing comes to rest by itself, proved by geometry: its base lies on a level top, with its weight over that.
+"""Rest poses proved by statics: the base lies on a level top, and the weight acts over it.
 
-The proof replaces a settle for the common case of a flat thing on a flat surface. It is one-sided: what it does not cover,
-such as a ball, a bowl within a bowl or a thing across two boards, is not known to fall; it has to be settled.
+The proof replaces a settle for the common case of a flat object on a flat surface. It is one-sided: an object that it does not
+cover, such as a ball, a nested bowl or an object across two boards, may still be stable and has to be settled.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
 
 FLAT_M: Final = 5e-5
-"""Points of a base that are this much higher than its lowest still touch what it stands on."""
+"""Points of a base up to this much above its lowest still touch the support."""
 FALL_M: Final = 0.001
-"""A thing that is further than this over a top falls too hard for a proof."""
+"""An object higher over a top falls too hard for a proof."""
 MARGIN_M: Final = 0.003
 MARGIN_SHARE: Final = 0.15
 """The weight acts at least this far within each edge of the supported area, and at least this share of the base's extent
 across that edge: nearer, objects rock by up to 2 mm."""
 CLEAR_M: Final = 0.001
-"""Nothing of the support but what bears the thing comes as near as this to it."""
+"""Other parts of the support keep at least this distance from the object."""
 LEVEL_COSINE: Final = math.cos(math.radians(1.0))
-"""Friction holds whatever stands on something that leans by less than a degree."""
+"""Friction holds objects on a slope of less than a degree."""
 SHORTEST_M: Final = 1e-6
-"""Edges of a polygon that are shorter than this have no direction."""
+"""Shorter polygon edges have no direction."""
 RIM_POINTS: Final = 16
 ROUND_CORNERS: Final = 8
 """A base with more corners is round. Bullet lets a round base rock on the edge of a surface."""
@@ -53,7 +53,7 @@ class Base:
 
 
 def base_of(asset: Asset) -> Base | None:
-    """The base of an asset without joints; None when it stands on an edge or a point, or its weight is not over its base."""
+    """Contact polygon of an asset without joints; None if it stands on an edge or a point, or its weight is outside."""
     if asset.joints:
         return None
     points = [point for link in asset.links for part in link.parts for point in _underside(part)]
@@ -65,10 +65,11 @@ def base_of(asset: Asset) -> Base | None:
 
 
 def rest_pose(held: Asset, base: Base, pose: Pose, support: Asset, fractions: Sequence[float]) -> Pose | None:
-    """Where a thing comes to rest that is let go at a pose, in the frame of its support; None when that is not proved.
+    """Rest pose, in the frame of its support, of an object that is let go at a pose; None if it is not proved.
 
-    It is when the thing stands upright just over the level top of one part, its weight acts over what that part bears of its
-    base, and no other part of the support comes near it. ``fractions`` are the support's joints; the support itself is level.
+    The proof requires: the object is upright just over the level top of one part, its weight acts over the supported area of
+    its base, and no other part of the support comes near it. ``fractions`` are the support's joints; the support itself is
+    level.
     """
     x, y, z, w = pose.quat_xyzw
     if x or y:
@@ -91,7 +92,7 @@ def rest_pose(held: Asset, base: Base, pose: Pose, support: Asset, fractions: Se
 
 
 def is_level(pose: Pose) -> bool:
-    """Whether the vertical axis leans by less than a degree."""
+    """Return True if the vertical axis leans by less than a degree."""
     x, y, _, _ = pose.quat_xyzw
     return 1 - 2 * (x * x + y * y) >= LEVEL_COSINE
 
@@ -99,7 +100,7 @@ def is_level(pose: Pose) -> bool:
 def _parts_near(
     support: Asset, fractions: Sequence[float], near: Aabb
 ) -> Iterator[tuple[ConvexPart | None, Aabb]]:
-    """Boxes of a support's parts, in its own frame, that overlap a box, each with its part; None for one that was turned."""
+    """Boxes of a support's parts that overlap a box, in the support's frame, each with its part; None for a rotated part."""
     boxes = iter(parts_of(support).boxes(IDENTITY, fractions))
     moving = iter(fractions)
     for link in support.links:
@@ -130,7 +131,7 @@ def _borne(corners: Sequence[Vec2], part: ConvexPart, box: Aabb) -> Sequence[Vec
 
 
 def _clipped(corners: Sequence[Vec2], axis: int, edge: float, sign: int) -> Sequence[Vec2]:
-    """The part of a convex polygon on one side of a line along an axis: Sutherland and Hodgman 1974."""
+    """Part of a convex polygon on one side of a line along an axis: Sutherland and Hodgman 1974."""
     inside = [sign * (corner[axis] - edge) >= 0.0 for corner in corners]
     if all(inside):
         return corners
@@ -147,7 +148,7 @@ def _clipped(corners: Sequence[Vec2], axis: int, edge: float, sign: int) -> Sequ
 
 
 def _bears(point: Vec2, corners: Sequence[Vec2], base: Sequence[Vec2]) -> bool:
-    """True if a point lies within a convex anticlockwise polygon, a margin away from each edge.
+    """Return True if a point lies within a convex anticlockwise polygon, a margin away from each edge.
 
     The margin grows with the extent of ``base`` across the edge.
     """
@@ -168,7 +169,7 @@ def _bears(point: Vec2, corners: Sequence[Vec2], base: Sequence[Vec2]) -> bool:
 
 
 def _underside(part: ConvexPart) -> list[Vec3]:
-    """Points of a part that may be its lowest, in the asset's frame. A sphere has none: it rests on a point."""
+    """Candidates for the lowest points of a part, in the asset's frame. A sphere has none: it rests on a point."""
     x, y, z = (extent / 2 for extent in part.size_m)
     match part.shape:
         case Shape.BOX:

@@ -1,7 +1,7 @@
-"""Where things rest on an asset and lie in it: its surfaces and cavities, each with its tolerance.
+"""Surfaces and cavities of an asset, with the tolerances of resting on them and lying in them.
 
-Surfaces and cavities that ride on a drawer or a door are where their link is: they are given with every joint at zero, so a
-question about them is asked in the frame that moves along with the link. The frame of the base is the asset's own.
+Surfaces and cavities of a drawer or a door move with their link. They are defined with every joint at zero, so queries about
+them use the link's frame. The frame of the base is the asset's own.
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ REST_M: Final = 0.01
 EDGE_M: Final = 0.005
 """A centre may lie this far outside the rectangle of its surface."""
 INSIDE_M: Final = 0.01
-"""A box may reach this far out of the cavity that it is in."""
+"""A box may reach this far out of its cavity."""
 UPRIGHT_COSINE: Final = math.cos(math.radians(10.0))
-"""Nothing rests on or in a thing whose vertical axis leans more than 10 degrees, nor is under it."""
+"""Nothing rests on, in or counts as under an object whose vertical axis leans by more than 10 degrees."""
 TOP: Final = "top of the box"
 """Name of the surface that every asset has: the top of its bounding box."""
 
 
 def is_upright(pose: Pose) -> bool:
-    """Whether the vertical axis leans by 10 degrees or less."""
+    """Return True if the vertical axis leans by 10 degrees or less."""
     x, y, _, _ = pose.quat_xyzw
     return 1 - 2 * (x * x + y * y) >= UPRIGHT_COSINE
 
 
 def is_shut(asset: Asset, interior: Interior, fractions: Sequence[float]) -> bool:
-    """Whether every joint that bars the way into the interior is shut. One open door of two is a way in."""
+    """Return True if every joint that closes the interior is shut. One open door of two is an opening."""
     positions = {name: fraction for (name, _), fraction in zip(asset.joints, fractions, strict=True)}
     barring = [positions[name] for name in interior.closed_by if name in positions]
     return bool(barring) and all(position <= OPEN_FRACTION for position in barring)
 
 
 def link_frame(asset: Asset, pose: Pose, fractions: Sequence[float], link: str) -> Pose:
-    """Frame in which what rides on a link keeps its place, for an asset at ``pose``: the asset's own for the base.
+    """Frame of a link's contents for an asset at ``pose``: the asset's own for the base.
 
-    It coincides with the asset's frame when the link's joint is at zero. Raises KeyError for a link that does not move.
+    It coincides with the asset's frame if the link's joint is at zero. Raises KeyError for a link that does not move.
     """
     if not link:
         return pose
@@ -59,12 +59,11 @@ def link_frame(asset: Asset, pose: Pose, fractions: Sequence[float], link: str) 
 def surface_under(
     box: Aabb, asset: Asset, pose: Pose, fractions: Sequence[float] = (), *, doored: bool
 ) -> str:
-    """Name of the surface of an asset at ``pose`` that a box rests on, "" when there is none.
+    """Name of the surface of an asset at ``pose`` that a box rests on; "" for none.
 
-    Its underside lies within 1 cm of the surface's height and its centre above the rectangle, 5 mm outside allowed, so a thin
-    thing beside another is not on it.
-    Surfaces are the asset's supports, where the joints' positions take them, and the top of its bounding box; those within a
-    cavity that can be shut only when ``doored``. Without ``fractions`` the joints are shut.
+    The box's underside lies within 1 cm of the surface and its centre above the rectangle, 5 mm outside allowed; a thin object
+    beside another is not on it. Surfaces are the asset's supports at the current joint positions and the top of its bounding
+    box; supports in closable cavities count only if ``doored``. Without ``fractions`` the joints are shut.
     """
     if not is_upright(pose):
         return ""
@@ -97,10 +96,10 @@ def _on_top(box: Aabb, asset: Asset, pose: Pose) -> bool:
 
 
 def interior_around(box_in_asset: Aabb, asset: Asset, link: str | None = None) -> Interior | None:
-    """The smallest interior of an asset that a box is in: of those that ride on a link, or of all with the joints shut.
+    """Smallest interior of an asset that contains a box: of one link's, or of all with the joints shut.
 
-    The box is given in the link's frame: "" names the base. Its centre lies in the cavity, and the box within it, 1 cm
-    outside allowed; out of a cavity that is always open it may stick out at the top.
+    The box is given in the link's frame; "" names the base. Its centre lies in the cavity, and the box within it, 1 cm outside
+    allowed; out of an always open cavity it may stick out at the top.
     """
     found = [item for item in asset.interiors if link in (None, item.link) and _within(box_in_asset, item)]
     return min(found, key=lambda interior: math.prod(interior.size_m), default=None)
@@ -117,13 +116,13 @@ def _within(box: Aabb, interior: Interior) -> bool:
     return True
 
 
-def links_with_spots(asset: Asset) -> set[str]:
-    """Links on which surfaces or cavities ride; "" for the base."""
+def links_with_surfaces(asset: Asset) -> set[str]:
+    """Links with surfaces or cavities; "" for the base."""
     return {surface.link for surface in asset.supports} | {interior.link for interior in asset.interiors}
 
 
 def link_under(box_in_asset: Aabb, asset: Asset, relation: Relation) -> str:
-    """Link on which a box rides that is in the relation to an asset with its joints shut; "" for the base."""
+    """Link that carries a box in the relation to an asset with its joints shut; "" for the base."""
     if relation is Relation.INSIDE:
         interior = interior_around(box_in_asset, asset)
         return interior.link if interior is not None else ""
@@ -134,17 +133,16 @@ def link_under(box_in_asset: Aabb, asset: Asset, relation: Relation) -> str:
 
 
 def is_under(box: Aabb, asset: Asset, pose: Pose) -> bool:
-    """Whether a box is under an asset at ``pose``.
+    """Return True if a box is under an asset at ``pose``.
 
-    Some part of the asset's base lies over the box's centre, and every part that does so begins above the box's top, 1 cm
-    deeper allowed.
+    Parts of the asset's base lie over the box's centre, and all of these begin above the box's top, 1 cm deeper allowed.
     """
     over = heights_over(box, asset, pose)
     return bool(over) and all(bottom >= box.high_m[2] - REST_M for bottom in over)
 
 
 def heights_over(box: Aabb, asset: Asset, pose: Pose) -> list[float]:
-    """Heights in the world at which parts of an asset's base begin that lie over, or below, the centre of a box."""
+    """World heights at which the parts of an asset's base over or below a box's centre begin."""
     if not is_upright(pose):
         return []
     cx, cy, _ = box.center_m

@@ -1,4 +1,4 @@
-"""Which places lie behind a door that stands open, as the robot stands: an arm does not reach through a leaf."""
+"""Regions behind open doors: the arm does not reach through a door panel."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from embomatrix.sim.geometry.batch_poses import Lineup
+    from embomatrix.sim.geometry.batch_poses import PoseBoxes
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Aabb, FloatArray, Pose
     from embomatrix.world.poses import StandPose
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
     BoolArray = NDArray[np.bool_]
 
 ARM_M: Final = 0.05
-"""Half the width of what reaches past a leaf."""
+"""Half the width of the arm beside a door panel."""
 UPRIGHT: Final = 0.9
-"""Cosine with the vertical from which a hinge is one of a door; what hangs on others, as an oven's, is reached over."""
+"""Smallest cosine between a door's hinge and the vertical; the arm reaches over other panels, such as an oven's."""
 
 
-def behind_leaves(
-    boxes: Lineup, asset: Asset, pose: Pose, fractions: Sequence[float], stand: StandPose
+def behind_panels(
+    boxes: PoseBoxes, asset: Asset, pose: Pose, fractions: Sequence[float], stand: StandPose
 ) -> BoolArray:
-    """Whether an open door of a thing lies between a standing pose and the middle of each box, shape (n,), in the plan.
+    """Tell for each box, shape (n,), if an open door of an object lies between its middle and a standing pose, in the plan.
 
-    Or a wall of it, as who stands behind an open door would else seem to reach in past the hinge. ``pose`` and ``fractions``
-    are where the thing stands and how far its joints are open. What is wholly above or below a leaf is not behind it.
+    Walls of the object count too: otherwise a robot behind an open door would seem to reach in past the hinge. ``pose`` and
+    ``fractions`` are the object's pose and joint positions. A box wholly above or below a panel is not behind it.
     """
     middles = (boxes.lows_m + boxes.highs_m) / 2
     doors = list(_open_doors(asset, pose, fractions))
@@ -46,8 +46,8 @@ def behind_leaves(
 
 
 def _open_doors(asset: Asset, pose: Pose, fractions: Sequence[float]) -> Iterator[tuple[Pose, Aabb]]:
-    """Frames of the doors that are not shut, and the box of each in its frame."""
-    boxes = iter(parts_of(asset).leaves(IDENTITY, (0.0,) * len(fractions)))
+    """Frames of the open doors, each with the door's box in its frame."""
+    boxes = iter(parts_of(asset).panels(IDENTITY, (0.0,) * len(fractions)))
     moving = [link for link in asset.links if link.joint is not None]
     for link, fraction in zip(moving, fractions, strict=True):
         joint = link.joint
@@ -61,9 +61,9 @@ def _open_doors(asset: Asset, pose: Pose, fractions: Sequence[float]) -> Iterato
 def _barred(
     middles: FloatArray, stand: StandPose, frame: Pose, boxes: Sequence[Aabb], margin_m: float
 ) -> BoolArray:
-    """Whether any of k boxes of a frame lies between a place and points of the world, shape (n, 3), in the plan; shape (n,).
+    """Tell for each world point, shape (n, 3), if any of k boxes lies between it and the standing pose, in the plan.
 
-    The boxes are grown by the margin in the plane.
+    The boxes are given in ``frame`` and grown by the margin in the plane.
     """
     back = frame.inverse()
     turn, offset = back.rotation, np.array(back.position_m)
@@ -77,7 +77,7 @@ def _barred(
 
 
 def _crossed(base: FloatArray, points: FloatArray, lows: FloatArray, highs: FloatArray) -> BoolArray:
-    """Whether the segments from a point, (2,), to others, (n, 2), pass right through rectangles: slab test, shape (k, n).
+    """Slab test, shape (k, n), of segments from a point, (2,), to others, (n, 2), against rectangles.
 
     ``lows`` and ``highs`` are the rectangles' corners, shape (k, 1, 2).
     """

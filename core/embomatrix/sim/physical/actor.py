@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim.actions import ACTIONS
-from embomatrix.sim.blockers import no_way_into, no_way_to
+from embomatrix.sim.blockers import path_refusal, room_refusal
 from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.physical.doors import close_all, open_all
 from embomatrix.sim.physical.pick import pick_up
@@ -90,7 +90,7 @@ def _move(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> Sk
     stands = world.navigator.stands(target, world.robot)
     if stands:
         return travel(stage, stands[0], target)
-    return no_way_to(world, target)
+    return path_refusal(world, target)
 
 
 def _turn(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
@@ -120,7 +120,7 @@ def _go_to_room(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator)
     room = call.room_name or ""
     entry = stage.world.navigator.room_entry(room, stage.world.robot)
     if entry is None:
-        return no_way_into(stage.world, room)
+        return room_refusal(stage.world, room)
     return travel(stage, entry)
 
 

@@ -174,7 +174,7 @@ def _move_all(stage: PhysicalStage, name: str, goal: float) -> SkillRefusal | No
         if refusal is not None:
             break
     # The refusal of this drive does not matter: the door's result stands.
-    fold(stage, stage.world.navigator.aside(name, home), name)
+    fold(stage, stage.world.navigator.step_aside(name, home), name)
     return refusal
 
 

@@ -91,7 +91,7 @@ class Floor:
     def _air(self, points: FloatArray) -> FloatArray:
         """Distances from points, (n, 2), to the nearest obstacle, (n,)."""
         ground = self._navigator.ground
-        rows = np.concatenate([ground.obstacles.barring, ground.leaves.barring])
+        rows = np.concatenate([ground.obstacles.blocking, ground.open_panels.blocking])
         nearest = np.clip(points[:, None], rows[:, :2], rows[:, 2:4])
         return np.asarray(np.linalg.norm(points[:, None] - nearest, axis=2).min(axis=1, initial=np.inf))
 

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.joints.panels import swing_leaves
+from embomatrix.sim.joints.panels import swing_panels
 from embomatrix.sim.joints.swings import SWING
 from embomatrix.sim.physical.pick import pick_paths
 from embomatrix.sim.physical.place import PLACES
@@ -74,14 +74,14 @@ class PlacementReachability:
     def _look(self, query: PlacementQuery) -> tuple[int | None, str]:
         """Return the number of the first reachable pose, and the blocker if all poses are certainly unreachable."""
         stands = self._poses.stands.get(query.target, ())
-        if not stands or not self._placer.knows(query.held, query.target, query.relation):
+        if not stands or not self._placer.has_verified(query.held, query.target, query.relation):
             return None, ""
         grip = self._grip(query.held)
         if grip is None:
             return None, ""
         self._make_ready(query)
         # The robot has stepped aside from the open panels.
-        stand = self._world.navigator.aside(query.target, stands[0])
+        stand = self._world.navigator.step_aside(query.target, stands[0])
         poses = self._placer.verified(query.held, query.target, query.relation, stand, LOOKS)
         if not poses:
             return None, ""
@@ -161,7 +161,7 @@ class PlacementReachability:
         world.hand.take(world.cargo(query.held))
         self._stage.open_around(query.target)
         if query.relation is Relation.INSIDE:
-            swing_leaves(world.engine, world.relations, query.target, SWING)
+            swing_panels(world.engine, world.relations, query.target, SWING)
         world.navigator.refresh()
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim.bullet.robot import tucked
-from embomatrix.sim.joints.panels import swing_leaves
+from embomatrix.sim.joints.panels import swing_panels
 from embomatrix.sim.joints.swings import SWING
 from embomatrix.sim.physical import arm
 from embomatrix.sim.physical.floor import Floor
@@ -92,7 +92,7 @@ class PhysicalStage:
         world = self.world
         for enclosure in world.relations.enclosing(name):
             if enclosure.closed:
-                swing_leaves(world.engine, world.relations, enclosure.name, SWING)
+                swing_panels(world.engine, world.relations, enclosure.name, SWING)
 
     def boxes(self) -> Boxes:
         """Return the parts of objects around the robot, without the load."""

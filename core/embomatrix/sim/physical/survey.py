@@ -16,7 +16,7 @@ import numpy as np
 
 from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.geometry.bounds import IDENTITY
-from embomatrix.sim.joints.panels import Leaves, swing_leaves
+from embomatrix.sim.joints.panels import DoorPanels, swing_panels
 from embomatrix.sim.joints.swings import SWING
 from embomatrix.sim.physical.doors import STRETCHES, close_all, open_all, panel_paths, panels_in_order
 from embomatrix.sim.physical.fold import PATHS_TRIED, approach
@@ -184,7 +184,7 @@ class _Surveyor:
                     if not item.fixed and item.name != name and world.relations.host_of(item.name):
                         world.engine.park(item.name)
                 shares = SWING if handling is Handling.CLOSE else (0.0,)
-                swing_leaves(world.engine, world.relations, name, shares)
+                swing_panels(world.engine, world.relations, name, shares)
             case Handling.TAKE | Handling.PRESS:
                 self._stage.open_around(name)
         world.navigator.refresh()
@@ -249,5 +249,5 @@ class _Surveyor:
     def _move_panel(self, panel: DoorPanel, share: float) -> None:
         fractions = list(self._world.engine.joints(panel.name))
         fractions[panel.number] = share
-        Leaves(self._world.engine, self._world.relations, panel.name).swing([fractions])
+        DoorPanels(self._world.engine, self._world.relations, panel.name).swing([fractions])
         self._world.navigator.refresh()

@@ -1,4 +1,4 @@
-"""Where one thing may stand on, in or under another, before anything else is looked at: verified poses and fresh ones."""
+"""Candidate poses of one object on, in or under another: verified poses and fresh ones, independent of the world's state."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of
 from embomatrix.sim.geometry.candidates import patches, proposed_places
 from embomatrix.sim.geometry.footprints import LEVEL_FLOOR, footprint_of, pose_box_asset
 from embomatrix.sim.geometry.statics import base_of
-from embomatrix.sim.geometry.surfaces import link_under, links_with_spots
+from embomatrix.sim.geometry.surfaces import link_under, links_with_surfaces
 from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.placements import pose_rows, rows_of
 from embomatrix.world.poses import PlacementKey
@@ -23,7 +23,7 @@ from embomatrix.world.state import Relation
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-    from embomatrix.sim.geometry.batch_poses import Lineup
+    from embomatrix.sim.geometry.batch_poses import PoseBoxes
     from embomatrix.sim.geometry.bounds import AssetBounds
     from embomatrix.sim.geometry.candidates import Patch
     from embomatrix.sim.geometry.statics import Base
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 PLACED: Final = (Relation.ONTOP, Relation.INSIDE, Relation.UNDER)
-"""The relations that placing brings about."""
+"""Relations that placing creates."""
 
 
-class Spots:
-    """Poses of one asset in the frames of a support's links. ``local`` gives a pose by its number."""
+class CandidatePoses:
+    """Poses of one asset in the frames of a support's links. ``local`` returns a pose by its number."""
 
     def __init__(
         self,
@@ -46,7 +46,7 @@ class Spots:
         boxes: LinkBoxes,
         places: Callable[[], PoseSet],
     ) -> None:
-        """``boxes`` are those of the asset with its joints shut. ``places`` makes the poses as arrays, for other joints."""
+        """``boxes`` are those of the asset with its joints shut. ``places`` builds the poses as arrays, for other joints."""
         self._local = local
         self._links = links
         self._boxes = boxes
@@ -56,60 +56,59 @@ class Spots:
         return len(self._links)
 
     def pose(self, number: int, frames: Mapping[str, Pose]) -> Pose:
-        """A pose in the world. Raises KeyError when its link has no frame."""
+        """Pose in the world. Raises KeyError if its link has no frame."""
         return frames[self._links[number]] @ self._local(number)
 
-    def ride(self, number: int) -> tuple[str, Pose]:
-        """The link that a pose rides on, and the pose in that link's frame."""
+    def link_pose(self, number: int) -> tuple[str, Pose]:
+        """Link that carries a pose, and the pose in that link's frame."""
         return self._links[number], self._local(number)
 
-    def lineup(self, bounds: AssetBounds, fractions: Sequence[float], frames: Mapping[str, Pose]) -> Lineup:
-        """Boxes at all the poses in the world, of the asset with these bounds; at infinity on links without a frame.
+    def world_boxes(
+        self, bounds: AssetBounds, fractions: Sequence[float], frames: Mapping[str, Pose]
+    ) -> PoseBoxes:
+        """World boxes at all the poses, of the asset with these bounds; at infinity on links without a frame.
 
-        Furniture stands square to the world: there the boxes in its frame are those in the world, but for a quarter turn.
+        Furniture stands square to the world: there a box in its frame is a world box after quarter turns.
         """
-        square = None if any(fractions) else self._boxes.lineup(frames)
-        return square if square is not None else self._places().lineup(bounds, fractions, frames)
+        square = None if any(fractions) else self._boxes.world_boxes(frames)
+        return square if square is not None else self._places().world_boxes(bounds, fractions, frames)
 
 
 @dataclass(frozen=True, slots=True)
-class Pattern:
-    """Where one asset fits on another by geometry alone; ``middles`` and ``boxes`` are of one pose for each patch."""
+class SurfacePattern:
+    """Fit of one asset on another by geometry alone; ``middles`` and ``boxes`` hold one pose per patch."""
 
     patches: tuple[Patch, ...]
     middles: PoseSet
     boxes: LinkBoxes
 
 
-class Repertoire:
-    """The poses that a cache and the surfaces of a scene's assets offer. Depends on no state of the world."""
+class PlacementOptions:
+    """Candidate poses from a pose cache and from the surfaces of a scene's assets."""
 
     def __init__(self, scene: Scene, cache: PoseCache) -> None:
         self._scene = scene
         self._cache = cache
-        self._exact: dict[PlacementKey, Spots] = {}
-        self._by_class: dict[PlacementKey, Spots] = {}
+        self._exact: dict[PlacementKey, CandidatePoses] = {}
+        self._by_class: dict[PlacementKey, CandidatePoses] = {}
         self._footprints: dict[str, tuple[str, Pose]] = {}
         self._bases: dict[str, Base | None] = {}
-        self._patterns: dict[PlacementKey, Pattern] = {}
+        self._patterns: dict[PlacementKey, SurfacePattern] = {}
 
-    def complete(self, tables: Iterable[Sequence[str]]) -> Iterator[None]:
-        """Look up what was verified for the things and supports of each table, one pair of assets at a step.
-
-        Work for a process that waits. Changes no answer.
-        """
+    def warm_up(self, tables: Iterable[Sequence[str]]) -> Iterator[None]:
+        """Look up the verified poses for the objects and supports of each table, one pair per step. Changes no answer."""
         scene = self._scene
         for table in tables:
             movable = [name for name in table if not scene.by_name[name].fixed]
-            hosts = [name for name in table if links_with_spots(scene.asset_of(name))]
+            hosts = [name for name in table if links_with_surfaces(scene.asset_of(name))]
             for held, target in itertools.product(movable, hosts):
                 for relation in PLACED:
                     for _ in self.verified(held, target, relation):
                         pass
                 yield
 
-    def verified(self, held: str, target: str, relation: Relation) -> Iterator[Spots]:
-        """Spots verified for this pair of assets, then those verified for the footprint of what is held."""
+    def verified(self, held: str, target: str, relation: Relation) -> Iterator[CandidatePoses]:
+        """Poses verified for this pair of assets, then those verified for the footprint of the held object."""
         one, other = self._scene.asset_of(held), self._scene.asset_of(target)
         key = PlacementKey(one.asset_id, other.asset_id, relation)
         if key not in self._exact:
@@ -121,8 +120,8 @@ class Repertoire:
             self._by_class[key] = _spots(boxes, pose_box_held, one, other, relation)
         yield self._by_class[key]
 
-    def fresh(self, held: str, target: str, relation: Relation, shift: Vec2, tries: int) -> Spots:
-        """At most so many poses by geometry alone, spread over the surfaces; ``shift`` moves the whole pattern."""
+    def fresh(self, held: str, target: str, relation: Relation, shift: Vec2, tries: int) -> CandidatePoses:
+        """Return up to ``tries`` poses by geometry alone, spread over the surfaces; ``shift`` moves the whole pattern."""
         one, other = self._scene.asset_of(held), self._scene.asset_of(target)
         key = PlacementKey(one.asset_id, other.asset_id, relation)
         pattern = self._patterns.get(key)
@@ -130,17 +129,17 @@ class Repertoire:
             found = patches(bounds_of(one), other, relation)
             middles = [Pose.from_xyz_yaw(*patch.center_m, patch.yaw) for patch in found]
             places = PoseSet.of(pose_rows(middles), [patch.link for patch in found])
-            pattern = self._patterns[key] = Pattern(found, places, places.boxes(bounds_of(one)))
+            pattern = self._patterns[key] = SurfacePattern(found, places, places.boxes(bounds_of(one)))
         return _spread(pattern, shift, tries)
 
     def base(self, asset: Asset) -> Base | None:
-        """What the asset stands on when it stands upright, as ``statics`` has it."""
+        """Contact polygon of the upright asset; see ``statics``."""
         if asset.asset_id not in self._bases:
             self._bases[asset.asset_id] = base_of(asset)
         return self._bases[asset.asset_id]
 
     def footprint(self, asset: Asset) -> tuple[str, Pose]:
-        """Name of the footprint class of an asset, "" without one, and the asset's pose in the frame of the class's box."""
+        """Footprint class of an asset ("" for none), and the asset's pose in the frame of the class's box."""
         known = self._footprints.get(asset.asset_id)
         if known is None:
             key = PlacementKey(asset.asset_id, LEVEL_FLOOR.asset_id, Relation.ONTOP)
@@ -154,22 +153,22 @@ class Repertoire:
 
 
 _NO_PLACES: Final = PoseSet.of(pose_rows(()), ())
-NO_SPOTS: Final = Spots(
+NO_CANDIDATES: Final = CandidatePoses(
     lambda number: IDENTITY, (), LinkBoxes(np.zeros((0, 6)), (), _NO_PLACES.link_of), lambda: _NO_PLACES
 )
 
 
-def _spots(rows: FloatArray, then: Pose, held: Asset, support: Asset, relation: Relation) -> Spots:
-    """Spots at poses in the frame of a support with its joints shut; ``then`` is the thing's pose in each of their frames.
+def _spots(rows: FloatArray, then: Pose, held: Asset, support: Asset, relation: Relation) -> CandidatePoses:
+    """Candidates at poses in the frame of a support with its joints shut.
 
-    ``rows``, shape (n, 7), are positions and quaternions.
+    ``rows``, shape (n, 7), are positions and quaternions; ``then`` is the object's pose in each of their frames.
     """
     if not len(rows):
-        return NO_SPOTS
+        return NO_CANDIDATES
     links = [""] * len(rows)
     places = PoseSet.of(rows, links, then)
     boxes = places.boxes(bounds_of(held))
-    if not links_with_spots(support) <= {""}:
+    if not links_with_surfaces(support) <= {""}:
         links = [
             link_under(Aabb((a, b, c), (d, e, f)), support, relation)
             for a, b, c, d, e, f in boxes.corners_m.tolist()
@@ -181,12 +180,12 @@ def _spots(rows: FloatArray, then: Pose, held: Asset, support: Asset, relation: 
         x, y, z, a, b, c, d = rows[number].tolist()
         return Pose((x, y, z), (a, b, c, d)) @ then
 
-    # Kept are the boxes only: what makes the arrays anew is asked where something stands askew, or is placed half open.
-    return Spots(local, links, boxes, lambda: PoseSet.of(rows, links, then))
+    # Only the boxes are kept. The arrays are rebuilt for the rare support that is tilted or object that is placed half open.
+    return CandidatePoses(local, links, boxes, lambda: PoseSet.of(rows, links, then))
 
 
-def _spread(pattern: Pattern, shift: Vec2, tries: int) -> Spots:
-    """Spots at so many poses, the patches taken in turn."""
+def _spread(pattern: SurfacePattern, shift: Vec2, tries: int) -> CandidatePoses:
+    """Candidates at ``tries`` poses, the patches taken in turn."""
     found, middles = pattern.patches, pattern.middles
     points = proposed_places(found, shift, tries)
     links = [patch.link for patch in islice(cycle(found), len(points))]
@@ -197,4 +196,4 @@ def _spread(pattern: Pattern, shift: Vec2, tries: int) -> Spots:
         x, y, z = points[number].tolist()
         return Pose.from_xyz_yaw(x, y, z, found[number % len(found)].yaw)
 
-    return Spots(local, links, boxes, lambda: middles.repeated_at(points))
+    return CandidatePoses(local, links, boxes, lambda: middles.repeated_at(points))

@@ -1,4 +1,4 @@
-"""Offline scene analysis: terminal poses for every pair of assets, each verified by settling, and standing poses."""
+"""Offline scene analysis: terminal poses, each verified by settling, and standing poses."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.bullet.mini_world import MiniWorld, Still
+from embomatrix.sim.bullet.mini_world import MiniWorld, StaticObject
 from embomatrix.sim.engine import TOLERANCE_M
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of
@@ -31,19 +31,19 @@ if TYPE_CHECKING:
 
 PLACE_RELATIONS: Final = (Relation.ONTOP, Relation.INSIDE, Relation.UNDER)
 POSES: Final = 16
-"""Verified poses that are kept for a pair."""
+"""Verified poses kept per pair."""
 TRIES: Final = 40
-"""Candidates that are looked at for a pair."""
+"""Candidates tried per pair."""
 CLASS_POSES: Final = 12
 CLASS_POSES_PER_M2: Final = 16
 CLASS_POSES_MOST: Final = 40
-"""Verified poses that are kept for a footprint class: more on larger surfaces."""
+"""Verified poses kept per footprint class; more on larger surfaces."""
 HOPELESS: Final = 12
-"""A pair none of whose first candidates is stable is given up."""
+"""A pair is given up if this many first candidates are unstable."""
 
 
 class Contents:
-    """Digests of assets, each worked out once."""
+    """Content digests of assets, each computed once."""
 
     def __init__(self) -> None:
         self._known: dict[int, tuple[Asset, str]] = {}
@@ -60,10 +60,10 @@ class Contents:
 
 
 class PlacementLibrary:
-    """Verified placements by the content of the two assets: equal pairs of other scenes are not simulated again."""
+    """Verified placements by the content of both assets: equal pairs of other scenes are not simulated again."""
 
     def __init__(self, pool: ClientPool | None = None) -> None:
-        """``pool`` lends the client to settle in; without one the library opens its own and closes it in the end."""
+        """``pool`` lends the client for settling; without one the library opens its own and closes it in the end."""
         self._owns_pool = pool is None
         self._pool = pool or ClientPool()
         self._mini = MiniWorld(self._pool)
@@ -72,9 +72,9 @@ class PlacementLibrary:
         self._contents = Contents()
 
     def poses(self, held: Asset, support: Asset, relation: Relation, seed: int) -> tuple[Pose, ...]:
-        """Poses of ``held`` in the frame of ``support``, each stable and in the relation; empty when none was found.
+        """Stable poses of ``held`` in the frame of ``support`` with the relation; empty for none.
 
-        Depends on nothing but the arguments' content.
+        Depends on the arguments' content only.
         """
         key = (self._contents.of(held), self._contents.of(support), relation, seed)
         if key not in self._known:
@@ -84,7 +84,7 @@ class PlacementLibrary:
     def footprint_poses(
         self, footprint: Footprint, support: Asset, relation: Relation, seed: int
     ) -> tuple[Pose, ...]:
-        """Poses of a class's box in the frame of ``support``, each stable, in the relation, and level all over."""
+        """Stable, level poses of a class's box in the frame of ``support`` with the relation."""
         key = (footprint.name, self._contents.of(support), relation, seed)
         if key not in self._known:
             box, most = box_of(footprint), _wanted(support, relation)
@@ -102,11 +102,11 @@ class PlacementLibrary:
     def poses_beside(
         self, held: Asset, support: Asset, relation: Relation, neighbour: Aabb
     ) -> tuple[Pose, ...]:
-        """As ``poses``, but each right beside a box in the frame of ``support``: what may be next to what has that box."""
+        """Poses right beside a box in the frame of ``support``, for objects that belong next to the one in the box."""
         return tuple(self._stable(held, support, relation, beside(held, support, relation, neighbour), POSES))
 
     def standing(self, asset: Asset) -> Pose | None:
-        """Pose in which the asset stands by itself on a level floor at height 0; None when it does not."""
+        """Pose in which the asset stands on a level floor at height 0; None if it falls."""
         key = self._contents.of(asset)
         if key not in self._standing:
             low = bounds_of(asset).box(IDENTITY).low_m[2]
@@ -117,7 +117,7 @@ class PlacementLibrary:
         return self._standing[key]
 
     def close(self) -> None:
-        """Give the client back. Known placements can still be read."""
+        """Return the client. Known placements stay readable."""
         self._mini.close()
         if self._owns_pool:
             self._pool.close()
@@ -131,13 +131,13 @@ class PlacementLibrary:
     def _stable(
         self, held: Asset, support: Asset, relation: Relation, tries: Iterator[Pose], most: int
     ) -> Iterator[Pose]:
-        """At most ``most`` poses. While one is looked at, the world in which it was verified stands."""
+        """Yield up to ``most`` stable poses. The settling world stays staged while a yielded pose is inspected."""
         first = next(tries, None)
         if first is None:
             return
         pose_world_support = _on_floor(support)
         shut = (0.0,) * len(held.joints)
-        still = Still(support, pose_world_support, (0.0,) * len(support.joints))
+        still = StaticObject(support, pose_world_support, (0.0,) * len(support.joints))
         self._mini.stage(held, pose_world_support @ first, shut, [still])
         back = pose_world_support.inverse()
         found = 0
@@ -162,10 +162,10 @@ def build_pose_cache(
     engine: PhysicsEngine | None = None,
     library: PlacementLibrary | None = None,
 ) -> PoseCache:
-    """Placements of every movable object's asset on, in and under every support's, and standing poses for all of them.
+    """Verified placements for every movable and every support, and standing poses for all of them.
 
-    ``engine`` must hold this scene in its initial state; without one the scene is loaded for the occasion. Pairs without a
-    stable pose have no entry. Raises EngineError when the scene is not valid, KeyError for an unknown name.
+    ``engine`` must hold this scene in its initial state; without one the scene is loaded. Pairs without a stable pose have no
+    entry. Raises EngineError for an invalid scene, KeyError for an unknown name.
     """
     with contextlib.ExitStack() as owned:
         if library is None:
@@ -185,9 +185,9 @@ def analyse_scene(
     engine: PhysicsEngine | None = None,
     library: PlacementLibrary | None = None,
 ) -> PoseCache:
-    """All that a scene offers: where every portable thing can go by its footprint, and standing poses for all objects.
+    """Analyse a scene: placements of every portable object by its footprint, and standing poses for all objects.
 
-    ``engine`` must hold this scene in its initial state. Raises EngineError when the scene is not valid.
+    ``engine`` must hold this scene in its initial state. Raises EngineError for an invalid scene.
     """
     with contextlib.ExitStack() as owned:
         if library is None:
@@ -204,7 +204,7 @@ def analyse_scene(
 def footprint_placements(
     scene: Scene, movable: Sequence[str], supports: Sequence[str], library: PlacementLibrary, seed: int
 ) -> dict[PlacementKey, tuple[Pose, ...]]:
-    """Poses of the classes of the movable objects on, in and under the supports, and how each asset stands by itself."""
+    """Poses of the movables' footprint classes on, in and under the supports, and the standing pose of each asset."""
     found: dict[PlacementKey, tuple[Pose, ...]] = {}
     classes: dict[Footprint, None] = {}
     for asset_id in sorted({scene.by_name[name].asset_id for name in movable}):
@@ -236,23 +236,23 @@ def _placements(
 
 
 def standing_poses(engine: PhysicsEngine, names: Sequence[str]) -> dict[str, tuple[StandPose, ...]]:
-    """Where the robot can stand to work on each object, in the scene as it was loaded but with all leaves shut."""
+    """Standing poses for each object, in the scene as loaded but with all panels shut."""
     navigator = Navigator(engine, Relations(engine))
     return {name: navigator.stands_past_shut(name, navigator.start) for name in dict.fromkeys(names)}
 
 
 def _on_floor(support: Asset) -> Pose:
-    """Pose at which a support stands on the floor by its box: what it really stands on does not touch what is placed."""
+    """Pose of a support on the floor by its box: its real host does not touch placed objects."""
     return Pose((0.0, 0.0, -bounds_of(support).box(IDENTITY).low_m[2]))
 
 
 def _wanted(support: Asset, relation: Relation) -> int:
-    """How many poses of a footprint class are kept on a support."""
+    """Number of poses kept for a footprint class on a support."""
     area_m2 = sum(math.prod(surface.size_m) for surface in surfaces_for(support, relation))
     return min(CLASS_POSES_MOST, CLASS_POSES + int(CLASS_POSES_PER_M2 * area_m2))
 
 
 def _shift(key: tuple[str, str, Relation, int]) -> tuple[float, float]:
-    """Two numbers in 0..1 that follow from the content of a pair and the seed."""
+    """Two numbers in 0..1 derived from the content of a pair and the seed."""
     digest = hashlib.sha256(":".join(map(str, key)).encode()).digest()
     return (int.from_bytes(digest[:4]) / 2**32, int.from_bytes(digest[4:8]) / 2**32)

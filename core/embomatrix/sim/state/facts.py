@@ -1,4 +1,4 @@
-"""Facts: what goals ask, answered from the engine's metric state and the symbolic states beside it."""
+"""Facts for goals, from the engine's metric state and the symbolic states."""
 
 from __future__ import annotations
 
@@ -21,50 +21,50 @@ SUBSTANCES = {relation.value: relation for relation in SubstanceRelation}
 REAL, FUTURE = "real", "future"
 
 
-class Symbols(dict[str, set[T]]):
-    """Sets by object name. Only those that were asked for by name can have been changed: it remembers which.
+class TrackedSets(dict[str, set[T]]):
+    """Sets by object name that remember which names were accessed and so may have changed.
 
-    Read with ``items`` and ``values``, which do not remember; change through ``[]``.
+    ``items`` and ``values`` do not count as access; change a set only through ``[]``.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self._asked: set[str] = set()
+        self._touched: set[str] = set()
         self._kept: dict[str, frozenset[T]] = {}
 
     def __getitem__(self, name: str) -> set[T]:
-        self._asked.add(name)
+        self._touched.add(name)
         return super().__getitem__(name)
 
     def __setitem__(self, name: str, members: set[T]) -> None:
-        self._asked.add(name)
+        self._touched.add(name)
         super().__setitem__(name, members)
 
-    def keep(self) -> None:
-        """Take what is so now as that which ``restore`` goes back to."""
+    def snapshot(self) -> None:
+        """Save the current sets for ``restore``."""
         self._kept = {name: frozenset(members) for name, members in self.items()}
-        self._asked.clear()
+        self._touched.clear()
 
     def changed(self) -> Sequence[tuple[str, set[T]]]:
-        """Names and sets that are not as kept, by name."""
-        if not self._asked:
+        """Names and sets that differ from the snapshot, by name."""
+        if not self._touched:
             return ()
-        asked = [(name, super(Symbols, self).__getitem__(name)) for name in sorted(self._asked)]
-        return [(name, members) for name, members in asked if members != self._kept[name]]
+        touched = [(name, super(TrackedSets, self).__getitem__(name)) for name in sorted(self._touched)]
+        return [(name, members) for name, members in touched if members != self._kept[name]]
 
     def restore(self) -> None:
-        """Make every set equal to the one that was kept."""
+        """Restore the snapshot."""
         for name, _ in self.changed():
             super().__setitem__(name, set(self._kept[name]))
-        self._asked.clear()
+        self._touched.clear()
 
 
 class FactError(ValueError):
-    """A goal asks something that the simulator can't answer."""
+    """Goal that asks for a fact which the simulator can't answer."""
 
 
 class EngineFacts:
-    """Facts of the present moment: they change as the engine and the states do."""
+    """Facts of the present moment; they change with the engine and the states."""
 
     def __init__(
         self,
@@ -74,9 +74,9 @@ class EngineFacts:
         absent: Set[str],
         future: Set[str],
     ) -> None:
-        """``states`` and ``substances`` map each object to what is so of it; ``absent`` are those not in the world.
+        """``states`` and ``substances`` map each object to its states and facts; ``absent`` are the objects outside the world.
 
-        All are read at every question, not copied. ``future`` are the objects that were absent at the start.
+        All are read at every query, not copied. ``future`` are the objects that were absent at the start.
         """
         self._relations = relations
         self._states = states
@@ -85,7 +85,7 @@ class EngineFacts:
         self._future = future
 
     def holds(self, predicate: str, args: tuple[str, ...]) -> bool:
-        """Whether ``predicate(args)`` holds. Raises FactError for an unknown predicate, object or number of arguments."""
+        """Return True if ``predicate(args)`` holds. Raises FactError for unknown predicates, objects or argument counts."""
         if predicate in RELATIONS and len(args) == 2:
             first, second = args
             relation = RELATIONS[predicate]
@@ -108,7 +108,7 @@ class EngineFacts:
         )
 
     def _state(self, name: str, state: State) -> bool:
-        """What is not in the world is in no state."""
+        """An object outside the world has no state."""
         if name in self._absent:
             return False
         if state in MEANINGS:

@@ -1,6 +1,6 @@
-"""Spatial relations between the objects of a live engine: one definition each, over the geometry of ``spots``.
+"""Spatial relations between the objects of a live engine, over the geometry of ``surfaces``.
 
-A parked object stands in no relation.
+A parked object has no relations.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.surfaces import REST_M, heights_over, is_under
-from embomatrix.sim.state.supports import Footings
+from embomatrix.sim.state.supports import SupportTracker
 from embomatrix.world.state import OPEN_FRACTION, Relation
 
 if TYPE_CHECKING:
@@ -22,27 +22,27 @@ if TYPE_CHECKING:
 
 TOUCH_M: Final = 0.005
 NEXT_SHARE: Final = 1 / 6
-"""Things are next to each other within this share of the mean of their six extents: OmniGibson's rule."""
+"""Two objects are next to each other within this share of the mean of their six extents: OmniGibson's rule."""
 NEXT_MIN_M: Final = 0.05
 NEXT_MAX_M: Final = 0.5
 
 
 class Relations:
-    """The relations between the objects of an engine, as they are at the moment of the call.
+    """Relations between the objects of an engine at the moment of the call.
 
-    How an object stands follows from it and its neighbours alone, so answers are kept until one of these changes. Object
-    names that the engine does not know raise EngineError.
+    An object's support follows from it and its neighbours alone; answers are cached until one of these changes. Unknown object
+    names raise EngineError.
     """
 
     def __init__(self, engine: PhysicsEngine) -> None:
         self._engine = engine
         self._scene = engine.scene
-        self.footings = Footings(engine)
+        self.supports = SupportTracker(engine)
         self._kept: dict[tuple[str, str], tuple[str, ...]] = {}
         self._kept_at = (-1, 0)
 
     def holds(self, relation: Relation, a: str, b: str) -> bool:
-        """Whether ``relation(a, b)`` holds; ``b`` is a room for INROOM and an object otherwise."""
+        """Return True if ``relation(a, b)`` holds; ``b`` is a room for INROOM and an object otherwise."""
         match relation:
             case Relation.ONTOP:
                 return self.ontop(a, b)
@@ -58,24 +58,24 @@ class Relations:
                 return self.inroom(a, b)
 
     def ontop(self, a: str, b: str) -> bool:
-        """``a`` rests on a surface of ``b``: underside within 1 cm of it, centre above its rectangle (5 mm outside allowed).
+        """Return True if ``a`` rests on a surface of ``b``: underside within 1 cm, centre above the rectangle (+ 5 mm).
 
-        Open shelf boards and the bottoms of bowls count, boards behind a door do not: what lies there is inside.
+        Open shelf boards and bottoms of bowls count. Boards behind a door do not: objects there are inside.
         """
-        return self._apart(a, b) and self.footings.is_on(a, b)
+        return self._apart(a, b) and self.supports.is_on(a, b)
 
     def inside(self, a: str, b: str) -> bool:
-        """The centre of ``a`` lies in a cavity of ``b``, and its box within the cavity, 1 cm outside allowed.
+        """Return True if the centre of ``a`` lies in a cavity of ``b`` and its box within the cavity, 1 cm outside allowed.
 
-        What stands in an open cavity may stick out at the top. Holds through nested containers.
+        An object in an open cavity may stick out at the top. The relation holds through nested containers.
         """
-        return self._apart(a, b) and self.footings.is_in(a, b)
+        return self._apart(a, b) and self.supports.is_in(a, b)
 
     def under(self, a: str, b: str) -> bool:
-        """Some part of ``b`` lies over the centre of ``a``, and all that do begin above its top, 1 cm deeper allowed.
+        """Return True if parts of ``b`` lie over the centre of ``a`` and all of these begin above its top, 1 cm tolerance.
 
-        Centre and top are those of ``a`` with its joints shut: a door that is ajar moves nothing out from under a shelf. What
-        lies in a cavity is under nothing beyond that cavity's roof: what is in the oven is not under the worktop.
+        Centre and top are those of ``a`` with its joints shut: an open door moves nothing out from under a shelf. The roof of
+        a cavity ends the relation: an object in the oven is not under the worktop.
         """
         if not self._apart(a, b):
             return False
@@ -88,14 +88,14 @@ class Relations:
         )
 
     def _roof_m(self, box: Aabb, name: str) -> float:
-        """Height at which what an object has over a box begins; infinite without anything."""
+        """Height of the lowest part of an object over a box; infinite for none."""
         heights = heights_over(box, self._scene.asset_of(name), self._engine.pose(name))
         return min((height for height in heights if height >= box.high_m[2] - REST_M), default=math.inf)
 
     def nextto(self, a: str, b: str) -> bool:
-        """Side by side: their heights overlap, neither's centre is over the other, and the gap between them is small.
+        """Return True if two objects stand side by side with a small gap: heights overlap, neither centre is over the other.
 
-        Small is a sixth of the mean of their six extents, but at least 5 cm and at most 50 cm.
+        A small gap is a sixth of the mean of their six extents, at least 5 cm and at most 50 cm.
         """
         if not self._apart(a, b):
             return False
@@ -109,38 +109,38 @@ class Relations:
         return self._engine.gap(a, b, limit) is not None
 
     def touching(self, a: str, b: str) -> bool:
-        """Their surfaces are 5 mm apart or less."""
+        """Return True if two surfaces are 5 mm apart or less."""
         return self._apart(a, b) and self._engine.gap(a, b, TOUCH_M) is not None
 
     def inroom(self, a: str, room: str) -> bool:
-        """The centre of ``a`` is over the floor of the room; in a wall, of the first room within 15 cm."""
+        """Return True if the centre of ``a`` is over the room's floor; in a wall, the first room within 15 cm counts."""
         return not self._engine.is_parked(a) and self.room_of(a) == room
 
     def open(self, a: str) -> bool:
-        """Any joint of ``a`` is past 5 % of its travel."""
+        """Return True if any joint of ``a`` is beyond 5 % of its travel."""
         return max(self._engine.joints(a), default=0.0) > OPEN_FRACTION
 
     def body(self, name: str) -> Aabb:
-        """Box of the object with its joints shut: an open door neither brings it nearer nor pushes the robot away."""
+        """Box of the object with its joints shut: an open door does not change the distance to the object."""
         fractions = self._engine.joints(name)
         if not any(fractions):
             return self._engine.aabb(name)
         return bounds_of(self._scene.asset_of(name)).box(self._engine.pose(name), (0.0,) * len(fractions))
 
     def room_of(self, name: str) -> str:
-        """Room that the object's centre is over, "" when it is in none."""
+        """Room under the object's centre; "" outside all rooms."""
         return self._scene.room_at(self.body(name).center_m)
 
     def host_of(self, name: str) -> Host | None:
-        """What the object rests on or in; None on the floor, at a wall or in the hand.
+        """Object that this one rests on or in; None on the floor, at a wall or in the hand.
 
-        Of several, the smallest: food on a plate on a table is on the plate. Lying in a cavity goes before resting on a
+        Of several hosts the smallest counts: food on a plate on a table is on the plate. A cavity takes precedence over a
         surface.
         """
-        return self.footings.of(name).host
+        return self.supports.of(name).host
 
     def hosts_of(self, name: str) -> tuple[str, ...]:
-        """What the object rests on or in, what that rests on or in, and so on."""
+        """Chain of hosts: the object's host, that one's host, and so on."""
         return self._answer("hosts", name, self._find_hosts)
 
     def _find_hosts(self, name: str) -> tuple[str, ...]:
@@ -150,7 +150,7 @@ class Relations:
         return tuple(chain[1:])
 
     def resting_on(self, name: str) -> tuple[str, ...]:
-        """Objects whose host is this one, in scene order: on its surfaces and in its cavities."""
+        """Objects with this host, in scene order: on its surfaces and in its cavities."""
         return self._answer("guests", name, self._find_guests)
 
     def _find_guests(self, name: str) -> tuple[str, ...]:
@@ -160,7 +160,7 @@ class Relations:
         return tuple(other for other in around if self._is_host(name, other))
 
     def _answer(self, question: str, name: str, find: Callable[[str], tuple[str, ...]]) -> tuple[str, ...]:
-        """What is kept of a question since the last change of anything, or what ``find`` finds: a step asks the same often."""
+        """Cached answer since the last change, or the result of ``find``: a step repeats its questions."""
         journal = self._engine.journal
         now = (journal.rounds, len(journal.entries))
         if now != self._kept_at:
@@ -172,7 +172,7 @@ class Relations:
         return answer
 
     def group_of(self, name: str) -> tuple[str, ...]:
-        """The object and all that moves along with it: what lies in its cavities, and what rests on or in that."""
+        """Object and all that moves with it: the contents of its cavities and what rests on or in those."""
         group = {name: None}
         waiting = [other for other in self.resting_on(name) if self._lies_in(other, name)]
         while waiting:
@@ -183,8 +183,8 @@ class Relations:
         return tuple(group)
 
     def enclosing(self, name: str) -> tuple[Enclosure, ...]:
-        """Containers around the object, the innermost first."""
-        return self.footings.of(name).enclosures
+        """Containers around the object, innermost first."""
+        return self.supports.of(name).enclosures
 
     def _lies_in(self, name: str, container: str) -> bool:
         host = self.host_of(name)
@@ -195,11 +195,11 @@ class Relations:
         return host is not None and host.name == name
 
     def _apart(self, a: str, b: str) -> bool:
-        """Whether both are in the world, and two: nothing stands in a relation to itself."""
+        """Return True if both objects are in the world and differ."""
         return a != b and not self._engine.is_parked(a) and not self._engine.is_parked(b)
 
 
 def _over(a: Aabb, b: Aabb) -> bool:
-    """Whether the centre of ``a`` is over or under ``b``."""
+    """Return True if the centre of ``a`` is over or under ``b``."""
     x, y, _ = a.center_m
     return b.low_m[0] <= x <= b.high_m[0] and b.low_m[1] <= y <= b.high_m[1]

@@ -37,12 +37,12 @@ VESSEL_M: Final = 0.3
 """Largest height over a source of the underside of an object that stands in a vessel on the source."""
 
 
-class News:
-    """Reads an engine's journal. A reset is no news: what follows it is."""
+class ChangeReader:
+    """Reader of an engine's journal. A reset alone is not a change."""
 
     def __init__(self, engine: PhysicsEngine) -> None:
-        self.again = False
-        """Whether the engine was reset between the last two looks."""
+        self.was_reset = False
+        """True if the engine was reset between the last two reads."""
         self._engine = engine
         self._round = engine.journal.rounds
         self._read = 0
@@ -50,10 +50,10 @@ class News:
         self._places: list[Aabb] = []
 
     def read(self) -> None:
-        """Go on to what changed since the last call."""
+        """Read the changes since the last call."""
         journal = self._engine.journal
-        self.again = journal.rounds != self._round
-        if self.again:
+        self.was_reset = journal.rounds != self._round
+        if self.was_reset:
             self._round, self._read = journal.rounds, 0
         names = self._names = set[str]()
         self._places.clear()
@@ -65,21 +65,21 @@ class News:
         self._read = len(journal.entries)
         self._places += [self._engine.aabb(name) for name in names if not self._engine.is_parked(name)]
 
-    def concerns(self, name: str, area: Aabb) -> bool:
-        """Whether the object is among what changed, or anything in an area before or after it changed."""
+    def affects(self, name: str, area: Aabb) -> bool:
+        """Return True if the object changed, or if anything in the area changed, before or after."""
         return name in self._names or any(area.overlaps(box) for box in self._places)
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What became of an object, as words that follow "is now": ``hot``, ``soaked``."""
+    """Change of an object, in words that follow "is now": ``hot``, ``soaked``."""
 
     name: str
     words: str
 
 
 class Thermal:
-    """The sources of a scene and what they do. ``states`` maps each object to its symbolic states, and is changed."""
+    """Heat and cold sources of a scene. Changes ``states``, the symbolic states by object."""
 
     def __init__(
         self, engine: PhysicsEngine, relations: Relations, states: MutableMapping[str, set[State]]
@@ -95,22 +95,22 @@ class Thermal:
             found = (heat_source(asset), cold_source(asset))
             self._sources += [(item.name, source) for source in found if source is not None]
 
-    def apply(self, news: News) -> list[Change]:
-        """Let every working source act. Returns what changed, in scene order of the sources."""
+    def apply(self, changed: ChangeReader) -> list[Change]:
+        """Let every working source act. Return the changes in scene order of the sources."""
         changes: list[Change] = []
         first, self._acted = not self._acted, True
         for name, source in self._sources:
-            # One that acts by itself has acted on all that is there, unless something has changed there since.
+            # A source without a switch has already acted on everything there, unless something changed since.
             if not self.works(name, source):
                 continue
-            if first or source.requires_on or news.concerns(name, self._area(name)):
+            if first or source.requires_on or changed.affects(name, self._area(name)):
                 for item in self._acted_on(name, source):
                     changes += self._expose(item, source)
         return changes
 
     def works(self, name: str, source: ThermalSource) -> bool:
-        """Whether the source is on and closed, as far as it must be."""
-        # The switch first: most sources of a scene are off, and all are asked after every change.
+        """Return True if the source is on and closed, as far as it must be."""
+        # The switch is checked first: most sources are off, and all are checked after every change.
         if source.requires_on and State.TOGGLED_ON not in self._states.get(name, ()):
             return False
         if self._engine.is_parked(name):
@@ -118,7 +118,7 @@ class Thermal:
         return not (source.requires_closed and self._relations.open(name))
 
     def is_at(self, item: str, name: str, source: ThermalSource) -> bool:
-        """Whether the source acts on the object where it lies: inside it, or on it, or in or on a vessel on it."""
+        """Return True if the source acts on the object: inside it, on it, or in or on a vessel on it."""
         if source.requires_inside:
             return self._relations.inside(item, name)
         if self._relations.ontop(item, name):
@@ -131,18 +131,18 @@ class Thermal:
         )
 
     def _acted_on(self, name: str, source: ThermalSource) -> Iterator[str]:
-        """Objects where the source acts, of those that it would change."""
+        """Objects at the source that it would change."""
         for item in self._above(name):
             if self._gained(item, source) and self.is_at(item, name, source):
                 yield item
 
     def _above(self, name: str) -> tuple[str, ...]:
-        """Movable objects in or near the source's box, or above it as far as vessels reach."""
+        """Movable objects in or near the source's box, or above it up to the height of vessels."""
         near = self._engine.near(self._area(name), frozenset((name,)))
         return tuple(item for item in near if not self._scene.by_name[item].fixed)
 
     def _area(self, name: str) -> Aabb:
-        """The source's box, and as far above it as vessels reach."""
+        """Box of the source, extended upwards by the height of vessels."""
         box = self._engine.aabb(name)
         x, y, z = box.high_m
         return Aabb(box.low_m, (x, y, z + VESSEL_M))
@@ -151,12 +151,12 @@ class Thermal:
         return self._relations.holds(Relation.INSIDE, item, vessel) or self._relations.ontop(item, vessel)
 
     def _gained(self, item: str, source: ThermalSource) -> list[State]:
-        """States that the object would get from the source and does not have."""
+        """States that the source would add to the object."""
         states = self._states.get(item, ())
         return [state for state in _states_at(self._scene.asset_of(item), source) if state not in states]
 
     def _expose(self, item: str, source: ThermalSource) -> list[Change]:
-        """Give the object the states of the source's temperature that its asset can have."""
+        """Apply the source's temperature to the object."""
         gained, states = self._gained(item, source), self._states[item]
         if State.HOT in gained:
             states.discard(State.FROZEN)
@@ -178,7 +178,7 @@ def _states_at(asset: Asset, source: ThermalSource) -> list[State]:
 
 
 class Water:
-    """The sinks and washing machines of a scene. ``substances`` maps each object to facts, and is changed."""
+    """Sinks and washing machines of a scene. Changes ``substances``, the facts by object."""
 
     def __init__(
         self,
@@ -202,15 +202,15 @@ class Water:
             if machine is not None or flows_from(asset.synset):
                 self._sources.append((item.name, machine))
 
-    def apply(self, news: News) -> list[Change]:
-        """Let every source that runs act on what lies in it. Returns what changed since the last time, by hand or by itself."""
-        if news.again and self._acting_at_start is not None:
+    def apply(self, changed: ChangeReader) -> list[Change]:
+        """Let every running source act on its contents. Return the changes since the last call, also those by hand."""
+        if changed.was_reset and self._acting_at_start is not None:
             self._acting = set(self._acting_at_start)
         for name, machine in self._sources:
             if State.TOGGLED_ON not in self._states.get(name, ()) or not self._runs(name, machine):
                 self._acting.discard(name)
-            # What a source did to a thing nothing undoes: it acts again when it was started, or something came.
-            elif name not in self._acting or news.concerns(name, self._engine.aabb(name)):
+            # Effects are permanent: a source acts again only after it was started or something arrived.
+            elif name not in self._acting or changed.affects(name, self._engine.aabb(name)):
                 self._acting.add(name)
                 self._act(name, machine)
         if self._acting_at_start is None:
@@ -219,7 +219,7 @@ class Water:
         return changes
 
     def _runs(self, name: str, machine: Washing | None) -> bool:
-        """Whether a source that is switched on is in the world, and closed if it must be."""
+        """Return True if a source that is on is in the world, and closed if it must be."""
         if self._engine.is_parked(name):
             return False
         return machine is None or not machine.requires_closed or not self._relations.open(name)
@@ -234,13 +234,13 @@ class Water:
             self.wet(item, liquids)
 
     def wet(self, name: str, liquids: tuple[str, ...]) -> None:
-        """Let liquids run over an object."""
+        """Wet an object with liquids."""
         gained = soaked_with(self._scene.asset_of(name), liquids) - self._substances[name]
         self._substances[name] |= gained
         self._changes += [Change(name, in_words(fact)) for fact in sorted(gained)]
 
     def take_off(self, name: str, covering: tuple[str, ...]) -> None:
-        """Take substances off an object that is covered with them."""
+        """Remove substances that cover an object."""
         lost = {SubstanceFact(SubstanceRelation.COVERED, substance) for substance in covering}
         self._substances[name] -= lost
         self._changes += [Change(name, f"free of {word_of(fact.substance)}") for fact in sorted(lost)]

@@ -1,4 +1,4 @@
-"""How objects stand among their neighbours, kept for as long as nothing near them changes."""
+"""Support of objects by their neighbours, cached until something near them changes."""
 
 from __future__ import annotations
 
@@ -29,25 +29,25 @@ SLACK_M: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Hollows:
-    """The cavities of an asset by the links that they ride on, and a width that nothing has which lies in one of them."""
+class AssetCavities:
+    """Cavities of an asset by the link that carries them, and a width that no object inside one has."""
 
     by_link: tuple[tuple[str, tuple[Interior, ...]], ...]
     too_wide_m: float
 
     @staticmethod
-    def of(asset: Asset) -> Hollows:
-        """The cavities of an asset that has some."""
+    def of(asset: Asset) -> AssetCavities:
+        """Cavities of an asset that has at least one."""
         links = dict.fromkeys(item.link for item in asset.interiors)
         by_link = [(link, tuple(item for item in asset.interiors if item.link == link)) for link in links]
-        return Hollows(
+        return AssetCavities(
             tuple(by_link), max(math.hypot(*item.size_m[:2]) for item in asset.interiors) + SLACK_M
         )
 
 
 @dataclass(frozen=True, slots=True)
 class Host:
-    """What an object rests on or in. ``spot`` names the support surface or the interior."""
+    """Object that another one rests on or in. ``spot`` names the support surface or the interior."""
 
     name: str
     relation: Relation
@@ -56,7 +56,7 @@ class Host:
 
 @dataclass(frozen=True, slots=True)
 class Enclosure:
-    """A container around an object: ``closed`` when every joint that bars the way in is shut, and there is one."""
+    """Container around an object; ``closed`` if it has joints that close it and all are shut."""
 
     name: str
     interior: str
@@ -64,57 +64,57 @@ class Enclosure:
 
 
 @dataclass(frozen=True, slots=True)
-class Footing:
-    """How an object stands among its neighbours: its host, the containers around it, and what it is on top of."""
+class SupportState:
+    """Support of an object: its host, the containers around it, and the objects that it is on top of."""
 
     host: Host | None = None
     enclosures: tuple[Enclosure, ...] = ()
     on: frozenset[str] = frozenset()
 
 
-NOWHERE: Final = Footing()
-"""Of what is in the hand, or not in the world."""
+UNSUPPORTED: Final = SupportState()
+"""State of objects in the hand or outside the world."""
 
 
-class Footings:
-    """Footings in an engine's present state.
+class SupportTracker:
+    """Support states in an engine's present state.
 
-    A footing follows from the object and its neighbours alone. Those of neighbourhoods in which nothing has changed since
-    the scene was loaded are good for ever; the others until the next change near them.
+    A state follows from the object and its neighbours alone. States whose surroundings have not changed since loading stay
+    valid; the others last until the next change near them.
     """
 
     def __init__(self, engine: PhysicsEngine) -> None:
         self._engine = engine
         self._scene = engine.scene
-        self._at_start: dict[str, Footing] = {}
-        self._now: dict[str, Footing] = {}
+        self._at_start: dict[str, SupportState] = {}
+        self._now: dict[str, SupportState] = {}
         self._middles_m: dict[str, float] = {}
-        """Of an asset's three extents the middle one: however it lies, it is nowhere narrower along both axes of the plane."""
-        self._hollows: dict[str, Hollows] = {}
+        """Middle one of an asset's three extents: in every orientation, one axis of the plane is at least this wide."""
+        self._cavities: dict[str, AssetCavities] = {}
         self._stale: set[str] = set()
-        """Objects near to which something has changed, so that they may stand otherwise since."""
+        """Objects with a change in their surroundings, whose support may differ since."""
         self._round = engine.journal.rounds
         self._read = 0
 
-    def of(self, name: str) -> Footing:
-        """How the object stands: its host, the containers around it, what it is on top of."""
+    def of(self, name: str) -> SupportState:
+        """Support of an object."""
         journal = self._engine.journal
         if len(journal.entries) != self._read or journal.rounds != self._round:
             self._read_journal()
         known = self._now if name in self._stale else self._at_start
-        footing = known.get(name)
-        if footing is None:
-            footing = known[name] = self._find(name)
-        return footing
+        state = known.get(name)
+        if state is None:
+            state = known[name] = self._find(name)
+        return state
 
-    def complete(self) -> Iterator[None]:
-        """Find out how everything stands, one object at a step: work for a process that waits. Changes no answer."""
+    def warm_up(self) -> Iterator[None]:
+        """Compute the support of every object, one per step. Changes no answer."""
         for item in self._scene.objects:
             self.of(item.name)
             yield
 
     def _read_journal(self) -> None:
-        """Forget what is kept of the objects that were near to a change."""
+        """Drop the cached states of objects near a change."""
         journal = self._engine.journal
         if journal.rounds != self._round:
             self._round, self._read = journal.rounds, 0
@@ -129,11 +129,13 @@ class Footings:
             if not self._engine.is_parked(name):
                 places.append(self._engine.aabb(name))
             self._forget(name)
-            hollow = bool(self._scene.asset_of(name).interiors)
+            has_cavities = bool(self._scene.asset_of(name).interiors)
             for place in places:
                 for other in self._engine.near(place.grown(REST_M)):
                     # A table neither rests on nor lies in a mug that stands on it.
-                    if _is_over(self._engine.aabb(other), place) or (hollow and self._fits(other, place)):
+                    if _is_over(self._engine.aabb(other), place) or (
+                        has_cavities and self._fits(other, place)
+                    ):
                         self._forget(other)
 
     def _forget(self, name: str) -> None:
@@ -141,7 +143,7 @@ class Footings:
         self._now.pop(name, None)
 
     def _fits(self, name: str, place: Aabb) -> bool:
-        """Whether an object may lie in something that takes a place."""
+        """Return True if an object may fit into something of this size."""
         width, depth, _ = place.size_m
         return self._middle_m(self._scene.asset_of(name)) <= math.hypot(width, depth) + SLACK_M
 
@@ -152,10 +154,10 @@ class Footings:
             self._middles_m[asset.asset_id] = known
         return known
 
-    def _find(self, name: str) -> Footing:
+    def _find(self, name: str) -> SupportState:
         engine, scene = self._engine, self._scene
         if engine.is_parked(name):
-            return NOWHERE
+            return UNSUPPORTED
         box = engine.aabb(name)
         hosts: list[tuple[float, str, Host]] = []
         around: list[tuple[float, str, Enclosure]] = []
@@ -179,26 +181,26 @@ class Footings:
                 around.append((math.prod(interior.size_m), other, enclosure))
             else:
                 hosts.append((volume, other, Host(other, Relation.ONTOP, surface)))
-        return Footing(
+        return SupportState(
             min(hosts, key=_first_two)[2] if hosts else None,
             tuple(item for _, _, item in sorted(around, key=_first_two)),
             frozenset(on),
         )
 
     def is_on(self, name: str, other: str) -> bool:
-        """Whether the object rests on a surface of another that no door shuts off."""
+        """Return True if the object rests on a surface of another one outside closable cavities."""
         known = self._known(name)
         return other in known.on if known is not None else self.would_be_on(name, other)
 
     def is_in(self, name: str, other: str) -> bool:
-        """Whether the object lies in a cavity of another."""
+        """Return True if the object lies in a cavity of another one."""
         known = self._known(name)
         if known is not None:
             return any(item.name == other for item in known.enclosures)
         return self.would_be_in(name, other)
 
     def would_be_on(self, name: str, other: str) -> bool:
-        """As ``is_on``, without a look at what is kept: for an object that is being tried in many places."""
+        """Evaluate ``is_on`` without the cache, for an object that is tried in many places."""
         engine = self._engine
         box, there = engine.aabb(name), engine.aabb(other)
         if not box.overlaps(there, REST_M) or not _is_over(box, there):
@@ -207,31 +209,31 @@ class Footings:
         return bool(surface_under(box, asset, pose, fractions, doored=False))
 
     def would_be_in(self, name: str, other: str) -> bool:
-        """As ``is_in``, without a look at what is kept."""
+        """Evaluate ``is_in`` without the cache."""
         engine, asset = self._engine, self._scene.asset_of(other)
         if not asset.interiors or not engine.aabb(name).overlaps(engine.aabb(other), REST_M):
             return False
         return self._interior(name, asset, engine.pose(other), engine.joints(other)) is not None
 
-    def _known(self, name: str) -> Footing | None:
+    def _known(self, name: str) -> SupportState | None:
         journal = self._engine.journal
         if len(journal.entries) != self._read or journal.rounds != self._round:
             self._read_journal()
         return (self._now if name in self._stale else self._at_start).get(name)
 
     def _interior(self, name: str, asset: Asset, pose: Pose, fractions: tuple[float, ...]) -> Interior | None:
-        """The smallest cavity of an asset at a pose that the object is in."""
+        """Smallest cavity of an asset at a pose that contains the object."""
         engine, own = self._engine, self._scene.asset_of(name)
-        hollows = self._hollows.get(asset.asset_id)
-        if hollows is None:
-            hollows = self._hollows[asset.asset_id] = Hollows.of(asset)
-        if self._middle_m(own) > hollows.too_wide_m:
+        cavities = self._cavities.get(asset.asset_id)
+        if cavities is None:
+            cavities = self._cavities[asset.asset_id] = AssetCavities.of(asset)
+        if self._middle_m(own) > cavities.too_wide_m:
             return None
         box = engine.aabb(name)
-        # However the object turns, the centre of its box moves less than this.
+        # In every orientation the centre of the object's box moves less than this.
         slack = math.dist(box.low_m, box.high_m) / 2
         found: list[Interior] = []
-        for link, interiors in hollows.by_link:
+        for link, interiors in cavities.by_link:
             frame = link_frame(asset, pose, fractions, link)
             if not is_upright(frame):
                 continue
@@ -248,14 +250,14 @@ class Footings:
 
 
 def _is_over(box: Aabb, other: Aabb) -> bool:
-    """Whether a box may rest on something in another: its centre is over it, give or take 5 cm for what a model lacks."""
+    """Return True if a box may rest on something in another: its centre is over it, with 5 cm tolerance for coarse models."""
     x, y, _ = box.center_m
     (low_x, low_y, _), (high_x, high_y, _) = other.low_m, other.high_m
     return low_x - SLACK_M <= x <= high_x + SLACK_M and low_y - SLACK_M <= y <= high_y + SLACK_M
 
 
 def _may_be_in(center: Vec3, interiors: Sequence[Interior], slack: float) -> bool:
-    """Whether a point lies in any of some cavities that are grown by a length on all sides."""
+    """Return True if a point lies in any cavity grown by ``slack`` on all sides."""
     x, y, z = center
     for item in interiors:
         (cx, cy, cz), (width, depth, height) = item.center_m, item.size_m
@@ -269,7 +271,7 @@ def _may_be_in(center: Vec3, interiors: Sequence[Interior], slack: float) -> boo
 
 
 def _is_open(box: Aabb, asset: Asset, pose: Pose, fractions: tuple[float, ...]) -> bool:
-    """Whether a box that rests on a surface of an asset rests on one that no door shuts off."""
+    """Return True if a box rests on a surface outside closable cavities."""
     if not any(interior.closed_by for interior in asset.interiors):
         return True
     return bool(surface_under(box, asset, pose, fractions, doored=False))

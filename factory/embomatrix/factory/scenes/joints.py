@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from embomatrix.factory.scenes.solids import placed_parts
 from embomatrix.sim.geometry.bounds import bounds_of
-from embomatrix.sim.geometry.surfaces import link_frame, link_under, links_with_spots
+from embomatrix.sim.geometry.surfaces import link_frame, link_under, links_with_surfaces
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -29,7 +29,7 @@ def with_joints(
     item = objects[name]
     asset, base = assets[item.asset_id], item.pose_world_asset
     changed = {name: replace(item, joints=tuple(float(share) for share in fractions))}
-    for link in sorted(links_with_spots(asset) - {""}):
+    for link in sorted(links_with_surfaces(asset) - {""}):
         before = link_frame(asset, base, item.joints, link)
         motion = link_frame(asset, base, changed[name].joints, link) @ before.inverse()
         for rider in _riders(objects, assets, name, before, link):

@@ -1,4 +1,4 @@
-"""A small authority of the cluster's own, and the certificate that it signs for the manager (elliptic curve P-256)."""
+"""Certificate authority of the cluster, and the manager's certificate (elliptic curve P-256)."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
 CA_LIFE: Final = timedelta(days=3650)
 SERVER_LIFE: Final = timedelta(days=730)
 RENEWAL: Final = timedelta(days=30)
-"""A server's certificate is renewed when less of its life is left."""
+"""A server certificate with less time left is renewed."""
 _SLACK: Final = timedelta(hours=1)
-"""Valid from a little earlier: the clocks of other machines may be slow."""
+"""Begin of validity before now, for slow clocks of other machines."""
 
 
 @dataclass(frozen=True, slots=True)
 class KeyPair:
-    """A certificate and its private key, both PEM."""
+    """Certificate and private key, both PEM."""
 
     certificate: bytes
     key: bytes
 
 
 def make_authority(name: str, now: datetime) -> KeyPair:
-    """A self-signed authority that may sign servers and no further authorities."""
+    """Return a self-signed authority that may sign servers and no further authorities."""
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name[:64])])
     usage = x509.KeyUsage(
@@ -57,11 +57,15 @@ def make_authority(name: str, now: datetime) -> KeyPair:
 
 
 def make_server_certificate(authority: KeyPair, names: Iterable[str], now: datetime) -> KeyPair:
-    """A certificate for these DNS names and IP addresses, followed by the authority's. ValueError names one that is neither."""
+    """Return a certificate for these DNS names and IP addresses, followed by the authority's. Raises ValueError for
+    an invalid name.
+    """
     issuer = x509.load_pem_x509_certificate(authority.certificate)
     issuer_key = serialization.load_pem_private_key(authority.key, password=None)
     if not isinstance(issuer_key, ec.EllipticCurvePrivateKey):
-        raise ValueError("the authority's key is of another kind than this version makes")
+        raise ValueError(
+            "the authority's key is no elliptic-curve key: let `embomatrix manager init` make another authority"
+        )
     key = ec.generate_private_key(ec.SECP256R1())
     alternatives = [general_name(name) for name in names]
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "EmboMatrix manager")])
@@ -80,7 +84,7 @@ def make_server_certificate(authority: KeyPair, names: Iterable[str], now: datet
 
 
 def names_in(certificate: bytes) -> tuple[str, ...]:
-    """The DNS names and IP addresses that a certificate (PEM) is for."""
+    """Return the DNS names and IP addresses of a certificate (PEM)."""
     parsed = x509.load_pem_x509_certificate(certificate)
     try:
         found = parsed.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
@@ -91,12 +95,12 @@ def names_in(certificate: bytes) -> tuple[str, ...]:
 
 
 def life_left(certificate: bytes, now: datetime) -> timedelta:
-    """Until the certificate (PEM) expires; negative when it has."""
+    """Return the time until the certificate (PEM) expires; negative if it has expired."""
     return x509.load_pem_x509_certificate(certificate).not_valid_after_utc - now
 
 
 def general_name(text: str) -> x509.GeneralName:
-    """An IP address or a DNS name. Raises ValueError."""
+    """Parse an IP address or a DNS name. Raises ValueError."""
     try:
         return x509.IPAddress(ipaddress.ip_address(text))
     except ValueError:

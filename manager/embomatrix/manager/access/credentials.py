@@ -1,7 +1,6 @@
-"""Tokens as the manager knows them: hashes, roles, ends. Decisions only; the clock and the randomness are arguments.
+"""Credentials of tokens: hashes, roles and expiry. Free of I/O; clock and randomness are arguments.
 
-A token is ``ID.SECRET``. The id is no secret: it finds the credential. The secret has 256 random bits, so one plain hash keeps
-it safe where a password would need a slow one.
+A token is ``ID.SECRET``. The public id finds the credential. The secret has 256 random bits, so a plain hash is safe.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.store.protocol import ShelfRow
-from embomatrix.rpc.roles import AccessRole, TokenInfo
 from embomatrix.rpc.status import (
     InvalidRequestError,
     NotAllowedError,
@@ -22,27 +20,28 @@ from embomatrix.rpc.status import (
     NotSignedInError,
     OverloadedError,
 )
+from embomatrix.rpc.wire.tokens import AccessRole, TokenInfo
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
 LONGEST_JOIN_S: Final = 86_400.0
-"""A token to join is valid for a day at most: it is meant to be used at once."""
+"""Longest validity of a join token, which is meant for immediate use."""
 REMEMBERED_S: Final = 30 * 86_400.0
-"""Expired credentials are remembered for so long, to say that they expired."""
+"""Time that expired credentials are kept, to report that they expired."""
 LIMIT: Final = 100_000
 LABEL_LENGTH: Final = 200
 NO_TOKEN: Final = (
-    "no token, or a wrong one: pass --token, or set EMBOMATRIX_TOKEN to the token of this manager; for a worker that is to "
-    "join, ask the operator for another string (`embomatrix manager token issue --role join`)"
+    "missing or unknown token: pass --token, or set EMBOMATRIX_TOKEN to a token of this manager; to join a worker, "
+    "ask the operator for an invitation (`embomatrix manager token issue --role join`)"
 )
-_REPLACED: Final = "its worker asked for another before it had shown it"
+_REPLACED: Final = "its worker requested another before it used this one"
 _NOTHING: Final = hashlib.sha256(b"").hexdigest()
 
 
 @dataclass(frozen=True, slots=True)
 class Credential:
-    """A token without its secret. Times are seconds since 1970, by the manager's clock."""
+    """Token without its secret. Times are seconds since the epoch on the manager's clock."""
 
     token_id: str
     role: AccessRole
@@ -51,13 +50,13 @@ class Credential:
     expires_s: float = 0.0
     """0: never."""
     worker_id: str = ""
-    """The worker that a credential belongs to, or that a token to join was used by."""
+    """Worker that a credential belongs to, or that used a join token."""
     boot_id: str = ""
-    """The process that a token to join was used by."""
+    """Process that used a join token."""
     joined_by: str = ""
-    """Id of the token to join that a worker's credential was given for."""
+    """Id of the join token that was exchanged for this credential."""
     revoked: str = ""
-    """Why it is void; empty while it is not."""
+    """Reason of the revocation; empty while valid."""
 
     @classmethod
     def from_row(cls, row: ShelfRow) -> Credential:
@@ -68,7 +67,7 @@ class Credential:
         return ShelfRow(self.token_id, json.dumps(asdict(self), separators=(",", ":")).encode())
 
     def named(self) -> str:
-        """How a sentence calls it."""
+        """Return the token's name for messages."""
         return f"the token {self.token_id}" + (f" ({self.label})" if self.label else "")
 
 
@@ -81,7 +80,7 @@ def new_id() -> str:
 
 
 class CredentialBook:
-    """Every credential of a cluster. Methods that change something return what is to be written, and ``keep`` takes it in."""
+    """All credentials of a cluster. Changing methods return credentials to store, and ``keep`` adds them afterwards."""
 
     def __init__(
         self,
@@ -94,9 +93,9 @@ class CredentialBook:
         self._make_id = make_id
         self._by_id: dict[str, Credential] = {}
         self._of_worker: dict[str, dict[str, Credential]] = {}
-        """Credentials of role worker by the name that they belong to, then by id."""
+        """Credentials of role worker by worker name, then by id."""
         self._seen: set[str] = set()
-        """Credentials that were shown since this process started."""
+        """Credentials that were used since this process started."""
         self.keep(*credentials)
 
     def __contains__(self, token_id: str) -> bool:
@@ -109,10 +108,10 @@ class CredentialBook:
                 self._of_worker.setdefault(credential.worker_id, {})[credential.token_id] = credential
 
     def find(self, token: str, *, now_s: float) -> Credential:
-        """The valid credential of a token. Raises NotSignedInError, which says why it is void."""
+        """Return the valid credential of a token. Raises NotSignedInError with the reason."""
         token_id, _, secret = token.partition(".")
         credential = self._by_id.get(token_id)
-        # Compared even if there is nothing to compare with: the answer takes as long whatever is wrong.
+        # Compared even without a credential, so that the time of the answer reveals nothing.
         known = credential.secret_hash if credential is not None else _NOTHING
         fits = hmac.compare_digest(hash_of(secret), known)
         if credential is None or not fits or not secret:
@@ -131,17 +130,17 @@ class CredentialBook:
     def issue(
         self, role: AccessRole, *, valid_s: float, label: str, now_s: float, worker_id: str = ""
     ) -> tuple[Credential, str]:
-        """A new credential, and the token that is told once. ``valid_s`` 0: until revoked, or a day for one to join."""
+        """Return a new credential and its token. ``valid_s`` 0: until revoked, or one day for a join token."""
         if not 0.0 <= valid_s < float("inf"):
             raise InvalidRequestError(f"a token's validity is {valid_s} s: expected 0 or more")
         if role is AccessRole.JOIN:
             valid_s = valid_s or LONGEST_JOIN_S
             if valid_s > LONGEST_JOIN_S:
                 raise InvalidRequestError(
-                    f"a token to join is asked to be valid for {valid_s:.0f} s: at most {LONGEST_JOIN_S:.0f} s"
+                    f"a join token cannot be valid for {valid_s:.0f} s: at most {LONGEST_JOIN_S:.0f} s"
                 )
         if len(self._by_id) >= LIMIT:
-            raise OverloadedError(f"{len(self._by_id)} tokens are known, which is the most: revoke some")
+            raise OverloadedError(f"{len(self._by_id)} tokens exist, which is the limit: revoke some")
         secret = self._make_secret()
         credential = Credential(
             token_id=self._make_id(),
@@ -156,10 +155,10 @@ class CredentialBook:
     def redeem(
         self, join: Credential, worker_id: str, boot_id: str, *, now_s: float
     ) -> tuple[tuple[Credential, ...], str]:
-        """What a token to join becomes: the changed credentials, the worker's own first, and its token.
+        """Exchange a join token. Return the changed credentials, the worker's own first, and its token.
 
-        It is good for one worker. The same process may show it again as long as the credential that it got was never shown:
-        the answer may have been lost on its way. Raises NotSignedInError or NotAllowedError.
+        A join token is valid for one worker. The same process may repeat the exchange until it uses the new
+        credential, since the answer may have been lost. Raises NotSignedInError or NotAllowedError.
         """
         changed: tuple[Credential, ...] = ()
         if join.worker_id:
@@ -171,7 +170,7 @@ class CredentialBook:
             again = (join.worker_id, join.boot_id) == (worker_id, boot_id) and bool(boot_id)
             if not again or any(c.revoked or c.token_id in self._seen for c in given):
                 raise NotSignedInError(
-                    f"this token to join was used already, by worker {join.worker_id}: ask the operator for another "
+                    f"this join token was used already, by worker {join.worker_id}: ask the operator for another "
                     "(`embomatrix manager token issue --role join`)"
                 )
             changed = tuple(replace(c, revoked=_REPLACED) for c in given)
@@ -188,7 +187,7 @@ class CredentialBook:
         return (own, used, *changed), token
 
     def check_name(self, credential_id: str, bound_to: str, worker_id: str) -> None:
-        """Raises NotAllowedError when a worker's token is not good for registering under this name."""
+        """Raise NotAllowedError if a worker's token may not register under this name."""
         if bound_to and bound_to != worker_id:
             raise NotAllowedError(
                 f"this credential belongs to worker {bound_to}: it can't register as {worker_id}"
@@ -196,15 +195,15 @@ class CredentialBook:
         holder = self._holder(worker_id)
         if not bound_to and holder is not None and holder.token_id != credential_id:
             raise NotAllowedError(
-                f"the name {worker_id} belongs to a machine that joined with a credential of its own: pass another --name"
+                f"the name {worker_id} belongs to a machine that joined with its own credential: pass another --name"
             )
         if not bound_to and any(c.revoked for c in self._of_worker.get(worker_id, {}).values()):
             raise NotAllowedError(
-                f"worker {worker_id} was revoked: let it join anew (`embomatrix manager token issue --role join`)"
+                f"worker {worker_id} was revoked: let it join again (`embomatrix manager token issue --role join`)"
             )
 
     def revoke(self, token_id: str, reason: str) -> Credential:
-        """The credential, void. Raises NotFoundError."""
+        """Return the revoked credential. Raises NotFoundError."""
         credential = self._by_id.get(token_id)
         if credential is None:
             raise NotFoundError(
@@ -213,7 +212,7 @@ class CredentialBook:
         return replace(credential, revoked=credential.revoked or reason)
 
     def revoke_worker(self, worker_id: str, reason: str) -> tuple[Credential, ...]:
-        """The worker's credentials, void. A worker of a shared token has none: its name alone is barred."""
+        """Return the worker's revoked credentials. A worker with a shared token has none: only its name is blocked."""
         own = self._credentials_of(worker_id)
         if own:
             return tuple(replace(c, revoked=reason) for c in own)
@@ -222,11 +221,11 @@ class CredentialBook:
         )
 
     def knows_worker(self, worker_id: str) -> bool:
-        """Whether a credential belongs to this name, be it void."""
+        """Return True if a credential, valid or revoked, belongs to this name."""
         return worker_id in self._of_worker
 
     def infos(self, *, now_s: float) -> tuple[TokenInfo, ...]:
-        """The tokens that are valid: not expired, not revoked, and not used up."""
+        """Return the valid tokens: not expired, revoked or used up."""
         return tuple(
             TokenInfo(c.token_id, c.role, c.label, c.expires_s - now_s if c.expires_s else 0.0, c.worker_id)
             for c in self._by_id.values()
@@ -236,7 +235,7 @@ class CredentialBook:
         )
 
     def _credentials_of(self, worker_id: str) -> list[Credential]:
-        """The valid credentials that belong to this name: one, or none."""
+        """Return the valid credentials of this name, one at most."""
         return [c for c in self._of_worker.get(worker_id, {}).values() if not c.revoked]
 
     def _holder(self, worker_id: str) -> Credential | None:
@@ -248,5 +247,5 @@ def hash_of(secret: str) -> str:
 
 
 def is_remembered(credential: Credential, *, now_s: float) -> bool:
-    """Whether it is still worth keeping: what never expires must be kept even when revoked, or it would be valid again."""
+    """Return True if the credential must be kept. Revoked credentials without expiry must be kept to stay revoked."""
     return not credential.expires_s or now_s < credential.expires_s + REMEMBERED_S

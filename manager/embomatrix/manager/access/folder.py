@@ -1,4 +1,4 @@
-"""The folder ``access`` in a manager's data folder: authority, certificate and first tokens, made once by ``manager init``."""
+"""Folder ``access`` of a data folder: authority, certificate and first tokens, made by ``manager init``."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from embomatrix.manager.access.certificates import (
 )
 from embomatrix.manager.access.credentials import LONGEST_JOIN_S, Credential, CredentialBook
 from embomatrix.manager.store.protocol import ShelfRow
-from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.trust import fingerprint_of
+from embomatrix.rpc.wire.tokens import AccessRole
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -32,19 +32,19 @@ _PRIVATE: Final = 0o600
 
 
 class AccessError(Exception):
-    """Certificates or tokens that can't be used, or are missing where they must be; the sentence names the remedy."""
+    """Unusable or missing certificates or tokens. The message names a remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class PreparedAccess:
-    """What ``prepare`` did: sentences for a person, in order."""
+    """Report of ``prepare``: sentences about created and existing files."""
 
     made: tuple[str, ...]
     found: tuple[str, ...]
 
 
 class AccessFolder:
-    """Paths, and what is in them. Nothing here is read before it is asked for."""
+    """Paths in the access folder."""
 
     def __init__(self, data_dir: Path) -> None:
         self.path = data_dir / "access"
@@ -53,14 +53,14 @@ class AccessFolder:
         self.server = self.path / "server.pem"
         self.server_key = self.path / "server.key"
         self.hashes = self.path / "tokens.json"
-        """First tokens as the manager reads them: hashed."""
+        """Hashes of the first tokens, which the manager reads."""
 
     def token(self, role: AccessRole) -> Path:
-        """The file with the first token of a role, for whom it is meant."""
+        """Return the file with the first token of a role."""
         return self.path / "tokens" / role.value
 
     def first_credentials(self) -> tuple[Credential, ...]:
-        """Raises AccessError."""
+        """Return the first credentials. Raises AccessError."""
         try:
             rows = json.loads(self.hashes.read_bytes())
             return tuple(
@@ -85,9 +85,9 @@ def prepare(
     roles: Sequence[AccessRole] = FIRST_ROLES,
     now: datetime | None = None,
 ) -> PreparedAccess:
-    """Make what is missing, and leave alone what is there: an authority is never overwritten.
+    """Create missing files. Existing files stay; an authority is never overwritten.
 
-    The server's certificate is made anew when it lacks one of ``sans`` or will expire soon. Raises AccessError.
+    The server certificate is renewed if it lacks one of ``sans`` or expires soon. Raises AccessError.
     """
     folder = AccessFolder(data_dir)
     moment = now or datetime.now(UTC)
@@ -106,9 +106,9 @@ def prepare(
 
 
 def hand_out_to(data_dir: Path, role: AccessRole, target: Path) -> None:
-    """Put what a client of this role needs into a folder of its own: the authority's certificate and the role's token.
+    """Copy the authority's certificate and the role's first token into a client's folder.
 
-    A token that was handed out there before stays. Raises AccessError.
+    An existing token there stays. Raises AccessError.
     """
     folder = AccessFolder(data_dir)
     try:
@@ -118,14 +118,14 @@ def hand_out_to(data_dir: Path, role: AccessRole, target: Path) -> None:
             write_private(target / "token", folder.token(role).read_bytes())
     except FileNotFoundError as error:
         raise AccessError(
-            f"{error.filename} is not there any more: issue a token with `embomatrix manager token issue --role {role}`"
+            f"{error.filename} no longer exists: issue a token with `embomatrix manager token issue --role {role}`"
         ) from error
     except OSError as error:
         raise AccessError(f"{error.filename or target} can't be written ({error.strerror})") from error
 
 
 def write_private(path: Path, content: bytes) -> None:
-    """Written beside and renamed, for the owner's eyes only from its first byte on."""
+    """Write atomically, readable by the owner only."""
     _write(path, content, _PRIVATE)
 
 
@@ -148,7 +148,7 @@ def _authority(folder: AccessFolder, now: datetime, made: list[str], found: list
             return KeyPair(folder.ca.read_bytes(), b"")
         return KeyPair(folder.ca.read_bytes(), folder.ca_key.read_bytes())
     authority = make_authority(f"EmboMatrix authority of {socket.gethostname()}", now)
-    # The key first: a certificate without its key would be taken for an authority that is kept elsewhere.
+    # The key is written first: a certificate without a key means an authority that is kept elsewhere.
     write_private(folder.ca_key, authority.key)
     write_public(folder.ca, authority.certificate)
     made.append(f"the authority {folder.ca}: clients pass it as --ca")
@@ -172,7 +172,7 @@ def _certify(
             return
     if not authority.key:
         raise AccessError(
-            f"{folder.ca_key} is missing, so no certificate can be signed: bring it back for as long as this takes"
+            f"{folder.ca_key} is missing, so no certificate can be signed: restore the file for this command"
         )
     names = tuple(dict.fromkeys((*before, *sans, *LOCAL_NAMES, *_own_names())))
     try:
@@ -208,7 +208,7 @@ def _first_tokens(
         write_private(path, f"{token}{pinned}\n".encode())
         credentials.append(credential)
         made.append(
-            f"a token of the role {role}: {path}" + (", good for one worker and a day" if valid_s else "")
+            f"a token of the role {role}: {path}" + (", valid for one worker and one day" if valid_s else "")
         )
     if len(credentials) > len(known):
         rows = [asdict(credential) for credential in credentials]

@@ -1,4 +1,4 @@
-"""Who may call what: the book of credentials with its store, and the answer to every call that comes in."""
+"""Access control of every call: stored credentials and role checks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from embomatrix.manager.access.folder import AccessError
 from embomatrix.manager.access.roles import OPEN, may_call, who_may
 from embomatrix.manager.store.protocol import Shelf, StateError
 from embomatrix.rpc.channel import TOKEN_KEY, token_of
-from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.status import (
     ClusterError,
     NotAllowedError,
@@ -27,46 +26,48 @@ from embomatrix.rpc.status import (
     PreconditionError,
     UnavailableError,
 )
+from embomatrix.rpc.wire.tokens import AccessRole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     import grpc
 
-    from embomatrix.manager.runtime.registry import WorkerSession
     from embomatrix.manager.store.protocol import StateStore
-    from embomatrix.rpc.roles import TokenInfo
+    from embomatrix.rpc.wire.tokens import TokenInfo
 
 logger = logging.getLogger(__name__)
 
 SHARED_ID: Final = "shared"
-"""What the token of ``--token`` is called; no issued token has an id like it."""
+"""Id of the shared token of ``--token``, distinct from all issued ids."""
 
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Who calls, as far as the token tells. Sessions remember ``token_id``, and only it may speak for them."""
+    """Caller, identified by its token. Only the token that opened a session may use it."""
 
     role: AccessRole
     token_id: str = ""
     worker_id: str = ""
-    """The worker that the credential belongs to; empty for tokens of several."""
+    """Worker that the credential belongs to; empty for shared tokens."""
 
 
 ANYONE: Final = Caller(AccessRole.ADMIN)
-"""The caller where no token is asked for."""
+"""Caller of a manager without tokens."""
 
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """How a worker was let in: the id of what it shows from here on, and the token of a new credential, if it got one."""
+    """Admission of a worker: the id of its token from now on, and the token of a new credential, if any."""
 
     token_id: str
     credential: str = ""
 
 
 class Gate:
-    """Tokens of one cluster. ``shared_token`` is an admin's for everybody; with ``guarded`` false nobody is asked for one."""
+    """Access control of one cluster. ``shared_token`` has the role of an admin; ``guarded`` False accepts every
+    caller.
+    """
 
     def __init__(
         self,
@@ -84,9 +85,9 @@ class Gate:
         self._lock = asyncio.Lock()
 
     async def open(self, first: Iterable[Credential] = ()) -> None:
-        """Read what former managers knew, and take in first tokens that the store never saw. Raises StateError.
+        """Load stored credentials and store new first tokens. Raises StateError.
 
-        Raises AccessError for a shared token that was issued for a role: whoever holds it would become an admin.
+        Raises AccessError for a shared token that was issued for a role, since it would become an admin's.
         """
         now_s = self._clock()
         known = [Credential.from_row(row) for row in await self._store.rows(Shelf.CREDENTIALS)]
@@ -97,12 +98,12 @@ class Gate:
             self._book.keep(*fresh)
         if self._shared.partition(".")[0] in self._book:
             raise AccessError(
-                "--token, or EMBOMATRIX_TOKEN, holds a token that this cluster issued for a role, and would make it an "
-                "admin's: leave it out, or pass another secret"
+                "--token, or EMBOMATRIX_TOKEN, holds a token that this cluster issued for a role, and would grant it the "
+                "role of an admin: leave it out, or pass another secret"
             )
 
     def caller(self, token: str) -> Caller:
-        """Raises NotSignedInError."""
+        """Return the caller of a token. Raises NotSignedInError."""
         if not self._guarded:
             return ANYONE
         if self._shared and hmac.compare_digest(token.encode(), self._shared.encode()):
@@ -113,7 +114,7 @@ class Gate:
         return Caller(found.role, found.token_id, found.worker_id if found.role is AccessRole.WORKER else "")
 
     def refusal(self, method: str, header: str | None) -> ClusterError | None:
-        """Why ``/package.Service/Method`` may not be called with this ``authorization`` header; None if it may."""
+        """Return the reason to refuse the method with this ``authorization`` header; None if it is allowed."""
         if method in OPEN and not header:
             return None
         try:
@@ -123,21 +124,21 @@ class Gate:
         if method in OPEN or may_call(caller.role, method):
             return None
         return NotAllowedError(
-            f"a token of the role {caller.role} may not call {method.rpartition('/')[2]}: it takes {who_may(method)}"
+            f"a token of the role {caller.role} may not call {method.rpartition('/')[2]}: it needs {who_may(method)}"
         )
 
     def caller_of(self, context: grpc.aio.ServicerContext) -> Caller:
-        """Who made this call, as its metadata tell. Raises NotSignedInError."""
+        """Return the caller of a gRPC call. Raises NotSignedInError."""
         return self.caller(token_of(_header(context)))
 
     async def admit(
         self, context: grpc.aio.ServicerContext, join_token: str, worker_id: str, boot_id: str
     ) -> Admission:
-        """Let a worker register under this name: by the token of its call, or by the one to join in its request."""
+        """Admit a worker under this name, by the token of its call or the join token of its request."""
         caller = self.caller(token_of(_header(context)) or join_token)
         if not may_call(caller.role, _REGISTER):
             raise NotAllowedError(
-                f"a token of the role {caller.role} may not register workers: it takes {who_may(_REGISTER)}"
+                f"a token of the role {caller.role} may not register workers: it needs {who_may(_REGISTER)}"
             )
         if caller.role is AccessRole.JOIN:
             return await self._join(token_of(_header(context)) or join_token, worker_id, boot_id)
@@ -145,15 +146,15 @@ class Gate:
             self._book.check_name(caller.token_id, caller.worker_id, worker_id)
         return Admission(caller.token_id)
 
-    def check_session(self, context: grpc.aio.ServicerContext, session: WorkerSession) -> None:
-        """Raises NotAllowedError unless the caller's credential is the one that opened the session."""
-        if self.caller_of(context).token_id != session.credential_id:
+    def check_session(self, context: grpc.aio.ServicerContext, worker_id: str, credential_id: str) -> None:
+        """Raise NotAllowedError unless the caller's credential is the one that opened the worker's session."""
+        if self.caller_of(context).token_id != credential_id:
             raise NotAllowedError(
-                f"the session of worker {session.worker_id} was opened with another credential: register with this one"
+                f"the session of worker {worker_id} was opened with another credential: register again with this one"
             )
 
     async def issue(self, role: AccessRole, *, valid_s: float, label: str) -> tuple[str, str]:
-        """A new token and its id."""
+        """Return a new token and its id."""
         self._need_guard()
         async with self._lock:
             credential, token = self._book.issue(role, valid_s=valid_s, label=label, now_s=self._clock())
@@ -172,7 +173,7 @@ class Gate:
         logger.info("token revoked token=%s", token_id)
 
     def knows_worker(self, worker_id: str) -> bool:
-        """Whether a credential was ever given to a worker of this name, or the name is barred."""
+        """Return True if the name has a credential or is blocked."""
         self._need_guard()
         return self._book.knows_worker(worker_id)
 
@@ -188,7 +189,7 @@ class Gate:
     async def _join(self, token: str, worker_id: str, boot_id: str) -> Admission:
         async with self._lock:
             now_s = self._clock()
-            # Looked up again: another process may have used it while this one waited.
+            # Looked up again: another process may have used the token during the wait for the lock.
             changed, own = self._book.redeem(
                 self._book.find(token, now_s=now_s), worker_id, boot_id, now_s=now_s
             )
@@ -199,7 +200,7 @@ class Gate:
         return Admission(changed[0].token_id, own)
 
     async def _keep(self, *credentials: Credential) -> None:
-        """Written first: what the store does not hold was never granted, and never taken back."""
+        """Store the credentials before they take effect, so that grants and revocations survive a restart."""
         try:
             await self._store.put_rows(Shelf.CREDENTIALS, [credential.row() for credential in credentials])
         except StateError as error:
@@ -209,8 +210,8 @@ class Gate:
     def _need_guard(self) -> None:
         if not self._guarded:
             raise PreconditionError(
-                "this manager asks nobody for a token, so there are none to hand out or take back: run "
-                "`embomatrix manager init` for its data folder and start it again"
+                "this manager requires no tokens, so none can be issued or revoked: run "
+                "`embomatrix manager init` for its data folder and restart it"
             )
 
 

@@ -1,4 +1,4 @@
-"""What a manager is protected by: certificates, tokens, both, or on loopback nothing. Anything less is refused at start."""
+"""Protection of a manager: TLS and tokens, which only loopback addresses may lack."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Tls:
-    """A certificate to serve with. ``chain``, ``key`` and ``authority`` are PEM; the last is empty where it isn't known."""
+    """Certificate of the server. ``chain``, ``key`` and ``authority`` are PEM; an unknown authority is empty."""
 
     chain_file: Path
     key_file: Path
@@ -36,7 +36,7 @@ class Tls:
 
 @dataclass(frozen=True, slots=True)
 class Protection:
-    """``first`` are the tokens that ``manager init`` made; ``guarded`` says whether tokens are asked for."""
+    """``first`` are the tokens of ``manager init``; ``guarded`` if tokens are required."""
 
     tls: Tls | None
     first: tuple[Credential, ...]
@@ -44,7 +44,9 @@ class Protection:
 
 
 def protection_of(settings: ManagerSettings) -> Protection:
-    """What the settings and the data folder give. Raises AccessError if it is too little for the addresses that are served."""
+    """Return the protection that settings and data folder provide. Raises AccessError if the served addresses need
+    more.
+    """
     folder = AccessFolder(settings.data_dir)
     tls = _tls(settings, folder)
     first = folder.first_credentials()
@@ -76,7 +78,7 @@ def _tls(settings: ManagerSettings, folder: AccessFolder) -> Tls | None:
             fingerprint_of(authority.decode("ascii"))
     except ssl.SSLError as error:
         raise AccessError(
-            f"{key_file} is not the key of the certificate {chain_file} ({error.reason}): pass two that belong together"
+            f"{key_file} is not the key of the certificate {chain_file} ({error.reason}): pass a matching pair"
         ) from error
     except OSError as error:
         raise AccessError(
@@ -87,8 +89,8 @@ def _tls(settings: ManagerSettings, folder: AccessFolder) -> Tls | None:
         raise AccessError(f"{chain_file} or {ca_file} holds no certificate (PEM): {error}") from error
     if left < timedelta(0):
         raise AccessError(
-            f"the certificate {chain_file} expired {-left.days} days ago: `embomatrix manager init` makes that of the data "
-            "folder anew"
+            f"the certificate {chain_file} expired {-left.days} days ago: `embomatrix manager init` renews the one of the "
+            "data folder"
         )
     if left < RENEWAL:
         logger.warning("the certificate %s expires in %d days: renew it", chain_file, left.days)

@@ -1,10 +1,10 @@
-"""Which roles may call which method: one table, and a test that it names every method of every service."""
+"""Roles that may call each method. A test checks that the table names every method."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.rpc.roles import AccessRole
+from embomatrix.rpc.wire.tokens import AccessRole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -15,7 +15,7 @@ _TRAINER: Final = frozenset({AccessRole.TRAINER})
 _VIEWER: Final = frozenset({AccessRole.VIEWER, AccessRole.TRAINER})
 _ADMIN: Final[frozenset[AccessRole]] = frozenset()
 
-# An admin may call every one of them, and is not repeated.
+# Admins may call every method and are not listed.
 _TABLE: Final[Mapping[str, Mapping[str, frozenset[AccessRole]]]] = {
     f"{_PACKAGE}.WorkerService": {
         "Register": frozenset({AccessRole.JOIN, AccessRole.WORKER}),
@@ -63,22 +63,22 @@ OPEN: Final = frozenset(
     {
         "/grpc.health.v1.Health/Check",
         "/grpc.health.v1.Health/Watch",
-        # Asked before a token may be shown: it tells whom the token would be shown to.
+        # Called before a client shows its token, to verify the manager.
         f"/{_PACKAGE}.RolloutService/GetCapabilities",
-        # A joining worker has no token for the header: the request carries the one that it joins with.
+        # A joining worker sends its join token in the request.
         f"/{_PACKAGE}.WorkerService/Register",
     }
 )
-"""Methods that may be called without a token; one that is shown is checked nevertheless."""
+"""Methods that need no token. A token that is sent is checked nevertheless."""
 
 
 def may_call(role: AccessRole, method: str) -> bool:
-    """Whether the role may call ``/package.Service/Method``; nobody may call what the table lacks."""
+    """Return True if the role may call ``/package.Service/Method``. Unlisted methods are forbidden."""
     roles = ROLES.get(method)
     return roles is not None and (role is AccessRole.ADMIN or role in roles)
 
 
 def who_may(method: str) -> str:
-    """The roles that may call it, in words."""
+    """Return the roles that may call the method, for messages."""
     others = sorted(ROLES.get(method, _ADMIN) - {AccessRole.ADMIN})
     return " or ".join([*others, AccessRole.ADMIN])

@@ -1,23 +1,23 @@
-"""`embomatrix manager`: serve a Simulation Manager, or ask one how it does."""
+"""`embomatrix manager`: serve a manager, or show its state."""
 
 from __future__ import annotations
 
-from pathlib import Path  # typer reads the annotation when the command runs
+from pathlib import Path  # typer evaluates the annotation
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
 from embomatrix.manager.commands.token import app as token_app
-from embomatrix.rpc.logs import LogFormat, hide, log_to_stderr
+from embomatrix.rpc.logs import LogFormat, hide, log_to_stderr, without_secrets
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from embomatrix.manager.settings import ManagerSettings
-    from embomatrix.rpc.roles import AccessRole
+    from embomatrix.rpc.wire.tokens import AccessRole
 
 app = typer.Typer(
-    help="Serve a Simulation Manager, or ask one how the cluster does.",
+    help="Serve a manager, or show the state of one.",
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -25,9 +25,7 @@ app = typer.Typer(
 
 app.add_typer(token_app, name="token")
 
-Token = Annotated[
-    str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="A token, or @FILE that holds it.", show_default=False)
-]
+Token = Annotated[str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="Token, or @FILE.", show_default=False)]
 Manager = Annotated[
     str,
     typer.Option("--manager", "--address", help="HOST:PORT of the manager.", envvar="EMBOMATRIX_MANAGER"),
@@ -35,55 +33,64 @@ Manager = Annotated[
 Ca = Annotated[
     Path | None,
     typer.Option(
-        envvar="EMBOMATRIX_CA", help="The ca.pem of a manager that serves by TLS.", show_default=False
+        envvar="EMBOMATRIX_CA", help="CA certificate (ca.pem) of a manager with TLS.", show_default=False
     ),
 ]
-DataDir = Annotated[Path | None, typer.Option(help="Folder of bundles and state.", show_default=False)]
+DataDir = Annotated[
+    Path | None, typer.Option(help="Folder of bundles and the state file.", show_default=False)
+]
 ShownDataset = Annotated[
-    Path | None, typer.Option(help="Folder of a dataset whose tasks the dashboard shows.", show_default=False)
+    Path | None, typer.Option(help="Dataset whose tasks the dashboard shows.", show_default=False)
 ]
 State = Annotated[
     str,
     typer.Option(help="memory: | sqlite:PATH | redis://HOST:PORT/DB. Default: a file in the data folder."),
 ]
 Advertise = Annotated[
-    str, typer.Option(help="HOST:PORT under which others reach this manager, if not where it serves.")
+    str,
+    typer.Option(
+        help="HOST:PORT under which others reach this manager, if different from the serving address."
+    ),
 ]
 SharedToken = Annotated[
     str,
     typer.Option(
         envvar="EMBOMATRIX_TOKEN",
-        help="One secret that is an admin's for everybody, beside the tokens of roles; or @FILE that holds it.",
+        help="Shared secret with the role of an admin, in addition to issued tokens; or @FILE.",
         show_default=False,
     ),
 ]
 TlsCert = Annotated[
-    Path | None, typer.Option(help="Certificate (PEM), else that of `init`.", show_default=False)
+    Path | None, typer.Option(help="Certificate chain (PEM). Default: the one of `init`.", show_default=False)
 ]
-TlsKey = Annotated[Path | None, typer.Option(help="Its private key.", show_default=False)]
-TlsCa = Annotated[Path | None, typer.Option(help="Certificate of who signed it.", show_default=False)]
+TlsKey = Annotated[
+    Path | None, typer.Option(help="Private key of the certificate (PEM).", show_default=False)
+]
+TlsCa = Annotated[
+    Path | None, typer.Option(help="Certificate of the signing authority (PEM).", show_default=False)
+]
 InsecureBind = Annotated[
-    bool, typer.Option("--insecure-bind", help="Serve outside this machine without TLS or tokens.")
+    bool, typer.Option("--insecure-bind", help="Serve beyond loopback without TLS or tokens.")
 ]
 Audit = Annotated[
     bool | None,
     typer.Option(
         "--audit/--no-audit",
-        help="Compare results of every run between workers; by default where others may join.",
+        help="Audit the results of all runs on other workers. Default: if other machines may join.",
         show_default=False,
     ),
 ]
 LogLines = Annotated[
-    LogFormat, typer.Option(help="Log lines for people, or as JSON.", envvar="EMBOMATRIX_LOG_FORMAT")
+    LogFormat, typer.Option(help="Format of log lines: human or json.", envvar="EMBOMATRIX_LOG_FORMAT")
 ]
 
 
 @app.command()
 def serve(
-    host: Annotated[str, typer.Option(help="Address for workers and trainers.")] = "127.0.0.1",
+    host: Annotated[str, typer.Option(help="Address of the gRPC services.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="gRPC port; 0 takes a free one.")] = 50070,
-    http_host: Annotated[str, typer.Option(help="Address of the status page.")] = "127.0.0.1",
-    http_port: Annotated[int, typer.Option(help="Port of the status page; 0 takes a free one.")] = 8070,
+    http_host: Annotated[str, typer.Option(help="Address of the dashboard.")] = "127.0.0.1",
+    http_port: Annotated[int, typer.Option(help="Port of the dashboard; 0 takes a free one.")] = 8070,
     state: State = "",
     advertise: Advertise = "",
     data_dir: DataDir = None,
@@ -122,10 +129,10 @@ def serve(
 
 @app.command()
 def status(manager: Manager = "127.0.0.1:50070", token: Token = "", ca: Ca = None) -> None:
-    """Show workers and runs of a manager."""
+    """Show the workers and runs of a manager."""
     import asyncio
 
-    from embomatrix.manager.services.status_table import show_status
+    from embomatrix.manager.commands.status_table import show_status
     from embomatrix.rpc.status import ClusterError
     from embomatrix.rpc.trust import read_ca
 
@@ -140,16 +147,18 @@ def init(
     data_dir: DataDir = None,
     san: Annotated[
         list[str] | None,
-        typer.Option(help="A further name or address that clients call this machine by.", show_default=False),
+        typer.Option(help="Additional name or address of this machine; may be repeated.", show_default=False),
     ] = None,
     hand_out: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="ROLE:FOLDER", help="Put ca.pem and a token of the role there too.", show_default=False
+            metavar="ROLE:FOLDER",
+            help="Also copy ca.pem and a token of the role to FOLDER.",
+            show_default=False,
         ),
     ] = None,
 ) -> None:
-    """Make certificates and first tokens for a manager that is served beyond this machine. What is there stays as it is."""
+    """Create certificates and first tokens for a manager that other machines reach. Existing files stay."""
     from embomatrix.manager.access.folder import FIRST_ROLES, AccessError, hand_out_to, prepare
 
     folder = _settings({} if data_dir is None else {"data_dir": data_dir}).data_dir
@@ -168,10 +177,10 @@ def init(
 
 
 def _parcel(text: str) -> tuple[AccessRole, Path]:
-    """What ``ROLE:FOLDER`` asks for."""
+    """Parse ``ROLE:FOLDER``."""
     from pathlib import Path
 
-    from embomatrix.rpc.roles import AccessRole
+    from embomatrix.rpc.wire.tokens import AccessRole
 
     name, _, target = text.partition(":")
     if name not in (AccessRole.WORKER, AccessRole.TRAINER, AccessRole.VIEWER, AccessRole.ADMIN) or not target:
@@ -203,7 +212,7 @@ def _settings(options: Mapping[str, object]) -> ManagerSettings:
             _refuse(expected)
         name = str(first["loc"][0])
         if name == "token":
-            # What was found stays untold: it may be nearly the secret.
+            # The value is not shown: it may be almost the secret.
             _refuse("--token: expected visible ASCII characters without spaces")
         _refuse(f"--{name.replace('_', '-')} {first['input']!r}: {expected[:1].lower()}{expected[1:]}")
 
@@ -212,16 +221,15 @@ def _serve(settings: ManagerSettings) -> None:
     import asyncio
 
     from embomatrix.manager.access.folder import AccessError
-    from embomatrix.manager.runtime.app import Endpoints, serve
-    from embomatrix.manager.runtime.listen import PortInUseError
+    from embomatrix.manager.services.app import Endpoints, serve
+    from embomatrix.manager.services.listen import PortInUseError
     from embomatrix.manager.store.protocol import StateError
-    from embomatrix.manager.store.url import without_password
 
     def on_ready(endpoints: Endpoints) -> None:
         kept = (
             "nowhere: it is lost on restart"
             if settings.state_url == "memory:"
-            else f"in {without_password(settings.state_url)}"
+            else f"in {without_secrets(settings.state_url)}"
         )
         print(
             f"manager serves at {endpoints.address}, status page {endpoints.status_url}, state {kept}",
@@ -229,7 +237,7 @@ def _serve(settings: ManagerSettings) -> None:
         )
 
     def on_standby(leader: str) -> None:
-        print(f"manager stands by: the one at {leader} leads", flush=True)
+        print(f"manager stands by: the manager at {leader} leads", flush=True)
 
     problem = ""
     try:
@@ -241,7 +249,7 @@ def _serve(settings: ManagerSettings) -> None:
 
 
 def _first_of(group: BaseExceptionGroup[BaseException]) -> BaseException:
-    """The first failure, however deep task groups have wrapped it."""
+    """Return the first failure in nested groups."""
     first = group.exceptions[0]
     return _first_of(first) if isinstance(first, BaseExceptionGroup) else first
 
@@ -254,6 +262,6 @@ def _log_to_stderr(level: str, log_format: LogFormat) -> None:
 
 
 def _refuse(sentence: str) -> NoReturn:
-    """One sentence and exit status 2: what a person can mend gets no traceback."""
+    """Print one sentence and exit with status 2, without a traceback."""
     typer.echo(f"embomatrix manager: {sentence}", err=True)
     raise typer.Exit(2)

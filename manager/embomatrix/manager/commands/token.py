@@ -1,8 +1,8 @@
-"""`embomatrix manager token`: hand out tokens of a role, look them over, take them back."""
+"""`embomatrix manager token`: issue, list and revoke tokens."""
 
 from __future__ import annotations
 
-from pathlib import Path  # typer reads the annotation when the command runs
+from pathlib import Path  # typer evaluates the annotation
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import typer
@@ -10,11 +10,11 @@ import typer
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine
 
-    from embomatrix.rpc.roles import TokenInfo
-    from embomatrix.rpc.token_client import TokenClient
+    from embomatrix.rpc.admin_client import AdminClient
+    from embomatrix.rpc.wire.tokens import TokenInfo
 
 app = typer.Typer(
-    help="Hand out tokens, look them over, take them back.",
+    help="Issue, list and revoke tokens.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
@@ -26,42 +26,40 @@ Manager = Annotated[
 ]
 Token = Annotated[
     str,
-    typer.Option(
-        envvar="EMBOMATRIX_TOKEN", help="An admin's token, or @FILE that holds it.", show_default=False
-    ),
+    typer.Option(envvar="EMBOMATRIX_TOKEN", help="Token of an admin, or @FILE.", show_default=False),
 ]
 Ca = Annotated[
     Path | None,
     typer.Option(
-        envvar="EMBOMATRIX_CA", help="The ca.pem of a manager that serves by TLS.", show_default=False
+        envvar="EMBOMATRIX_CA", help="CA certificate (ca.pem) of a manager with TLS.", show_default=False
     ),
 ]
 
 
 @app.command()
 def issue(
-    role: Annotated[str, typer.Option(help="join, worker, trainer, viewer or admin.")],
-    label: Annotated[str, typer.Option(help="For people: whom it is for.")] = "",
+    role: Annotated[str, typer.Option(help="Role: join, worker, trainer, viewer or admin.")],
+    label: Annotated[str, typer.Option(help="Label for lists, such as the owner's name.")] = "",
     hours: Annotated[
-        float, typer.Option(min=0.0, help="How long it is valid; 0: until revoked, or a day for one to join.")
+        float, typer.Option(min=0.0, help="Validity in hours; 0: until revoked, or one day for a join token.")
     ] = 0.0,
     manager: Manager = "127.0.0.1:50070",
     token: Token = "",
     ca: Ca = None,
 ) -> None:
-    """Hand out a token. It is told once: the manager keeps only its hash."""
-    from embomatrix.rpc.roles import AccessRole
+    """Issue a token. It is shown once: the manager keeps only a hash."""
     from embomatrix.rpc.trust import Invitation, fingerprint_of, read_ca
+    from embomatrix.rpc.wire.tokens import AccessRole
 
     if role not in list(AccessRole):
         _refuse(f"--role {role!r}: expected {', '.join(AccessRole)}")
     wanted = AccessRole(role)
     new, token_id = _ask(
-        manager, token, ca, lambda client: client.issue(wanted, valid_s=hours * 3600.0, label=label)
+        manager, token, ca, lambda client: client.issue_token(wanted, valid_s=hours * 3600.0, label=label)
     )
     if wanted is not AccessRole.JOIN:
         print(new)
-        typer.echo(f"id {token_id}; it is not told again", err=True)
+        typer.echo(f"id {token_id}; the token is not shown again", err=True)
         return
     pem = read_ca(ca).decode("ascii")
     print(Invitation(manager, new, fingerprint_of(pem) if pem else ""))
@@ -70,25 +68,25 @@ def issue(
 
 @app.command(name="list")
 def list_(manager: Manager = "127.0.0.1:50070", token: Token = "", ca: Ca = None) -> None:
-    """Show the tokens that are valid, by id."""
+    """List the valid tokens by id."""
     from rich.console import Console
     from rich.table import Table
 
     table = Table("id", "role", "label", "valid for", "worker")
-    for info in _ask(manager, token, ca, lambda client: client.listed()):
+    for info in _ask(manager, token, ca, lambda client: client.list_tokens()):
         table.add_row(info.token_id, info.role, info.label, _left(info), info.worker_id)
     Console().print(table)
 
 
 @app.command()
 def revoke(
-    token_id: Annotated[str, typer.Argument(help="The id that `list` shows.")],
+    token_id: Annotated[str, typer.Argument(help="Token id, as `list` shows it.")],
     manager: Manager = "127.0.0.1:50070",
     token: Token = "",
     ca: Ca = None,
 ) -> None:
-    """Make a token void. Sessions of workers that it opened end at once."""
-    _ask(manager, token, ca, lambda client: client.revoke(token_id))
+    """Revoke a token. Worker sessions that it opened end at once."""
+    _ask(manager, token, ca, lambda client: client.revoke_token(token_id))
     print(f"revoked {token_id}")
 
 
@@ -96,16 +94,16 @@ def _left(info: TokenInfo) -> str:
     return f"{info.left_s / 3600:.1f} h" if info.left_s else "until revoked"
 
 
-def _ask(manager: str, token: str, ca: Path | None, question: Callable[[TokenClient], Awaitable[T]]) -> T:
-    """One call to the manager; whatever is wrong ends as a sentence."""
+def _ask(manager: str, token: str, ca: Path | None, question: Callable[[AdminClient], Awaitable[T]]) -> T:
+    """Call the manager; errors end the command with one sentence."""
     import asyncio
 
+    from embomatrix.rpc.admin_client import AdminClient
     from embomatrix.rpc.status import ClusterError
-    from embomatrix.rpc.token_client import TokenClient
     from embomatrix.rpc.trust import read_ca, read_token
 
     async def ask() -> T:
-        async with TokenClient(manager, read_token(token), ca=read_ca(ca)) as client:
+        async with AdminClient(manager, read_token(token), ca=read_ca(ca)) as client:
             return await question(client)
 
     call: Coroutine[Any, Any, T] = ask()

@@ -9,7 +9,7 @@ from embomatrix.reward.settings import PAPER, RewardSettings
 
 if TYPE_CHECKING:
     from embomatrix.manager.control.events import Event
-    from embomatrix.rpc.leases import LeaseOrigin, LeaseRef
+    from embomatrix.rpc.wire.leases import LeaseOrigin, LeaseRef
     from embomatrix.rpc.wire.values import Rollout, RolloutResult
 
 

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from embomatrix.manager.control.reputation import Reputation
-    from embomatrix.rpc.leases import LeaseClaim, LeaseProgress, LeaseRef
+    from embomatrix.rpc.wire.leases import LeaseClaim, LeaseProgress, LeaseRef
     from embomatrix.rpc.wire.values import (
         Batch,
         Completed,

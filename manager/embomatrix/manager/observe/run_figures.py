@@ -1,4 +1,4 @@
-"""What a run comes to, kept in bounded memory while it goes on: phases, workers, outcomes by time, latest failures."""
+"""Figures of an open run in bounded memory: durations by phase, work by worker, outcomes over time, latest failures."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.observe.histogram import Histogram
-from embomatrix.rpc.run_log import PhaseSummary, RolloutPhase, RunEvent, RunSeries, RunWorker
+from embomatrix.manager.histogram import Histogram
+from embomatrix.rpc.wire.run_log import PhaseSummary, RolloutPhase, RunEvent, RunSeries, RunWorker
 
 if TYPE_CHECKING:
     from embomatrix.rpc.wire.values import Timings
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 FAILURES_KEPT: Final = 200
 WORKERS_KEPT: Final = 4096
 OTHERS: Final = "(others)"
-"""Stands for workers beyond those that are kept."""
+"""Name that stands for all workers beyond ``WORKERS_KEPT``."""
 STEPS: Final = 600
 FIRST_STEP_S: Final = 0.25
 
 
 @dataclass(slots=True)
 class WorkerFigures:
-    """What one worker did for the run."""
+    """Work of one worker for the run."""
 
     completed: int = 0
     failed: int = 0
@@ -31,7 +31,7 @@ class WorkerFigures:
 
 
 class Series:
-    """Outcomes by time. When it is full, neighbouring steps are put together, and each is twice as long from then on."""
+    """Outcomes over time. When it is full, adjacent steps are merged and the step length doubles."""
 
     __slots__ = ("_completed", "_failed", "_first_s", "_step_s")
 
@@ -42,7 +42,7 @@ class Series:
         self._failed: list[int] = []
 
     def count(self, now_s: float, *, completed: int = 0, failed: int = 0) -> None:
-        """These many rollouts reached their outcome now."""
+        """Count outcomes at this time."""
         step = int((now_s - self._first_s) / self._step_s)
         while step >= STEPS:
             self._step_s *= 2
@@ -60,7 +60,7 @@ class Series:
 
 
 class RunFigures:
-    """Of one run. ``opened_s`` and every ``now_s`` are of one monotonic clock."""
+    """Figures of one run. ``opened_s`` and every ``now_s`` are on one monotonic clock."""
 
     __slots__ = ("failures", "phases", "series", "workers")
 
@@ -71,7 +71,7 @@ class RunFigures:
         self.failures: deque[RunEvent] = deque(maxlen=FAILURES_KEPT)
 
     def completed(self, timings: Timings, now_s: float) -> None:
-        """A rollout has a result; its delivery is timed later."""
+        """Count a result; its delivery is timed later."""
         phases = self.phases
         phases[RolloutPhase.QUEUE].observe(timings.queued_s)
         phases[RolloutPhase.LEASE].observe(timings.lease_s)
@@ -80,7 +80,7 @@ class RunFigures:
         self.series.count(now_s, completed=1)
 
     def worker(self, worker_id: str) -> WorkerFigures:
-        """The figures of a worker, to be changed."""
+        """Return the mutable figures of a worker."""
         found = self.workers.get(worker_id)
         if found is None:
             name = worker_id if len(self.workers) < WORKERS_KEPT else OTHERS
@@ -88,7 +88,7 @@ class RunFigures:
         return found
 
     def worker_rows(self) -> tuple[RunWorker, ...]:
-        """By name."""
+        """Return the work of each worker, sorted by name."""
         return tuple(
             RunWorker(name, found.completed, found.failed, found.execute_s, found.load_s)
             for name, found in sorted(self.workers.items())

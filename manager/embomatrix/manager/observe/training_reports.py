@@ -1,6 +1,6 @@
-"""How training goes, as trainers report it: curves and sampled plans of the latest runs, within bounds, for people who watch.
+"""Training reports of the latest runs: learning curves and sampled plans, in bounded memory.
 
-Nothing is decided by it and nothing of it is stored: after a restart the curves go on from there.
+They are not stored: after a restart the curves continue from the next report.
 """
 
 from __future__ import annotations
@@ -9,23 +9,23 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.rpc.status import NotFoundError
-from embomatrix.rpc.training import FIGURES, PLANS, SampledPlan
+from embomatrix.rpc.wire.training import FIGURES, PLANS, SampledPlan
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from embomatrix.rpc.training import TrainingReport
+    from embomatrix.rpc.wire.training import TrainingReport
 
 RUNS_KEPT: Final = 16
 PHASES_KEPT: Final = 4
-"""Of one run: imitation, GRPO, and evaluations before and after it."""
+"""Phases of one run at most: imitation, GRPO, and evaluations before and after it."""
 STEPS_KEPT: Final = 512
-"""Of one phase. Beyond it every second of those that are there goes, so that a long run keeps its whole curve."""
+"""Steps of one phase at most. Beyond it every second step is dropped, so that a long run keeps its whole curve."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingView:
-    """A run that reports. ``revision`` grows with every report; ``reported_s`` is seconds since the epoch."""
+    """Run with training reports. ``revision`` grows with every report; ``reported_s`` is seconds since the epoch."""
 
     run_id: str
     name: str
@@ -37,7 +37,7 @@ class TrainingView:
 
 @dataclass(frozen=True, slots=True)
 class Curves:
-    """Figures of a phase by name, each as long as ``steps``; None where a step did not tell it."""
+    """Figures of a phase by name, each as long as ``steps``; None for steps without the figure."""
 
     phase: str
     steps: list[int]
@@ -46,7 +46,7 @@ class Curves:
 
 @dataclass(frozen=True, slots=True)
 class TrainingDetail:
-    """Everything that is kept of a run's training. ``plans`` are of step ``plans_step``."""
+    """All reports of a run. ``plans`` belong to step ``plans_step``."""
 
     run: TrainingView
     phases: list[Curves]
@@ -67,13 +67,13 @@ class _Record:
 
 
 class TrainingBook:
-    """Runs by id, the one that reported last at the end; the first makes room for a new one beyond ``RUNS_KEPT``."""
+    """Runs by id, latest report last. Beyond ``RUNS_KEPT`` the first run is dropped."""
 
     def __init__(self) -> None:
         self._runs: dict[str, _Record] = {}
 
     def note(self, run_id: str, name: str, report: TrainingReport, *, at_s: float) -> None:
-        """Take a report in. A step that was told already gets these figures too; a lower one takes back what lies beyond it."""
+        """Add a report. A repeated step is updated; a lower step discards all later ones."""
         record = self._runs.pop(run_id, None) or _Record(name)
         self._runs[run_id] = record
         while len(self._runs) > RUNS_KEPT:
@@ -87,11 +87,11 @@ class TrainingBook:
         record.revision += 1
 
     def views(self) -> list[TrainingView]:
-        """The run that reported last first."""
+        """Return the runs, latest report first."""
         return [_view(run_id, record) for run_id, record in reversed(self._runs.items())]
 
     def detail(self, run_id: str) -> TrainingDetail:
-        """Raises ``NotFoundError`` for a run that did not report, or made room for others."""
+        """Return all reports of a run. Raises NotFoundError."""
         record = self._runs.get(run_id)
         if record is None:
             raise NotFoundError(
@@ -120,7 +120,7 @@ def _add(curves: Curves, step: int, figures: Mapping[str, float]) -> None:
             curves.figures[name][-1] = value
     if len(curves.steps) > STEPS_KEPT:
         for row in _rows(curves):
-            # The newest stays.
+            # The newest step stays.
             del row[-2::-2]
 
 

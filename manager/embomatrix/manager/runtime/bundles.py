@@ -1,4 +1,4 @@
-"""Bundles on disk, each under the digest of its content; what does not fit its digest never gets a name."""
+"""Bundles on disk, each named after the digest of its content."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ logger = logging.getLogger(__name__)
 
 PREFIX: Final = "sha256:"
 INCOMING: Final = "incoming-"
-"""What the names of files begin with that are not whole yet."""
+"""Prefix of the names of incomplete files."""
 _DIGEST: Final = re.compile(r"sha256:[0-9a-f]{64}")
 
 
 class BundleStore:
-    """A folder of bundles, each within the limits that workers keep to; ``total_bytes`` bounds the folder.
+    """Folder of bundles, bounded by ``total_bytes``.
 
-    When the folder is full, bundles go that nobody needs and that were not used for ``keep_s`` seconds, the longest unused
-    first. A file's time of change is when it was last used; ``clock`` gives seconds of the same clock.
+    When it is full, bundles that no run needs and that were unused for ``keep_s`` seconds are deleted, least recently
+    used first. The modification time of a file is its last use; ``clock`` returns seconds of the same clock.
     """
 
     def __init__(
@@ -56,11 +56,11 @@ class BundleStore:
                 left_over.unlink(missing_ok=True)
 
     def keep(self, needed: Callable[[], AbstractSet[str]]) -> None:
-        """Never delete those that this returns, by digest."""
+        """Protect the bundles whose digests this function returns."""
         self._needed = needed
 
     def has(self, digest: str) -> bool:
-        """Whether it is here; it counts as used."""
+        """Return True if the bundle is present. It then counts as used."""
         now_s = self._clock()
         try:
             os.utime(self._path(digest), (now_s, now_s))
@@ -69,11 +69,11 @@ class BundleStore:
         return True
 
     def missing(self, digests: list[str]) -> list[str]:
-        """Those that were never put here, in the same order."""
+        """Return the digests of bundles that are absent, in the same order."""
         return [digest for digest in dict.fromkeys(digests) if not self.has(digest)]
 
     async def lacking(self, digests: list[str]) -> list[str]:
-        """Those that are missing or damaged, to be put again. Damaged files are removed: no worker could use them."""
+        """Return the digests of bundles that are absent or damaged. Damaged files are deleted."""
 
         def check() -> list[str]:
             return [digest for digest in dict.fromkeys(digests) if not self._is_sound(digest)]
@@ -81,9 +81,9 @@ class BundleStore:
         return await asyncio.to_thread(check)
 
     async def put(self, digest: str, chunks: AsyncIterator[bytes]) -> None:
-        """Take a bundle in. It appears under its name only when all of it is there and its digest is right.
+        """Store a bundle. It gets its name only when it is complete and its digest is right.
 
-        Raises InvalidRequestError at the first piece that no worker would take.
+        Raises InvalidRequestError at the first chunk that a worker would reject.
         """
         path = self._path(digest)
         try:
@@ -107,7 +107,7 @@ class BundleStore:
             found = PREFIX + sha.hexdigest()
             if found != digest:
                 raise InvalidRequestError(
-                    f"the bundle's content has digest {found}, expected {digest}: it was damaged on its way, or misnamed"
+                    f"the bundle's content has digest {found}, expected {digest}: it was damaged in transit, or misnamed"
                 )
             inflation.finish()
             await asyncio.to_thread(self._make_room, size, self._needed())
@@ -118,10 +118,10 @@ class BundleStore:
                 os.unlink(name)
 
     async def get(self, digest: str) -> AsyncIterator[bytes]:
-        """The bundle in chunks; ``NotFoundError`` when it was never put."""
+        """Yield the bundle in chunks. Raises NotFoundError for an absent bundle."""
         path = self._path(digest)
         if not self.has(digest):
-            raise NotFoundError(f"the manager has no bundle {digest}: put it first")
+            raise NotFoundError(f"the manager has no bundle {digest}: upload it first")
         with path.open("rb") as file:
             while chunk := await asyncio.to_thread(file.read, CHUNK_BYTES):
                 yield chunk
@@ -140,7 +140,7 @@ class BundleStore:
         return found == digest
 
     def _make_room(self, size: int, needed: AbstractSet[str]) -> None:
-        """Have the folder, which holds the incoming bundle already, keep its bound."""
+        """Delete bundles until the folder, with the incoming bundle of ``size`` bytes, is within its bound."""
         files = {entry.name: entry.stat() for entry in os.scandir(self._folder) if entry.is_file()}
         used = sum(found.st_size for found in files.values())
         kept = {self._path(digest).name for digest in needed}
@@ -156,7 +156,7 @@ class BundleStore:
         if used > self._total_bytes:
             raise OverloadedError(
                 f"the bundle folder {self._folder} holds {used} of {self._total_bytes} bytes and has no room for {size} "
-                "more; all others are needed or were used lately: try again later, raise bundle_total_mb, or close runs"
+                "more; all others are needed or were used recently: try again later, raise bundle_total_mb, or close runs"
             )
 
     def _path(self, digest: str) -> Path:
@@ -168,7 +168,7 @@ class BundleStore:
 
 
 def _check_and_write(inflation: Inflation, chunk: bytes, file: IO[bytes]) -> None:
-    """Looks into the chunk before it reaches the disk; what it holds is dropped, piece by piece."""
+    """Check the chunk's decompressed size, then write it. The decompressed data is discarded."""
     for _ in inflation.feed(chunk):
         pass
     file.write(chunk)

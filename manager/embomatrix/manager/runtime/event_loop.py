@@ -1,6 +1,6 @@
-"""The one owner of the state machines: feeds them events, carries out their commands, and keeps the clock going.
+"""Owner of the state machines: feeds them events, executes their commands, and drives the clock.
 
-Everything here runs on one event loop and never awaits between an event and its commands, so no lock is needed.
+Everything runs on one event loop and never awaits between an event and its commands, so it needs no lock.
 """
 
 from __future__ import annotations
@@ -23,54 +23,53 @@ from embomatrix.manager.control.commands import (
     SetDesired,
 )
 from embomatrix.manager.control.events import DispatchPaused, DispatchResumed
-from embomatrix.manager.observe.chronicle import Chronicle
-from embomatrix.manager.observe.effort import Effort
-from embomatrix.manager.observe.history import RunHistory
-from embomatrix.manager.observe.meter import Meter
+from embomatrix.manager.observe.event_log import RunEventLog
+from embomatrix.manager.observe.metrics import ManagerLoad, Meter
+from embomatrix.manager.observe.run_archive import RunHistory
 from embomatrix.manager.observe.training_reports import TrainingBook
-from embomatrix.manager.runtime.delivery import ResultDelivery
 from embomatrix.manager.runtime.garbage import Collector
 from embomatrix.manager.runtime.intake import TICK_S, Heartbeat, Intake
-from embomatrix.manager.runtime.keeper import Keeper
-from embomatrix.manager.runtime.links import WorkerLink
 from embomatrix.manager.runtime.registry import WorkerStanding
-from embomatrix.manager.runtime.results import ResultLogs
+from embomatrix.manager.runtime.results import ResultDelivery, ResultLogs
 from embomatrix.manager.runtime.runs import RunLimits, Runs
-from embomatrix.manager.store.timed import timed_store
-from embomatrix.manager.web.views import UNAUDITED
+from embomatrix.manager.runtime.state_journal import StateJournal
+from embomatrix.manager.runtime.worker_link import WorkerLink
+from embomatrix.manager.store.opening import timed_store
 from embomatrix.rpc.status import SupersededError, UnavailableError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from embomatrix.manager.control.cluster_state import ClusterState
-    from embomatrix.manager.observe.archive import RunArchive
+    from embomatrix.manager.observe.run_archive import RunArchive
     from embomatrix.manager.runtime.bundles import BundleStore
-    from embomatrix.manager.runtime.links import WorkerCommand
     from embomatrix.manager.runtime.registry import Registry, WorkerSession
+    from embomatrix.manager.runtime.worker_link import WorkerCommand
     from embomatrix.manager.store.protocol import StateStore
-    from embomatrix.rpc.leases import LeaseResult, WorkerState
     from embomatrix.rpc.status import ClusterError
+    from embomatrix.rpc.wire.leases import LeaseResult, WorkerState
     from embomatrix.rpc.wire.values import Resources
 
 logger = logging.getLogger(__name__)
 
+UNAUDITED: Final = "results are not audited: auditing needs a second worker"
 CLEANUP_S: Final = 5.0
 STOOD_STILL_S: Final = 1.0
-"""A tick that comes so late says that nobody was heard meanwhile."""
+"""A tick that is this late means that no worker was heard meanwhile."""
 LET_GO_S: Final = 30.0
-"""A manager that is cut off from its store for so long has its workers turn to another. As long as a lease lives."""
+"""A manager without its store for this long disconnects its workers, which then turn to another manager. Equals the
+life of a lease."""
 STORE_AWAY: Final = (
-    "the manager is cut off from its store, and another one may lead: try again, or try the others"
+    "the manager cannot reach its store, and another one may lead: try again, or try the other managers"
 )
 _SUSPENSION: Final = {True: ("suspended", "is away"), False: ("goes on", "is back")}
 
 
 class ManagerRuntime:
-    """What the services call. ``start`` before the first call, ``serve`` for as long as it shall work.
+    """Entry point of the services. Call ``start`` first, then run ``serve``.
 
-    Results are kept for ``results_ttl_s`` after their batch ended, and at most ``results_kept`` of them. ``lapsed_s`` tells
-    for how long another manager may have had the lead, and ``unrenewed`` why: nothing is dispatched meanwhile.
+    Results are kept for ``results_ttl_s`` after their batch ended, ``results_kept`` of them at most. ``lapsed_s``
+    returns how long another manager may have led, and ``unrenewed`` why; nothing is dispatched meanwhile.
     """
 
     def __init__(
@@ -94,16 +93,16 @@ class ManagerRuntime:
         bundles.keep(cluster.needed_scenes)
         self.meter = Meter()
         self.training = TrainingBook()
-        self.effort = Effort()
-        store = timed_store(store, self.effort.operated)
+        self.load = ManagerLoad()
+        store = timed_store(store, self.load.operated)
         self.started_s = time.monotonic()
         self._collector = Collector(self.started_s)
-        self.chronicle = Chronicle(epoch_s=time.time() - self.started_s)
-        self.history = RunHistory(self.chronicle, archive, cluster)
+        self.event_log = RunEventLog(epoch_s=time.time() - self.started_s)
+        self.history = RunHistory(self.event_log, archive, cluster)
         self.runs = Runs(cluster, store, bundles, logs, self._carry_out, limits or RunLimits(), self.history)
         self._intake = Intake(cluster, registry)
-        self._keeper = Keeper(store, registry, cluster)
-        self._delivery = ResultDelivery(store, logs, self._say, self.chronicle.in_log)
+        self._journal = StateJournal(store, registry, cluster)
+        self._delivery = ResultDelivery(store, logs, self._say, self.event_log.in_log)
         self._links: dict[str, WorkerLink] = {}
         self._lapsed_s = lapsed_s
         self._unrenewed = unrenewed
@@ -112,18 +111,18 @@ class ManagerRuntime:
         self._said_unaudited = False
 
     async def start(self) -> None:
-        """Take the state up where a former manager left it."""
-        self._carry_out(self._intake.feed(await self._keeper.reputes(), now_s=time.monotonic()))
-        self._paused = await self._keeper.paused()
+        """Restore the state of a former manager."""
+        self._carry_out(self._intake.feed(await self._journal.reputes(), now_s=time.monotonic()))
+        self._paused = await self._journal.paused()
         self._dispatch_or_not()
         await self.runs.restore()
 
     async def serve(self) -> None:
-        """Keep time and write results until cancelled. Ends with ``FencedError`` when another manager took over."""
+        """Drive the clock and write results until cancelled. Raises FencedError after another manager took over."""
         async with asyncio.TaskGroup() as group:
             group.create_task(self._keep_time())
             group.create_task(self._clean_up())
-            group.create_task(self._keeper.serve())
+            group.create_task(self._journal.serve())
             group.create_task(self._delivery.serve())
             group.create_task(self.runs.serve())
 
@@ -135,21 +134,23 @@ class ManagerRuntime:
         *,
         credential_id: str = "",
     ) -> tuple[WorkerSession, float]:
-        """Open a session for a worker; returns it and the heartbeat's interval in seconds once the worker is noted."""
+        """Open a session for a worker. Return it and the heartbeat interval in seconds after the worker has been
+        journaled.
+        """
         if self._lapsed_s() > LET_GO_S:
             raise UnavailableError(STORE_AWAY)
         session, commands = self._intake.register(worker_id, boot_id, resources, now_s=time.monotonic())
         session.credential_id = credential_id
         self._close_link(worker_id)
-        self.chronicle.fleet.joined(worker_id, resources, now_s=time.monotonic())
+        self.event_log.fleet.joined(worker_id, resources, now_s=time.monotonic())
         self._carry_out(commands)
         logger.info("worker registered worker=%s slots=%d", worker_id, resources.slots)
-        await self._keeper.noted(worker_id)
+        await self._journal.noted(worker_id)
         return session, self.registry.interval_s
 
     @contextlib.contextmanager
     def attached(self, session: WorkerSession) -> Iterator[WorkerLink]:
-        """The worker's stream is open for as long as this is held."""
+        """Hold the worker's stream open."""
         self._close_link(session.worker_id)
         link = self._links[session.worker_id] = WorkerLink(session)
         self.registry.attach(session, now_s=time.monotonic())
@@ -166,21 +167,23 @@ class ManagerRuntime:
     def take_report(
         self, link: WorkerLink, state: WorkerState | None, results: Sequence[LeaseResult], *, resync: bool
     ) -> None:
-        """What a worker says on its stream, or a part of it; ``deliver`` follows the last. ``resync`` for the first of all."""
+        """Process a worker's message, or a slice of it; ``deliver`` follows the last slice. ``resync`` marks the
+        first message.
+        """
         now_s, worker_id = time.monotonic(), link.session.worker_id
         ended = (*state.finished, *results) if state is not None else results
-        self.chronicle.reported(worker_id, ended, self.cluster.dispatcher.live_leases, now_s=now_s)
+        self.event_log.reported(worker_id, ended, self.cluster.dispatcher.live_leases, now_s=now_s)
         commands = self._intake.report(link.session, state, results, resync=resync, now_s=now_s)
         if state is not None:
-            self.chronicle.fleet.residents(worker_id, state.residents, now_s=now_s)
+            self.event_log.fleet.residents(worker_id, state.residents, now_s=now_s)
         self._carry_out(commands, more=True)
 
     def deliver(self) -> None:
-        """A worker's message is heard to its end: results go on their way, in one transaction for all that it brought."""
+        """Write the results of a worker's message in one transaction, after its last slice."""
         self._delivery.hurry()
 
     def take_heartbeat(self, session_id: str, epoch: int, beat: Heartbeat) -> float:
-        """Renew the leases that the worker names; returns the seconds until the next heartbeat."""
+        """Renew the leases that the worker names. Return the seconds until the next heartbeat."""
         interval_s, commands = self._intake.heartbeat(session_id, epoch, beat, now_s=time.monotonic())
         self._carry_out(commands)
         return interval_s
@@ -192,7 +195,7 @@ class ManagerRuntime:
         error: ClusterError,
         standing: WorkerStanding = WorkerStanding.LOST,
     ) -> None:
-        """The session is over at once: its stream ends with the error, and what it held goes to others."""
+        """End the session at once: its stream ends with the error and its leases are re-dispatched."""
         events = self.registry.end(session, reason, standing)
         if events:
             logger.info("session ended worker=%s: %s", session.worker_id, reason)
@@ -200,44 +203,44 @@ class ManagerRuntime:
             self._close_link(session.worker_id, error)
 
     def drain_worker(self, worker_id: str) -> None:
-        """The worker gets nothing new, and leaves when it has finished what it holds."""
+        """Give the worker no new leases, and have it leave after its last one."""
         self._carry_out(self._intake.feed(*self.registry.drain(worker_id), now_s=time.monotonic()))
         if worker_id in self._links:
             self._links[worker_id].drain()
 
     def resume_worker(self, worker_id: str) -> None:
-        """Take a drain back; a worker that has left stays away."""
+        """Cancel the drain of a worker that has not left."""
         self._carry_out(self._intake.feed(*self.registry.resume(worker_id), now_s=time.monotonic()))
         if worker_id in self._links:
             self._links[worker_id].resume()
-        self._keeper.hurry()
+        self._journal.hurry()
 
     @property
     def paused(self) -> bool:
-        """Whether an operator stopped dispatch."""
+        """True if an operator paused dispatch."""
         return self._paused
 
     @property
     def store_problem(self) -> str:
-        """Why nothing can be written down, while that is so."""
+        """Problem of the state store; empty while it can be written."""
         if self._suspended and not self._delivery.problem:
             return self._unrenewed() or "the state store is away"
         return self._delivery.problem
 
     async def pause_dispatch(self) -> None:
-        """No new leases are given, also by the managers that come after this one; what runs goes on.
+        """Stop giving leases, also under later managers. Live leases continue.
 
-        UnavailableError where those could not be told.
+        Raises UnavailableError if later managers could not be told.
         """
         self._paused = True
         self._dispatch_or_not()
-        await self._keeper.note_pause(True)
+        await self._journal.note_pause(True)
 
     async def resume_dispatch(self) -> None:
-        """Leases are given again, unless the store is away. UnavailableError as above."""
+        """Give leases again, unless the store is away. Raises UnavailableError like ``pause_dispatch``."""
         self._paused = False
         self._dispatch_or_not()
-        await self._keeper.note_pause(False)
+        await self._journal.note_pause(False)
 
     def _dispatch_or_not(self) -> None:
         event = DispatchPaused() if self._paused or self._suspended else DispatchResumed()
@@ -252,23 +255,25 @@ class ManagerRuntime:
                 case GiveLease():
                     self._say(command)
                     if not command.audit:
-                        self.chronicle.leased(command, now_s=now_s)
+                        self.event_log.leased(command, now_s=now_s)
                 case AcknowledgeLease():
                     self._delivery.put_acknowledgement(command)
                 case DeliverResult():
                     self.meter.observe(command.run_id, command.result, now_s)
-                    self.chronicle.delivered(command, now_s=now_s)
+                    self.event_log.delivered(command, now_s=now_s)
                     self._delivery.put(command)
                 case FinishBatch():
                     self._delivery.put(command)
                 case QuarantineWorker():
                     logger.error("worker quarantined worker=%s: %s", command.worker_id, command.reason)
-                    self._keeper.hurry()
+                    self._journal.hurry()
         if not more:
             self._delivery.hurry()
 
     def _say(self, command: WorkerCommand) -> None:
-        """Without a stream the command is lost; the worker's next full state shows that, and it is given again."""
+        """Send a command. Without a stream the command is lost; the worker's next full state shows that, and it is
+        repeated.
+        """
         link = self._links.get(command.worker_id)
         if link is not None:
             link.put(command)
@@ -280,7 +285,7 @@ class ManagerRuntime:
             link.close(reason or SupersededError(taken))
 
     def _watch_the_lead(self) -> None:
-        """Dispatch nothing while another manager may; after some time leave the workers to it."""
+        """Suspend dispatch while another manager may lead, and disconnect the workers after ``LET_GO_S``."""
         lapsed_s = self._lapsed_s()
         if (lapsed_s > 0.0) != self._suspended:
             self._suspended = not self._suspended
@@ -301,10 +306,10 @@ class ManagerRuntime:
             due_s = time.monotonic() + TICK_S
             await asyncio.sleep(TICK_S)
             late_s = time.monotonic() - due_s
-            self.effort.lag.observe(late_s)
+            self.load.lag.observe(late_s)
             if late_s >= STOOD_STILL_S:
                 logger.warning(
-                    "the manager stood still for %.1f s: is its machine paused, or short of memory?", late_s
+                    "the manager did not run for %.1f s: is its machine paused, or short of memory?", late_s
                 )
                 self.registry.stood_still(late_s, now_s=time.monotonic())
             self._watch_the_lead()
@@ -312,13 +317,13 @@ class ManagerRuntime:
             lost, commands = self._intake.tick(now_s=time.monotonic())
             for event in lost:
                 logger.warning("worker lost worker=%s: %s", event.worker_id, event.reason)
-                self.chronicle.fleet.lost(event.worker_id, event.reason, now_s=time.monotonic())
+                self.event_log.fleet.lost(event.worker_id, event.reason, now_s=time.monotonic())
                 self._close_link(event.worker_id)
             self._carry_out(commands)
 
     async def _clean_up(self) -> None:
         while True:
-            self.effort.sample(time.monotonic(), time.process_time(), self.chronicle.execute_s)
+            self.load.sample(time.monotonic(), time.process_time(), self.event_log.execute_s)
             await asyncio.sleep(CLEANUP_S)
             await self._delivery.give_up_outdated(time.monotonic())
             await self.runs.close_idle(time.monotonic())

@@ -1,6 +1,6 @@
-"""What workers say and what the clock brings, told to the registry and the state machines: commands come back.
+"""Input of worker messages and clock ticks: passes them to registry and state machines, and returns commands.
 
-The way in without the wire: the service calls it with messages and its own clock, the simulator with simulated ones.
+Free of I/O. The services call it with messages and the real clock, the simulator with simulated ones.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ if TYPE_CHECKING:
     from embomatrix.manager.control.cluster_state import ClusterState
     from embomatrix.manager.control.commands import Command
     from embomatrix.manager.runtime.registry import Registry, WorkerSession
-    from embomatrix.rpc.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
+    from embomatrix.rpc.wire.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
     from embomatrix.rpc.wire.values import Resources
 
 
 TICK_S: Final = 0.1
-"""The state machines are told of the time this often."""
+"""Interval of clock ticks to the state machines."""
 
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """What a worker says between its reports: the leases that it holds, how far those are that run, and how busy it is."""
+    """Heartbeat of a worker: the leases it holds, the progress of the running ones, and its load."""
 
     held: tuple[LeaseRef, ...]
     load: float = 0.0
@@ -42,14 +42,14 @@ class Heartbeat:
 
 
 class Intake:
-    """No I/O. ``now_s`` is seconds of one monotonic clock; calls under a session that ended raise ``SupersededError``."""
+    """Free of I/O. ``now_s`` is seconds of one monotonic clock. Calls of an ended session raise SupersededError."""
 
     def __init__(self, cluster: ClusterState, registry: Registry) -> None:
         self.cluster = cluster
         self.registry = registry
 
     def feed(self, *events: Event, now_s: float) -> list[Command]:
-        """Tell the state machines of these, in order; what became free is given away after the last of them."""
+        """Pass events to the state machines in order. Free slots are leased after the last event."""
         return self.cluster.handle(*events, now_s=now_s)
 
     def register(
@@ -73,7 +73,7 @@ class Intake:
         resync: bool,
         now_s: float,
     ) -> list[Command]:
-        """What a worker says on its stream; ``resync`` for the first message of a stream."""
+        """Process a worker's message; ``resync`` marks the first message of a stream."""
         session = self.registry.find(session.session_id, session.epoch)
         finished = (*(state.finished if state is not None else ()), *results)
         events: list[Event] = self.registry.heard(session, now_s=now_s)
@@ -84,14 +84,14 @@ class Intake:
             reported = WorkerReported(
                 session.worker_id, state.residents, held, state.draining, resync, state.claims, state.paused
             )
-            # A first state comes first: what is leased on the strength of its results was not there when it was written.
+            # The first state precedes its results: leases given on the strength of those results were not in it yet.
             events.insert(0 if resync else len(events), reported)
         return self.feed(*events, now_s=now_s)
 
     def heartbeat(
         self, session_id: str, epoch: int, beat: Heartbeat, *, now_s: float
     ) -> tuple[float, list[Command]]:
-        """Renew the leases that the worker names; returns the seconds until the next heartbeat as well."""
+        """Renew the leases that the worker names. Return the seconds until the next heartbeat, and commands."""
         session = self.registry.find(session_id, epoch)
         session.load, session.memory_used_mb = beat.load, beat.memory_mb
         events = self.registry.heard(session, now_s=now_s)
@@ -100,7 +100,7 @@ class Intake:
         return self.registry.interval_s, commands
 
     def tick(self, *, now_s: float) -> tuple[list[WorkerLost], list[Command]]:
-        """Time has passed: who is lost, and what else is due."""
+        """Process the passage of time. Return lost workers and commands."""
         events = self.registry.tick(now_s=now_s)
         lost = [event for event in events if isinstance(event, WorkerLost)]
         return lost, self.feed(*events, Tick(), now_s=now_s)

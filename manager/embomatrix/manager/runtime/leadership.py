@@ -1,16 +1,19 @@
-"""Who leads: of several managers on one store one dispatches, the others stand by until its lead lapses."""
+"""Leader election: of several managers on one store one leads, the others stand by until its leader lease lapses."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
+import secrets
 import time
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.store.protocol import FencedError, StateError
+from embomatrix.manager.store.protocol import FencedError, Shelf, ShelfRow, StateError
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
+    from pathlib import Path
 
     from embomatrix.manager.store.protocol import Candidate, StateStore
 
@@ -18,11 +21,11 @@ logger = logging.getLogger(__name__)
 
 RENEWALS: Final = 3
 ATTEMPTS: Final = 6
-"""In the time after which a lead lapses, the leader renews it so often, and others try so often to take it."""
+"""Renewals by the leader, and attempts by each standby, during the life of a leader lease."""
 
 
 class Leadership:
-    """One manager's part in the election. A leader that was overtaken ends; whoever starts it again has it stand by."""
+    """Role of one manager in the election. A leader that was replaced exits; its supervisor restarts it as a standby."""
 
     def __init__(self, store: StateStore, candidate: Candidate) -> None:
         self._store = store
@@ -31,17 +34,18 @@ class Leadership:
         self._problem = ""
 
     def lapsed_s(self) -> float:
-        """For how long another manager may have had the lead, since this one could not renew it; 0 while it leads."""
+        """Return the seconds in which another manager may have led, since this one could not renew; 0 while it leads."""
         return max(0.0, time.monotonic() - self._renewed_s - self._candidate.ttl_s)
 
     def problem(self) -> str:
-        """Why the lead could not be renewed the last time; empty where it was."""
+        """Return the reason why the last renewal failed; empty after a success."""
         return self._problem
 
     async def win(self, on_standby: Callable[[str], Awaitable[None]]) -> int:
-        """Wait until this manager leads; returns its epoch. ``on_standby`` hears the address of whoever leads until then.
+        """Wait until this manager leads and return its epoch. ``on_standby`` receives each leader's address until
+        then.
 
-        Raises ``StateError`` when the store is away from the start; later it is waited for.
+        Raises StateError if the store is away at the start; later failures are retried.
         """
         known = ""
         lead = await self._store.claim(self._candidate)
@@ -54,7 +58,8 @@ class Leadership:
             try:
                 lead = await self._store.claim(self._candidate)
             except StateError as error:
-                # When the store is back, its leader comes first: its lead lapsed with the store.
+                # The former leader gets the first chance when the store is back, since its lease lapsed with the
+                # store.
                 logger.warning("standing by, and the store is away: %s", error)
                 await asyncio.sleep(self._candidate.ttl_s)
         self._renewed_s = time.monotonic()
@@ -62,7 +67,7 @@ class Leadership:
         return lead.epoch
 
     async def keep(self) -> None:
-        """Renew the lead until cancelled. Ends with ``FencedError`` when another manager took it."""
+        """Renew the leader lease until cancelled. Raises FencedError after another manager took over."""
         pause_s = self._candidate.ttl_s / RENEWALS
         while True:
             await asyncio.sleep(pause_s)
@@ -73,6 +78,38 @@ class Leadership:
                 raise
             except StateError as error:
                 self._problem = str(error)
-                logger.warning("the lead could not be renewed: %s", error)
+                logger.warning("leader lease not renewed: %s", error)
             else:
                 self._renewed_s, self._problem = asked_s, ""
+
+
+MARK: Final = "folder-id"
+_KEY: Final = "data_folder"
+
+
+async def warn_of_another_folder(store: StateStore, folder: Path) -> None:
+    """Log a warning if the last leader had another data folder. Raises StateError or OSError.
+
+    Managers of one state share a data folder, since bundles are files there. Each folder has a random id in a file,
+    and the leader notes it in the state.
+    """
+    noted = {row.key: row.payload for row in await store.rows(Shelf.SWITCHES)}.get(_KEY)
+    if noted is not None and noted != _mark_of(folder):
+        logger.warning(
+            "the data folder %s differs from that of the last leader on this state: bundles of its runs are missing here, "
+            "and their rollouts would fail. Give all managers of a state the same --data-dir, such as a network share",
+            folder,
+        )
+
+
+async def note_folder(store: StateStore, folder: Path) -> None:
+    """Note this manager's data folder in the state. Raises StateError or OSError."""
+    await store.put_rows(Shelf.SWITCHES, [ShelfRow(_KEY, _mark_of(folder))])
+
+
+def _mark_of(folder: Path) -> bytes:
+    """Return the id of the folder, creating it on first use."""
+    file = folder / MARK
+    with contextlib.suppress(FileExistsError), file.open("xb") as made:
+        made.write(secrets.token_hex(16).encode())
+    return file.read_bytes()

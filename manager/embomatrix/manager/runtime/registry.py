@@ -1,4 +1,4 @@
-"""Sessions of workers: who is there, under which epoch, and who fell silent. Decisions only; the clock is an argument."""
+"""Registry of worker sessions: presence, epochs and silence. Free of I/O; the clock is an argument."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 
 
 LISTED: Final = 10
-"""Names that a sentence takes."""
+"""Names listed in one message at most."""
 
 
 class WorkerStanding(StrEnum):
-    """What a person sees of a worker."""
+    """State of a worker as users see it."""
 
     READY = "ready"
     SUSPECT = "suspect"
@@ -44,32 +44,32 @@ class WorkerStanding(StrEnum):
 
     @property
     def is_gone(self) -> bool:
-        """It was here, and nothing is to be had of it any more."""
+        """True for a worker that was connected and is lost or has left."""
         return self in (WorkerStanding.LOST, WorkerStanding.LEFT)
 
 
 @dataclass(frozen=True, slots=True)
 class LivenessLimits:
-    """When a worker is heard, doubted, and given up; seconds, except for counts."""
+    """Limits of worker liveness, in seconds except for counts."""
 
     heartbeat_s: float = 1.0
-    """Between two heartbeats of a worker, in a small cluster."""
+    """Interval between two heartbeats of a worker in a small cluster."""
     heartbeats_per_s: float = 100.0
-    """The interval grows with the cluster, so that the manager gets no more than this …"""
+    """Heartbeats per second at most: the interval grows with the cluster."""
     longest_heartbeat_s: float = 7.5
-    """… but not beyond this: a quarter of a lease's life, which heartbeats renew."""
+    """Longest interval: a quarter of a lease's life, which heartbeats renew."""
     misses_suspect: int = 3
-    """Intervals of silence after which a worker gets no new leases."""
+    """Silent intervals after which a worker gets no new leases."""
     lost_after_s: float = 10.0
     stream_grace_s: float = 1.0
-    """A worker whose session stream broke may come back within this time."""
+    """Time in which a worker may reconnect after its stream broke."""
     remember_lost_s: float = 300.0
-    """How long a lost worker stays in the lists for people to see."""
+    """Time that a lost worker stays in the lists."""
 
 
 @dataclass(slots=True, eq=False)
 class WorkerSession:
-    """One registration of a worker. A newer one of the same worker supersedes it."""
+    """Registration of a worker. A newer registration of the same worker supersedes it."""
 
     worker_id: str
     boot_id: str
@@ -81,21 +81,21 @@ class WorkerSession:
     attached: bool = False
     detached_s: float | None = None
     reason: str = ""
-    """Why it was lost, left, or is paused."""
+    """Reason why it was lost, left, or is paused."""
     drained: bool = False
-    """An operator takes it out."""
+    """An operator drains it."""
     load: float = 0.0
     memory_used_mb: int = 0
     credential_id: str = ""
-    """The token that opened it: no other speaks for it."""
+    """Token that opened the session. No other token may use it."""
     asked: set[str] = field(default_factory=set)
-    """Bundles that the worker was asked to hold, or to execute in: it may fetch these."""
+    """Bundles that the worker may fetch, since it was told to hold or execute them."""
 
 
 class Registry:
-    """Sessions by worker; ``new_id`` names each, by default as nobody can guess.
+    """Sessions by worker. ``new_id`` names each session, by default randomly.
 
-    Methods return what the state machines should hear of.
+    Methods return events for the state machines.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Registry:
         self._new_id = new_id or functools.partial(secrets.token_hex, 8)
         self._sessions: dict[str, WorkerSession] = {}
         self._by_silence: OrderedDict[str, WorkerSession] = OrderedDict()
-        """Sessions that are not lost, those first that were heard longest ago: the silent are found without a search."""
+        """Sessions that are not lost, the longest silent first, which finds silent workers without a search."""
         self._detached: dict[str, WorkerSession] = {}
         self._lost: OrderedDict[str, WorkerSession] = OrderedDict()
         self._worker_of: dict[str, str] = {}
@@ -118,7 +118,7 @@ class Registry:
 
     @property
     def sessions(self) -> Mapping[str, WorkerSession]:
-        """By worker id; lost ones stay for a while."""
+        """Sessions by worker id; lost ones stay for a while."""
         return self._sessions
 
     @property
@@ -140,7 +140,9 @@ class Registry:
         *,
         now_s: float,
     ) -> tuple[WorkerSession, list[Event]]:
-        """Open a session; an older one of the same worker ends. The same process keeps its leases, another one loses them."""
+        """Open a session and end an older one of the same worker. Leases survive only if the worker's process is the
+        same.
+        """
         before = self._sessions.get(worker_id)
         alive = before is not None and not before.standing.is_gone
         self._epoch += 1
@@ -160,16 +162,17 @@ class Registry:
         if before is not None:
             self._worker_of.pop(before.session_id, None)
             if alive and boot_id and before.boot_id == boot_id and before.resources == resources:
-                # The same process under a new session: it still holds its leases, and its full state will tell which.
+                # The same process under a new session still holds its leases and reports them in its full state.
                 session.standing = before.standing
                 return session, []
         lost = [WorkerLost(worker_id, "a newer session of the same worker took over")] if alive else []
         return session, [*lost, WorkerJoined(worker_id, resources)]
 
     def find(self, session_id: str, epoch: int) -> WorkerSession:
-        """The live session of that name; raises ``SupersededError`` for one that ended, so that its worker stops.
+        """Return the live session. Raises SupersededError for an ended one, whose worker must stop.
 
-        ``UnknownSessionError`` for one that a former manager opened: its worker keeps what it holds, and registers.
+        Raises UnknownSessionError for a session of a former manager, whose worker keeps its leases and registers
+        again.
         """
         if epoch < self._first_epoch:
             raise UnknownSessionError(
@@ -182,38 +185,38 @@ class Registry:
                 "this session is not known or was superseded by a newer one: register again"
             )
         if session.standing.is_gone:
-            raise SupersededError(f"worker {worker_id} was given up ({session.reason}): register again")
+            raise SupersededError(f"worker {worker_id} is lost ({session.reason}): register again")
         return session
 
     def holder(self, session_id: str) -> WorkerSession:
-        """The live session of that name, for calls that carry no epoch."""
+        """Return the live session, for calls without an epoch."""
         session = self._sessions.get(self._worker_of.get(session_id, ""))
         return self.find(session_id, session.epoch if session is not None else 0)
 
     def end(
         self, session: WorkerSession, reason: str, standing: WorkerStanding = WorkerStanding.LOST
     ) -> list[Event]:
-        """The session is over at once, whatever its worker does; what it held goes to others."""
+        """End the session at once. Its leases are re-dispatched."""
         if session.standing.is_gone or self._sessions.get(session.worker_id) is not session:
             return []
         return [self._lose(session, reason, standing)]
 
     def attach(self, session: WorkerSession, *, now_s: float) -> None:
-        """The worker's stream is open. A suspect gets nothing before its first state was heard on it."""
+        """Note that the worker's stream is open. A suspect gets no leases before its first state arrives on it."""
         session.attached = True
         session.detached_s = None
         self._detached.pop(session.worker_id, None)
         self._note(session, now_s)
 
     def detach(self, session: WorkerSession, *, now_s: float) -> None:
-        """The worker's stream broke; unless it comes back within the grace, the worker is lost."""
+        """Note that the worker's stream broke. The worker is lost unless it reconnects within the grace."""
         session.attached = False
         session.detached_s = now_s
         if self._by_silence.get(session.worker_id) is session:
             self._detached[session.worker_id] = session
 
     def heard(self, session: WorkerSession, *, now_s: float) -> list[Event]:
-        """Any sign of life."""
+        """Note a sign of life."""
         self._note(session, now_s)
         if session.standing is not WorkerStanding.SUSPECT:
             return []
@@ -221,19 +224,19 @@ class Registry:
         return [WorkerRecovered(session.worker_id)]
 
     def drain(self, worker_id: str) -> list[Event]:
-        """Take a worker out of service once it has finished what it holds."""
+        """Drain a worker."""
         session = self._there(worker_id)
         session.drained, session.standing = True, WorkerStanding.DRAINING
         return [WorkerDrained(worker_id)]
 
     def resume(self, worker_id: str) -> list[Event]:
-        """Take a drain back. The worker says itself whether it still leaves."""
+        """Cancel a drain. The worker reports itself whether it still leaves."""
         session = self._there(worker_id)
         session.drained, session.standing = False, WorkerStanding.READY
         return [WorkerResumed(worker_id)]
 
     def told(self, session: WorkerSession, *, draining: bool, paused: str) -> None:
-        """The worker itself says whether it will leave, or why it takes nothing new for now."""
+        """Note the worker's own report that it drains or is paused."""
         if draining or session.drained:
             session.standing = WorkerStanding.DRAINING
         else:
@@ -241,7 +244,7 @@ class Registry:
         session.reason = paused
 
     def stood_still(self, seconds: float, *, now_s: float) -> None:
-        """For so long, until now, the manager itself did not run and heard nobody: that is no silence of theirs."""
+        """Excuse the silence of all workers during ``seconds`` in which the manager did not run."""
         for session in self._by_silence.values():
             session.last_seen_s = min(session.last_seen_s + seconds, now_s)
         for session in self._detached.values():
@@ -249,14 +252,14 @@ class Registry:
                 session.detached_s = min(session.detached_s + seconds, now_s)
 
     def tick(self, *, now_s: float) -> list[Event]:
-        """Suspect the silent, give up the lost, forget the long gone."""
+        """Suspect silent workers, lose those that stayed silent, and forget old lost ones."""
         self._forget_lost(now_s)
         events: list[Event] = []
         suspect_s = self._limits.misses_suspect * self.interval_s
         for session in self._silent_for(suspect_s, now_s):
             silent_s = now_s - session.last_seen_s
             if silent_s >= max(self._limits.lost_after_s, suspect_s):
-                events.append(self._lose(session, f"not heard of for {silent_s:.1f} s"))
+                events.append(self._lose(session, f"silent for {silent_s:.1f} s"))
             elif session.standing is WorkerStanding.READY:
                 session.standing = WorkerStanding.SUSPECT
                 events.append(WorkerSuspected(session.worker_id))
@@ -265,7 +268,7 @@ class Registry:
                 if session.standing is WorkerStanding.DRAINING:
                     events.append(self._lose(session, "it drained and left", WorkerStanding.LEFT))
                 else:
-                    events.append(self._lose(session, "its connection broke and it did not come back"))
+                    events.append(self._lose(session, "its connection broke and it did not reconnect"))
         return events
 
     def _there(self, worker_id: str) -> WorkerSession:
@@ -273,9 +276,7 @@ class Registry:
         if session is None:
             raise NotFoundError(f"there is no worker {worker_id!r}: connected are {listed(self.present)}")
         if session.standing.is_gone:
-            raise NotFoundError(
-                f"worker {worker_id!r} is gone ({session.reason}): start it again at its machine"
-            )
+            raise NotFoundError(f"worker {worker_id!r} is gone ({session.reason}): restart it on its machine")
         return session
 
     def _note(self, session: WorkerSession, now_s: float) -> None:
@@ -309,7 +310,7 @@ class Registry:
 
 
 def listed(worker_ids: Iterable[str]) -> str:
-    """The names in a sentence; of very many the first, and how many more there are."""
+    """Return the first names for a message, and the number of others."""
     names = sorted(worker_ids)
     more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
     return (", ".join(names[:LISTED]) or "none") + more

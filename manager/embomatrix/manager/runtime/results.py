@@ -1,30 +1,39 @@
-"""Result logs: what was delivered, by batch, for trainers to read from any cursor for as long as it is kept."""
+"""Result logs of batches, and the delivery of results from outcome to log."""
 
 from __future__ import annotations
 
 import asyncio
 import bisect
 import contextlib
+import logging
 import time
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple
 
+from embomatrix.manager.control.commands import DeliverResult, FinishBatch
 from embomatrix.manager.control.dispatch.batches import GroupEnds
+from embomatrix.manager.runtime.serialization import result_row, timed_row
+from embomatrix.manager.store.protocol import BatchResults, FencedError, StateError
+from embomatrix.rpc.wire.values import Completed
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+    from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 
-    from embomatrix.manager.store.protocol import ResultRow
+    from embomatrix.manager.control.commands import AcknowledgeLease
+    from embomatrix.manager.store.protocol import ResultRow, StateStore
+    from embomatrix.rpc.wire.values import RolloutResult
+
+logger = logging.getLogger(__name__)
 
 PER_MESSAGE: Final = 256
 LINGER_S: Final = 0.1
-"""Results are sent at once when a message is full or the batch at its end, else one message in this time: a batch that
-trickles shall not send one by one."""
+"""A full message, or the end of the batch, is sent at once; other results at most one message in this interval."""
 
 
 class BatchLog:
-    """The results of one batch in the order of their cursors.
+    """Results of one batch, ordered by cursor.
 
-    These rise from 1, without gaps unless the store lost its last second: what was lost comes again under later ones.
+    Cursors rise from 1 without gaps, unless the store lost its last second: lost results return under later cursors.
     """
 
     def __init__(
@@ -35,17 +44,17 @@ class BatchLog:
         rows: Sequence[ResultRow] = (),
         groups: Mapping[str, int] | None = None,
     ) -> None:
-        """``groups`` tells how many rollouts each has."""
+        """``groups`` gives the number of rollouts in each group."""
         self.run_id = run_id
         self.batch_id = batch_id
         self.digest = digest
         self.rows = list(rows)
         self.ends = GroupEnds(groups or {})
-        """Told of each result before it is appended."""
+        """Receives each result before it is appended."""
         self.finished_s: float | None = None
-        """When every rollout had its outcome; None before."""
+        """Time at which every rollout had its outcome; None before."""
         self.dropped = False
-        """The run was closed, or the log was given up: nothing more will come."""
+        """The run was closed, or the log was discarded: no more results follow."""
         self._changed = asyncio.Event()
         self._over = asyncio.Event()
 
@@ -68,7 +77,9 @@ class BatchLog:
         return self.dropped or self.finished_s is not None
 
     async def messages(self, cursor: int) -> AsyncIterator[list[ResultRow]]:
-        """All results beyond the cursor, to the end of the batch: the first at once, then as ``LINGER_S`` allows."""
+        """Yield all results after the cursor until the batch ends: the first at once, later ones as ``LINGER_S``
+        allows.
+        """
         due_s = 0.0
         while rows := await self.after(cursor, due_s):
             cursor = rows[-1].cursor
@@ -76,10 +87,10 @@ class BatchLog:
             yield rows
 
     async def after(self, cursor: int, due_s: float | None = None) -> list[ResultRow]:
-        """Waits for results beyond the cursor; returns some of them, or nothing when the batch is at its end.
+        """Wait for results after the cursor and return some of them; nothing once the batch has ended.
 
-        Others are waited for until ``due_s`` on the monotonic clock, by default as long as results linger. The wait ends
-        with the batch, whose rollouts have deadlines, or with the caller's own.
+        Further results are awaited until ``due_s`` on the monotonic clock, by default for ``LINGER_S``. The wait ends
+        with the batch, whose rollouts have deadlines, or with the caller's deadline.
         """
         while self.last_cursor <= cursor and not self.ended:
             await self._changed.wait()
@@ -93,7 +104,7 @@ class BatchLog:
 
     @property
     def last_cursor(self) -> int:
-        """Of the newest result; 0 before the first."""
+        """Cursor of the newest result; 0 before the first."""
         return self.rows[-1].cursor if self.rows else 0
 
     def _position(self, cursor: int) -> int:
@@ -105,7 +116,7 @@ class BatchLog:
 
 
 class ResultLogs:
-    """All logs, bounded: finished ones go after ``ttl_s``, or earlier when more than ``limit`` results are kept."""
+    """All logs. Finished logs are discarded after ``ttl_s``, or earlier if more than ``limit`` results are kept."""
 
     def __init__(self, *, ttl_s: float, limit: int) -> None:
         self._ttl_s = ttl_s
@@ -130,7 +141,7 @@ class ResultLogs:
             self.remove(log)
 
     def outdated(self, now_s: float) -> list[BatchLog]:
-        """Finished logs that are to be given up, oldest first."""
+        """Return the finished logs to discard, oldest first."""
         finished = sorted(
             (log for log in self if log.finished_s is not None), key=lambda log: log.finished_s or 0.0
         )
@@ -142,3 +153,131 @@ class ResultLogs:
             kept -= len(log.rows)
             out.append(log)
         return out
+
+
+STORE_RETRY_S: Final = 0.5
+"""Seconds between two attempts to write while the store is away."""
+
+
+class ResultDelivery:
+    """Delivery of results. They are stored before a trainer sees them, so a restarted manager never reuses a cursor.
+
+    A worker's result is acknowledged only after it is stored: until then the worker keeps it. ``on_logged`` receives
+    the run of logged results and the delivery time in seconds of each completed one.
+    """
+
+    def __init__(
+        self,
+        store: StateStore,
+        logs: ResultLogs,
+        acknowledge: Callable[[AcknowledgeLease], None],
+        on_logged: Callable[[str, Sequence[float]], None],
+    ) -> None:
+        self._store = store
+        self._logs = logs
+        self._acknowledge = acknowledge
+        self._on_logged = on_logged
+        self._waiting: list[_Waiting] = []
+        self._acknowledgements: list[AcknowledgeLease] = []
+        self._fresh = asyncio.Event()
+        self.problem = ""
+        """Reason why results wait for the store; empty while they do not."""
+
+    def put(self, command: DeliverResult | FinishBatch) -> None:
+        """Queue a result, or the end of a batch. The queue is bounded by the number of rollouts in the cluster."""
+        self._waiting.append(_Waiting(command, time.monotonic()))
+
+    def put_acknowledgement(self, command: AcknowledgeLease) -> None:
+        """Queue an acknowledgement, which is sent after everything queued before it is stored."""
+        self._acknowledgements.append(command)
+
+    def hurry(self) -> None:
+        """Start to write the queue: no related results follow."""
+        if self._waiting or self._acknowledgements:
+            self._fresh.set()
+
+    async def serve(self) -> None:
+        """Write until cancelled. Raises FencedError after another manager took over."""
+        while True:
+            await self._fresh.wait()
+            self._fresh.clear()
+            waiting, self._waiting = self._waiting, []
+            acknowledgements, self._acknowledgements = self._acknowledgements, []
+            by_batch: dict[tuple[str, str], list[_Waiting]] = {}
+            for entry in waiting:
+                by_batch.setdefault((entry.command.run_id, entry.command.batch_id), []).append(entry)
+            logs = {key: log for key in by_batch if (log := self._logs.get(*key)) is not None}
+            pages = [_page(log, by_batch[key]) for key, log in logs.items()]
+            await self._write(pages)
+            for page in pages:
+                self._show(page)
+            for acknowledgement in acknowledgements:
+                self._acknowledge(acknowledgement)
+
+    async def give_up_outdated(self, now_s: float) -> None:
+        """Discard logs that are too old or too many."""
+        for log in self._logs.outdated(now_s):
+            self._logs.remove(log)
+            with contextlib.suppress(StateError):
+                await self._store.drop_batch(log.run_id, log.batch_id)
+
+    async def _write(self, pages: Sequence[_Page]) -> None:
+        """Write the new results of all batches in one transaction, since a commit of one row costs about as much as
+        one of hundreds.
+        """
+        while parts := [page.part for page in pages if page.rows and not page.log.dropped]:
+            try:
+                await self._store.append_results(parts)
+                break
+            except FencedError:
+                raise
+            except StateError as error:
+                self.problem = str(error)
+                logger.warning("results wait for the store: %s", error)
+                await asyncio.sleep(STORE_RETRY_S)
+        self.problem = ""
+
+    def _show(self, page: _Page) -> None:
+        now_s = time.monotonic()
+        for result, _ in page.results:
+            page.log.ends.take(result.cursor, result.group_id, type(result.outcome))
+        page.log.append(
+            [
+                timed_row(row, now_s - arrived_s) if isinstance(result.outcome, Completed) else row
+                for row, (result, arrived_s) in zip(page.rows, page.results, strict=True)
+            ]
+        )
+        completed = (at_s for result, at_s in page.results if isinstance(result.outcome, Completed))
+        self._on_logged(page.log.run_id, [now_s - arrived_s for arrived_s in completed])
+        if page.last:
+            page.log.finish(now_s)
+
+
+class _Waiting(NamedTuple):
+    """Queued command and its arrival time on the monotonic clock."""
+
+    command: DeliverResult | FinishBatch
+    arrived_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Page:
+    """New results of one batch with their arrival times; ``last`` if the batch ends with them."""
+
+    log: BatchLog
+    results: Sequence[tuple[RolloutResult, float]]
+    rows: Sequence[ResultRow]
+    last: bool
+
+    @property
+    def part(self) -> BatchResults:
+        return BatchResults(self.log.run_id, self.log.batch_id, self.rows)
+
+
+def _page(log: BatchLog, ended: Sequence[_Waiting]) -> _Page:
+    delivered = [(entry.command, entry.arrived_s) for entry in ended]
+    results = [
+        (command.result, arrived_s) for command, arrived_s in delivered if isinstance(command, DeliverResult)
+    ]
+    last = any(isinstance(command, FinishBatch) for command, _ in delivered)
+    return _Page(log, results, [result_row(result) for result, _ in results], last)

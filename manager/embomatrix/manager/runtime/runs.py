@@ -1,24 +1,29 @@
-"""What trainers may do: open runs, announce scenes, submit batches, and read their results."""
+"""Open runs and their batches: operations of the trainer."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import re
 import secrets
 import time
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.control.dispatch.batches import group_sizes
 from embomatrix.manager.control.events import (
     BatchCancelled,
+    BatchContinued,
     BatchRestored,
+    BatchSubmitted,
     LookaheadAnnounced,
     RunOpened,
     WorkersExpected,
 )
-from embomatrix.manager.runtime.records import (
+from embomatrix.manager.runtime.results import BatchLog
+from embomatrix.manager.runtime.serialization import (
     announced_in,
     batch_of,
     batch_row,
@@ -27,8 +32,6 @@ from embomatrix.manager.runtime.records import (
     terms_of,
     terms_payload,
 )
-from embomatrix.manager.runtime.results import BatchLog
-from embomatrix.manager.runtime.submissions import Submissions
 from embomatrix.manager.store.protocol import PutOutcome, RunRow, Shelf, StateError, StateFullError
 from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.status import (
@@ -47,7 +50,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.control.cluster_state import ClusterState
     from embomatrix.manager.control.commands import Command
     from embomatrix.manager.control.events import Event
-    from embomatrix.manager.observe.history import RunHistory
+    from embomatrix.manager.observe.run_archive import RunHistory
     from embomatrix.manager.runtime.bundles import BundleStore
     from embomatrix.manager.runtime.results import ResultLogs
     from embomatrix.manager.store.protocol import StateStore
@@ -62,20 +65,20 @@ _RUN_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
 @dataclass(frozen=True, slots=True)
 class RunLimits:
-    """Bounds of what trainers may leave here."""
+    """Limits of runs, batches and look-ahead windows."""
 
     batch_rollouts: int = 65_536
-    """Of one batch."""
+    """Rollouts of one batch at most."""
     queued_rollouts: int = 262_144
-    """Of all batches together."""
+    """Rollouts of all batches together at most."""
     runs: int = 1024
     lookahead_entries: int = 65_536
     idle_s: float = 6 * 3600.0
-    """A run that nobody spoke of for this long, and that waits for nothing, is closed."""
+    """A run without pending rollouts is closed after this time without a call."""
 
 
 class Runs:
-    """Open runs and their batches. ``carry_out`` executes commands of the cluster's state machines at once."""
+    """Open runs and their batches. ``carry_out`` executes commands of the state machines at once."""
 
     def __init__(
         self,
@@ -100,11 +103,11 @@ class Runs:
 
     @property
     def open(self) -> Mapping[str, RunRow]:
-        """By id, oldest first."""
+        """Open runs by id, oldest first."""
         return self._runs
 
     async def restore(self) -> None:
-        """Take up what a former manager left. Its open batches go on at once, whether their trainer asks for them or not."""
+        """Restore the runs of a former manager. Open batches continue at once, without a call of their trainer."""
         announced = {row.key: announced_in(row) for row in await self._store.rows(Shelf.WINDOWS)}
         for run in await self._store.runs():
             self._runs[run.run_id] = run
@@ -129,16 +132,16 @@ class Runs:
                 self._feed(BatchRestored(batch, delivered, failed_rows(log.rows)))
         self._feed(WorkersExpected(await self._store.workers()))
         if self._runs:
-            logger.info("took up %d runs of a former manager", len(self._runs))
+            logger.info("restored %d runs of a former manager", len(self._runs))
 
     async def serve(self) -> None:
-        """Take large batches in, until cancelled."""
+        """Queue large batches in slices, until cancelled."""
         await self._submissions.serve()
 
     async def open_run(self, name: str, run_id: str, terms: RunTerms = DEFAULT_TERMS) -> str:
-        """Open a run, or attach to the one of that id, which keeps its terms; an empty id gets a new one.
+        """Open a run, or attach to an open one, which keeps its terms. An empty id gets a new one.
 
-        ConflictError for coefficients of the reward that are not those of the run that is there.
+        Raises ConflictError for other reward coefficients than those of the open run.
         """
         run_id = run_id or f"run-{secrets.token_hex(6)}"
         if not _RUN_ID.fullmatch(run_id):
@@ -165,7 +168,7 @@ class Runs:
     def announce(
         self, run_id: str, version: int, entries: tuple[LookaheadEntry, ...]
     ) -> list[LookaheadAnswer]:
-        """Replace the run's window; answers how far each scene is."""
+        """Replace the run's look-ahead window. Return the loading state of each scene."""
         self._check_run(run_id)
         if len(entries) > self.limits.lookahead_entries:
             raise InvalidRequestError(
@@ -177,7 +180,7 @@ class Runs:
         return [outlook.answer(scene) for scene in scenes]
 
     async def submit(self, batch: Batch) -> BatchLog:
-        """Have the batch executed, or attach to it when it was submitted before; returns its results' log."""
+        """Queue the batch, or attach to an earlier submission. Return its result log."""
         self._check_run(batch.run_id)
         row = batch_row(batch)
         taken = ConflictError(
@@ -205,22 +208,22 @@ class Runs:
         return log
 
     def log_of(self, run_id: str, batch_id: str) -> BatchLog:
-        """The results of a batch that was submitted."""
+        """Return the result log of a submitted batch. Raises NotFoundError."""
         self._check_run(run_id)
         log = self._logs.get(run_id, batch_id)
         if log is None:
             raise NotFoundError(
-                f"batch {batch_id!r} of run {run_id!r} is not known (any more): submit it again"
+                f"batch {batch_id!r} of run {run_id!r} is unknown or forgotten: submit it again"
             )
         return log
 
     def cancel(self, run_id: str, batch_id: str) -> None:
-        """Call a batch off: what has no outcome yet ends as cancelled."""
+        """Cancel a batch: rollouts without an outcome end as cancelled."""
         self.log_of(run_id, batch_id)
         self._feed(BatchCancelled(run_id, batch_id))
 
     async def close_run(self, run_id: str) -> RunStats:
-        """End the run and forget its results; returns its final counters."""
+        """Close the run and discard its results. Return its counters."""
         self._check_run(run_id)
         del self._runs[run_id], self._heard_s[run_id]
         leads = self._history.leads(run_id)
@@ -233,7 +236,7 @@ class Runs:
         return stats
 
     async def close_idle(self, now_s: float) -> None:
-        """Close runs whose trainers went away without a word."""
+        """Close runs whose trainers disappeared."""
         for run_id, heard_s in list(self._heard_s.items()):
             if now_s - heard_s > self.limits.idle_s and not self._cluster.dispatcher.pending_of(run_id):
                 logger.info("closing idle run run=%s", run_id)
@@ -241,7 +244,7 @@ class Runs:
                     await self.close_run(run_id)
 
     def hear_of(self, run_id: str) -> RunRow:
-        """The open run, which its trainer has not forgotten. NotFoundError where there is none."""
+        """Return the open run and note a sign of life of its trainer. Raises NotFoundError."""
         self._check_run(run_id)
         return self._runs[run_id]
 
@@ -260,12 +263,14 @@ class Runs:
             )
         queued = self._cluster.dispatcher.queued
         if queued + count > self.limits.queued_rollouts:
-            raise OverloadedError(f"{queued} rollouts wait already: submit again when some have come back")
+            raise OverloadedError(
+                f"{queued} rollouts are queued already: submit again after some have finished"
+            )
         missing = self._bundles.missing([rollout.bundle_digest for rollout in batch.rollouts])
         if missing:
             raise PreconditionError(
                 f"the manager lacks {len(missing)} bundles of batch {batch.batch_id!r}, first {missing[0]}: "
-                f"put them first"
+                f"upload them first"
             )
 
     def _feed(self, event: Event) -> None:
@@ -274,10 +279,46 @@ class Runs:
 
 @contextlib.contextmanager
 def _store_errors() -> Iterator[None]:
-    """A store that is away makes the manager unavailable, one that is full makes it refuse; the caller may try again."""
+    """Turn StateError into UnavailableError, and StateFullError into OverloadedError."""
     try:
         yield
     except StateFullError as error:
         raise OverloadedError(str(error)) from error
     except StateError as error:
         raise UnavailableError(str(error)) from error
+
+
+PIECE: Final = 256
+"""Rollouts queued at once, which takes about 3 ms in which nothing else is decided."""
+
+
+class Submissions:
+    """Queues large batches slice by slice. Batches that arrive together take turns. ``feed`` passes an event to the
+    state machines.
+    """
+
+    def __init__(self, feed: Callable[[Event], None]) -> None:
+        self._feed = feed
+        self._entering: deque[tuple[str, str, int]] = deque()
+        self._more = asyncio.Event()
+
+    def enter(self, batch: Batch) -> None:
+        """Queue the first slice at once; ``serve`` queues the rest."""
+        self._feed(BatchSubmitted(batch, PIECE))
+        left = len(batch.rollouts) - PIECE
+        if left > 0:
+            self._entering.append((batch.run_id, batch.batch_id, left))
+            self._more.set()
+
+    async def serve(self) -> None:
+        """Queue the remaining slices, until cancelled."""
+        while True:
+            await self._more.wait()
+            self._more.clear()
+            while self._entering:
+                # Other events are processed between two slices.
+                await asyncio.sleep(0)
+                run_id, batch_id, left = self._entering.popleft()
+                self._feed(BatchContinued(run_id, batch_id, PIECE))
+                if left > PIECE:
+                    self._entering.append((run_id, batch_id, left - PIECE))

@@ -1,30 +1,31 @@
-"""AdminService: what the cluster is doing, and a way to take a worker out."""
+"""AdminService: lists, logs, operator commands, and tokens."""
 
 from __future__ import annotations
 
 import time
 from typing import TYPE_CHECKING
 
-from embomatrix.manager.services.tokens import TokenMethods
-from embomatrix.manager.web.health import health
-from embomatrix.manager.web.views import overview, plan, run_infos, worker_infos
+from embomatrix.manager.web.cluster_view import health, overview, plan, run_infos, worker_infos
 from embomatrix.proto.v1 import admin_service_pb2 as pb
+from embomatrix.proto.v1 import admin_service_pb2_grpc
 from embomatrix.rpc.status import translate
 from embomatrix.rpc.wire.run_log import event_page_to_proto, run_summary_to_proto
 from embomatrix.rpc.wire.session import plan_cell_to_proto, run_info_to_proto, worker_info_to_proto
+from embomatrix.rpc.wire.tokens import role_from_proto, token_info_to_proto
 
 if TYPE_CHECKING:
     import grpc
 
     from embomatrix.manager.access.gate import Gate
     from embomatrix.manager.runtime.event_loop import ManagerRuntime
-    from embomatrix.manager.services.expulsion import Expulsion
+    from embomatrix.manager.runtime.revocation import Revocation
 
 
-class AdminServicer(TokenMethods):
-    def __init__(self, runtime: ManagerRuntime, gate: Gate, expulsion: Expulsion) -> None:
-        super().__init__(gate, expulsion)
+class AdminServicer(admin_service_pb2_grpc.AdminServiceServicer):
+    def __init__(self, runtime: ManagerRuntime, gate: Gate, expulsion: Revocation) -> None:
         self._runtime = runtime
+        self._gate = gate
+        self._expulsion = expulsion
 
     async def ListWorkers(
         self, request: pb.ListWorkersRequest, context: grpc.aio.ServicerContext
@@ -88,3 +89,32 @@ class AdminServicer(TokenMethods):
         async with translate(context):
             await self._runtime.resume_dispatch()
         return pb.ResumeDispatchResponse()
+
+    async def IssueToken(
+        self, request: pb.IssueTokenRequest, context: grpc.aio.ServicerContext
+    ) -> pb.IssueTokenResponse:
+        async with translate(context):
+            role = role_from_proto(request.role)
+            token, token_id = await self._gate.issue(role, valid_s=request.valid_s, label=request.label)
+        return pb.IssueTokenResponse(token=token, token_id=token_id)
+
+    async def ListTokens(
+        self, request: pb.ListTokensRequest, context: grpc.aio.ServicerContext
+    ) -> pb.ListTokensResponse:
+        async with translate(context):
+            tokens = [token_info_to_proto(info) for info in self._gate.infos()]
+        return pb.ListTokensResponse(tokens=tokens)
+
+    async def RevokeToken(
+        self, request: pb.RevokeTokenRequest, context: grpc.aio.ServicerContext
+    ) -> pb.RevokeTokenResponse:
+        async with translate(context):
+            await self._expulsion.revoke_token(request.token_id)
+        return pb.RevokeTokenResponse()
+
+    async def RevokeWorker(
+        self, request: pb.RevokeWorkerRequest, context: grpc.aio.ServicerContext
+    ) -> pb.RevokeWorkerResponse:
+        async with translate(context):
+            await self._expulsion.revoke_worker(request.worker_id, request.reason[:200] or "by the operator")
+        return pb.RevokeWorkerResponse()

@@ -1,4 +1,4 @@
-"""RolloutService: trainers open runs, announce what comes, submit batches, and read results from a cursor."""
+"""RolloutService: runs, look-ahead, batches, and result streams."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from embomatrix.proto.v1 import rollout_service_pb2_grpc
 from embomatrix.rpc.logs import bind
 from embomatrix.rpc.status import NotFoundError, TrimmedError, translate
 from embomatrix.rpc.versions import SPOKEN, VersionRange, agree, software_version
-from embomatrix.rpc.wire.batch import batch_with
-from embomatrix.rpc.wire.rollout import each, rollout_from_proto
+from embomatrix.rpc.wire.codec import each
+from embomatrix.rpc.wire.rollout import batch_with, rollout_from_proto
 from embomatrix.rpc.wire.run import (
     group_done_to_proto,
     lookahead_answer_to_proto,
@@ -36,11 +36,11 @@ if TYPE_CHECKING:
     from embomatrix.rpc.wire.values import Batch, Rollout
 
 SLICE: Final = 128
-"""Rollouts of a batch that are converted in one go: about two milliseconds."""
+"""Rollouts of a batch converted without a pause, which takes about 2 ms."""
 
 
 class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
-    """``gate`` knows who calls; ``authority`` is the certificate (PEM) of who signed the manager's, empty without TLS."""
+    """``authority`` is the PEM certificate of the signing authority; empty without TLS."""
 
     def __init__(self, runs: Runs, training: TrainingBook, gate: Gate, *, authority: bytes = b"") -> None:
         self._runs = runs
@@ -86,7 +86,7 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
             bind("batch", request.batch_id)
             log = await self._runs.submit(await _batch(request))
             async for rows in _results(log, 0):
-                self._gate.caller_of(context)  # a token that was revoked meanwhile reads nothing more
+                self._gate.caller_of(context)  # A revoked token reads no further results.
                 message = pb.ExecuteResponse()
                 _tell(log, rows, message)
                 yield message
@@ -133,7 +133,7 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
 
 
 async def _batch(request: pb.ExecuteRequest) -> Batch:
-    """The batch of a request. A large one takes longer than workers may wait: others have their turn meanwhile."""
+    """Return the batch of a request. Large batches are converted in slices, so that other calls are not delayed."""
     rollouts: list[Rollout] = []
     for start in range(0, len(request.rollouts), SLICE):
         part = request.rollouts[start : start + SLICE]
@@ -143,7 +143,7 @@ async def _batch(request: pb.ExecuteRequest) -> Batch:
 
 
 async def _results(log: BatchLog, cursor: int) -> AsyncIterator[list[ResultRow]]:
-    """All results beyond the cursor, as they come, to the end of the batch."""
+    """Yield the results after the cursor, as they arrive, until the batch ends."""
     if cursor > log.last_cursor and log.ended:
         raise TrimmedError(
             f"batch {log.batch_id!r} ends at cursor {log.last_cursor}: {cursor} lies beyond it"
@@ -151,13 +151,13 @@ async def _results(log: BatchLog, cursor: int) -> AsyncIterator[list[ResultRow]]
     async for rows in log.messages(cursor):
         yield rows
     if log.dropped:
-        raise NotFoundError(f"batch {log.batch_id!r} is no longer kept: its run was closed")
+        raise NotFoundError(f"batch {log.batch_id!r} was discarded: its run was closed")
 
 
 def _tell(
     log: BatchLog, rows: Sequence[ResultRow], message: pb.ExecuteResponse | pb.WaitExecutionResponse
 ) -> None:
-    """Fill an empty message with these results, as they are kept, and with the groups that end among them."""
+    """Fill an empty message with stored results and the groups that end with them."""
     for row in rows:
         message.results.add().MergeFromString(row.payload)
     message.groups.extend(map(group_done_to_proto, log.ends.among(rows)))

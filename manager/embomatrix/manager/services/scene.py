@@ -1,4 +1,4 @@
-"""SceneService: bundles in and out, by digest."""
+"""SceneService: upload and download of bundles by digest."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The gRPC server: all services of the manager on one port, with health and reflection."""
+"""gRPC server with all services on one port, health checks, reflection, and access control."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from embomatrix.manager.runtime.listen import bind_server
+from embomatrix.manager.runtime.revocation import Revocation
 from embomatrix.manager.services.admin import AdminServicer
-from embomatrix.manager.services.auth import RoleInterceptor
-from embomatrix.manager.services.expulsion import Expulsion
+from embomatrix.manager.services.listen import bind_server
 from embomatrix.manager.services.rollout import RolloutServicer
 from embomatrix.manager.services.scene import SceneServicer
+from embomatrix.manager.services.standby import refusing
 from embomatrix.manager.services.worker import WorkerServicer
 from embomatrix.proto.v1 import (
     admin_service_pb2,
@@ -25,9 +25,11 @@ from embomatrix.proto.v1 import (
     worker_service_pb2,
     worker_service_pb2_grpc,
 )
-from embomatrix.rpc.channel import SERVER_OPTIONS
+from embomatrix.rpc.channel import SERVER_OPTIONS, TOKEN_KEY
 
 if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
     from embomatrix.manager.access.gate import Gate
     from embomatrix.manager.access.protection import Tls
     from embomatrix.manager.runtime.event_loop import ManagerRuntime
@@ -47,7 +49,7 @@ SERVICES: Final = tuple(
 async def build_server(
     runtime: ManagerRuntime, gate: Gate, tls: Tls | None, settings: ManagerSettings
 ) -> tuple[grpc.aio.Server, int]:
-    """A server that is bound but not started, and its port (``port`` 0 takes a free one).
+    """Return a bound server that is not started, and its port.
 
     Raises PortInUseError.
     """
@@ -61,7 +63,7 @@ async def build_server(
     )
     scene_service_pb2_grpc.add_SceneServiceServicer_to_server(SceneServicer(runtime.bundles), server)
     admin_service_pb2_grpc.add_AdminServiceServicer_to_server(
-        AdminServicer(runtime, gate, Expulsion(runtime, gate)), server
+        AdminServicer(runtime, gate, Revocation(runtime, gate)), server
     )
     await _add_health(server)
     reflection.enable_server_reflection((*SERVICES, health.SERVICE_NAME, reflection.SERVICE_NAME), server)
@@ -73,3 +75,23 @@ async def _add_health(server: grpc.aio.Server) -> None:
     health_pb2_grpc.add_HealthServicer_to_server(servicer, server)
     for name in ("", *SERVICES):
         await servicer.set(name, health_pb2.HealthCheckResponse.SERVING)
+
+
+class RoleInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc is untyped
+    """Rejects calls that the gate refuses, before their messages are parsed."""
+
+    def __init__(self, gate: Gate) -> None:
+        self._gate = gate
+
+    async def intercept_service(
+        self,
+        continuation: Callable[[grpc.HandlerCallDetails], Awaitable[grpc.RpcMethodHandler]],
+        handler_call_details: grpc.HandlerCallDetails,
+    ) -> grpc.RpcMethodHandler:
+        handler = await continuation(handler_call_details)
+        if handler is None:
+            return handler
+        metadata = dict(handler_call_details.invocation_metadata or ())
+        method = handler_call_details.method
+        refusal = self._gate.refusal(method, metadata.get(TOKEN_KEY))
+        return handler if refusal is None else refusing(method, refusal)

@@ -1,4 +1,4 @@
-"""WorkerService: workers register, hold a session stream, send heartbeats, and fetch bundles."""
+"""WorkerService: registration, session streams, heartbeats, and bundle downloads of workers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from embomatrix.rpc.status import (
     translate,
 )
 from embomatrix.rpc.versions import SPOKEN, VersionRange, agree
-from embomatrix.rpc.wire.rollout import each, inside
+from embomatrix.rpc.wire.codec import each, inside
 from embomatrix.rpc.wire.session import (
     lease_progress_from_proto,
     lease_ref_from_proto,
@@ -37,22 +37,23 @@ if TYPE_CHECKING:
 
     from embomatrix.manager.access.gate import Gate
     from embomatrix.manager.runtime.event_loop import ManagerRuntime
-    from embomatrix.manager.runtime.links import OutgoingMessage, WorkerLink
-    from embomatrix.rpc.leases import Lease, LeaseResult
+    from embomatrix.manager.runtime.registry import WorkerSession
+    from embomatrix.manager.runtime.worker_link import OutgoingMessage, WorkerLink
+    from embomatrix.rpc.wire.leases import Lease, LeaseResult
 
 FIRST_STATE_S: Final = 10.0
-"""A session stream must begin with the worker's state within this time."""
+"""Time limit for the first state on a session stream."""
 SESSION_SHOWN: Final = 6
-"""Letters of an id in log lines: whoever knows all of a session's could speak for its worker."""
+"""Characters of a session id in log lines. The full id would let a reader speak for the worker."""
 LEASES_PER_MESSAGE: Final = 256
 RESULTS_AT_ONCE: Final = 16
-"""A message's results are heard in slices, and what a slice freed is given away before the next: hearing one takes 0.1 ms, and
-a message that carries hundreds would hold up the leases of every worker."""
+"""Results processed without a pause. Processing one takes 0.1 ms, so a message of hundreds would delay the leases of
+every worker."""
 _WORKER_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._:@-]{0,127}")
 
 
 class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
-    """``lease_ttl_s`` is told to workers: whoever can't renew within it must stop. ``gate`` knows who may speak for whom."""
+    """Workers must stop leases that they could not renew within ``lease_ttl_s``."""
 
     def __init__(self, runtime: ManagerRuntime, gate: Gate, *, lease_ttl_s: float) -> None:
         self._runtime = runtime
@@ -65,7 +66,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
         async with translate(context):
             _check_name(request.worker_id)
             bind("worker", request.worker_id)
-            # First of all: a version that is refused may mean other things by its fields, and must not use up a token to join.
+            # Versions are checked first: a refused version must not use up a join token.
             protocol = _agreed(request)
             resources = inside("resources", resources_from_proto, request.resources)
             admission = await self._gate.admit(
@@ -92,7 +93,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
         async with translate(context):
             first = await _first_state(request_iterator)
             session = self._runtime.registry.find(first.session_id, first.session_epoch)
-            self._gate.check_session(context, session)
+            self._check_session(context, session)
             bind("worker", session.worker_id)
             bind("session", session.session_id[:SESSION_SHOWN])
             with self._runtime.attached(session) as link:
@@ -103,7 +104,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
         self, request: pb.HeartbeatRequest, context: grpc.aio.ServicerContext
     ) -> pb.HeartbeatResponse:
         async with translate(context):
-            self._gate.check_session(context, self._runtime.registry.holder(request.session_id))
+            self._check_session(context, self._runtime.registry.holder(request.session_id))
             interval_s = self._runtime.take_heartbeat(
                 request.session_id,
                 request.session_epoch,
@@ -121,7 +122,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
     ) -> AsyncIterator[pb.FetchBundleResponse]:
         async with translate(context):
             session = self._runtime.registry.holder(request.session_id)
-            self._gate.check_session(context, session)
+            self._check_session(context, session)
             if request.bundle_digest not in session.asked:
                 raise NotAllowedError(
                     f"worker {session.worker_id} was not asked to hold bundle {request.bundle_digest[:80]!r}"
@@ -134,10 +135,13 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
     ) -> pb.DeregisterResponse:
         async with translate(context):
             session = self._runtime.registry.find(request.session_id, request.session_epoch)
-            self._gate.check_session(context, session)
-            left = SupersededError(f"worker {session.worker_id} said that it leaves: its session is over")
+            self._check_session(context, session)
+            left = SupersededError(f"worker {session.worker_id} has left: its session is over")
             self._runtime.end_session(session, "it left", left, WorkerStanding.LEFT)
         return pb.DeregisterResponse()
+
+    def _check_session(self, context: grpc.aio.ServicerContext, session: WorkerSession) -> None:
+        self._gate.check_session(context, session.worker_id, session.credential_id)
 
     async def _listen(self, link: WorkerLink, requests: AsyncIterator[pb.SessionRequest]) -> None:
         async for request in requests:
@@ -148,7 +152,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
         try:
             self._runtime.take_report(link, state, _results(request, 0), resync=resync)
             for first in range(RESULTS_AT_ONCE, len(request.results), RESULTS_AT_ONCE):
-                await asyncio.sleep(0)  # what was given meanwhile is sent, and others are heard
+                await asyncio.sleep(0)  # lets other coroutines send leases and hear workers
                 self._runtime.take_report(link, None, _results(request, first), resync=False)
         finally:
             self._runtime.deliver()
@@ -166,7 +170,7 @@ async def _speak(link: WorkerLink, context: grpc.aio.ServicerContext) -> None:
 
 
 def _messages(outbox: OutgoingMessage) -> list[pb.SessionResponse]:
-    """The outbox in messages of bounded size: leases carry plans."""
+    """Split the outbox into messages of bounded size, since leases carry plans."""
     leases = outbox.leases
     parts = [leases[at : at + LEASES_PER_MESSAGE] for at in range(0, len(leases), LEASES_PER_MESSAGE)]
     messages = [_with_leases(part) for part in parts] or [pb.SessionResponse()]
@@ -206,7 +210,7 @@ async def _first_state(requests: AsyncIterator[pb.SessionRequest]) -> pb.Session
 
 
 async def _until_one_ends(*parts: Coroutine[None, None, None]) -> None:
-    """Run the parts until the first ends, stop the others, and raise what the first raised."""
+    """Run the coroutines until the first ends, cancel the others, and raise the first one's error."""
     tasks = [asyncio.create_task(part) for part in parts]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -226,7 +230,7 @@ def _check_name(worker_id: str) -> None:
 
 
 def _agreed(request: pb.RegisterRequest) -> int:
-    """The version that both sides will speak. Raises PreconditionError."""
+    """Return the version that both sides speak. Raises PreconditionError."""
     newest = request.protocol_version
     theirs = VersionRange(request.protocol_low or newest, newest)
     return agree(SPOKEN, theirs, us="this manager", them=f"worker {request.worker_id}")

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from embomatrix.manager.simulation.agenda import Agenda
-    from embomatrix.rpc.leases import LeaseRef, WorkerState
+    from embomatrix.rpc.wire.leases import LeaseRef, WorkerState
     from embomatrix.rpc.wire.values import Batch, RolloutResult
 
 

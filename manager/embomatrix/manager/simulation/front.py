@@ -16,7 +16,7 @@ from embomatrix.manager.control.commands import (
 )
 from embomatrix.manager.control.events import BatchSubmitted, LookaheadAnnounced, RunOpened
 from embomatrix.manager.runtime.intake import TICK_S, Heartbeat
-from embomatrix.rpc.leases import Lease
+from embomatrix.rpc.wire.leases import Lease
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.simulation.auditor import InvariantChecker
     from embomatrix.manager.simulation.gauge import Gauge
     from embomatrix.manager.simulation.scenario import ManagerPace
-    from embomatrix.rpc.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
+    from embomatrix.rpc.wire.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
     from embomatrix.rpc.wire.values import (
         Batch,
         LookaheadEntry,

@@ -10,7 +10,7 @@ from statistics import fmean
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.control.cluster_state import ClusterState
-from embomatrix.manager.observe.histogram import quantile
+from embomatrix.manager.histogram import quantile
 from embomatrix.manager.runtime.intake import Intake
 from embomatrix.manager.runtime.registry import Registry
 from embomatrix.manager.simulation.agenda import Agenda

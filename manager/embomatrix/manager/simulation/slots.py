@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.reward.breakdown import RewardBreakdown
-from embomatrix.rpc.leases import LeaseProgress, LeaseResult
+from embomatrix.rpc.wire.leases import LeaseProgress, LeaseResult
 from embomatrix.rpc.wire.values import (
     Completed,
     InfraCode,
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.simulation.gauge import Gauge
     from embomatrix.manager.simulation.machines import Setting, SimulatedMachine
     from embomatrix.manager.simulation.scenario import Faults
-    from embomatrix.rpc.leases import Lease, LeaseRef
+    from embomatrix.rpc.wire.leases import Lease, LeaseRef
 
 RETRY_LOAD_S: Final = 10.0
 """A scene that failed to load is tried again after this long, as the real worker does."""

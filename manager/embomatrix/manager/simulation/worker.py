@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, TypeVar
 
+from embomatrix.host.backoff import Backoff
 from embomatrix.manager.simulation.front import Stream
 from embomatrix.manager.simulation.line import Line
 from embomatrix.manager.simulation.slots import SimulatedSlots, SlotEnvironment
-from embomatrix.rpc.leases import WorkerState
 from embomatrix.rpc.status import SupersededError
+from embomatrix.rpc.wire.leases import WorkerState
 from embomatrix.rpc.wire.values import Completed
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.simulation.gauge import Gauge
     from embomatrix.manager.simulation.machines import Setting, SimulatedMachine
     from embomatrix.manager.simulation.scenario import SimulationScenario
-    from embomatrix.rpc.leases import LeaseRef, LeaseResult
+    from embomatrix.rpc.wire.leases import LeaseRef, LeaseResult
 
 ANSWER_S: Final = 2.0
 """A heartbeat or a new stream without an answer for this long is given up."""
@@ -62,7 +63,8 @@ class SimulatedWorker:
         )
         self._fetched: set[str] = set()
         self._life = 0
-        self._misses = self._attempts = 0
+        self._misses = 0
+        self._backoff = Backoff(FIRST_WAIT_S, LONGEST_WAIT_S, lambda: self._dice.uniform(0.8, 1.2))
         self._renewed_s = 0.0
         self._report_due = False
         self.slots: SimulatedSlots | None = None
@@ -152,7 +154,8 @@ class SimulatedWorker:
         state = WorkerState(slots.residents(), slots.held(), tuple(self._outbox.values()))
 
         def greeted(_: None) -> None:
-            self._attempts = self._misses = 0
+            self._misses = 0
+            self._backoff.reset()
             self._renewed_s = self._agenda.now_s
             self._later(self._scenario.liveness.heartbeat_s, lambda: self._beat(stream))
 
@@ -209,10 +212,8 @@ class SimulatedWorker:
 
     def _wait(self) -> None:
         """Try again later, longer each time; what can't be renewed meanwhile is stopped."""
-        wait_s = min(LONGEST_WAIT_S, FIRST_WAIT_S * 2.0 ** min(self._attempts, 10))
-        self._attempts += 1
         self._fence()
-        self._later(wait_s * self._dice.uniform(0.8, 1.2), self._attach)
+        self._later(self._backoff.next_s(), self._attach)
 
     def _fence(self) -> None:
         if (

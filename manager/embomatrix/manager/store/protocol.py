@@ -1,7 +1,6 @@
-"""What the manager writes down, so that another process of it can go on: runs, batches, delivered results, and what is known
-of tokens and workers.
+"""State store: runs, batches, results, credentials and worker state that a later manager needs.
 
-Leases are not among it: the workers that hold them say so when they come back.
+Leases are not stored: the workers that hold them report them.
 """
 
 from __future__ import annotations
@@ -15,43 +14,43 @@ if TYPE_CHECKING:
 
 
 class StateError(Exception):
-    """The store can't be used; the sentence names it and the remedy."""
+    """Unusable store. The message names the store and a remedy."""
 
 
 class StateFullError(StateError):
-    """The store has no room: nothing was written. What is submitted must wait until somebody makes room."""
+    """Full store: nothing was written. Submissions must wait for free space."""
 
 
 class FencedError(StateError):
-    """A newer manager took the store over: this one must stop dispatching."""
+    """Another manager took the store over: this one must stop dispatching."""
 
 
 class PutOutcome(StrEnum):
-    """What became of a batch that was put."""
+    """Result of storing a batch."""
 
     CREATED = "created"
     SAME = "same"
-    """It was there already, with the same content."""
+    """The batch was stored before with the same content."""
     CONFLICT = "conflict"
-    """Its id is taken by other content."""
+    """The id is taken by other content."""
     NO_RUN = "no_run"
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A manager that would lead."""
+    """Candidate for leadership."""
 
     holder: str
-    """The same after a restart, so that a manager need not wait for its own former life to lapse."""
+    """Stable across restarts, so that a restarted manager need not wait for its own leader lease to lapse."""
     address: str
-    """Where workers and trainers reach it."""
+    """Address for workers and trainers."""
     ttl_s: float
-    """Its lead lapses when it was not renewed for so long."""
+    """Life of a leader lease without renewal, in seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lead:
-    """Who leads, and under which epoch; ``mine`` when it is the candidate that asked."""
+    """Current leader and epoch; ``mine`` if it is the candidate."""
 
     epoch: int
     address: str
@@ -60,7 +59,7 @@ class Lead:
 
 @dataclass(frozen=True, slots=True)
 class RunRow:
-    """``terms`` is what the run asked for, opaque to the store."""
+    """Run; ``terms`` is opaque to the store."""
 
     run_id: str
     name: str
@@ -69,7 +68,7 @@ class RunRow:
 
 @dataclass(frozen=True, slots=True)
 class BatchRow:
-    """A batch as it was submitted: ``payload`` is opaque to the store, ``digest`` that of its content."""
+    """Submitted batch; ``payload`` is opaque to the store, ``digest`` identifies its content."""
 
     run_id: str
     batch_id: str
@@ -79,7 +78,7 @@ class BatchRow:
 
 @dataclass(frozen=True, slots=True)
 class ResultRow:
-    """A delivered result, opaque to the store. Cursors of a batch rise from 1."""
+    """Delivered result, opaque to the store. Cursors of a batch rise from 1."""
 
     cursor: int
     rollout_id: str
@@ -96,76 +95,76 @@ class BatchResults:
 
 
 class Shelf(StrEnum):
-    """What is kept by name beside the runs, for every manager that comes."""
+    """Named rows beside the runs, for later managers."""
 
     CREDENTIALS = "credentials"
-    """Who may call, by the token's id. They hold no secret, only its hash."""
+    """Credentials by token id, with the hash of the secret."""
     REPUTES = "reputes"
-    """What is known of workers' honesty, by their ids."""
+    """Audit reputations by worker id."""
     SWITCHES = "switches"
-    """What operators turned on or off."""
+    """Switches of the operator."""
     WINDOWS = "windows"
-    """What open runs announced last, by their ids; a run takes it along when it is closed."""
+    """Last announced look-ahead windows by run id; deleted with the run."""
 
 
 @dataclass(frozen=True, slots=True)
 class ShelfRow:
-    """One thing that is kept by name; ``payload`` is opaque to the store."""
+    """Named row; ``payload`` is opaque to the store."""
 
     key: str
     payload: bytes
 
 
 class StateStore(Protocol):
-    """Every write belongs to the manager that leads; one that led before gets ``FencedError``.
+    """Only the leading manager may write; earlier leaders get FencedError.
 
-    Writing raises ``StateFullError`` when there is no room, ``StateError`` when the store is away.
+    Writes raise StateFullError without free space, and StateError while the store is away.
     """
 
     async def claim(self, candidate: Candidate) -> Lead:
-        """Become the one manager that writes, under an epoch higher than any before, unless another one leads."""
+        """Become the leader under a new, higher epoch, unless another manager leads."""
 
     async def renew(self) -> None:
-        """The lead goes on. ``FencedError`` when another manager took it; that it lapsed meanwhile does no harm."""
+        """Renew the leader lease, even if it lapsed. Raises FencedError after another manager took over."""
 
     async def open_run(self, run: RunRow) -> None:
-        """Note a run; the same id again keeps the first name and terms."""
+        """Store a run. A repeated id keeps the first name and terms."""
 
     async def close_run(self, run_id: str) -> None:
-        """Forget the run with its batches, results and window; unknown ids are no error."""
+        """Delete a run with its batches, results and window. Unknown ids are ignored."""
 
     async def put_batch(self, batch: BatchRow) -> PutOutcome:
-        """Note a batch, if its run is open and its id is free."""
+        """Store a batch if its run is open and its id is free."""
 
     async def append_results(self, parts: Sequence[BatchResults]) -> int:
-        """Add results of several batches, all or none, in one write; of each rollout only the first counts.
+        """Store results of several batches in one atomic write. The first result of each rollout counts.
 
-        Returns how many were new. Of an unknown batch: none.
+        Returns the number of new results; none of unknown batches.
         """
 
     async def results_after(self, run_id: str, batch_id: str, cursor: int, limit: int) -> list[ResultRow]:
-        """Results with a higher cursor, in order."""
+        """Return results with a higher cursor, in order."""
 
     async def drop_batch(self, run_id: str, batch_id: str) -> None:
-        """Forget a batch and its results: nobody will ask for it again."""
+        """Delete a batch and its results."""
 
     async def runs(self) -> list[RunRow]:
-        """Open runs, oldest first."""
+        """Return the open runs, oldest first."""
 
     async def batches(self, run_id: str) -> list[BatchRow]:
-        """Batches of a run, oldest first."""
+        """Return the batches of a run, oldest first."""
 
     async def put_workers(self, worker_ids: Collection[str]) -> None:
-        """Replace the list of workers that are there: whom the next manager waits for."""
+        """Replace the list of present workers, which a later manager waits for."""
 
     async def workers(self) -> frozenset[str]:
-        """The workers of that list."""
+        """Return the list of present workers."""
 
     async def put_rows(self, shelf: Shelf, rows: Sequence[ShelfRow]) -> None:
-        """Note these, all or none; one of a known key replaces it."""
+        """Store rows in one atomic write, replacing rows of the same key."""
 
     async def rows(self, shelf: Shelf) -> list[ShelfRow]:
-        """The last of every key that was ever put there, in no order."""
+        """Return the latest row of every key, in any order."""
 
     async def close(self) -> None:
-        """Leave the lead to whoever claims it next, and let go of connections and files."""
+        """Release the leader lease, connections and files."""

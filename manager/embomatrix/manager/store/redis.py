@@ -1,10 +1,10 @@
-"""State in Redis (6.2 command set, also Valkey): for clusters, and for another manager to take over.
+"""State store in Redis (6.2 command set, also Valkey), for clusters with manager fail-over.
 
-Keys, all below one prefix: ``epoch``; ``leader`` (hash holder, address; it lapses); ``workers`` (set); ``credentials``,
-``reputes`` and ``switches`` (hashes name -> payload); ``runs`` (hash id -> name), ``run_terms`` (hash id -> terms) and
-``run_order`` (list); of a run ``batches:RUN`` (list of ids); of a batch ``batch:RUN:BATCH`` (hash digest, payload),
-``done:RUN:BATCH`` (set of rollouts), ``results:RUN:BATCH`` (sorted set of "rollout id length:rollout id payload" by cursor).
-Every conditional write is one Lua script that checks the epoch first.
+Keys below one prefix: ``epoch``; ``leader`` (hash holder, address; it expires); ``workers`` (set); ``credentials``,
+``reputes``, ``switches`` and ``windows`` (hashes key -> payload); ``runs`` (hash id -> name), ``run_terms`` (hash id
+-> terms), ``run_order`` (list); per run ``batches:RUN`` (list of ids); per batch ``batch:RUN:BATCH`` (hash digest,
+payload), ``done:RUN:BATCH`` (set of rollouts), ``results:RUN:BATCH`` (sorted set of "rollout id length:rollout id
+payload" by cursor). Every conditional write is one Lua script that checks the epoch first.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from embomatrix.manager.store.protocol import (
     StateError,
     StateFullError,
 )
-from embomatrix.manager.store.url import without_password
+from embomatrix.rpc.logs import without_secrets
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Collection, Sequence
@@ -147,10 +147,10 @@ return 1
 
 
 class RedisStore:
-    """``url`` as in ``redis://HOST:PORT/DB``. Every call is bounded by ``timeout_s``; failures are ``StateError``."""
+    """``url`` is ``redis://HOST:PORT/DB``. Every call is limited to ``timeout_s``; failures are StateError."""
 
     def __init__(self, url: str, *, prefix: str = "embomatrix", timeout_s: float = 5.0) -> None:
-        self._shown = without_password(url)
+        self._shown = without_secrets(url)
         self._prefix = prefix
         self._epoch = 0
         self._candidate: Candidate | None = None
@@ -249,7 +249,7 @@ class RedisStore:
         await self._redis.aclose()
 
     async def _check_server(self) -> None:
-        """Refuse a server that may forget what it was told."""
+        """Raise StateError for a server that may evict keys."""
         if self._checked:
             return
         about = await self._call(self._redis.info())
@@ -260,7 +260,7 @@ class RedisStore:
                 f"them results that were delivered: set `maxmemory-policy noeviction`"
             )
         if not about.get("aof_enabled"):
-            logger.warning("Redis at %s keeps no AOF: what it holds is lost when it stops", self._shown)
+            logger.warning("Redis at %s has no AOF: its data is lost when it stops", self._shown)
         self._checked = True
 
     async def _batch_ids(self, run_id: str) -> list[str]:
@@ -275,7 +275,7 @@ class RedisStore:
 
     async def _script(self, source: str, names: Sequence[str], *values: str | bytes | int) -> Any:
         keys = [self._key("epoch"), *map(self._key, names)]
-        # EVAL and not EVALSHA: nothing has to be loaded again after the server was restarted.
+        # EVAL instead of EVALSHA: scripts need no reload after a server restart.
         return await self._call(self._redis.eval(source, len(keys), *keys, self._epoch, *values))
 
     async def _call(self, answer: Any) -> Any:
@@ -286,7 +286,7 @@ class RedisStore:
                 raise FencedError(
                     f"another manager took over the state in {self._shown}: stop this one"
                 ) from error
-            # Redis 6.2 tells of it inside another error, when it was a script that found no memory.
+            # Redis 6.2 wraps the out-of-memory error of a script in another error.
             if isinstance(error, OutOfMemoryError) or _NO_MEMORY in str(error):
                 raise StateFullError(
                     f"Redis at {self._shown} has no memory left ({error}): raise its maxmemory"

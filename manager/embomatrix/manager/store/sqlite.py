@@ -1,4 +1,4 @@
-"""State in one file beside the manager: it survives a restart, and needs no server."""
+"""State store in one SQLite file, which survives a restart and needs no server, or in memory."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 _FULL: Final = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE)
-"""The disk, or what the process may write, is used up."""
+"""Error codes of a full disk or an exhausted quota."""
 
 BUSY_S: Final = 5.0
-"""How long a transaction waits for another process that writes to the same file."""
+"""Time that a transaction waits for another process that writes to the same file."""
 BUSY_RETRY_S: Final = 0.005
 BRIEF_BYTES: Final = 128 * 1024
-"""A transaction that writes no more than this is done at once: handing it to a thread and back takes longer. It writes to
-memory of the system: with this journal only a checkpoint waits for the disk."""
+"""Smaller transactions run on the event loop, since a thread switch takes longer. In WAL mode they write to the page cache;
+only a checkpoint waits for the disk."""
 CHECKPOINT_BYTES: Final = 4 * 1024 * 1024
-"""The journal is copied into the file when it has grown to this."""
+"""Size of the journal at which it is copied into the file."""
 
 _SCHEMA: Final = """
 PRAGMA journal_mode = WAL;
@@ -68,32 +68,31 @@ CREATE INDEX IF NOT EXISTS result_order ON result (run_id, batch_id, cursor);
 
 
 class SqliteStore:
-    """One connection, used by one thread at a time. Opening raises ``StateError`` when the file can't be used.
+    """Store in a file, or in memory for a SQLite URI. Raises StateError if it cannot be opened.
 
-    ``clock`` gives seconds that every process of this machine agrees on.
+    One connection, used by one thread at a time. ``clock`` returns seconds that all processes of this machine agree on.
     """
 
-    def __init__(self, path: Path, *, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, path: Path | str, *, clock: Callable[[], float] = time.time) -> None:
         self._path = path
-        self._journal = path.with_name(path.name + "-wal")
+        self._journal = None if isinstance(path, str) else path.with_name(path.name + "-wal")
         self._clock = clock
         self._epoch = 0
         self._candidate: Candidate | None = None
         self._lock = asyncio.Lock()
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._db = sqlite3.connect(path, timeout=0.0, check_same_thread=False, isolation_level=None)
-            self._patiently(self._prepare)
+            if not isinstance(path, str):
+                path.parent.mkdir(parents=True, exist_ok=True)
+            self._db = sqlite3.connect(
+                path, timeout=0.0, check_same_thread=False, isolation_level=None, uri=isinstance(path, str)
+            )
+            self._retry_while_busy(lambda: self._db.executescript(_SCHEMA))
         except (sqlite3.Error, OSError) as error:
             full = getattr(error, "sqlite_errorcode", None) in _FULL
             remedy = "make room on its disk" if full else "check its folder's permissions"
             raise StateError(
                 f"the state file {path} can't be used ({error}): {remedy}, or pass --state"
             ) from error
-
-    def _prepare(self) -> None:
-        self._db.executescript(_SCHEMA)
-        self._take_up_older()
 
     async def claim(self, candidate: Candidate) -> Lead:
         def claim() -> Lead:
@@ -197,16 +196,6 @@ class SqliteStore:
         async with self._lock:
             self._db.close()
 
-    def _take_up_older(self) -> None:
-        """Read on in the file of an older manager, which kept no terms, and credentials in a table of their own."""
-        if all(column[1] != "terms" for column in self._db.execute("PRAGMA table_info(run)")):
-            self._db.execute("ALTER TABLE run ADD COLUMN terms BLOB NOT NULL DEFAULT x''")
-        if self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'credential'").fetchone():
-            self._db.execute(
-                "INSERT OR IGNORE INTO shelf SELECT ?, token_id, payload FROM credential",
-                (Shelf.CREDENTIALS.value,),
-            )
-
     def _lead(self, candidate: Candidate) -> None:
         row = (candidate.holder, candidate.address, self._clock() + candidate.ttl_s)
         self._db.execute("INSERT OR REPLACE INTO leader VALUES (1, ?, ?, ?)", row)
@@ -221,9 +210,9 @@ class SqliteStore:
         return await self._run(lambda: self._db.execute(query, values).fetchall(), fenced=False)
 
     async def _run(self, work: Callable[[], T], *, fenced: bool = True, written: int = BRIEF_BYTES + 1) -> T:
-        """The work in one transaction: at once when it is brief and nobody is in the way, else on a thread.
+        """Run the work in one transaction: on the event loop if it is small and the file is free, else on a thread.
 
-        A slow disk, or another process that writes, shall not hold up heartbeats.
+        On a thread, a slow disk or another writing process does not delay heartbeats.
         """
         async with self._lock:
             with self._errors():
@@ -251,27 +240,27 @@ class SqliteStore:
         try:
             return await asyncio.shield(thread)
         except asyncio.CancelledError:
-            # The connection is the thread's until it is done, whoever waits for its answer no longer.
+            # The thread still uses the connection: wait for it before the lock is released.
             await asyncio.wait([thread])
             raise
 
     def _checkpointed(self, work: Callable[[], T], fenced: bool) -> T:
-        answer = self._patiently(lambda: self._transaction(work, fenced))
+        answer = self._retry_while_busy(lambda: self._transaction(work, fenced))
         if self._journal_bytes() >= CHECKPOINT_BYTES:
-            # What was written is safe in the journal. Where it can't be emptied now, since somebody reads or the disk is full,
-            # the next transaction tries again.
+            # The data is safe in the journal. If a reader or a full disk blocks the checkpoint, the next transaction tries
+            # again.
             with contextlib.suppress(sqlite3.Error):
                 self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         return answer
 
     def _journal_bytes(self) -> int:
         try:
-            return self._journal.stat().st_size
+            return self._journal.stat().st_size if self._journal else 0
         except FileNotFoundError:
             return 0
 
-    def _patiently(self, work: Callable[[], T]) -> T:
-        """Do it again while another process writes, for a bounded time."""
+    def _retry_while_busy(self, work: Callable[[], T]) -> T:
+        """Repeat the work while another process writes, for at most ``BUSY_S`` seconds."""
         ends_s = time.monotonic() + BUSY_S
         while True:
             try:
@@ -289,7 +278,7 @@ class SqliteStore:
             answer = work()
             self._db.execute("COMMIT")
         except BaseException:
-            # On a full disk SQLite takes it back by itself.
+            # On a full disk SQLite has rolled back already.
             if self._db.in_transaction:
                 self._db.execute("ROLLBACK")
             raise
@@ -297,5 +286,5 @@ class SqliteStore:
 
 
 def _is_busy(error: sqlite3.OperationalError) -> bool:
-    """Another process writes: extended codes share the low byte."""
+    """Return True if another process writes. Extended error codes share the low byte."""
     return getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_BUSY

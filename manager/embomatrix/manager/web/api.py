@@ -1,49 +1,73 @@
-"""The manager's HTTP port: the dashboard, the REST API that feeds it, and the metrics."""
+"""HTTP application of the manager: the dashboard, its REST API, rewards, and Prometheus metrics."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from importlib.resources import files
+from typing import TYPE_CHECKING, Final
 
-from fastapi import FastAPI
-from fastapi.responses import Response
+from fastapi import FastAPI, HTTPException, Response
+from fastapi.responses import FileResponse
+from fastapi.staticfiles import StaticFiles
+from starlette.middleware.gzip import GZipMiddleware
 
-from embomatrix.manager.web.http_rules import Guard
-from embomatrix.manager.web.page import page
+from embomatrix.manager.web.cluster_view import Snapshots
+from embomatrix.manager.web.http_rules import STATIC, Guard
 from embomatrix.manager.web.prometheus import CONTENT_TYPE, metrics_page
-from embomatrix.manager.web.rest import PREFIX, changing, reading
-from embomatrix.manager.web.rest_tasks import showing
-from embomatrix.manager.web.rewards import rewarding
-from embomatrix.manager.web.snapshot import Snapshots
+from embomatrix.manager.web.rest import PREFIX, command_routes, read_routes
+from embomatrix.manager.web.rest_tasks import task_routes
+from embomatrix.manager.web.rewards import reward_routes
 from embomatrix.rpc.versions import software_version
 
 if TYPE_CHECKING:
+    import os
+    from collections.abc import Mapping
+
+    from starlette.types import Scope
+
     from embomatrix.manager.runtime.event_loop import ManagerRuntime
-    from embomatrix.manager.services.expulsion import Expulsion
+    from embomatrix.manager.runtime.revocation import Revocation
     from embomatrix.manager.web.gallery import Gallery
     from embomatrix.manager.web.http_rules import HttpRules
-    from embomatrix.manager.web.no_gallery import NoGallery
+
+DASHBOARD: Final = str(files("embomatrix.manager.web") / "dashboard")
+COMPRESSED_BYTES: Final = 1024
+"""Smaller answers fit one packet and are sent as they are."""
+PAGE_HEADERS: Final[Mapping[str, str]] = {
+    # The chart library sets inline styles on its own elements; everything else comes from this server's files.
+    "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; connect-src 'self'; "
+    "img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    # Browsers revalidate the files, so that an upgrade shows at once.
+    "cache-control": "no-cache",
+}
 
 
 def build_api(
-    runtime: ManagerRuntime, rules: HttpRules, expulsion: Expulsion, gallery: Gallery | NoGallery
+    runtime: ManagerRuntime, rules: HttpRules, revocation: Revocation, gallery: Gallery | None
 ) -> FastAPI:
-    """The application. With tokens, everything but the page's own files and the health check asks for one."""
+    """Return the application. If the manager asks for tokens, only the page's files and the health check need none."""
     app = FastAPI(
         title="EmboMatrix manager",
         version=software_version() or "source",
-        description="What a cluster does, an operator's verbs, rewards. With tokens: `Authorization: Bearer TOKEN`.",
+        description="State of the cluster, operator commands, and rewards. With tokens: `Authorization: Bearer TOKEN`.",
         openapi_url=f"{PREFIX}/openapi.json",
-        # Those of FastAPI load scripts from elsewhere.
+        # FastAPI's own pages load scripts from other servers.
         docs_url=None,
         redoc_url=None,
     )
+    app.add_middleware(GZipMiddleware, minimum_size=COMPRESSED_BYTES, compresslevel=1)
     app.add_middleware(Guard, rules=rules)
+    app.mount(STATIC, _PageFiles(directory=DASHBOARD))
     snapshots = Snapshots(runtime)
-    app.include_router(page())
-    app.include_router(reading(runtime, snapshots))
-    app.include_router(showing(gallery))
-    app.include_router(changing(runtime, snapshots, expulsion))
-    app.include_router(rewarding(runtime.runs))
+    app.include_router(read_routes(runtime, snapshots))
+    app.include_router(task_routes(gallery))
+    app.include_router(command_routes(runtime, snapshots, revocation))
+    app.include_router(reward_routes(runtime.runs))
+
+    @app.get("/", include_in_schema=False)
+    async def index() -> FileResponse:
+        return FileResponse(f"{DASHBOARD}/index.html", headers=dict(PAGE_HEADERS))
 
     @app.get("/healthz", include_in_schema=False)
     async def health() -> dict[str, str]:
@@ -54,3 +78,20 @@ def build_api(
         return Response(metrics_page(runtime), media_type=CONTENT_TYPE)
 
     return app
+
+
+class _PageFiles(StaticFiles):
+    """Scripts and styles of the page, with its security headers."""
+
+    def file_response(
+        self,
+        full_path: str | os.PathLike[str],
+        stat_result: os.stat_result,
+        scope: Scope,
+        status_code: int = 200,
+    ) -> Response:
+        if not str(full_path).endswith((".js", ".css")):
+            raise HTTPException(404)
+        response = super().file_response(full_path, stat_result, scope, status_code)
+        response.headers.update(PAGE_HEADERS)
+        return response

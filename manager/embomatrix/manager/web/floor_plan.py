@@ -1,7 +1,7 @@
-"""A scene from above, and where things are while a plan goes on: numbers for a page to draw.
+"""Floor plan of a scene, and object positions during a plan, for the dashboard.
 
-The manager has no physics. What a call moves is put where the call says, in the middle of its target; verified poses are seen
-with ``embomatrix factory inspect``.
+The manager has no physics: a moved object appears at the centre of its target. ``embomatrix factory inspect`` shows
+verified poses.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ if TYPE_CHECKING:
     from embomatrix.world.task import Task
 
 HUNG_M: Final = 1.6
-"""What begins higher hangs over the robot's way and is left out."""
+"""Objects whose lower edge is above this height are left out."""
 SMALL_M: Final = 0.2
-"""Less than this across, an object is a dot where a task names it, and is left out elsewhere."""
+"""Smaller objects are drawn as dots if a task names them, else left out."""
 SKIRTING_M: Final = 0.1
-"""Walls that begin higher are lintels, panes and the like: the plan shows an opening there."""
+"""Walls whose lower edge is above this height are lintels or panes: the plan shows an opening."""
 PIECES: Final = 1500
 _ORIGIN: Final = Pose((0.0, 0.0, 0.0))
 
 
 def floor_plan(scene: Scene) -> FloorPlanView:
-    """The whole scene, from above."""
+    """Return the plan of the whole scene."""
     walls = [wall.aabb(_ORIGIN) for wall in scene.walls]
     boxes = [(item, scene.box_of(item.name)) for item in scene.objects if not item.absent]
     pieces = [
@@ -48,13 +48,13 @@ def floor_plan(scene: Scene) -> FloorPlanView:
 
 
 def small_things(scene: Scene, task: Task) -> dict[str, list[float]]:
-    """Things of the task's table that a robot may carry, and where they are at the start."""
+    """Return the start positions of the task's movable objects."""
     found = [scene.by_name[name] for name in task.table if name in scene.by_name]
     return {item.name: _middle(scene, item.name) for item in found if not item.fixed and not item.absent}
 
 
 def played(scene: Scene, task: Task, plan: Plan) -> list[MomentView]:
-    """The plan call by call, each as if it did what it says."""
+    """Return the state after each call of the plan, assuming that every call succeeds."""
     moments = [MomentView("", _rounded(scene.robot.x_m, scene.robot.y_m))]
     for call in plan:
         moments.append(_after(scene, task, call, moments[-1]))
@@ -85,7 +85,7 @@ def _after(scene: Scene, task: Task, call: SkillCall, before: MomentView) -> Mom
 
 
 def _beside(scene: Scene, name: str, at: list[float] | None, robot: list[float]) -> list[float]:
-    """Before the object, on the side that the robot comes from."""
+    """Return the point of the object's box that is nearest to the robot."""
     if at is not None:
         return at
     box = scene.box_of(name)
@@ -95,7 +95,7 @@ def _beside(scene: Scene, name: str, at: list[float] | None, robot: list[float])
 
 
 def _named(scene: Scene, task: Task, row: int | None) -> str:
-    """Name of the object in that row; empty where the table or the scene has none."""
+    """Return the object in that row; empty if the table or the scene lacks it."""
     name = task.table[row] if row is not None and 0 <= row < len(task.table) else ""
     return name if name in scene.by_name else ""
 
@@ -109,5 +109,5 @@ def _box(name: str, low_m: Vec2 | Vec3, high_m: Vec2 | Vec3) -> Box:
 
 
 def _rounded(*metres: float) -> list[float]:
-    """To the centimetre, which is less than a line of the picture."""
+    """Round to centimetres, finer than a line of the drawing."""
     return [round(value, 2) for value in metres]

@@ -1,7 +1,7 @@
-"""The tasks of a dataset, for the dashboard: looked up by id, in pages, read and never written.
+"""Tasks of a dataset for the dashboard. The dataset is only read.
 
-Names in a dataset are foreign text. None becomes a path before it is known to be a plain name, and nothing is read through a
-link that leads out of the folder, or beyond a size.
+Names in a dataset are untrusted. Only plain names become paths, links must stay within the folder, and file sizes are
+limited.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 TASKS_BYTES: Final = 256_000_000
-"""Of ``tasks.jsonl``: some 60,000 tasks."""
+"""Size limit of ``tasks.jsonl``, about 60,000 tasks."""
 NOTE_BYTES: Final = 262_144
-"""Of a transcript or a tree."""
+"""Size limit of a transcript or a layout tree."""
 PICTURE_BYTES: Final = 2_000_000
 SCENES_KEPT: Final = 8
-"""Decoded: a few tens of MB at most."""
+"""Decoded scenes in memory, a few tens of MB."""
 PLANS_KEPT: Final = 256
 PICTURES_FOLDER: Final = "pictures"
 HANGS_M: Final = 0.05
-"""What begins higher, and rests on nothing, hangs."""
+"""An object above this height without support hangs on a wall."""
 _PLAIN: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,199}")
 _JPEG: Final = b"\xff\xd8\xff"
 
 
 class Gallery:
-    """Of the dataset in ``folder``. Reading happens in a thread, one reader at a time."""
+    """Tasks of the dataset in ``folder``. Reads run in a thread, one at a time."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -62,7 +62,9 @@ class Gallery:
         self._plans: OrderedDict[str, FloorPlanView] = OrderedDict()
 
     async def page(self, *, search: str, scene: str, category: str, offset: int, limit: int) -> TaskPage:
-        """Tasks with the text in their instruction or id, in the order of the file. UnavailableError for a damaged dataset."""
+        """Return a page of the tasks with these words in their instruction or id, in file order. Raises
+        UnavailableError.
+        """
         records = list((await self._loaded()).values())
         words = search.lower().split()
         found = [
@@ -82,25 +84,25 @@ class Gallery:
         )
 
     async def scenes(self, *, offset: int, limit: int) -> list[SceneName]:
-        """The scene of each bundle, in the order of the tasks. UnavailableError for a damaged dataset."""
+        """Return the scene of each bundle, in the order of the tasks. Raises UnavailableError."""
         records = (await self._loaded()).values()
         names = {record.bundle_digest: record.task.scene_id for record in records}
         return [SceneName(digest, name) for digest, name in names.items()][offset : offset + limit]
 
     async def detail(self, task_id: str) -> TaskDetail:
-        """Everything of one task. NotFoundError, or UnavailableError for a damaged dataset."""
+        """Return one task. Raises NotFoundError, or UnavailableError for a damaged dataset."""
         record = await self._record(task_id)
         async with self._reading:
             return await asyncio.to_thread(self._read_detail, record)
 
     async def floor(self, digest: str) -> FloorPlanView:
-        """The scene of a bundle from above. NotFoundError for one that no task is in."""
+        """Return the floor plan of a bundle's scene. Raises NotFoundError."""
         await self._check_bundle(digest)
         async with self._reading:
             return await asyncio.to_thread(self._read_floor, digest)
 
     async def picture(self, digest: str) -> bytes:
-        """A JPEG of the scene of a bundle, as ``embomatrix factory pictures`` leaves it. NotFoundError where there is none."""
+        """Return the JPEG of a bundle's scene that ``embomatrix factory pictures`` made. Raises NotFoundError."""
         await self._check_bundle(digest)
         data = self._file(PICTURES_FOLDER, f"{digest.removeprefix('sha256:')}.jpg", PICTURE_BYTES)
         if not data.startswith(_JPEG):
@@ -120,7 +122,7 @@ class Gallery:
         return record
 
     async def _loaded(self) -> dict[str, TaskRecord]:
-        """Records by id; read again once the file is another one."""
+        """Return the records by id. They are read again after the file changes."""
         async with self._reading:
             return await asyncio.to_thread(self._load)
 
@@ -207,7 +209,7 @@ class Gallery:
         return self._file(folder, f"{task_id}.{ending}", NOTE_BYTES).decode("utf-8", "replace")
 
     def _file(self, folder: str, name: str, at_most: int) -> bytes:
-        """Content of a file that a dataset may have; empty where it has none, or one that is too large."""
+        """Return the content of an optional file; empty if it is absent or too large."""
         path = self._path(folder, name)
         try:
             return b"" if path is None else read_whole(path, at_most=at_most)
@@ -215,7 +217,7 @@ class Gallery:
             return b""
 
     def _path(self, folder: str, name: str) -> Path | None:
-        """Of a file that is there, with a plain name, and truly within the dataset's folder."""
+        """Return the path of an existing file with a plain name inside the dataset; None otherwise."""
         if not _PLAIN.fullmatch(name):
             return None
         path = self._folder / folder / name
@@ -240,7 +242,7 @@ def _row(scene: Scene, name: str, about: frozenset[str]) -> ObjectRow:
 
 
 def _where(scene: Scene, name: str) -> str:
-    """What it rests on or in; by itself it stands on the floor or hangs on a wall."""
+    """Return the support of the object: its host, the wall, or the floor."""
     item = scene.by_name[name]
     if item.host and item.relation:
         return f"{item.relation.value} {item.host}"
@@ -248,14 +250,14 @@ def _where(scene: Scene, name: str) -> str:
 
 
 def _rooms(scene: Scene, record: TaskRecord, moments: list[MomentView]) -> list[str]:
-    """Those that the table's objects are in, and those that the robot comes through."""
+    """Return the rooms of the table's objects, and those that the robot visits."""
     table = {scene.by_name[name].room for name in record.task.table if name in scene.by_name}
     visited = {scene.room_at((moment.robot[0], moment.robot[1])) for moment in moments}
     return sorted((table | visited) - {""})
 
 
 def _parsed(text: str) -> object:
-    """A layout tree; None where there is none, or the file is no JSON."""
+    """Return a parsed layout tree; None if there is none, or for invalid JSON."""
     try:
         return json.loads(text) if text else None
     except (ValueError, RecursionError):

@@ -1,15 +1,15 @@
-"""What the REST API tells of a dataset's tasks. FastAPI evaluates these annotations: here they are no text."""
+"""Task values of the REST API. FastAPI evaluates the annotations, so they are not postponed."""
 
 from dataclasses import dataclass, field
 from typing import Any
 
 Box = tuple[str, float, float, float, float]
-"""A name, and west, south, east and north in metres."""
+"""Name, then west, south, east and north edges in metres."""
 
 
 @dataclass(frozen=True, slots=True)
 class FloorPlanView:
-    """Rooms, walls and what stands about, as boxes in the world's xy plane."""
+    """Rooms, walls and objects as boxes in the world's xy plane."""
 
     rooms: list[Box]
     walls: list[Box]
@@ -19,8 +19,8 @@ class FloorPlanView:
 
 @dataclass(frozen=True, slots=True)
 class MomentView:
-    """After a call; the first is the start. ``things`` are those that are elsewhere than at the start, ``active`` what the plan
-    opened or switched on. Metres in the world's xy plane.
+    """State after a call; the first one is the start. ``things`` are displaced objects, ``active`` objects that the
+    plan opened or switched on. Positions are metres in the world's xy plane.
     """
 
     call: str
@@ -32,7 +32,7 @@ class MomentView:
 
 @dataclass(frozen=True, slots=True)
 class TaskCard:
-    """A task in a list. ``steps`` are those of the oracle's plan, ``objects`` rows of the object table."""
+    """Task in a list. ``steps`` counts the oracle's calls, ``objects`` the rows of the object table."""
 
     task_id: str
     instruction: str
@@ -43,12 +43,12 @@ class TaskCard:
     objects: int
     bundle_digest: str
     picture: bool
-    """Whether there is a picture of its scene."""
+    """True if there is a picture of its scene."""
 
 
 @dataclass(frozen=True, slots=True)
 class SceneCount:
-    """A scene and how many tasks are in it."""
+    """Scene and its number of tasks."""
 
     scene_id: str
     tasks: int
@@ -56,7 +56,7 @@ class SceneCount:
 
 @dataclass(frozen=True, slots=True)
 class SceneName:
-    """What the scene in a bundle is called."""
+    """Name of the scene in a bundle."""
 
     bundle_digest: str
     scene_id: str
@@ -64,9 +64,10 @@ class SceneName:
 
 @dataclass(frozen=True, slots=True)
 class TaskPage:
-    """Tasks from ``offset``, of ``total`` that fit what was asked for, with all scenes and categories that there are.
+    """Page of tasks from ``offset``; ``total`` counts all matches. ``scenes`` and ``categories`` are those of the
+    dataset.
 
-    ``notice`` says why there are none.
+    ``notice`` says why there are no tasks.
     """
 
     total: int
@@ -79,7 +80,7 @@ class TaskPage:
 
 @dataclass(frozen=True, slots=True)
 class ObjectRow:
-    """A row of the object table at the start: ``size_m`` is width, depth and height, ``goal`` whether the goal names it."""
+    """Row of the object table at the start: ``size_m`` is width, depth and height; ``goal`` if the goal names it."""
 
     name: str
     room: str
@@ -92,9 +93,10 @@ class ObjectRow:
 
 @dataclass(frozen=True, slots=True)
 class TaskDetail:
-    """One task. ``rooms`` are those to be shown, ``things`` small ones at the start, ``moments`` the oracle's plan by calls.
+    """One task. ``rooms`` are the rooms to show, ``things`` the small objects at the start, ``moments`` the oracle's
+    plan call by call.
 
-    ``tree`` is the layout tree of a scene that was laid out by one, else None; ``problem`` why there is no plan to be played.
+    ``tree`` is the layout tree of a generated scene, else None; ``problem`` says why there is no plan to show.
     """
 
     card: TaskCard

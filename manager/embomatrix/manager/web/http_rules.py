@@ -1,4 +1,4 @@
-"""Who may ask the manager's HTTP port for what: decided from the head of a request, before anything reads its body."""
+"""Access rules of the HTTP port, decided from a request's head before its body is read."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse
 
 from embomatrix.manager.settings import is_loopback
-from embomatrix.manager.web.page import STATIC
 from embomatrix.manager.web.rewards import REWARDS
 from embomatrix.rpc.channel import token_of
-from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.status import NotSignedInError
+from embomatrix.rpc.wire.tokens import AccessRole
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Receive, Scope, Send
@@ -22,8 +21,10 @@ if TYPE_CHECKING:
     from embomatrix.manager.access.gate import Gate
     from embomatrix.manager.access.protection import Tls
 
+STATIC: Final = "/static/"
+"""Prefix of the page's files, which hold nothing about the cluster and need no token."""
 OPEN_PATHS: Final = frozenset({"/", "/healthz"})
-"""The empty page, which asks for the token itself, and the health check; the page's own files lie below ``STATIC``."""
+"""Page and health check, which need no token."""
 READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 VIEWERS: Final = frozenset({AccessRole.VIEWER, AccessRole.TRAINER, AccessRole.ADMIN})
 TRAINERS: Final = frozenset({AccessRole.TRAINER, AccessRole.ADMIN})
@@ -32,7 +33,7 @@ LOOPBACK_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
 
 
 class HttpRefusal(NamedTuple):
-    """Why a request gets no answer: the HTTP status, and a sentence for whoever asked."""
+    """HTTP status and message of a refused request."""
 
     status: int
     sentence: str
@@ -40,38 +41,40 @@ class HttpRefusal(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class HttpRules:
-    """``hosts`` are the names that this server answers to; empty: to any."""
+    """``hosts`` are the names that this server answers to; empty: any name."""
 
     gate: Gate
     hosts: frozenset[str]
 
     def refusal(self, method: str, path: str, headers: Headers) -> HttpRefusal | None:
-        """Why the request is refused; None if it isn't."""
+        """Return the reason to refuse the request; None if it is allowed."""
         host = headers.get("host", "")
         if self.hosts and _name_of(host) not in self.hosts:
-            # A page elsewhere must not reach this one under a name of its own (DNS rebinding).
+            # Prevents DNS rebinding: a foreign page must not reach this server under its own name.
             return HttpRefusal(
                 400, f"this server is not called {host[:100]!r}: add the name with `manager init --san`"
             )
         changes = method not in READING
         if changes and _is_foreign(headers, host):
-            return HttpRefusal(403, "a page of another origin asks for a change: open the manager's own page")
+            return HttpRefusal(
+                403, "a page of another origin requested a change: open the manager's own dashboard"
+            )
         if (path in OPEN_PATHS or path.startswith(STATIC)) and not changes:
             return None
         try:
             role = self.gate.caller(token_of(headers.get("authorization"))).role
         except NotSignedInError as error:
-            return HttpRefusal(401, f"{error}; HTTP requests show it as `Authorization: Bearer TOKEN`")
+            return HttpRefusal(401, f"{error}; HTTP requests send it as `Authorization: Bearer TOKEN`")
         if role not in _allowed(path, changes=changes):
             needed = (
                 AccessRole.TRAINER if path == REWARDS else AccessRole.ADMIN if changes else AccessRole.VIEWER
             )
-            return HttpRefusal(403, f"a token of the role {role} may not do this: it takes {needed}")
+            return HttpRefusal(403, f"a token of the role {role} may not do this: it needs {needed}")
         return None
 
 
 class Guard:
-    """ASGI middleware that keeps the rules; what comes over a WebSocket is refused, nothing here speaks it."""
+    """ASGI middleware that applies the rules. WebSockets are refused."""
 
     def __init__(self, app: ASGIApp, rules: HttpRules) -> None:
         self._app = app
@@ -90,7 +93,7 @@ class Guard:
 
 
 def allowed_hosts(bound: str, tls: Tls | None) -> frozenset[str]:
-    """The names to answer to: those in the certificate, those of loopback, or any where neither says."""
+    """Return the names to answer to: those of the certificate and of loopback; any name if neither applies."""
     if tls is not None:
         return LOOPBACK_NAMES | {name.lower() for name in tls.names}
     return LOOPBACK_NAMES if is_loopback(bound) else frozenset()
@@ -103,7 +106,7 @@ def _allowed(path: str, *, changes: bool) -> frozenset[AccessRole]:
 
 
 def _is_foreign(headers: Headers, host: str) -> bool:
-    """Whether a page of another origin sent this: browsers say so, other programs send neither header."""
+    """Return True if a page of another origin sent the request. Programs other than browsers send neither header."""
     origin = headers.get("origin")
     if origin is not None:
         return urlsplit(origin).netloc.lower() != host.lower()
@@ -111,5 +114,5 @@ def _is_foreign(headers: Headers, host: str) -> bool:
 
 
 def _name_of(host: str) -> str:
-    """The ``Host`` header without its port."""
+    """Return the ``Host`` header without its port."""
     return (urlsplit(f"//{host}").hostname or "").lower()

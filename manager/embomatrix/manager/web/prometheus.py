@@ -1,6 +1,6 @@
-"""The metrics page. It is made from the manager's own counters when somebody asks, so it costs nothing between two scrapes.
+"""Prometheus metrics, made from the manager's counters on each scrape.
 
-No label ever carries an id of a run, rollout, worker or scene: each has a closed set of values.
+Labels have closed sets of values; none carries the id of a run, rollout, worker or scene.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from prometheus_client import CollectorRegistry, ProcessCollector, generate_late
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.registry import Collector
 
-from embomatrix.manager.observe.histogram import BOUNDS_S
-from embomatrix.manager.observe.history import manager_version
+from embomatrix.manager.histogram import BOUNDS_S
+from embomatrix.manager.observe.run_archive import manager_version
 from embomatrix.manager.runtime.registry import WorkerStanding
-from embomatrix.manager.web.views import standing_counts
+from embomatrix.manager.web.cluster_view import standing_counts
 from embomatrix.rpc.wire.values import InfraCode, ResidentState
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from prometheus_client.metrics_core import Metric
 
     from embomatrix.manager.control.workers import WorkerRecord
-    from embomatrix.manager.observe.histogram import Histogram
+    from embomatrix.manager.histogram import Histogram
     from embomatrix.manager.runtime.event_loop import ManagerRuntime
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
@@ -33,7 +33,7 @@ SLOT_STATES: Final = ("idle", "warming", "warm", "running", "quarantined")
 
 
 def metrics_page(runtime: ManagerRuntime) -> str:
-    """What Prometheus scrapes: the cluster, and the manager's own process."""
+    """Return the metrics of the cluster and of the manager's process."""
     registry = CollectorRegistry(auto_describe=False)
     registry.register(_Cluster(runtime))
     ProcessCollector(registry=registry)
@@ -41,7 +41,7 @@ def metrics_page(runtime: ManagerRuntime) -> str:
 
 
 class _Cluster(Collector):
-    """Metric families of one moment; ``docs/operations.md`` says what each is for."""
+    """Metric families of one moment, listed in ``docs/operations.md``."""
 
     def __init__(self, runtime: ManagerRuntime) -> None:
         self._runtime = runtime
@@ -65,55 +65,53 @@ class _Cluster(Collector):
         )
         found = {state.value: residents[state.value] for state in ResidentState}
         yield _gauges("embo_residents", "Scenes on workers by state.", "state", found)
-        loads = self._runtime.chronicle.fleet.scene_load
+        loads = self._runtime.event_log.fleet.scene_load
         yield _histograms(
             "embo_scene_load_seconds", "Time that workers took to load a scene.", "", {"": loads}
         )
 
     def _work(self) -> Iterator[Metric]:
-        runtime, chronicle = self._runtime, self._runtime.chronicle
+        runtime, chronicle = self._runtime, self._runtime.event_log
         dispatcher, totals = runtime.cluster.dispatcher, runtime.cluster.totals()
         yield _gauge("embo_runs", "Open runs.", len(runtime.runs.open))
-        yield _gauge("embo_queue_depth", "Rollouts that wait for a lease.", dispatcher.queued)
+        yield _gauge("embo_queue_depth", "Queued rollouts.", dispatcher.queued)
         yield _gauge("embo_leases", "Live leases.", len(dispatcher.live_leases))
         outcomes = {name: runtime.meter.outcomes[name] for name in OUTCOMES}
         yield _counters("embo_rollouts", "Rollouts by outcome.", "outcome", outcomes)
         phases = {phase.value: histogram for phase, histogram in chronicle.phases().items()}
         yield _histograms("embo_rollout_seconds", "Time of completed rollouts by phase.", "phase", phases)
         yield _attempts(chronicle.attempts)
-        yield _counter("embo_redispatched", "Leases that were given again.", totals.redispatched)
-        yield _counter("embo_lease_expired", "Leases that nobody renewed or answered.", dispatcher.expired)
-        yield _counter("embo_stale_results", "Late results that were fenced off.", totals.stale_results)
+        yield _counter("embo_redispatched", "Re-dispatched leases.", totals.redispatched)
+        yield _counter("embo_lease_expired", "Expired leases.", dispatcher.expired)
+        yield _counter("embo_stale_results", "Late results that were rejected.", totals.stale_results)
         won = chronicle.hedges_won
         hedges = {"true": won, "false": max(0, totals.hedged - won)}
-        yield _counters(
-            "embo_hedges", "Second leases of stragglers, by whether they came first.", "won", hedges
-        )
-        yield _counter("embo_groups_failed", "Groups that were given up.", totals.groups_failed)
+        yield _counters("embo_hedges", "Hedge leases, by whether they delivered first.", "won", hedges)
+        yield _counter("embo_groups_failed", "Failed groups.", totals.groups_failed)
 
     def _prewarming(self) -> Iterator[Metric]:
         totals = self._runtime.cluster.totals()
         hits, misses = totals.prewarm_hits, totals.prewarm_misses
-        yield _counter("embo_prewarm_hits", "Scenes that were warm when their batch came.", hits)
-        yield _counter("embo_prewarm_misses", "Scenes that were not warm when their batch came.", misses)
-        yield _counter(
-            "embo_prewarm_wasted", "Loads ahead of demand that nobody used.", totals.prewarm_wasted
-        )
+        yield _counter("embo_prewarm_hits", "Scenes that were warm when their batch arrived.", hits)
+        yield _counter("embo_prewarm_misses", "Scenes that were not warm when their batch arrived.", misses)
+        yield _counter("embo_prewarm_wasted", "Preloaded scenes that were not used.", totals.prewarm_wasted)
         leads = {"": self._runtime.cluster.scheduler.prewarm.leads}
-        yield _histograms("embo_prewarm_lead_seconds", "From a scene being warm to its demand.", "", leads)
+        yield _histograms(
+            "embo_prewarm_lead_seconds", "Time between a scene being warm and its demand.", "", leads
+        )
 
     def _manager(self) -> Iterator[Metric]:
         runtime = self._runtime
-        share = runtime.effort.overhead()
+        share = runtime.load.overhead()
         text = "CPU time of the manager over that of the manager and the slots, in the last minute."
         yield _gauge("embo_manager_overhead_ratio", text, share)
-        lag = {"": runtime.effort.lag}
-        yield _histograms("embo_manager_lag_seconds", "How late the manager's clock ticked.", "", lag)
-        operations = runtime.effort.store
+        lag = {"": runtime.load.lag}
+        yield _histograms("embo_manager_lag_seconds", "Lag of the manager's clock ticks.", "", lag)
+        operations = runtime.load.store
         yield _histograms("embo_store_op_seconds", "Time of the state store's operations.", "op", operations)
-        dropped = sum(run.ring.dropped for run in runtime.chronicle.runs.values())
-        dropped += runtime.chronicle.dropped + runtime.chronicle.fleet.ring.dropped
-        yield _counter("embo_events_dropped", "Events of logs that made room for later ones.", dropped)
+        dropped = sum(run.ring.dropped for run in runtime.event_log.runs.values())
+        dropped += runtime.event_log.dropped + runtime.event_log.fleet.ring.dropped
+        yield _counter("embo_events_dropped", "Events discarded from full logs.", dropped)
 
     def _slot_states(self) -> dict[str, int]:
         states = Counter[str]()
@@ -124,7 +122,7 @@ class _Cluster(Collector):
         return {state: states[state] for state in SLOT_STATES}
 
     def _state_of_free(self, worker: WorkerRecord) -> str:
-        """What a slot without a rollout could do: start one at once, soon, or not."""
+        """Return the state of a slot without a rollout."""
         if worker.quarantined:
             return "quarantined"
         states = {resident.state for resident in self._runtime.cluster.scheduler.residents(worker.worker_id)}
@@ -156,7 +154,7 @@ def _counters(name: str, text: str, label: str, values: Mapping[str, float]) -> 
 
 
 def _histograms(name: str, text: str, label: str, values: Mapping[str, Histogram]) -> Metric:
-    """One histogram for each value of the label; without a label, the one under the empty name."""
+    """Return a family with one histogram per label value; without a label, the one under the empty name."""
     family = HistogramMetricFamily(name, text, labels=[label] if label else [])
     for key, histogram in values.items():
         counts = zip(BOUNDS_S, histogram.cumulative(), strict=True)
@@ -166,7 +164,7 @@ def _histograms(name: str, text: str, label: str, values: Mapping[str, Histogram
 
 
 def _attempts(attempts: Mapping[int, int]) -> Metric:
-    family = HistogramMetricFamily("embo_attempts", "Leases that a rollout took to its outcome.", labels=[])
+    family = HistogramMetricFamily("embo_attempts", "Attempts per rollout.", labels=[])
     bounds = (1, 2, 3, 5, 10)
     within = [sum(count for attempt, count in attempts.items() if attempt <= bound) for bound in bounds]
     buckets = [(str(bound), float(count)) for bound, count in zip(bounds, within, strict=True)]

@@ -1,31 +1,31 @@
-"""The REST API of the dataset that the manager was told of: its tasks in pages, each with everything about it."""
+"""REST API of the tasks of a dataset."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
-from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import JSONResponse
+from fastapi import APIRouter, Query, Response
 
 from embomatrix.manager.web.gallery_values import FloorPlanView, SceneName, TaskDetail, TaskPage
-from embomatrix.manager.web.packing import packed
-from embomatrix.manager.web.rest import PREFIX, Limit, Offset, answered
+from embomatrix.manager.web.rest import PREFIX, Limit, Offset, http_errors
 from embomatrix.manager.web.rest_values import PAGE
+from embomatrix.rpc.status import NotFoundError
 
 if TYPE_CHECKING:
     from embomatrix.manager.web.gallery import Gallery
-    from embomatrix.manager.web.no_gallery import NoGallery
 
-CARDS = 24
+NO_DATASET: Final = "no dataset is shown: start the manager with --dataset FOLDER"
+CARDS: Final = 24
+"""Default number of tasks on a page."""
 Words = Annotated[str, Query(max_length=200, description="Only tasks with these words.")]
 Scene = Annotated[str, Query(max_length=256, description="Only tasks in this scene.")]
 Category = Annotated[str, Query(max_length=64, description="Only tasks of this category.")]
 
 
-def showing(gallery: Gallery | NoGallery) -> APIRouter:
-    """What a viewer may ask about tasks."""
+def task_routes(gallery: Gallery | None) -> APIRouter:
+    """Return the routes of viewers about tasks. ``gallery`` is None if the manager shows no dataset."""
     router = APIRouter(prefix=PREFIX, tags=["tasks"])
 
     @router.get("/tasks", response_model=TaskPage)
@@ -37,42 +37,48 @@ def showing(gallery: Gallery | NoGallery) -> APIRouter:
         limit: Limit = CARDS,
     ) -> Response:
         """Tasks of the dataset, in its order."""
-        with answered():
-            found = await gallery.page(
-                search=search, scene=scene, category=category, offset=offset, limit=limit
+        if gallery is None:
+            return _json(TaskPage(0, offset, [], [], [], NO_DATASET))
+        with http_errors():
+            return _json(
+                await gallery.page(search=search, scene=scene, category=category, offset=offset, limit=limit)
             )
-        return JSONResponse(dataclasses.asdict(found))
 
     @router.get("/tasks/{task_id}", response_model=TaskDetail)
-    async def task(request: Request, task_id: str) -> Response:
-        """One task: what is asked, its objects, and the oracle's plan on the plan view."""
-        with answered():
-            return _json(request, await gallery.detail(task_id))
+    async def task(task_id: str) -> Response:
+        """One task: instruction, objects, and the oracle's plan on the floor plan."""
+        with http_errors():
+            return _json(await _shown(gallery).detail(task_id))
 
-    _scenes(router, gallery)
-    return router
-
-
-def _scenes(router: APIRouter, gallery: Gallery | NoGallery) -> None:
     @router.get("/scenes", response_model=list[SceneName])
-    async def scenes(request: Request, offset: Offset = 0, limit: Limit = PAGE) -> Response:
-        """What the scenes of the dataset are called, by the digests of their bundles."""
-        with answered():
-            return _json(request, await gallery.scenes(offset=offset, limit=limit))
+    async def scenes(offset: Offset = 0, limit: Limit = PAGE) -> Response:
+        """Names of the dataset's scenes, by bundle digest."""
+        if gallery is None:
+            return _json([])
+        with http_errors():
+            return _json(await gallery.scenes(offset=offset, limit=limit))
 
     @router.get("/scenes/{digest}/floor", response_model=FloorPlanView)
-    async def floor(request: Request, digest: str) -> Response:
-        """A scene from above."""
-        with answered():
-            return _json(request, await gallery.floor(digest))
+    async def floor(digest: str) -> Response:
+        """Floor plan of a scene."""
+        with http_errors():
+            return _json(await _shown(gallery).floor(digest))
 
     @router.get("/scenes/{digest}/picture", response_class=Response)
     async def picture(digest: str) -> Response:
-        """A scene at an angle, as a JPEG."""
-        with answered():
-            return Response(await gallery.picture(digest), media_type="image/jpeg")
+        """Rendered picture of a scene, as JPEG."""
+        with http_errors():
+            return Response(await _shown(gallery).picture(digest), media_type="image/jpeg")
+
+    return router
 
 
-def _json(request: Request, value: TaskDetail | FloorPlanView | list[SceneName]) -> Response:
-    told = json.dumps(value, default=dataclasses.asdict, separators=(",", ":"))
-    return packed(request, told.encode())
+def _shown(gallery: Gallery | None) -> Gallery:
+    if gallery is None:
+        raise NotFoundError(NO_DATASET)
+    return gallery
+
+
+def _json(value: object) -> Response:
+    text = json.dumps(value, default=dataclasses.asdict, separators=(",", ":"))
+    return Response(text, media_type="application/json")

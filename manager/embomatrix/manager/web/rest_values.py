@@ -1,30 +1,29 @@
-"""What the REST API answers with: pages of lists, and what a change came to.
+"""Responses of the REST API.
 
-FastAPI derives the OpenAPI page from these, by annotations that it evaluates: here they are no text.
+FastAPI evaluates the annotations for the OpenAPI page, so this module has no postponed annotations.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.manager.observe.training_reports import TrainingView
-from embomatrix.manager.web.health import Health
-from embomatrix.manager.web.views import LookaheadStep, Overview, RunView, WorkerView
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.manager.web.snapshot import Snapshot
+from embomatrix.manager.web.cluster_view import Health, LookaheadStep, Overview, Snapshot, WorkerView
+from embomatrix.rpc.timeline import Span, slot_spans
+from embomatrix.rpc.wire.run_log import EventPage
+from embomatrix.rpc.wire.values import RunInfo
 
 PAGE: Final = 100
-"""Rows of a page, unless another number is asked for."""
+"""Default number of rows on a page."""
 LARGEST_PAGE: Final = 1000
+TRACKS: Final = 200
+"""Slots of a timeline at most, the first by name."""
 TROUBLE: Final = ("quarantined", "lost", "suspect", "draining", "paused")
-"""States in the order in which an operator wants to see them; all others come after, and who left comes last."""
+"""States that are listed first, in this order. Workers that left come last."""
 
 
 @dataclass(frozen=True, slots=True)
 class WorkerPage:
-    """Workers from ``offset``, of ``total`` that fit what was asked for."""
+    """Page of workers from ``offset``; ``total`` counts all that match."""
 
     at_s: float
     total: int
@@ -34,31 +33,31 @@ class WorkerPage:
 
 @dataclass(frozen=True, slots=True)
 class RunPage:
-    """Some of the runs, those from ``offset`` on, of ``total``; ``at_s`` is wall time."""
+    """Page of runs from ``offset``; ``at_s`` is seconds since the epoch."""
 
     at_s: float
     total: int
     offset: int
-    items: list[RunView]
+    items: list[RunInfo]
 
 
 @dataclass(frozen=True, slots=True)
 class SnapshotPage:
-    """The cluster at one moment, with one page of its workers."""
+    """State of the cluster at one moment, with one page of its workers."""
 
     at_s: float
     health: Health
     paused: bool
     overview: Overview
     workers: WorkerPage
-    runs: list[RunView]
+    runs: list[RunInfo]
     lookahead: list[LookaheadStep]
     training: list[TrainingView]
 
 
 @dataclass(frozen=True, slots=True)
 class SlotSpan:
-    """A slot worked on a rollout. Times are seconds since the epoch on the manager's clock."""
+    """Work of a slot on one rollout. Times are seconds since the epoch on the manager's clock."""
 
     begin_s: float
     end_s: float
@@ -72,7 +71,7 @@ class SlotSpan:
 
 @dataclass(frozen=True, slots=True)
 class SlotTrack:
-    """What one slot of a worker did, in the order of time."""
+    """Work of one slot of a worker, in the order of time."""
 
     worker_id: str
     slot: int
@@ -81,9 +80,9 @@ class SlotTrack:
 
 @dataclass(frozen=True, slots=True)
 class Timeline:
-    """What each slot did between two moments, by the event log. ``dropped`` events made room for later ones.
+    """Work of each slot between two moments, from the event log. ``dropped`` events were discarded for later ones.
 
-    ``slots`` is how many did anything, of which the tracks are the first.
+    ``slots`` counts the slots with work; ``tracks`` holds the first of them.
     """
 
     run_id: str
@@ -96,16 +95,16 @@ class Timeline:
 
 @dataclass(frozen=True, slots=True)
 class Changed:
-    """What a change came to."""
+    """Result of a command."""
 
     thing: str
     state: str
 
 
 def worker_page(
-    seen: "Snapshot", *, state: str = "", search: str = "", offset: int = 0, limit: int = PAGE
+    seen: Snapshot, *, state: str = "", search: str = "", offset: int = 0, limit: int = PAGE
 ) -> WorkerPage:
-    """Those in the state, or with the text in their name or a label; who doesn't work comes first."""
+    """Return a page of the workers in the state, with the text in their name or a label. Workers with trouble come first."""
     found = [
         worker for worker in seen.workers if state in ("", worker.state) and search.lower() in _words(worker)
     ]
@@ -113,17 +112,57 @@ def worker_page(
     return WorkerPage(seen.at_s, len(found), offset, found[offset : offset + limit])
 
 
-def run_page(seen: "Snapshot", *, offset: int = 0, limit: int = PAGE) -> RunPage:
-    """Open runs, the one opened last first."""
-    newest: Sequence[RunView] = seen.runs[::-1]
-    return RunPage(seen.at_s, len(newest), offset, list(newest[offset : offset + limit]))
+def run_page(seen: Snapshot, *, offset: int = 0, limit: int = PAGE) -> RunPage:
+    """Return a page of the open runs, newest first."""
+    newest = seen.runs[::-1]
+    return RunPage(seen.at_s, len(newest), offset, newest[offset : offset + limit])
 
 
 def _words(worker: WorkerView) -> str:
-    """What a search looks in."""
+    """Return the text that a search covers."""
     return " ".join([worker.worker_id, *(f"{name}={value}" for name, value in worker.labels.items())]).lower()
 
 
 def _urgency(worker: WorkerView) -> tuple[int, str]:
     order = TROUBLE.index(worker.state) if worker.state in TROUBLE else len(TROUBLE)
     return order + (worker.state == "left"), worker.worker_id
+
+
+def snapshot_page(seen: Snapshot, *, state: str, search: str, offset: int, limit: int) -> SnapshotPage:
+    return SnapshotPage(
+        seen.at_s,
+        seen.health,
+        seen.paused,
+        seen.overview,
+        worker_page(seen, state=state, search=search, offset=offset, limit=limit),
+        seen.runs,
+        seen.lookahead,
+        seen.training,
+    )
+
+
+def timeline(run_id: str, page: EventPage, *, seconds: float, search: str = "") -> Timeline:
+    """Return the last seconds before the latest event, for workers with the text in their name."""
+    until_s = max((event.at_s for event in page.events), default=0.0)
+    from_s = until_s - seconds
+    tracks = [
+        SlotTrack(key.worker_id, key.slot, [_span(span) for span in spans if span.end_s >= from_s])
+        for key, spans in slot_spans(page.events).items()
+        if search.lower() in key.worker_id.lower()
+    ]
+    busy = [track for track in tracks if track.spans]
+    return Timeline(run_id, from_s, until_s, page.dropped, len(busy), busy[:TRACKS])
+
+
+def _span(span: Span) -> SlotSpan:
+    event = span.event
+    return SlotSpan(
+        begin_s=span.begin_s,
+        end_s=span.end_s,
+        load_s=span.load_s,
+        outcome=event.code or event.kind.value,
+        rollout_id=event.rollout_id,
+        bundle_digest=event.bundle_digest,
+        attempt=event.attempt,
+        deliver_s=event.timings.deliver_s if event.timings is not None else 0.0,
+    )

@@ -1,6 +1,6 @@
-"""Rewards over HTTP, in the shape in which OpenRLHF asks a remote reward model: answers in, numbers out.
+"""Rewards over HTTP, in the request format of OpenRLHF's remote reward model.
 
-A request is one batch of a run that all such requests share. It waits until each answer has its reward.
+Each request is one batch of a run that all such requests share, and waits until every answer has its reward.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from fastapi import APIRouter, HTTPException, Request
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from embomatrix.manager.web.rest import PREFIX, answered
+from embomatrix.manager.web.rest import PREFIX, http_errors
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.hierarchy import unparsable
 from embomatrix.rpc.reward_label import RewardLabel, answer_in
@@ -36,18 +36,18 @@ TERMS: Final = RunTerms(GroupPolicy.PARTIAL)
 LARGEST_BYTES: Final = 64 * 1024 * 1024
 MOST_ANSWERS: Final = 4096
 LONGEST_S: Final = 170.0
-"""OpenRLHF's client gives a request up after 180 s, and sends it again."""
+"""OpenRLHF's client repeats a request after 180 s."""
 
 
 class RewardRequest(BaseModel):
-    """What OpenRLHF posts. ``query`` is the prompt with the answer after it; other fields are left alone."""
+    """Request of OpenRLHF. ``query`` is the prompt followed by the answer; unknown fields are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
     query: list[str] = Field(min_length=1, max_length=MOST_ANSWERS)
     prompts: list[str]
-    """The prompts alone, so that the plan that a prompt shows as an example is not taken for an answer."""
+    """Prompts without answers. They keep the example plan in a prompt from being parsed as the answer."""
     labels: list[str]
-    """One ``RewardLabel`` as text for each."""
+    """``RewardLabel`` of each answer, as text."""
 
     @model_validator(mode="after")
     def _as_many(self) -> RewardRequest:
@@ -58,16 +58,16 @@ class RewardRequest(BaseModel):
         return self
 
 
-def rewarding(runs: Runs) -> APIRouter:
-    """What a trainer may ask."""
+def reward_routes(runs: Runs) -> APIRouter:
+    """Return the routes of trainers."""
     router = APIRouter(prefix=PREFIX, tags=["train"])
 
     @router.post("/rewards", openapi_extra={"requestBody": _BODY})
     async def rewards(request: Request) -> JSONResponse:
-        """The reward of each answer, its success as the score, and its tiers; 503 where the infrastructure lost one."""
-        with answered():
-            asked = _request(await _body(request))
-            return JSONResponse(_told(await _rewards(runs, asked)))
+        """Reward, success (as score) and tiers of each answer; 503 after an infrastructure failure."""
+        with http_errors():
+            requested = _request(await _body(request))
+            return JSONResponse(_response(await _rewards(runs, requested)))
 
     return router
 
@@ -76,7 +76,7 @@ _BODY: Final = {"content": {"application/json": {"schema": RewardRequest.model_j
 
 
 async def _body(request: Request) -> bytes:
-    """The body, as long as it is not too large: the server itself has no limit."""
+    """Return the body. Raise HTTP 413 above ``LARGEST_BYTES``, since uvicorn has no limit."""
     body = bytearray()
     async for chunk in request.stream():
         body += chunk
@@ -94,14 +94,14 @@ def _request(body: bytes) -> RewardRequest:
         raise InvalidRequestError(f"{field}: {first['msg']}") from error
 
 
-async def _rewards(runs: Runs, asked: RewardRequest) -> list[RewardBreakdown]:
-    """In the order of the answers. Texts that are no plan are scored here and never executed."""
+async def _rewards(runs: Runs, requested: RewardRequest) -> list[RewardBreakdown]:
+    """Return the rewards in the order of the answers. Unparsable answers are scored here and never executed."""
     batch_id = secrets.token_hex(8)
     found: dict[int, RewardBreakdown] = {}
     rollouts: dict[int, Rollout] = {}
-    for index, label in enumerate(map(RewardLabel.parse, asked.labels)):
+    for index, label in enumerate(map(RewardLabel.parse, requested.labels)):
         try:
-            plan = parse_plan(answer_in(asked.query[index], asked.prompts[index]), label.profile)
+            plan = parse_plan(answer_in(requested.query[index], requested.prompts[index]), label.profile)
         except PlanError:
             found[index] = unparsable()
             continue
@@ -114,11 +114,11 @@ async def _rewards(runs: Runs, asked: RewardRequest) -> list[RewardBreakdown]:
         outcomes = await _executed(runs, batch)
         for index, rollout in rollouts.items():
             found[index] = _reward(outcomes.get(rollout.rollout_id))
-    return [found[index] for index in range(len(asked.query))]
+    return [found[index] for index in range(len(requested.query))]
 
 
 async def _executed(runs: Runs, batch: Batch) -> dict[str, Outcome]:
-    """The outcome of each rollout. A batch that takes too long, or that nobody waits for any more, is called off."""
+    """Return the outcome of each rollout. Cancel the batch on timeout, or if the client disconnects."""
     await runs.open_run("rewards over HTTP", RUN_ID, TERMS)
     log = await runs.submit(batch)
     try:
@@ -126,7 +126,7 @@ async def _executed(runs: Runs, batch: Batch) -> dict[str, Outcome]:
             return await _read(log)
     except TimeoutError as error:
         raise UnavailableError(
-            f"{len(batch.rollouts)} answers took more than {LONGEST_S:g} s: send fewer at once, or add workers"
+            f"{len(batch.rollouts)} answers took more than {LONGEST_S:g} s: send fewer per request, or add workers"
         ) from error
     finally:
         if not log.ended:
@@ -146,12 +146,13 @@ async def _read(log: BatchLog) -> dict[str, Outcome]:
 
 def _reward(outcome: Outcome | None) -> RewardBreakdown:
     if not isinstance(outcome, Completed):
-        # There is no number for it: what the infrastructure loses says nothing about the answer.
-        raise UnavailableError("the infrastructure lost an answer's rollout: send the request again")
+        raise UnavailableError(
+            "a rollout ended in an infrastructure failure and has no reward: send the request again"
+        )
     return outcome.reward
 
 
-def _told(rewards: Sequence[RewardBreakdown]) -> Mapping[str, object]:
+def _response(rewards: Sequence[RewardBreakdown]) -> Mapping[str, object]:
     return {
         "rewards": [reward.total for reward in rewards],
         "scores": [float(reward.success) for reward in rewards],

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from embomatrix.reward.breakdown import RewardBreakdown
     from embomatrix.reward.settings import RewardSettings
     from embomatrix.rpc.client import ClusterClient
-    from embomatrix.rpc.training import TrainingReport
+    from embomatrix.rpc.wire.training import TrainingReport
     from embomatrix.rpc.wire.values import Outcome
     from embomatrix.skills.prompt import Situation
     from embomatrix.skills.syntax import Plan

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
 import torch
 
-from embomatrix.rpc.nameless import nameless_file
+from embomatrix.host.anonymous_memory import nameless_file
 from embomatrix.trainer.config.errors import DAMAGE, TrainerError
 from embomatrix.trainer.config.settings import TrainSettings
 from embomatrix.trainer.grpo.learner import Learner

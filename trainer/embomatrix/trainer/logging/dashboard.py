@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.rpc.training import (
+from embomatrix.rpc.wire.training import (
     FIGURES,
     NAME_CHARS,
     RewardTiers,

@@ -9,7 +9,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from embomatrix.rpc.channel import DEFAULT_ADDRESS, TOKEN_PATTERN
-from embomatrix.rpc.managers import addresses_of
+from embomatrix.rpc.managers import Managers
 from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.rpc.wire.session import MAX_LABELS
 from embomatrix.worker.host.preferences import Preferences
@@ -59,7 +59,7 @@ class WorkerSettings(BaseModel):
     @classmethod
     def _check_address(cls, value: str) -> str:
         try:
-            addresses_of(value)
+            Managers(value)
         except InvalidRequestError as error:
             raise ValueError("not HOST:PORT") from error
         return value

@@ -17,7 +17,7 @@ from embomatrix.rpc.wire.values import Completed
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from embomatrix.rpc.leases import LeaseResult
+    from embomatrix.rpc.wire.leases import LeaseResult
     from embomatrix.rpc.wire.values import Resources
     from embomatrix.worker.host.settings import WorkerSettings
     from embomatrix.worker.link.cache import BundleCache

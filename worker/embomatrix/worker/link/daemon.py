@@ -12,6 +12,7 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.host.backoff import Backoff
 from embomatrix.host.cgroup import MIB
 from embomatrix.rpc.logs import bind, hide
 from embomatrix.rpc.managers import Managers
@@ -29,7 +30,6 @@ from embomatrix.worker.host.courtesy import Courtesy
 from embomatrix.worker.host.machine import HostMachine
 from embomatrix.worker.host.spare_memory import SpareMemory
 from embomatrix.worker.host.status import StatusReport, daemon_pids
-from embomatrix.worker.link.backoff import Backoff
 from embomatrix.worker.link.cache import BundleCache
 from embomatrix.worker.link.membership import Membership, MembershipFile
 from embomatrix.worker.link.outbox import ResultOutbox
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.rpc.leases import LeaseResult
+    from embomatrix.rpc.wire.leases import LeaseResult
     from embomatrix.rpc.wire.values import InfraFailure, Resources
     from embomatrix.worker.host.machine import Probe
     from embomatrix.worker.host.settings import WorkerSettings
@@ -52,6 +52,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+FIRST_WAIT_S: Final = 0.2
 LONGEST_WAIT_S: Final = 3.0
 """Between two attempts to connect: a manager that comes back has its workers within five seconds."""
 SESSION_SHOWN: Final = 6
@@ -84,7 +85,9 @@ class Daemon:
         self._boot_id = secrets.token_hex(8)
         self._managers = Managers(self._membership.manager)
         # Each of several managers is asked as often as one would be.
-        self._backoff = Backoff(rng, longest_s=LONGEST_WAIT_S / self._managers.count)
+        self._backoff = Backoff(
+            FIRST_WAIT_S, LONGEST_WAIT_S / self._managers.count, jitter=lambda: float(rng.uniform(0.8, 1.2))
+        )
         self._outbox = ResultOutbox()
         self._cache = self._opened_cache()
         self._pool = self._new_pool(program)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.rpc.leases import LeaseClaim
+from embomatrix.rpc.wire.leases import LeaseClaim
 
 if TYPE_CHECKING:
-    from embomatrix.rpc.leases import LeaseRef, LeaseResult
+    from embomatrix.rpc.wire.leases import LeaseRef, LeaseResult
 
 logger = logging.getLogger(__name__)
 

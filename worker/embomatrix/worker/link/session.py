@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.rpc.channel import open_channel
-from embomatrix.rpc.leases import WorkerState
 from embomatrix.rpc.status import (
     ClusterError,
     DeadlineError,
@@ -22,7 +21,8 @@ from embomatrix.rpc.status import (
     cluster_errors,
 )
 from embomatrix.rpc.versions import PROTOCOL_VERSION
-from embomatrix.rpc.wire.rollout import each
+from embomatrix.rpc.wire.codec import each
+from embomatrix.rpc.wire.leases import WorkerState
 from embomatrix.rpc.wire.session import (
     lease_from_proto,
     lease_progress_to_proto,

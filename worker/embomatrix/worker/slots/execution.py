@@ -24,7 +24,7 @@ from embomatrix.worker.slots.processes import ProcessGoneError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from embomatrix.rpc.leases import Lease
+    from embomatrix.rpc.wire.leases import Lease
     from embomatrix.rpc.wire.values import Completed
     from embomatrix.worker.slots.residents import Residents, ResidentScene, Slot
 

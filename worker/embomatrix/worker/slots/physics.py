@@ -79,8 +79,8 @@ class PhysicsScene:
         navigator = self._simulator.world.navigator
         navigator.reachable(navigator.start, navigator.start)
         yield
-        yield from self._engine.complete()
-        yield from self._simulator.complete()
+        yield from self._engine.warm_up()
+        yield from self._simulator.warm_up()
 
     def close(self) -> None:
         """Give the clients back. The scene can't be used afterwards."""

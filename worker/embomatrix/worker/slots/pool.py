@@ -10,7 +10,7 @@ import logging
 import time
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.rpc.leases import LeaseClaim, LeaseProgress, LeaseResult
+from embomatrix.rpc.wire.leases import LeaseClaim, LeaseProgress, LeaseResult
 from embomatrix.rpc.wire.values import (
     Completed,
     InfraCode,
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
     from pathlib import Path
 
-    from embomatrix.rpc.leases import Lease, LeaseRef
+    from embomatrix.rpc.wire.leases import Lease, LeaseRef
     from embomatrix.rpc.wire.values import Resident
     from embomatrix.worker.slots.residents import ResidentScene, SlotLimits
 

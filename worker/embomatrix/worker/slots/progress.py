@@ -12,7 +12,7 @@ import struct
 import weakref
 from typing import Final
 
-from embomatrix.rpc.nameless import nameless_file
+from embomatrix.host.anonymous_memory import nameless_file
 
 _COUNTER: Final = struct.Struct("=Q")
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.control.commands import CancelLease, GiveLease
 from embomatrix.manager.control.dispatch.state import RolloutStep
-from embomatrix.rpc.leases import LeaseOrigin
+from embomatrix.rpc.wire.leases import LeaseOrigin
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.control.dispatch.state import DispatchState
     from embomatrix.manager.control.events import BatchRestored
     from embomatrix.manager.control.workers import Standing, WorkerRecord
-    from embomatrix.rpc.leases import LeaseOrigin, LeaseRef
+    from embomatrix.rpc.wire.leases import LeaseOrigin, LeaseRef
 
 
 def worker_joined(state: DispatchState, event: WorkerJoined) -> None:

@@ -13,7 +13,7 @@ from embomatrix.rpc.wire.values import RunStats, Timings
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from embomatrix.rpc.leases import LeaseRef
+    from embomatrix.rpc.wire.leases import LeaseRef
     from embomatrix.rpc.wire.values import Rollout
 
 

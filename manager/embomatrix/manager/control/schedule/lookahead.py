@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from embomatrix.manager.observe.histogram import Histogram
+from embomatrix.manager.histogram import Histogram
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -1,0 +1,134 @@
+"""Client of AdminService: workers, runs, logs, tokens, and the operator's commands."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.proto.v1 import admin_service_pb2 as pb
+from embomatrix.proto.v1 import admin_service_pb2_grpc
+from embomatrix.rpc.channel import DEFAULT_ADDRESS
+from embomatrix.rpc.managers import FAILOVER_S, LeaderClient, of_the_leader
+from embomatrix.rpc.wire.codec import each, inside
+from embomatrix.rpc.wire.run_log import event_page_from_proto, run_summary_from_proto
+from embomatrix.rpc.wire.session import plan_cell_from_proto, run_info_from_proto, worker_info_from_proto
+from embomatrix.rpc.wire.tokens import ROLE_NUMBERS, token_info_from_proto
+from embomatrix.rpc.wire.values import FleetStatus
+
+if TYPE_CHECKING:
+    from embomatrix.rpc.wire.run_log import EventPage, RunEvent, RunSummary
+    from embomatrix.rpc.wire.tokens import AccessRole, TokenInfo
+    from embomatrix.rpc.wire.values import PlanCell, RunInfo, WorkerInfo
+
+CALL_S: Final = 10.0
+"""Default time limit of one call."""
+
+
+class AdminClient(LeaderClient):
+    """Calls that need no run. The role of the token decides which of them are allowed."""
+
+    def __init__(
+        self,
+        address: str = DEFAULT_ADDRESS,
+        token: str = "",
+        *,
+        ca: bytes = b"",
+        call_s: float = CALL_S,
+        failover_s: float = FAILOVER_S,
+    ) -> None:
+        super().__init__(address, token, ca=ca, failover_s=failover_s)
+        self._call_s = call_s
+
+    @property
+    def _admin(self) -> admin_service_pb2_grpc.AdminServiceAsyncStub:
+        return admin_service_pb2_grpc.AdminServiceStub(self._channel)
+
+    async def list_workers(self) -> tuple[WorkerInfo, ...]:
+        """Return the workers that the manager knows, including recently lost ones."""
+        return (await self.fleet()).workers
+
+    @of_the_leader
+    async def fleet(self) -> FleetStatus:
+        """Return the workers and the health of the cluster."""
+        answer = await self._admin.ListWorkers(pb.ListWorkersRequest(), timeout=self._call_s)
+        return FleetStatus(
+            each("workers", worker_info_from_proto, answer.workers), answer.health, answer.mood
+        )
+
+    @of_the_leader
+    async def list_runs(self, *, closed: bool = False) -> tuple[RunInfo, ...]:
+        """Return the open runs, oldest first; or the archived runs, the last closed first."""
+        answer = await self._admin.ListRuns(pb.ListRunsRequest(closed=closed), timeout=self._call_s)
+        return each("runs", run_info_from_proto, answer.runs)
+
+    @of_the_leader
+    async def run(self, run_id: str) -> RunSummary:
+        """Return the totals of an open or archived run. Raises NotFoundError."""
+        answer = await self._admin.GetRun(pb.GetRunRequest(run_id=run_id), timeout=self._call_s)
+        return inside("summary", run_summary_from_proto, answer)
+
+    @of_the_leader
+    async def read_events(self, run_id: str = "", *, after: int = 0) -> EventPage:
+        """Return a page of a run's log, or of the fleet's, with sequences above ``after``. Raises NotFoundError."""
+        request = pb.ReadEventsRequest(run_id=run_id, after=after)
+        return inside(
+            "page", event_page_from_proto, await self._admin.ReadEvents(request, timeout=self._call_s)
+        )
+
+    async def all_events(self, run_id: str = "") -> tuple[RunEvent, ...]:
+        """Return the whole log of a run, or of the fleet."""
+        found: list[RunEvent] = []
+        while page := (await self.read_events(run_id, after=found[-1].sequence if found else 0)).events:
+            found += page
+        return tuple(found)
+
+    @of_the_leader
+    async def plan(self, run_id: str = "") -> tuple[PlanCell, ...]:
+        """Return the look-ahead grid of a run, or of all runs."""
+        answer = await self._admin.GetPlan(pb.GetPlanRequest(run_id=run_id), timeout=self._call_s)
+        return each("cells", plan_cell_from_proto, answer.cells)
+
+    @of_the_leader
+    async def drain_worker(self, worker_id: str) -> None:
+        """Let a worker finish its leases, give it no new ones, and have it leave. Raises NotFoundError."""
+        await self._admin.DrainWorker(pb.DrainWorkerRequest(worker_id=worker_id), timeout=self._call_s)
+
+    @of_the_leader
+    async def resume(self, worker_id: str) -> None:
+        """Cancel the drain, or lift the quarantine, of a connected worker. Raises NotFoundError."""
+        await self._admin.ResumeWorker(pb.ResumeWorkerRequest(worker_id=worker_id), timeout=self._call_s)
+
+    @of_the_leader
+    async def pause_dispatch(self) -> None:
+        """Stop giving leases. Live leases continue."""
+        await self._admin.PauseDispatch(pb.PauseDispatchRequest(), timeout=self._call_s)
+
+    @of_the_leader
+    async def resume_dispatch(self) -> None:
+        """Give leases again."""
+        await self._admin.ResumeDispatch(pb.ResumeDispatchRequest(), timeout=self._call_s)
+
+    @of_the_leader
+    async def issue_token(
+        self, role: AccessRole, *, valid_s: float = 0.0, label: str = ""
+    ) -> tuple[str, str]:
+        """Return a new token and its id. The manager keeps only a hash. ``valid_s`` 0: until revoked."""
+        request = pb.IssueTokenRequest(role=ROLE_NUMBERS[role], valid_s=valid_s, label=label)
+        answer = await self._admin.IssueToken(request, timeout=self._call_s)
+        return answer.token, answer.token_id
+
+    @of_the_leader
+    async def list_tokens(self) -> tuple[TokenInfo, ...]:
+        """Return the valid tokens."""
+        answer = await self._admin.ListTokens(pb.ListTokensRequest(), timeout=self._call_s)
+        return each("tokens", token_info_from_proto, answer.tokens)
+
+    @of_the_leader
+    async def revoke_token(self, token_id: str) -> None:
+        """Revoke a token and end the sessions that were opened with it."""
+        await self._admin.RevokeToken(pb.RevokeTokenRequest(token_id=token_id), timeout=self._call_s)
+
+    @of_the_leader
+    async def revoke_worker(self, worker_id: str, reason: str = "") -> None:
+        """Revoke a worker's credential and end its session. Its leases go to other workers."""
+        request = pb.RevokeWorkerRequest(worker_id=worker_id, reason=reason)
+        await self._admin.RevokeWorker(request, timeout=self._call_s)

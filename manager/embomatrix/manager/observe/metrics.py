@@ -1,0 +1,126 @@
+"""Load of the manager (CPU accounting, clock lag, store latency), and counters of delivered results."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from embomatrix.manager.histogram import Histogram, quantile
+from embomatrix.rpc.wire.values import Cancelled, Completed, InfraFailure
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.rpc.wire.values import RolloutResult
+
+WINDOW_S: Final = 60.0
+OPERATIONS: Final = 64
+"""Kinds of store operations at most."""
+
+
+class _Sample(NamedTuple):
+    """CPU time of the manager and of the slots so far, in seconds, at a time of the monotonic clock."""
+
+    at_s: float
+    manager_s: float
+    slots_s: float
+
+
+class ManagerLoad:
+    """CPU accounting, clock lag and store latency of the manager."""
+
+    def __init__(self) -> None:
+        self.lag = Histogram()
+        """Lag of each tick in seconds. More than a few hundredths mean that the event loop is saturated."""
+        self._store: dict[str, Histogram] = {}
+        self._samples: deque[_Sample] = deque()
+
+    @property
+    def store(self) -> Mapping[str, Histogram]:
+        """Durations of store operations in seconds, by name."""
+        return self._store
+
+    def operated(self, operation: str, seconds: float) -> None:
+        """Count an operation of the store."""
+        if operation in self._store or len(self._store) < OPERATIONS:
+            self._store.setdefault(operation, Histogram()).observe(seconds)
+
+    def sample(self, now_s: float, manager_s: float, slots_s: float) -> None:
+        """Note the CPU time so far. A slot runs on one core, so its busy time counts as CPU time."""
+        self._samples.append(_Sample(now_s, manager_s, slots_s))
+        while len(self._samples) > 2 and self._samples[1].at_s <= now_s - WINDOW_S:
+            self._samples.popleft()
+
+    def overhead(self) -> float:
+        """Return the manager's share of the CPU time of manager and slots in the last minute; 0 if nothing ran."""
+        if len(self._samples) < 2:
+            return 0.0
+        first, last = self._samples[0], self._samples[-1]
+        manager_s, slots_s = last.manager_s - first.manager_s, last.slots_s - first.slots_s
+        return manager_s / (manager_s + slots_s) if slots_s > 0 else 0.0
+
+
+THROUGHPUT_S: Final = 120
+"""Seconds of throughput history."""
+SAMPLES: Final = 2048
+FAILURES_KEPT: Final = 50
+WORKERS_KEPT: Final = 20_000
+"""Workers whose results are counted at most; the first seen are dropped."""
+
+
+@dataclass(frozen=True, slots=True)
+class FailureNote:
+    """Infrastructure failure for the dashboard. ``at_s`` is seconds since the epoch."""
+
+    at_s: float
+    code: str
+    message: str
+    worker_id: str
+    run_id: str
+    rollout_id: str
+
+
+class Meter:
+    """Counters of delivered results. Times are on the caller's monotonic clock."""
+
+    def __init__(self) -> None:
+        self.outcomes: Counter[str] = Counter()
+        self.completed_by: Counter[str] = Counter()
+        """Completed rollouts by worker, connected or not."""
+        self.failures: deque[FailureNote] = deque(maxlen=FAILURES_KEPT)
+        self._latency_s: deque[float] = deque(maxlen=SAMPLES)
+        self._per_second: deque[tuple[int, int]] = deque(maxlen=THROUGHPUT_S)
+
+    def observe(self, run_id: str, result: RolloutResult, now_s: float) -> None:
+        match result.outcome:
+            case Completed(timings=timings, worker_id=worker_id):
+                self.outcomes["completed"] += 1
+                self.completed_by[worker_id] += 1
+                if len(self.completed_by) > WORKERS_KEPT:
+                    del self.completed_by[next(iter(self.completed_by))]
+                lease_s = timings.lease_s + timings.load_s + timings.execute_s
+                self._latency_s.append(timings.queued_s + lease_s)
+                self._count(int(now_s))
+            case InfraFailure(code, message, worker_id):
+                self.outcomes[code.value] += 1
+                note = FailureNote(time.time(), code.value, message, worker_id, run_id, result.rollout_id)
+                self.failures.appendleft(note)
+            case Cancelled():
+                self.outcomes["cancelled"] += 1
+
+    def throughput(self, now_s: float) -> list[int]:
+        """Return the completed rollouts of each of the last ``THROUGHPUT_S`` whole seconds, oldest first."""
+        counts = dict(self._per_second)
+        return [counts.get(second, 0) for second in range(int(now_s) - THROUGHPUT_S, int(now_s))]
+
+    def latency_s(self, share: float) -> float:
+        """Return the latency in seconds that this share of recent rollouts does not exceed; 0 before the first."""
+        return quantile(sorted(self._latency_s), share)
+
+    def _count(self, second: int) -> None:
+        if self._per_second and self._per_second[-1][0] == second:
+            self._per_second[-1] = (second, self._per_second[-1][1] + 1)
+        else:
+            self._per_second.append((second, 1))

@@ -1,0 +1,233 @@
+"""History of runs: open runs from the event log, closed runs from an archive on disk."""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+import itertools
+import logging
+import os
+import re
+import time
+import zlib
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Final
+
+from google.protobuf.message import DecodeError
+
+from embomatrix.manager.observe.event_log import PAGE
+from embomatrix.manager.observe.run_figures import summary_of
+from embomatrix.proto.v1 import admin_service_pb2 as pb
+from embomatrix.rpc.status import NotFoundError
+from embomatrix.rpc.wire.codec import ConvertError, each
+from embomatrix.rpc.wire.run_log import (
+    EventPage,
+    PhaseSummary,
+    RunEvent,
+    RunSummary,
+    run_event_from_proto,
+    run_event_to_proto,
+    run_summary_from_proto,
+    run_summary_to_proto,
+)
+from embomatrix.rpc.wire.values import RunInfo
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from embomatrix.manager.control.cluster_state import ClusterState
+    from embomatrix.manager.observe.event_log import RunEventLog, RunRecord
+    from embomatrix.reward.settings import RewardSettings
+    from embomatrix.rpc.wire.values import Batch, RunStats
+
+logger = logging.getLogger(__name__)
+
+
+class RunHistory:
+    """History of open and closed runs. Reads the process's own clocks."""
+
+    def __init__(self, chronicle: RunEventLog, archive: RunArchive, cluster: ClusterState) -> None:
+        self._event_log = chronicle
+        self._archive = archive
+        self._cluster = cluster
+
+    def opened(self, run_id: str, name: str, reward: RewardSettings) -> None:
+        logger.info("run opened run=%s: %s", run_id, name or "no name")
+        self._event_log.open_run(
+            run_id, name, now_s=time.monotonic(), cpu_s=time.process_time(), reward=reward
+        )
+
+    def submitted(self, batch: Batch) -> None:
+        self._event_log.submitted(batch, now_s=time.monotonic())
+
+    def leads(self, run_id: str) -> PhaseSummary:
+        """Return how long before their demand the run's scenes were warm. Available until the run is closed."""
+        return summary_of(self._cluster.scheduler.prewarm.counters(run_id).leads)
+
+    async def closed(self, run_id: str, stats: RunStats, leads: PhaseSummary) -> None:
+        """Move a closed run, with its final counters, to the archive."""
+        record = self._event_log.close_run(run_id, now_s=time.monotonic())
+        logger.info(
+            "run closed run=%s: %d outcomes, %d failures", run_id, stats.delivered, stats.infra_failures
+        )
+        if record is not None:
+            info = self._info(record, stats, pending=0, closed_s=time.time())
+            await self._archive.keep(self._summed(record, info, leads), tuple(record.ring.events))
+
+    async def summary(self, run_id: str) -> RunSummary:
+        """Return the totals of an open or archived run. Raises NotFoundError."""
+        record = self._event_log.runs.get(run_id)
+        if record is not None:
+            return self._summed(record, self.info(record), self.leads(run_id))
+        kept = await self._archive.load(run_id)
+        if kept is None:
+            raise _unknown(run_id)
+        return kept[0]
+
+    def info(self, record: RunRecord) -> RunInfo:
+        """Return the listing of an open run."""
+        pending = self._cluster.dispatcher.pending_of(record.run_id)
+        return self._info(record, self._cluster.stats(record.run_id), pending=pending)
+
+    async def kept(self) -> list[RunInfo]:
+        """Return the archived runs, the last closed first."""
+        return [summary.run for summary in await self._archive.summaries()]
+
+    async def events(self, run_id: str, after: int, limit: int) -> EventPage:
+        """Return a page of the run's log, or of workers and scenes for an empty id. Raises NotFoundError."""
+        limit = min(limit or PAGE, PAGE)
+        page = self._event_log.page(run_id, after, limit)
+        if page is not None:
+            return page
+        kept = await self._archive.load(run_id)
+        if kept is None:
+            raise _unknown(run_id)
+        summary, events = kept
+        beyond = [event for event in events if event.sequence > after]
+        return EventPage(tuple(beyond[:limit]), summary.events_dropped)
+
+    async def latest(self, run_id: str, seconds: float) -> EventPage:
+        """Return the events of the last seconds before the run's last event. Raises NotFoundError."""
+        record = self._event_log.runs.get(run_id)
+        if record is not None:
+            events: Sequence[RunEvent] = record.ring.events
+            dropped = record.ring.dropped
+        else:
+            kept = await self._archive.load(run_id)
+            if kept is None:
+                raise _unknown(run_id)
+            dropped, events = kept[0].events_dropped, kept[1]
+        since_s = events[-1].at_s - seconds if events else 0.0
+        late = itertools.takewhile(lambda event: event.at_s >= since_s, reversed(events))
+        return EventPage(tuple(late)[::-1], dropped)
+
+    def _summed(self, record: RunRecord, info: RunInfo, leads: PhaseSummary) -> RunSummary:
+        figures = record.figures
+        return RunSummary(
+            run=info,
+            phases={phase: summary_of(histogram) for phase, histogram in figures.phases.items()},
+            workers=figures.worker_rows(),
+            series=figures.series.values(),
+            failures=tuple(figures.failures),
+            manager_cpu_s=time.process_time() - record.cpu_s,
+            prewarm_lead=leads,
+            scene_load=summary_of(self._event_log.fleet.scene_load),
+            events_dropped=record.ring.dropped,
+            version=manager_version(),
+        )
+
+    def _info(self, record: RunRecord, stats: RunStats, *, pending: int, closed_s: float = 0.0) -> RunInfo:
+        opened_s = self._event_log.epoch_s + record.opened_s
+        return RunInfo(
+            record.run_id,
+            record.name,
+            stats,
+            pending,
+            opened_s,
+            closed_s,
+            record.reward,
+            self._cluster.waits_for(record.run_id),
+        )
+
+
+def manager_version() -> str:
+    """Return the version of the installed package."""
+    try:
+        return version("embomatrix")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _unknown(run_id: str) -> NotFoundError:
+    return NotFoundError(
+        f"no run {run_id!r} is open or kept: `embomatrix cluster runs --closed` lists those that are kept"
+    )
+
+
+RUNS_KEPT: Final = 50
+SUFFIX: Final = ".run.gz"
+_RUN_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+
+
+class RunArchive:
+    """Folder with one file for each of the ``kept`` last closed runs.
+
+    Read and write errors are logged and ignored: no run fails for its history.
+    """
+
+    def __init__(self, folder: Path, *, kept: int = RUNS_KEPT) -> None:
+        self._folder = folder
+        self._kept = kept
+
+    async def keep(self, summary: RunSummary, events: Sequence[RunEvent]) -> None:
+        """Write a closed run. It replaces an earlier run of the same id."""
+        await asyncio.to_thread(self._write, summary, events)
+
+    async def summaries(self) -> list[RunSummary]:
+        """Return the archived runs, the last closed first."""
+        return await asyncio.to_thread(self._read_all)
+
+    async def load(self, run_id: str) -> tuple[RunSummary, tuple[RunEvent, ...]] | None:
+        """Return an archived run; None if there is none of that id."""
+        # The id becomes a file name, so only valid run ids are accepted.
+        if not _RUN_ID.fullmatch(run_id):
+            return None
+        return await asyncio.to_thread(self._read, self._path(run_id))
+
+    def _path(self, run_id: str) -> Path:
+        return self._folder / f"{run_id}{SUFFIX}"
+
+    def _write(self, summary: RunSummary, events: Sequence[RunEvent]) -> None:
+        message = pb.KeptRun(summary=run_summary_to_proto(summary), events=map(run_event_to_proto, events))
+        path = self._path(summary.run.run_id)
+        fresh = path.with_suffix(".new")
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            fresh.write_bytes(gzip.compress(message.SerializeToString(), compresslevel=3))
+            os.replace(fresh, path)
+            for old in self._files()[self._kept :]:
+                old.unlink(missing_ok=True)
+        except OSError as error:
+            logger.warning("run history not archived run=%s: %s", summary.run.run_id, error)
+
+    def _files(self) -> list[Path]:
+        """Return the files, newest first."""
+        found = self._folder.glob(f"*{SUFFIX}")
+        return sorted(found, key=lambda path: (path.stat().st_mtime_ns, path.name), reverse=True)
+
+    def _read_all(self) -> list[RunSummary]:
+        found = (self._read(path) for path in self._files())
+        return [entry[0] for entry in found if entry is not None]
+
+    def _read(self, path: Path) -> tuple[RunSummary, tuple[RunEvent, ...]] | None:
+        try:
+            message = pb.KeptRun.FromString(gzip.decompress(path.read_bytes()))
+            return run_summary_from_proto(message.summary), each(
+                "events", run_event_from_proto, message.events
+            )
+        except FileNotFoundError:
+            return None
+        except (OSError, EOFError, zlib.error, DecodeError, ConvertError) as error:
+            logger.warning("run history can't be read file=%s: %s", path.name, error)
+            return None

@@ -1,0 +1,114 @@
+"""Serialized rows of the state store: batches, results, look-ahead windows and reputations.
+
+Result streams send the stored bytes without parsing them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.control.events import LookaheadAnnounced
+from embomatrix.manager.control.reputation import Reputation
+from embomatrix.manager.store.protocol import BatchRow, ResultRow, ShelfRow
+from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
+from embomatrix.rpc.wire.codec import each
+from embomatrix.rpc.wire.outcome import rollout_result_to_proto
+from embomatrix.rpc.wire.rollout import batch_from_proto, batch_to_proto
+from embomatrix.rpc.wire.run import (
+    lookahead_entry_from_proto,
+    lookahead_entry_to_proto,
+    run_terms_from_proto,
+    run_terms_to_proto,
+)
+from embomatrix.rpc.wire.values import Cancelled, Completed, InfraFailure
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from embomatrix.manager.control.schedule.lookahead import LookaheadWindow
+    from embomatrix.manager.store.protocol import RunRow
+    from embomatrix.rpc.wire.values import Batch, Outcome, RolloutResult, RunTerms
+
+_KINDS: Final[Mapping[str, type[Outcome]]] = {
+    "completed": Completed,
+    "infra_failure": InfraFailure,
+    "cancelled": Cancelled,
+}
+"""Kind of outcome by the name of its protobuf field."""
+_DOUBLE: Final = struct.Struct("<d")
+_DELIVERED: Final = types_pb2.RolloutResult(
+    completed=types_pb2.Completed(timings=types_pb2.Timings(deliver_s=1.0))
+).SerializeToString()[: -_DOUBLE.size]
+"""Tags and lengths that precede the delivery time in a message that holds nothing else."""
+
+
+def batch_row(batch: Batch) -> BatchRow:
+    """Return the batch's row. Equal batches give equal digests."""
+    payload = batch.wire or batch_to_proto(batch).SerializeToString(deterministic=True)
+    return BatchRow(batch.run_id, batch.batch_id, hashlib.sha256(payload).hexdigest(), payload)
+
+
+def batch_of(row: BatchRow) -> Batch:
+    return batch_from_proto(rollout_service_pb2.ExecuteRequest.FromString(row.payload))
+
+
+def failed_rows(rows: Iterable[ResultRow]) -> int:
+    """Return how many of these results are infrastructure failures."""
+    results = (types_pb2.RolloutResult.FromString(row.payload) for row in rows)
+    return sum(result.WhichOneof("outcome") == "infra_failure" for result in results)
+
+
+def result_row(result: RolloutResult) -> ResultRow:
+    return ResultRow(result.cursor, result.rollout_id, rollout_result_to_proto(result).SerializeToString())
+
+
+def group_and_kind(row: ResultRow) -> tuple[str, type[Outcome]]:
+    """Return the group and the kind of outcome of a result."""
+    message = types_pb2.RolloutResult.FromString(row.payload)
+    return message.group_id, _KINDS[message.WhichOneof("outcome") or "cancelled"]
+
+
+def timed_row(row: ResultRow, deliver_s: float) -> ResultRow:
+    """Return a completed rollout's row with its delivery time, which is unknown when the row is stored.
+
+    Concatenated bytes of protobuf messages merge, so the row is extended without parsing it.
+    """
+    return ResultRow(row.cursor, row.rollout_id, row.payload + _DELIVERED + _DOUBLE.pack(deliver_s))
+
+
+def repute_row(worker_id: str, repute: Reputation) -> ShelfRow:
+    """Return the row of a reputation. Open disputes are dropped, since their rollouts are executed again."""
+    kept = {name: value for name, value in asdict(repute).items() if name != "disputed"}
+    return ShelfRow(worker_id, json.dumps(kept, separators=(",", ":")).encode())
+
+
+def repute_of(row: ShelfRow) -> Reputation:
+    """Return the reputation of `repute_row`."""
+    return Reputation(**json.loads(row.payload))
+
+
+def window_row(run_id: str, window: LookaheadWindow) -> ShelfRow:
+    """Return the row of a run's remaining look-ahead window."""
+    entries = [lookahead_entry_to_proto(entry) for entry in window.entries]
+    message = rollout_service_pb2.AnnounceLookaheadRequest(version=window.version, entries=entries)
+    return ShelfRow(run_id, message.SerializeToString())
+
+
+def announced_in(row: ShelfRow) -> LookaheadAnnounced:
+    """Return the window of `window_row`, as an announcement."""
+    message = rollout_service_pb2.AnnounceLookaheadRequest.FromString(row.payload)
+    entries = each("entries", lookahead_entry_from_proto, message.entries)
+    return LookaheadAnnounced(row.key, message.version, entries)
+
+
+def terms_payload(terms: RunTerms) -> bytes:
+    return run_terms_to_proto(terms).SerializeToString(deterministic=True)
+
+
+def terms_of(row: RunRow) -> RunTerms:
+    """Return the terms of a stored run."""
+    return run_terms_from_proto(rollout_service_pb2.OpenRunRequest.FromString(row.terms))

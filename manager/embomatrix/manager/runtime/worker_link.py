@@ -1,0 +1,89 @@
+"""Outbox of one worker: commands that wait for its stream."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.control.commands import AcknowledgeLease, CancelLease, GiveLease, SetDesired
+from embomatrix.rpc.wire.leases import Lease
+
+if TYPE_CHECKING:
+    from embomatrix.manager.runtime.registry import WorkerSession
+    from embomatrix.rpc.status import ClusterError
+    from embomatrix.rpc.wire.leases import LeaseRef
+
+ACKNOWLEDGE_S: Final = 0.2
+"""An acknowledgement waits this long to travel with other commands. While work goes on, leases leave sooner, and each
+message saved is a wake-up less at both ends."""
+
+WorkerCommand = SetDesired | GiveLease | CancelLease | AcknowledgeLease
+
+
+@dataclass(slots=True)
+class OutgoingMessage:
+    """One message to a worker. ``desired`` is None if it did not change."""
+
+    desired: tuple[str, ...] | None = None
+    leases: list[Lease] = field(default_factory=list)
+    acknowledged: list[LeaseRef] = field(default_factory=list)
+    cancelled: list[LeaseRef] = field(default_factory=list)
+    drain: bool = False
+    resume: bool = False
+
+
+class WorkerLink:
+    """Open session stream. The worker's credits bound its outbox; a later desired set replaces an earlier one."""
+
+    def __init__(self, session: WorkerSession) -> None:
+        self.session = session
+        self._outbox = OutgoingMessage()
+        self._ready = asyncio.Event()
+        self._later: asyncio.TimerHandle | None = None
+        self._closed: ClusterError | None = None
+
+    def put(self, command: WorkerCommand) -> None:
+        match command:
+            case SetDesired():
+                self.session.asked.update(command.bundle_digests)
+                self._outbox.desired = command.bundle_digests
+            case GiveLease():
+                self.session.asked.add(command.rollout.bundle_digest)
+                self._outbox.leases.append(
+                    Lease(command.ref, command.rollout, command.deadline_s, command.origin, command.reward)
+                )
+            case CancelLease():
+                self._outbox.cancelled.append(command.ref)
+            case AcknowledgeLease():
+                self._outbox.acknowledged.append(command.ref)
+                if self._later is None:
+                    self._later = asyncio.get_running_loop().call_later(ACKNOWLEDGE_S, self._ready.set)
+                return
+        self._ready.set()
+
+    def drain(self) -> None:
+        self._outbox.drain, self._outbox.resume = True, False
+        self._ready.set()
+
+    def resume(self) -> None:
+        """Cancel a drain."""
+        self._outbox.drain, self._outbox.resume = False, True
+        self._ready.set()
+
+    def close(self, reason: ClusterError) -> None:
+        """End the stream: a waiting ``take`` raises the reason."""
+        self._closed = reason
+        self._ready.set()
+
+    async def take(self) -> OutgoingMessage:
+        """Wait for commands and return them. Raises the reason when the stream is closed."""
+        await self._ready.wait()
+        if self._closed is not None:
+            raise self._closed
+        self._ready.clear()
+        if self._later is not None:
+            self._later.cancel()
+            self._later = None
+        outbox, self._outbox = self._outbox, OutgoingMessage()
+        return outbox

@@ -1,0 +1,299 @@
+"""Process of a manager: election, gRPC server, HTTP server, and shutdown."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import secrets
+import signal
+import socket
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import uvicorn
+
+from embomatrix.manager.access.gate import Gate
+from embomatrix.manager.access.protection import protection_of
+from embomatrix.manager.control.cluster_state import ClusterState
+from embomatrix.manager.control.dispatch.state import DispatchLimits
+from embomatrix.manager.control.reputation import AuditRules
+from embomatrix.manager.control.schedule.scheduler import ScheduleLimits
+from embomatrix.manager.observe.run_archive import RunArchive
+from embomatrix.manager.runtime.bundles import BundleStore
+from embomatrix.manager.runtime.event_loop import ManagerRuntime
+from embomatrix.manager.runtime.garbage import only_young
+from embomatrix.manager.runtime.leadership import Leadership, note_folder, warn_of_another_folder
+from embomatrix.manager.runtime.registry import LivenessLimits, Registry
+from embomatrix.manager.runtime.revocation import Revocation
+from embomatrix.manager.services.listen import bound_socket
+from embomatrix.manager.services.server import build_server
+from embomatrix.manager.services.standby import Standby
+from embomatrix.manager.settings import is_every_address, is_loopback
+from embomatrix.manager.store.opening import open_store
+from embomatrix.manager.store.protocol import Candidate, StateError
+from embomatrix.manager.web.api import build_api
+from embomatrix.manager.web.connections import allow_files, connections_through
+from embomatrix.manager.web.http_rules import HttpRules, allowed_hosts
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Iterator
+    from pathlib import Path
+
+    import grpc
+    from fastapi import FastAPI
+    from starlette.types import Receive, Scope, Send
+
+    from embomatrix.manager.access.protection import Tls
+    from embomatrix.manager.settings import ManagerSettings
+    from embomatrix.manager.store.protocol import StateStore
+    from embomatrix.manager.web.connections import BoundedListener
+    from embomatrix.manager.web.gallery import Gallery
+
+logger = logging.getLogger(__name__)
+
+STOP_GRACE_S: Final = 0.5
+"""Calls may finish during this time; workers and trainers then attach to the next manager."""
+MEGABYTE: Final = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoints:
+    """Addresses that a manager serves."""
+
+    address: str
+    """HOST:PORT of the gRPC services."""
+    status_url: str
+
+
+async def serve(
+    settings: ManagerSettings,
+    on_ready: Callable[[Endpoints], None],
+    on_standby: Callable[[str], None] = lambda leader: None,
+) -> None:
+    """Serve until SIGINT or SIGTERM. Raises AccessError, StateError or PortInUseError with a remedy.
+
+    ``on_standby`` receives the leader's address while another manager leads.
+    """
+    allow_files()
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    leads = asyncio.Event()
+
+    async def lead() -> None:
+        async with running(settings, on_standby) as endpoints:
+            leads.set()
+            only_young()
+            on_ready(endpoints)
+            await stop.wait()
+
+    leading = asyncio.create_task(lead())
+    stopping = asyncio.create_task(stop.wait())
+    await asyncio.wait((leading, stopping), return_when=asyncio.FIRST_COMPLETED)
+    stopping.cancel()
+    if not leads.is_set():
+        leading.cancel()  # A standby has nothing to finish.
+    with contextlib.suppress(asyncio.CancelledError):
+        await leading
+
+
+@contextlib.asynccontextmanager
+async def running(
+    settings: ManagerSettings, on_standby: Callable[[str], None] = lambda leader: None
+) -> AsyncIterator[Endpoints]:
+    """Run a manager while the context is held. It is entered when this manager leads."""
+    protection = protection_of(settings)
+    with _folder_errors(settings):
+        total_bytes = settings.bundle_total_mb * MEGABYTE
+        bundles = BundleStore(settings.data_dir / "bundles", total_bytes=total_bytes)
+    async with contextlib.AsyncExitStack() as stack:
+        # Ports are bound first: a manager that cannot serve must not take over the state.
+        http_socket = stack.enter_context(
+            bound_socket(settings.http_host, settings.http_port, option="http-")
+        )
+        with bound_socket(settings.host, settings.port) as probe:
+            # gRPC binds it again below, with less specific errors.
+            settings = settings.model_copy(update={"port": probe.getsockname()[1]})
+        store = open_store(settings.state_url)
+        stack.push_async_callback(store.close)
+        with _folder_errors(settings):
+            await warn_of_another_folder(store, settings.data_dir)
+        leadership = Leadership(store, _candidate(settings))
+        standby = Standby(protection.tls)
+        http = _HttpServer(standby.page(), http_socket, protection.tls)
+        group = await stack.enter_async_context(_stopped_at_exit())
+        group.create_task(http.serve())
+        epoch = await _win(leadership, standby, settings, on_standby)
+        runtime = await _start_runtime(settings, store, bundles, leadership, epoch)
+        gate = Gate(store, guarded=protection.guarded, shared_token=settings.token)
+        await gate.open(protection.first)
+        server, port = await build_server(runtime, gate, protection.tls, settings)
+        rules = HttpRules(gate, hosts=allowed_hosts(settings.http_host, protection.tls))
+        http.show(build_api(runtime, rules, Revocation(runtime, gate), _gallery(settings.dataset)))
+        group.create_task(leadership.keep())
+        group.create_task(runtime.serve())
+        await server.start()
+        stack.push_async_callback(server.stop, STOP_GRACE_S)
+        page_url = _page_url(settings.http_host, http_socket.getsockname()[1], protection.tls)
+        yield Endpoints(f"{settings.host}:{port}", page_url)
+
+
+def _page_url(host: str, port: int, tls: Tls | None) -> str:
+    """Return the dashboard's URL. For a wildcard address its host is a name in the certificate, else this machine's
+    name.
+    """
+    if is_every_address(host):
+        names = () if tls is None else tls.names
+        host = next((name for name in names if not is_loopback(name)), socket.gethostname())
+    return f"{'http' if tls is None else 'https'}://{host}:{port}/"
+
+
+def _gallery(dataset: Path | None) -> Gallery | None:
+    if dataset is None:
+        return None
+    # Imported here: reading scenes needs numpy, which the manager's image lacks.
+    from embomatrix.manager.web.gallery import Gallery
+
+    return Gallery(dataset)
+
+
+def _candidate(settings: ManagerSettings) -> Candidate:
+    # Only one process can be bound to this address, so a leader lease of the same holder belongs to an earlier
+    # process of this manager.
+    holder = f"{socket.gethostname()}/{settings.address}"
+    return Candidate(holder, settings.address, settings.leader_ttl_s)
+
+
+async def _win(
+    leadership: Leadership,
+    standby: Standby,
+    settings: ManagerSettings,
+    on_standby: Callable[[str], None],
+) -> int:
+    """Wait until this manager leads and return its epoch."""
+    server: grpc.aio.Server | None = None
+
+    async def stand_by(leader: str) -> None:
+        nonlocal server
+        standby.leader = leader
+        if server is None:
+            server = await standby.serve_calls(settings.host, settings.port)
+        on_standby(leader)
+
+    try:
+        return await leadership.win(stand_by)
+    finally:
+        if server is not None:
+            await server.stop(None)
+
+
+def _dispatch_limits(settings: ManagerSettings) -> DispatchLimits:
+    return DispatchLimits(
+        lease_ttl_s=settings.lease_ttl_s,
+        lease_limit_s=settings.lease_limit_s,
+        execute_deadline_s=settings.execute_deadline_s,
+        rollout_deadline_s=settings.rollout_deadline_s,
+        no_capacity_s=settings.no_capacity_s,
+        max_attempts=settings.max_attempts,
+        hedge_after_s=settings.hedge_after_s,
+        hedge_share=settings.hedge_share,
+        stall_after_s=settings.stall_after_s,
+        restart_grace_s=settings.restart_grace_s,
+        audit=AuditRules(settings.audit_probation, settings.audit_share, settings.audits_all_runs),
+    )
+
+
+async def _start_runtime(
+    settings: ManagerSettings, store: StateStore, bundles: BundleStore, leadership: Leadership, epoch: int
+) -> ManagerRuntime:
+    with _folder_errors(settings):
+        await note_folder(store, settings.data_dir)
+    schedule = ScheduleLimits(affinity_wait_s=settings.affinity_wait_s)
+    liveness = LivenessLimits(
+        heartbeat_s=settings.heartbeat_s,
+        lost_after_s=settings.lost_after_s,
+        stream_grace_s=settings.stream_grace_s,
+    )
+    # Epochs of sessions and leases exceed those of all earlier managers.
+    first_epoch = (epoch << 32) + 1
+    registry = Registry(liveness, first_epoch=first_epoch)
+    cluster = ClusterState(
+        _dispatch_limits(settings),
+        schedule,
+        boot_id=secrets.token_hex(4),
+        first_epoch=first_epoch,
+        audit_key=secrets.token_bytes(32),
+    )
+    archive = RunArchive(settings.data_dir / "runs")
+    runtime = ManagerRuntime(
+        cluster,
+        registry,
+        store,
+        bundles,
+        archive,
+        results_ttl_s=settings.results_ttl_s,
+        lapsed_s=leadership.lapsed_s,
+        unrenewed=leadership.problem,
+    )
+    await runtime.start()
+    return runtime
+
+
+class _HttpServer:
+    """Uvicorn on a bound socket, without its signal handlers, since the manager has its own."""
+
+    def __init__(self, app: FastAPI, bound: BoundedListener, tls: Tls | None) -> None:
+        self._socket = bound
+        self._app = app
+        config = uvicorn.Config(
+            self._answer,
+            interface="asgi3",
+            http=connections_through(bound),
+            # Uvicorn's log lines go through our handlers.
+            log_config=None,
+            log_level="warning",
+            access_log=False,
+            lifespan="off",
+            timeout_graceful_shutdown=1,
+            ssl_certfile=None if tls is None else tls.chain_file,
+            ssl_keyfile=None if tls is None else tls.key_file,
+        )
+        self._server = uvicorn.Server(config)
+        self._server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign,assignment]
+
+    def show(self, app: FastAPI) -> None:
+        """Serve this application from now on."""
+        self._app = app
+
+    async def serve(self) -> None:
+        await self._server.serve(sockets=[self._socket])
+
+    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        await self._app(scope, receive, send)
+
+
+@contextlib.asynccontextmanager
+async def _stopped_at_exit() -> AsyncIterator[asyncio.TaskGroup]:
+    """Task group whose tasks are cancelled when the block ends. The first failing task ends the block."""
+    try:
+        async with asyncio.TaskGroup() as group:
+            yield group
+            raise _BlockEndedError
+    except* _BlockEndedError:
+        pass
+
+
+class _BlockEndedError(Exception):
+    """Signal that the block ended."""
+
+
+@contextlib.contextmanager
+def _folder_errors(settings: ManagerSettings) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise StateError(
+            f"the data folder {settings.data_dir} can't be used ({error.strerror}): pass another --data-dir"
+        ) from error

@@ -1,0 +1,133 @@
+"""Limits of the HTTP port: connections, TLS handshakes, and silent clients."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import resource
+import socket
+from typing import TYPE_CHECKING, Any, Final, cast
+
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from uvicorn import Config
+    from uvicorn.server import ServerState
+
+CONNECTIONS: Final = 2048
+"""Connections at most. A page opens six, an event stream holds one."""
+SILENT_S: Final = 10.0
+"""Seconds from the start of a connection to its first whole request."""
+FILES: Final = 65_536
+"""Requested limit of open files: sockets of workers, trainers and viewers, bundles, and the store."""
+
+
+class BoundedConnections(H11Protocol):
+    """HTTP connection that is closed at once above ``CONNECTIONS``, and after ``SILENT_S`` without a request."""
+
+    most = CONNECTIONS
+    silent_s = SILENT_S
+    door: BoundedListener | None = None
+    """Listener that accepted the connections."""
+
+    def __init__(
+        self,
+        config: Config,
+        server_state: ServerState,
+        app_state: dict[str, Any],
+        _loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
+        super().__init__(config, server_state, app_state, _loop)
+        self._patience: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        # uvicorn narrows the parameter's type; a server passes a stream transport only.
+        super().connection_made(cast("asyncio.Transport", transport))
+        if self.door is not None:
+            self.door.entered(transport.get_extra_info("peername"))
+        if len(self.connections) > self.most:
+            self.transport.abort()
+        else:
+            self._patience = self.loop.call_later(self.silent_s, self._close_silent)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._patience is not None:
+            self._patience.cancel()
+        super().connection_lost(exc)
+
+    def _close_silent(self) -> None:
+        # The first whole request creates the cycle.
+        if self.cycle is None:
+            self.transport.abort()
+
+
+def connections_through(door: BoundedListener) -> type[BoundedConnections]:
+    """Return the connection class of a server that uses this listener."""
+    return type("ConnectionsThroughADoor", (BoundedConnections,), {"door": door})
+
+
+def allow_files() -> None:
+    """Raise the process's limit of open files towards ``FILES``, as far as the system allows."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = FILES if hard == resource.RLIM_INFINITY else min(FILES, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+
+
+WAITING: Final = 256
+"""Accepted connections without a finished handshake at most. TLS takes 300 kB for each."""
+HANDSHAKE_S: Final = 10.0
+"""Time limit of a handshake, in seconds."""
+TURNED_AWAY_AT_A_TIME: Final = 256
+"""Rejected connections before other work of the process gets a turn."""
+
+
+class BoundedListener(socket.socket):
+    """Listening socket for an asyncio server. When too many handshakes are pending, new connections are closed at
+    once.
+    """
+
+    most = WAITING
+    patience_s = HANDSHAKE_S
+
+    def __init__(self, *given: Any, **options: Any) -> None:
+        super().__init__(*given, **options)
+        self._waiting: dict[object, asyncio.TimerHandle] = {}
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        for _ in range(TURNED_AWAY_AT_A_TIME):
+            plain, peer = super().accept()
+            if len(self._waiting) < self.most:
+                return self._take_in(plain, peer), peer
+            plain.close()
+        raise BlockingIOError
+
+    def entered(self, peer: object) -> None:
+        """Note that the connection from this address finished its handshake, or is closed."""
+        timer = self._waiting.pop(peer, None)
+        if timer is not None:
+            timer.cancel()
+
+    def _take_in(self, plain: socket.socket, peer: object) -> socket.socket:
+        guest = _Guest(plain, lambda: self.entered(peer))
+        self._waiting[peer] = asyncio.get_running_loop().call_later(self.patience_s, guest.send_away)
+        return guest
+
+
+class _Guest(socket.socket):
+    """Accepted connection that reports its end."""
+
+    def __init__(self, plain: socket.socket, on_close: Callable[[], None]) -> None:
+        super().__init__(plain.family, plain.type, plain.proto, fileno=plain.detach())
+        self._on_close = on_close
+
+    def close(self) -> None:
+        self._on_close()
+        super().close()
+
+    def send_away(self) -> None:
+        """Shut the connection down, which wakes its readers."""
+        with contextlib.suppress(OSError):
+            self.shutdown(socket.SHUT_RDWR)

@@ -1,0 +1,145 @@
+"""The log of runs: bounded, whole where it can be, and honest about what it dropped."""
+
+from dataclasses import replace
+
+from tests.fakes.worker import completed
+
+from embomatrix.manager.control.commands import GiveLease
+from embomatrix.manager.control.dispatch.records import LeaseRecord, RolloutKey, RolloutRecord
+from embomatrix.manager.observe.event_log import EVENTS_KEPT, LEAST_KEPT, RunEventLog
+from embomatrix.manager.observe.run_archive import RunArchive
+from embomatrix.rpc.wire.leases import LeaseOrigin, LeaseRef, LeaseResult
+from embomatrix.rpc.wire.run_log import EventKind, PhaseSummary, RunSeries, RunSummary
+from embomatrix.rpc.wire.values import (
+    InfraCode,
+    InfraFailure,
+    Resident,
+    ResidentState,
+    Rollout,
+    RunInfo,
+    RunStats,
+    Timings,
+)
+
+EPOCH_S = 1_000.0
+
+
+def chronicle(*run_ids):
+    told = RunEventLog(epoch_s=EPOCH_S)
+    for run_id in run_ids:
+        told.open_run(run_id, "a run", now_s=1.0, cpu_s=0.0)
+    return told
+
+
+def lease(number, run_id="r1"):
+    rollout = Rollout(f"x{number}", "g", "sha256:scene", "t", (), 0)
+    return GiveLease(
+        "w1", LeaseRef(f"l{number}", number), rollout, 1.0, LeaseOrigin(run_id, "b", f"x{number}", 1)
+    )
+
+
+def test_a_busy_run_drops_its_own_oldest_events_and_counts_them():
+    told = chronicle("busy", "quiet")
+    for number in range(EVENTS_KEPT):
+        told.leased(lease(number, "busy"), now_s=2.0)
+    told.leased(lease(1, "quiet"), now_s=3.0)
+    assert told.page("busy", 0).dropped == EVENTS_KEPT + 1 - EVENTS_KEPT // 2
+    assert [event.kind for event in told.page("quiet", 0).events] == [EventKind.RUN_OPENED, EventKind.LEASED]
+    assert told.page("quiet", 0).dropped == 0
+
+
+def test_every_run_keeps_something_however_many_there_are():
+    told = chronicle(*(f"r{number}" for number in range(2 * EVENTS_KEPT // LEAST_KEPT)))
+    for number in range(2 * LEAST_KEPT):
+        told.leased(lease(number), now_s=2.0)
+    assert len(told.page("r1", 0).events) == LEAST_KEPT
+
+
+def test_pages_of_a_log_come_one_after_the_other():
+    told = chronicle("r1")
+    for number in range(10):
+        told.leased(lease(number), now_s=2.0)
+    first = told.page("r1", 0, 4).events
+    second = told.page("r1", first[-1].sequence, 100).events
+    assert [event.rollout_id for event in (*first, *second)][1:] == [f"x{number}" for number in range(10)]
+    assert first[0].at_s == EPOCH_S + 1.0
+    assert told.page("another", 0) is None
+
+
+def test_a_lease_of_a_run_that_was_closed_is_left_out():
+    told = chronicle("r1")
+    told.close_run("r1", now_s=2.0)
+    told.leased(lease(1), now_s=3.0)
+    assert told.page("r1", 0) is None
+
+
+def live(command):
+    record = RolloutRecord(
+        RolloutKey("r1", "b", command.rollout.rollout_id), command.rollout, 1, submitted_s=1.0, warm=True
+    )
+    return {command.ref.lease_id: LeaseRecord(command.ref, "w1", record, 2.0, 30.0, 60.0)}
+
+
+def test_a_hedge_is_won_when_its_own_result_comes():
+    told = chronicle("r1")
+    first, second = lease(1), replace(lease(2), hedge=True)
+    for command in (first, second):
+        told.leased(command, now_s=2.0)
+    crashed = InfraFailure(InfraCode.SLOT_CRASHED, "died")
+    told.reported("w1", [LeaseResult(first.ref, crashed)], live(first), now_s=3.0)
+    assert told.hedges_won == 0
+    told.reported("w1", [LeaseResult(second.ref, completed())], live(second), now_s=3.0)
+    assert told.hedges_won == 1
+
+
+def test_results_of_leases_that_are_not_live_are_nobodys():
+    told = chronicle("r1")
+    told.reported("w1", [LeaseResult(LeaseRef("l1", 1), completed())], {}, now_s=3.0)
+    told.reported("w2", [LeaseResult(lease(1).ref, completed())], live(lease(1)), now_s=3.0)
+    assert [event.kind for event in told.page("r1", 0).events] == [EventKind.RUN_OPENED]
+
+
+def test_phases_of_a_lease_add_up_to_its_life():
+    told = chronicle("r1")
+    done = replace(completed(), timings=Timings(load_s=0.5, execute_s=1.0))
+    told.reported("w1", [LeaseResult(lease(1).ref, done, slot=3, held_s=1.2)], live(lease(1)), now_s=4.0)
+    (event,) = [event for event in told.page("r1", 0).events if event.kind is EventKind.COMPLETED]
+    assert event.timings == Timings(queued_s=1.0, load_s=0.5, execute_s=1.0, lease_s=0.5)
+    assert (event.slot, event.held_s, event.attempt) == (3, 1.2, 1)
+
+
+def test_scenes_are_told_when_they_change_and_not_before():
+    told = chronicle()
+    loading = Resident("a", ResidentState.LOADING)
+    warm = Resident("a", ResidentState.WARM, load_s=0.5)
+    broken = Resident("b", ResidentState.FAILED, error="no mesh")
+    for now_s, residents in enumerate([[loading], [warm], [warm, broken], [warm, broken], [broken], []]):
+        told.fleet.residents("w1", residents, now_s=now_s)
+    found = [(event.at_s - EPOCH_S, event.kind, event.bundle_digest) for event in told.page("", 0).events]
+    assert found == [
+        (1, EventKind.SCENE_WARM, "a"),
+        (2, EventKind.SCENE_FAILED, "b"),
+        (4, EventKind.SCENE_EVICTED, "a"),
+    ]
+    assert told.fleet.scene_load.sum_s == 0.5
+
+
+def summary(run_id):
+    nothing = PhaseSummary()
+    run = RunInfo(run_id, "a run", RunStats(), 0, 1.0, 2.0)
+    return RunSummary(run, {}, (), RunSeries(1.0, (), ()), (), 0.0, nothing, nothing, 0, "1")
+
+
+async def test_the_archive_keeps_the_latest_and_passes_over_what_is_damaged(tmp_path):
+    archive = RunArchive(tmp_path / "runs", kept=3)
+    for number in range(5):
+        await archive.keep(summary(f"r{number}"), chronicle("r").page("r", 0).events)
+    assert [kept.run.run_id for kept in await archive.summaries()] == ["r4", "r3", "r2"]
+    (tmp_path / "runs" / "r3.run.gz").write_bytes(b"no gzip")
+    assert [kept.run.run_id for kept in await archive.summaries()] == ["r4", "r2"]
+    assert await archive.load("r3") is None
+    assert await archive.load("r0") is None
+    assert await archive.load("../runs/r4") is None
+    assert await archive.load("r4\0") is None
+    _, events = await archive.load("r4")
+    assert [event.kind for event in events] == [EventKind.RUN_OPENED]
