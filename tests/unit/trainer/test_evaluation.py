@@ -43,13 +43,13 @@ def setup_of(bench, samples=2, codec="lines", **changes):
 
 def judged(bench, answers, setup=None):
     executor = HereExecutor(bench.folder)
-    found = AnswerJudge(bench, setup or setup_of(bench), executor).judge(answers)
+    found = AnswerJudge(bench, setup or setup_of(bench), executor).next_pause_state(answers)
     return found, executor
 
 
 def report(bench, answers, setup=None):
     setup = setup or setup_of(bench)
-    marked = WorldExam(bench, HereExecutor(bench.folder)).judge(setup, answers, lambda *_: None)
+    marked = WorldExam(bench, HereExecutor(bench.folder)).next_pause_state(setup, answers, lambda *_: None)
     value = report_of(setup, marked)
     return value, evaluation_page(value, marked.pictures)
 
@@ -121,7 +121,7 @@ def test_equal_plans_of_a_task_are_executed_once(bench):
 def test_processes_of_this_machine_give_what_this_process_gives(bench):
     answers = asked(bench, BaselineName.RANDOM, 2)
     here, _ = judged(bench, answers)
-    assert AnswerJudge(bench, setup_of(bench), RolloutPool(bench.folder, 2)).judge(answers) == here
+    assert AnswerJudge(bench, setup_of(bench), RolloutPool(bench.folder, 2)).next_pause_state(answers) == here
 
 
 def test_report_is_made_again_from_the_kept_answers_bit_for_bit(bench, tmp_path):

@@ -14,7 +14,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
-from embomatrix.factory.scenes.solids import Solids, placed_parts
+from embomatrix.factory.assets.solids import Solids, placed_parts
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.live_world import LiveWorld

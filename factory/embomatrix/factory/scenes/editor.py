@@ -10,12 +10,12 @@ from dataclasses import replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.factory.assets.solids import Solids, placed_parts
 from embomatrix.factory.furnish.roles import is_portable
 from embomatrix.factory.scenes.check import reach_problems
 from embomatrix.factory.scenes.clearance import Clearance
 from embomatrix.factory.scenes.floor import ReachableFloor
 from embomatrix.factory.scenes.joints import with_joints
-from embomatrix.factory.scenes.solids import Solids, placed_parts
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.asset import FLOOR_CATEGORY, Asset, Link, SupportSurface

@@ -5,10 +5,10 @@ from __future__ import annotations
 from functools import cached_property
 from typing import TYPE_CHECKING, Final, Protocol
 
+from embomatrix.factory.assets.solids import Solids
 from embomatrix.factory.furnish.roles import FurnitureRole, role_of
 from embomatrix.factory.furnish.small_objects import NEVER_SWITCHED
 from embomatrix.factory.scenes.joints import bumped_into
-from embomatrix.factory.scenes.solids import Solids
 from embomatrix.sim.joints.swings import SWING
 from embomatrix.skills.appliances import cold_source, cooks, freezes, heat_source, heats
 from embomatrix.skills.limits import ROBOT

@@ -6,6 +6,7 @@ import itertools
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.factory.assets.solids import Solids, placed_parts
 from embomatrix.factory.furnish.small_objects import (
     BASKETS,
     MEMBERS,
@@ -20,7 +21,6 @@ from embomatrix.factory.scenes.check import reach_problems
 from embomatrix.factory.scenes.editor import SceneEditor
 from embomatrix.factory.scenes.floor import ReachableFloor, box_of
 from embomatrix.factory.scenes.joints import bumped_into, with_joints
-from embomatrix.factory.scenes.solids import Solids, placed_parts
 from embomatrix.factory.scenes.view import SceneView, is_liftable
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.state import State
