@@ -94,21 +94,21 @@ def _move(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> Sk
 
 
 def _turn(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-    heading, told = _heading(stage, call), stage.commanded
+    heading, here = _heading(stage, call), stage.commanded
     refusal = drive(stage, stage.mover.posture[None, :2], heading)
-    stage.commanded = StandPose(told.x_m, told.y_m, heading)
+    stage.commanded = StandPose(here.x_m, here.y_m, heading)
     return refusal
 
 
 def _move_forward(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     heading, distance_m = _heading(stage, call), call.distance or 0.0
     course = heading if distance_m >= 0 else heading + math.pi
-    told = stage.commanded
-    free_m = stage.world.navigator.forward(told, course, abs(distance_m))
+    start = stage.commanded
+    free_m = stage.world.navigator.forward(start, course, abs(distance_m))
     if free_m < abs(distance_m):
         return refuse(FailureReason.BLOCKED, distance=metres(free_m))
     here = stage.mover.posture[:2]
-    x, y = told.x_m + abs(distance_m) * math.cos(course), told.y_m + abs(distance_m) * math.sin(course)
+    x, y = start.x_m + abs(distance_m) * math.cos(course), start.y_m + abs(distance_m) * math.sin(course)
     return drive(stage, here[None], heading) or drive(stage, np.array([here, (x, y)]), heading)
 
 

@@ -302,12 +302,12 @@ class ArmReach:
         centres, radii = limb_balls(postures, held)
         widest = float(radii.max()) + 0.05
         close = boxes.near(centres.min(axis=(0, 1)) - widest, centres.max(axis=(0, 1)) + widest)
-        barred = struck(close, centres, radii, margin_m)
-        free = ~barred
+        hit = struck(close, centres, radii, margin_m)
+        free = ~hit
         free[free] = ~body.strikes_itself(postures[free], centres[free], radii)
         if held is not None and held.up is not None:
             free[free] = held.is_level(postures[free])
-        return np.asarray(free), Struck(close, centres, radii, margin_m, barred) if barred.any() else None
+        return np.asarray(free), Struck(close, centres, radii, margin_m, hit) if hit.any() else None
 
 
 def _share(most: int, bases: FloatArray) -> int:
