@@ -10,8 +10,7 @@ from typer.testing import CliRunner
 from embomatrix.factory.assets.check import EXCUSED_FROM_PROBE, PROBE_M, AssetFinding, Rule, check_asset
 from embomatrix.factory.assets.contact_sheet import TILE_PX, draw_sheet
 from embomatrix.factory.assets.families import Family
-from embomatrix.factory.assets.library import build_asset
-from embomatrix.factory.assets.naming import family_of
+from embomatrix.factory.assets.library import build_asset, family_of
 from embomatrix.factory.commands.assets import app
 from embomatrix.world.asset import Asset, Interior, Joint, JointKind, Link
 from embomatrix.world.catalog import Catalog

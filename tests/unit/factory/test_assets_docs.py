@@ -9,7 +9,7 @@ from pathlib import Path
 
 from embomatrix.factory.assets.check import Rule
 from embomatrix.factory.assets.families import Family
-from embomatrix.factory.assets.naming import family_of
+from embomatrix.factory.assets.library import family_of
 from embomatrix.world.asset import Asset
 from embomatrix.world.catalog import Catalog
 

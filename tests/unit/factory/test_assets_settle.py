@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from embomatrix.factory.assets.check import AssetFinding, Rule
+from embomatrix.factory.assets.check import GLANCE_STEPS, AssetFinding, Rule, check_standing
+from embomatrix.factory.assets.check import STEPS as STEPS_OF_TWO_SECONDS
 from embomatrix.factory.assets.library import build_asset
-from embomatrix.factory.assets.standing import GLANCE_STEPS, check_standing
-from embomatrix.factory.assets.standing import STEPS as STEPS_OF_TWO_SECONDS
 from embomatrix.world.asset import Link
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import Pose

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from embomatrix.factory.assets.solids import convex_of, depth_m
 from embomatrix.factory.scenes.check import ProblemKind, check_in_engine, check_scene
-from embomatrix.factory.scenes.solids import convex_of, depth_m
 from embomatrix.world.geometry import ConvexPart, Pose, Shape
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ import pytest
 from tests.fakes import furniture as make
 from tests.fakes.scenes import NORTH, placed, scene_of, upright
 
+from embomatrix.factory.assets.solids import Solids
 from embomatrix.factory.scenes.joints import bumped_into, with_joints
-from embomatrix.factory.scenes.solids import Solids
 from embomatrix.world.geometry import Pose
 from embomatrix.world.state import Relation
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from embomatrix.factory.assets.solids import Solids, placed_parts
 from embomatrix.factory.furnish.small_objects import BASKETS, belongs, is_left_on
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.check import reach_problems
 from embomatrix.factory.scenes.floor import ReachableFloor, box_of
-from embomatrix.factory.scenes.solids import Solids, placed_parts
 from embomatrix.factory.writer.variant import build_variant
 from embomatrix.world.scene import Scene
 

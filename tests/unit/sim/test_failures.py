@@ -1,4 +1,4 @@
-"""Every failure reason, produced by the shortest plan."""
+"""Every failure reason, reached by the shortest plan that leads to it."""
 
 from dataclasses import replace
 
@@ -87,7 +87,7 @@ AT_HOME = {
     FailureReason.GIVES_NO_LIQUID: "soak_object_in_source rag_1 plate_1",
     FailureReason.NOT_SOAKABLE: "soak_object_in_source plate_1 sink_1",
 }
-"""Those of cutting, cleaning and soaking."""
+"""Plans that fail with the reasons of cutting, cleaning and soaking."""
 ELSEWHERE = {
     FailureReason.NO_PATH,
     FailureReason.NO_STANDING_POSE,
@@ -96,18 +96,18 @@ ELSEWHERE = {
     FailureReason.DOOR_BLOCKED,
     FailureReason.NO_FREE_POSE,
 }
-"""Reasons that the tests below this table meet in scenes of their own."""
+"""Reasons that the tests below reach in dedicated scenes."""
 
 
 @pytest.mark.parametrize("reason", list(REACHED))
-def test_plan_fails_with_the_reason(awkward, reason):
+def test_plan_fails_with_the_expected_reason(awkward, reason):
     trace = executed(awkward, REACHED[reason])
     assert trace.failure is reason, trace.steps[-1].message
     assert trace.steps[-1].failure in reasons_of(trace.steps[-1].call.skill)
 
 
 @pytest.mark.parametrize("reason", list(AT_HOME))
-def test_household_plan_fails_with_the_reason(home, reason):
+def test_household_plan_fails_with_the_expected_reason(home, reason):
     trace = executed(home, AT_HOME[reason])
     assert trace.failure is reason, trace.steps[-1].message
     assert trace.steps[-1].failure in reasons_of(trace.steps[-1].call.skill)
@@ -129,12 +129,12 @@ def test_household_plan_fails_with_the_reason(home, reason):
         ),
     ],
 )
-def test_unready_tool_or_tap_is_named(home, text, reason):
+def test_unready_tool_or_tap_is_reported(home, text, reason):
     trace = executed(home, text)
     assert trace.failure is reason, trace.steps[-1].message
 
 
-def test_every_failure_reason_is_covered():
+def test_tests_cover_every_failure_reason():
     mishaps = frozenset().union(*MISHAPS.values())
     assert {*REACHED, *AT_HOME} | ELSEWHERE | mishaps == set(FailureReason)
     assert not mishaps & {*REACHED, *AT_HOME, *ELSEWHERE}
@@ -147,12 +147,12 @@ def test_no_path_leads_into_a_room_without_a_door():
     assert trace.steps[0].message == "the robot can't get to apple_2: a wall blocks the way"
 
 
-def test_room_without_a_door_can_not_be_entered():
+def test_a_room_without_a_door_can_not_be_entered():
     trace = executed_alone(replace(kitchen_scene(), doorways=()), "go_to_room living_room_0")
     assert trace.failure is FailureReason.NO_PATH
 
 
-def test_object_in_the_middle_of_a_huge_table_can_not_be_reached():
+def test_middle_of_a_huge_table_is_out_of_reach():
     island, apple = make.block("island", "island.n.01", (2.6, 2.6, 0.5), {}), make.apple()
     scene = scene_of(
         "island",
@@ -178,7 +178,7 @@ def test_blocker_in_the_doorway_is_named(text):
     assert trace.steps[0].message.endswith(": chest_1 blocks the way")
 
 
-def test_arm_does_not_reach_through_a_wall():
+def test_the_arm_does_not_reach_through_a_wall():
     low, apple = make.coffee_table(), make.apple()
     scene = scene_of(
         "wall",
@@ -191,7 +191,7 @@ def test_arm_does_not_reach_through_a_wall():
     assert trace.failure is FailureReason.NO_LINE_OF_APPROACH
 
 
-def test_chest_is_too_large_for_the_gripper():
+def test_a_chest_is_too_large_for_the_gripper():
     chest = replace(make.block("chest", "chest.n.01", (0.5, 0.5, 0.5), {}), mass_kg=3.0)
     scene = scene_of("chest", [(placed("chest_1", chest, "kitchen_0", upright(1.5, 1.5, 0, chest)), chest)])
     trace = executed_alone(scene, "move chest_1; pick_up chest_1")
@@ -230,14 +230,14 @@ def test_mug_in_front_of_the_microwave_blocks_its_door():
     assert trace.steps[-1].message == "mug_1 is in the way of the door of microwave_1"
 
 
-def test_blocked_door_keeps_its_position():
+def test_blocked_door_stays_in_place():
     simulator = load_simulator(Bundle(in_front_of_the_microwave(), {}))
     executed(simulator, "move microwave_1; open microwave_1")
     assert not simulator.facts.holds("open", ("microwave_1",))
     simulator.close()
 
 
-def test_full_bowl_takes_nothing_more(flat):
+def test_a_full_bowl_takes_nothing_more(flat):
     trace = executed(
         flat,
         "move apple_1; pick_up apple_1; move bowl_1; place bowl_1 inside; move mug_1; pick_up mug_1; "

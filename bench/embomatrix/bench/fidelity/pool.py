@@ -1,6 +1,6 @@
-"""Processes that execute trials in both modes, scene by scene. One that dies or hangs costs the trial that it was at.
+"""Process pool that executes trials in both modes, scene by scene. A process that dies or hangs costs its current trial.
 
-Children are spawned, never forked: the parent may hold threads and a loaded engine.
+Children are spawned, never forked, because the parent may hold threads and a loaded engine.
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.sim.fidelity.compare import FidelityTrial, compare
-from embomatrix.sim.fidelity.records import comparison_to_json, trial_to_json
+from embomatrix.sim.fidelity.compare import FidelityTrial, compare, comparison_to_json, trial_to_json
 from embomatrix.world.dataset import Dataset
 
 if TYPE_CHECKING:
@@ -30,12 +29,12 @@ if TYPE_CHECKING:
 
 JOIN_S: Final = 5.0
 LOST: Final = "lost"
-"""Key under which a line of results tells why a trial has none."""
+"""Key of the reason in the result line of a lost trial."""
 
 
 @dataclass(frozen=True, slots=True)
 class Modes:
-    """How a scene is loaded in each mode. Both are functions of a module: they are sent to other processes by name."""
+    """Functions that load a scene in each mode. They are pickled by name, so they must belong to a module."""
 
     cached: Load
     physical: Load
@@ -50,7 +49,7 @@ class TrialJob:
 
 
 class FidelityPool:
-    """Runs jobs in processes of its own. ``limit_s`` is the time that a process may be silent: load a scene, run a trial."""
+    """Runs jobs in dedicated processes. ``limit_s`` bounds the time for loading a scene and for each trial."""
 
     def __init__(self, folder: Path, modes: Modes, processes: int, limit_s: float) -> None:
         self._folder = folder
@@ -60,7 +59,7 @@ class FidelityPool:
         self._spawn = multiprocessing.get_context("spawn")
 
     def run(self, jobs: Sequence[TrialJob], on_result: Callable[[Mapping[str, Any]], None]) -> None:
-        """Execute every trial once. ``on_result`` gets a JSON value for each: a comparison, or a trial that is lost."""
+        """Execute every trial once. ``on_result`` gets a JSON value for each: a comparison, or a lost trial."""
         waiting = deque(job for job in jobs if job.trials)
         busy: list[_Child] = []
         try:
@@ -72,7 +71,7 @@ class FidelityPool:
                     [child.connection for child in busy], max(0.0, soonest - time.monotonic())
                 )
                 for child in tuple(busy):
-                    rest = child.hear(on_result)
+                    rest = child.receive(on_result)
                     if rest is not None:
                         busy.remove(child)
                         child.stop()
@@ -93,7 +92,7 @@ class FidelityPool:
 
 
 class _Child:
-    """One process and the trials that it has yet to answer for."""
+    """One process and its remaining trials."""
 
     def __init__(self, started: tuple[BaseProcess, Connection], job: TrialJob, limit_s: float) -> None:
         self._process, self.connection = started
@@ -103,8 +102,8 @@ class _Child:
         self.deadline = time.monotonic() + limit_s
         self.connection.send(job)
 
-    def hear(self, on_result: Callable[[Mapping[str, Any]], None]) -> TrialJob | None:
-        """Take what has come. The rest of the job when the process is of no more use, None while it works."""
+    def receive(self, on_result: Callable[[Mapping[str, Any]], None]) -> TrialJob | None:
+        """Read results. Return the rest of the job if the process has to be replaced, None while it works."""
         try:
             while self.connection.poll():
                 value = self.connection.recv()
@@ -135,7 +134,7 @@ class _Child:
 
 
 def _serve(connection: Connection, folder: Path, modes: Modes) -> None:
-    """Load the job's scene in both modes and answer for its trials one by one."""
+    """Load the job's scene in both modes and send the result of each trial."""
     job: TrialJob = connection.recv()
     trial = job.trials[0]
     try:
@@ -144,5 +143,5 @@ def _serve(connection: Connection, folder: Path, modes: Modes) -> None:
         for trial in job.trials:
             comparison = compare(cached, physical, bundle.tasks[trial.task_id], trial)
             connection.send(comparison_to_json(comparison))
-    except Exception:  # noqa: BLE001 -- whatever a mode raises is a finding, told with the trial that shows it
+    except Exception:  # noqa: BLE001 -- any exception of a mode is a finding, reported with its trial
         connection.send({**trial_to_json(trial), LOST: traceback.format_exc(limit=-6)})

@@ -1,6 +1,6 @@
-"""Bodies: how parts, doors, cavities and supports of an asset are put together.
+"""Building blocks of asset bodies: shells, doors, cavities and support surfaces.
 
-Everything is in the asset's frame: origin at the centre of the box, front at +x, z up, joints closed.
+All coordinates are in the asset's frame: origin at the centre of its box, front at +x, z up, joints closed, metres.
 """
 
 from __future__ import annotations
@@ -15,17 +15,23 @@ from embomatrix.world.asset import Interior, Joint, JointKind, Link, SupportSurf
 from embomatrix.world.geometry import Aabb, Pose
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
 
+    Proportions = tuple[Vec2, Vec2, Vec2]
+
 OPEN_ABOVE_M: Final = 2.0
-"""Clearance of a surface in the open: nothing of the asset is above it, and rooms end soon after."""
+"""Clearance of a surface with no part of the asset above it; no room is higher."""
+FULL: Final = (-1.0, 1.0)
+"""Interval of `proportioned` from the low side of the box to the high side."""
 FIT_M: Final = 0.002
 """Gap between a door and its frame, and between an interior and the walls of its cavity."""
 
 
 @dataclass(slots=True)
 class Body:
-    """What a generator has built so far; the library turns it into an asset."""
+    """Parts, moving links, surfaces and cavities of one asset while a generator builds it."""
 
     parts: list[ConvexPart] = field(default_factory=list)
     moving: list[Link] = field(default_factory=list)
@@ -35,7 +41,7 @@ class Body:
     def add_support(
         self, name: str, low: Vec2, high: Vec2, z: float, clearance_m: float = OPEN_ABOVE_M
     ) -> None:
-        """A surface in the open between two corners at height ``z``."""
+        """Add an open surface between two corners at height ``z``."""
         self.supports.append(_surface(name, low, high, z, clearance_m))
 
     def add_interior(
@@ -46,9 +52,9 @@ class Body:
         clearance_m: float = 0.0,
         link: str = "",
     ) -> None:
-        """A cavity and its floor, which ride on ``link`` where it has a name.
+        """Add a cavity and its floor; both move with ``link`` if it is named.
 
-        ``clearance_m`` exceeds the cavity's height where things may stick out at the top.
+        Set ``clearance_m`` above the cavity's height if objects may stick out of its top.
         """
         (x0, y0, z0), (x1, y1, z1) = cavity.low_m, cavity.high_m
         x0, y0, x1, y1 = x0 + FIT_M, y0 + FIT_M, x1 - FIT_M, y1 - FIT_M
@@ -66,14 +72,28 @@ def _surface(name: str, low: Vec2, high: Vec2, z: float, clearance_m: float) -> 
 
 
 def centred(size_m: Vec3) -> Aabb:
-    """The box of a model in its asset frame."""
+    """Return the box of a model, centred on the origin of its asset frame."""
     x, y, z = (extent / 2 for extent in size_m)
     return Aabb((-x, -y, -z), (x, y, z))
 
 
 def region(x: Vec2, y: Vec2, z: Vec2) -> Aabb:
-    """Box from its intervals along x, y and z."""
+    """Return the box with these intervals along x, y and z."""
     return Aabb((x[0], y[0], z[0]), (x[1], y[1], z[1]))
+
+
+def proportioned(size_m: Vec3, rows: Sequence[Proportions]) -> list[ConvexPart]:
+    """Return boxes whose edges are given as shares of the half extents, from -1 (low side) to 1 (high side)."""
+
+    def edge(share: float, extent: float) -> float:
+        if share < 0:
+            return -extent / 2 + (share + 1) / 2 * extent
+        return extent / 2 - (1 - share) / 2 * extent
+
+    return [
+        box(*([edge(span[end], extent) for span, extent in zip(row, size_m, strict=True)] for end in (0, 1)))
+        for row in rows
+    ]
 
 
 def clamp(value: float, low: float, high: float) -> float:
@@ -82,7 +102,7 @@ def clamp(value: float, low: float, high: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Walls:
-    """Thickness of the six walls of a shell, in metres; zero leaves the side open."""
+    """Thickness of the six walls of a shell in metres. Zero leaves a side open."""
 
     back: float
     front: float
@@ -93,7 +113,7 @@ class Walls:
 
 
 def shell(outer: Aabb, walls: Walls) -> tuple[list[ConvexPart], Aabb]:
-    """Boards around a cavity, edge to edge without overlap, and the cavity."""
+    """Return boards around a cavity, edge to edge without overlap, and the cavity itself."""
     (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m
     inner = region(
         (x0 + walls.back, x1 - walls.front),
@@ -118,8 +138,11 @@ def shell(outer: Aabb, walls: Walls) -> tuple[list[ConvexPart], Aabb]:
 
 
 class Hinge(StrEnum):
-    """The edge that a panel turns about. It is always an *outer* edge of the panel: so the panel swings clear of the
-    frame, stays within its own width, and at the end covers no more of the mouth than its own thickness."""
+    """Edge that a panel turns about.
+
+    It is always an outer edge. The panel therefore swings clear of the frame, stays within its own width, and covers no more
+    of the opening than its thickness when open.
+    """
 
     RIGHT = "right"  # vertical, at -y
     LEFT = "left"  # vertical, at +y
@@ -129,7 +152,7 @@ class Hinge(StrEnum):
 
 
 def hinged(name: str, panel: Aabb, hinge: Hinge) -> Link:
-    """A door, flap or lid that opens by a quarter turn."""
+    """Return a door, flap or lid that opens by a quarter turn."""
     (x0, y0, z0), (x1, y1, z1) = panel.low_m, panel.high_m
     _, cy, cz = panel.center_m
     origin: Vec3
@@ -150,13 +173,13 @@ def hinged(name: str, panel: Aabb, hinge: Hinge) -> Link:
 
 
 def sliding(name: str, panel: Aabb, axis: Vec3, travel_m: float) -> Link:
-    """A panel that moves along a straight rail."""
+    """Return a panel that slides along a straight rail."""
     centre = rounded(*panel.center_m)
     return Link(name, (box_of(panel),), Joint(JointKind.PRISMATIC, centre, axis, round(travel_m, 6)))
 
 
 def raised(body: Body, lift_m: float) -> Body:
-    """The same body ``lift_m`` higher in its frame."""
+    """Return the body ``lift_m`` higher in its frame."""
     links = [
         Link(
             link.name,
@@ -174,7 +197,7 @@ def raised(body: Body, lift_m: float) -> Body:
 
 
 def stacked(lower: Body, upper: Body, lift_m: float) -> Body:
-    """Both bodies as one, the upper one raised. Their links, surfaces and cavities have different names."""
+    """Join two bodies and raise the upper one. Names of links, surfaces and cavities must differ."""
     above = raised(upper, lift_m)
     return Body(
         lower.parts + above.parts,

@@ -1,4 +1,4 @@
-"""Things with a cavity and a front: cabinets, fridges, ovens, open shelving, chests with a lid, plain open boxes."""
+"""Assets with a cavity: cabinets, fridges, ovens, open shelving, chests with a lid, open boxes."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
 
 MAX_PARTS: Final = 16
-"""Bullet drops further parts of one link without a word."""
+"""Upper limit for the parts of a link: Bullet silently drops further ones."""
 _BOARD_M: Final = 0.012
-"""Thickness of the board between drawers and what is below them."""
+"""Thickness of the board below drawers."""
 
 
 class FrontKind(StrEnum):
-    """What closes the front."""
+    """Closure of a cabinet's front."""
 
     OPEN = "open"
     SIDE_HINGED = "side_hinged"
@@ -45,9 +45,9 @@ class FrontKind(StrEnum):
 class CabinetStyle:
     """Proportions of a family of cabinets, in metres.
 
-    ``tier_m`` is the height that one shelf compartment should have; ``bay_m`` the greatest width of a door pair;
-    ``plinth_m`` lifts the door off the floor; ``head_m`` is a strip above it and ``panel_share`` the share of the width
-    that a control panel takes at the left. ``drawer_share`` is the share of the height, from the top, that drawers take.
+    ``tier_m`` is the preferred height of a shelf compartment and ``bay_m`` the greatest width of a pair of doors.
+    ``plinth_m`` lifts the door off the floor, ``head_m`` is a strip above the door. ``panel_share`` is the share of the width
+    for a control panel at the left, ``drawer_share`` the share of the height for drawers at the top.
     """
 
     front: FrontKind
@@ -76,7 +76,7 @@ WASHER: Final = CabinetStyle(
     FrontKind.SIDE_HINGED, wall_m=0.045, tier_m=2.0, plinth_m=0.1, head_m=0.12, single_door_m=9.0, bay_m=9.0
 )
 FREEZER: Final = CabinetStyle(FrontKind.OPEN, wall_m=0.045, tier_m=0.4, plinth_m=0.08)
-"""Without a door: BEHAVIOR-1K does not call these categories openable, yet things are kept inside them."""
+"""No door: BEHAVIOR-1K does not list these categories as openable, yet its tasks keep objects inside them."""
 OVEN: Final = CabinetStyle(FrontKind.DROP_DOWN, wall_m=0.03, tier_m=0.3, plinth_m=0.05, head_m=0.07)
 DISHWASHER: Final = CabinetStyle(FrontKind.DROP_DOWN, wall_m=0.03, tier_m=0.28, plinth_m=0.08, head_m=0.05)
 SHELVING: Final = CabinetStyle(FrontKind.OPEN, wall_m=0.02, tier_m=0.32, plinth_m=0.05, bay_m=1.3)
@@ -86,7 +86,7 @@ WARDROBE: Final = CabinetStyle(FrontKind.OPEN, wall_m=0.022, tier_m=1.1, plinth_
 
 
 def cabinet(size_m: Vec3, style: CabinetStyle) -> Body:
-    """Box with shelves, in bays of one or two doors or with drawers above them; its top carries things too."""
+    """A box with shelves, in bays with one or two doors, perhaps with drawers above them; its top is a surface too."""
     body = Body()
     outer = centred(size_m)
     wall = min(style.wall_m, 0.08 * min(size_m))
@@ -118,7 +118,7 @@ def cabinet(size_m: Vec3, style: CabinetStyle) -> Body:
 
 
 def _fill(body: Body, style: CabinetStyle, bay: Aabb, front: Aabb, boards: int, prefix: str) -> None:
-    """Drawers at the top of a bay, shelves behind doors below them, with at most ``boards`` boards."""
+    """Add drawers at the top of a bay and shelves behind doors below them, with at most ``boards`` boards."""
     if style.drawer_share:
         gap = min(FIT_M, 0.2 * front.size_m[0])
         panels = Aabb((front.low_m[0] + gap, *front.low_m[1:]), front.high_m)
@@ -138,7 +138,7 @@ def _fill(body: Body, style: CabinetStyle, bay: Aabb, front: Aabb, boards: int, 
 
 
 def shelving(size_m: Vec3) -> Body:
-    """Open shelves; a low model is a single wall board."""
+    """Open shelves; a low model is a single board for a wall."""
     if size_m[2] < 0.2:
         return slab(size_m)
     return cabinet(size_m, SHELVING)
@@ -164,7 +164,7 @@ def _walls(size_m: Vec3, style: CabinetStyle, wall: float) -> Walls:
 
 
 def _bays(cavity: Aabb, style: CabinetStyle, divider_m: float) -> list[Vec2]:
-    """Intervals along y between the dividers; a divider covers the edges of two open doors."""
+    """Return the intervals along y between the dividers; a divider covers the edges of two doors."""
     low, high = cavity.low_m[1], cavity.high_m[1]
     count = int(clamp(round((high - low) / style.bay_m), 1, 4))
     width = (high - low - (count - 1) * divider_m) / count
@@ -199,7 +199,7 @@ def _doors(body: Body, style: CabinetStyle, front: Aabb, prefix: str) -> tuple[s
 def _add_tiers(
     body: Body, bay: Aabb, tier_m: float, boards: int, prefix: str, doors: tuple[str, ...]
 ) -> None:
-    """Divide a bay into shelf compartments of equal height, with at most ``boards`` shelf boards."""
+    """Divide a bay into compartments of equal height, with at most ``boards`` shelf boards."""
     (x0, y0, z0), (x1, y1, z1) = bay.low_m, bay.high_m
     count = int(clamp(round((z1 - z0) / tier_m), 1, boards + 1))
     board = clamp(0.02 * (z1 - z0), 0.006, 0.016)
@@ -213,7 +213,7 @@ def _add_tiers(
 
 
 def chest(size_m: Vec3, lid_share: float = 0.12) -> Body:
-    """Box with a lid that is hinged at the back and opens by a quarter turn."""
+    """A box with a lid that is hinged at the back and opens by a quarter turn."""
     body = Body()
     outer = centred(size_m)
     wall = clamp(0.05 * min(size_m[:2]), 0.003, 0.025)
@@ -228,11 +228,11 @@ def chest(size_m: Vec3, lid_share: float = 0.12) -> Body:
 
 
 SHALLOW_M: Final = 0.025
-"""A rim lower than this holds nothing in: a tray has a surface, not an inside."""
+"""Depth from which an open vessel has a cavity; a shallower tray has only a surface."""
 
 
 def open_box(size_m: Vec3) -> Body:
-    """Box without a lid: baskets, crates, bins, tubs, trays."""
+    """A box without a lid: baskets, crates, bins, tubs, trays."""
     body = Body()
     wall = clamp(0.04 * min(size_m[:2]), 0.003, 0.05)
     floor = clamp(0.06 * size_m[2], 0.002, 0.04)

@@ -1,4 +1,4 @@
-"""Pictures of assets side by side, closed and open, each in its own frame: for looking at what the families build."""
+"""Contact sheet of assets: one picture for each, and a second one with doors and drawers open."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _BASE: Final = np.array((205.0, 190.0, 165.0))
 _MOVING: Final = np.array((120.0, 165.0, 215.0))
 _LIGHT: Final = np.array((0.62, 0.30, 0.72))
 OPEN_SHARE: Final = 0.6
-"""How far doors and drawers stand open in the second picture."""
+"""Share of their travel by which doors and drawers are open in the second picture."""
 
 
 def draw_sheet(assets: Sequence[Asset], columns: int = _COLUMNS) -> Image.Image:
-    """One tile for each asset, and a second one, doors and drawers open, for each that has any. Returns an RGB image."""
+    """Return an RGB image with one tile for each asset, and a second tile for each asset with doors or drawers."""
     tiles = [(asset, 0.0) for asset in assets]
     tiles += [(asset, OPEN_SHARE) for asset in assets if asset.joints]
     tiles.sort(key=lambda tile: tile[0].asset_id)
@@ -47,7 +47,7 @@ def draw_sheet(assets: Sequence[Asset], columns: int = _COLUMNS) -> Image.Image:
 
 
 def _draw_asset(draw: ImageDraw.ImageDraw, asset: Asset, share: float, corner: tuple[int, int]) -> None:
-    """Faces from the back to the front: parts are convex and don't interlock, so that order is nearly right."""
+    """Draw faces from back to front: parts are convex and do not interlock, so this order is nearly right."""
     faces, colors = _faces(asset, share)
     right, up, toward = _camera()
     flat = np.stack((faces @ right, faces @ up), axis=-1)  # (n, 3, 2)
@@ -61,7 +61,7 @@ def _draw_asset(draw: ImageDraw.ImageDraw, asset: Asset, share: float, corner: t
 
 
 def _camera() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Axes of the picture to the right and up, and the direction towards the eye, which sees front and left."""
+    """Return the picture's right and up axes and the direction to the camera, which sees the front and left sides."""
     cos_a, sin_a = math.cos(_AZIMUTH), math.sin(_AZIMUTH)
     cos_e, sin_e = math.cos(_ELEVATION), math.sin(_ELEVATION)
     toward = np.array((cos_e * cos_a, cos_e * sin_a, sin_e))
@@ -70,13 +70,13 @@ def _camera() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _faces(asset: Asset, share: float) -> tuple[FloatArray, list[list[int]]]:
-    """Triangles that face the eye, shape (n, 3, 3), and their colours."""
+    """Return the triangles that face the camera, shape (n, 3, 3), and their colours."""
     _, _, toward = _camera()
     faces, colors = [], []
     for link in asset.links:
         motion = joint_motion(link.joint, share) if link.joint is not None else IDENTITY
         for part in link.parts:
-            # Finely divided faces sort better by depth.
+            # Small faces sort better by depth.
             mesh = mesh_of(part).subdivide().subdivide()
             normals = mesh.face_normals @ motion.rotation.T
             seen = normals @ toward > 0

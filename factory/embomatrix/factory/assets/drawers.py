@@ -1,4 +1,4 @@
-"""Drawers: boxes open above that slide out of the front of a carcass, with what lies in them."""
+"""Drawers: open boxes that slide out of the front of a carcass with their contents."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import Vec2
 
 TRAVEL_SHARE: Final = 0.8
-"""How much of its depth a drawer comes out: the rest stays on the rails."""
+"""Share of its depth by which a drawer slides out; the rest stays on the rails."""
 TRAVEL_M: Final = 0.6
-"""No rails are longer, however deep the furniture: the inventories have a cabinet of three metres."""
+"""Longest travel, however deep the furniture: the inventories list a cabinet of 3 m."""
 PLAY_M: Final = 0.004
-"""Gap between a drawer and what it slides past."""
+"""Gap between a drawer and its carcass."""
 DRAWER_M: Final = 0.21
-"""Height that a drawer should have."""
+"""Preferred height of a drawer."""
 _RIM_SHARE: Final = 0.7
-"""Height of a drawer's walls against the room that it has: what lies in it may stick out a little."""
+"""Height of a drawer's walls as a share of its room: contents may stick out a little."""
 
 
 def add_drawers(body: Body, bay: Aabb, front: Aabb, prefix: str = "", most: int = 4) -> None:
     """Fill a bay with drawers of equal height, named from the top down.
 
-    ``bay`` is the room within the carcass, open at its +x side; ``front`` what their panels cover, before it.
+    ``bay`` is the space within the carcass, open at its +x side; ``front`` is the box that the panels fill before it.
     """
     height = front.size_m[2]
     count = int(clamp(round(height / DRAWER_M), 1, most))
-    # Panels divide the front, boxes the bay: a panel also covers the edges of the carcass.
+    # Panels share the front, boxes share the bay: a panel also covers the edges of the carcass.
     fronts = _divided((front.low_m[2], front.high_m[2]), count)
     for number, (low, high) in enumerate(fronts, start=1):
         room = (max(low, bay.low_m[2]), min(high, bay.high_m[2]))
@@ -41,7 +41,7 @@ def add_drawers(body: Body, bay: Aabb, front: Aabb, prefix: str = "", most: int 
 
 
 def _add_drawer(body: Body, name: str, panel: Aabb, room: Aabb) -> None:
-    """One drawer: a panel and behind it a box with four walls, the panel being the fifth board's cover."""
+    """Add one drawer: a panel with a box behind it."""
     (x0, y0, z0), (x1, y1, z1) = room.low_m, room.high_m
     low, top = z0 + PLAY_M, z1 - PLAY_M
     wall = clamp(0.02 * (y1 - y0), 0.004, 0.012)
@@ -59,7 +59,7 @@ def _add_drawer(body: Body, name: str, panel: Aabb, room: Aabb) -> None:
 
 
 def _divided(span: Vec2, count: int) -> list[Vec2]:
-    """Equal intervals from the top down."""
+    """Return equal intervals from the top down."""
     low, high = span
     pitch = (high - low) / count
     return [(high - (k + 1) * pitch, high - k * pitch) for k in range(count)]

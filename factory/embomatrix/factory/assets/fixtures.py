@@ -1,4 +1,4 @@
-"""Sinks, baths, toilets, stoves, doors, windows, screens, plants, vehicles: what a building is equipped with."""
+"""Fixtures of a building: sinks, baths, toilets, stoves, doors, windows, screens, plants, cars."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.body import (
     FIT_M,
+    FULL,
     OPEN_ABOVE_M,
     Body,
     Hinge,
@@ -13,6 +14,7 @@ from embomatrix.factory.assets.body import (
     centred,
     clamp,
     hinged,
+    proportioned,
     region,
     shell,
     sliding,
@@ -25,13 +27,13 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
 
 _ON_LEGS_M: Final = 0.6
-"""A grill as high as this is one to stand at."""
+"""Height from which a grill stands on legs."""
 _TAP_M: Final = 0.2
 _BASIN_DEPTH_M: Final = 0.18
 
 
 def furniture_sink(size_m: Vec3) -> Body:
-    """Base cabinet with a basin in its top, worktop on both sides, and a tap behind."""
+    """A base cabinet with a basin in its top, worktop on both sides, and a tap behind."""
     return _sink(size_m, basins=1, basin_width_m=0.6)
 
 
@@ -41,7 +43,7 @@ def multi_sink(size_m: Vec3) -> Body:
 
 
 def _sink(size_m: Vec3, basins: int, basin_width_m: float) -> Body:
-    """Block from the floor to the worktop with basins let in; rims and worktop carry things."""
+    """A block from the floor to the worktop with basins let in; the worktop carries objects."""
     outer = centred(size_m)
     (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m
     deck = z1 - min(_TAP_M, 0.3 * size_m[2])
@@ -83,12 +85,12 @@ def _tap_radius(z: Vec2) -> float:
 
 
 def _under_tap(z: Vec2) -> float:
-    """Height of the spout's underside."""
+    """Return the height of the spout's underside."""
     return z[1] - 2 * _tap_radius(z)
 
 
 def pedestal_sink(size_m: Vec3) -> Body:
-    """A single basin on a column, or on a bracket where it hangs on a wall."""
+    """A single basin on a column; on a bracket if it hangs on a wall."""
     outer = centred(size_m)
     (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m
     deck = z1 - min(_TAP_M, 0.3 * size_m[2])
@@ -162,36 +164,33 @@ def grill(size_m: Vec3) -> Body:
     return body
 
 
+_COFFEE_MACHINE: Final = (
+    ((-1.0, -0.2), FULL, (-0.84, 1.0)),
+    (FULL, FULL, (-1.0, -0.84)),
+    ((-0.2, 1.0), FULL, (0.4, 1.0)),
+)
+
+
 def coffee_machine(size_m: Vec3) -> Body:
-    """A back with a head, over a tray that a cup stands on."""
+    """A back with a head, over a tray for cups."""
     outer = centred(size_m)
     (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m
     foot, head, back = z0 + 0.08 * size_m[2], z1 - 0.3 * size_m[2], x0 + 0.4 * size_m[0]
-    body = Body(
-        parts=[
-            box((x0, y0, foot), (back, y1, z1)),
-            box((x0, y0, z0), (x1, y1, foot)),
-            box((back, y0, head), (x1, y1, z1)),
-        ]
-    )
+    body = Body(parts=proportioned(size_m, _COFFEE_MACHINE))
     body.add_interior("bay", region((back, x1), (y0, y1), (foot, head)))
     body.add_support("top", (x0, y0), (x1, y1), z1)
     return body
 
 
 def door(size_m: Vec3) -> Body:
-    """Frame of two posts and a lintel with a leaf that turns about its right edge."""
-    outer = centred(size_m)
-    body, gap = _frame(outer)
-    depth = min(0.05, 0.5 * size_m[0])
-    leaf = Aabb((gap.high_m[0] - depth, gap.low_m[1] + FIT_M, gap.low_m[2] + FIT_M), gap.high_m)
-    leaf = Aabb(leaf.low_m, (leaf.high_m[0], leaf.high_m[1] - FIT_M, leaf.high_m[2] - FIT_M))
-    body.moving.append(hinged("leaf", leaf, Hinge.RIGHT))
+    """A frame of two posts and a lintel, and a panel that turns about its right edge."""
+    body, gap = _frame(centred(size_m))
+    body.moving.append(hinged("leaf", _fitted(gap, min(0.05, 0.5 * size_m[0])), Hinge.RIGHT))
     return body
 
 
 def sliding_door(size_m: Vec3) -> Body:
-    """Frame with a fixed pane on the right half and one on the left that slides before it."""
+    """A frame with a fixed pane in its right half and a pane in its left half that slides in front of it."""
     outer = centred(size_m)
     body, gap = _frame(outer)
     (x0, y0, z0), (x1, y1, z1) = gap.low_m, gap.high_m
@@ -203,7 +202,7 @@ def sliding_door(size_m: Vec3) -> Body:
 
 
 def garage_door(size_m: Vec3) -> Body:
-    """Frame with a leaf before it that is drawn up."""
+    """A frame with a panel in front of it that slides up."""
     outer = centred(size_m)
     leaf_m = min(0.06, 0.4 * size_m[0])
     x1 = outer.high_m[0]
@@ -214,18 +213,20 @@ def garage_door(size_m: Vec3) -> Body:
 
 
 def window(size_m: Vec3) -> Body:
-    """Frame and sill with a sash that opens to the front."""
-    outer = centred(size_m)
-    body, gap = _frame(outer, sill_m=clamp(0.05 * size_m[2], 0.02, 0.1))
-    depth = min(0.04, 0.5 * size_m[0])
-    low = (gap.high_m[0] - depth, gap.low_m[1] + FIT_M, gap.low_m[2] + FIT_M)
-    sash = Aabb(low, (gap.high_m[0], gap.high_m[1] - FIT_M, gap.high_m[2] - FIT_M))
-    body.moving.append(hinged("sash", sash, Hinge.RIGHT))
+    """A frame and sill with a sash that opens to the front."""
+    body, gap = _frame(centred(size_m), sill_m=clamp(0.05 * size_m[2], 0.02, 0.1))
+    body.moving.append(hinged("sash", _fitted(gap, min(0.04, 0.5 * size_m[0])), Hinge.RIGHT))
     return body
 
 
+def _fitted(gap: Aabb, depth_m: float) -> Aabb:
+    """Return the box of a panel at the front of an opening, with a gap to the frame on all sides."""
+    (_, y0, z0), (x1, y1, z1) = gap.low_m, gap.high_m
+    return Aabb((x1 - depth_m, y0 + FIT_M, z0 + FIT_M), (x1, y1 - FIT_M, z1 - FIT_M))
+
+
 def _frame(outer: Aabb, sill_m: float = 0.0) -> tuple[Body, Aabb]:
-    """Two posts, a lintel and perhaps a sill, and the opening between them."""
+    """Return two posts, a lintel and, if ``sill_m`` is above 0, a sill; and the opening between them."""
     post = clamp(0.05 * outer.size_m[1], 0.02, 0.1)
     parts, gap = shell(outer, Walls(0.0, 0.0, post, post, sill_m, post))
     return Body(parts=parts), gap
@@ -277,7 +278,7 @@ def tree(size_m: Vec3) -> Body:
 def car(size_m: Vec3) -> Body:
     """Bonnet and cabin as blocks, and a boot with a lid that is hinged at the cabin.
 
-    The boot is at +x, where furniture has its doors: that side is served, and the bonnet is what stands to a wall.
+    The boot is at +x, like the doors of furniture: furnishing keeps that side free and puts the bonnet to the wall.
     """
     outer = centred(size_m)
     (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m

@@ -1,10 +1,11 @@
-"""Tables, seats, beds, lamps and the like: boards on legs with true free space below."""
+"""Tables, desks, seats, beds and lamps: boards on legs with free space below."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.assets.body import Body, centred, clamp
+from embomatrix.factory.assets.body import Body, Walls, centred, clamp, raised, region, shell
+from embomatrix.factory.assets.drawers import add_drawers
 from embomatrix.factory.assets.shapes import box, octagon
 
 if TYPE_CHECKING:
@@ -12,18 +13,18 @@ if TYPE_CHECKING:
 
 
 def legs(low: Vec2, high: Vec2, z: Vec2, thickness_m: float) -> list[ConvexPart]:
-    """Four square legs at the corners of a rectangle."""
+    """Return four square legs at the corners of a rectangle."""
     (x0, y0), (x1, y1), t = low, high, thickness_m
     return [box((x, y, z[0]), (x + t, y + t, z[1])) for x in (x0, x1 - t) for y in (y0, y1 - t)]
 
 
 def top_thickness(size_m: Vec3) -> float:
-    """Thickness of a table's top, in metres."""
+    """Return the thickness of a table's top in metres."""
     return clamp(0.05 * size_m[2], 0.006, 0.04)
 
 
 def leg_thickness(size_m: Vec3) -> float:
-    """Width of a table's square legs, in metres."""
+    """Return the width of a table's square legs in metres."""
     return clamp(0.07 * min(size_m[:2]), 0.008, 0.07)
 
 
@@ -59,7 +60,7 @@ def pedestal_table(size_m: Vec3) -> Body:
         box((-0.12 * x1, -0.12 * y1, z0 + foot), (0.12 * x1, 0.12 * y1, z1 - top)),
         *octagon((0.0, 0.0), (0.6 * x1, 0.6 * y1), (z0, z0 + foot)),
     ]
-    # the square that fits the octagon: corners of a larger one would hang over
+    # Inscribed square of the octagon: a larger rectangle would hang over.
     body.add_support("top", (-0.7 * x1, -0.7 * y1), (0.7 * x1, 0.7 * y1), z1)
     return body
 
@@ -85,13 +86,13 @@ def slab(size_m: Vec3) -> Body:
 
 
 def block(size_m: Vec3) -> Body:
-    """A solid box that is no place for other things; its top is where its box ends."""
+    """A solid box that carries nothing."""
     outer = centred(size_m)
     return Body(parts=[box(outer.low_m, outer.high_m)])
 
 
 def _seat_height(height_m: float) -> float:
-    """Seats are 0.42 m high; stools and children's chairs follow their own height."""
+    """Return the height of a seat: 0.42 m, bounded by shares of the whole height for low and high models."""
     return clamp(0.42, 0.35 * height_m, 0.62 * height_m)
 
 
@@ -137,11 +138,11 @@ def stool(size_m: Vec3) -> Body:
 
 
 CORNER_FROM_M: Final = 1.4
-"""A sofa that exceeds this along both sides is one for a corner: nobody's seat is as deep."""
+"""A sofa larger than this along both sides is a corner sofa: no seat is as deep."""
 
 
 def sofa(size_m: Vec3) -> Body:
-    """Upholstered base on short feet, with back and arms; a deep and wide one goes round a corner."""
+    """Upholstered base on short feet with back and arms; a deep and wide model is a corner sofa."""
     if size_m[0] > CORNER_FROM_M and size_m[1] > CORNER_FROM_M:
         return _corner_sofa(size_m)
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
@@ -162,7 +163,7 @@ def sofa(size_m: Vec3) -> Body:
 
 
 def _corner_sofa(size_m: Vec3) -> Body:
-    """Seats along the back and along the right side, with a back behind each; the corner between them is open floor."""
+    """Seats along the back and along the right side with a back rest behind each; open floor between them."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     z, feet = z0 + _seat_height(size_m[2]), 0.1 * size_m[2]
     deep, back = 0.95, 0.22
@@ -182,7 +183,7 @@ def _corner_sofa(size_m: Vec3) -> Body:
 
 
 def bed(size_m: Vec3) -> Body:
-    """Mattress on a frame with legs, headboard at the back: the foot of the bed is its front."""
+    """Mattress on a frame with legs and a headboard at the back; the foot of the bed is its front."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     body = Body()
     z = z0 + clamp(0.55, 0.3 * size_m[2], 0.72 * size_m[2])
@@ -222,3 +223,79 @@ def lamp(size_m: Vec3) -> Body:
             *octagon((0.0, 0.0), (x1, y1), (z1 - shade, z1)),
         ]
     )
+
+
+PEDESTAL_FROM_M: Final = 1.15
+"""Width from which a desk has its drawers in a pedestal: a chair still fits beside it."""
+TALL_M: Final = 1.05
+"""Height from which a desk has a hutch: nobody works at such a height."""
+_WORK_M: Final = 0.76
+_PANEL_M: Final = 0.018
+_BOARD_M: Final = 0.012
+_FIT_M: Final = 0.002
+
+
+def desk(size_m: Vec3) -> Body:
+    """A top on four legs; a high model carries a hutch at its back."""
+    if size_m[2] <= TALL_M:
+        return table(size_m)
+    return _with_hutch(table(_below_hutch(size_m)), size_m)
+
+
+def drawer_desk(size_m: Vec3) -> Body:
+    """A desk with drawers in a pedestal at its left; a narrow model has one drawer under its top."""
+    if size_m[2] <= TALL_M:
+        return _desk_of_drawers(size_m)
+    return _with_hutch(_desk_of_drawers(_below_hutch(size_m)), size_m)
+
+
+def drawer_table(size_m: Vec3) -> Body:
+    """A table with a drawer under its top; without the drawer if it is too small."""
+    body = table(size_m)
+    leg, under = leg_thickness(size_m), size_m[2] / 2 - top_thickness(size_m)
+    depth = clamp(0.3 * size_m[2], 0.09, 0.13)
+    if min(size_m[:2]) >= 0.25:
+        half = size_m[1] / 2 - leg
+        _hang(body, size_m, (-half, half), (under - depth, under))
+    return body
+
+
+def _desk_of_drawers(size_m: Vec3) -> Body:
+    if size_m[1] < PEDESTAL_FROM_M:
+        return drawer_table(size_m)
+    body = table(size_m)
+    left = size_m[1] / 2 - leg_thickness(size_m)
+    width = clamp(0.28 * size_m[1], 0.3, 0.45)
+    _hang(body, size_m, (left - width, left), (0.12 - size_m[2] / 2, size_m[2] / 2 - top_thickness(size_m)))
+    return body
+
+
+def _hang(body: Body, size_m: Vec3, y: Vec2, z: Vec2) -> None:
+    """Add a carcass of drawers below the top, which closes it above."""
+    x = size_m[0] / 2
+    carcass = region((-x, x - _PANEL_M), y, z)
+    boards, bay = shell(carcass, Walls(_BOARD_M, 0.0, _BOARD_M, _BOARD_M, _BOARD_M, 0.0))
+    body.parts += boards
+    add_drawers(body, bay, region((x - _PANEL_M + _FIT_M, x), y, (z[0], z[1] - _FIT_M)))
+
+
+def _below_hutch(size_m: Vec3) -> Vec3:
+    return (size_m[0], size_m[1], min(_WORK_M, 0.65 * size_m[2]))
+
+
+def _with_hutch(lower: Body, size_m: Vec3) -> Body:
+    """Add a shelf between two uprights at the back of a desk; the result has the given size."""
+    (x0, y0, z0), (_, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    work = _below_hutch(size_m)[2]
+    body = raised(lower, (work - size_m[2]) / 2)
+    deck, depth, board = z0 + work, 0.4 * size_m[0], 0.02
+    body.parts += [
+        box((x0, y0, deck), (x0 + depth, y0 + board, z1 - board)),
+        box((x0, y1 - board, deck), (x0 + depth, y1, z1 - board)),
+        box((x0, y0, z1 - board), (x0 + depth, y1, z1)),
+    ]
+    body.supports = [surface for surface in body.supports if surface.interior]
+    body.add_support("worktop", (x0 + depth, y0), (-x0, y1), deck)
+    body.add_support("under_hutch", (x0, y0 + board), (x0 + depth, y1 - board), deck, z1 - board - deck)
+    body.add_support("top", (x0, y0), (x0 + depth, y1), z1)
+    return body

@@ -1,10 +1,10 @@
-"""Small loose things: food, cutlery, soft goods. All have a flat base, so that they rest where they are put."""
+"""Small loose objects: food, cutlery, soft goods. All have a flat base, so they do not roll away."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.assets.body import Body, centred
+from embomatrix.factory.assets.body import FULL, Body, centred
 from embomatrix.factory.assets.shapes import (
     box,
     box_of,
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
 
 LEAST_ROUND_M: Final = 0.01
-"""What is thinner is a plain box: an engine's margins are of that order, and a box rests most quietly."""
+"""Thinner objects become plain boxes: the engine's collision margin is of this order, and a box comes to rest fastest."""
 _LONG: Final = 2.2
-"""What is longer than this many of its widths is a bar, not a ball."""
+"""Ratio of length to width from which a fruit is a bar instead of a ball."""
 
 
 def round_food(size_m: Vec3) -> Body:
@@ -44,7 +44,7 @@ def round_food(size_m: Vec3) -> Body:
 
 
 def half_food(size_m: Vec3) -> Body:
-    """A half on its cut face; of a flat round, half a disc."""
+    """A half that lies on its cut face; half a disc if the whole is flat."""
     if size_m[2] < 0.25 * max(size_m[:2]):
         return _of(half_disc, size_m)
     return Body(parts=[dome(centred(size_m))])
@@ -61,7 +61,7 @@ def slice_of_cake(size_m: Vec3) -> Body:
 
 
 def cloth(size_m: Vec3) -> Body:
-    """A thing of cloth, folded: a low block that narrows upwards, on which others can be stacked."""
+    """Folded cloth: a low block that narrows upwards and carries other objects."""
     outer = centred(size_m)
     share = 0.84
     thick = min(size_m) >= LEAST_ROUND_M
@@ -72,7 +72,7 @@ def cloth(size_m: Vec3) -> Body:
 
 
 def bar(size_m: Vec3) -> Body:
-    """A round bar that lies: logs, rolled things, torches."""
+    """A round bar lying on its side: logs, rolls, torches."""
     return _of(log, size_m)
 
 
@@ -94,32 +94,22 @@ def hoop(size_m: Vec3) -> Body:
     return Body(parts=ring((0.0, 0.0), (x1, y1), (z0, z1), 0.22 * min(size_m[:2])))
 
 
-def figure(size_m: Vec3) -> Body:
-    """A base with a trunk and a head on it: statues, dolls, toy figures."""
-    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    foot, neck = z0 + 0.12 * size_m[2], z0 + 0.72 * size_m[2]
-    return Body(
-        parts=[
-            box((x0, y0, z0), (x1, y1, foot)),
-            box((0.7 * x0, 0.7 * y0, foot), (0.7 * x1, 0.7 * y1, neck)),
-            box((0.42 * x0, 0.42 * y0, neck), (0.42 * x1, 0.42 * y1, z1)),
-        ]
-    )
-
-
-def dumbbell(size_m: Vec3) -> Body:
-    """Two heads with a grip between them."""
-    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    ends = [
-        box((x0, y0, z0), (x1, y0 + 0.3 * size_m[1], z1)),
-        box((x0, y1 - 0.3 * size_m[1], z0), (x1, y1, z1)),
-        box((0.3 * x0, 0.4 * y0, 0.3 * z0), (0.3 * x1, 0.4 * y1, 0.3 * z1)),
-    ]
-    return Body(parts=ends)
+FIGURE: Final = (
+    (FULL, FULL, (-1.0, -0.76)),
+    ((-0.7, 0.7), (-0.7, 0.7), (-0.76, 0.44)),
+    ((-0.42, 0.42), (-0.42, 0.42), (0.44, 1.0)),
+)
+"""A base with a trunk and a head on it: statues, dolls, toy figures."""
+DUMBBELL: Final = (
+    (FULL, (-1.0, -0.4), FULL),
+    (FULL, (0.4, 1.0), FULL),
+    ((-0.3, 0.3), (-0.4, 0.4), (-0.3, 0.3)),
+)
+"""Two heads with a grip between them."""
 
 
 def _of(shape: Callable[[Aabb], ConvexPart], size_m: Vec3) -> Body:
-    """One convex piece that fills the box, or the box itself where that is thin."""
+    """One convex part that fills the box; the box itself if it is thin."""
     outer = centred(size_m)
     return Body(parts=[shape(outer) if min(size_m) >= LEAST_ROUND_M else box_of(outer)])
 
@@ -134,10 +124,8 @@ def disc(size_m: Vec3) -> Body:
 
 def soft(size_m: Vec3) -> Body:
     """Pillows, filled bags, shoes: a box with cut edges."""
-    if size_m[2] < 0.02:
-        (low, high) = (centred(size_m).low_m, centred(size_m).high_m)
-        return Body(parts=[box(low, high)])
-    return Body(parts=[cushion(centred(size_m))])
+    outer = centred(size_m)
+    return Body(parts=[box_of(outer) if size_m[2] < 0.02 else cushion(outer)])
 
 
 def utensil(size_m: Vec3) -> Body:
@@ -145,7 +133,7 @@ def utensil(size_m: Vec3) -> Body:
     outer = centred(size_m)
     (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m
     axis = max(range(3), key=lambda i: size_m[i])
-    if axis == 2 or min(size_m) < 0.006:  # one that stands has the whole base to stand on
+    if axis == 2 or min(size_m) < 0.006:  # an upright utensil needs its whole base to stand
         return Body(parts=[box(outer.low_m, outer.high_m)])
     grip = 0.3
     top = z0 + 0.6 * (z1 - z0)

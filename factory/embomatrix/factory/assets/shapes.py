@@ -1,7 +1,7 @@
-"""Convex pieces of assets: boxes, octagons and rings of boxes, prisms and rounded lumps, in the asset's frame, in metres.
+"""Convex parts of assets: boxes, octagons and rings of boxes, prisms and rounded lumps, in the asset's frame, in metres.
 
-The unit shapes are hulls computed once with trimesh; a piece of an asset is a scaled copy. `mesh_of` turns any part
-back into a mesh, for pictures and for checks of volume and closedness.
+Unit shapes are hulls computed once with trimesh; a part of an asset is a scaled copy. `mesh_of` turns a part back into a
+mesh, for pictures and for checks of volume.
 """
 
 from __future__ import annotations
@@ -21,25 +21,27 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import FloatArray, Vec2, Vec3
 
 DECIMALS: Final = 6
-"""Coordinates are rounded to a micrometre, so that equal models give equal bytes on every machine."""
+"""Coordinates are rounded to 1 µm, so that equal models give equal bytes on every machine."""
 
 _SLANT: Final = math.tan(math.pi / 8)
 _OCTAGON: Final = (
     (1.0, -_SLANT), (1.0, _SLANT), (_SLANT, 1.0), (-_SLANT, 1.0),
     (-1.0, _SLANT), (-1.0, -_SLANT), (-_SLANT, -1.0), (_SLANT, -1.0),
 )  # fmt: skip
-"""Corners of the octagon about the unit circle, anticlockwise: a vessel's bottom (3 boxes), its wall (8) and handles stay
-below the 16 parts that a link may have."""
+"""Corners of the octagon about the unit circle, anticlockwise.
+
+A vessel's bottom (3 boxes), wall (8 boxes) and handles stay below the 16 parts that a link may have.
+"""
 
 
 def rounded(*values: float) -> Vec3:
-    """Three coordinates, rounded; negative zero becomes zero."""
+    """Round three coordinates; negative zero becomes zero."""
     x, y, z = (round(float(value), DECIMALS) + 0.0 for value in values)
     return (x, y, z)
 
 
 def box(low: Sequence[float], high: Sequence[float]) -> ConvexPart:
-    """Axis-aligned box between two corners. Raises ValueError when it is thinner than 0.1 mm somewhere."""
+    """Return the axis-aligned box between two corners. Raises ValueError if a side is shorter than 0.1 mm."""
     size = [b - a for a, b in zip(low, high, strict=True)]
     if min(size) < 1e-4:
         raise ValueError(f"box from {tuple(low)} to {tuple(high)} m has no volume: expected low < high")
@@ -52,7 +54,7 @@ def box_of(region: Aabb) -> ConvexPart:
 
 
 def hull(points: FloatArray) -> ConvexPart:
-    """Convex part from points, shape (n, 3), that are all corners of their hull; its own origin is their box's centre."""
+    """Return a convex part from the corners of a hull, shape (n, 3). Its origin is the centre of their bounding box."""
     low, high = points.min(axis=0), points.max(axis=0)
     centre = rounded(*((low + high) / 2))
     vertices = tuple(rounded(*point) for point in (points - np.asarray(centre)))
@@ -60,25 +62,25 @@ def hull(points: FloatArray) -> ConvexPart:
 
 
 def prism(centre: Vec2, radii: Vec2, z: Vec2, *, sides: int = 12) -> ConvexPart:
-    """Upright elliptic cylinder as a polygon prism; ``radii`` are its half extents along x and y.
+    """Return an upright elliptic cylinder as a polygon prism; ``radii`` are its half extents along x and y.
 
-    With ``sides`` a multiple of four its box is exactly twice the radii.
+    If ``sides`` is a multiple of four, its bounding box is exactly twice the radii.
     """
     rim = _polygon(sides) * radii + centre
     return hull(np.vstack([np.column_stack((rim, np.full(sides, height))) for height in z]))
 
 
 def shouldered(radii: Vec2, neck_share: float, z: Vec3) -> ConvexPart:
-    """Bottle: upright to the shoulder at the second height, then narrowing to the neck's share of the radii."""
+    """Return a bottle: upright to the shoulder at the second height, then narrowing to the neck's share of the radii."""
     rims = ((1.0, z[0]), (1.0, z[1]), (neck_share, z[2]))
     levels = [np.column_stack((_polygon(12) * radii * share, np.full(12, height))) for share, height in rims]
     return hull(np.vstack(levels))
 
 
 def octagon(centre: Vec2, radii: Vec2, z: Vec2) -> list[ConvexPart]:
-    """Flat disc as three boxes that cover an octagon, its flats at the ends of both axes, but for slivers at its slants.
+    """Return a flat disc as three boxes that cover an octagon except for slivers at its slanted sides.
 
-    Boxes share one compound in Bullet and rest on each other without rocking; hulls and cylinders do neither.
+    Boxes share one compound in Bullet and rest on each other without rocking. Hulls and cylinders do neither.
     """
     (cx, cy), (rx, ry), (z0, z1) = centre, radii, z
     return [
@@ -88,7 +90,7 @@ def octagon(centre: Vec2, radii: Vec2, z: Vec2) -> list[ConvexPart]:
 
 
 def ring(centre: Vec2, radii: Vec2, z: Vec2, wall_m: float) -> list[ConvexPart]:
-    """Wall of a round vessel: eight turned boards whose outer faces are the sides of the octagon."""
+    """Return the wall of a round vessel: eight boards whose outer faces are the sides of the octagon."""
     corners = np.array(_OCTAGON) * radii + centre  # (8, 2)
     boards = []
     for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
@@ -104,54 +106,54 @@ def ring(centre: Vec2, radii: Vec2, z: Vec2, wall_m: float) -> list[ConvexPart]:
 
 
 def inscribed(radii: Vec2, wall_m: float) -> Vec2:
-    """Half extents of a rectangle that fits the octagon within a ring of such walls."""
+    """Return the half extents of the rectangle inscribed in a ring with walls of this thickness."""
     rx, ry = radii
     share = math.sqrt(0.5) - wall_m / 2 * math.hypot(1 / rx, 1 / ry)
     return (share * rx, share * ry)
 
 
 def lump(region: Aabb) -> ConvexPart:
-    """Ellipsoid-like hull that fills a box, with a flat base.
+    """Return an ellipsoid-like hull with a flat base that fills a box.
 
-    A true ellipsoid would roll for ever on a table in a rigid-body engine; a fruit rests in a dent of its own.
+    A true ellipsoid would roll for ever in a rigid-body engine, which has no rolling friction.
     """
     return _stretched(_unit_lump(), region)
 
 
 def dome(region: Aabb) -> ConvexPart:
-    """Half an ellipsoid on its cut face: halves of fruit, buns, heaps."""
+    """Return half an ellipsoid on its cut face: halves of fruit, buns, heaps."""
     return _stretched(_unit_dome(), region)
 
 
 def cushion(region: Aabb) -> ConvexPart:
-    """Box with its edges cut: pillows, bags, shoes."""
+    """Return a box with its edges cut: pillows, bags, shoes."""
     return _stretched(_unit_cushion(), region)
 
 
 def loaf(region: Aabb) -> ConvexPart:
-    """Bread: a bar along the longer side with an arched back."""
+    """Return a bar along the longer side with an arched back: bread."""
     return _extruded(region, _LOAF, ((0.0, 1.0), (1.0, 1.0)))
 
 
 def log(region: Aabb) -> ConvexPart:
-    """Round bar lying along the longer side; its eighth side is flat on the ground, so it does not roll."""
+    """Return a round bar along the longer side. One of its eight sides lies flat on the ground, so it does not roll."""
     return _extruded(region, _ROUND, ((0.0, 1.0), (1.0, 1.0)))
 
 
 def capsule(region: Aabb) -> ConvexPart:
-    """Lying bar with rounded ends: sausages, carrots, bananas."""
+    """Return a lying bar with rounded ends: sausages, carrots, bananas."""
     return _extruded(
         region, _ROUND, ((0.0, 0.45), (0.15, 0.9), (0.3, 1.0), (0.7, 1.0), (0.85, 0.9), (1.0, 0.45))
     )
 
 
 def ridge(region: Aabb) -> ConvexPart:
-    """Prism with a ridge along the longer side: tents and roofs."""
+    """Return a prism with a ridge along the longer side: tents and roofs."""
     return _extruded(region, ((0.0, 0.0), (1.0, 0.0), (0.5, 1.0)), ((0.0, 1.0), (1.0, 1.0)))
 
 
 def frustum(region: Aabb, top_share: float) -> ConvexPart:
-    """Block that narrows to a share of its base towards the top: folded cloth, heaps, boulders."""
+    """Return a block that narrows towards the top to a share of its base: folded cloth."""
     (x0, y0, z0), (x1, y1, z1) = region.low_m, region.high_m
     (cx, cy, _), share = region.center_m, top_share
     top = [(cx + share * (x - cx), cy + share * (y - cy), z1) for x in (x0, x1) for y in (y0, y1)]
@@ -159,7 +161,7 @@ def frustum(region: Aabb, top_share: float) -> ConvexPart:
 
 
 def wedge(region: Aabb) -> ConvexPart:
-    """Slice of a cake: a triangle seen from above, its tip at the end of the longer side."""
+    """Return a slice of cake: a triangle seen from above, with its tip at the end of the longer side."""
     (x0, y0, z0), (x1, y1, z1) = region.low_m, region.high_m
     cx, cy, _ = region.center_m
     tip = ((x0, y0), (x0, y1), (x1, cy)) if x1 - x0 >= y1 - y0 else ((x0, y0), (x1, y0), (cx, y1))
@@ -167,7 +169,7 @@ def wedge(region: Aabb) -> ConvexPart:
 
 
 def half_disc(region: Aabb) -> ConvexPart:
-    """Half a flat round: its straight edge is the longer side."""
+    """Return half a disc; its straight edge is the longer side."""
     turn = np.linspace(0.0, math.pi, 9)
     along, out = (1 - np.cos(turn)) / 2, np.sin(turn)
     out[-1] = 0.0
@@ -181,9 +183,9 @@ _ROUND: Final = tuple((0.5 + x / 2, 0.5 + y / 2) for x, y in _OCTAGON)
 
 
 def _extruded(region: Aabb, section: Sequence[Vec2], stations: Sequence[Vec2]) -> ConvexPart:
-    """A section in the unit square (across, up), drawn along the longer horizontal side.
+    """Extrude a section in the unit square (across, up) along the longer horizontal side.
 
-    ``stations`` lists (share of the length, scale of the section about its centre).
+    ``stations`` lists pairs: share of the length, scale of the section about its centre.
     """
     size = np.asarray(region.size_m)
     flat = np.asarray(section) - 0.5  # (n, 2)
@@ -200,7 +202,7 @@ def _stretched(unit: FloatArray, region: Aabb) -> ConvexPart:
 
 @functools.cache
 def _polygon(sides: int) -> FloatArray:
-    """Corners of the regular polygon in the unit circle, shape (sides, 2), the first at +x."""
+    """Return the corners of the regular polygon in the unit circle, shape (sides, 2), the first at +x."""
     turn = 2 * math.pi * np.arange(sides) / sides
     return np.column_stack((np.cos(turn), np.sin(turn)))
 
@@ -224,20 +226,20 @@ def _unit_cushion() -> FloatArray:
 
 
 def _lathe(profile: Sequence[Vec2], sides: int = 12) -> FloatArray:
-    """Corners of a solid of revolution in the unit box; ``profile`` lists (height, radius)."""
+    """Return the corners of a solid of revolution in the unit box; ``profile`` lists (height, radius)."""
     rims = [np.column_stack((_polygon(sides) * radius, np.full(sides, z))) for z, radius in profile]
     return _hull_corners(np.vstack(rims))
 
 
 def _hull_corners(points: FloatArray) -> FloatArray:
-    """Corners of the convex hull in the order given: the profile may not be convex everywhere."""
+    """Return the corners of the convex hull in the given order; points inside the hull are dropped."""
     corners = trimesh.convex.convex_hull(points).vertices
     kept = [point for point in points if np.abs(corners - point).max(axis=1).min() < 1e-9]
     return np.asarray(kept, dtype=np.float64)
 
 
 def mesh_of(part: ConvexPart) -> trimesh.Trimesh:
-    """Closed triangle mesh of a part in the asset's frame."""
+    """Return the closed triangle mesh of a part in the asset's frame."""
     match part.shape:
         case Shape.BOX:
             mesh: trimesh.Trimesh = trimesh.creation.box(extents=part.size_m)

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.assets.body import OPEN_ABOVE_M, Body, Walls, centred, clamp, shell
+from embomatrix.factory.assets.body import (
+    FULL,
+    OPEN_ABOVE_M,
+    Body,
+    Walls,
+    centred,
+    clamp,
+    proportioned,
+    shell,
+)
 from embomatrix.factory.assets.furniture import legs
 from embomatrix.factory.assets.shapes import box, octagon
 from embomatrix.world.geometry import Aabb
@@ -15,9 +24,9 @@ if TYPE_CHECKING:
 COUNTER_M: Final = 0.9
 """Height of a stall's counter."""
 RUNG_M: Final = 0.12
-"""Distance between the rungs of a rack: near enough for what is laid across to rest on several."""
+"""Distance between the rungs of a rack: an object laid across rests on several of them."""
 MOST_RUNGS: Final = 10
-"""On long racks they are further apart: an object's link has 16 parts at most."""
+"""Upper limit for a rack's rungs: a link has at most 16 parts."""
 
 
 def post(size_m: Vec3) -> Body:
@@ -30,7 +39,7 @@ def post(size_m: Vec3) -> Body:
 
 
 def pendant(size_m: Vec3) -> Body:
-    """What hangs from a ceiling: a rod with a round shade or blades at its lower end."""
+    """A rod with a round shade or blades at its lower end: lamps and fans under a ceiling."""
     (_, _, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     shade = z0 + clamp(0.35 * size_m[2], 0.02, 0.4)
     thick = clamp(0.06 * min(size_m[:2]), 0.003, 0.03)
@@ -65,7 +74,7 @@ def _across(
     high: tuple[float, float],
     z: tuple[float, float],
 ) -> ConvexPart:
-    """Box over an interval of one horizontal axis, and over what two corners span on the other."""
+    """Return a box over ``span`` along one horizontal axis, and from ``low`` to ``high`` along the other."""
     if along == 0:
         return box((span[0], low[1], z[0]), (span[1], high[1], z[1]))
     return box((low[0], span[0], z[0]), (high[0], span[1], z[1]))
@@ -108,12 +117,12 @@ def rungs(size_m: Vec3) -> Body:
 
 
 def bar_thickness(size_m: Vec3) -> float:
-    """Thickness of a rack's bars, in metres."""
+    """Return the thickness of a rack's bars in metres."""
     return clamp(0.06 * min(size_m[:2]), 0.01, 0.08)
 
 
 def roof_thickness(size_m: Vec3) -> float:
-    """Thickness of a canopy's roof, in metres."""
+    """Return the thickness of a canopy's roof in metres."""
     return clamp(0.05 * size_m[2], 0.02, 0.2)
 
 
@@ -172,7 +181,7 @@ def treadmill(size_m: Vec3) -> Body:
 
 
 def lorry(size_m: Vec3) -> Body:
-    """A loading bed and a cab on wheels; toy cars and trains too. The front of the vehicle is at +x, or at +y."""
+    """A loading bed and a cab at +x, on wheels: lorries, toy cars and trains."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     deck, axle = z0 + 0.45 * size_m[2], z0 + 0.22 * size_m[2]
     cab = x1 - 0.32 * size_m[0]
@@ -187,42 +196,33 @@ def lorry(size_m: Vec3) -> Body:
     return body
 
 
-def cycle(size_m: Vec3) -> Body:
-    """Two wheels, a frame and handlebars, on a stand."""
-    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    hub = z0 + 0.6 * size_m[2]
-    wheel, slim = 0.36 * size_m[0], 0.12
-    return Body(
-        parts=[
-            box((x0, slim * y0, z0), (x0 + wheel, slim * y1, hub)),
-            box((x1 - wheel, slim * y0, z0), (x1, slim * y1, hub)),
-            box(
-                (x0 + wheel, slim * y0, z0 + 0.3 * size_m[2]), (x1 - wheel, slim * y1, hub + 0.1 * size_m[2])
-            ),
-            box((x1 - 0.35 * size_m[0], y0, z1 - 0.1 * size_m[2]), (x1 - 0.25 * size_m[0], y1, z1)),
-            box(
-                (x1 - 0.33 * size_m[0], slim * y0, hub),
-                (x1 - 0.27 * size_m[0], slim * y1, z1 - 0.1 * size_m[2]),
-            ),
-            box((-0.04 * size_m[0], 0.7 * y0, z0), (0.04 * size_m[0], 0.7 * y1, z0 + 0.06 * size_m[2])),
-            box(
-                (-0.02 * size_m[0], slim * y0, z0 + 0.06 * size_m[2]),
-                (0.02 * size_m[0], slim * y1, z0 + 0.3 * size_m[2]),
-            ),
-        ]
-    )
-
-
-def range_hood(size_m: Vec3) -> Body:
-    """A broad hood with a duct above."""
-    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    hood = z0 + 0.4 * size_m[2]
-    return Body(
-        parts=[
-            box((x0, y0, z0), (x1, y1, hood)),
-            box((x0, 0.4 * y0, hood), (x0 + 0.6 * size_m[0], 0.4 * y1, z1)),
-        ]
-    )
+_SLIM: Final = (-0.12, 0.12)
+CYCLE: Final = (
+    ((-1.0, -0.28), _SLIM, (-1.0, 0.2)),
+    ((0.28, 1.0), _SLIM, (-1.0, 0.2)),
+    ((-0.28, 0.28), _SLIM, (-0.4, 0.4)),
+    ((0.3, 0.5), FULL, (0.8, 1.0)),
+    ((0.34, 0.46), _SLIM, (0.2, 0.8)),
+    ((-0.08, 0.08), (-0.7, 0.7), (-1.0, -0.88)),
+    ((-0.04, 0.04), _SLIM, (-0.88, -0.4)),
+)
+"""Two wheels, a frame, handlebars with their stem, and a stand."""
+RANGE_HOOD: Final = ((FULL, FULL, (-1.0, -0.2)), ((-1.0, 0.2), (-0.4, 0.4), (-0.2, 1.0)))
+"""A broad hood with a duct above."""
+SHOWER_RAIL: Final = (((-1.0, -0.76), _SLIM, FULL), ((-0.76, 1.0), FULL, (0.84, 1.0)))
+"""A rail on the wall with an arm and a shower head at its upper end."""
+TELEPHONE: Final = ((FULL, FULL, (-1.0, 0.2)), (FULL, (0.3, 1.0), (0.2, 1.0)))
+"""A low case with a handset across its left."""
+_MICROSCOPE: Final = (
+    (FULL, FULL, (-1.0, -0.7)),
+    ((-1.0, -0.3), (-0.4, 0.4), (-0.7, 1.0)),
+    ((-0.3, 0.6), (-0.4, 0.4), (0.4, 1.0)),
+)
+_WHEELED_BOARD: Final = (
+    (FULL, FULL, (0.2, 1.0)),
+    (FULL, (-0.7, -0.5), (-1.0, 0.2)),
+    (FULL, (0.5, 0.7), (-1.0, 0.2)),
+)
 
 
 def urinal(size_m: Vec3) -> Body:
@@ -236,19 +236,6 @@ def urinal(size_m: Vec3) -> Body:
     return body
 
 
-def shower_rail(size_m: Vec3) -> Body:
-    """A rail on the wall with an arm and a rose at its upper end."""
-    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    rail, rose = 0.12, z1 - 0.08 * size_m[2]
-    edge = x0 + rail * size_m[0]
-    return Body(
-        parts=[
-            box((x0, rail * y0, z0), (edge, rail * y1, z1)),
-            box((edge, y0, rose), (x1, y1, z1)),
-        ]
-    )
-
-
 def workstation(size_m: Vec3) -> Body:
     """Walls on three sides of an open front: cubicles, booths, stalls."""
     outer = centred(size_m)
@@ -257,40 +244,18 @@ def workstation(size_m: Vec3) -> Body:
     return Body(parts=parts)
 
 
-def telephone(size_m: Vec3) -> Body:
-    """A low case with a handset across its left."""
-    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    case = z0 + 0.6 * size_m[2]
-    return Body(
-        parts=[box((x0, y0, z0), (x1, y1, case)), box((x0, y0 + 0.65 * size_m[1], case), (x1, y1, z1))]
-    )
-
-
 def microscope(size_m: Vec3) -> Body:
     """A foot, an arm behind and a head that reaches forward."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     foot, head, arm = z0 + 0.15 * size_m[2], z1 - 0.3 * size_m[2], x0 + 0.35 * size_m[0]
-    body = Body(
-        parts=[
-            box((x0, y0, z0), (x1, y1, foot)),
-            box((x0, 0.4 * y0, foot), (arm, 0.4 * y1, z1)),
-            box((arm, 0.4 * y0, head), (x1 - 0.2 * size_m[0], 0.4 * y1, z1)),
-        ]
-    )
+    body = Body(parts=proportioned(size_m, _MICROSCOPE))
     body.add_support("stage", (arm, y0), (x1, y1), foot, head - foot)
     return body
 
 
 def wheeled_board(size_m: Vec3) -> Body:
     """A board on two axles: skateboards, scooters."""
-    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    axle = z0 + 0.6 * size_m[2]
-    body = Body(
-        parts=[
-            box((x0, y0, axle), (x1, y1, z1)),
-            box((x0, 0.7 * y0, z0), (x1, 0.5 * y0, axle)),
-            box((x0, 0.5 * y1, z0), (x1, 0.7 * y1, axle)),
-        ]
-    )
-    body.add_support("deck", (x0, y0), (x1, y1), z1)
+    outer = centred(size_m)
+    body = Body(parts=proportioned(size_m, _WHEELED_BOARD))
+    body.add_support("deck", outer.low_m[:2], outer.high_m[:2], outer.high_m[2])
     return body

@@ -1,4 +1,4 @@
-"""Round things: bowls, pots, pans, cups, glasses, plates, bottles, jars and pots with a lid."""
+"""Round objects: bowls, pots, pans, cups, glasses, plates, bottles, jars and pots with a lid."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class Handle(StrEnum):
-    """Where a vessel is held. A handle takes the part of the box that the round body leaves over."""
+    """Handles of a vessel. They fill the part of the box beyond the round body."""
 
     NONE = "none"
     ONE = "one"  # at one end of the longer side: mugs, pans, jugs
@@ -35,8 +35,11 @@ class Handle(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class VesselStyle:
-    """``wall_share`` is the wall's thickness against the smaller radius, ``stem_share`` the height of foot and stem
-    against the whole."""
+    """Proportions of a vessel.
+
+    ``wall_share`` is the wall's thickness as a share of the smaller radius; ``stem_share`` the height of foot and stem as a
+    share of the whole.
+    """
 
     handle: Handle = Handle.NONE
     wall_share: float = 0.08
@@ -52,14 +55,14 @@ POT: Final = VesselStyle(Handle.BOTH, wall_share=0.05)
 
 @dataclass(frozen=True, slots=True)
 class _Round:
-    """The round body of a vessel: centre and outer radii at the rim."""
+    """Round body of a vessel: centre and outer radii at the rim."""
 
     centre: Vec2
     radii: Vec2
 
 
 def vessel(size_m: Vec3, style: VesselStyle) -> Body:
-    """Bottom, a wall of eight sectors, handles; the cavity is open above."""
+    """A bottom, a wall of eight boards, and handles; the cavity is open above."""
     outer = centred(size_m)
     body = Body()
     shape = _round(outer, style.handle)
@@ -72,7 +75,7 @@ def vessel(size_m: Vec3, style: VesselStyle) -> Body:
 
 
 def _cup(body: Body, shape: _Round, z: Vec2, style: VesselStyle, closed_by: tuple[str, ...] = ()) -> None:
-    """Bottom, wall and cavity between two heights."""
+    """Add bottom, wall and cavity between two heights."""
     z0, z1 = z
     thin = min(shape.radii)
     wall = clamp(style.wall_share * thin, min(0.003, 0.2 * thin), 0.03)
@@ -89,7 +92,7 @@ def _cup(body: Body, shape: _Round, z: Vec2, style: VesselStyle, closed_by: tupl
 
 
 def _round(outer: Aabb, handle: Handle) -> _Round:
-    """Round body within the box; what the handles take is at most 40 % of the longer side, so that it stands."""
+    """Return the round body within the box. Handles get at most 40 % of the longer side, so that the vessel stands."""
     half = list(outer.high_m[:2])
     long = 0 if half[0] > half[1] else 1
     if handle is Handle.NONE or half[long] < 1.08 * half[1 - long]:
@@ -103,7 +106,7 @@ def _round(outer: Aabb, handle: Handle) -> _Round:
 
 
 def _handles(outer: Aabb, shape: _Round, handle: Handle) -> list[ConvexPart]:
-    """Bars from the body to the ends of the box, near the rim."""
+    """Return bars from the body to the ends of the box, near the rim."""
     long = 0 if outer.size_m[0] > outer.size_m[1] else 1
     reach = shape.centre[long] + shape.radii[long]
     if handle is Handle.NONE or outer.high_m[long] - reach < 1e-3:
@@ -122,7 +125,7 @@ def _handles(outer: Aabb, shape: _Round, handle: Handle) -> list[ConvexPart]:
 
 
 def _stem(body: Body, shape: _Round, z: Vec2, share: float) -> float:
-    """Foot and stem of a goblet; returns the height where its cup begins."""
+    """Add foot and stem of a goblet; return the height at which its cup begins."""
     z0, z1 = z
     top = z0 + share * (z1 - z0)
     foot = z0 + 0.05 * (z1 - z0)
@@ -156,7 +159,7 @@ def blender(size_m: Vec3) -> Body:
 
 
 def plate(size_m: Vec3) -> Body:
-    """A flat disc that things lie on, and over whose edge they may hang; a rim would keep a steak off most plates."""
+    """A flat disc without a rim, so that food may reach over its edge: a steak is larger than most plates."""
     (_, _, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     body = Body(parts=octagon((0.0, 0.0), (x1, y1), (z0, z1)))
     body.add_support("top", (-0.7 * x1, -0.7 * y1), (0.7 * x1, 0.7 * y1), z1)
@@ -164,7 +167,7 @@ def plate(size_m: Vec3) -> Body:
 
 
 def bottle(size_m: Vec3) -> Body:
-    """Closed body with a neck; one that lies on its side in the catalog is a bar."""
+    """A closed body with a neck; a plain box if the catalog's model lies on its side."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     if size_m[2] < 0.8 * max(size_m[:2]):
         return Body(parts=[box((x0, y0, z0), (x1, y1, z1))])
@@ -172,6 +175,6 @@ def bottle(size_m: Vec3) -> Body:
 
 
 def can(size_m: Vec3) -> Body:
-    """Closed cylinder with a flat top: cans, jars, candles, cakes, rolls standing up."""
+    """A closed cylinder with a flat top: cans, jars, candles, cakes, upright rolls."""
     (_, _, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     return Body(parts=[prism((0.0, 0.0), (x1, y1), (z0, z1))])

@@ -11,11 +11,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from embomatrix.factory.assets.check import Rule, check_asset
+from embomatrix.factory.assets.check import GLANCE_STEPS, STEPS, Rule, check_asset, check_standing
 from embomatrix.factory.assets.contact_sheet import draw_sheet
-from embomatrix.factory.assets.library import build_asset
-from embomatrix.factory.assets.naming import family_of
-from embomatrix.factory.assets.standing import GLANCE_STEPS, STEPS, check_standing
+from embomatrix.factory.assets.library import build_asset, family_of
 from embomatrix.factory.importers.assemble import import_model, read_model
 from embomatrix.factory.importers.convex import Coacd, by_components
 from embomatrix.factory.importers.model import AxisConvention, ModelFileError

@@ -1,4 +1,4 @@
-"""Where a group may stand: stops along the walls, a lattice over the open floor, and what each place costs."""
+"""Candidate places of a group: stops along the walls or a lattice over the open floor, each with its cost."""
 
 from __future__ import annotations
 
@@ -18,25 +18,24 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from embomatrix.factory.furnish.boxes import FloatArray
     from embomatrix.factory.furnish.pieces import FurnitureGroup, Placed
-    from embomatrix.factory.furnish.space import RoomSpace
+    from embomatrix.factory.furnish.space import FloatArray, RoomSpace
 
 WALL_GAP_M: Final = 0.006
 SIDE_GAP_M: Final = 0.005
 STEP_M: Final = 0.05
 AHEAD: Final = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
-"""The way that a group looks at each number of quarter turns."""
+"""Heading of a group after 0 to 3 quarter turns."""
 _RUN_ROLES: Final = (FurnitureRole.RUN, FurnitureRole.COUNTERTOP, FurnitureRole.HUNG_CABINET)
 _SIGHT_M: Final = 0.8
 _MANY: Final = 4
 _BED_SHARE: Final = 0.28
-"""Planting keeps this close to a garden's edges, as a share of its shorter side."""
+"""Greatest distance of plants from a garden's edges, as a share of its shorter side."""
 
 
 @dataclass(frozen=True, slots=True)
 class GroupCandidates:
-    """Group frames: x, y and quarter turns, with the cost of each. All arrays have n rows."""
+    """Group frames as x, y and quarter turns, and the cost of each. All arrays have n rows."""
 
     x: FloatArray
     y: FloatArray
@@ -51,7 +50,7 @@ class GroupCandidates:
 
 
 class RoomSurroundings:
-    """What stands in a room, looked up by category: middles and headings, and the edges of runs."""
+    """Index of the furniture in a room: centres and headings by category, and the boxes of runs."""
 
     def __init__(self, space: RoomSpace) -> None:
         self._spots: dict[str, list[tuple[float, float, float]]] = defaultdict(list)
@@ -66,18 +65,18 @@ class RoomSurroundings:
                 self._runs.append(item.box)
 
     def of(self, categories: Iterable[str]) -> FloatArray:
-        """(x, y, yaw) of everything of these categories, shape (k, 3)."""
+        """Return (x, y, yaw) of everything of these categories, shape (k, 3)."""
         found = [spot for category in categories for spot in self._spots.get(category, ())]
         return np.array(found).reshape(-1, 3)
 
     def runs(self, level_m: float) -> FloatArray:
-        """Boxes of counters, cabinets and appliances whose underside is within a metre of a height, shape (k, 6)."""
+        """Return boxes of counters, cabinets and appliances with their underside within 1 m of a height, shape (k, 6)."""
         boxes = np.array(self._runs).reshape(-1, 6)
         return boxes[np.abs(boxes[:, 2] - level_m) < 1.0]
 
 
 def candidates_of(group: FurnitureGroup, space: RoomSpace, around: RoomSurroundings) -> GroupCandidates:
-    """All places that the group's style allows, with their costs; none is checked against what stands there."""
+    """Return all places that the group's style allows, with their costs. Collisions are not tested."""
     if group.style in (Style.FREE, Style.OVERHEAD, Style.AISLE):
         x, y, turns = _open_floor(group, space)
     else:
@@ -86,14 +85,14 @@ def candidates_of(group: FurnitureGroup, space: RoomSpace, around: RoomSurroundi
         x, y, turns = (
             np.concatenate(both) for both in zip((x, y, turns), _open_floor(group, space), strict=True)
         )
-        # The middle of a garden stays open.
+        # The centre of a garden stays open.
         near = _to_edge(space, x, y) <= _BED_SHARE * min(space.room.size_m)
         x, y, turns = x[near], y[near], turns[near]
     if not len(x):
         return GroupCandidates(x, y, turns, np.empty(0))
     cost = _style_cost(group, space, around, x, y, turns)
     cost = cost + 1.2 * _nearest(around.of(group.near), x, y) + _sight(around.of(group.faces), x, y, turns)
-    # Equal things keep apart: up to 2.5 m count.
+    # Equal objects keep apart; distances beyond 2.5 m make no difference.
     cost = cost - 1.5 * np.minimum(_nearest(around.of(group.spread), x, y), 2.5)
     return GroupCandidates(x, y, turns, np.asarray(cost))
 
@@ -120,7 +119,7 @@ def _along_walls(group: FurnitureGroup, space: RoomSpace) -> tuple[FloatArray, F
 
 
 def _flush(space: RoomSpace, along_y: bool, left: float, right: float) -> FloatArray:
-    """Stops that leave 5 mm to something that stands already."""
+    """Return stops that leave a gap of 5 mm to furniture in the room."""
     axis = 1 if along_y else 0
     solids = space.solids.rows
     return np.concatenate([solids[:, axis + 3] + SIDE_GAP_M - left, solids[:, axis] - SIDE_GAP_M - right])
@@ -128,12 +127,12 @@ def _flush(space: RoomSpace, along_y: bool, left: float, right: float) -> FloatA
 
 def _open_floor(group: FurnitureGroup, space: RoomSpace) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
     (x0, y0), (x1, y1) = space.room.low_m, space.room.high_m
-    # About 60 x 60 places at most, so that a hall takes no longer than a parlour.
+    # At most about 60 x 60 places: a hall takes no longer than a small room.
     step = max(0.1, math.sqrt((x1 - x0) * (y1 - y0)) / 60)
     gx, gy = np.meshgrid(np.arange(x0 + 0.1, x1, step), np.arange(y0 + 0.1, y1, step), indexing="ij")
-    ways = {Style.OVERHEAD: 2, Style.AISLE: 2, Style.EDGE: 1}.get(group.style, 4)
-    turns = np.repeat(np.arange(ways), gx.size)
-    return np.tile(gx.ravel(), ways), np.tile(gy.ravel(), ways), turns
+    headings = {Style.OVERHEAD: 2, Style.AISLE: 2, Style.EDGE: 1}.get(group.style, 4)
+    turns = np.repeat(np.arange(headings), gx.size)
+    return np.tile(gx.ravel(), headings), np.tile(gy.ravel(), headings), turns
 
 
 def _style_cost(
@@ -144,7 +143,7 @@ def _style_cost(
     y: FloatArray,
     turns: NDArray[np.int64],
 ) -> FloatArray:
-    """Lower is better; the unit is about a metre."""
+    """Return the cost of each place by the group's style, in metres or so; lower is better."""
     room = space.room
     cx, cy = room.center_m
     along = np.where(turns % 2 == 0, y, x)
@@ -164,7 +163,7 @@ def _style_cost(
         case Style.FREE:
             cost = 0.6 * np.hypot(x - cx, y - cy)
         case Style.AISLE:
-            # Lines of shelves fill the hall from one side, each an aisle away from the last.
+            # Lines of shelves fill the hall from one side, an aisle apart.
             across = np.where(turns % 2 == 0, x - room.low_m[0], y - room.low_m[1])
             shorter = np.where(turns % 2 == 0, room.size_m[0], room.size_m[1])
             cost = 0.4 * across + 0.8 * off - 0.6 * shorter
@@ -178,7 +177,7 @@ def _style_cost(
 
 
 def _to_edge(space: RoomSpace, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Distance from each place to the nearest edge of the room."""
+    """Return the distance from each place to the nearest edge of the room."""
     (x0, y0), (x1, y1) = space.room.low_m, space.room.high_m
     return np.asarray(np.minimum(np.minimum(x - x0, x1 - x), np.minimum(y - y0, y1 - y)))
 
@@ -186,7 +185,7 @@ def _to_edge(space: RoomSpace, x: FloatArray, y: FloatArray) -> FloatArray:
 def _gap_to_run(
     group: FurnitureGroup, around: RoomSurroundings, x: FloatArray, y: FloatArray, turns: NDArray[np.int64]
 ) -> FloatArray:
-    """Distance from the group's edge to the nearest counter, cabinet or appliance at its height."""
+    """Return the distance from the group's edge to the nearest counter, cabinet or appliance at its height."""
     boxes = around.runs(group.members[0].bottom)
     if not len(boxes):
         return np.zeros(len(x))
@@ -202,7 +201,7 @@ def _gap_to_run(
 
 
 def _nearest(spots: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Distance from each place to the nearest of the spots, shape (k, 3); zero where there are none."""
+    """Return the distance from each place to the nearest of the spots, shape (k, 3); 0 if there are none."""
     if not len(spots):
         return np.zeros(len(x))
     if len(spots) <= 2 * _MANY:
@@ -211,9 +210,9 @@ def _nearest(spots: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def _sight(partners: FloatArray, x: FloatArray, y: FloatArray, turns: NDArray[np.int64]) -> FloatArray:
-    """Sideways distance of the best partner from the line of sight, theirs and ours; one that is behind costs more.
+    """Return the sideways distance of the best partner from both lines of sight; a partner behind costs more.
 
-    Many partners, a class and its board, count as one in their middle.
+    More than four partners, such as a class before its board, count as one at their centre.
     """
     if not len(partners):
         return np.zeros(len(x))

@@ -1,4 +1,4 @@
-"""Grouping: which pieces of a room belong together (counters, seating, table sets) and in what order they are placed."""
+"""Groups of a room: counters, seating, table sets, and the order in which they are placed."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from embomatrix.factory.furnish.pieces import (
     CORNER_SOFA_M,
     FurnitureGroup,
     Member,
+    Pool,
     Rows,
     Style,
     around_table,
     stacked,
     top_of,
+    worth,
 )
-from embomatrix.factory.furnish.pool import Pool, worth
 from embomatrix.factory.furnish.roles import FurnitureRole
 from embomatrix.factory.furnish.tables import table_groups, work_groups
 
@@ -31,16 +32,16 @@ if TYPE_CHECKING:
 _COFFEE_GAP_M: Final = 0.38
 _PAIR: Final = 2
 _CORNER_SEAT_M: Final = 0.95
-"""Depth of a corner sofa's two seats; its table stands in the nook between them."""
+"""Depth of both seats of a corner sofa; its table stands in the nook between them."""
 _TV_STANDS: Final = ("console_table", "bottom_cabinet", "bookcase", "coffee_table", "breakfast_table")
 _CLEAR_M: Final = 0.8
-"""Free floor on all sides of what stands in the open."""
+"""Free floor on all sides of furniture in the middle of a room."""
 _ISLANDS: Final = ("commercial_kitchen_table", "display_case", "bar")
 _LONG_SIDE: Final = ("bathtub", "bicycle")
 _ISLAND_M: Final = 2.0
-"""Longer kitchen tables stand in the middle of the kitchen."""
+"""Kitchen tables longer than this stand in the middle of the kitchen."""
 _IN_LINE: Final = 3
-"""This many equal pieces stand side by side: lockers, toilets, shelves."""
+"""Number of equal pieces from which they stand side by side: lockers, toilets, shelves."""
 _NEAR: Final[Mapping[str, tuple[str, ...]]] = {
     "armchair": ("coffee_table", "sofa"),
     "ottoman": ("sofa", "armchair"),
@@ -78,7 +79,7 @@ _OFF_FLOOR: Final = frozenset(
 def room_groups(
     pieces: Sequence[FurniturePiece], room_type: str = "", floor_m: tuple[float, float] = (5.0, 5.0)
 ) -> tuple[list[FurnitureGroup | Rows], list[tuple[FurniturePiece, str]]]:
-    """Everything that stands on the floor, as groups, the important ones first; and what no group takes, with the reason."""
+    """Return the groups of everything on the floor, important ones first, and the pieces that no group takes, with reasons."""
     pool = Pool((p for p in pieces if p.role not in _OFF_FLOOR), room_type, floor_m)
     left_out: list[tuple[FurniturePiece, str]] = []
     screens = [p for p in pieces if p.category == "wall_mounted_tv"]
@@ -99,7 +100,7 @@ def room_groups(
 
 
 def hung_and_laid(pieces: Sequence[FurniturePiece], taken: set[int]) -> list[FurnitureGroup | Rows]:
-    """What hangs on walls and ceilings, then mats and rugs; without the pieces that a group on the floor has taken."""
+    """Return groups for walls and ceilings, then mats and rugs, without the pieces already ``taken``."""
     rest = [p for p in pieces if p.number not in taken]
     rugs = Pool(p for p in rest if p.role is FurnitureRole.RUG)
     mats = mat_rows(rugs)
@@ -107,7 +108,7 @@ def hung_and_laid(pieces: Sequence[FurniturePiece], taken: set[int]) -> list[Fur
 
 
 def alone(piece: FurniturePiece) -> FurnitureGroup:
-    """A piece that its group found no place for, by itself at a wall; a worktop on brackets, a basin at its height."""
+    """Return a group of one piece for which its own group had no place: at a wall, on brackets, or hung at its height."""
     if piece.role is FurnitureRole.COUNTERTOP:
         return worktop(piece)
     if piece.role is FurnitureRole.FITTED:
@@ -118,7 +119,7 @@ def alone(piece: FurniturePiece) -> FurnitureGroup:
 
 
 def in_the_open(piece: FurniturePiece) -> FurnitureGroup | None:
-    """A piece that found no wall, in the middle of the room; None for what belongs to a wall."""
+    """Return a group in the middle of the room for a piece that found no wall; None if it must stand at one."""
     if (
         piece.role in (FurnitureRole.TABLE, FurnitureRole.LOW_TABLE, FurnitureRole.OPEN)
         or piece.category in _ISLANDS
@@ -128,12 +129,12 @@ def in_the_open(piece: FurniturePiece) -> FurnitureGroup | None:
 
 
 def _sideways(piece: FurniturePiece) -> Member:
-    """The piece in its group: a bathtub and a bench that is modelled end on have their long side at the wall."""
+    """Return the piece as a member, turned by a quarter if its long side belongs to the wall: bathtubs, bicycles."""
     return Member(piece, turns=1 if piece.category in _LONG_SIDE and piece.size_m[0] > piece.size_m[1] else 0)
 
 
 def _first(group: FurnitureGroup) -> FurnitureGroup:
-    """A screen goes up before the sofa, which then looks at it."""
+    """Return the group of a screen with an importance above the sofa's: the sofa is then placed to face it."""
     return replace(group, style=Style.CENTERED, importance=9.6)
 
 
@@ -173,7 +174,7 @@ def _beds(pool: Pool) -> list[FurnitureGroup]:
 
 
 def _sofas(pool: Pool) -> list[FurnitureGroup]:
-    """Sofas with a coffee table before them and armchairs at its ends; corner sofas in a corner, the table in the nook."""
+    """Return sofas with a coffee table and armchairs at its ends; a corner sofa stands in a corner, its table in the nook."""
     groups = []
     sofas = pool.take(sorted(pool.of("sofa"), key=lambda p: -p.size_m[1]))
     armchairs = pool.of("armchair") if pool.room_type in ("living_room", "lobby", "garden") else []
@@ -202,7 +203,7 @@ def _sofas(pool: Pool) -> list[FurnitureGroup]:
 
 
 def _armchairs(pool: Pool, armchairs: Sequence[FurniturePiece]) -> list[FurnitureGroup]:
-    """Where there is no sofa, armchairs face one another over a coffee table."""
+    """Return armchairs that face one another over a coffee table, for rooms without a sofa."""
     tables = pool.of("coffee_table", "garden_coffee_table")
     if len(armchairs) < _PAIR or not tables:
         return []

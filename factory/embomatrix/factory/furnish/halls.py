@@ -1,26 +1,24 @@
-"""Shops, gardens and halls: lines of shelves back to back, planting along the edges, mats and machines in the open."""
+"""Groups of shops, gardens and halls: lines of shelves, plants along the edges, mats and machines in the open."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.furnish.pieces import FurnitureGroup, Member, Rows, Style
-from embomatrix.factory.furnish.pool import worth
+from embomatrix.factory.furnish.pieces import FurnitureGroup, Member, Rows, Style, worth
 from embomatrix.factory.furnish.roles import FurnitureRole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from embomatrix.factory.furnish.pieces import FurniturePiece
-    from embomatrix.factory.furnish.pool import Pool
+    from embomatrix.factory.furnish.pieces import FurniturePiece, Pool
 
 _SHELVES: Final = ("grocery_shelf", "snack_rack", "dry_food_dispenser_shelf", "candy_dispenser_shelf")
 _TALL_M: Final = 1.9
-"""Taller shelves stand at the walls, as far as those reach."""
+"""Taller shelves stand at the walls as long as there is space."""
 _AISLE_M: Final = 1.0
 _WALKS_M: Final = 3.2
-"""Free floor left over at both ends of a line of shelves, shelves at the walls included."""
+"""Length that a line of shelves leaves free at both ends together, shelves at the walls included."""
 _LONGEST_LINE_M: Final = 9.0
 _STEP_M: Final = 0.005
 _PLANTS_WORTH: Final = 0.5
@@ -28,7 +26,7 @@ _MATS: Final = 4
 
 
 def hall_groups(pool: Pool) -> list[FurnitureGroup | Rows]:
-    """What fills large rooms: shelves in aisles, machines in the open."""
+    """Return the groups of large rooms: shelves in aisles, machines in the open."""
     found: list[FurnitureGroup | Rows] = [*_aisles(pool)]
     standing = pool.take(pool.with_role(FurnitureRole.OPEN))
     if pool.room_type == "gym" and len(standing) >= _MATS:
@@ -47,14 +45,14 @@ def hall_groups(pool: Pool) -> list[FurnitureGroup | Rows]:
 
 
 def planting_groups(pool: Pool) -> list[FurnitureGroup]:
-    """Trees, bushes and stones: along the edges first, the small ones last, after all that people use."""
+    """Return trees, bushes and stones, the largest first, at an importance below all furniture."""
     plants = pool.take(pool.with_role(FurnitureRole.PLANTING))
     plants.sort(key=lambda p: -p.size_m[0] * p.size_m[1])
     return [FurnitureGroup((Member(p),), Style.EDGE, _PLANTS_WORTH) for p in plants]
 
 
 def mat_rows(pool: Pool) -> list[Rows]:
-    """Equal mats side by side as one field."""
+    """Return rows of equal mats, side by side."""
     kinds: dict[str, list[FurniturePiece]] = defaultdict(list)
     for piece in pool.of("gym_mat"):
         kinds[piece.asset.asset_id].append(piece)
@@ -69,7 +67,7 @@ def mat_rows(pool: Pool) -> list[Rows]:
 
 
 def _aisles(pool: Pool) -> list[FurnitureGroup]:
-    """Shelves of a shop: tall ones along the walls, the others back to back in lines across the hall."""
+    """Return the shelves of a shop: tall ones along the walls, the others back to back in lines across the hall."""
     shelves = pool.of(*_SHELVES)
     if pool.room_type != "grocery_store" or len(shelves) < 2 * _MATS:
         return []
@@ -107,7 +105,7 @@ def _lines(shelves: Sequence[FurniturePiece], longest: float) -> list[list[Furni
 
 
 def _line(shelves: Sequence[FurniturePiece], turns: int) -> list[Member]:
-    """Shelves side by side with their backs on the group's y axis, looking along x or against it."""
+    """Return shelves side by side with their backs on the group's y axis, facing +x or -x."""
     total = sum(p.size_m[1] + _STEP_M for p in shelves) - _STEP_M
     side = 1 if turns == 0 else -1
     at = -total / 2

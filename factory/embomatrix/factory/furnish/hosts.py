@@ -1,7 +1,7 @@
-"""Which furniture small things stand on and in, best first: by category, else by the kind that a name tells.
+"""Preferred furniture of small objects, best first: by category, else by a pattern of the category's name.
 
-The order follows how often people's rooms hold them there, counted over the hand-made rooms of iTHOR (Kolve et al., "AI2-THOR",
-2017): eggs in the fridge, plates on dining table and counter before the cupboard, books on the desk, pillows on bed and sofa.
+Hosts are ordered by their frequency in the hand-made rooms of iTHOR (Kolve et al., "AI2-THOR", 2017): eggs in the fridge,
+plates on dining table and counter before the cupboard, books on the desk, pillows on bed and sofa.
 """
 
 from __future__ import annotations
@@ -102,12 +102,12 @@ _NO_HOST_NAMES: Final = (
     "shopping_cart coatrack suitcase swing_set sandbox wading_pool low_resolution_tree garden_plant photocopier"
 )
 NO_HOSTS: Final = frozenset(_NO_HOST_NAMES.split())
-"""Nothing is put down on these unless the tables above name them."""
+"""Categories that hold no small objects unless the tables above name them as hosts."""
 
 
 @functools.cache
 def hosts_of(category: str) -> tuple[str, ...]:
-    """Furniture that a small thing likes, best first; empty when any surface of the room serves."""
+    """Return the preferred hosts of a small object, best first; empty if any surface will do."""
     if category in _BY_NAME:
         return _BY_NAME[category]
     cold = tuple(_COLD.split()) if _PERISHABLE.fullmatch(category) else ()
@@ -118,7 +118,7 @@ def hosts_of(category: str) -> tuple[str, ...]:
 
 
 def kept_behind_doors(category: str, host: str) -> bool:
-    """Whether people keep such a thing in such a piece of furniture when it has doors: crockery, stores, what must be cold."""
+    """True if people keep objects of this category behind the doors of this host: crockery, provisions, cold food."""
     if host in _COLD_NAMES:
         return host in hosts_of(category)
     return category in _CUPBOARD or _PACKED.fullmatch(category) is not None

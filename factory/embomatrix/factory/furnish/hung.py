@@ -1,4 +1,4 @@
-"""What hangs: cabinets and hoods over the counters, things on walls, lights under the ceiling; and rugs on the floor."""
+"""Groups off the floor: cabinets and hoods over the counters, objects on walls, lights under the ceiling; and rugs."""
 
 from __future__ import annotations
 
@@ -58,14 +58,14 @@ _RUGS_NEAR: Final = (
 
 
 def hung_groups(pieces: Sequence[FurniturePiece]) -> list[FurnitureGroup]:
-    """Wall cabinets and hoods over the counters, then what hangs on the walls, big things first."""
+    """Return wall cabinets and hoods over the counters, then objects on walls, large ones first."""
     groups = []
     for piece in pieces:
         if piece.role is FurnitureRole.HUNG_CABINET:
             hood = piece.category == "range_hood"
             near: tuple[str, ...] = COOKERS if hood else ("countertop", *SINKS, *UNDER_COUNTER)
             highest = WALL_HEIGHT_M - piece.size_m[2] - 0.01
-            # A hood too high for the room reaches into the ceiling rather than into the cook's way.
+            # A hood that is too high for the room reaches into the ceiling, not into the cook's head room.
             bottom = _HOOD_M if hood else max(min(HUNG_BOTTOM_M, highest), 0.9)
             member = Member(piece, bottom=bottom)
             groups.append(FurnitureGroup((member,), Style.RUN, 8.0 if hood else 5.0, near))
@@ -75,7 +75,7 @@ def hung_groups(pieces: Sequence[FurniturePiece]) -> list[FurnitureGroup]:
 
 
 def on_wall(piece: FurniturePiece) -> FurnitureGroup:
-    """A thing at its height on a wall; taller than the wall, just above the floor."""
+    """Return an object at its height on a wall; just above the floor if it is higher than the wall."""
     height = piece.size_m[2]
     bottom = max(0.05, min(wall_height_m(piece.category) - height / 2, WALL_HEIGHT_M - height - 0.02))
     near = _NEAR_ON_WALL.get(piece.category, ())
@@ -86,7 +86,7 @@ def on_wall(piece: FurniturePiece) -> FurnitureGroup:
 
 
 def ceiling_groups(pieces: Sequence[FurniturePiece]) -> list[FurnitureGroup | Rows]:
-    """Lights, fans and racks under the ceiling: equal ones evenly over the room, those that hang low over a table."""
+    """Return lights, fans and racks under the ceiling: equal ones spread evenly, low ones over a table."""
     groups: list[FurnitureGroup | Rows] = []
     kinds: dict[str, list[FurnitureGroup]] = defaultdict(list)
     for piece in pieces:
@@ -111,7 +111,7 @@ def ceiling_groups(pieces: Sequence[FurniturePiece]) -> list[FurnitureGroup | Ro
 
 
 def rug_groups(pieces: Sequence[FurniturePiece]) -> list[FurnitureGroup]:
-    """Rugs lie on free floor before the sofa, the bed or the sink."""
+    """Return rugs on free floor before the sofa, the bed or the sink."""
     return [
         FurnitureGroup((Member(p, bottom=REST_GAP_M),), Style.FREE, 1.0, _RUGS_NEAR, spread=("carpet",))
         for p in pieces

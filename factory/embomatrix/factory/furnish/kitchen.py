@@ -1,4 +1,4 @@
-"""Runs: slabs over base cabinets and low appliances, sinks and cookers let into the line, one unit after the other."""
+"""Runs along the walls: worktops over base cabinets and low appliances, with sinks and cookers set into the line."""
 
 from __future__ import annotations
 
@@ -19,8 +19,7 @@ from embomatrix.factory.furnish.roles import FurnitureRole
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from embomatrix.factory.furnish.pieces import FurniturePiece
-    from embomatrix.factory.furnish.pool import Pool
+    from embomatrix.factory.furnish.pieces import FurniturePiece, Pool
 
     Unplaced = tuple[FurniturePiece, str]
 
@@ -48,24 +47,24 @@ FITTED: Final = (
     "multi_station_tabletop_sink",
     "burner",
 )
-"""What stands on a counter and stays there."""
+"""Categories that are set into a counter for good."""
 _RUN_WORTH: Final = 20.5
-"""Runs go before other furniture: a kitchen without its line is none."""
+"""Importance of runs, above that of other furniture: a kitchen needs its line of cabinets."""
 _FILLED: Final = 0.55
-"""A slab is carried when cabinets fill this share of its width."""
+"""Share of a worktop's width that the cabinets below it must fill to carry it."""
 _CARRIED: Final = 0.3
-"""A slab that would be left over is carried by one cabinet at this share: a peninsula."""
+"""The same share for a single cabinet, if the worktop would otherwise be left over: a peninsula."""
 _STEP_M: Final = 0.003
 _LEVEL_M: Final = 0.035
 _HIGHEST_M: Final = 0.95
 _OVERHANG_M: Final = 0.15
-"""No slab reaches farther than this over the fronts below it."""
+"""Greatest overhang of a worktop over the fronts below it."""
 _WORKTOP_M: Final = 0.72
 _BASIN_RIM_M: Final = 0.86
 
 
 def run_groups(pool: Pool, left_out: list[Unplaced]) -> list[FurnitureGroup]:
-    """Everything that stands in lines along the walls, in the order of a kitchen: cold, wet, work, hot, and the rest."""
+    """Return everything that stands in lines along the walls, in the order of a kitchen: cold, wet, work, hot, the rest."""
     counters = _counters(pool, left_out)
     _fit(pool, counters)
     counters = [_with_chair(pool, group) for group in counters]
@@ -85,7 +84,7 @@ def run_groups(pool: Pool, left_out: list[Unplaced]) -> list[FurnitureGroup]:
 
 
 def _in_order(units: Sequence[FurnitureGroup]) -> list[FurnitureGroup]:
-    """Fridge in the corner, then by turns counters and what people work at, so that every appliance has a counter beside it."""
+    """Order units so that the fridge comes first and every cooker and sink has a counter beside it."""
     counters = [g for g in units if any(_is_counter(m.piece) for m in g.members)]
     rest = [g for g in units if all(not _is_counter(m.piece) for m in g.members)]
     rank = {"fridge": 0, **dict.fromkeys(SINKS, 1), "dishwasher": 2, **dict.fromkeys(COOKERS, 3)}
@@ -110,7 +109,7 @@ def _is_counter(piece: FurniturePiece) -> bool:
 
 
 def _counters(pool: Pool, left_out: list[Unplaced]) -> list[FurnitureGroup]:
-    """Slabs over base cabinets and low appliances: widest first, close in height."""
+    """Return worktops over base cabinets and low appliances of about one height, the widest first."""
     groups: list[FurnitureGroup] = []
     left: list[FurniturePiece] = []
     for slab in pool.take(sorted(pool.of("countertop"), key=lambda p: -p.size_m[1])):
@@ -121,7 +120,7 @@ def _counters(pool: Pool, left_out: list[Unplaced]) -> list[FurnitureGroup]:
         else:
             left.append(slab)
     if left and not groups and pool.room_type != "kitchen":
-        # A worktop on brackets: the basins of a washroom, the table of a copy room.
+        # A worktop on brackets, as in a washroom or a copy room.
         groups.append(worktop(left.pop(0)))
     left_out += [(slab, "no base cabinets are left to carry it") for slab in left]
     groups += [
@@ -132,7 +131,7 @@ def _counters(pool: Pool, left_out: list[Unplaced]) -> list[FurnitureGroup]:
 
 
 def _carriers(pool: Pool, slab: FurniturePiece) -> list[FurniturePiece]:
-    """Cabinets for the slab: those that fill it best, of about one height."""
+    """Return the cabinets of about one height that fill the worktop's width best; empty if they fill too little."""
     width = slab.size_m[1]
     candidates = sorted(
         (p for p in pool.of(*UNDER_COUNTER) if p.size_m[2] <= _HIGHEST_M and p.size_m[1] <= width + 0.02),
@@ -146,7 +145,7 @@ def _carriers(pool: Pool, slab: FurniturePiece) -> list[FurniturePiece]:
 
 
 def _best_row(candidates: Sequence[FurniturePiece], width: float) -> list[FurniturePiece]:
-    """The fullest row of pieces of about one height that fits under a slab."""
+    """Return the fullest row of pieces of about one height that fits under a worktop."""
     best: list[FurniturePiece] = []
     for first in range(len(candidates)):
         row: list[FurniturePiece] = []
@@ -162,9 +161,9 @@ def _best_row(candidates: Sequence[FurniturePiece], width: float) -> list[Furnit
 
 
 def _counter_members(slab: FurniturePiece, row: Sequence[FurniturePiece]) -> tuple[Member, ...]:
-    """Cabinets side by side, backs aligned with the slab's, the slab on the tallest of them.
+    """Return cabinets side by side with their backs aligned, and the worktop on the tallest of them.
 
-    Under a deep slab they stand forward: who opens a drawer stands before the slab's edge and reaches under it.
+    Under a deep worktop the cabinets move forward: the robot opens them while it stands before the worktop's edge.
     """
     total = sum(p.size_m[1] + _STEP_M for p in row) - _STEP_M
     left = -total / 2
@@ -181,7 +180,7 @@ def _counter_members(slab: FurniturePiece, row: Sequence[FurniturePiece]) -> tup
 
 
 def _fit(pool: Pool, counters: list[FurnitureGroup]) -> None:
-    """Set basins and cooktops on counters, else on base cabinets, as many as stand there side by side."""
+    """Set basins and cooktops on counters as long as there is space, else on base cabinets."""
     for piece in sorted(pool.of(*FITTED), key=lambda p: -p.size_m[1]):
         for number, group in enumerate(counters):
             spot = _free_span(group, piece)
@@ -212,12 +211,12 @@ def _fit_on_cabinet(pool: Pool, counters: list[FurnitureGroup], piece: Furniture
 
 
 def _carcass(group: FurnitureGroup) -> list[Member]:
-    """The group without what is fitted into it: the last one is the slab."""
+    """Return the members without those set into the worktop; the last one is the worktop."""
     return [m for m in group.members if m.piece.category not in FITTED]
 
 
 def _free_span(group: FurnitureGroup, piece: FurniturePiece) -> float | None:
-    """Where along the counter the piece finds room beside what is fitted there already; None when it doesn't."""
+    """Return the y at which the piece fits beside those already set into the counter; None if there is no space."""
     slab = _carcass(group)[-1]
     if piece.size_m[0] > slab.piece.size_m[0] + 0.1 or top_of(slab.piece) + slab.bottom > _HIGHEST_M + 0.1:
         return None
@@ -230,7 +229,7 @@ def _free_span(group: FurnitureGroup, piece: FurniturePiece) -> float | None:
 
 
 def _evened(group: FurnitureGroup) -> FurnitureGroup:
-    """The counter with equal gaps between the things fitted into it."""
+    """Return the counter with equal gaps between the basins and cooktops set into it."""
     carcass = _carcass(group)
     fitted = [m for m in group.members if m.piece.category in FITTED]
     slab = carcass[-1]
@@ -244,12 +243,12 @@ def _evened(group: FurnitureGroup) -> FurnitureGroup:
 
 
 def worktop(slab: FurniturePiece) -> FurnitureGroup:
-    """A slab without cabinets under it, on brackets at the wall."""
+    """Return a worktop on brackets at the wall, without cabinets under it."""
     return FurnitureGroup((Member(slab, bottom=_WORKTOP_M),), Style.RUN, 0.0, near=SINKS)
 
 
 def _with_chair(pool: Pool, group: FurnitureGroup) -> FurnitureGroup:
-    """A worktop on brackets is a desk where a swivel chair has none; a conference needs its chairs itself."""
+    """Add a spare swivel chair to a worktop on brackets, unless a conference table needs the chairs."""
     slab = group.members[0]
     if (
         len(group.members) > 1
@@ -262,6 +261,6 @@ def _with_chair(pool: Pool, group: FurnitureGroup) -> FurnitureGroup:
 
 
 def basin(piece: FurniturePiece) -> FurnitureGroup:
-    """A basin or cooktop without a counter hangs on the wall."""
+    """Return a basin or cooktop that hangs on the wall, for lack of a counter."""
     bottom = max(0.4, _BASIN_RIM_M - piece.size_m[2])
     return FurnitureGroup((Member(piece, bottom=bottom),), Style.ALONG, 12.0, near=SINKS)

@@ -1,42 +1,43 @@
-"""Pieces and groups: the inventory's items of a room, arranged into the units that furnishing places as a whole.
+"""Pieces and groups: the inventory items of a room, arranged into units that are placed as a whole.
 
-A group's own frame has x towards the room and y to its left; the wall, if it stands at one, is behind it at -x.
+A group's frame has x towards the room and y to its left. The wall behind it, if any, is at -x.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.furnish.roles import FurnitureRole
+from embomatrix.factory.furnish.roles import FurnitureRole, importance_of
+from embomatrix.sim.geometry.bounds import joint_motion
 from embomatrix.world.geometry import Pose
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
-    from embomatrix.factory.furnish.boxes import Box
-    from embomatrix.world.asset import Asset, Joint, Link
+    from embomatrix.factory.furnish.space import Box
+    from embomatrix.world.asset import Asset, Link
     from embomatrix.world.geometry import ConvexPart, Vec3
     from embomatrix.world.state import Relation
 
 CORNER_SOFA_M: Final = 1.4
-"""A sofa that exceeds this along both sides goes round a corner, its second arm on its right: the nook is open floor."""
+"""A sofa larger than this along both sides is a corner sofa with its second arm on the right; its nook is open floor."""
 REST_GAP_M: Final = 0.0005
-"""Things rest half a millimetre above what carries them: close enough to be on it, far enough not to be in it."""
+"""Gap between an object and its support: close enough to rest on it, too far to penetrate it."""
 FRONT_M: Final = 0.6
 _UPENDED: Final = Pose((0.0, 0.0, 0.0), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)))
-"""A flat model's face, at +z of its asset frame, turned to +x."""
+"""Rotation that turns the face of a flat model from +z of its asset frame to +x."""
 
 Rect4 = tuple[float, float, float, float]
 
 
 class Access(StrEnum):
-    """What the robot must be able to reach of a piece."""
+    """Free space from which the robot uses a piece."""
 
     NONE = "none"
     BESIDE = "beside"  # some free spot near it
@@ -46,7 +47,7 @@ class Access(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class FurniturePiece:
-    """One item of a room's inventory. ``number`` tells it from its equals; ``upended`` models hang with z to the room."""
+    """One item of a room's inventory. ``number`` identifies it; ``upended`` models hang with their z axis to the room."""
 
     number: int
     category: str
@@ -56,13 +57,13 @@ class FurniturePiece:
 
     @property
     def size_m(self) -> Vec3:
-        """Extent along x, y and z as it is placed at zero yaw."""
+        """Extent along x, y and z as placed at zero yaw."""
         x, y, z = self.asset.size_m
         return (z, y, x) if self.upended else (x, y, z)
 
     @property
     def blocks(self) -> tuple[Box, ...]:
-        """What it takes up, about its middle and above its underside: one box, or what an open shape is made of."""
+        """Boxes it occupies, relative to its centre and underside: one, or the parts of an open shape."""
         corner = self.category == "sofa" and min(self.size_m[:2]) > CORNER_SOFA_M
         if (corner or self.category in _OPEN_SHAPES) and not self.upended:
             return _blocks_of(self.asset.links[0].parts, self.asset.size_m[2] / 2)
@@ -70,14 +71,14 @@ class FurniturePiece:
         return ((-x, -y, 0.0, x, y, 2 * z),)
 
     def pose(self, x: float, y: float, bottom: float, yaw: float) -> Pose:
-        """Pose of the asset with its lowest point at height ``bottom``."""
+        """Return the pose of the asset with its lowest point at height ``bottom``."""
         upright = Pose.from_xyz_yaw(x, y, bottom + self.size_m[2] / 2, yaw)
         return upright @ _UPENDED if self.upended else upright
 
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """A piece with its place: centre of the footprint, underside, heading, and its host's number (-1: none)."""
+    """Piece with its place: centre of the footprint, height of the underside, heading, number of its host (-1: none)."""
 
     piece: FurniturePiece
     room: str
@@ -103,7 +104,7 @@ class Placed:
 
     @property
     def boxes(self) -> tuple[Box, ...]:
-        """The boxes in the world that the piece takes up, at quarter turns; its bounding box at any other heading."""
+        """Boxes in the world that the piece occupies at quarter turns; its bounding box at any other heading."""
         blocks = self.piece.blocks
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         if len(blocks) == 1 or abs(c * s) > 1e-6:
@@ -119,7 +120,10 @@ class Placed:
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """A piece in its group's frame: centre of its footprint, underside, quarter turns; ``on`` is its host's position."""
+    """Piece in its group's frame: centre of the footprint, height of the underside, quarter turns.
+
+    ``on`` is the index of the member that carries it, -1 for none.
+    """
 
     piece: FurniturePiece
     x: float = 0.0
@@ -135,7 +139,7 @@ class Member:
 
 
 class Style(StrEnum):
-    """Where a group looks for its place."""
+    """Part of the room in which a group is placed."""
 
     RUN = "run"
     CENTERED = "centered"  # at the middle of a wall
@@ -143,16 +147,17 @@ class Style(StrEnum):
     CORNER = "corner"
     NOOK = "nook"  # in a corner with the right side at the other wall
     FREE = "free"  # in the middle of the room
-    EDGE = "edge"  # along the walls and, where those are taken, next to what stands there
+    EDGE = "edge"  # along the walls, or in front of furniture there
     AISLE = "aisle"  # lines across the room, an aisle apart
     OVERHEAD = "overhead"
 
 
 @dataclass(frozen=True, slots=True)
 class FurnitureGroup:
-    """Pieces that are placed as one. ``near`` and ``faces`` name categories whose closeness or sight is worth something.
+    """Pieces that are placed as one.
 
-    ``spread`` names categories that it keeps away from; ``clear_m`` is free floor on all sides to anything else.
+    A place is better the closer it is to categories in ``near``, the better it sees those in ``faces``, and the farther it is
+    from those in ``spread``. ``clear_m`` is free floor on all sides.
     """
 
     members: tuple[Member, ...]
@@ -173,9 +178,9 @@ class FurnitureGroup:
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Equal groups that stand in rows and columns, all looking one way; ``gap_m`` is free floor behind and beside each.
+    """Equal groups in rows and columns with one heading. ``gap_m`` is the free floor behind and beside each.
 
-    They spread over the room up to ``stretch`` times their closest pitch; ``clear_m`` is free floor to what stands already.
+    They spread over the room up to ``stretch`` times their closest pitch. ``clear_m`` is free floor to other furniture.
     """
 
     groups: tuple[FurnitureGroup, ...]
@@ -195,7 +200,7 @@ _BESIDE: Final = frozenset((FurnitureRole.TABLE, FurnitureRole.LOW_TABLE, Furnit
 
 
 def access_of(piece: FurniturePiece) -> Access:
-    """What access the piece needs: a free front where it opens or works, a spot beside it where one puts things on it."""
+    """Return the access of a piece: a free front to open or operate it, or floor beside it to put objects on it."""
     if piece.role is FurnitureRole.SURFACE:
         return Access.NONE
     if piece.role is FurnitureRole.HUNG_CABINET:
@@ -217,62 +222,50 @@ def access_of(piece: FurniturePiece) -> Access:
 
 
 _OPEN_SHAPES: Final = frozenset(("tree", "low_resolution_tree"))
-"""What one can walk under: a tree takes up its trunk and its crown, not the box around both."""
+"""Categories with free space below: a tree occupies its trunk and its crown, not the box around both."""
 
 
 @functools.lru_cache(maxsize=1024)
 def _blocks_of(parts: tuple[ConvexPart, ...], half_m: float) -> tuple[Box, ...]:
-    """Boxes around the parts of an asset, with heights above its underside."""
+    """Return boxes around the parts of an asset, with heights above its underside."""
     boxes = [part.aabb(Pose((0.0, 0.0, half_m))) for part in parts]
     return tuple((*box.low_m, *box.high_m) for box in boxes)
 
 
 def front_depth_m(asset: Asset) -> float:
-    """Free depth that the front needs: 0.6 m, or as far as its doors and drawers come out."""
+    """Return the free depth before the front: 0.6 m, or the reach of doors and drawers up to 1 m."""
     return max(FRONT_M, min(_furthest_out(asset.links) - asset.size_m[0] / 2 + 0.02, 1.0))
 
 
 @functools.lru_cache(maxsize=4096)
 def _furthest_out(links: tuple[Link, ...]) -> float:
-    """How far moving links come before the asset's middle on their way, along x."""
+    """Return the largest x that moving links reach on their travel, from the asset's centre."""
     out = 0.0
     for link in links:
         if link.joint is None:
             continue
         for fraction in (0.5, 1.0):
-            moved = _joint_pose(link.joint, fraction)
+            moved = joint_motion(link.joint, fraction)
             out = max([out, *(part.aabb(moved).high_m[0] for part in link.parts)])
     return out
 
 
-def _joint_pose(joint: Joint, fraction: float) -> Pose:
-    """Displacement of a link, in the asset's frame, at a share of its joint's travel."""
-    ax, ay, az = joint.axis
-    q = fraction * joint.upper
-    if joint.kind == "prismatic":
-        return Pose((ax * q, ay * q, az * q))
-    s = math.sin(q / 2)
-    turn = Pose((0.0, 0.0, 0.0), (ax * s, ay * s, az * s, math.cos(q / 2)))
-    ox, oy, oz = joint.origin_m
-    return Pose(joint.origin_m) @ turn @ Pose((-ox, -oy, -oz))
-
-
 def top_of(piece: FurniturePiece) -> float:
-    """Height of the piece's main top surface above its underside; its full height when it has no surface in the open."""
+    """Return the height of the piece's largest open surface above its underside; its full height if it has none."""
     half = piece.asset.size_m[2] / 2
     tops = [(s.size_m[0] * s.size_m[1], s.center_m[2] + half) for s in piece.asset.supports if not s.interior]
     return max(tops)[1] if tops else piece.asset.size_m[2]
 
 
 def stacked(base: Member, piece: FurniturePiece, index: int) -> Member:
-    """The piece centred on top of the group's member at ``index``."""
+    """Return the piece centred on top of ``base``, the group's member at ``index``."""
     return Member(piece, base.x, base.y, base.bottom + top_of(base.piece) + REST_GAP_M, base.turns, on=index)
 
 
 def around_table(
     table: FurniturePiece, chairs: Sequence[FurniturePiece], gap_m: float = 0.04
 ) -> tuple[Member, ...]:
-    """A table with chairs facing it: along the long sides first, then at the ends."""
+    """Return a table with chairs facing it: along the long sides first, then at the ends."""
     side, end = _places(table, max((c.size_m[1] for c in chairs), default=0.5))
     ends = end if len(chairs) > 2 * side else 0
     counts = _seats(len(chairs), (side, side, ends, ends))
@@ -287,18 +280,18 @@ def around_table(
 def before_table(
     table: FurniturePiece, chairs: Sequence[FurniturePiece], gap_m: float = 0.04
 ) -> tuple[Member, ...]:
-    """A table with chairs on its front side only, facing it: a workplace, a row of a class."""
+    """Return a table with chairs on its front side only, facing it: a workplace, a row of a class."""
     return (Member(table), *_line(table, list(chairs), 0, gap_m))
 
 
 def seats_around(table: FurniturePiece, seat_m: float) -> int:
-    """How many chairs of this width find a place around the table."""
+    """Return the number of chairs of this width that fit around the table."""
     side, end = _places(table, seat_m)
     return 2 * (side + end)
 
 
 def _places(table: FurniturePiece, seat_m: float) -> tuple[int, int]:
-    """Chairs along a long side and at an end of the table."""
+    """Return the number of chairs along a long side and at an end of the table."""
     depth, width, _ = table.size_m
     seat = seat_m + 0.08
     return max(1, int(width / seat)), max(0, int(depth / seat))
@@ -307,7 +300,7 @@ def _places(table: FurniturePiece, seat_m: float) -> tuple[int, int]:
 def _line(
     table: FurniturePiece, chairs: Sequence[FurniturePiece], direction: int, gap_m: float
 ) -> list[Member]:
-    """Chairs side by side along the table's side that looks this many quarter turns away from its front."""
+    """Return chairs side by side at the table's side that is ``direction`` quarter turns from its front."""
     depth, width, _ = table.size_m
     across, run = (depth, width) if direction % 2 == 0 else (width, depth)
     seat = max((c.size_m[1] for c in chairs), default=0.5) + 0.08
@@ -321,7 +314,7 @@ def _line(
 
 
 def _seats(chairs: int, places: tuple[int, int, int, int]) -> tuple[int, ...]:
-    """Chairs per side: the two long sides share them, the ends take the rest."""
+    """Return the chairs per side: the two long sides share them evenly, the ends take the rest."""
     counts = [0, 0, 0, 0]
     for _ in range(chairs):
         open_sides = [i for i in range(4) if counts[i] < places[i]]
@@ -332,5 +325,30 @@ def _seats(chairs: int, places: tuple[int, int, int, int]) -> tuple[int, ...]:
     return tuple(counts)
 
 
-def shifted(members: Sequence[Member], dx: float, dy: float) -> tuple[Member, ...]:
-    return tuple(replace(m, x=m.x + dx, y=m.y + dy) for m in members)
+class Pool:
+    """Pieces of a room that no group has taken yet, with the room's type and floor size."""
+
+    def __init__(
+        self, pieces: Iterable[FurniturePiece], room_type: str = "", floor_m: tuple[float, float] = (5.0, 5.0)
+    ) -> None:
+        self.rest = list(pieces)
+        self.room_type = room_type
+        self.floor_m = floor_m
+
+    def of(self, *categories: str) -> list[FurniturePiece]:
+        return [p for c in categories for p in self.rest if p.category == c]
+
+    def with_role(self, *roles: FurnitureRole) -> list[FurniturePiece]:
+        return [p for p in self.rest if p.role in roles]
+
+    def take(self, pieces: Iterable[FurniturePiece]) -> list[FurniturePiece]:
+        """Remove the pieces from the pool and return them."""
+        taken = list(pieces)
+        numbers = {p.number for p in taken}
+        self.rest = [p for p in self.rest if p.number not in numbers]
+        return taken
+
+
+def worth(members: Sequence[Member]) -> float:
+    """Return the importance of a group: that of its best member, plus 0.1 for each member."""
+    return max(importance_of(m.piece.category, m.piece.role) for m in members) + 0.1 * len(members)

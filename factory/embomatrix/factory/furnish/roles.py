@@ -1,6 +1,6 @@
-"""What each category is to a room: where it stands, hangs or lies, how much it matters, what it wants nearby.
+"""Role of each category in a room: placement, importance, and height on a wall.
 
-The tables name the categories of the 51 inventories that need a decision; every other model is judged by its size and mass.
+The tables list categories of the 51 inventories that need a decision. Any other model gets its role from its size and mass.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class FurnitureRole(StrEnum):
-    """How a model is placed."""
+    """Kind of place that a model gets."""
 
     RUN = "run"  # shoulder to shoulder along a wall: cabinets, appliances, sinks
     COUNTERTOP = "countertop"  # a slab over base cabinets
@@ -34,7 +34,7 @@ class FurnitureRole(StrEnum):
     FITTED = "fitted"  # on a counter, for good: basins and cooktops
     OPEN = "open"  # in the open, away from walls: cars, machines, a pool table
     PLANTING = "planting"  # along the edges of a garden
-    STRUCTURE = "structure"  # part of the building or its surroundings: walls and floors stand for it
+    STRUCTURE = "structure"  # part of the building or its surroundings, not placed
 
 
 _BY_ROLE: Final[Mapping[FurnitureRole, str]] = {
@@ -97,10 +97,10 @@ _WALL_HEIGHT: Final[Mapping[str, float]] = {
     "toilet_paper_holder": 0.75, "wall_socket": 0.3, "wall_nail": 1.6, "pay_phone": 1.35, "shelf": 1.45,
     "wall_mounted_sink": 0.75, "fire_extinguisher": 1.0, "security_camera": 2.15, "hand_dryer": 1.2,
 }  # fmt: skip
-"""Height of the centre of things on a wall, in metres; the underside for what is named in ``HUNG_BOTTOM_M``."""
+"""Height of the centre of objects on a wall, in metres."""
 
 HUNG_BOTTOM_M: Final = 1.4
-"""Underside of wall cabinets: above the counters, and no obstacle to the robot."""
+"""Height of the underside of wall cabinets: above the counters and out of the robot's way."""
 
 _WALL_DEFAULT_M: Final = 1.5
 _SMALL_EXTENT_M: Final = 0.65
@@ -108,7 +108,7 @@ _SMALL_VOLUME_M3: Final = 0.06
 
 
 def role_of(category: str, size_m: tuple[float, float, float], mass_kg: float) -> FurnitureRole:
-    """The role of a model of this size (depth, width, height) and mass."""
+    """Return the role of a model of this size (depth, width, height) and mass."""
     if category == "pot_plant":
         return FurnitureRole.CORNER if size_m[2] > 0.6 else FurnitureRole.SURFACE
     if category in _ROLE_OF:
@@ -122,7 +122,7 @@ def role_of(category: str, size_m: tuple[float, float, float], mass_kg: float) -
 
 
 def importance_of(category: str, role: FurnitureRole) -> float:
-    """What dropping one costs: large for what makes the room what it is."""
+    """Return the cost of leaving one out: large for pieces that define the room."""
     if category in _IMPORTANCE:
         return _IMPORTANCE[category]
     return {
@@ -138,12 +138,12 @@ def importance_of(category: str, role: FurnitureRole) -> float:
 
 
 def wall_height_m(category: str) -> float:
-    """Height above the floor of the centre of a thing on a wall."""
+    """Return the height of the centre of an object on a wall above the floor."""
     return _WALL_HEIGHT.get(category, _WALL_DEFAULT_M)
 
 
 def is_portable(asset: Asset) -> bool:
-    """True when the robot can pick the model up; appliances that heat stay where they are."""
+    """True if the robot can pick the model up. Appliances that heat are fixed."""
     return (
         asset.mass_kg <= ROBOT.mass_kg
         and min(asset.size_m) <= ROBOT.grip_m

@@ -1,4 +1,4 @@
-"""Furnishing: the inventory of every room, placed at its own sizes so that a robot can get to all that it may use."""
+"""Furnishing of a floor plan: the inventory of every room, placed so that the robot can reach everything it may use."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from embomatrix.factory.floorplan.walls import WALL_HEIGHT_M
 from embomatrix.factory.furnish.groups import alone, hung_and_laid, in_the_open, room_groups
 from embomatrix.factory.furnish.pieces import Rows
 from embomatrix.factory.furnish.roles import FurnitureRole, importance_of
-from embomatrix.factory.furnish.rows import lay_rows
-from embomatrix.factory.furnish.solver import RoomSolver
+from embomatrix.factory.furnish.solver import RoomSolver, lay_rows
 from embomatrix.factory.furnish.space import RoomSpace
 from embomatrix.factory.furnish.surfaces import SurfacePlacer
 from embomatrix.factory.furnish.tables import STOOLS
@@ -28,19 +27,19 @@ if TYPE_CHECKING:
 
 ATTEMPTS: Final = 24
 CROWDED_ATTEMPTS: Final = 6
-"""Arrangements of a room that are tried before one that leaves something out is taken; fewer where there is much to place."""
+"""Arrangements tried before one that leaves something out is accepted; fewer for rooms with many pieces."""
 CROWD: Final = 30
 HALL: Final = 90
-"""A room with more to place than this is arranged at most twice."""
+"""A room with more pieces than this is arranged at most twice."""
 GOOD_ENOUGH: Final = 2.0
-"""After CROWDED_ATTEMPTS an arrangement that loses no more than this is taken: a trash can, a picture."""
+"""After CROWDED_ATTEMPTS, an arrangement that leaves out no more importance than this is accepted: a trash can, a picture."""
 _IN_THE_WAY: Final = "no free place keeps the room passable"
 MAX_EQUAL: Final = 6
-"""Small things and lights of one model in one room at most: the diner's kitchen lists 137 trays."""
+"""Upper limit for small objects and lights of one model in a room: the diner's kitchen lists 137 trays."""
 MAX_FURNITURE: Final = 60
 MAX_SEATS: Final = 120
 MAX_PLANTS: Final = 24
-"""Warehouses and woods: so many of a model stand for all of them."""
+"""Upper limit for plants of one model: a wood is represented by this many."""
 _CAPS: Final[Mapping[FurnitureRole, int]] = {
     FurnitureRole.SURFACE: MAX_EQUAL,
     FurnitureRole.CEILING: MAX_EQUAL,
@@ -52,18 +51,18 @@ _PAST_M: Final = 2 * ROBOT.radius_m + 0.1
 _LIGHT_LOSSES: Final = frozenset(
     (FurnitureRole.WALL, FurnitureRole.CEILING, FurnitureRole.RUG, FurnitureRole.PLANTING)
 )
-"""What finds no place of these is no reason to start again with it, unless the room is none without it: a basin."""
+"""Roles whose loss does not trigger a new arrangement, unless the piece is essential to the room, like a basin."""
 _WEIGHTY: Final = 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class Furnishing:
-    """Placed pieces of a whole plan, hosts by position in ``placed``, and what found no place, one sentence each."""
+    """Placed pieces of a whole plan, with hosts as indices into ``placed``, and a sentence for each model left out."""
 
     placed: tuple[Placed, ...]
     left_out: tuple[str, ...]
     loss: float = 0.0
-    """Importance of what found no place on floor, walls and ceilings, summed."""
+    """Summed importance of the pieces without a place on floor, walls and ceilings."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +70,7 @@ class _Arrangement:
     placed: tuple[Placed, ...]
     dropped: tuple[FurniturePiece, ...]
     unfit: tuple[tuple[FurniturePiece, str], ...]
-    """What no group takes, with the reason."""
+    """Pieces that no group takes, with the reason."""
 
     @property
     def loss(self) -> float:
@@ -81,7 +80,7 @@ class _Arrangement:
 def furnish(plan: FloorPlan, pieces: dict[str, list[FurniturePiece]], rng: np.random.Generator) -> Furnishing:
     """Place the pieces of every room of the plan; ``pieces`` maps room names to their inventories.
 
-    Deterministic for a given generator state. What has no place is never dropped silently: see ``left_out``.
+    Equal generator states give equal results. ``left_out`` names every piece without a place.
     """
     placed: list[Placed] = []
     left_out: list[str] = []
@@ -112,7 +111,7 @@ def furnish(plan: FloorPlan, pieces: dict[str, list[FurniturePiece]], rng: np.ra
 def _moved(
     plan: FloorPlan, pieces: Mapping[str, Sequence[FurniturePiece]]
 ) -> dict[str, list[FurniturePiece]]:
-    """The inventories; a bar that its own room can't take stands in the room next door, and its stools with it."""
+    """Return the inventories; a bar too large for its room moves to a neighbouring room together with its stools."""
     rooms = {room.name: room for room in plan.rooms}
     moved: dict[str, list[FurniturePiece]] = {name: [] for name in rooms}
     for name, mine in pieces.items():
@@ -126,13 +125,13 @@ def _moved(
 
 
 def _has_room(piece: FurniturePiece, room: Room) -> bool:
-    """Whether the robot gets past the piece when it stands at a wall."""
+    """True if the robot can pass the piece when it stands at a wall."""
     short, long = sorted(piece.size_m[:2])
     return short + _PAST_M <= min(room.size_m) and long <= max(room.size_m)
 
 
 def _capped(pieces: Sequence[FurniturePiece], room: str) -> tuple[list[FurniturePiece], list[str]]:
-    """As many of each model as `_CAPS` allows, nothing that belongs to the building; with sentences on the rest."""
+    """Return as many pieces of each model as `_CAPS` allows, without parts of the building; and sentences on the rest."""
     kept: list[FurniturePiece] = []
     totals = Counter(p.asset.asset_id for p in pieces)
     seen: Counter[str] = Counter()
@@ -160,7 +159,7 @@ def _capped(pieces: Sequence[FurniturePiece], room: str) -> tuple[list[Furniture
 
 
 def _too_high(piece: FurniturePiece) -> bool:
-    """Whether a thing for wall or ceiling has no room above the floor: lamps of a hall, screens of a theatre."""
+    """True if an object for wall or ceiling is higher than the room: lamps of a hall, screens of a theatre."""
     return (
         piece.role in (FurnitureRole.WALL, FurnitureRole.CEILING)
         and piece.size_m[2] > WALL_HEIGHT_M - _ABOVE_FLOOR_M
@@ -176,7 +175,7 @@ def _best_arrangement(
     attempts = ATTEMPTS if standing < CROWD else CROWDED_ATTEMPTS if standing < HALL else 2
     for attempt in range(attempts):
         tried = _arrange(room, plan, pieces, rng, first, wobble=0.4 + 0.2 * attempt)
-        # What found no place comes first the next time.
+        # Pieces without a place are placed first in the next attempt.
         lost = [p for p in tried.dropped if _matters(p)]
         first |= {p.number for p in lost}
         if best is None or tried.loss < best.loss:
@@ -201,7 +200,7 @@ def _arrange(
     groups, unfit = room_groups(pieces, room.type, room.size_m)
     groups.sort(key=lambda g: all(m.piece.number not in first for m in _members(g)))
     dropped = _place_all(solver, groups, wobble, rng)
-    # What its group had no room for may still stand alone: a chair at the wall, an armchair in the corner.
+    # Pieces dropped from a group may still find a place alone: a chair at the wall, an armchair in the corner.
     dropped = _place_all(solver, [alone(p) for p in dropped], wobble, rng)
     walls = [p for p in dropped if in_the_open(p) is None]
     dropped = walls + _place_all(solver, [g for p in dropped if (g := in_the_open(p))], wobble, rng)
@@ -213,25 +212,25 @@ def _arrange(
 def _place_all(
     solver: RoomSolver, groups: Iterable[FurnitureGroup | Rows], wobble: float, rng: np.random.Generator
 ) -> list[FurniturePiece]:
-    """Place group after group; returns the pieces that found no place."""
+    """Place group after group; return the pieces without a place."""
     dropped: list[FurniturePiece] = []
     hopeless: set[tuple[str, ...]] = set()
     for item in groups:
         for group in lay_rows(solver, item, wobble, rng) if isinstance(item, Rows) else (item,):
             remaining = group
             while _signature(remaining) in hopeless or not solver.place(remaining, wobble=wobble):
-                # An equal group finds no place either: a room only fills up.
+                # An equal group finds no place later: the room only gets fuller.
                 hopeless.add(_signature(remaining))
                 dropped.append(remaining.members[-1].piece)
                 if len(remaining.members) == 1:
                     break
-                # The last member is the least important one: a chair, a stool, the coffee table.
+                # The last member is the least important: a chair, a stool, the coffee table.
                 remaining = replace(remaining, members=remaining.members[:-1])
     return dropped
 
 
 def _matters(piece: FurniturePiece) -> bool:
-    """Whether it is a reason to arrange the room anew that the piece found no place."""
+    """True if losing the piece triggers a new arrangement of the room."""
     return piece.role not in _LIGHT_LOSSES or importance_of(piece.category, piece.role) >= _WEIGHTY
 
 
@@ -249,7 +248,7 @@ def _set_small_things(
     small: Sequence[tuple[str, FurniturePiece]],
     rng: np.random.Generator,
 ) -> list[str]:
-    """Put small things on and in the furniture of their room, else of the room next door."""
+    """Put small objects on and in the furniture of their room, else of a neighbouring room."""
     placer = SurfacePlacer(placed, rng)
     beside = {
         r.name: [_other(d, r.name) for d in plan.doorways if r.name in d.rooms and d.rooms[1]]
@@ -269,7 +268,7 @@ def _other(doorway: Doorway, room: str) -> str:
 
 
 def _unplaced(pieces: Sequence[FurniturePiece], room: Room) -> list[str]:
-    """Sentences on what found no place on floor or walls: larger than the room, or in the way."""
+    """Return sentences on pieces without a place on floor or walls: larger than the room, or blocking it."""
     large = [
         p for p in pieces if max(p.size_m[:2]) > max(room.size_m) or min(p.size_m[:2]) > min(room.size_m)
     ]

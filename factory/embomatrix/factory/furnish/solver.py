@@ -1,4 +1,7 @@
-"""Placing groups in a room: the best of their candidates that is free and leaves everything within the robot's reach."""
+"""Placement of groups in a room: the cheapest free candidate that keeps everything within the robot's reach.
+
+Equal groups are placed as rows: on a lattice, an aisle apart, like desks of a class, tables of a restaurant, mats of a gym.
+"""
 
 from __future__ import annotations
 
@@ -26,24 +29,23 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from embomatrix.factory.furnish.boxes import BoolArray, Box, FloatArray
-    from embomatrix.factory.furnish.pieces import FurnitureGroup, FurniturePiece, Member
-    from embomatrix.factory.furnish.space import RoomSpace
+    from embomatrix.factory.furnish.pieces import FurnitureGroup, FurniturePiece, Member, Rect4, Rows
+    from embomatrix.factory.furnish.space import BoolArray, Box, FloatArray, RoomSpace
 
 TRIES: Final = 12
-"""Candidates of a group whose access is checked before the group is given up."""
+"""Candidates of a group that are tested for reachability before the group is given up."""
 _ACCESS_TOP_M: Final = 1.35
-_CHUNK: Final = 256
+
 _FLAT_M: Final = 0.25
 _RUG_SEEN_M: Final = 0.6
-"""Over a rug nothing is lower than this: one under a sofa is seen by nobody."""
+"""Height that stays free over a rug, so that it is not hidden under a sofa."""
 _CLEAR_SHARES: Final = (1.0, 0.5, 0.0)
 _APART_M: Final = 0.12
-"""A candidate this close to one that failed fails for the same reason; the distance grows with every failure."""
+"""Candidates this close to a failed one are skipped; the distance grows with every failure."""
 
 
 class RoomSolver:
-    """Places the groups of one room one after the other; what doesn't fit is returned as such."""
+    """Places the groups of one room, one after the other."""
 
     def __init__(self, space: RoomSpace, rng: np.random.Generator) -> None:
         self.space = space
@@ -52,10 +54,10 @@ class RoomSolver:
         self._rng = rng
 
     def place(self, group: FurnitureGroup, *, wobble: float = 1.0) -> bool:
-        """Place the group at its best free candidate; False when none leaves the room passable.
+        """Place the group at its cheapest free candidate; False if none keeps the room passable.
 
-        ``wobble`` scales the noise on the costs: more of it makes attempts differ more. Where no place has the clearance that
-        the group asks for, it does with half of it, then with none.
+        ``wobble`` scales the noise on the costs: attempts differ more with a larger value. The clearance that the group asks
+        for is halved, then dropped, if no candidate has it.
         """
         shares = _CLEAR_SHARES if group.clear_m else (0.0,)
         return any(self._place(replace(group, clear_m=share * group.clear_m), wobble) for share in shares)
@@ -67,7 +69,7 @@ class RoomSolver:
         cost = options.cost + wobble * self._rng.uniform(0.0, 0.5, len(options))
         options = options.take(np.argsort(cost))
         failed: list[tuple[float, float, int]] = []
-        for index in self._free(group, options):
+        for index in np.flatnonzero(self.free(group, options)):
             x, y, turns = float(options.x[index]), float(options.y[index]), int(options.turns[index])
             near = _APART_M * (1 + len(failed))
             if any(t == turns and math.hypot(x - a, y - b) < near for a, b, t in failed):
@@ -80,12 +82,12 @@ class RoomSolver:
         return False
 
     def place_at(self, group: FurnitureGroup, x: float, y: float, turns: int) -> bool:
-        """Place the group in a frame known to be free, unless that takes something out of the robot's reach."""
+        """Place the group in a frame that is known to be free; False if the robot could then not reach everything."""
         items = self._items(group, x, y, turns)
         boxes = [_with_knee_room(item, box) for item in items for box in item.boxes]
         targets, zones, fronts = _access(items)
-        bars_no_way = not targets and all(box[2] >= ROBOT.height_m or box[5] <= LOW_M for box in boxes)
-        if not bars_no_way and not self.space.reachable(boxes, targets):
+        passable = not targets and all(box[2] >= ROBOT.height_m or box[5] <= LOW_M for box in boxes)
+        if not passable and not self.space.reachable(boxes, targets):
             return False
         self.placed += items
         self._around.add(items)
@@ -93,26 +95,19 @@ class RoomSolver:
         return True
 
     def is_free_at(self, group: FurnitureGroup, x: float, y: float, turns: int) -> bool:
-        """Whether the group stands free in this frame, its fronts included."""
+        """True if the group and the space before its fronts are free in this frame."""
         spot = GroupCandidates(np.array([x]), np.array([y]), np.array([turns]), np.zeros(1))
         return bool(self.free(group, spot)[0])
 
     def free(self, group: FurnitureGroup, options: GroupCandidates) -> BoolArray:
-        """Which candidates stand free of everything, with their fronts free too; shape (n,)."""
-        free = self._looks_free(group, options)
+        """Mark the candidates that are free, with free space before their fronts; shape (n,)."""
+        free = self._inside(group, options)
         rows = np.flatnonzero(free)
         free[rows] = self._is_free(group, options.take(rows))
         return free
 
-    def _free(self, group: FurnitureGroup, options: GroupCandidates) -> Iterator[int]:
-        """Numbers of the free candidates in their order, checked a few at a time."""
-        rows = np.flatnonzero(self._looks_free(group, options))
-        for start in range(0, len(rows), _CHUNK):
-            chunk = rows[start : start + _CHUNK]
-            yield from (int(row) for row in chunk[self._is_free(group, options.take(chunk))])
-
-    def _looks_free(self, group: FurnitureGroup, options: GroupCandidates) -> BoolArray:
-        """Candidates inside the room that the quick look does not rule out."""
+    def _inside(self, group: FurnitureGroup, options: GroupCandidates) -> BoolArray:
+        """Mark the candidates that lie within the room; shape (n,)."""
         (x0, y0), (x1, y1) = self.space.room.low_m, self.space.room.high_m
         gap = WALL_GAP_M - 1e-6 + group.clear_m
         free = np.ones(len(options), dtype=bool)
@@ -120,11 +115,11 @@ class RoomSolver:
             for boxes in _boxes(member, options):
                 free &= (boxes[:, 0] >= x0 + gap) & (boxes[:, 1] >= y0 + gap)
                 free &= (boxes[:, 3] <= x1 - gap) & (boxes[:, 4] <= y1 - gap)
-                free &= ~self.space.surely_barred(boxes, hung=_hangs(member))
+
             front = _front(member, options)
             if front is not None:
                 free &= (front[:, 0] >= x0) & (front[:, 1] >= y0) & (front[:, 3] <= x1) & (front[:, 4] <= y1)
-                free &= ~self.space.surely_collides(front)
+
         return free
 
     def _is_free(self, group: FurnitureGroup, options: GroupCandidates) -> BoolArray:
@@ -160,12 +155,12 @@ class RoomSolver:
 
 
 def _hangs(member: Member) -> bool:
-    """Whether it is a flat thing on a wall, which takes no floor before what stands opposite."""
+    """True for flat objects on a wall: they take no floor away."""
     return member.piece.role is FurnitureRole.WALL and member.piece.size_m[0] <= _FLAT_M
 
 
 def _access(items: Sequence[Placed]) -> tuple[list[Target], list[Box], list[Box]]:
-    """Where the robot must be able to stand for these pieces, what their doors need to open, floor that stays free."""
+    """Return the targets of these pieces, the zones in which their doors swing, and the fronts where nothing may stand."""
     targets: list[Target] = []
     zones: list[Box] = []
     fronts: list[Box] = []
@@ -175,7 +170,7 @@ def _access(items: Sequence[Placed]) -> tuple[list[Target], list[Box], list[Box]
             continue
         x0, y0, _, x1, y1, _ = item.box
         if kind in (Access.BESIDE, Access.HUNG):
-            # A little less than the reach: the grid is coarse, and what is served may lie further in.
+            # Less than the full reach: the grid is coarse, and objects may lie further in.
             wide = ROBOT.reach_m - 0.15
             targets.append(Target((x0 - wide, y0 - wide, x1 + wide, y1 + wide)))
             if kind is Access.BESIDE:
@@ -193,7 +188,7 @@ def _access(items: Sequence[Placed]) -> tuple[list[Target], list[Box], list[Box]
 
 
 def _before(box: Box, ax: int, ay: int, near: float, far: float) -> tuple[float, float, float, float]:
-    """The strip from ``near`` to ``far`` metres before the face of the box that looks along (ax, ay)."""
+    """Return the strip from ``near`` to ``far`` metres before the face of the box that looks along (ax, ay)."""
     x0, y0, _, x1, y1, _ = box
     if ax:
         a, b = (x1 + near, x1 + far) if ax > 0 else (x0 - far, x0 - near)
@@ -207,17 +202,17 @@ def _yaw(turns: int) -> float:
 
 
 def _on_brackets(piece: FurniturePiece, host: int) -> bool:
-    """Whether it is a worktop on brackets, with room for knees under it rather than for other furniture."""
+    """True for a worktop on brackets: the space below it is for knees, not for furniture."""
     return piece.role is FurnitureRole.COUNTERTOP and host < 0
 
 
 def _with_knee_room(item: Placed, box: Box) -> Box:
-    """The box down to the floor, where nothing shall stand under the piece."""
+    """Return the box of a piece, extended down to the floor if nothing may stand under it."""
     return (*box[:2], 0.0, *box[3:]) if _on_brackets(item.piece, item.host) else box
 
 
 def _seen(member: Member, boxes: FloatArray) -> FloatArray:
-    """The boxes with the space over a rug that keeps it in sight."""
+    """Return the boxes; those of a rug include the space over it that stays free."""
     if member.piece.role is not FurnitureRole.RUG:
         return boxes
     return np.concatenate([boxes[:, :5], np.maximum(boxes[:, 5:], _RUG_SEEN_M)], axis=1)
@@ -228,7 +223,7 @@ def _grown(boxes: FloatArray, by_m: float) -> FloatArray:
 
 
 def _boxes(member: Member, options: GroupCandidates) -> Iterator[FloatArray]:
-    """World boxes of the member's blocks for every candidate, each (n, 6)."""
+    """Yield the world boxes of each of the member's blocks for every candidate, shape (n, 6)."""
     x, y, yaw = _frames(member, options)
     for x0, y0, z0, x1, y1, z1 in member.piece.blocks:
         low = 0.0 if _on_brackets(member.piece, member.on) else member.bottom + z0
@@ -236,7 +231,7 @@ def _boxes(member: Member, options: GroupCandidates) -> Iterator[FloatArray]:
 
 
 def _front(member: Member, options: GroupCandidates) -> FloatArray | None:
-    """Free space that the member needs before it for every candidate, (n, 6); None when it needs none."""
+    """Return the free space that the member needs before it for every candidate, (n, 6); None if it needs none."""
     kind = access_of(member.piece)
     if kind not in (Access.FRONT, Access.HUNG):
         return None
@@ -261,7 +256,7 @@ def _turned(
     flat: tuple[float, float, float, float],
     span: tuple[float, float],
 ) -> FloatArray:
-    """The rectangle (x0, y0, x1, y1) of a piece's frame as boxes in the world, (n, 6)."""
+    """Return a rectangle (x0, y0, x1, y1) in the piece's frame as boxes in the world, (n, 6)."""
     x0, y0, x1, y1 = flat
     corners = np.array([(x0, y0, x1, y1), (-y1, x0, -y0, x1), (-x1, -y1, -x0, -y0), (y0, -x1, y1, -x0)])[yaw]
     full = np.ones(len(x))
@@ -269,3 +264,99 @@ def _turned(
     return np.stack(
         [x + corners[:, 0], y + corners[:, 1], low, x + corners[:, 2], y + corners[:, 3], high], axis=1
     )
+
+
+_MARGINS_M: Final = ((0.75, 0.75), (0.75, 0.05), (0.05, 0.75), (0.05, 0.05))
+"""Free floor along the walls in x and y: a passage around the rows, or none."""
+_SPARE: Final = 0.04
+"""Cost of a superfluous lattice node, as a share of the cost of a group without a place."""
+_LATTICES: Final = 4
+"""Lattices tried for each heading and margin, those closest to the room's shape first."""
+
+
+def lay_rows(solver: RoomSolver, rows: Rows, wobble: float, rng: np.random.Generator) -> list[FurnitureGroup]:
+    """Place the groups on the lattice with room for most of them. Return the groups without a place."""
+    unit = _unit(rows.groups)
+    best: tuple[float, GroupCandidates] | None = None
+    for turns in range(4):
+        for lattice in _lattices(solver, unit, rows, turns):
+            nodes = GroupCandidates(
+                lattice[:, 0], lattice[:, 1], np.full(len(lattice), turns), np.zeros(len(lattice))
+            )
+            free = nodes.take(np.flatnonzero(_all_free(solver, rows, nodes)))
+            score = (
+                min(len(free), len(rows.groups)) - _SPARE * len(nodes) + wobble * float(rng.uniform(0.0, 0.5))
+            )
+            if best is None or score > best[0]:
+                best = (score, free)
+    if best is None:
+        return list(rows.groups)
+    return _fill(solver, rows.groups, best[1])
+
+
+def _fill(
+    solver: RoomSolver, groups: Sequence[FurnitureGroup], nodes: GroupCandidates
+) -> list[FurnitureGroup]:
+    left = list(groups)
+    for index in range(len(nodes)):
+        if not left:
+            break
+        spot = float(nodes.x[index]), float(nodes.y[index]), int(nodes.turns[index])
+        if solver.is_free_at(left[0], *spot) and solver.place_at(left[0], *spot):
+            left.pop(0)
+    return left
+
+
+def _all_free(
+    solver: RoomSolver, rows: Rows, nodes: GroupCandidates
+) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Mark the nodes where the largest group is free: every other group fits there too."""
+    largest = max(rows.groups, key=lambda g: len(g.members))
+    return solver.free(replace(largest, clear_m=rows.clear_m), nodes)
+
+
+def _unit(groups: Sequence[FurnitureGroup]) -> Rect4:
+    """Return bounds that hold each of the groups in its own frame."""
+    bounds = np.array([g.bounds for g in groups])
+    low, high = bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)
+    return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+
+
+def _lattices(solver: RoomSolver, unit: Rect4, rows: Rows, turns: int) -> Iterator[FloatArray]:
+    """Yield lattices of group frames in the middle of the room, nodes of the first row first; each (n, 2)."""
+    x0, y0, x1, y1 = unit
+    room = solver.space.room
+    size, gap = np.array([x1 - x0, y1 - y0]), np.array(rows.gap_m)
+    middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
+    if turns % 2:
+        size, gap = size[::-1], gap[::-1]
+    c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[turns]
+    offset = np.array([c * middle[0] - s * middle[1], s * middle[0] + c * middle[1]])
+    for margin in _MARGINS_M:
+        space = np.asarray(room.size_m) - 2 * np.array(margin)
+        most = np.floor((space + gap + 1e-9) / (size + gap)).astype(int)
+        if min(most) < 1:
+            continue
+        for nx, ny in _counts(len(rows.groups), int(most[0]), int(most[1])):
+            number = np.array([nx, ny])
+            pitch = size + gap
+            free = np.where(number > 1, (space - size) / np.maximum(1, number - 1), pitch)
+            pitch = np.clip(free, pitch, rows.stretch * pitch)
+            start = np.asarray(room.center_m) - pitch * (number - 1) / 2
+            gx, gy = np.meshgrid(
+                start[0] + pitch[0] * np.arange(nx), start[1] + pitch[1] * np.arange(ny), indexing="ij"
+            )
+            nodes = np.stack([gx.ravel(), gy.ravel()], axis=1) - offset
+            ahead = nodes @ np.array([c, s])
+            yield nodes[np.argsort(-ahead.round(3), kind="stable")]
+
+
+def _counts(wanted: int, most_x: int, most_y: int) -> list[tuple[int, int]]:
+    """Return (columns, rows) with enough nodes, those shaped like the room and without waste first; the full floor last."""
+    found = []
+    for nx in range(1, most_x + 1):
+        ny = min(most_y, -(-wanted // nx))
+        if nx * ny >= wanted:
+            found.append((nx, ny))
+    found.sort(key=lambda n: (n[0] * n[1] - wanted) / wanted + abs(n[0] / most_x - n[1] / most_y))
+    return [*found[:_LATTICES], (most_x, most_y)]

@@ -1,4 +1,4 @@
-"""A room while it is being furnished: solids, keep-out zones and the floor that the robot can still reach."""
+"""Occupancy of a room while it is furnished: solids, zones that stay free, and the floor that the robot can reach."""
 
 from __future__ import annotations
 
@@ -8,72 +8,96 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from embomatrix.factory.floorplan.walls import WALL_M
-from embomatrix.factory.furnish.boxes import BoxStack, Planes
 from embomatrix.skills.limits import ROBOT
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
-    from numpy.typing import NDArray
-
-    from embomatrix.factory.furnish.boxes import BoolArray, Box, FloatArray
     from embomatrix.world.scene import Doorway, Room, Window
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+Box = tuple[float, float, float, float, float, float]
+"""(x0, y0, z0, x1, y1, z1) in the world frame, in metres."""
 
 CELL_M: Final = 0.05
 DOOR_CLEAR_M: Final = 0.8
 DOOR_HEIGHT_M: Final = 2.1
 WINDOW_CLEAR_M: Final = 0.5
 WINDOW_FROM_M: Final = 0.9
-"""What is no higher than this may stand before a window, however low its sill: a sofa, a desk, a counter."""
+"""Lower furniture may stand before a window, however low its sill: a sofa, a desk, a counter."""
 LOW_M: Final = 0.03
-"""What is no higher than this is floor to the robot: a rug."""
+"""The robot drives over objects up to this height: rugs."""
+TOUCH_M: Final = 1e-4
+"""Boxes that overlap by less than this along an axis only touch."""
 _MARGIN_M: Final = 0.3
 _BASE_CLEAR_M: Final = ROBOT.radius_m + 0.01
 _HALF: Final = CELL_M / 2
 _KEEP_CELLS: Final = (_BASE_CLEAR_M + _HALF) / CELL_M
-"""The base stands nowhere closer than this many cells to a cell that something touches."""
+"""The centre of the base keeps this many cells away from each occupied cell."""
 _RING: Final = math.ceil(_KEEP_CELLS)
 _AROUND: Final = 2
 _ISLAND_CELLS: Final = round(0.5 / CELL_M**2)
-"""Half a square metre: more floor that the base fits on is not cut off from the doorways."""
+"""Unreachable floor that is tolerated: 0.5 m²."""
 
 _Cell = tuple[int, int]
 _Cells = tuple[int, int, int, int]
-"""(i0, i1, j0, j1): a window of cells."""
+"""(i0, i1, j0, j1): a rectangle of cells."""
+
+
+class BoxStack:
+    """Growing list of axis-aligned boxes. ``rows`` has shape (n, 6), in the order in which boxes were added."""
+
+    def __init__(self, boxes: Iterable[Box] = ()) -> None:
+        self.rows: FloatArray = np.array([*boxes], dtype=np.float64).reshape(-1, 6)
+
+    def extend(self, boxes: Iterable[Box]) -> None:
+        self.rows = np.concatenate([self.rows, np.array([*boxes], dtype=np.float64).reshape(-1, 6)])
+
+    def meets(self, boxes: FloatArray) -> BoolArray:
+        """Mark the candidates that overlap a box of the stack. boxes: (n, 6); result: (n,)."""
+        if not len(self.rows) or not len(boxes):
+            return np.zeros(len(boxes), dtype=bool)
+        low, high = boxes[:, :3].min(axis=0), boxes[:, 3:].max(axis=0)
+        rest = self.rows[~np.any((self.rows[:, 3:] <= low) | (self.rows[:, :3] >= high), axis=1)]
+        meets = np.ones((len(boxes), len(rest)), dtype=bool)
+        for axis in range(3):
+            meets &= boxes[:, None, axis] < rest[None, :, axis + 3] - TOUCH_M
+            meets &= rest[None, :, axis] < boxes[:, None, axis + 3] - TOUCH_M
+        return np.asarray(meets.any(axis=1))
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A strip of floor, (x0, y0, x1, y1), that must hold a spot where the robot can stand."""
+    """Strip of floor (x0, y0, x1, y1) that must keep a cell where the robot can stand."""
 
     strip: tuple[float, float, float, float]
 
 
 class RoomSpace:
-    """Occupancy of one room. Boxes are axis-aligned: everything on the floor stands at quarter turns.
+    """Occupancy of one room by axis-aligned boxes: furniture on the floor stands at quarter turns.
 
-    The floor that the robot can reach is kept up to date box by box: a new one changes only the cells around it.
+    The reachable floor is updated box by box: a new box changes only the cells around it.
     """
 
     def __init__(self, room: Room, doorways: Sequence[Doorway], windows: Sequence[Window] = ()) -> None:
         self.room = room
         self.doorways = tuple(d for d in doorways if room.name in d.rooms)
-        self.solids = BoxStack()
-        self.zones = BoxStack([self._door_zone(d) for d in self.doorways])
         self.windows = tuple(w for w in windows if room.name in w.rooms)
-        self.zones.extend([self._window_zone(w) for w in self.windows])
+        self.solids = BoxStack()
+        self.zones = BoxStack(
+            [*(self._door_zone(d) for d in self.doorways), *(self._window_zone(w) for w in self.windows)]
+        )
+        self.fronts = BoxStack()
         self._origin, self._shape = _grid_of(room)
         self._targets: list[_Cells] = []
         stand, reach, self._doors = _bare_floor(room, self.doorways)
         self._stand, self._reach = stand.copy(), reach.copy()
         self._joined = bool(self._doors) and all(reach[cell] for cell in self._doors)
-        self.fronts = BoxStack()
-        self._planes = Planes(room.low_m, room.high_m, (self.solids, self.zones, self.fronts))
-        self._hung_planes = Planes(room.low_m, room.high_m, (self.solids, self.zones))
-        self._solid_planes = Planes(room.low_m, room.high_m, (self.solids,))
 
     def occupy(
         self,
@@ -82,9 +106,9 @@ class RoomSpace:
         fronts: Sequence[Box] = (),
         targets: Sequence[Target] = (),
     ) -> None:
-        """Stand something in the room: its boxes, space that stays free for it, floor before it, spots to be reached.
+        """Add furniture: its boxes, the space it needs free, and the floor from which the robot uses it.
 
-        In ``zones`` nothing may be, for doors open there; in ``fronts`` nothing may stand.
+        Nothing may be in ``zones``, where doors swing. Nothing may stand in ``fronts``. Each target keeps a reachable cell.
         """
         self._stand, self._reach = self._after(boxes)
         self.solids.extend(boxes)
@@ -93,27 +117,19 @@ class RoomSpace:
         self._targets += [self._cells_of(t) for t in targets]
 
     def collides(self, boxes: FloatArray) -> BoolArray:
-        """Which candidates meet a solid. boxes: (n, 6); result: (n,)."""
+        """Mark the candidates that overlap a solid. boxes: (n, 6); result: (n,)."""
         return self.solids.meets(boxes)
 
     def blocks_zone(self, boxes: FloatArray) -> BoolArray:
-        """Which candidates would stand in a zone or front that must stay free. boxes: (n, 6); result: (n,)."""
+        """Mark the candidates that would stand in a zone or front that must stay free. boxes: (n, 6); result: (n,)."""
         return self.zones.meets(boxes) | self.fronts.meets(boxes)
 
     def hangs_in_zone(self, boxes: FloatArray) -> BoolArray:
-        """Which candidates would hang in a zone that must stay free. boxes: (n, 6); result: (n,)."""
+        """Mark the candidates that would hang in a zone that must stay free. boxes: (n, 6); result: (n,)."""
         return self.zones.meets(boxes)
 
-    def surely_barred(self, boxes: FloatArray, *, hung: bool) -> BoolArray:
-        """A quick look: candidates that certainly meet a solid or a zone. boxes: (n, 6), all of one height; result: (n,)."""
-        return (self._hung_planes if hung else self._planes).meets(boxes)
-
-    def surely_collides(self, boxes: FloatArray) -> BoolArray:
-        """A quick look: candidates that certainly meet a solid. boxes: (n, 6), all of one height; result: (n,)."""
-        return self._solid_planes.meets(boxes)
-
     def reachable(self, extra: Sequence[Box] = (), targets: Sequence[Target] = ()) -> bool:
-        """True when, with the extra solids in place, doorways, targets and nearly all floor share one stretch of free floor."""
+        """True if doorways, targets and nearly all floor stay connected with the extra solids in place."""
         if not self._joined:
             return False
         stand, reach = self._after(extra)
@@ -126,7 +142,7 @@ class RoomSpace:
         lost = self._window_of(extra)
         if lost is None or reach is self._reach:
             return True
-        # Cells outside the window change only where an island was cut off, which the count shows.
+        # Cells outside the window change only if an island was cut off, which the count shows.
         i0, i1, j0, j1 = lost
         inside = self._reach[i0:i1, j0:j1].sum() - reach[i0:i1, j0:j1].sum()
         everywhere = int(self._reach.sum()) != int(reach.sum()) + int(inside)
@@ -134,13 +150,13 @@ class RoomSpace:
         return all(reach[a:b, c:d].any() for a, b, c, d in near)
 
     def free_cells(self) -> FloatArray:
-        """Centres of the cells where the robot's base can stand, connected to the doorways; shape (n, 2)."""
+        """Return the centres of the cells of this room that the robot's base can reach from a doorway, shape (n, 2)."""
         cells = self._origin + (np.argwhere(self._reach) + 0.5) * CELL_M
         inside = np.all((cells > self.room.low_m) & (cells < self.room.high_m), axis=1)
         return np.asarray(cells[inside])
 
     def inward(self, opening: Doorway | Window) -> tuple[float, float]:
-        """Unit vector from a doorway or window into this room."""
+        """Return the unit vector from a doorway or window into this room."""
         if opening.along == "x":
             return (0.0, 1.0 if self.room.center_m[1] > opening.center_m[1] else -1.0)
         return (1.0 if self.room.center_m[0] > opening.center_m[0] else -1.0, 0.0)
@@ -148,17 +164,17 @@ class RoomSpace:
     # Floor
 
     def _after(self, extra: Sequence[Box]) -> tuple[BoolArray, BoolArray]:
-        """Where the base can stand, and where of that it can get, with the extra boxes in the room."""
+        """Return the cells where the base can stand, and those it can reach, with the extra boxes in the room."""
         window = self._window_of(extra)
         if window is None:
             return self._stand, self._reach
         i0, i1, j0, j1 = window
         lost = np.zeros((i1 - i0, j1 - j0), dtype=bool)
         for box in extra:
-            if _bars(box):
+            if _blocks_robot(box):
                 a, b, c, d = self._touched(box)
-                di = _away(np.arange(i0, i1), a, b)
-                dj = _away(np.arange(j0, j1), c, d)
+                di = _cells_outside(np.arange(i0, i1), a, b)
+                dj = _cells_outside(np.arange(j0, j1), c, d)
                 lost |= di[:, None] ** 2 + dj[None, :] ** 2 < _KEEP_CELLS**2
         stand = self._stand.copy()
         stand[i0:i1, j0:j1] &= ~lost
@@ -171,7 +187,7 @@ class RoomSpace:
         return stand, reach
 
     def _still_joined(self, reach: BoolArray, window: _Cells) -> bool:
-        """Whether what is left around the window hangs together there: then it does so everywhere."""
+        """True if the cells around the window are connected: then the whole floor still is."""
         i0, i1, j0, j1 = window
         near = reach[max(0, i0 - _AROUND) : i1 + _AROUND, max(0, j0 - _AROUND) : j1 + _AROUND]
         return bool(ndimage.label(near)[1] == 1)
@@ -181,12 +197,12 @@ class RoomSpace:
         return bool(reach[i0:i1, j0:j1].any())
 
     def _cells_of(self, target: Target) -> _Cells:
-        """Cells whose centres lie in the strip."""
+        """Return the cells with their centres in the strip."""
         x0, y0, x1, y1 = target.strip
         return self._cells((x0, x1), (y0, y1))
 
     def _touched(self, box: Box) -> _Cells:
-        """Every cell that the box touches, so that no other grid over the same room finds less floor."""
+        """Return every cell that the box touches, so that no other grid over this room has less floor."""
         return self._cells((box[0] - _HALF, box[3] + _HALF), (box[1] - _HALF, box[4] + _HALF))
 
     def _cells(self, x: tuple[float, float], y: tuple[float, float]) -> _Cells:
@@ -196,8 +212,8 @@ class RoomSpace:
         return (min(max(i0, 0), nx), min(max(i1, 0), nx), min(max(j0, 0), ny), min(max(j1, 0), ny))
 
     def _window_of(self, boxes: Sequence[Box]) -> _Cells | None:
-        """Cells that the boxes take from the robot; None when they bar nothing."""
-        spans = [self._touched(box) for box in boxes if _bars(box)]
+        """Return the cells that the boxes can take from the robot; None if no box blocks it."""
+        spans = [self._touched(box) for box in boxes if _blocks_robot(box)]
         if not spans:
             return None
         i0, i1 = min(s[0] for s in spans) - _RING, max(s[1] for s in spans) + _RING
@@ -208,20 +224,17 @@ class RoomSpace:
     # Zones
 
     def _door_zone(self, doorway: Doorway) -> Box:
-        """Floor that stays free inside the room before a doorway."""
-        depth = min(DOOR_CLEAR_M, 0.7 * min(self.room.size_m))
-        x0, y0, x1, y1 = self._before(doorway, depth)
+        x0, y0, x1, y1 = self._before(doorway, DOOR_CLEAR_M)
         return (x0, y0, 0.0, x1, y1, DOOR_HEIGHT_M)
 
     def _window_zone(self, window: Window) -> Box:
-        """Space that stays free inside the room before a window."""
-        x0, y0, x1, y1 = self._before(window, min(WINDOW_CLEAR_M, 0.7 * min(self.room.size_m)))
+        x0, y0, x1, y1 = self._before(window, WINDOW_CLEAR_M)
         return (x0, y0, max(window.sill_m, WINDOW_FROM_M), x1, y1, window.head_m)
 
-    def _before(self, opening: Doorway | Window, depth_m: float) -> tuple[float, float, float, float]:
-        """The strip (x0, y0, x1, y1) of this depth before an opening, from the middle of its wall."""
+    def _before(self, opening: Doorway | Window, clear_m: float) -> tuple[float, float, float, float]:
+        """Return the strip (x0, y0, x1, y1) that stays free before an opening, from the middle of its wall."""
         x, y = opening.center_m
-        half, far = opening.width_m / 2, depth_m + WALL_M / 2
+        half, far = opening.width_m / 2, min(clear_m, 0.7 * min(self.room.size_m)) + WALL_M / 2
         nx, ny = self.inward(opening)
         if opening.along == "x":
             return (x - half, min(y, y + far * ny), x + half, max(y, y + far * ny))
@@ -229,7 +242,7 @@ class RoomSpace:
 
 
 def _grid_of(room: Room) -> tuple[FloatArray, tuple[int, int]]:
-    """Corner of the room's grid and its cells along x and y."""
+    """Return the corner of the room's grid and its number of cells along x and y."""
     origin = np.asarray(room.low_m) - _MARGIN_M
     cells = np.ceil((np.asarray(room.size_m) + 2 * _MARGIN_M) / CELL_M).astype(int)
     return origin, (int(cells[0]), int(cells[1]))
@@ -237,9 +250,9 @@ def _grid_of(room: Room) -> tuple[FloatArray, tuple[int, int]]:
 
 @functools.lru_cache(maxsize=64)
 def _bare_floor(room: Room, doorways: tuple[Doorway, ...]) -> tuple[BoolArray, BoolArray, tuple[_Cell, ...]]:
-    """Where the base can stand in the empty room, where of that it gets from the doorways, and a cell before each of them.
+    """Return the cells of the empty room where the base can stand, those it can reach, and a cell before each doorway.
 
-    A doorway with no floor before it that the base fits on has no cell: then there are no cells at all.
+    The tuple of cells is empty if the base fits nowhere before one of the doorways.
     """
     origin, shape = _grid_of(room)
     x, y = (origin[axis] + (np.arange(shape[axis]) + 0.5) * CELL_M for axis in (0, 1))
@@ -260,7 +273,7 @@ def _bare_floor(room: Room, doorways: tuple[Doorway, ...]) -> tuple[BoolArray, B
 
 
 def _before_door(stand: BoolArray, origin: FloatArray, room: Room, door: Doorway) -> _Cell | None:
-    """The standable cell nearest to half a metre inside the doorway, no further off than another half."""
+    """Return the free cell nearest to a point 0.5 m inside the doorway, None if it is 0.5 m or more away."""
     cells = np.argwhere(stand)
     if not len(cells):
         return None
@@ -274,20 +287,19 @@ def _before_door(stand: BoolArray, origin: FloatArray, room: Room, door: Doorway
 
 
 def _component(free: BoolArray, seeds: Sequence[_Cell]) -> BoolArray:
-    """The connected part of the free cells that holds the first seed; empty without one."""
+    """Return the connected part of the free cells that holds the first seed; empty without a seed."""
     if not seeds or not free[seeds[0]]:
         return np.zeros_like(free)
     labels: NDArray[np.int32] = ndimage.label(free)[0]
     return np.asarray(labels == labels[seeds[0]])
 
 
-def _bars(box: Box) -> bool:
-    """Whether the robot has to go around the box."""
+def _blocks_robot(box: Box) -> bool:
     return box[2] < ROBOT.height_m and box[5] > LOW_M
 
 
-def _away(cells: NDArray[np.int64], first: int, end: int) -> NDArray[np.int64]:
-    """How many cells each one lies before the first or after the last cell of a span."""
+def _cells_outside(cells: NDArray[np.int64], first: int, end: int) -> NDArray[np.int64]:
+    """Return the distance of each cell to the span from ``first`` to ``end`` (exclusive), in cells; 0 inside."""
     return np.asarray(np.maximum(np.maximum(first - cells, cells - (end - 1)), 0))
 
 

@@ -1,4 +1,4 @@
-"""Small things: free places on the surfaces and in the cavities of furniture that stands already."""
+"""Placement of small objects: free places on the surfaces and in the cavities of placed furniture."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.furnish.boxes import BoxStack
 from embomatrix.factory.furnish.hosts import NO_HOSTS, hosts_of, kept_behind_doors
 from embomatrix.factory.furnish.pieces import REST_GAP_M, Placed
 from embomatrix.factory.furnish.roles import FurnitureRole
+from embomatrix.factory.furnish.space import BoxStack
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
@@ -27,19 +27,19 @@ if TYPE_CHECKING:
 _EDGE_M: Final = 0.01
 _SAMPLES: Final = 60
 _SPACING_M: Final = np.array([0.01, 0.01, 0.0])
-"""Free space to other things along each axis."""
+"""Free space to other objects along each axis."""
 _HIGHEST_M: Final = 1.75
 _TALL_M: Final = 1.3
-"""The top of a higher cabinet is no place to put things down, its boards are."""
+"""Cabinets higher than this hold objects on their boards, not on their top."""
 _HEAD_SHARE: Final = 0.3
-"""Pillows keep to this share of a bed's free length, at its head."""
+"""Share of a bed's free length, at its head, on which pillows lie."""
 _SAME_KIND: Final = 2.0
-"""Equal things stand together: a surface that holds one already goes this many ranks before others."""
+"""Ranks by which a surface is preferred if it already holds an object of the same category."""
 
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """A support surface in the world: axis-aligned, ``host`` is the number of the piece that owns it."""
+    """Axis-aligned support surface in the world. ``host`` is the index of its piece; ``shut`` means behind a door."""
 
     host: int
     name: str
@@ -54,7 +54,7 @@ class Surface:
 
 
 def surfaces_of(placed: Placed, number: int) -> list[Surface]:
-    """The support surfaces of a placed piece at a quarter turn."""
+    """Return the support surfaces of a piece placed at a quarter turn."""
     found = []
     turned = abs(math.sin(placed.yaw)) > 0.5
     asset = placed.piece.asset
@@ -69,7 +69,7 @@ def surfaces_of(placed: Placed, number: int) -> list[Surface]:
 
 
 class SurfacePlacer:
-    """Sets small things on surfaces, none closer than a centimetre to another."""
+    """Places small objects on surfaces, at least 1 cm apart."""
 
     def __init__(self, placed: list[Placed], rng: np.random.Generator) -> None:
         self.placed = placed
@@ -82,7 +82,7 @@ class SurfacePlacer:
         self._holds: set[tuple[str, int, str]] = set()
 
     def place(self, piece: FurniturePiece, rooms: Sequence[str]) -> bool:
-        """Set the piece on the best surface with room, in the first of the rooms that has one. False when none has."""
+        """Place the piece on the best free surface of the first room that has one; False if none has."""
         for room in rooms:
             for surface in self._ranked(piece, room):
                 if self._set_on(piece, surface):
@@ -109,7 +109,7 @@ class SurfacePlacer:
         ]
 
     def _ranked(self, piece: FurniturePiece, room: str) -> list[Surface]:
-        """Surfaces of the room in the order of preference: the listed hosts, then any other in the open."""
+        """Return the surfaces of a room in order of preference: listed hosts first, then any other open surface."""
         wanted = {host: rank for rank, host in enumerate(hosts_of(piece.category))}
         surfaces = self._surfaces[room]
         noise = self._rng.uniform(0.0, 0.8, len(surfaces))
@@ -129,11 +129,11 @@ class SurfacePlacer:
         return [s for _, s in sorted(ranked, key=lambda item: item[0])]
 
     def _set_on(self, piece: FurniturePiece, surface: Surface) -> bool:
-        """Try sampled spots on the surface and take the first that is free."""
+        """Sample places on the surface and use the first free one; False if none is free."""
         if piece.size_m[2] + 0.01 > surface.clearance_m:
             return False
         host = self.placed[surface.host]
-        # Screens and machines look where their host looks; loose things lie as they were put down.
+        # Screens and machines get their host's heading; loose objects get a random one.
         square = max(piece.size_m[:2]) > 0.3 or bool(hosts_of(piece.category) and piece.asset.joints)
         turn = np.zeros(_SAMPLES) if square else self._rng.uniform(-0.6, 0.6, _SAMPLES)
         x, y, half, fits = self._spots(piece, surface, host, host.yaw + turn)
@@ -165,7 +165,7 @@ class SurfacePlacer:
     def _spots(
         self, piece: FurniturePiece, surface: Surface, host: Placed, yaw: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-        """Random middles on the surface, the half extents there (n, 2), and which of them keep to its edges."""
+        """Return random centres on the surface, the half extents there (n, 2), and a mask of those within its edges."""
         overhang = 0.2 if piece.category == "standing_tv" else 0.0
         depth, width, _ = piece.size_m
         cos, sin = np.abs(np.cos(yaw)), np.abs(np.sin(yaw))
@@ -180,7 +180,7 @@ class SurfacePlacer:
         return spots[:, 0], spots[:, 1], half, np.asarray(slack.min(axis=1) >= 0)
 
     def _hits(self, low: FloatArray, high: FloatArray, host: int) -> NDArray[np.bool_]:
-        """Which of the boxes, given by corners of shape (n, 3), meet anything but their host and what carries it."""
+        """Mark the boxes, given by corners of shape (n, 3), that meet anything but their host and its supports."""
         boxes = self._boxes.rows
         near = ~np.any(
             (boxes[:, 3:] <= low.min(axis=0) - _SPACING_M) | (boxes[:, :3] >= high.max(axis=0) + _SPACING_M),
@@ -202,7 +202,7 @@ class SurfacePlacer:
 
 
 def _to_head(shares: FloatArray, yaw: float) -> None:
-    """Move places on a bed, (n, 2) in shares of its free length and width from its middle, to its head: its back."""
+    """Move the first half of the places on a bed to its head. shares: (n, 2) of its free length and width."""
     axis = int(abs(math.sin(yaw)) > 0.5)
     back = -math.copysign(0.5, (math.cos(yaw), math.sin(yaw))[axis])
     shares[: len(shares) // 2, axis] = back + _HEAD_SHARE * (shares[: len(shares) // 2, axis] - back)

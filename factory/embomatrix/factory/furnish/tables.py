@@ -1,4 +1,4 @@
-"""Tables with their seats: dining sets, workplaces, rows that look at a board, booths and bars."""
+"""Groups of tables and seats: dining sets, workplaces, rows that face a board, booths and bars."""
 
 from __future__ import annotations
 
@@ -13,43 +13,42 @@ from embomatrix.factory.furnish.pieces import (
     before_table,
     seats_around,
     top_of,
+    worth,
 )
-from embomatrix.factory.furnish.pool import worth
 from embomatrix.factory.furnish.roles import FurnitureRole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from embomatrix.factory.furnish.pieces import FurniturePiece
-    from embomatrix.factory.furnish.pool import Pool
+    from embomatrix.factory.furnish.pieces import FurniturePiece, Pool
 
 STOOLS: Final = ("music_stool", "taboret")
 _KNEE_M: Final = 0.05
 _STOOL_GAP_M: Final = 0.12
 _DINING_TOP_M: Final = 0.62
-"""A higher coffee table is one to eat at."""
+"""Height from which a coffee table serves for eating."""
 _HIGH_TABLE_M: Final = 0.85
 _EATING: Final = frozenset(
     ("dining_room", "conference_hall", "break_room", "bar", "lobby", "garden", "meeting_room")
 )
-"""Rooms where an armchair, too, is a seat at a table when there are tables without chairs."""
+"""Rooms in which armchairs also serve as seats at tables that lack chairs."""
 _FACING: Final = frozenset(("classroom", "computer_lab", "biology_lab", "chemistry_lab", "conference_hall"))
-"""Rooms whose seats all look the same way."""
+"""Rooms in which all seats face one way."""
 _WORK: Final = ("desk", "cubicle")
 ROW_OF: Final = 4
-"""This many equal sets stand in rows."""
+"""Number of equal sets from which they stand in rows."""
 ALIKE: Final = 1.4
 _SET_CLEAR_M: Final = 0.5
 _WALK_M: Final = 0.8
 _ROW_M: Final = 0.3
-"""Floor behind the chairs of a class: one gets there by the aisle beside them."""
+"""Free floor behind the chairs of a class, which are reached by the aisle beside them."""
 _SEAT_M: Final = 0.45
-"""Floor between the chairs of two tables."""
+"""Free floor between the chairs of two tables."""
 _BESIDE_DESK_M: Final = 0.65
 
 
 def work_groups(pool: Pool) -> list[FurnitureGroup | Rows]:
-    """Desks and cubicles with their chairs and drawers."""
+    """Return desks and cubicles with their chairs and drawers."""
     desks = pool.take(pool.of(*_WORK))
     others = [p for p in pool.rest if p.role is FurnitureRole.TABLE]
     swivels = not others or len(pool.of("swivel_chair")) <= 2 * len(desks)
@@ -57,7 +56,7 @@ def work_groups(pool: Pool) -> list[FurnitureGroup | Rows]:
 
 
 def table_groups(pool: Pool) -> list[FurnitureGroup | Rows]:
-    """Everything else that people sit at, with what they sit on; seats that are left over stay in the pool."""
+    """Return all other tables with their seats; spare seats stay in the pool."""
     groups: list[FurnitureGroup] = [*_booths(pool), *_bars(pool)]
     tables = sorted(_tables(pool), key=lambda t: -t.size_m[0] * t.size_m[1])
     found = _in_rows([*groups, *_sets(pool, tables)], pool)
@@ -77,7 +76,7 @@ def _tables(pool: Pool) -> list[FurniturePiece]:
 
 
 def _workplaces(pool: Pool, desks: Sequence[FurniturePiece], *, swivels: bool) -> list[FurnitureGroup]:
-    """A desk at the wall with its chair at the room's side; deep double desks with a chair on either side."""
+    """Return desks at the wall with a chair on the room's side; deep double desks get a chair on either side."""
     kinds = ("swivel_chair",) if swivels else ()
     kinds = (*kinds, "eames_chair", "straight_chair", "armchair" if pool.room_type in _EATING else "taboret")
     count = sum(len(pool.of(kind)) for kind in kinds)
@@ -98,7 +97,7 @@ def _workplaces(pool: Pool, desks: Sequence[FurniturePiece], *, swivels: bool) -
 
 
 def _drawers_beside(desk: FurniturePiece, drawers: Sequence[FurniturePiece]) -> list[Member]:
-    """Low cabinets at the sides of the desk: the first opens to the chair's side, the second to the other."""
+    """Return low cabinets at the sides of a desk: the first opens to the chair's side, the second to the other."""
     found = []
     for drawer, side in zip(drawers, (1, -1), strict=False):
         x = side * (desk.size_m[0] - drawer.size_m[0]) / 2
@@ -108,7 +107,7 @@ def _drawers_beside(desk: FurniturePiece, drawers: Sequence[FurniturePiece]) -> 
 
 
 def _sets(pool: Pool, tables: Sequence[FurniturePiece]) -> list[FurnitureGroup]:
-    """Tables with seats shared out among them, in the middle of the room; those without seats go to a wall."""
+    """Return tables with seats shared among them, in the middle of the room; tables without seats go to a wall."""
     high = [t for t in tables if top_of(t) > _HIGH_TABLE_M]
     stools = pool.of(*STOOLS)
     seats = pool.of("straight_chair", "garden_chair", "eames_chair", "swivel_chair", "rocking_chair")
@@ -126,7 +125,7 @@ def _sets(pool: Pool, tables: Sequence[FurniturePiece]) -> list[FurnitureGroup]:
 def _shared(
     pool: Pool, tables: Sequence[FurniturePiece], seats: list[FurniturePiece], one_side: bool
 ) -> list[FurnitureGroup]:
-    """Seats of one kind to each table, as evenly as they go."""
+    """Share seats among tables as evenly as possible."""
     pool.take(seats)
     groups = []
     for number, table in enumerate(tables):
@@ -144,7 +143,7 @@ def _shared(
 
 
 def _in_rows(groups: Sequence[FurnitureGroup], pool: Pool) -> list[FurnitureGroup | Rows]:
-    """Sets of about one size, four or more, as rows."""
+    """Combine four or more sets of about one size into rows."""
     found: list[FurnitureGroup | Rows] = []
     for equal in _alike(groups):
         if len(equal) < ROW_OF or len(equal[0].members) < 2:
@@ -158,7 +157,7 @@ def _in_rows(groups: Sequence[FurnitureGroup], pool: Pool) -> list[FurnitureGrou
 
 
 def _alike(groups: Sequence[FurnitureGroup]) -> list[list[FurnitureGroup]]:
-    """Groups of one style whose sides differ by less than ALIKE, the larger ones first."""
+    """Collect groups of one style with sides that differ by less than a factor of ALIKE, large ones first."""
     kinds: list[list[FurnitureGroup]] = []
     for group in sorted(groups, key=lambda g: -_side(g)):
         for kind in kinds:
@@ -178,7 +177,7 @@ def _side(group: FurnitureGroup) -> float:
 
 
 def _booths(pool: Pool) -> list[FurnitureGroup]:
-    """A table end-on to the wall, with a bench on either side facing it."""
+    """Return tables end-on to the wall with a bench on either side that faces them."""
     groups = []
     benches = pool.of("bench")
     tables = pool.of("booth")
@@ -197,7 +196,7 @@ def _booths(pool: Pool) -> list[FurnitureGroup]:
 
 
 def _bars(pool: Pool) -> list[FurnitureGroup]:
-    """Bars along a wall with stools before the longest."""
+    """Return bars along a wall with stools, the longest bar first."""
     groups = []
     bars = pool.take(sorted(pool.of("bar"), key=lambda p: -p.size_m[1]))
     for bar in bars:

@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.factory.assets.solids import Solids, placed_parts
 from embomatrix.factory.floorplan.spec import MIN_DOOR_M
 from embomatrix.factory.furnish.pieces import Access
 from embomatrix.factory.scenes.access import unserved
 from embomatrix.factory.scenes.clearance import Clearance
 from embomatrix.factory.scenes.floor import ReachableFloor, box_of
-from embomatrix.factory.scenes.solids import Solids, placed_parts
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.settling import settle_scene
 from embomatrix.sim.engine import FLOOR

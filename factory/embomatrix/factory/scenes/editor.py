@@ -10,12 +10,12 @@ from dataclasses import replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.factory.assets.solids import Solids, placed_parts
 from embomatrix.factory.furnish.roles import is_portable
 from embomatrix.factory.scenes.check import reach_problems
 from embomatrix.factory.scenes.clearance import Clearance
 from embomatrix.factory.scenes.floor import ReachableFloor
 from embomatrix.factory.scenes.joints import with_joints
-from embomatrix.factory.scenes.solids import Solids, placed_parts
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.asset import FLOOR_CATEGORY, Asset, Link, SupportSurface
@@ -173,9 +173,7 @@ class SceneEditor:
         self._objects[name] = replace(self.known(name), fixed=False)
 
     def remove(self, name: str) -> tuple[str, ...]:
-        """Remove an object with all objects on or in it, and return their names. Raise PlacementError for an unknown
-        name.
-        """
+        """Remove an object with all objects on or in it, and return their names. Raise PlacementError for an unknown name."""
         self.known(name)
         gone = {name: None}
         for item in self._objects.values():  # hosts precede the objects on them

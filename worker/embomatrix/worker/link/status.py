@@ -1,4 +1,4 @@
-"""What a daemon does at present, in a file beside its credentials, from which `embomatrix worker status` tells it."""
+"""Status file of a daemon, beside its credentials. `embomatrix worker status` reads it."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 STATUS_S: Final = 1.0
-"""Seconds between two looks."""
+"""Interval between two updates."""
 FOLDER: Final = "running"
-"""Under the folder of credentials."""
+"""Subfolder of the credentials' folder."""
 CLOCK_STEP_S: Final = 60.0
-"""A process that began this much later than the daemon that wrote the file is another one with its number."""
+"""A process that began this much later than the file says is another one with the same process id."""
 
 
 @dataclass(frozen=True, slots=True)
 class WorkerStatus:
-    """One daemon. Times are wall clock; ``connected_since_s`` is 0 while nobody answers."""
+    """Status of one daemon. Times are wall clock; ``connected_since_s`` is 0 without a connection."""
 
     name: str
     pid: int
@@ -60,14 +60,14 @@ class WorkerStatus:
 
 
 class StatusFile:
-    """One daemon's file. A full disk costs the status and nothing else."""
+    """Status file of one daemon. Errors of the disk are logged and otherwise ignored."""
 
     def __init__(self, state_dir: Path, name: str) -> None:
         self._path = state_dir.expanduser() / FOLDER / f"{name}.json"
         self._last: WorkerStatus | None = None
 
     def write(self, status: WorkerStatus) -> None:
-        """Written aside and renamed, when it differs from the last."""
+        """Write the status beside and rename it, if it has changed."""
         if status == self._last:
             return
         part = self._path.with_suffix(".part")
@@ -81,7 +81,7 @@ class StatusFile:
         self._last = status
 
     def remove(self) -> None:
-        """The daemon has left."""
+        """Remove the file after the daemon has left."""
         try:
             self._path.unlink(missing_ok=True)
         except OSError as error:
@@ -89,7 +89,7 @@ class StatusFile:
 
 
 class StatusReport:
-    """Keeps a daemon's file true. What it can look up it looks up; the rest it is told."""
+    """Keeps the file of a daemon up to date: some values are read from its parts, others are reported by it."""
 
     def __init__(
         self,
@@ -117,10 +117,10 @@ class StatusReport:
         self._failed = 0
 
     async def run(self) -> None:
-        """Write until cancelled; then the file goes."""
+        """Write the file until cancelled; then remove it."""
         try:
             while True:
-                self._file.write(self._look_up(await asyncio.to_thread(self._cache.used_mb)))
+                self._file.write(self._current(await asyncio.to_thread(self._cache.used_mb)))
                 await asyncio.sleep(STATUS_S)
         finally:
             self._file.remove()
@@ -132,7 +132,7 @@ class StatusReport:
         self._status = replace(self._status, connected_since_s=0.0)
 
     def paused(self, reason: str) -> None:
-        """An empty reason: it works again."""
+        """Set the reason of a pause; an empty one ends it."""
         self._status = replace(self._status, paused=reason)
 
     def draining(self) -> None:
@@ -144,7 +144,7 @@ class StatusReport:
         else:
             self._failed += 1
 
-    def _look_up(self, cache_used_mb: float) -> WorkerStatus:
+    def _current(self, cache_used_mb: float) -> WorkerStatus:
         running = len(self._pool.progress())
         return replace(
             self._status,
@@ -160,7 +160,7 @@ class StatusReport:
 
 
 def running_daemons(state_dir: Path) -> list[WorkerStatus]:
-    """The daemons of this folder that run, by name; what killed ones left behind is passed over."""
+    """Running daemons of this folder by name; files of killed daemons are ignored."""
     found = []
     for path in sorted((state_dir.expanduser() / FOLDER).glob("*.json")):
         try:
@@ -173,7 +173,7 @@ def running_daemons(state_dir: Path) -> list[WorkerStatus]:
 
 
 def daemon_pids(state_dir: Path) -> set[int]:
-    """Process ids of all daemons of this folder, and of this one."""
+    """Process ids of all daemons of this folder, and of this process."""
     return {os.getpid(), *(status.pid for status in running_daemons(state_dir))}
 
 

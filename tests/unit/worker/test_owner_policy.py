@@ -1,4 +1,4 @@
-"""When a worker pauses: never against a wish, never to and fro."""
+"""Owner policy: pauses follow the preferences and do not toggle."""
 
 import itertools
 
@@ -7,8 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from embomatrix.worker.host.pausing import CALM_SHARE, LOADED_S, WORKING, Observation, judge
-from embomatrix.worker.host.preferences import DAY_MINUTES, Hours, Preferences
+from embomatrix.worker.host.owner_policy import (
+    CALM_SHARE,
+    DAY_MINUTES,
+    LOADED_S,
+    WORKING,
+    Hours,
+    Observation,
+    Preferences,
+    next_pause_state,
+)
 
 WISHES = Preferences(hours="18:00-08:00", idle_s=300, mains_only=True, max_load=0.5, calm_s=30)
 QUIET = Observation(minute=20 * 60, owner_idle_s=1000, on_mains=True, others_load=0.0)
@@ -29,7 +37,7 @@ def standings(history, wishes=WISHES):
     now_s, standing = 100.0, WORKING
     for passed_s, seen in history:
         now_s += passed_s
-        standing = judge(standing, seen, wishes, now_s)
+        standing = next_pause_state(standing, seen, wishes, now_s)
         yield now_s, seen, standing
 
 
@@ -38,7 +46,7 @@ def after(*history):
 
 
 @given(HISTORIES)
-def test_nothing_works_outside_of_its_hours_on_battery_or_while_the_owner_is_active(history):
+def test_worker_pauses_outside_its_hours_on_battery_and_for_its_owner(history):
     for _, seen, standing in standings(history):
         objects = (
             8 * 60 <= seen.minute < 18 * 60
@@ -49,7 +57,7 @@ def test_nothing_works_outside_of_its_hours_on_battery_or_while_the_owner_is_act
 
 
 @given(HISTORIES)
-def test_a_pause_lasts_until_it_has_been_calm_for_long_enough(history):
+def test_pause_lasts_until_the_calm_period_has_passed(history):
     for (_, _, before), (now_s, _, standing) in itertools.pairwise(standings(history)):
         if before.reason and not standing.reason:
             assert before.calm_since_s is not None
@@ -58,12 +66,12 @@ def test_a_pause_lasts_until_it_has_been_calm_for_long_enough(history):
 
 
 @given(HISTORIES)
-def test_a_worker_works_again_once_nothing_speaks_against_it(history):
+def test_worker_resumes_without_a_reason_to_pause(history):
     assert after(*history, (1.0, QUIET), (WISHES.calm_s + 1, QUIET)) == ""
 
 
 @given(HISTORIES)
-def test_whoever_wishes_nothing_never_pauses(history):
+def test_worker_without_preferences_never_pauses(history):
     assert not any(standing.reason for _, _, standing in standings(history, Preferences()))
 
 
@@ -71,13 +79,13 @@ def test_whoever_wishes_nothing_never_pauses(history):
     st.lists(st.tuples(st.floats(0.1, 20), st.floats(0.5 * CALM_SHARE + 1e-6, 0.5)), max_size=40),
     st.booleans(),
 )
-def test_a_load_about_the_limit_changes_nothing(loads, paused):
+def test_load_near_the_limit_does_not_toggle_a_pause(loads, paused):
     history = [(1.0, Observation(1200, 1000, True, 0.9))] * 12 if paused else [(1.0, QUIET)]
     history += [(passed_s, Observation(1200, 1000, True, load)) for passed_s, load in loads]
     assert bool(after(*history)) == paused
 
 
-def test_others_must_stay_busy_before_it_counts():
+def test_only_lasting_load_pauses_a_worker():
     busy = Observation(1200, 1000, True, 0.9)
     assert after((1.0, busy), (LOADED_S - 1, busy)) == ""
     assert after((1.0, busy), (LOADED_S - 1, QUIET), (2.0, busy), (LOADED_S - 1, busy)) == ""
@@ -93,12 +101,12 @@ def test_others_must_stay_busy_before_it_counts():
         (Observation(1200), ""),
     ],
 )
-def test_the_reason_is_said_and_what_cannot_be_seen_is_no_reason(seen, reason):
+def test_unknown_values_are_no_reason_to_pause(seen, reason):
     assert after((1.0, seen)) == reason
 
 
 @given(MINUTES, MINUTES, MINUTES)
-def test_hours_and_the_rest_of_the_day_share_every_minute_between_them(begin, end, minute):
+def test_hours_and_their_complement_cover_every_minute_once(begin, end, minute):
     if begin != end:
         assert Hours(begin, end).has(minute) != Hours(end, begin).has(minute)
 
@@ -106,11 +114,11 @@ def test_hours_and_the_rest_of_the_day_share_every_minute_between_them(begin, en
 @pytest.mark.parametrize(
     "text", ["18-8", "24:00-08:00", "18:00-18:00", "18:60-08:00", "nights", "18:00-08:00 "]
 )
-def test_hours_that_are_none_are_refused(text):
+def test_invalid_hours_are_refused(text):
     with pytest.raises(ValidationError, match=r"HH:MM|all day"):
         Preferences(hours=text)
 
 
-def test_hours_reach_over_midnight():
+def test_hours_may_span_midnight():
     night = Hours.parse("18:00-8:00")
     assert [night.has(hour * 60) for hour in (0, 7, 8, 17, 18, 23)] == [True, True, False, False, True, True]

@@ -1,7 +1,7 @@
-"""Collision of placed assets part by part: separating axes on convex vertex sets, without a physics engine.
+"""Collision test of placed assets by separating axes on convex vertex sets, without a physics engine.
 
-Boxes are exact at any yaw; cylinders are prisms of 32 sides. Axes that only edges of tilted parts would give are left out, so a
-reported depth may be too large for tilted parts and is never too small.
+Boxes are exact at any yaw; cylinders are prisms of 32 sides. Edge-edge axes are not tested, so the depth reported for tilted
+parts may be too large, but never too small.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _ORIGIN: Final = Pose((0.0, 0.0, 0.0))
 
 @dataclass(frozen=True, slots=True)
 class Convex:
-    """A convex part in the world: vertices (n, 3), unit axes to test (k, 3), a radius around the vertices (spheres)."""
+    """Convex part in the world: vertices (n, 3), unit axes to test (k, 3), and a radius around the vertices (spheres)."""
 
     vertices: FloatArray
     axes: FloatArray
@@ -49,7 +49,7 @@ class Convex:
 
 
 def convex_of(part: ConvexPart, pose_world_asset: Pose) -> Convex:
-    """The part of an asset at a pose."""
+    """Return a part of an asset at a pose."""
     local, axes, radius = _template(part.shape, part.size_m, part.vertices_m)
     placed = pose_world_asset @ part.pose
     return Convex(placed.apply_all(local), np.asarray(axes @ placed.rotation.T), radius)
@@ -78,7 +78,7 @@ def _template(
 
 
 def depth_m(a: Convex, b: Convex) -> float:
-    """How deep two convex parts overlap along the best tested axis; negative when an axis separates them."""
+    """Return the overlap of two convex parts along the best tested axis; negative if an axis separates them."""
     ca, cb = a.vertices.mean(axis=0), b.vertices.mean(axis=0)
     between = cb - ca
     lines = (
@@ -96,7 +96,7 @@ def depth_m(a: Convex, b: Convex) -> float:
 
 
 class Solids:
-    """The parts of walls and placed assets, with a box over each for a quick first test."""
+    """Parts of walls and placed assets, each with a bounding box for a quick first test."""
 
     def __init__(self) -> None:
         self._parts: list[Convex] = []
@@ -105,7 +105,7 @@ class Solids:
 
     @staticmethod
     def of_scene(scene: Scene) -> Solids:
-        """Walls and all objects of a scene, joints shut."""
+        """Return the walls and all objects of a scene with their joints shut."""
         solids = Solids()
         solids.add(WALL, [convex_of(wall, _ORIGIN) for wall in scene.walls])
         for item in scene.objects:
@@ -121,7 +121,7 @@ class Solids:
     def overlaps(
         self, parts: Iterable[Convex], *, ignore: str = "", tolerance_m: float = TOLERANCE_M
     ) -> dict[str, float]:
-        """Owners that any of the parts overlaps by more than the tolerance, with the greatest depth of each."""
+        """Return the owners that the parts overlap by more than the tolerance, with the greatest depth in metres."""
         found: dict[str, float] = {}
         for part in parts:
             apart = (self._boxes[:, :3] >= part.high - tolerance_m) | (
@@ -138,7 +138,7 @@ class Solids:
 
 
 def placed_parts(asset: Asset, pose: Pose, fractions: Sequence[float] = ()) -> list[Convex]:
-    """All parts of an asset at a pose, its joints at these shares of their travel: shut without any."""
+    """Return all parts of an asset at a pose, with its joints at these shares of their travel (default: shut)."""
     shares = iter(fractions)
     placed: list[Convex] = []
     for link in asset.links:

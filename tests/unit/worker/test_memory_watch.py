@@ -1,4 +1,4 @@
-"""A worker gives memory back when others need it, and takes its scenes up again when they don't."""
+"""Memory watch: scenes are evicted while other programs need the memory, and loaded again afterwards."""
 
 import asyncio
 import contextlib
@@ -12,10 +12,10 @@ from tests.unit.worker.test_slots import running
 
 from embomatrix.host.cgroup import MIB
 from embomatrix.rpc.wire.values import Completed, ResidentState, Resources
-from embomatrix.worker.host import spare_memory
 from embomatrix.worker.host.settings import WorkerSettings
-from embomatrix.worker.host.spare_memory import SCARCE_MEMORY, SpareMemory, spare_memory_mb
 from embomatrix.worker.link.daemon import Daemon
+from embomatrix.worker.slots import yielding
+from embomatrix.worker.slots.yielding import SCARCE_MEMORY, MemoryWatch, spare_memory_mb
 
 SCENES = ["ok-1", "ok-2", "ok-3"]
 
@@ -30,7 +30,7 @@ async def watched(folder):
     """A pool whose scenes are warm, and the machine that it leaves memory to."""
     machine = Machine()
     async with running(folder) as harness:
-        watch = asyncio.create_task(SpareMemory(harness.pool, lambda: machine.spare_mb).run(0.02))
+        watch = asyncio.create_task(MemoryWatch(harness.pool, lambda: machine.spare_mb).run(0.02))
         try:
             harness.pool.want(SCENES)
             await harness.until(lambda: warm(harness) == SCENES)
@@ -44,7 +44,7 @@ def warm(harness):
     return sorted(r.bundle_digest for r in residents if r.state is ResidentState.WARM)
 
 
-async def test_scenes_go_when_others_take_the_memory_and_come_back_with_it(tmp_path):
+async def test_scenes_are_evicted_while_memory_is_scarce_and_loaded_again_after(tmp_path):
     async with watched(tmp_path) as (harness, machine):
         machine.spare_mb = -1e6
         await harness.until(lambda: warm(harness) == SCENES[:1])
@@ -53,7 +53,7 @@ async def test_scenes_go_when_others_take_the_memory_and_come_back_with_it(tmp_p
         await harness.until(lambda: warm(harness) == SCENES)
 
 
-async def test_what_is_to_be_executed_is_executed_however_little_memory_there_is(tmp_path):
+async def test_leases_are_executed_however_little_memory_there_is(tmp_path):
     async with watched(tmp_path) as (harness, machine):
         machine.spare_mb = -1e6
         await harness.until(lambda: len(harness.pool.residents()) == 1)
@@ -63,19 +63,19 @@ async def test_what_is_to_be_executed_is_executed_however_little_memory_there_is
         assert all(isinstance(outcome, Completed) for outcome in outcomes.values())
 
 
-async def test_a_memory_that_grows_allows_no_more_than_the_limits(tmp_path):
+async def test_memory_limit_never_exceeds_the_configured_one(tmp_path):
     # Each takes 40 MB and what it shares with no other process.
     async with running(tmp_path, memory_mb=75.0) as harness:
-        harness.pool.allow(1e6)
+        harness.pool.limit_memory(1e6)
         harness.pool.want(["large-1", "large-2", "large-3"])
         await harness.until(lambda: len(warm(harness)) == 1)
         await asyncio.sleep(0.1)
         assert harness.pool.memory_used_mb <= 75.0
 
 
-async def test_a_daemon_watches_from_its_start(tmp_path, monkeypatch):
+async def test_daemon_watches_memory_from_its_start(tmp_path, monkeypatch):
     machine = Machine()
-    monkeypatch.setattr(spare_memory, "spare_memory_mb", lambda: machine.spare_mb)
+    monkeypatch.setattr(yielding, "spare_memory_mb", lambda: machine.spare_mb)
     manager = FakeManager()
     async with serving(manager) as address:
         settings = WorkerSettings(manager=address, name="w1", cache_dir=tmp_path, state_dir=tmp_path)

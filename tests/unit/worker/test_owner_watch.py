@@ -1,4 +1,4 @@
-"""A worker whose owner comes back: it pauses, hands back what it can't finish, keeps its scenes, and goes on by itself."""
+"""Owner watch: a worker pauses for its owner, hands leases back, keeps its scenes, and resumes."""
 
 import asyncio
 import contextlib
@@ -8,11 +8,10 @@ from tests.fakes.manager import FakeManager, serving
 from tests.fakes.simulation import PROGRAM
 
 from embomatrix.rpc.wire.values import ResidentState, Resources
-from embomatrix.worker.host.pausing import Observation
-from embomatrix.worker.host.preferences import Preferences
+from embomatrix.worker.host.owner_policy import Observation, Preferences
 from embomatrix.worker.host.settings import WorkerSettings
-from embomatrix.worker.host.status import running_daemons
 from embomatrix.worker.link.daemon import Daemon
+from embomatrix.worker.link.status import running_daemons
 
 AWAY = Observation(0, owner_idle_s=1000.0)
 THERE = Observation(0, owner_idle_s=0.0)
@@ -64,7 +63,7 @@ def _held(manager):
     return [ref.lease_id for ref in manager.states[-1].running]
 
 
-async def test_what_runs_is_finished_what_waits_is_handed_back_and_nothing_is_begun(tmp_path):
+async def test_pause_finishes_running_leases_and_hands_waiting_ones_back(tmp_path):
     manager = FakeManager()
     digest = manager.bundle(b"ok")
     async with lent(manager, tmp_path) as room:
@@ -85,7 +84,7 @@ async def test_what_runs_is_finished_what_waits_is_handed_back_and_nothing_is_be
     assert len(manager.registrations) == 1
 
 
-async def test_what_runs_for_longer_than_its_grace_is_ended_and_handed_back(tmp_path):
+async def test_leases_beyond_the_grace_period_are_handed_back(tmp_path):
     manager = FakeManager()
     async with lent(manager, tmp_path, grace_s=0.2) as room:
         manager.lease("l1", manager.bundle(b"ok"), "hang", deadline_s=600.0)
@@ -123,7 +122,7 @@ async def test_nothing_is_loaded_during_a_pause(tmp_path):
         assert manager.fetches == []
 
 
-async def test_a_pause_is_told_again_on_a_new_session(tmp_path):
+async def test_pause_is_reported_again_on_a_new_session(tmp_path):
     manager = FakeManager()
     async with lent(manager, tmp_path) as room:
         room.seen = THERE
@@ -133,7 +132,7 @@ async def test_a_pause_is_told_again_on_a_new_session(tmp_path):
         await _until(lambda: manager.states[-1].paused == "its owner is active")
 
 
-async def test_the_status_file_tells_of_pause_and_connection_and_goes_with_the_daemon(tmp_path):
+async def test_status_file_shows_pause_and_connection_and_is_removed_with_the_daemon(tmp_path):
     manager = FakeManager()
     async with lent(manager, tmp_path) as room:
         await _until(lambda: any(status.connected_since_s for status in running_daemons(tmp_path)))
