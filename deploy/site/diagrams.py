@@ -1,7 +1,7 @@
 """Diagrams of the documentation site, drawn ahead by Mermaid and shown as pictures, so that no page needs a script.
 
-A page holds a diagram as a Mermaid fence, which code hosts draw themselves. Its light and dark pictures are named by a digest of
-the fence's text, so a changed diagram has no picture until it is drawn again.
+A page holds a diagram as a Mermaid fence, which code hosts draw themselves. A digest of the fence's text names its light
+and dark pictures, so a changed diagram has no picture until it is drawn again.
 
 The MkDocs hook replaces the fences. The command draws: diagrams.py DOCS MERMAID_JS  (`make diagrams`).
 """
