@@ -92,7 +92,7 @@ def test_furniture_without_a_capable_model_is_refused_with_the_missing_ability(h
     assert isinstance(outcome, TaskRefusal)
     assert outcome.reason is RefusalReason.DOES_NOT_FIT
     assert outcome.sentence == (
-        "'sofa.n.01_1' has no place: its type has no model that can do what the task asks of it: container, openable"
+        "'sofa.n.01_1' has no place: its type has no model with the abilities that the task needs: container, openable"
     )
 
 

@@ -1,5 +1,4 @@
-"""Pose cache of a task's scene: verified poses for objects that goals bring together, and standing poses for all
-rows.
+"""Pose cache of a task's scene: verified poses for objects that goals bring together, and standing poses for all rows.
 
 Other pairs are left to the executor's live search, which takes milliseconds at run time. No skill aims at ``nextto``,
 so the cache holds only suitable poses for pairs that a goal wants next to each other. The neighbour stays where it
@@ -44,6 +43,107 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
+class NeighbourPair:
+    """Two objects that a goal wants next to each other. The neighbour stays, or both are carried to ``host``."""
+
+    thing: str
+    neighbour: str
+    host: str = ""
+
+
+def poses_beside(view: SceneView, pairs: Iterable[NeighbourPair], library: PlacementLibrary) -> Poses:
+    """Return poses beside neighbours that stay, on or in the neighbour's host."""
+    found: Poses = {}
+    for pair in pairs:
+        near = view.item(pair.neighbour)
+        host, relation = near.host or view.floor_of(near.room), near.relation or Relation.ONTOP
+        if pair.host or not host or relation not in (Relation.ONTOP, Relation.INSIDE):
+            continue
+        frame = view.item(host).pose_world_asset.inverse() @ near.pose_world_asset
+        box = bounds_of(view.asset(pair.neighbour)).box(frame)
+        key = PlacementKey(view.item(pair.thing).asset_id, view.item(host).asset_id, relation)
+        poses = library.poses_beside(view.asset(pair.thing), view.asset(host), relation, box)
+        found[key] = (*found.get(key, ()), *poses)
+    return found
+
+
+class PairedPlacements:
+    """Poses of objects that are carried to one host and must stand next to each other there."""
+
+    def __init__(
+        self,
+        view: SceneView,
+        library: PlacementLibrary,
+        stand_at: Callable[[str], tuple[StandPose, ...]],
+        seed: int,
+    ) -> None:
+        """``stand_at`` returns the robot's standing poses for an object."""
+        self._view = view
+        self._library = library
+        self._stand_at = stand_at
+        self._seed = seed
+        self._solids = Solids.of_scene(view.scene)
+        self._taken: list[Aabb] = []
+        self._at: dict[tuple[str, str, Relation], Pose] = {}
+
+    def poses(self, pairs: Iterable[NeighbourPair]) -> Poses:
+        """Return one pose of each neighbour, and the poses of the other object beside it.
+
+        For two equal models, one pose each.
+        """
+        found: Poses = {}
+        for pair in pairs:
+            for relation in (Relation.ONTOP, Relation.INSIDE):
+                for key, poses in self._chosen(pair, relation).items() if pair.host else ():
+                    found[key] = (*found.get(key, ()), *poses)
+        return found
+
+    def _chosen(self, pair: NeighbourPair, relation: Relation) -> Poses:
+        view = self._view
+        thing, neighbour, host = (view.asset(name) for name in (pair.thing, pair.neighbour, pair.host))
+        known = self._at.get((pair.neighbour, pair.host, relation))
+        for pose in (known,) if known else self._free(pair, neighbour, relation):
+            beside = self._library.poses_beside(thing, host, relation, bounds_of(neighbour).box(pose))
+            near = tuple(other for other in beside if self._is_free(pair, thing, other))
+            if not near:
+                continue
+            self._at[pair.neighbour, pair.host, relation] = pose
+            self._at[pair.thing, pair.host, relation] = near[0]
+            self._taken += [
+                self._world_box(pair.host, asset, at) for asset, at in ((neighbour, pose), (thing, near[0]))
+            ]
+            key = PlacementKey(thing.asset_id, host.asset_id, relation)
+            if thing.asset_id == neighbour.asset_id:
+                return {key: (near[0],) if known else (pose, near[0])}
+            stays = {PlacementKey(neighbour.asset_id, host.asset_id, relation): (pose,)}
+            return {**({} if known else stays), key: near}
+        return {}
+
+    def _free(self, pair: NeighbourPair, asset: Asset, relation: Relation) -> Iterator[Pose]:
+        """Yield free poses of an asset on or in the host, the nearest to the robot first."""
+        found = self._library.poses(asset, self._view.asset(pair.host), relation, self._seed)
+        for stand in self._stand_at(pair.host)[:1]:
+            frame = self._view.item(pair.host).pose_world_asset
+
+            def away_m(pose: Pose, stand: StandPose = stand, frame: Pose = frame) -> float:
+                x, y, _ = (frame @ pose).position_m
+                return math.hypot(x - stand.x_m, y - stand.y_m)
+
+            yield from (pose for pose in sorted(found, key=away_m) if self._is_free(pair, asset, pose))
+
+    def _is_free(self, pair: NeighbourPair, asset: Asset, pose: Pose) -> bool:
+        frame = self._view.item(pair.host).pose_world_asset
+        met = self._solids.overlaps(placed_parts(asset, frame @ pose))
+        box = self._world_box(pair.host, asset, pose)
+        return not met.keys() - {pair.host, pair.thing, pair.neighbour} and not any(
+            box.overlaps(other) for other in self._taken
+        )
+
+    def _world_box(self, host: str, asset: Asset, pose: Pose) -> Aabb:
+        return bounds_of(asset).box(self._view.item(host).pose_world_asset @ pose)
+
+
+@dataclass(frozen=True, slots=True)
 class PoseNeeds:
     """Requirements of one task for a pose cache.
 
@@ -57,16 +157,13 @@ class PoseNeeds:
 
 
 class SceneSurvey:
-    """Standing poses of the robot for the objects of a scene, and the handlings that its arm can't do. Computed on
-    demand.
+    """Standing poses of the robot for the objects of a scene, and the handlings that its arm can't do. Computed on demand.
 
     Context manager of an engine. The answers don't depend on the order of the queries.
     """
 
     def __init__(self, scene: Scene, foresight: ReachabilitySurvey | None) -> None:
-        """Load the scene. Without ``foresight``, the arm is not analysed. Raise EngineError if the scene can't be
-        loaded.
-        """
+        """Load the scene. Without ``foresight``, the arm is not analysed. Raise EngineError if the scene can't be loaded."""
         self._foresight = foresight
         self._engine = BulletEngine(scene)
         self._world = LiveWorld(Bundle(scene, {}, PoseCache()), self._engine)
@@ -81,13 +178,13 @@ class SceneSurvey:
 
     def blocks(self, handled: Sequence[tuple[Handling, str]]) -> bool:
         """True if the arm can't do one of the handlings in the initial scene."""
-        self._look_at(name for _, name in handled)
+        self._compute(name for _, name in handled)
         return any(name in self._blocked.get(handling, {}) for handling, name in handled)
 
     def poses(self, names: Iterable[str]) -> PoseCache:
         """Return standing poses and arm limits of these objects as a bundle carries them, without placements."""
         wanted = dict.fromkeys(names)
-        self._look_at(wanted)
+        self._compute(wanted)
         barred = {
             handling: {name: found[name] for name in wanted if name in found}
             for handling in Handling
@@ -99,7 +196,7 @@ class SceneSurvey:
         """Return the cache with the reachable poses of each placed object."""
         return poses if self._foresight is None else placement_reachability(self._world, poses, placings)
 
-    def _look_at(self, names: Iterable[str]) -> None:
+    def _compute(self, names: Iterable[str]) -> None:
         fresh = [name for name in dict.fromkeys(names) if name not in self._stands]
         if not fresh:
             return
@@ -177,103 +274,3 @@ def _pairs(view: SceneView, about: tuple[str, ...]) -> Iterator[tuple[str, str, 
                 yield thing, host, Relation.ONTOP
             if view.is_container(host) or view.is_basket(host):
                 yield thing, host, Relation.INSIDE
-
-
-@dataclass(frozen=True, slots=True)
-class NeighbourPair:
-    """Two objects that a goal wants next to each other. The neighbour stays, or both are carried to ``host``."""
-
-    thing: str
-    neighbour: str
-    host: str = ""
-
-
-def poses_beside(view: SceneView, pairs: Iterable[NeighbourPair], library: PlacementLibrary) -> Poses:
-    """Return poses beside neighbours that stay, on or in the neighbour's host."""
-    found: Poses = {}
-    for pair in pairs:
-        near = view.item(pair.neighbour)
-        host, relation = near.host or view.floor_of(near.room), near.relation or Relation.ONTOP
-        if pair.host or not host or relation not in (Relation.ONTOP, Relation.INSIDE):
-            continue
-        frame = view.item(host).pose_world_asset.inverse() @ near.pose_world_asset
-        box = bounds_of(view.asset(pair.neighbour)).box(frame)
-        key = PlacementKey(view.item(pair.thing).asset_id, view.item(host).asset_id, relation)
-        poses = library.poses_beside(view.asset(pair.thing), view.asset(host), relation, box)
-        found[key] = (*found.get(key, ()), *poses)
-    return found
-
-
-class PairedPlacements:
-    """Poses of objects that are carried to one host and must stand next to each other there."""
-
-    def __init__(
-        self,
-        view: SceneView,
-        library: PlacementLibrary,
-        stand_at: Callable[[str], tuple[StandPose, ...]],
-        seed: int,
-    ) -> None:
-        """``stand_at`` returns the robot's standing poses for an object."""
-        self._view = view
-        self._library = library
-        self._stand_at = stand_at
-        self._seed = seed
-        self._solids = Solids.of_scene(view.scene)
-        self._taken: list[Aabb] = []
-        self._at: dict[tuple[str, str, Relation], Pose] = {}
-
-    def poses(self, pairs: Iterable[NeighbourPair]) -> Poses:
-        """Return one pose of each neighbour, and the poses of the other object beside it. For two equal models, one
-        pose each.
-        """
-        found: Poses = {}
-        for pair in pairs:
-            for relation in (Relation.ONTOP, Relation.INSIDE):
-                for key, poses in self._chosen(pair, relation).items() if pair.host else ():
-                    found[key] = (*found.get(key, ()), *poses)
-        return found
-
-    def _chosen(self, pair: NeighbourPair, relation: Relation) -> Poses:
-        view = self._view
-        thing, neighbour, host = (view.asset(name) for name in (pair.thing, pair.neighbour, pair.host))
-        known = self._at.get((pair.neighbour, pair.host, relation))
-        for pose in (known,) if known else self._free(pair, neighbour, relation):
-            beside = self._library.poses_beside(thing, host, relation, bounds_of(neighbour).box(pose))
-            near = tuple(other for other in beside if self._is_free(pair, thing, other))
-            if not near:
-                continue
-            self._at[pair.neighbour, pair.host, relation] = pose
-            self._at[pair.thing, pair.host, relation] = near[0]
-            self._taken += [
-                self._world_box(pair.host, asset, at) for asset, at in ((neighbour, pose), (thing, near[0]))
-            ]
-            key = PlacementKey(thing.asset_id, host.asset_id, relation)
-            if thing.asset_id == neighbour.asset_id:
-                return {key: (near[0],) if known else (pose, near[0])}
-            stays = {PlacementKey(neighbour.asset_id, host.asset_id, relation): (pose,)}
-            return {**({} if known else stays), key: near}
-        return {}
-
-    def _free(self, pair: NeighbourPair, asset: Asset, relation: Relation) -> Iterator[Pose]:
-        """Yield free poses of an asset on or in the host, the nearest to the robot first."""
-        found = self._library.poses(asset, self._view.asset(pair.host), relation, self._seed)
-        for stand in self._stand_at(pair.host)[:1]:
-            frame = self._view.item(pair.host).pose_world_asset
-
-            def away_m(pose: Pose, stand: StandPose = stand, frame: Pose = frame) -> float:
-                x, y, _ = (frame @ pose).position_m
-                return math.hypot(x - stand.x_m, y - stand.y_m)
-
-            yield from (pose for pose in sorted(found, key=away_m) if self._is_free(pair, asset, pose))
-
-    def _is_free(self, pair: NeighbourPair, asset: Asset, pose: Pose) -> bool:
-        frame = self._view.item(pair.host).pose_world_asset
-        met = self._solids.overlaps(placed_parts(asset, frame @ pose))
-        box = self._world_box(pair.host, asset, pose)
-        return not met.keys() - {pair.host, pair.thing, pair.neighbour} and not any(
-            box.overlaps(other) for other in self._taken
-        )
-
-    def _world_box(self, host: str, asset: Asset, pose: Pose) -> Aabb:
-        return bounds_of(asset).box(self._view.item(host).pose_world_asset @ pose)

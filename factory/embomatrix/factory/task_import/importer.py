@@ -88,8 +88,8 @@ def importing(settings: ImportSettings, jobs: int) -> Iterator[ImportMany]:
     )
     with shared_work(
         jobs, ProblemImporter, ProblemImporter.run if jobs == 1 else _picklable_import, settings, died=died
-    ) as judge:
-        yield judge
+    ) as import_many:
+        yield import_many
 
 
 def _picklable_import(importer: ProblemImporter, source: SourceText) -> ImportOutcome:

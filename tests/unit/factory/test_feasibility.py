@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from embomatrix.factory.pipeline.task_poses import SceneSurvey
-from embomatrix.factory.scenes.rehearsal import SimulatedRobot
+from embomatrix.factory.scenes.feasibility import SimulatedRobot
 from embomatrix.factory.scenes.view import CapableRobot, SceneView
 from embomatrix.factory.social.requests import RequestedAtom, RequestPredicate, TaskRequest, check_request
-from embomatrix.factory.writer.tasks import PlainWriter
+from embomatrix.factory.writer.tasks import DraftOrder, PlainWriter
 from embomatrix.factory.writer.variant import Variant
 from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.world.geometry import Pose
@@ -76,7 +76,11 @@ def test_infeasible_wishes_are_never_written(home: Scene) -> None:
         category: {
             draft.task.goal_bddl
             for seed in range(40)
-            if (draft := PlainWriter().write(variant, view, category, "t", np.random.default_rng(seed)))
+            if (
+                draft := PlainWriter().write(
+                    variant, view, DraftOrder(category, "t", np.random.default_rng(seed))
+                )
+            )
         }
         for category in TaskCategory
     }
