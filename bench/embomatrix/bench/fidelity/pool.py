@@ -16,8 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.bench.cluster.processes import kill_tree
-from embomatrix.sim.fidelity.compare import FidelityTrial, compare
-from embomatrix.sim.fidelity.records import comparison_to_json, trial_to_json
+from embomatrix.sim.fidelity.compare import FidelityTrial, compare, comparison_to_json, trial_to_json
 from embomatrix.sim.process_pool import process_pool
 from embomatrix.world.dataset import Dataset
 

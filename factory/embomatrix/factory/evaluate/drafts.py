@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.factory.scenes.view import SceneView
-from embomatrix.factory.writer.tasks import Draft
+from embomatrix.factory.writer.tasks import Draft, DraftOrder
 from embomatrix.factory.writer.variant import build_variant
 from embomatrix.world.task import TaskCategory
 
@@ -58,7 +58,9 @@ def _drafts(base: Scene, writer: TaskWriter, number: int, seed: int) -> Iterator
     view, categories, given = SceneView(variant.scene), [*TaskCategory], 0
     for attempt in range(TRIES * EACH_VARIANT):
         category = categories[(number + attempt) % len(categories)]
-        draft = writer.write(variant, view, category, f"{variant.scene.scene_id}-{attempt:02d}", rng)
+        draft = writer.write(
+            variant, view, DraftOrder(category, f"{variant.scene.scene_id}-{attempt:02d}", rng)
+        )
         if isinstance(draft, Draft):
             yield draft
             given += 1

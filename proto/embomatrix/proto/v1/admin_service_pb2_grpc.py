@@ -26,7 +26,7 @@ if _version_not_supported:
 
 
 class AdminServiceStub(object):
-    """Operators: what the cluster is doing, and a way to take a worker out.
+    """State of the cluster, logs, operator commands, and tokens.
     """
 
     def __init__(self, channel):
@@ -103,7 +103,7 @@ class AdminServiceStub(object):
 
 
 class AdminServiceServicer(object):
-    """Operators: what the cluster is doing, and a way to take a worker out.
+    """State of the cluster, logs, operator commands, and tokens.
     """
 
     def ListWorkers(self, request, context):
@@ -125,28 +125,28 @@ class AdminServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def ResumeWorker(self, request, context):
-        """Takes a drain back.
+        """Cancels a drain.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def RevokeWorker(self, request, context):
-        """The worker's credential is void, its session ends, and what it held goes to others.
+        """Revokes the worker's credential and ends its session. Its leases go to other workers.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def GetPlan(self, request, context):
-        """The look-ahead grid: steps by scenes, and who holds them.
+        """Look-ahead grid: steps by scenes, with the workers that hold them.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def PauseDispatch(self, request, context):
-        """No new leases are given until ResumeDispatch; what runs goes on.
+        """No new leases are given until ResumeDispatch. Live leases continue.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -159,7 +159,7 @@ class AdminServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def IssueToken(self, request, context):
-        """A token of a role, told once and kept as a hash.
+        """Returns a new token, which is shown once and stored as a hash.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -178,14 +178,14 @@ class AdminServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def GetRun(self, request, context):
-        """What a run came to so far, or in the end: closed ones are kept for a while.
+        """Totals of an open run, or of a closed run that is still archived.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def ReadEvents(self, request, context):
-        """A page of the event log of a run, or of the cluster.
+        """Page of the event log of a run, or of workers and scenes.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -268,7 +268,7 @@ def add_AdminServiceServicer_to_server(servicer, server):
 
  # This class is part of an EXPERIMENTAL API.
 class AdminService(object):
-    """Operators: what the cluster is doing, and a way to take a worker out.
+    """State of the cluster, logs, operator commands, and tokens.
     """
 
     @staticmethod

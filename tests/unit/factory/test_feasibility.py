@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from embomatrix.factory.pipeline.task_poses import SceneSurvey
-from embomatrix.factory.scenes.rehearsal import SimulatedRobot
+from embomatrix.factory.scenes.feasibility import SimulatedRobot
 from embomatrix.factory.scenes.view import CapableRobot, SceneView
 from embomatrix.factory.social.requests import RequestedAtom, RequestPredicate, TaskRequest, check_request
-from embomatrix.factory.writer.tasks import PlainWriter
+from embomatrix.factory.writer.tasks import DraftOrder, PlainWriter
 from embomatrix.factory.writer.variant import Variant
-from embomatrix.sim.physical.survey import Foresight
+from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import Handling
 from embomatrix.world.scene import Scene
@@ -76,7 +76,11 @@ def test_infeasible_wishes_are_never_written(home: Scene) -> None:
         category: {
             draft.task.goal_bddl
             for seed in range(40)
-            if (draft := PlainWriter().write(variant, view, category, "t", np.random.default_rng(seed)))
+            if (
+                draft := PlainWriter().write(
+                    variant, view, DraftOrder(category, "t", np.random.default_rng(seed))
+                )
+            )
         }
         for category in TaskCategory
     }
@@ -88,7 +92,7 @@ def test_infeasible_wishes_are_never_written(home: Scene) -> None:
 
 def test_survey_answers_do_not_depend_on_the_order_of_queries(home: Scene) -> None:
     names = ("apple_1", "stove_1")
-    foresight = Foresight()
+    foresight = ReachabilitySurvey()
     with SceneSurvey(home, foresight) as at_once, SceneSurvey(home, foresight) as bit_by_bit:
         assert not bit_by_bit.blocks([(Handling.PRESS, "stove_1")])
         assert not bit_by_bit.blocks([(Handling.TAKE, "apple_1")])

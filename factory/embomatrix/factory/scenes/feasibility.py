@@ -41,8 +41,9 @@ class SimulatedRobot:
     """Feasibility checks in the simulator. Each check runs once. Close after use; not thread-safe."""
 
     def __init__(self, scene: Scene, blocks: ArmLimits = lambda _: False) -> None:
-        """Load the scene. ``blocks`` reports handlings that the arm can't do. Raise EngineError if the scene can't be
-        loaded.
+        """Load the scene.
+
+        ``blocks`` reports handlings that the arm can't do. Raise EngineError if the scene can't be loaded.
         """
         self._view = SceneView(scene)
         self._blocks = blocks
@@ -57,37 +58,37 @@ class SimulatedRobot:
 
     def can_pick_up(self, thing: str) -> bool:
         """True if the robot can pick the object up."""
-        return self._tries(f"take {thing}", (thing,), None, lambda script: script.take(thing))
+        return self._is_feasible(f"take {thing}", (thing,), None, lambda script: script.take(thing))
 
     def can_place(self, thing: str, relation: Relation, host: str) -> bool:
         """True if the robot can place the object on or in the host, where it is not yet."""
         placed = Subgoals(placements=(PlacementGoal(thing, relation, host),))
-        return self._brings_about(Atom(relation.value, (thing, host)), placed, thing, host)
+        return self._achieves(Atom(relation.value, (thing, host)), placed, thing, host)
 
     def can_swing(self, name: str, *, shut: bool) -> bool:
         """True if the robot can open, or close, all doors and drawers of the object, and they are not so yet."""
         atom = Atom(State.OPEN.value, (name,))
-        return self._brings_about(Not(atom) if shut else atom, Subgoals(open={name: not shut}), name)
+        return self._achieves(Not(atom) if shut else atom, Subgoals(open={name: not shut}), name)
 
     def can_switch(self, name: str, *, on: bool) -> bool:
         """True if the robot can switch the object on, or off, and it is not so yet."""
         atom = Atom(State.TOGGLED_ON.value, (name,))
-        return self._brings_about(atom if on else Not(atom), Subgoals(on={name: on}), name)
+        return self._achieves(atom if on else Not(atom), Subgoals(on={name: on}), name)
 
     def can_treat(self, thing: str, source: str, state: State) -> bool:
         """True if the object can become hot, cooked or frozen at the source and is not so yet."""
         exposure = Exposure(thing, source, hot=state is not State.FROZEN)
-        return self._brings_about(Atom(state.value, (thing,)), Subgoals(exposures=(exposure,)), thing, source)
+        return self._achieves(Atom(state.value, (thing,)), Subgoals(exposures=(exposure,)), thing, source)
 
-    def _brings_about(self, goal: Formula, subgoals: Subgoals, *names: str) -> bool:
+    def _achieves(self, goal: Formula, subgoals: Subgoals, *names: str) -> bool:
         simulator = self._simulator
-        return self._tries(render(goal), names, goal, lambda script: subgoals.run(script, simulator))
+        return self._is_feasible(render(goal), names, goal, lambda script: subgoals.run(script, simulator))
 
-    def _tries(
-        self, deed: str, names: tuple[str, ...], goal: Formula | None, do: Callable[[PlanScript], None]
+    def _is_feasible(
+        self, action: str, names: tuple[str, ...], goal: Formula | None, do: Callable[[PlanScript], None]
     ) -> bool:
         """True if the action succeeds. ``names`` lists the objects that it needs besides their supports."""
-        key = (deed, *names)
+        key = (action, *names)
         if key not in self._known:
             self._known[key] = self._succeeds(names, goal, do)
         return self._known[key]
@@ -113,11 +114,15 @@ class SimulatedRobot:
         return not self._blocks(handled)
 
     def _task_about(self, names: tuple[str, ...]) -> Task:
-        """Return a task for the simulator with these objects and their supports in its table. Its goal is a
-        placeholder.
-        """
+        """Return a task for the simulator with these objects and their supports in its table. Its goal is a placeholder."""
         goal = Atom(State.OPEN.value, names[:1])
         rows = dict.fromkeys(row for name in names for row in (name, *self._view.hosts(name)))
         return Task(
-            "rehearsal", self._view.scene.scene_id, "", TaskCategory.COMPOUND, goal, render(goal), tuple(rows)
+            "feasibility",
+            self._view.scene.scene_id,
+            "",
+            TaskCategory.COMPOUND,
+            goal,
+            render(goal),
+            tuple(rows),
         )

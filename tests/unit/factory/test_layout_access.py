@@ -9,7 +9,7 @@ from embomatrix.factory.layout.pending import MAX_MOVES, PendingObjects, Support
 from embomatrix.factory.layout.request import RequestedObject
 from embomatrix.factory.layout.values import LayoutFailure, LayoutRelation
 from embomatrix.factory.scenes.editor import LayoutReason, SceneEditor
-from embomatrix.factory.scenes.rehearsal import SimulatedRobot
+from embomatrix.factory.scenes.feasibility import SimulatedRobot
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.factory.task_import.task import MAX_REDRAWN, ImportedTask, ImportOptions, import_problem
 from embomatrix.world.catalog import Catalog
