@@ -200,7 +200,7 @@ def test_missing_package_is_named_with_what_brings_it(kitchen, tmp_path, package
             "expected memory:, sqlite:PATH or redis://HOST:PORT/DB",
         ),
         (
-            ("manager", "status", "--manager=nowhere"),
+            ("status", "--manager=nowhere"),
             "'nowhere' is no address of a manager: expected HOST:PORT",
         ),
         (("worker", "run", "--manager=host:99999"), "--manager 'host:99999': expected HOST:PORT"),
