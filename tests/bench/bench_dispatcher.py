@@ -1,4 +1,4 @@
-"""How many decisions a second the manager's state machines take: python tests/bench/bench_dispatcher.py [ROLLOUTS WORKERS]
+"""Throughput of the manager's state machines in decisions a second: python tests/bench/bench_dispatcher.py [ROLLOUTS WORKERS]
 
 Every rollout is submitted, leased and finished; the workers are values, not processes. Prints one JSON object.
 """

@@ -1,4 +1,4 @@
-"""`bench fidelity`: a process that dies costs one trial, a suite goes on where it was cut short, disagreements are replayed."""
+"""`bench fidelity`: a dead process costs one trial, an interrupted suite resumes, disagreements are replayed."""
 
 import json
 
@@ -20,8 +20,7 @@ from embomatrix.bench.fidelity.suite import (
     write_all_trials,
 )
 from embomatrix.bench.report.figures import BenchError
-from embomatrix.sim.fidelity.compare import FidelityTrial, PlanKind
-from embomatrix.sim.fidelity.records import trial_from_json, trial_to_json
+from embomatrix.sim.fidelity.compare import FidelityTrial, PlanKind, trial_from_json, trial_to_json
 from embomatrix.sim.fidelity.sampler import SKILLS
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import parse_plan
@@ -56,7 +55,7 @@ def test_a_suite_compares_every_plan_and_writes_the_disagreements(suite):
     assert {value["trial"] for value in told} >= {item.trial.trial_id for item in differing}
 
 
-def test_figures_bear_the_names_that_others_read(suite):
+def test_figures_have_their_documented_names(suite):
     figures = {figure.name: figure for figure in figures_of(suite[1], minutes=None)}
     assert {"final_atoms_equal", "step_outcomes_equal", "plans", "scenes", "skill_speedup_min"} <= set(
         figures
@@ -65,7 +64,7 @@ def test_figures_bear_the_names_that_others_read(suite):
     assert figures["scenes"].value == 1.0
 
 
-def test_a_suite_that_was_cut_short_goes_on_where_it_was(suite, dataset, tmp_path):
+def test_interrupted_suite_resumes(suite, dataset, tmp_path):
     folder, outcome = suite
     for name in (PLANS_FILE, "settings.json"):
         (tmp_path / name).write_text((folder / name).read_text())
@@ -80,7 +79,7 @@ def test_a_suite_that_was_cut_short_goes_on_where_it_was(suite, dataset, tmp_pat
     ]
 
 
-def test_a_trial_that_was_lost_is_tried_again_when_the_suite_goes_on(suite, dataset, tmp_path):
+def test_lost_trial_is_repeated_on_resume(suite, dataset, tmp_path):
     folder, outcome = suite
     for name in (PLANS_FILE, "settings.json"):
         (tmp_path / name).write_text((folder / name).read_text())
@@ -93,7 +92,7 @@ def test_a_trial_that_was_lost_is_tried_again_when_the_suite_goes_on(suite, data
     assert (len(again.comparisons), again.lost) == (len(outcome.comparisons), ())
 
 
-def test_without_processes_the_results_so_far_are_summed_up(suite, dataset, tmp_path):
+def test_zero_processes_sum_up_the_results_so_far(suite, dataset, tmp_path):
     folder, _ = suite
     for name in (PLANS_FILE, "settings.json"):
         (tmp_path / name).write_text((folder / name).read_text())
@@ -151,7 +150,7 @@ def trials_of(dataset, *texts):
         pytest.param(hanging, "no answer in 10 s", 10.0, marks=pytest.mark.slow),
     ],
 )
-def test_a_process_that_fails_costs_only_the_trial_that_it_was_at(dataset, physical, reason, limit_s):
+def test_failing_process_costs_only_its_current_trial(dataset, physical, reason, limit_s):
     trials = trials_of(dataset, "move fridge", "move fridge\nopen fridge", "turn 1.0")
     values = []
     pool = FidelityPool(dataset.folder, Modes(load_simulator, physical), 1, limit_s)
@@ -161,7 +160,7 @@ def test_a_process_that_fails_costs_only_the_trial_that_it_was_at(dataset, physi
     assert reason in values[1][LOST]
 
 
-def test_a_disagreement_is_shown_again_step_by_step(suite, dataset):
+def test_disagreement_is_replayed_step_by_step(suite, dataset):
     folder, _ = suite
     path = folder / DISAGREEMENTS_FILE
     number = next(
@@ -176,7 +175,7 @@ def test_a_disagreement_is_shown_again_step_by_step(suite, dataset):
 
 
 @pytest.mark.parametrize("spot", ["nowhere", "file:0", "file:x"])
-def test_a_line_that_is_not_named_right_is_refused(spot):
+def test_malformed_line_reference_is_refused(spot):
     with pytest.raises(BenchError, match="FILE:N"):
         read_disagreement(spot)
 
@@ -189,7 +188,7 @@ def test_a_line_that_is_not_named_right_is_refused(spot):
         (["--replay", "nowhere:3"], "nowhere"),
     ],
 )
-def test_what_a_person_gets_wrong_is_one_sentence(dataset, options, sentence):
+def test_wrong_option_is_one_sentence(dataset, options, sentence):
     given = options if "--dataset" in options else ["--dataset", str(dataset.folder), *options]
     answer = CliRunner().invoke(app, ["fidelity", *given])
     assert answer.exit_code == 2

@@ -64,7 +64,7 @@ async def test_page_shows_workers_slots_warm_scenes_and_throughput(browser, kitc
     assert workers.classes.count("chip warm") == 1
     assert workers.words["total"] == "1 to 1 of 1"
     assert page.words["slots"] == "0/2"
-    peak = re.fullmatch(rf"peak (\d+), {ROLLOUTS} in all", page.words["peak"])
+    peak = re.fullmatch(rf"peak (\d+), {ROLLOUTS} in total", page.words["peak"])
     assert 1 < int(peak[1]) <= ROLLOUTS
     assert float(page.words["rate"]) >= 0
     assert page.words["runs"].startswith("run done open warm failed evening <b>run</b> 24 0 ")
@@ -92,11 +92,11 @@ async def test_page_of_training_shows_curves_and_plans_and_runs_no_script_of_a_m
     assert page.words["success"] == "step 3 all 0.25 compound 0.5"
     assert page.words["spent"].startswith("activity share time update 75 % 30 s sampling 25 % 10 s")
     assert page.words["heldout"] == "tasks before GRPO after GRPO all tasks 21 % –"
-    assert page.words["which"] == "that differ most in step 3: Tidy <b>up</b>"
+    assert page.words["which"] == "with the largest reward differences in step 3: Tidy <b>up</b>"
     sampled = page.words["sampled"]
-    assert sampled.startswith("reached the goal · reward 30.90 (form 0.50, relevance 0.40, goal 30.00)")
+    assert sampled.startswith("reached the goal · reward 30.90 (format 0.50, relevance 0.40, goal 30.00)")
     assert "pick_up holds the vase place it is closed" in sampled
-    assert f"lost, not judged · t1 worker_lost: it went silent {script}" in sampled
+    assert f"infrastructure failure, no reward · t1 worker_lost: it went silent {script}" in sampled
 
 
 async def test_page_of_training_says_what_to_do_where_nobody_trains(browser, tmp_path):

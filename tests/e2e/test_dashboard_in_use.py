@@ -144,12 +144,12 @@ async def test_what_died_failed_or_was_called_a_script_is_told_as_it_is(browser,
 async def test_the_look_ahead_is_read_by_keyboard(browser, tmp_path):
     async with manager(tmp_path) as at, ten_workers(at.address), window(browser, at.status_url) as opened:
         await opened.open("lookahead")
-        await opened.until("#cell", "Each cell")
+        await opened.until("#cell", "Each cell shows")
         await opened.page.get_by_role("region", name="steps by scenes").focus()
         await opened.page.keyboard.press("Tab")
         (first, second), places = (
             sorted((KITCHEN, BEDROOM)),
-            {KITCHEN: "warm, on", BEDROOM: "no worker can hold it"},
+            {KITCHEN: "warm, on", BEDROOM: "fits on no worker"},
         )
         await opened.until("#cell", f"^Step 7, {_brief(first)}: 4 rollouts, {places[first]}")
         await opened.page.keyboard.press("ArrowDown")
@@ -244,7 +244,9 @@ async def test_a_page_without_its_manager_says_from_when_it_is_and_goes_on_with_
             await at_work()
             await opened.open("overview")
             await opened.until("#health", "No worker has joined yet")
-        assert "the manager has told nothing since" in await opened.until("#health", "What stands here is of")
+        assert "the manager has not answered since" in await opened.until(
+            "#health", "This page shows the state of"
+        )
         with contextlib.ExitStack() as stack:
             await at_work()
             await opened.until("#health", "No worker has joined yet")
@@ -260,7 +262,7 @@ async def test_a_thousand_workers_come_in_pages_of_fifty(browser, tmp_path):
         async with window(browser, at.status_url) as opened:
             await opened.open("workers")
             await opened.until("#total", "1 to 50 of 1,000")
-            await opened.page.get_by_role("button", name="After").click()
+            await opened.page.get_by_role("button", name="Next").click()
             await opened.until("#total", "51 to 100 of 1,000")
             await opened.page.get_by_label("search by name or label").fill("pc-0777")
             await opened.until("#total", "1 to 1 of 1")

@@ -1,4 +1,4 @@
-"""`embomatrix experiment` from imitation to the page, on a cluster of its own; what is done is not done again."""
+"""`embomatrix experiment` from imitation to the page, on a dedicated cluster; finished runs are not repeated."""
 
 import json
 
@@ -16,7 +16,7 @@ SMALL = (
 )
 
 
-def test_an_experiment_runs_to_its_page_and_goes_on_with_what_is_there(kitchen, tmp_path):
+def test_experiment_runs_to_its_page_and_resumes(kitchen, tmp_path):
     page, figures = tmp_path / "page.md", tmp_path / "figures.json"
     command = (
         *("experiment", "compare", f"--dataset={kitchen}", f"--out={tmp_path / 'out'}", *SMALL),

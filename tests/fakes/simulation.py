@@ -36,7 +36,7 @@ class FakeSimulation:
 
 
 def _word_in(path):
-    """What the file says; a real manager hands out bundles that are compressed."""
+    """Return the text of the file, which a real manager sends compressed."""
     content = path.read_bytes()
     return (zlib.decompress(content) if content.startswith(b"x") else content).decode()
 

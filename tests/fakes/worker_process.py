@@ -18,7 +18,7 @@ import numpy as np
 
 from embomatrix.rpc.wire.values import Resources
 from embomatrix.worker.host.machine import HostMachine, Owner
-from embomatrix.worker.host.preferences import Preferences
+from embomatrix.worker.host.owner_policy import Preferences
 from embomatrix.worker.host.settings import WorkerSettings
 from embomatrix.worker.link.daemon import Daemon, serve
 

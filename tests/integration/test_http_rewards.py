@@ -82,9 +82,9 @@ async def test_a_lost_rollout_is_an_answer_to_try_again_and_no_number(tmp_path):
         ({**asked("move 1"), "labels": []}, 422, "send as many of each"),
         (asked("move 1", label="42"), 422, "found the label '42'"),
         (
-            asked("move 1", label=RewardLabel("t", KITCHEN, Profile.PAPER, -1).text()),
+            asked("move 1", label=LABEL.replace('"seed": 7', '"seed": -1')),
             422,
-            "found the seed -1",
+            "seed: Input should be greater than or equal to 0",
         ),
         ({**asked("move 1"), "query": ["move 1"]}, 422, "the query 'move 1' does not hold its prompt"),
         (

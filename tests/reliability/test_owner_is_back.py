@@ -5,7 +5,7 @@ import asyncio
 import pytest
 from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell, until
 
-from embomatrix.worker.host.status import running_daemons
+from embomatrix.worker.link.status import running_daemons
 
 pytestmark = [pytest.mark.timeout(240), pytest.mark.slow]
 

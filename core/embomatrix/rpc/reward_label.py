@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
-from typing import Self
+from dataclasses import asdict
+from typing import Annotated, Self
+
+from pydantic import Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
 
 from embomatrix.rpc.status import InvalidRequestError
-from embomatrix.world.task import Profile
+from embomatrix.world.task import Profile  # noqa: TC001  # pydantic evaluates the annotations
 
 LARGEST_SEED = 2**31 - 1
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class RewardLabel:
     """Task, bundle, skill profile and seed of a rollout."""
 
-    task_id: str
-    bundle_digest: str
+    task_id: Annotated[str, Field(min_length=1)]
+    bundle_digest: Annotated[str, Field(min_length=1)]
     profile: Profile
-    seed: int
+    seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)]
 
     def text(self) -> str:
         """Return the label as one line of JSON, for the label column of a dataset."""
@@ -29,21 +32,14 @@ class RewardLabel:
     def parse(cls, text: str) -> Self:
         """Parse the JSON of ``text``. Raises InvalidRequestError."""
         try:
-            value = json.loads(text)
-            label = cls(
-                task_id=_string(value["task_id"]),
-                bundle_digest=_string(value["bundle_digest"]),
-                profile=Profile(value["profile"]),
-                seed=int(value["seed"]),
-            )
-        except (ValueError, TypeError, KeyError, RecursionError) as error:
+            return TypeAdapter(cls).validate_json(text)
+        except ValidationError as error:
+            first = error.errors(include_url=False, include_context=False)[0]
+            field = ".".join(map(str, first["loc"])) or "label"
             raise InvalidRequestError(
-                f"found the label {text[:80]!r} ({type(error).__name__}: {str(error)[:80]}): expected one that "
+                f"found the label {text[:80]!r} ({field}: {first['msg']}): expected one that "
                 "`trainer.adapters.openrlhf.rows` wrote"
             ) from error
-        if not 0 <= label.seed <= LARGEST_SEED:
-            raise InvalidRequestError(f"found the seed {label.seed} in a label: expected 0 to {LARGEST_SEED}")
-        return label
 
 
 def answer_in(query: str, prompt: str) -> str:
@@ -57,9 +53,3 @@ def answer_in(query: str, prompt: str) -> str:
             f"the query {query[:80]!r} does not hold its prompt {prompt[:80]!r}: send both as they were"
         )
     return answer
-
-
-def _string(value: object) -> str:
-    if not isinstance(value, str) or not value:
-        raise ValueError(f"expected a text, found {value!r}")
-    return value

@@ -26,6 +26,45 @@ if TYPE_CHECKING:
     from embomatrix.world.task import Task
 
 
+class RefusalReason(StrEnum):
+    """Reasons in the order of the checks: two for drafts, ten for bindings, the rest for admission."""
+
+    NO_ANSWER = "no_answer"
+    UNUSABLE_ANSWER = "unusable_answer"
+    UNKNOWN_TYPE = "unknown_type"
+    SUBSTANCE = "substance"
+    INEXPRESSIBLE = "inexpressible"
+    ROOM_MISSING = "room_missing"
+    ROOM_AS_OBJECT = "room_as_object"
+    AGENT_IN_GOAL = "agent_in_goal"
+    NO_SCENE_OBJECT = "no_scene_object"
+    DOES_NOT_FIT = "does_not_fit"
+    NO_PLACE_GIVEN = "no_place_given"
+    TABLE_TOO_LONG = "table_too_long"
+    INIT_NOT_MET = "init_not_met"
+    GOAL_HOLDS = "goal_holds"
+    MOSTLY_DONE = "mostly_done"
+    NO_PLAN = "no_plan"
+    ORACLE_FAILED = "oracle_failed"
+    PHYSICS_FAILED = "physics_failed"
+
+
+@dataclass(frozen=True, slots=True)
+class TaskRefusal:
+    """Refused task: the reason, and a sentence about the case."""
+
+    reason: RefusalReason
+    sentence: str
+
+
+class RefusedError(Exception):
+    """Refusal raised inside a binding. Callers of the import get the refusal as a value."""
+
+    def __init__(self, reason: RefusalReason, sentence: str) -> None:
+        super().__init__(sentence)
+        self.refusal = TaskRefusal(reason, sentence)
+
+
 SEED: Final = 0
 """Seed of the executions that verify a task."""
 MAX_HELD_SHARE: Final = 0.5
@@ -106,42 +145,3 @@ def plan_failure(executor: PlanExecutor, task: Task, plan: Plan) -> str:
         return "" if reached else "goal_missed: every step succeeds, but the goal does not hold at the end"
     last = trace.steps[-1]
     return f"{last.failure}: step {len(trace.steps)}, {last.call.skill}: {last.message}"
-
-
-class RefusalReason(StrEnum):
-    """Reasons in the order of the checks: two for drafts, ten for bindings, the rest for admission."""
-
-    NO_ANSWER = "no_answer"
-    UNUSABLE_ANSWER = "unusable_answer"
-    UNKNOWN_TYPE = "unknown_type"
-    SUBSTANCE = "substance"
-    INEXPRESSIBLE = "inexpressible"
-    ROOM_MISSING = "room_missing"
-    ROOM_AS_OBJECT = "room_as_object"
-    AGENT_IN_GOAL = "agent_in_goal"
-    NO_SCENE_OBJECT = "no_scene_object"
-    DOES_NOT_FIT = "does_not_fit"
-    NO_PLACE_GIVEN = "no_place_given"
-    TABLE_TOO_LONG = "table_too_long"
-    INIT_NOT_MET = "init_not_met"
-    GOAL_HOLDS = "goal_holds"
-    MOSTLY_DONE = "mostly_done"
-    NO_PLAN = "no_plan"
-    ORACLE_FAILED = "oracle_failed"
-    PHYSICS_FAILED = "physics_failed"
-
-
-@dataclass(frozen=True, slots=True)
-class TaskRefusal:
-    """Refused task: the reason, and a sentence about the case."""
-
-    reason: RefusalReason
-    sentence: str
-
-
-class RefusedError(Exception):
-    """Refusal raised inside a binding. Callers of the import get the refusal as a value."""
-
-    def __init__(self, reason: RefusalReason, sentence: str) -> None:
-        super().__init__(sentence)
-        self.refusal = TaskRefusal(reason, sentence)

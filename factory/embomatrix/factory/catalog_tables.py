@@ -1,5 +1,4 @@
-"""Build the catalog's package data from the ``bddl`` package: ``python -m embomatrix.factory.catalog_tables --out
-FOLDER``.
+"""Build the catalog's package data from the ``bddl`` package: ``python -m embomatrix.factory.catalog_tables --out FOLDER``.
 
 BEHAVIOR-1K's knowledge base (``bddl`` 3.6.0, MIT) holds the box of every object model, the mass and abilities of
 their categories, and the inventories of 51 scenes by room. This script reduces its 28 MB to three small tables, which
@@ -56,9 +55,7 @@ class CatalogSourceError(Exception):
 
 
 def source_folder() -> Path:
-    """Return the folder of the package's generated data. Raise CatalogSourceError if it is missing or has another
-    version.
-    """
+    """Return the folder of the package's generated data. Raise CatalogSourceError if it is missing or has another version."""
     spec = importlib.util.find_spec("bddl")
     if spec is None or spec.origin is None:
         raise CatalogSourceError(f"the package bddl is not installed: try `pip install bddl=={BDDL_VERSION}`")
@@ -141,9 +138,7 @@ def _masses(path: Path) -> dict[str, float]:
 
 
 def build_scenes(folder: Path) -> Json:
-    """Return the inventories of all scenes: for each room its floor (m), and model counts of doors, windows and
-    objects.
-    """
+    """Return the inventories of all scenes: for each room its floor (m), and model counts of doors, windows and objects."""
     boxes = _read_json(folder / "object_inventory.json")["bounding_box_sizes"]
     scenes = _read_json(folder / "combined_room_object_list.json")["scenes"]
     typical = _typical_floors(scenes, boxes)

@@ -1,4 +1,4 @@
-"""`embomatrix experiment`: what it refuses, what it takes as done, and what it makes of finished runs."""
+"""`embomatrix experiment`: refusals, resumption, and reports of finished runs."""
 
 import json
 import math
@@ -24,7 +24,7 @@ from embomatrix.bench.experiments.design import (
 )
 from embomatrix.bench.experiments.findings import Run, curve, figures_of, findings_of
 from embomatrix.bench.experiments.section import add_section, learning_section
-from embomatrix.cli.foreground import no_problem
+from embomatrix.cli.local_cluster import no_problem
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import read_settings
 from embomatrix.trainer.logging.outcome import RunOutcome, TaskRate, read_outcome, write_outcome
@@ -86,13 +86,13 @@ def dataset(tmp_path):
     return folder
 
 
-def test_a_task_counts_once_with_its_mean_over_the_seeds():
+def test_task_counts_once_with_its_mean_over_the_seeds():
     assert ARMS[0].before.value == pytest.approx(0.35)
     assert ARMS[0].after.value == pytest.approx(0.65)
     assert ARMS[0].gain.value == pytest.approx(0.3)
 
 
-def test_a_task_of_which_all_was_lost_moves_no_figure():
+def test_task_without_results_changes_no_figure():
     found = findings_of("a", [run(0, "a", (0.2, None), (0.4, 1.0))])
     assert (found.before.value, found.gain.value) == (pytest.approx(0.2), pytest.approx(0.2))
 
@@ -107,14 +107,14 @@ def test_figures_have_the_names_of_the_ablation():
     assert figures["success_gain"].is_reached
 
 
-def test_a_curve_has_ten_stretches_or_as_many_as_there_are_steps():
+def test_curve_has_ten_stretches_or_one_for_each_step():
     long = run(0, "a", (0.0,), (0.0,))
     assert curve(long, "success") == pytest.approx([(2 * at + 0.5) / 20 for at in range(10)])
     assert len(curve(replace(long, metrics=long.metrics[:3]), "success")) == 3
     assert curve(replace(long, metrics=[]), "success") == ()
 
 
-def test_steps_without_a_metric_count_in_no_stretch_and_a_stretch_of_them_is_told_as_none():
+def test_steps_without_a_metric_are_left_out_of_the_curve():
     told = run(0, "a", (0.0,), (0.0,))
     metrics = [
         dict(row, entropy=None if step in (1, 18, 19) else 0.3) for step, row in enumerate(told.metrics)
@@ -124,7 +124,7 @@ def test_steps_without_a_metric_count_in_no_stretch_and_a_stretch_of_them_is_tol
     assert math.isnan(values[9])
 
 
-def test_the_section_tells_configuration_success_curves_and_times():
+def test_section_has_configuration_success_curves_and_times():
     text = learning_section(DESIGN, ARMS, MACHINE, "abc", TODAY)
     assert text.startswith("## 2026-11-21: learning")
     assert "at most 60 s of imitation" in text
@@ -137,20 +137,20 @@ def test_the_section_tells_configuration_success_curves_and_times():
     assert widths == {14}
 
 
-def test_the_section_tells_the_memory_of_a_run_that_kept_it():
+def test_section_has_the_memory_of_a_run_that_recorded_it():
     told = run(0, "a", (), ())
     found = findings_of("a", [replace(told, outcome=replace(told.outcome, peak_mb=2345.6))])
     assert "| 10.0% | 2,346 MB |" in learning_section(DESIGN, [found], MACHINE, "abc", TODAY)
 
 
-def test_where_no_task_is_held_out_there_is_no_success_to_tell():
+def test_section_without_held_out_tasks_has_no_success():
     found = findings_of("a", [run(0, "a", (), ())])
     assert [figure.name for figure in figures_of([found])] == ["sim_wait_share", "overhead_ratio"]
     text = learning_section(DESIGN, [found], MACHINE, "abc", TODAY)
     assert "| a | 0 | 20 | 320 | 0 | – | – | – |" in text
 
 
-def test_sections_are_added_and_none_is_taken_away(tmp_path):
+def test_sections_are_appended_and_never_removed(tmp_path):
     page = tmp_path / "docs" / "experiments.md"
     add_section(page, "## one\n")
     page.write_text(page.read_text() + "\nBy hand: it failed.\n")
@@ -180,14 +180,14 @@ def test_arms_of_one_name_are_refused():
         checked_arms([Arm("a", {}), Arm("a", {"grpo.group": "4"})])
 
 
-def test_an_experiment_goes_on_only_as_what_it_is(tmp_path):
+def test_experiment_resumes_only_with_the_same_design(tmp_path):
     keep_design(tmp_path, DESIGN)
     keep_design(tmp_path, DESIGN)
     with pytest.raises(TrainerError, match="another experiment: grpo differ"):
         keep_design(tmp_path, replace(DESIGN, grpo=Budget(120.0)))
 
 
-def test_what_is_done_is_not_done_again(tmp_path):
+def test_finished_runs_are_not_repeated(tmp_path):
     """There is no dataset: a command that was run would end in SystemExit."""
     conductor = Conductor(DESIGN, tmp_path / "nowhere", tmp_path, lambda heading: None)
     place = Venue(("--manager=127.0.0.1:1",), no_problem)
@@ -198,7 +198,7 @@ def test_what_is_done_is_not_done_again(tmp_path):
     conductor.train(0, RELEVANCE_ARMS[0], place)
 
 
-def test_what_finished_runs_found_is_told_while_others_are_not_done(dataset, tmp_path):
+def test_so_far_reports_finished_runs_only(dataset, tmp_path):
     out, page = tmp_path / "out", tmp_path / "page.md"
     options = ("--seed=0", "--seed=1", "--so-far", f"--dataset={dataset}", f"--out={out}", f"--page={page}")
     status, text = told("learning", *options)
@@ -216,12 +216,12 @@ def test_what_finished_runs_found_is_told_while_others_are_not_done(dataset, tmp
     assert "success_after_no_relevance" not in figures
 
 
-def test_an_outcome_is_read_as_it_was_written(tmp_path):
+def test_outcome_survives_a_round_trip(tmp_path):
     found = outcome((0.2, None), (0.5, 1.0))
     write_outcome(tmp_path, found)
     assert read_outcome(tmp_path) == found
     (tmp_path / "outcome.json").write_text('{"schema": 1}')
-    with pytest.raises(TrainerError, match="no outcome of a finished run"):
+    with pytest.raises(TrainerError, match="not the outcome of a finished run"):
         read_outcome(tmp_path)
 
 
@@ -232,10 +232,10 @@ def test_an_outcome_is_read_as_it_was_written(tmp_path):
         (("compare", "--arm=Fast:a=1", "--dataset=DS"), "has the name 'Fast': expected small letters"),
         (("compare", "--arm=a:grpo.speed=1", "--dataset=DS"), "unknown setting 'grpo.speed'"),
         (("learning", "--set=grpo.group=1", "--dataset=DS"), "setting 'grpo.group'"),
-        (("table", "--run=nowhere", "--bench=DS"), "no outcome of a finished run"),
+        (("table", "--run=nowhere", "--bench=DS"), "not the outcome of a finished run"),
     ],
 )
-def test_an_experiment_that_can_not_be_made_is_told_why_at_once(dataset, tmp_path, arguments, words):
+def test_impossible_experiment_is_refused_at_once(dataset, tmp_path, arguments, words):
     filled = [item.replace("DS", str(dataset)) for item in arguments]
     out = () if arguments[0] == "table" else (f"--out={tmp_path / 'out'}",)
     status, text = told(*filled, *out)
@@ -252,7 +252,7 @@ def test_an_experiment_that_can_not_be_made_is_told_why_at_once(dataset, tmp_pat
         ("eai-native", "eai_native_success"),
     ],
 )
-def test_a_bench_has_a_line_for_each_stage(tmp_path, bench, figure):
+def test_benchmark_has_a_line_for_each_stage(tmp_path, bench, figure):
     stages = (PolicyStage("imitation", tmp_path / "a"), PolicyStage("GRPO", tmp_path / "b"))
     for stage, value in zip(stages, (0.25, 0.5), strict=True):
         estimate = {"value": value, "low": 0.1, "high": 0.8}

@@ -162,4 +162,4 @@ def test_interrupted_import_resumes_with_the_same_result(tmp_path: Path) -> None
     jsonl.write_text("\n".join(reversed(lines)))
     other = imported()
     assert other.exit_code == 2
-    assert "tells of other problems" in " ".join(other.output.split())
+    assert "is about other problems" in " ".join(other.output.split())

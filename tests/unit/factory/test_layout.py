@@ -31,8 +31,8 @@ from embomatrix.factory.layout.values import (
 )
 from embomatrix.factory.scenes.check import check_scene
 from embomatrix.factory.scenes.editor import LayoutReason, SceneEditor
+from embomatrix.llm.batch import FailureLimit
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
-from embomatrix.llm.patience import FailureLimit
 from embomatrix.llm.values import EndpointError
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.catalog import Catalog
@@ -44,7 +44,7 @@ ON, IN = LayoutRelation.ONTOP, LayoutRelation.INSIDE
 KITCHEN = LayoutRoomFacts("kitchen_0", "kitchen", (4.0, 4.0), ("countertop", "fridge"))
 BEDROOM = LayoutRoomFacts("bedroom_0", "bedroom", (4.0, 4.0), ("bed", "nightstand"))
 TABLE = HostFacts("breakfast_table_1", "breakfast_table", (HostOffer(ON, ((0.8, 1.2, 9.0),), 0.7),))
-FRIDGE = HostFacts("fridge_1", "fridge", (HostOffer(IN, ((0.5, 0.5, 0.4),), 0.6),), shut=True)
+FRIDGE = HostFacts("fridge_1", "fridge", (HostOffer(IN, ((0.5, 0.5, 0.4),), 0.6),), closed=True)
 PLATE = ObjectBrief("plate_1", "plate", (0.24, 0.24, 0.02))
 
 

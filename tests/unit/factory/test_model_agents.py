@@ -85,7 +85,7 @@ def written(*script, category=TaskCategory.PICK_AND_PLACE, look=None):
     with server.serving() as url:
         endpoint = Endpoint(url, "small-1", limits=limits)
         with ModelWriter(SocialModelAgents(endpoint), look=look) as writer:
-            draft = writer.write(VARIANT, VIEW, category, "t", np.random.default_rng(0))
+            draft = writer.write(VARIANT, VIEW, DraftOrder(category, "t", np.random.default_rng(0)))
     return draft, server
 
 
@@ -120,7 +120,7 @@ def test_invalid_descriptions_are_rejected_and_the_inventory_is_used():
     short = {"rooms": {room: SIGHT["rooms"][room] for room in ROOMS[1:]}}
     draft, server = written(*map(json.dumps, (order, short, order)), CAST, TALK, GOOD, look=seen)
     assert "string should match pattern" in server.requests[1]["messages"][-1]["content"]
-    assert f"nothing is said of {ROOMS[0]}" in server.requests[2]["messages"][-1]["content"]
+    assert f"no sentence describes {ROOMS[0]}" in server.requests[2]["messages"][-1]["content"]
     assert draft is not None
     assert "fire" not in server.requests[3]["messages"][1]["content"]
 
@@ -187,7 +187,7 @@ def test_build_numbers_concurrent_drafts_in_the_order_kept():
         at_once = 3
 
         def write_all(self, variant, view, orders):
-            first, *_ = (self.write(variant, view, each.category, each.task_id, each.rng) for each in orders)
+            first, *_ = (self.write(variant, view, each) for each in orders)
             return [first, first]
 
     order = VariantOrder("train", 0, VARIANT.scene.base, ROOMS, dict.fromkeys(TaskCategory, 2), frozenset())
@@ -210,7 +210,7 @@ def in_a_row(*script, drafts):
     ):
         for number in range(drafts):
             rng = np.random.default_rng(number)
-            found.append(writer.write(VARIANT, VIEW, TaskCategory.PICK_AND_PLACE, "t", rng))
+            found.append(writer.write(VARIANT, VIEW, DraftOrder(TaskCategory.PICK_AND_PLACE, "t", rng)))
             yield found[-1]
 
 

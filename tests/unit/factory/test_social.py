@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
-from embomatrix.factory.social.casting import HOBBIES, NAMES, GrammarRolePlayer
+from embomatrix.factory.social.casting import HOBBIES, NAMES, draw_cast
 from embomatrix.factory.social.fitting import is_plausible, reasons_for, themes_of
 from embomatrix.factory.social.occasions import Theme, occasion_of, occasions, occasions_in
 from embomatrix.factory.social.phrases import (
@@ -29,6 +29,7 @@ from embomatrix.factory.social.phrases import (
 from embomatrix.factory.social.values import ROBOT, Act, Cast, DaySlot, Person
 from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.factory.writer.goals import GoalConjunct
+from embomatrix.factory.writer.tasks import DraftOrder
 from embomatrix.factory.writer.variant import build_variant
 from embomatrix.factory.writer.words import PHRASES
 from embomatrix.world.catalog import Catalog
@@ -46,14 +47,14 @@ def drafts():
     variant = build_variant(SCENE, ROOMS[:4], "Rs_int-talk", rng)
     view, writer = SceneView(variant.scene), SocialWriter(seed=2)
     categories = list(TaskCategory)
-    found = [writer.write(variant, view, categories[at % 4], f"t{at}", rng) for at in range(60)]
+    found = [writer.write(variant, view, DraftOrder(categories[at % 4], f"t{at}", rng)) for at in range(60)]
     return [draft for draft in found if draft is not None], writer.cast_of(SCENE)
 
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32))
 def test_every_room_has_a_person_and_ties_are_mutual(seed):
-    cast = GrammarRolePlayer().cast(SCENE, np.random.default_rng(seed))
+    cast = draw_cast(SCENE, np.random.default_rng(seed))
     assert cast.rooms_without_anyone(ROOMS) == ()
     for person in cast.people:
         for other in person.ties:
@@ -64,7 +65,7 @@ def test_every_room_has_a_person_and_ties_are_mutual(seed):
 @settings(max_examples=30)
 @given(st.integers(0, 2**32))
 def test_every_activity_of_a_room_has_a_person(seed):
-    cast = GrammarRolePlayer().cast(SCENE, np.random.default_rng(seed))
+    cast = draw_cast(SCENE, np.random.default_rng(seed))
     done = {(slot.room, slot.activity) for slot in cast.day}
     for room in SCENE.rooms:
         for occasion in occasions_in(room.type):
@@ -75,7 +76,7 @@ def test_every_activity_of_a_room_has_a_person(seed):
 @settings(max_examples=50)
 @given(st.integers(0, 2**32))
 def test_parents_are_a_generation_older_and_setting_matches_the_household(seed):
-    cast = GrammarRolePlayer().cast(SCENE, np.random.default_rng(seed))
+    cast = draw_cast(SCENE, np.random.default_rng(seed))
     first = cast.people[0]
     ties = {tie for person in cast.people[1:] for tie in person.ties.values()}
     for person in cast.people[1:]:
@@ -92,7 +93,7 @@ def test_parents_are_a_generation_older_and_setting_matches_the_household(seed):
 )
 def test_other_scenes_have_other_casts(base):
     scene = build_base_scene(base, seed=0)
-    cast = GrammarRolePlayer().cast(scene, np.random.default_rng(0))
+    cast = draw_cast(scene, np.random.default_rng(0))
     assert cast.rooms_without_anyone(tuple(room.name for room in scene.rooms)) == ()
     assert {person.job for person in cast.people}.isdisjoint({"pensioner", "lodger"})
 
@@ -130,7 +131,9 @@ def test_equal_generators_write_equal_tasks():
     def written():
         rng = np.random.default_rng(9)
         variant = build_variant(SCENE, ROOMS[:3], "Rs_int-same", rng)
-        draft = SocialWriter(1).write(variant, SceneView(variant.scene), TaskCategory.COMPOUND, "t", rng)
+        draft = SocialWriter(1).write(
+            variant, SceneView(variant.scene), DraftOrder(TaskCategory.COMPOUND, "t", rng)
+        )
         return draft.task.instruction, draft.transcript, draft.signature
 
     assert written() == written()
@@ -208,7 +211,7 @@ def test_every_activity_has_reasons_and_every_theme_occurs():
 @settings(max_examples=40)
 @given(st.integers(0, 2**32), st.sampled_from(["Rs_int", "shop"]))
 def test_activities_suit_age_and_place(seed, base):
-    cast = GrammarRolePlayer().cast(
+    cast = draw_cast(
         dataclasses.replace(SCENE, base="grocery_x" if base == "shop" else base), np.random.default_rng(seed)
     )
     for slot in cast.day:
@@ -289,7 +292,7 @@ def test_tidying_person_does_not_ask_for_running_water():
     assert sinks
     for sink in sinks:
         sign = f"toggled_on({sink})"
-        piece = GoalConjunct(Atom("toggled_on", (sink,)), "", (sink,), (sign,), "switch", "it", options="tap")
+        piece = GoalConjunct(Atom("toggled_on", (sink,)), "", (sink,), (sign,), "switch", "it", manner="tap")
         assert Theme.TIDYING not in themes_of(piece, Flat()), sink
 
 

@@ -16,7 +16,7 @@ from embomatrix.factory.furnish.small_objects import (
     suits,
 )
 from embomatrix.factory.scenes.view import SceneView, is_liftable
-from embomatrix.factory.writer.tasks import Draft, PlainWriter, is_heldout_signature, object_table
+from embomatrix.factory.writer.tasks import Draft, DraftOrder, PlainWriter, is_heldout_signature, object_table
 from embomatrix.factory.writer.variant import Variant
 from embomatrix.factory.writer.words import Voice, refer, room_words, sentence
 from embomatrix.world.bddl import ROOM_TYPES, parse_formula
@@ -48,7 +48,8 @@ def variant(scene: Scene) -> Variant:
 
 def drafts(variant: Variant, view: SceneView, category: TaskCategory, count: int = 30) -> list[Draft]:
     found = (
-        PlainWriter().write(variant, view, category, f"t{i}", np.random.default_rng(i)) for i in range(count)
+        PlainWriter().write(variant, view, DraftOrder(category, f"t{i}", np.random.default_rng(i)))
+        for i in range(count)
     )
     return [draft for draft in found if draft is not None]
 

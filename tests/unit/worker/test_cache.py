@@ -1,4 +1,4 @@
-"""Bundles on disk: what is there is not fetched, what is damaged is fetched again, what is old goes."""
+"""Bundle cache: known bundles are not fetched, damaged ones are fetched again, old ones are evicted."""
 
 import asyncio
 import os
@@ -55,7 +55,7 @@ async def test_a_bundle_damaged_on_disk_is_fetched_again(tmp_path):
     assert len(source.asked) == 2
 
 
-async def test_a_bundle_damaged_on_its_way_twice_is_given_up(tmp_path):
+async def test_bundle_damaged_in_transit_twice_is_given_up(tmp_path):
     source = Source(b"scene", wrong=2)
     with pytest.raises(LoadError, match="fetched twice") as caught:
         await _cache(tmp_path, source).path_of(next(iter(source.bundles)))
@@ -64,14 +64,14 @@ async def test_a_bundle_damaged_on_its_way_twice_is_given_up(tmp_path):
 
 
 @pytest.mark.parametrize("digest", ["", "sha256:xyz", "../../etc/passwd", "sha256:" + "0" * 63])
-async def test_what_is_no_digest_is_never_a_path(tmp_path, digest):
+async def test_invalid_digest_never_becomes_a_path(tmp_path, digest):
     source = Source()
     with pytest.raises(LoadError, match="is no digest"):
         await _cache(tmp_path, source).path_of(digest)
     assert source.asked == []
 
 
-async def test_the_longest_unused_bundles_go_when_the_disk_is_full(tmp_path):
+async def test_least_recently_used_bundles_are_evicted_at_the_limit(tmp_path):
     source = Source(b"a" * 400, b"b" * 400, b"c" * 400)
     cache = _cache(tmp_path, source, limit_bytes=1000)
     oldest, middle, newest = source.bundles
@@ -84,7 +84,7 @@ async def test_the_longest_unused_bundles_go_when_the_disk_is_full(tmp_path):
     assert names == {digest.removeprefix("sha256:") + ".bundle" for digest in (oldest, newest)}
 
 
-async def test_a_cache_that_is_opened_again_fetches_nothing_it_has(tmp_path):
+async def test_reopened_cache_fetches_no_known_bundle(tmp_path):
     source = Source(b"scene", b"other")
     for digest in source.bundles:
         await _cache(tmp_path, source).path_of(digest)
@@ -94,7 +94,7 @@ async def test_a_cache_that_is_opened_again_fetches_nothing_it_has(tmp_path):
     assert later.asked == []
 
 
-async def test_two_daemons_share_a_folder_without_harm(tmp_path):
+async def test_two_daemons_share_a_cache_folder(tmp_path):
     contents = [bytes([number]) * 400 for number in range(8)]
     sources = [Source(*contents), Source(*contents)]
     caches = [_cache(tmp_path, source, limit_bytes=1300) for source in sources]
@@ -110,7 +110,7 @@ async def test_two_daemons_share_a_folder_without_harm(tmp_path):
     assert sum(path.stat().st_size for path in left) <= 1300
 
 
-async def test_what_a_killed_daemon_left_half_written_goes_in_time(tmp_path):
+async def test_old_partial_files_of_a_killed_daemon_are_removed(tmp_path):
     source = Source(b"scene")
     cache = _cache(tmp_path, source)
     (tmp_path / "bundles").mkdir()
@@ -145,7 +145,7 @@ MOUNT = 'mount -t tmpfs -o size=72k none "$0"'
 
 
 def _small_disks():
-    """Whether this system lets a person mount a disk of their own."""
+    """Return whether this system allows mounting a small disk."""
     command = (*ON_SMALL_DISK, MOUNT, "/mnt")
     return (
         shutil.which("unshare") is not None
@@ -154,7 +154,7 @@ def _small_disks():
 
 
 @pytest.mark.skipif(not _small_disks(), reason="needs a user namespace")
-def test_on_a_full_disk_other_bundles_make_way(tmp_path):
+def test_full_disk_evicts_all_other_bundles(tmp_path):
     command = (
         *ON_SMALL_DISK,
         f'{MOUNT} && exec "$1" -c "$2" "$0"',

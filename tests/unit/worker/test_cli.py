@@ -1,4 +1,4 @@
-"""The command line: one clear sentence and status 2 for what a person can mend."""
+"""Command line of the worker: one sentence and status 2 for every error that a user can mend."""
 
 import subprocess
 import sys
@@ -12,7 +12,7 @@ def _worker(*arguments, prelude=""):
     )
 
 
-def test_a_machine_without_the_engine_is_told_what_to_install():
+def test_missing_engine_is_reported_with_the_install_command():
     # Only the wheel is hidden: the rest of the installation is the real one.
     hidden = (
         "import importlib.machinery as m\n"
@@ -29,7 +29,7 @@ def test_a_machine_without_the_engine_is_told_what_to_install():
     assert "Traceback" not in result.stderr
 
 
-def test_an_absent_manager_is_named_when_asked_once(tmp_path):
+def test_absent_manager_is_named_with_once(tmp_path):
     result = _worker("run", "--once", "--manager=127.0.0.1:1", f"--cache-dir={tmp_path}")
     assert result.returncode == 2
     assert "no manager answers at 127.0.0.1:1: start one with `embomatrix manager serve`" in result.stderr
@@ -43,13 +43,13 @@ def test_a_wrong_option_is_named_with_what_was_expected():
     assert "greater than or equal to 0" in result.stderr
 
 
-def test_a_wrong_address_is_told_what_one_looks_like():
+def test_wrong_address_is_reported_with_an_example():
     result = _worker("run", "--manager=nowhere")
     assert result.returncode == 2
     assert "--manager 'nowhere': expected HOST:PORT, as in 127.0.0.1:50070" in result.stderr
 
 
-def test_the_doctor_reports_what_it_found_and_what_is_missing():
+def test_doctor_reports_resources_and_missing_parts():
     result = _worker("doctor", "--manager=127.0.0.1:1")
     assert result.returncode == 2
     assert "pybullet 3.2.7" in result.stdout

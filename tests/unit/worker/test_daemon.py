@@ -1,4 +1,4 @@
-"""The daemon against a manager: it keeps results until they are taken, and comes back after every break."""
+"""Daemon against a fake manager: it keeps results until they are acknowledged and reconnects after every break."""
 
 import asyncio
 import contextlib
@@ -68,7 +68,7 @@ async def test_a_desired_scene_becomes_warm_and_a_lease_comes_back_scored(tmp_pa
     assert outcome.warm
 
 
-async def test_heartbeats_renew_what_is_held(tmp_path):
+async def test_heartbeats_renew_held_leases(tmp_path):
     manager = FakeManager()
     async with joined(manager, tmp_path):
         manager.lease("l1", manager.bundle(b"ok"), "slow")
@@ -86,7 +86,7 @@ async def test_many_leases_are_executed_once_each(tmp_path):
     assert sorted(_done(manager)) == sorted(f"l{number}" for number in range(200))
 
 
-async def test_results_travel_together_while_enough_waits_behind_the_slots(tmp_path, monkeypatch):
+async def test_results_share_messages_while_slots_have_enough_leases(tmp_path, monkeypatch):
     # So long that what is counted does not depend on the machine's speed.
     monkeypatch.setattr(session, "LINGER_S", 60.0)
     manager = FakeManager()
@@ -99,7 +99,7 @@ async def test_results_travel_together_while_enough_waits_behind_the_slots(tmp_p
     assert manager.deliveries < 100
 
 
-async def test_a_broken_stream_is_opened_again_and_unacknowledged_results_come_again(tmp_path):
+async def test_broken_stream_is_reopened_and_unacknowledged_results_are_resent(tmp_path):
     manager = FakeManager(acknowledging=False)
     digest = manager.bundle(b"ok")
     async with joined(manager, tmp_path):
@@ -117,7 +117,7 @@ async def test_a_broken_stream_is_opened_again_and_unacknowledged_results_come_a
     assert _done(manager) == ["l1", "l1", "l2", "l2"]
 
 
-async def test_heartbeats_tell_the_steps_of_what_runs(tmp_path):
+async def test_heartbeats_report_the_steps_of_running_rollouts(tmp_path):
     manager = FakeManager()
     async with joined(manager, tmp_path):
         digest = manager.bundle(b"ok")
@@ -128,7 +128,7 @@ async def test_heartbeats_tell_the_steps_of_what_runs(tmp_path):
         await _until(lambda: manager.steps.get("l2", [])[-2:] == [2, 2])
 
 
-async def test_a_worker_whose_drain_was_taken_back_stays(tmp_path):
+async def test_worker_stays_after_its_drain_was_cancelled(tmp_path):
     manager = FakeManager()
     async with joined(manager, tmp_path):
         digest = manager.bundle(b"ok")
@@ -142,7 +142,7 @@ async def test_a_worker_whose_drain_was_taken_back_stays(tmp_path):
         await _until(lambda: "l2" in _done(manager))
 
 
-async def test_leases_go_on_while_the_stream_is_broken(tmp_path):
+async def test_leases_continue_while_the_stream_is_broken(tmp_path):
     manager = FakeManager()
     async with joined(manager, tmp_path):
         manager.lease("l1", manager.bundle(b"ok"), "slow")
@@ -152,7 +152,7 @@ async def test_leases_go_on_while_the_stream_is_broken(tmp_path):
         assert [ref.lease_id for ref in manager.states[-1].running] in (["l1"], [])
 
 
-async def test_a_manager_that_forgot_the_session_is_joined_anew_and_old_leases_are_dropped(tmp_path):
+async def test_worker_registers_again_with_a_manager_that_forgot_its_session(tmp_path):
     manager = FakeManager()
     digest = manager.bundle(b"ok")
     async with joined(manager, tmp_path):
@@ -165,7 +165,7 @@ async def test_a_manager_that_forgot_the_session_is_joined_anew_and_old_leases_a
     assert _done(manager) == ["new"]
 
 
-async def test_a_manager_that_was_away_is_joined_when_it_is_back(tmp_path):
+async def test_worker_joins_a_manager_that_comes_back(tmp_path):
     manager = FakeManager()
     async with serving(manager) as address:
         pass
@@ -180,13 +180,13 @@ async def test_a_manager_that_was_away_is_joined_when_it_is_back(tmp_path):
             await task
 
 
-async def test_with_once_an_absent_manager_ends_the_daemon_with_a_sentence(tmp_path):
+async def test_once_ends_the_daemon_if_the_manager_is_absent(tmp_path):
     daemon = _daemon("127.0.0.1:1", tmp_path, once=True)
     with pytest.raises(ManagerUnreachableError, match=re.escape("no manager answers at 127.0.0.1:1")):
         await daemon.run()
 
 
-async def test_leases_that_cannot_be_renewed_are_stopped(tmp_path):
+async def test_unrenewable_leases_are_stopped(tmp_path):
     manager = FakeManager(lease_ttl_s=0.5, answering_heartbeats=False)
     async with joined(manager, tmp_path) as (daemon, _):
         manager.lease("l1", manager.bundle(b"ok"), "hang", deadline_s=600.0)
@@ -195,7 +195,7 @@ async def test_leases_that_cannot_be_renewed_are_stopped(tmp_path):
     assert manager.results == []
 
 
-async def test_a_name_that_is_taken_over_again_and_again_ends_the_daemon(tmp_path):
+async def test_repeated_session_conflicts_end_the_daemon(tmp_path):
     manager = FakeManager()
     async with joined(manager, tmp_path) as (_, task):
         for count in range(1, 5):
@@ -218,7 +218,7 @@ async def test_a_cancelled_lease_gives_no_result(tmp_path):
     assert _done(manager) == ["l1"]
 
 
-async def test_a_bundle_damaged_on_its_way_is_fetched_once_more(tmp_path):
+async def test_bundle_damaged_in_transit_is_fetched_once_more(tmp_path):
     manager = FakeManager()
     digest = manager.bundle(b"ok")
     manager.damaged.add(digest)
@@ -229,7 +229,7 @@ async def test_a_bundle_damaged_on_its_way_is_fetched_once_more(tmp_path):
     assert manager.fetches == [digest, digest]
 
 
-async def test_a_bundle_that_the_manager_lacks_fails_its_leases_with_the_reason(tmp_path):
+async def test_bundle_missing_at_the_manager_fails_its_leases_with_the_reason(tmp_path):
     manager = FakeManager()
     digest = manager.bundle(b"ok")
     del manager.bundles[digest]
@@ -241,7 +241,7 @@ async def test_a_bundle_that_the_manager_lacks_fails_its_leases_with_the_reason(
     assert "there is no bundle" in outcome.message
 
 
-async def test_a_drain_finishes_what_runs_then_leaves(tmp_path):
+async def test_drain_finishes_running_leases_and_leaves(tmp_path):
     manager = FakeManager()
     async with joined(manager, tmp_path) as (daemon, task):
         manager.lease("l1", manager.bundle(b"ok"), "slow")

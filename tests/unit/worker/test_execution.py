@@ -1,4 +1,4 @@
-"""What lies ahead in a slot's stream: it is executed without the daemon, and what becomes of its process costs it nothing."""
+"""Leases ahead in a slot's stream: they run without the daemon, and a failing process loses none of them."""
 
 import asyncio
 import itertools
@@ -35,7 +35,7 @@ def executions(tmp_path, monkeypatch):
 
 
 def submit(harness, lease_id, task="ok", deadline_s=30.0, digest="scene"):
-    """As the manager's leases come: with the rollout's message, which may wait in a stream."""
+    """Submit a lease with the rollout's message, as the manager sends it."""
     lease = Lease(LeaseRef(lease_id, 1), Rollout(lease_id, "g", digest, task, (), 1), deadline_s)
     lease = lease_from_proto(lease_to_proto(lease))
     harness.pool.submit(lease)
@@ -57,7 +57,7 @@ async def learn_pace(harness):
     return count
 
 
-async def test_a_slot_goes_on_while_the_daemon_does_something_else(tmp_path, executions):
+async def test_slot_continues_while_the_daemon_is_busy(tmp_path, executions):
     async with running(tmp_path, slots=1) as harness:
         early = await learn_pace(harness)
         for number in range(12):
@@ -82,9 +82,7 @@ async def test_a_slot_goes_on_while_the_daemon_does_something_else(tmp_path, exe
         ("hang", InfraCode.SLOT_TIMEOUT),
     ],
 )
-async def test_what_a_rollout_does_to_its_process_costs_none_of_those_behind_it(
-    tmp_path, executions, task, code
-):
+async def test_failed_rollout_does_not_affect_leases_behind_it(tmp_path, executions, task, code):
     async with running(tmp_path, slots=1) as harness:
         await learn_pace(harness)
         for number in range(4):
@@ -103,9 +101,7 @@ async def test_what_a_rollout_does_to_its_process_costs_none_of_those_behind_it(
     assert before.isdisjoint(behind), "a damaged process executes nothing more"
 
 
-async def test_a_lease_that_is_cancelled_in_a_stream_gives_no_result_and_nothing_is_killed(
-    tmp_path, executions
-):
+async def test_lease_cancelled_in_a_stream_gives_no_result_and_kills_nothing(tmp_path, executions):
     async with running(tmp_path, slots=1) as harness:
         await learn_pace(harness)
         submit(harness, "first", "slow")
@@ -118,7 +114,7 @@ async def test_a_lease_that_is_cancelled_in_a_stream_gives_no_result_and_nothing
     assert all(isinstance(outcome, Completed) for outcome in outcomes.values())
 
 
-async def test_what_waits_behind_a_rollout_that_is_cancelled_is_executed_elsewhere(tmp_path, executions):
+async def test_leases_behind_a_cancelled_rollout_are_executed_elsewhere(tmp_path, executions):
     async with running(tmp_path, slots=1) as harness:
         await learn_pace(harness)
         stuck = submit(harness, "stuck", "hang")
@@ -131,7 +127,7 @@ async def test_what_waits_behind_a_rollout_that_is_cancelled_is_executed_elsewhe
     assert set(executions().values()) == {1}
 
 
-async def test_a_lease_of_another_scene_is_executed_though_those_at_hand_never_end(tmp_path):
+async def test_lease_of_another_scene_is_executed_despite_endless_leases_of_a_busy_scene(tmp_path):
     async with running(tmp_path, slots=1) as harness:
         harness.pool.want(["scene", "other"])
         await harness.until(lambda: harness.state("scene") is harness.state("other") is ResidentState.WARM)
@@ -146,7 +142,7 @@ async def test_a_lease_of_another_scene_is_executed_though_those_at_hand_never_e
             await asyncio.sleep(0.002)
 
 
-async def test_a_lease_that_is_given_again_after_it_was_cancelled_has_one_result(tmp_path):
+async def test_lease_given_again_after_a_cancellation_has_one_result(tmp_path):
     async with running(tmp_path, slots=1) as harness:
         await learn_pace(harness)
         submit(harness, "first", "slow")
@@ -162,9 +158,7 @@ async def test_a_lease_that_is_given_again_after_it_was_cancelled_has_one_result
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-async def test_whatever_happens_in_slots_every_lease_that_is_waited_for_has_one_result(
-    tmp_path, executions, seed
-):
+async def test_every_lease_that_is_not_cancelled_has_one_result(tmp_path, executions, seed):
     rng = random.Random(seed)
     kinds = {"ok": 12, "brief": 2, "crash": 1, "raise": 1, "hang": 1}
     tasks = dict(enumerate(rng.choices(list(kinds), list(kinds.values()), k=50)))

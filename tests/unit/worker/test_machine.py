@@ -1,4 +1,4 @@
-"""What a machine shows, read from real files, real processes and what loginctl prints."""
+"""Observation of a machine from real files, real processes and output of loginctl."""
 
 import os
 import subprocess
@@ -16,14 +16,13 @@ from embomatrix.worker.host.machine import (
     family_cpu_s,
     terminal_active_s,
 )
-from embomatrix.worker.host.pausing import Observation
-from embomatrix.worker.host.preferences import Preferences
+from embomatrix.worker.host.owner_policy import Observation, Preferences
 from embomatrix.worker.host.resources import free_disk_mb
 
 BUSY = "import time\nend = time.process_time() + 0.4\nwhile time.process_time() < end: pass\n"
 
 
-def test_the_last_key_in_any_terminal_is_a_sign_of_the_owner(tmp_path):
+def test_typing_in_any_terminal_is_user_activity(tmp_path):
     for name, typed_s in (
         ("pts/0", 1000),
         ("pts/7", 3000),
@@ -38,7 +37,7 @@ def test_the_last_key_in_any_terminal_is_a_sign_of_the_owner(tmp_path):
     assert terminal_active_s(tmp_path) == 3000
 
 
-def test_a_machine_without_terminals_and_desktops_has_been_left_alone_for_ever(tmp_path):
+def test_machine_without_terminals_and_desktops_is_idle(tmp_path):
     assert Owner(tmp_path, sessions=str).idle_s(time.time()) == NEVER_S
 
 
@@ -60,31 +59,31 @@ CLOSING = "Type=x11\nClass=user\nState=closing\nIdleHint=no\nIdleSinceHint=0\n"
         (TERMINAL + "\n" + DESKTOP.format("no", 0), 5000.0),
     ],
 )
-def test_a_desktop_is_used_until_it_says_that_it_is_idle(sessions, active_s):
+def test_desktop_is_in_use_until_its_idle_hint(sessions, active_s):
     assert desktop_active_s(sessions, 5000.0) == active_s
 
 
-def test_what_others_use_is_what_is_busy_and_not_ours():
+def test_load_of_others_is_busy_time_without_our_processes():
     before = CpuTimes(total_s=100, busy_s=50, ours_s=40)
     assert CpuTimes(200, 90, 60).others_share_since(before) == pytest.approx(0.2)
     assert CpuTimes(200, 90, 10).others_share_since(before) == pytest.approx(0.4)
     assert before.others_share_since(before) == 0.0
 
 
-def test_processes_below_ours_count_as_ours_also_after_their_end():
+def test_descendants_count_as_ours_even_after_their_end():
     before_s = family_cpu_s(os.getpid())
     subprocess.run([sys.executable, "-c", BUSY], check=True)
     # The kernel tells of whole ticks here, hundredths of a second, of which it may drop one at each end.
     assert family_cpu_s(os.getpid()) - before_s >= 0.38
 
 
-def test_a_process_that_is_gone_used_nothing():
+def test_ended_process_has_no_cpu_time():
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     assert family_cpu_s(process.pid) == 0.0
 
 
-def test_our_own_work_is_no_load_of_others_and_theirs_is():
+def test_only_other_programs_are_load_of_others():
     ours, nobody = HostMachine(lambda: [os.getpid()]), HostMachine(list)
     subprocess.run([sys.executable, "-c", BUSY], check=True)
     # Whatever else this machine does, both saw it; between them lies what was ours.
@@ -100,14 +99,14 @@ def test_this_machine_can_be_observed():
     assert seen.owner_idle_s >= 0
 
 
-def test_a_wish_that_this_machine_cannot_heed_is_told():
+def test_unsupported_preference_is_reported():
     machine = HostMachine(list)
     wishes = Preferences(idle_s=60, mains_only=True)
-    assert len(machine.blind_to(wishes, Observation(0))) == 2
-    assert machine.blind_to(wishes, Observation(0, owner_idle_s=5.0, on_mains=True)) == []
-    assert machine.blind_to(Preferences(), Observation(0)) == []
+    assert len(machine.unsupported(wishes, Observation(0))) == 2
+    assert machine.unsupported(wishes, Observation(0, owner_idle_s=5.0, on_mains=True)) == []
+    assert machine.unsupported(Preferences(), Observation(0)) == []
 
 
-def test_free_space_is_that_of_the_folder_or_of_what_is_there_of_it(tmp_path):
+def test_free_space_is_measured_at_the_nearest_existing_folder(tmp_path):
     assert free_disk_mb(tmp_path / "not" / "yet") == pytest.approx(free_disk_mb(tmp_path), rel=0.5)
     assert free_disk_mb(tmp_path) > 0

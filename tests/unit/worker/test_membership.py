@@ -1,4 +1,4 @@
-"""What a worker remembers of the managers that let it in."""
+"""Membership file: a worker keeps the credentials of its managers."""
 
 import stat
 
@@ -11,12 +11,12 @@ from embomatrix.worker.link.membership import Membership, MembershipFile, member
 KEPT = Membership("lab.example:50070", "spare", "own.credential", b"PEM")
 
 
-async def test_without_a_token_the_settings_count(tmp_path):
+async def test_membership_without_a_token_comes_from_the_settings(tmp_path):
     settings = WorkerSettings(manager="a:1,b:2", name="w1", state_dir=tmp_path)
     assert await membership_of(settings) == Membership("a:1,b:2", "w1")
 
 
-async def test_what_a_token_was_changed_for_comes_before_the_token(tmp_path):
+async def test_credential_takes_precedence_over_its_token(tmp_path):
     settings = WorkerSettings(manager="elsewhere:1", name="w1", token="join.secret", state_dir=tmp_path)
     assert (await membership_of(settings)).token == "join.secret"
     MembershipFile(tmp_path, "join.secret").keep(KEPT)
@@ -31,7 +31,7 @@ async def test_an_invitation_is_remembered_by_its_token_and_may_name_a_new_addre
     assert not found.joining
 
 
-def test_each_token_has_a_private_file_of_its_own_that_does_not_name_it(tmp_path):
+def test_each_token_has_a_private_file_that_does_not_name_it(tmp_path):
     for token in ("join.secret", "other.secret"):
         MembershipFile(tmp_path / "state", token).keep(KEPT)
     files = list((tmp_path / "state").iterdir())

@@ -1,4 +1,4 @@
-"""Results are kept until they are acknowledged, and carried again by the next stream."""
+"""Outbox: results are kept until they are acknowledged, and sent again on the next stream."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -30,7 +30,7 @@ def test_a_result_is_sent_once_on_a_stream_and_kept():
     assert len(outbox) == 3
 
 
-def test_a_new_stream_carries_what_was_not_acknowledged():
+def test_new_stream_sends_unacknowledged_results():
     outbox = _filled(3)
     outbox.take_unsent(3)
     outbox.acknowledge(_result(1).ref)
@@ -44,7 +44,7 @@ def test_an_acknowledgement_of_something_unknown_is_ignored():
     assert len(outbox) == 1
 
 
-def test_the_oldest_result_goes_when_nobody_listens_for_very_long():
+def test_oldest_result_is_dropped_beyond_the_limit():
     outbox = _filled(module.LIMIT + 1)
     assert len(outbox) == module.LIMIT
     assert outbox.take_unsent(1) == (_result(1),)

@@ -1,4 +1,4 @@
-"""Which scenes are loaded and evicted: decided from wishes, memory and use."""
+"""Residency decisions from wanted scenes, memory and last use."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -23,20 +23,20 @@ def test_the_most_urgent_missing_scene_is_next():
     assert decide(["a", "b"], _held("a"), budget_mb=500, known_mb={}) == Decision("b")
 
 
-def test_nothing_is_loaded_when_everything_wanted_is_there():
+def test_nothing_is_loaded_if_all_wanted_scenes_are_held():
     assert decide(["a"], _held("a", "z"), budget_mb=500, known_mb={}) == NOTHING
 
 
-def test_a_scene_whose_loading_failed_does_not_hold_up_the_next():
+def test_failed_scene_does_not_block_the_next():
     assert decide(["bad", "b"], {}, budget_mb=500, known_mb={}, refused={"bad"}) == Decision("b")
 
 
-def test_unwanted_scenes_go_first_and_the_longest_unused_before_others():
+def test_unwanted_scenes_are_evicted_first_by_last_use():
     decision = decide(["a", "new"], _held("x", "y", "a"), budget_mb=170, known_mb={"new": 50})
     assert decision == Decision("new", ("x",))
 
 
-def test_a_less_urgent_scene_makes_room_for_a_more_urgent_one_but_not_the_reverse():
+def test_less_urgent_scene_is_evicted_for_a_more_urgent_one_only():
     held = _held("late")
     assert decide(["now", "late"], held, budget_mb=60, known_mb={"now": 50}) == Decision("now", ("late",))
     assert decide(["late", "now"], held, budget_mb=60, known_mb={"now": 50}) == NOTHING
@@ -50,13 +50,13 @@ def test_a_scene_larger_than_the_budget_is_loaded_alone():
     assert decide(["huge"], _held("x"), budget_mb=60, known_mb={"huge": 900}) == Decision("huge", ("x",))
 
 
-def test_scenes_that_turned_out_too_large_are_evicted_down_to_the_most_urgent():
+def test_scenes_beyond_the_budget_are_evicted_down_to_the_most_urgent():
     assert surplus(["a", "b"], _held("a", "b", "z", memory_mb=100), budget_mb=150) == ("z", "b")
     assert surplus(["a"], _held("a", memory_mb=1000), budget_mb=150) == ()
 
 
 @given(WANTED, HELD, st.floats(50, 800))
-def test_a_load_keeps_to_the_budget_or_stands_alone(wanted, held, budget_mb):
+def test_load_stays_within_the_budget_or_is_the_only_scene(wanted, held, budget_mb):
     decision = decide(wanted, held, budget_mb=budget_mb, known_mb={})
     left = {digest: scene for digest, scene in held.items() if digest not in decision.evict}
     assert not any(held[digest].busy for digest in decision.evict)

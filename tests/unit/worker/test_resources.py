@@ -1,16 +1,16 @@
-"""What a machine offers, and settings that say so."""
+"""Resources of a machine and settings that override them."""
 
 import os
 
 import pytest
 from pydantic import ValidationError
 
-from embomatrix.worker.host.gpu import Gpu, ask_nvml, ask_program, find_gpu
+from embomatrix.worker.host.gpu import Gpu, find_gpu
 from embomatrix.worker.host.resources import fingerprint, measure
 from embomatrix.worker.host.settings import WorkerSettings
 
 
-def test_a_machine_offers_its_cores_and_part_of_its_memory():
+def test_resources_are_all_cores_and_a_share_of_the_memory():
     resources = measure(WorkerSettings())
     assert resources.slots == resources.cores == len(os.sched_getaffinity(0))
     assert resources.memory_mb > 0
@@ -18,7 +18,7 @@ def test_a_machine_offers_its_cores_and_part_of_its_memory():
     assert set(resources.versions) == {"embomatrix", "python", "pybullet", "numpy", "platform"}
 
 
-def test_settings_overrule_what_was_measured():
+def test_settings_take_precedence_over_measurements():
     resources = measure(WorkerSettings(slots=3, memory_mb=77))
     assert (resources.slots, resources.memory_mb) == (3, 77)
 
@@ -33,7 +33,7 @@ def test_a_gpu_is_found_by_nvidia_smi(tmp_path, monkeypatch):
     program.write_text("#!/bin/sh\necho 'NVIDIA H200, 143771'\n")
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    assert ask_program() == Gpu("NVIDIA H200", 143771)
+    assert find_gpu() == Gpu("NVIDIA H200", 143771)
 
 
 def test_a_gpu_program_that_fails_means_no_gpu(tmp_path, monkeypatch):
@@ -41,7 +41,7 @@ def test_a_gpu_program_that_fails_means_no_gpu(tmp_path, monkeypatch):
     program.write_text("#!/bin/sh\necho 'driver mismatch'\nexit 9\n")
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    assert ask_program() is None
+    assert find_gpu() == Gpu()
 
 
 def test_slots_render_only_where_a_gpu_has_memory_for_them():
@@ -51,12 +51,12 @@ def test_slots_render_only_where_a_gpu_has_memory_for_them():
     assert Gpu("A", 80_000).render_slots(8) == 8
 
 
-def test_a_machine_without_the_driver_of_a_gpu_has_none_and_says_nothing(monkeypatch):
+def test_machine_without_a_gpu_driver_has_no_gpu(monkeypatch):
     monkeypatch.setenv("PATH", "")
-    assert find_gpu() == (ask_nvml() or Gpu())
+    assert find_gpu() == Gpu()
 
 
-def test_a_machine_tells_its_labels_and_its_free_disk(tmp_path):
+def test_resources_include_labels_and_free_disk(tmp_path):
     resources = measure(WorkerSettings(cache_dir=tmp_path / "cache", labels={"room": "attic"}))
     assert resources.labels == {"room": "attic"}
     assert resources.disk_mb > 0

@@ -1,4 +1,4 @@
-"""Slots: whatever happens to a simulator's process, every lease ends in one result and the others don't notice."""
+"""Slots: every lease ends in one result, whatever happens to simulator processes."""
 
 import asyncio
 import contextlib
@@ -133,7 +133,7 @@ async def test_a_slot_is_used_again_for_the_next_lease_of_its_scene(tmp_path):
     ]
 
 
-async def test_results_hold_a_slot_for_what_they_took_though_many_are_read_together(tmp_path):
+async def test_results_read_together_have_their_own_execution_times(tmp_path):
     async with running(tmp_path, slots=1) as harness:
         began_s = time.monotonic()
         for number in range(40):
@@ -187,7 +187,7 @@ async def test_a_lease_that_is_given_twice_is_executed_once(tmp_path):
         assert sorted(result.ref.lease_id for result in harness.results) == ["l1", "l2"]
 
 
-async def test_a_crash_costs_one_rollout_and_the_next_one_finds_a_new_slot(tmp_path):
+async def test_crash_costs_one_rollout_and_the_next_gets_a_new_slot(tmp_path):
     async with running(tmp_path, slots=1) as harness:
         harness.submit("l1", "crash")
         harness.submit("l2")
@@ -199,7 +199,7 @@ async def test_a_crash_costs_one_rollout_and_the_next_one_finds_a_new_slot(tmp_p
     assert harness.fetched == ["scene"]
 
 
-async def test_a_rollout_that_hangs_is_killed_at_its_deadline_while_others_go_on(tmp_path):
+async def test_hanging_rollout_is_killed_at_its_deadline_without_affecting_others(tmp_path):
     async with running(tmp_path, slots=2) as harness:
         harness.submit("stuck", "hang", deadline_s=0.4)
         for number in range(20):
@@ -210,7 +210,7 @@ async def test_a_rollout_that_hangs_is_killed_at_its_deadline_while_others_go_on
     assert all(isinstance(outcome, Completed) for name, outcome in outcomes.items() if name != "stuck")
 
 
-async def test_an_exception_during_a_rollout_is_a_failure_of_the_infrastructure_and_no_reward(tmp_path):
+async def test_exception_during_a_rollout_is_an_infrastructure_failure(tmp_path):
     async with running(tmp_path) as harness:
         harness.submit("l1", "raise")
         outcome = (await harness.outcomes(1))["l1"]
@@ -229,7 +229,7 @@ async def test_a_rollout_that_takes_too_much_memory_fails_alone(tmp_path):
     assert isinstance(outcomes["l2"], Completed)
 
 
-async def test_a_scene_whose_process_died_is_loaded_anew_for_the_next_lease(tmp_path):
+async def test_scene_whose_process_died_is_loaded_again(tmp_path):
     async with running(tmp_path, slots=1) as harness:
         harness.submit("l1", "orphan")
         harness.submit("l2")
@@ -239,7 +239,7 @@ async def test_a_scene_whose_process_died_is_loaded_anew_for_the_next_lease(tmp_
     assert harness.fetched == ["scene", "scene"]
 
 
-async def test_a_scene_whose_process_was_stopped_is_replaced_while_its_running_rollout_goes_on(tmp_path):
+async def test_stopped_scene_process_is_replaced_while_its_rollout_continues(tmp_path):
     async with running(tmp_path, slots=2, fork_s=0.3) as harness:
         harness.submit("other", digest="other")
         await harness.outcomes(1)
@@ -257,7 +257,7 @@ async def test_a_scene_whose_process_was_stopped_is_replaced_while_its_running_r
         assert harness.fetched == ["other", "scene", "scene"]
 
 
-async def test_a_root_that_was_killed_is_started_anew(tmp_path):
+async def test_killed_root_is_restarted(tmp_path):
     async with running(tmp_path, slots=1) as harness:
         harness.submit("l1")
         await harness.outcomes(1)
@@ -289,7 +289,7 @@ async def test_a_scene_that_cannot_be_loaded_fails_its_leases_with_the_reason(tm
     assert isinstance(outcomes["l2"], Completed)
 
 
-async def test_scenes_that_nobody_wants_are_evicted_when_memory_is_short(tmp_path):
+async def test_unwanted_scenes_are_evicted_if_memory_is_short(tmp_path):
     async with running(tmp_path, memory_mb=100.0) as harness:
         harness.pool.want(["large-1"])
         await harness.until(lambda: harness.state("large-1") is ResidentState.WARM)
@@ -325,7 +325,7 @@ async def test_cancelling_right_after_the_start_does_not_lose_the_slot(tmp_path)
         await harness.until(lambda: any(result.ref.lease_id == "last" for result in harness.results))
 
 
-async def test_a_simulator_that_cannot_start_says_why(tmp_path):
+async def test_simulator_that_cannot_start_reports_the_reason(tmp_path):
     harness = Harness(tmp_path, program=("env", "FAKE_SIMULATION=broken", *PROGRAM))
     with pytest.raises(ProcessGoneError, match="the engine is missing: install it"):
         await harness.pool.start()
@@ -366,7 +366,7 @@ def test_no_process_outlives_a_daemon_that_was_killed(tmp_path):
     assert psutil.wait_procs(processes, timeout=5)[1] == []
 
 
-def test_what_is_forked_has_imported_neither_grpc_nor_pydantic():
+def test_forked_processes_have_imported_neither_grpc_nor_pydantic():
     check = (
         "import sys, embomatrix.worker.slots.slot_program, threading\n"
         "print([name for name in ('grpc', 'pydantic', 'torch', 'fastapi') if name in sys.modules], threading.active_count())"

@@ -1,4 +1,4 @@
-"""A spare PC at the command line: preferences from options and a file, status in words, a unit for systemd."""
+"""Command line of a spare PC: preferences from options and a file, status, and a systemd unit."""
 
 import os
 import shutil
@@ -14,14 +14,14 @@ from typer.testing import CliRunner
 from embomatrix.worker.commands.app import app
 from embomatrix.worker.commands.install import closed_to_others, quote, unit_text
 from embomatrix.worker.commands.run import settings_of
-from embomatrix.worker.commands.status import describe, spell
-from embomatrix.worker.host.status import StatusFile, WorkerStatus, running_daemons
+from embomatrix.worker.commands.status import describe, format_duration
+from embomatrix.worker.link.status import StatusFile, WorkerStatus, running_daemons
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 STATUS = WorkerStatus("w1", os.getpid(), time.time(), slots=4, memory_mb=2000, cache_mb=1024)
 
 
-def test_options_go_before_the_file_and_the_file_before_defaults(tmp_path):
+def test_options_take_precedence_over_the_file_and_the_file_over_defaults(tmp_path):
     config = tmp_path / "spare.toml"
     config.write_text(
         'name = "attic"\nslots = 3\ncache_mb = 77\n[labels]\nroom = "attic"\n'
@@ -41,7 +41,7 @@ def test_options_go_before_the_file_and_the_file_before_defaults(tmp_path):
         (["--max-load=7"], "--max-load 7.0: input should be less than or equal to 1"),
         (["--label=attic"], "--label 'attic': expected KEY=VALUE, as in room=lab"),
         (["--config=/nowhere.toml"], "--config /nowhere.toml: No such file or directory"),
-        (["--join", ""], "--join is empty, perhaps a variable that is not set: expected TOKEN@HOST:PORT"),
+        (["--join", ""], "--join is empty, perhaps an unset variable: expected TOKEN@HOST:PORT"),
         (["--cache-mb=0"], "--cache-mb 0: input should be greater than or equal to 1"),
     ],
 )
@@ -58,7 +58,7 @@ def test_a_wrong_preference_is_named_with_what_was_expected(arguments, said):
         ("cache_mbb = 3\n", "cache_mbb is no setting: expected one of ca, cache_dir, cache_mb,"),
     ],
 )
-def test_a_file_with_a_key_that_is_none_is_refused_and_told_those_that_there_are(tmp_path, text, said):
+def test_file_with_an_unknown_key_is_refused_with_the_known_ones(tmp_path, text, said):
     config = tmp_path / "spare.toml"
     config.write_text(text)
     result = CliRunner().invoke(app, ["run", f"--config={config}"])
@@ -66,7 +66,7 @@ def test_a_file_with_a_key_that_is_none_is_refused_and_told_those_that_there_are
     assert said in " ".join(result.stderr.split())
 
 
-def test_the_status_of_a_daemon_is_told_in_words(tmp_path):
+def test_status_of_a_daemon_is_described_in_lines(tmp_path):
     StatusFile(tmp_path, "w1").write(STATUS)
     result = CliRunner().invoke(app, ["status", f"--state-dir={tmp_path}"])
     assert result.exit_code == 0
@@ -75,7 +75,7 @@ def test_the_status_of_a_daemon_is_told_in_words(tmp_path):
     assert "0 of 4 slots run a rollout" in result.stdout
 
 
-def test_where_no_worker_runs_the_status_says_how_to_start_one(tmp_path):
+def test_status_without_workers_names_the_start_command(tmp_path):
     result = CliRunner().invoke(app, ["status", f"--state-dir={tmp_path}"])
     assert result.exit_code == 2
     assert "start one with `embomatrix worker run`" in result.stderr
@@ -89,15 +89,15 @@ def test_where_no_worker_runs_the_status_says_how_to_start_one(tmp_path):
         ({"paused": "on battery"}, "paused: on battery"),
         ({"running": 2}, "working"),
         ({}, "waiting for work"),
-        ({"draining": True, "paused": "on battery"}, "draining: leaves when what runs has ended"),
+        ({"draining": True, "paused": "on battery"}, "draining: leaves after the running rollouts"),
     ],
 )
-def test_each_standing_has_its_words(changes, said):
+def test_each_state_has_a_description(changes, said):
     lines = describe(WorkerStatus(**{**asdict(STATUS), "started_s": 0.0, **changes}), 100.0)
     assert said in [line.strip() for line in lines]
 
 
-def test_what_a_killed_daemon_left_is_passed_over(tmp_path):
+def test_status_files_of_killed_daemons_are_ignored(tmp_path):
     process = subprocess.Popen(["true"])
     process.wait()
     StatusFile(tmp_path, "dead").write(WorkerStatus("dead", process.pid, time.time()))
@@ -119,11 +119,11 @@ def test_a_status_that_cannot_be_written_is_no_error(tmp_path):
     ("seconds", "said"),
     [(5.9, "5 s"), (65, "1 min 5 s"), (3 * 3600 + 720, "3 h 12 min"), (200_000, "2 d 7 h")],
 )
-def test_durations_are_told_in_their_two_largest_units(seconds, said):
-    assert spell(seconds) == said
+def test_durations_have_their_two_largest_units(seconds, said):
+    assert format_duration(seconds) == said
 
 
-def test_a_unit_is_written_and_the_next_steps_are_said(tmp_path):
+def test_unit_is_written_and_the_next_steps_are_printed(tmp_path):
     config = tmp_path / "a b%.toml"
     config.write_text('join = "secret.of.mine@host:1"\n')
     result = _install(tmp_path, "--hours", "18:00-08:00", f"--config={config}")
@@ -132,7 +132,7 @@ def test_a_unit_is_written_and_the_next_steps_are_said(tmp_path):
     assert f'worker run --hours 18:00-08:00 --config "{tmp_path}/a b%%.toml"\n' in _unit(tmp_path)
 
 
-def test_paths_of_a_unit_are_those_that_were_meant_where_it_was_installed(tmp_path, monkeypatch):
+def test_relative_paths_of_a_unit_become_absolute(tmp_path, monkeypatch):
     (tmp_path / "spare.toml").write_text("slots = 2\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", "/home/ann")
@@ -145,14 +145,14 @@ def test_paths_of_a_unit_are_those_that_were_meant_where_it_was_installed(tmp_pa
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--join", "secret@host:1"], "a token in a unit is for everyone to read"),
-        (["--token=secret"], "a token in a unit is for everyone to read"),
+        (["--join", "secret@host:1"], "every user can read a token in a unit"),
+        (["--token=secret"], "every user can read a token in a unit"),
         (["--config=/nowhere.toml"], "--config /nowhere.toml: No such file or directory"),
         (["--hours=nights"], "--hours 'nights': expected HH:MM-HH:MM"),
         (["--slotz=3"], "No such option: --slotz"),
     ],
 )
-def test_what_would_end_a_worker_in_the_background_is_told_before_its_unit_is_written(tmp_path, words, said):
+def test_options_that_would_fail_in_the_background_are_refused_at_install(tmp_path, words, said):
     result = _install(tmp_path, *words)
     assert result.exit_code == 2
     assert said in " ".join(result.stderr.split())
@@ -160,15 +160,15 @@ def test_what_would_end_a_worker_in_the_background_is_told_before_its_unit_is_wr
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_unit_of_the_whole_machine_writes_where_it_may(tmp_path):
+def test_system_unit_writes_to_its_state_folder(tmp_path):
     result = _install(tmp_path, "--cache-dir=/var/cache/mine", system=True)
     assert result.exit_code == 2
-    assert "writes below /var/lib/embomatrix-worker alone: leave --cache-dir out" in " ".join(
+    assert "can write below /var/lib/embomatrix-worker only: leave --cache-dir out" in " ".join(
         result.stderr.split()
     )
 
 
-def test_a_unit_without_rights_is_handed_the_files_that_root_alone_may_read():
+def test_unprivileged_unit_gets_root_files_as_credentials():
     words = ["--config", "/etc/embomatrix/100%.toml", "--nice", "5", "--token", "@/etc/embomatrix/token"]
     text = unit_text(["/opt/embomatrix"], words, system=True)
     assert (
@@ -191,7 +191,7 @@ def test_worker_and_manager_of_a_machine_keep_their_files_apart():
     assert len(folders) == len(set(folders)) == 2
 
 
-def test_a_folder_that_only_its_owner_may_pass_is_found(tmp_path):
+def test_folder_closed_to_other_users_is_found(tmp_path):
     tmp_path.chmod(0o700)
     assert closed_to_others(tmp_path / "venv" / "bin" / "embomatrix") is not None
     assert closed_to_others(Path("/usr/bin/env")) is None
@@ -206,7 +206,7 @@ def _unit(folder):
     return (folder / "embomatrix-worker.service").read_text()
 
 
-def test_words_of_a_command_are_taken_literally():
+def test_special_characters_are_quoted_for_systemd():
     assert [quote(word) for word in ("--nice=5", "a b", "100%", '$HOME"')] == [
         "--nice=5",
         '"a b"',

@@ -1,4 +1,4 @@
-"""What `bench fidelity` shows: its figures, a table of skills, and one disagreement step by step."""
+"""Figures of `bench fidelity`, and the replay of one disagreement step by step."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.pages.figures import Better, Figure
-from embomatrix.sim.fidelity.compare import objects_in, true_atoms
-from embomatrix.sim.fidelity.records import trial_from_json
+from embomatrix.sim.fidelity.compare import objects_in, trial_from_json, true_atoms
 from embomatrix.sim.fidelity.report import MANIPULATION, calls_of, report_on
 from embomatrix.sim.fidelity.sampler import SKILLS
 
@@ -37,7 +36,7 @@ MINUTES_GOAL: Final = 25.0
 
 
 def figures_of(outcome: SuiteResult, minutes: float | None) -> tuple[Figure, ...]:
-    """All figures. ``minutes`` is the wall time of the whole suite, None when part of it was done before."""
+    """All figures. ``minutes`` is the wall time of the whole suite; None if part of it had been done before."""
     report = report_on(outcome.comparisons)
     suite = (
         () if minutes is None else (Figure("suite_minutes", minutes, "min", Better.LOWER, 1, MINUTES_GOAL),)
@@ -52,7 +51,7 @@ def figures_of(outcome: SuiteResult, minutes: float | None) -> tuple[Figure, ...
 
 
 def _agreement(report: FidelityReport) -> Iterator[Figure]:
-    """Shares of what was compared that is equal in both modes."""
+    """Shares of the compared values that are equal in both modes."""
     for name, value, compared, goal in (
         ("final_atoms_equal", report.atoms_equal, report.atoms, ATOMS_GOAL),
         ("step_outcomes_equal", report.steps_equal, report.steps, STEPS_GOAL),
@@ -64,7 +63,7 @@ def _agreement(report: FidelityReport) -> Iterator[Figure]:
 
 
 def _extent(outcome: SuiteResult, report: FidelityReport) -> Iterator[Figure]:
-    """How much was compared, and of what kind."""
+    """Numbers of plans, scenes and calls that were compared."""
     higher, plans, lost = Better.HIGHER, report.plans, len(outcome.lost)
     calls = calls_of(outcome.comparisons)
     rarest = float(min(calls[skill] for skill in SKILLS))
@@ -93,7 +92,7 @@ def _skill_figures(report: FidelityReport) -> Iterator[Figure]:
 
 
 def read_disagreement(spot: str) -> FidelityTrial:
-    """The trial of a line, given as FILE:N with N from 1. Raises BenchError."""
+    """Read the trial of a line FILE:N, N from 1. Raise BenchError."""
     name, _, number = spot.rpartition(":")
     if not name or not number.isdecimal() or int(number) < 1:
         raise BenchError(f"found {spot!r}: expected FILE:N, a line of a file of disagreements, N from 1")
@@ -106,15 +105,15 @@ def read_disagreement(spot: str) -> FidelityTrial:
                     raise BenchError(
                         f"{spot} is no trial ({error}): expected a line that the suite wrote"
                     ) from error
-    raise BenchError(f"{name} has fewer than {number} lines: name one that is there")
+    raise BenchError(f"{name} has fewer than {number} lines: name an existing line")
 
 
 def replay_trial(dataset: Dataset, trial: FidelityTrial, modes: Modes) -> Iterator[str]:
-    """Lines about the trial, executed again in both modes. Raises DatasetError, BenchError and EngineError."""
+    """Execute the trial again in both modes and yield lines about it. Raise DatasetError, BenchError and EngineError."""
     bundle = dataset.bundle(trial.bundle_digest)
     task = bundle.tasks.get(trial.task_id)
     if task is None:
-        raise BenchError(f"the bundle has no task {trial.task_id!r}: name the dataset that the suite ran on")
+        raise BenchError(f"the bundle has no task {trial.task_id!r}: name the dataset of the suite")
     yield f"{trial.trial_id} ({trial.kind.value} plan) in {trial.base}, task {trial.task_id}, seed {trial.seed}"
     yield f"goal: {task.goal_bddl}"
     with (
@@ -127,14 +126,14 @@ def replay_trial(dataset: Dataset, trial: FidelityTrial, modes: Modes) -> Iterat
             one, other = cached.run_step(call), physical.run_step(call)
             mark = " " if one.ok is other.ok else "≠"
             yield f"{mark} {number}. {one.call.skill.value}"
-            yield f"      cached:   {_told(one)}"
-            yield f"      physical: {_told(other)}"
+            yield f"      cached:   {_line(one)}"
+            yield f"      physical: {_line(other)}"
             if not (one.ok and other.ok):
                 break
         yield from _atom_lines(cached, physical, task, trial)
 
 
-def _told(step: Step) -> str:
+def _line(step: Step) -> str:
     return step.message if step.failure is None else f"{step.failure.value}: {step.message}"
 
 

@@ -1,7 +1,6 @@
-"""`bench fidelity`: the same plans in both execution modes, and how far they agree.
+"""`bench fidelity`: the same plans in both execution modes, and their agreement.
 
-What is done stands in a folder: the trials, a line for each result, and the disagreements. A suite that was cut short goes on
-where it was.
+A folder holds the trials, a line for each result, and the disagreements. An interrupted suite resumes from it.
 """
 
 from __future__ import annotations
@@ -15,14 +14,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.bench.fidelity.pool import LOST, FidelityPool, Modes, TrialJob
 from embomatrix.bench.report.figures import BenchError
-from embomatrix.sim.fidelity.compare import PlanKind
-from embomatrix.sim.fidelity.plans import Example, Request, write_trials
-from embomatrix.sim.fidelity.records import (
+from embomatrix.sim.fidelity.compare import (
+    PlanKind,
     comparison_from_json,
     disagreement_to_json,
     trial_from_json,
     trial_to_json,
 )
+from embomatrix.sim.fidelity.plans import SolvedTask, TrialRequest, write_trials
 from embomatrix.sim.fidelity.sampler import SKILLS
 from embomatrix.skills.parse import PlanError, plan_from_json
 from embomatrix.world.dataset import DatasetError
@@ -42,11 +41,11 @@ SHARES: Final[Mapping[PlanKind, float]] = {
     PlanKind.PERTURBED: 0.17,
     PlanKind.FAILING: 0.11,
 }
-"""Plans of each kind."""
+"""Shares of the plans by kind."""
 ROUNDS: Final = 6
-"""Times that plans are written for the skills that still lack calls."""
+"""Rounds of plans for skills that still lack calls."""
 LIMIT_S: Final = 180.0
-"""Time that a process may take to load a scene and run a trial, on a busy machine."""
+"""Limit for a process to load a scene and run a trial on a busy machine."""
 SETTINGS_FILE: Final = "settings.json"
 PLANS_FILE: Final = "plans.jsonl"
 RESULTS_FILE: Final = "results.jsonl"
@@ -55,7 +54,7 @@ DISAGREEMENTS_FILE: Final = "disagreements.jsonl"
 
 @dataclass(frozen=True, slots=True)
 class FidelitySettings:
-    """What decides the trials: at least ``plans`` of them, with at least ``calls`` of every skill, where scenes allow it."""
+    """Settings of the trials: at least ``plans``, with at least ``calls`` of every skill if the scenes allow it."""
 
     plans: int = 1_000
     calls: int = 200
@@ -64,7 +63,7 @@ class FidelitySettings:
 
 @dataclass(frozen=True, slots=True)
 class SuiteResult:
-    """What a suite yielded. ``lost`` are sentences about trials without a result."""
+    """Result of a suite. ``lost`` has one sentence for each trial without a result."""
 
     comparisons: tuple[Comparison, ...]
     lost: tuple[str, ...]
@@ -72,7 +71,7 @@ class SuiteResult:
 
 @dataclass(frozen=True, slots=True)
 class SuiteProgress:
-    """Who is told how far the suite is: scenes whose trials are written, and trials that are executed, each of how many."""
+    """Progress callbacks with a count and its total: scenes with written trials, and executed trials."""
 
     written: Callable[[int, int], None]
     executed: Callable[[int, int], None]
@@ -86,14 +85,13 @@ def run_fidelity(
     modes: Modes,
     progress: SuiteProgress,
 ) -> SuiteResult:
-    """Write the trials, or read them; execute those without a result; save the disagreements.
+    """Write or read the trials, execute those without a result, and save the disagreements.
 
-    Trials that were lost before, as a machine was halted in their midst, are tried again. Without processes nothing is
-    executed: the outcome is that of the results so far.
+    Lost trials are repeated. Without processes nothing is executed, and the result covers the results so far.
 
-    Raises BenchError when the folder holds a suite of other settings or can't be read, DatasetError and EngineError.
+    Raise BenchError if the folder holds a suite of other settings or can't be read; DatasetError and EngineError.
     """
-    with _told(folder):
+    with _readable(folder):
         folder.mkdir(parents=True, exist_ok=True)
         trials = _trials(dataset, settings, folder, modes, progress)
         path = folder / RESULTS_FILE
@@ -114,9 +112,9 @@ def run_fidelity(
         return _outcome(trials, done, folder)
 
 
-def examples_of(dataset: Dataset) -> dict[str, list[Example]]:
-    """Tasks with their oracle plans, by bundle. Raises BenchError for a plan that is none."""
-    found: dict[str, list[Example]] = {}
+def examples_of(dataset: Dataset) -> dict[str, list[SolvedTask]]:
+    """Tasks with their oracle plans, by bundle. Raise BenchError for an invalid plan."""
+    found: dict[str, list[SolvedTask]] = {}
     for record in dataset.records:
         found.setdefault(record.bundle_digest, []).append(_example(record))
     if not found:
@@ -129,7 +127,7 @@ def examples_of(dataset: Dataset) -> dict[str, list[Example]]:
 def write_all_trials(
     dataset: Dataset, settings: FidelitySettings, modes: Modes, progress: SuiteProgress
 ) -> tuple[FidelityTrial, ...]:
-    """Trials over all bundles of the dataset; equal arguments give equal trials."""
+    """Write trials over all bundles of the dataset; equal arguments give equal trials."""
     examples = examples_of(dataset)
     plans = {kind: math.ceil(settings.plans * share / len(examples)) for kind, share in SHARES.items()}
     trials: list[FidelityTrial] = []
@@ -137,29 +135,29 @@ def write_all_trials(
     wanted = dict.fromkeys(SKILLS, math.ceil(settings.calls / len(examples)))
     for turn in range(ROUNDS):
         for number, (digest, items) in enumerate(examples.items(), start=1):
-            request = Request(plans, wanted, settings.seed + turn, extra, first=len(trials))
+            request = TrialRequest(plans, wanted, settings.seed + turn, extra, first=len(trials))
             with contextlib.closing(modes.cached(dataset.read_bundle(digest))) as simulator:
                 trials += write_trials(simulator, digest, items, request)
             progress.written(number, len(examples))
         lacking = {skill: settings.calls - count for skill, count in _calls(trials).items()}
         if all(count <= 0 for count in lacking.values()):
             break
-        # Scenes without what a skill needs make no plan for it, so the others are asked for more than their share.
+        # Some scenes can't use a skill, so the others get more than their share of its plans.
         wanted = {skill: math.ceil(2 * max(0, lacking[skill]) / len(examples)) for skill in SKILLS}
         plans, extra = {}, max(wanted.values())
     return tuple(trials)
 
 
 def _calls(trials: Iterable[FidelityTrial]) -> dict[Skill, int]:
-    """Calls of each skill in plans that are to succeed."""
+    """Calls of each skill in plans that should succeed."""
     sure = (PlanKind.ORACLE, PlanKind.VALID)
     counts = Counter(call.skill for trial in trials if trial.kind in sure for call in trial.plan)
     return {skill: counts[skill] for skill in SKILLS}
 
 
-def _example(record: TaskRecord) -> Example:
+def _example(record: TaskRecord) -> SolvedTask:
     try:
-        return Example(record.task, plan_from_json([*record.oracle], record.task.profile))
+        return SolvedTask(record.task, plan_from_json([*record.oracle], record.task.profile))
     except PlanError as error:
         raise BenchError(
             f"the oracle plan of task {record.task.task_id!r} is no plan: {error}; build the dataset anew"
@@ -169,7 +167,7 @@ def _example(record: TaskRecord) -> Example:
 def _trials(
     dataset: Dataset, settings: FidelitySettings, folder: Path, modes: Modes, progress: SuiteProgress
 ) -> tuple[FidelityTrial, ...]:
-    """The trials in the folder, written there first when it is empty."""
+    """Read the trials of the folder; write them first if it is empty."""
     bundles = sorted({record.bundle_digest for record in dataset.records})
     wanted = {**asdict(settings), "bundles": bundles}
     path = folder / SETTINGS_FILE
@@ -187,7 +185,7 @@ def _trials(
 
 
 def _jobs(trials: Iterable[FidelityTrial]) -> list[TrialJob]:
-    """One job a bundle, the longest first: two processes then end at about the same time."""
+    """One job for each bundle, the longest first, so that processes end at about the same time."""
     by_bundle: dict[str, list[FidelityTrial]] = {}
     for trial in trials:
         by_bundle.setdefault(trial.bundle_digest, []).append(trial)
@@ -213,9 +211,9 @@ def _outcome(
 def _appending(
     path: Path, values: Iterable[Mapping[str, Any]]
 ) -> Iterator[Callable[[Mapping[str, Any]], None]]:
-    """Adds results to the file, written anew first without a last line that was cut short.
+    """Append results to the file, after rewriting it without a truncated last line.
 
-    Only who executes does that: a suite that is summed up meanwhile keeps the file which it writes to.
+    Only an executing suite does so: summing up must not replace the file that another process writes.
     """
     write_whole(path, "".join(json.dumps(value) + "\n" for value in values).encode("utf-8"))
     with path.open("a", encoding="utf-8") as file:
@@ -228,7 +226,7 @@ def _appending(
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:
-    """JSON values of a file's lines, none without the file. A last line that was cut short is left out."""
+    """JSON values of a file's lines; none without the file. A truncated last line is left out."""
     if not path.exists():
         return
     lines = path.read_text(encoding="utf-8").splitlines()
@@ -237,11 +235,13 @@ def _lines(path: Path) -> Iterator[dict[str, Any]]:
             yield json.loads(line)
         except ValueError as error:
             if number != len(lines) - 1:
-                raise BenchError(f"{path}:{number + 1} is damaged: remove the folder and run anew") from error
+                raise BenchError(
+                    f"{path}:{number + 1} is damaged: remove the folder and run again"
+                ) from error
 
 
 @contextlib.contextmanager
-def _told(folder: Path) -> Iterator[None]:
+def _readable(folder: Path) -> Iterator[None]:
     try:
         yield
     except DatasetError:

@@ -114,14 +114,16 @@ def import_(
         log = _resumed_log(outcomes, sources, settings)
         made = _import_all(console, sources[len(log.outcomes) :], settings, processes(jobs), log)
         admitted = out is None or _written(out, made)
-        told = log.outcomes
+        all_outcomes = log.outcomes
         verified = depth is Depth.VERIFY
-        evaluation = solved_of(told, seed, solids=solids) if verified else evaluation_of(told, seed)
-        _write(told, evaluation, report, json_file)
+        evaluation = (
+            solved_of(all_outcomes, seed, solids=solids) if verified else evaluation_of(all_outcomes, seed)
+        )
+        _write(all_outcomes, evaluation, report, json_file)
     if len(sources) == len(made) == 1:
         _print_one(console, sources[0], made[0])
         return
-    _print_outcomes(console, told, depth)
+    _print_outcomes(console, all_outcomes, depth)
     if not admitted:
         fail(
             f"no problem was admitted, so {out} was not written: use --bind-only to see which problems can be bound"
@@ -144,13 +146,13 @@ def _resumed_log(
 ) -> ResumableLog[ProblemOutcome]:
     """Return the log of the problems done so far. Raise EvaluationError if the file is about other problems."""
     log = ResumableLog[ProblemOutcome](path)
-    told = {
+    decisive_settings = {
         "seed": settings.seed,
         "depth": settings.depth,
         "scenes": [*settings.scenes],
         "look_ahead": settings.look_ahead,
     }
-    log.resume(told, outcome_from_json)
+    log.resume(decisive_settings, outcome_from_json)
     known = [outcome.name for outcome in log.outcomes]
     if known != [source.name for source in sources[: len(known)]]:
         raise EvaluationError(f"{path} is about other problems than this import: name another file")
@@ -247,12 +249,12 @@ def _import_all(
     """
     made: list[ImportedTask | Verified | TaskRefusal] = []
     done = len(log.outcomes)
-    with progress(console) as bars, importing(settings, min(jobs, len(sources) or 1)) as judge:
+    with progress(console) as bars, importing(settings, min(jobs, len(sources) or 1)) as import_many:
         bar = bars.add_task("problems", total=done + len(sources), completed=done)
-        for judged in judge(sources):
-            log.add(judged.outcome)
-            if judged.item is not None:
-                made.append(judged.item)
+        for imported in import_many(sources):
+            log.add(imported.outcome)
+            if imported.item is not None:
+                made.append(imported.item)
             bars.advance(bar)
     return made
 

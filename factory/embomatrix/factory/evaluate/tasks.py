@@ -16,7 +16,7 @@ from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.casting import NAMES
 from embomatrix.factory.social.writer import SocialWriter
-from embomatrix.factory.writer.tasks import Draft, PlainWriter
+from embomatrix.factory.writer.tasks import Draft, DraftOrder, PlainWriter
 from embomatrix.factory.writer.variant import build_variant
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.task import TaskCategory
@@ -133,7 +133,9 @@ def _drafts(base: Scene, writer: TaskWriter, number: int, seed: int) -> Iterator
     view, categories, given = SceneView(variant.scene), [*TaskCategory], 0
     for attempt in range(TRIES * EACH_VARIANT):
         category = categories[(number + attempt) % len(categories)]
-        draft = writer.write(variant, view, category, f"{variant.scene.scene_id}-{attempt:02d}", rng)
+        draft = writer.write(
+            variant, view, DraftOrder(category, f"{variant.scene.scene_id}-{attempt:02d}", rng)
+        )
         if isinstance(draft, Draft):
             yield draft
             given += 1

@@ -43,9 +43,7 @@ def task_page(
     tree: object = None,
     picture: str = "",
 ) -> str:
-    """Return the page. ``transcript`` is Markdown, ``tree`` a nested layout tree, ``picture`` the HTML of
-    `scene_picture`.
-    """
+    """Return the page. ``transcript`` is Markdown, ``tree`` a nested layout tree, ``picture`` the HTML of `scene_picture`."""
     task = record.task
     about = objects_of(task.goal, task.types)
     things = list(show.moments[0].things_m)
@@ -134,10 +132,10 @@ def _object_rows(record: TaskRecord, scene: Scene, about: frozenset[str]) -> str
     for number, name in enumerate(record.task.table):
         item, asset = scene.by_name[name], scene.asset_of(name)
         size = " × ".join(f"{extent:.2f}" for extent in asset.size_m)
-        told = ", ".join(sorted(state.value for state in item.states))
+        states = ", ".join(sorted(state.value for state in item.states))
         if any(share > 0 for share in item.joints):
-            told = ", ".join(filter(None, (told, "open")))
-        cells = (str(number), name, item.room, view.whereabouts(name), size, f"{asset.mass_kg:.1f}", told)
+            states = ", ".join(filter(None, (states, "open")))
+        cells = (str(number), name, item.room, view.whereabouts(name), size, f"{asset.mass_kg:.1f}", states)
         row = "".join(f"<td>{escape(cell)}</td>" for cell in cells)
         rows.append(f'<tr class="{"goal" if name in about else ""}">{row}</tr>')
     return "".join(rows)

@@ -72,9 +72,7 @@ GRADED_SHARE: Final = 0.3
 
 @dataclass(frozen=True, slots=True)
 class SpotCandidates:
-    """Candidate spots of one object: centres (n, 2), yaws (n,), and half extents (n, 2) of the box around the rotated
-    footprint.
-    """
+    """Candidate spots of one object: centres (n, 2), yaws (n,), and half extents (n, 2) of the rotated footprint's box."""
 
     center: FloatArray
     yaw: FloatArray
@@ -183,9 +181,7 @@ def next_to_m(size_m: Size3, other: PlaneFootprint) -> float:
 
 
 def _beside(spots: SpotCandidates, size_m: Size3, other: PlaneFootprint) -> BoolArray:
-    """Mask of spots side by side with a footprint: overlapping heights, a shared span along one axis, and a small
-    gap.
-    """
+    """Mask of spots side by side with a footprint: overlapping heights, a shared span along one axis, and a small gap."""
     if other.low_m >= size_m[2] or other.high_m <= 0.0:
         return np.zeros(len(spots), dtype=bool)
     apart = np.abs(spots.center - np.asarray(other.center_m)) - spots.half - _half(other)  # (n, 2)

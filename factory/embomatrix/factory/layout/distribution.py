@@ -38,8 +38,9 @@ class DistributionError(ValueError):
 
 
 def distribute(brief: DistributionBrief) -> Distribution:
-    """Return a room for each object. Raise DistributionError if an object fits no room, or if demands contradict one
-    another.
+    """Return a room for each object.
+
+    Raise DistributionError if an object fits no room, or if demands contradict one another.
     """
     rooms = {room.name: room for room in brief.rooms}
     rng = np.random.default_rng((brief.seed, 5))

@@ -39,8 +39,7 @@ def rooms_of(editor: SceneEditor) -> tuple[LayoutRoomFacts, ...]:
 
 
 def hosts_in(editor: SceneEditor, room: str, named: Container[str] = ()) -> tuple[HostFacts, ...]:
-    """Return the possible hosts in a room: furniture that people put objects on or in, and objects that the task
-    names.
+    """Return the possible hosts in a room: furniture that people put objects on or in, and objects that the task names.
 
     Furniture that the robot can't reach is left out.
     """
@@ -57,25 +56,26 @@ def _hosts(
     for item in editor.objects.values():
         asset = editor.asset_of(item.name)
         if item.name not in named:
-            nobody = HOST_GROUPS.get(asset.category) == frozenset()
-            if item.room != room or not item.fixed or nobody or item.name in editor.unserved:
+            unused = HOST_GROUPS.get(asset.category) == frozenset()
+            if item.room != room or not item.fixed or unused or item.name in editor.unserved:
                 continue
-        offers = _offers(asset, round(item.pose_world_asset.position_m[2], 3), asked=item.name in named)
-        shut = any(interior.closed_by for interior in asset.interiors)
+        offers = _offers(asset, round(item.pose_world_asset.position_m[2], 3), is_named=item.name in named)
+        closed = any(interior.closed_by for interior in asset.interiors)
         given = item.name in named or item.name not in editor.base.by_name
-        if shut and not given and not editor.view.opens(item.name):
+        if closed and not given and not editor.view.opens(item.name):
             offers = tuple(offer for offer in offers if offer.relation is not LayoutRelation.INSIDE)
         if offers:
-            yield HostFacts(item.name, asset.category, offers, tuple(contents.get(item.name, ())), shut)
+            yield HostFacts(item.name, asset.category, offers, tuple(contents.get(item.name, ())), closed)
 
 
-def _offers(asset: Asset, base_m: float, *, asked: bool) -> tuple[HostOffer, ...]:
-    highest_m = ROBOT.reach_high_m if asked else HIGHEST_M
+def _offers(asset: Asset, base_m: float, *, is_named: bool) -> tuple[HostOffer, ...]:
+    highest_m = ROBOT.reach_high_m if is_named else HIGHEST_M
     found = (_offer(asset, relation, base_m, highest_m) for relation in OFFERED)
     return tuple(
         offer
         for offer in found
-        if offer is not None and (asked or (bool(asset.supports) and LOWEST_M <= offer.height_m <= HIGHEST_M))
+        if offer is not None
+        and (is_named or (bool(asset.supports) and LOWEST_M <= offer.height_m <= HIGHEST_M))
     )
 
 

@@ -63,9 +63,7 @@ MAX_SURFACES: Final = 4
 """Number of a host's surfaces that the planar solver arranges. After them, only the sampler tries."""
 SHIFT_M: Final = 0.008
 TURN_RAD: Final = 0.15
-"""Random shift in metres and rotation of objects without an aligning constraint, so that layouts don't look like a
-grid.
-"""
+"""Random shift in metres and rotation of objects without an aligning constraint, so that layouts don't look like a grid."""
 MIN_PACKED: Final = 2
 """Number of objects from which on a loose container is packed from a corner, the largest object first."""
 ALIGNING: Final = frozenset(
@@ -92,8 +90,8 @@ def lay(
     left: list[LayoutFailure] = []
     unreachable: list[LayoutFailure] = []
     for number, room in enumerate(dict.fromkeys(rooms.values())):
-        mine = [item for item in items if rooms[item.name] == room]
-        job = _RoomJob(editor, agents, editor.rooms[room], mine, seed * 1009 + number, record)
+        room_items = [item for item in items if rooms[item.name] == room]
+        job = _RoomJob(editor, agents, editor.rooms[room], room_items, seed * 1009 + number, record)
         left += job.run()
         names |= job.names
         unreachable += job.unreachable
@@ -222,8 +220,9 @@ class _RoomJob:
                     self._sample(child, Relation(relation.value), host)
 
     def _is_packed(self, host: str, children: Sequence[str]) -> bool:
-        """True if the children are packed from a corner. Furniture shelves are not packed, since their objects must
-        stay reachable.
+        """True if the children are packed from a corner.
+
+        Furniture shelves are not packed, since their objects must stay reachable.
         """
         item = self._editor.objects.get(host)
         return item is not None and not item.fixed and len(children) >= MIN_PACKED
@@ -339,8 +338,7 @@ class _RoomJob:
         self._pending.record_failure(name, relation, host, error.reason, str(error))
 
     def _settle(self, fresh: Sequence[str]) -> None:
-        """Test the new objects for stability and access, and withdraw those that fail together with the objects on
-        them.
+        """Test the new objects for stability and access, and withdraw those that fail together with the objects on them.
 
         An unreachable object is accepted after repeated attempts. Before, its host is replaced or furniture is
         removed.

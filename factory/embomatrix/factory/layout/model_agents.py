@@ -25,8 +25,7 @@ from embomatrix.factory.layout.values import (
     PlacementConstraint,
     PlacementConstraints,
 )
-from embomatrix.llm.loop import OnOneLoop
-from embomatrix.llm.patience import FailureLimit
+from embomatrix.llm.batch import FailureLimit, OnOneLoop
 from embomatrix.llm.structured import ask
 from embomatrix.llm.values import ChatRequest, EndpointError, Message, Speaker, UnusableReplyError
 
@@ -78,8 +77,7 @@ class ConstraintsAnswer(_Answer):
 
 
 class ModelLayoutAgents(OnOneLoop):
-    """Layout agents on one language model. The rules replace unusable answers, and missing ones up to
-    ``failure_limit``.
+    """Layout agents on one language model. The rules replace unusable answers, and missing ones up to ``failure_limit``.
 
     Without a limit, the first missing answer raises EndpointError.
     """
@@ -144,12 +142,12 @@ class ModelLayoutAgents(OnOneLoop):
             _check_complete({thing.name for thing in brief.objects}, hung, "a parent")
             for thing in brief.objects:
                 allowed = [*choices(brief, thing, hung)]
-                mine = hung[thing.name]
-                nested = mine.parent in {other.name for other in brief.objects} and thing.relation is None
-                if allowed and mine not in allowed and not nested:
+                chosen = hung[thing.name]
+                nested = chosen.parent in {other.name for other in brief.objects} and thing.relation is None
+                if allowed and chosen not in allowed and not nested:
                     options = "; ".join(f"{branch.relation} {branch.parent}" for branch in allowed[:8])
                     raise ValueError(
-                        f"{thing.name} can't be {mine.relation} {mine.parent}: it can be {options}"
+                        f"{thing.name} can't be {chosen.relation} {chosen.parent}: it can be {options}"
                     )
 
         answer = self._ask(
@@ -207,9 +205,7 @@ class ModelLayoutAgents(OnOneLoop):
         seed: int,
         history: str = "",
     ) -> T | None:
-        """Return a checked answer, or None if it is unusable or missing. Raise EndpointError beyond the failure
-        limit.
-        """
+        """Return a checked answer, or None if it is unusable or missing. Raise EndpointError beyond the failure limit."""
         text = USER.format(brief=LAYOUT_AGENTS[name].brief.dump_json(brief).decode())
         if history:
             text += f"\nEarlier failures:\n{history}"

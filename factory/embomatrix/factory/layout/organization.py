@@ -37,169 +37,6 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import SceneObject
 
 
-MAX_ATTEMPTS: Final = 3
-SPOT_REASONS: Final = frozenset({LayoutReason.UNSTABLE, LayoutReason.INACCESSIBLE})
-"""Reasons that exclude a spot but not its host."""
-HIGHEST_M: Final = 1.5
-"""Maximum height for objects, from the paper."""
-LOWEST_M: Final = 0.15
-"""Lower furniture surfaces count as floor."""
-PREFERRED_SCORE: Final = 1.2
-RANK_PENALTY: Final = 0.12
-"""Score of an object's preferred host, and its decrease for each further host in the list."""
-UNKNOWN_SCORE: Final = 0.2
-"""Score of a host without a known convention."""
-AVOIDED_SCORE: Final = -0.6
-"""Score of a host that people avoid."""
-UNSUITABLE_SCORE: Final = -2.0
-FLOOR_SCORE: Final = -2.5
-"""Score of the floor for objects that don't belong there."""
-_FLOOR_GOODS: Final = (
-    "wicker_basket storage_box bucket hamper shopping_basket carton toolbox toy_box suitcase backpack duffel_bag "
-    "tote_bag ashcan recycling_bin trash_can plastic_bin broom mop vacuum watering_can basketball soccer_ball cage "
-    "cooler crate"
-)
-FLOOR_OBJECTS: Final = frozenset(_FLOOR_GOODS.split())
-"""Categories that people put on the floor."""
-CLOSED_SCORE: Final = -0.5
-"""Score of a closed cavity, unless the object is usually stored there."""
-CROWD_PENALTY: Final = 0.12
-SAME_CATEGORY_BONUS: Final = 0.35
-"""Bonus for standing with an object of the same category."""
-RANDOM_SCORE: Final = 0.45
-
-
-def organize(brief: RoomBrief) -> LayoutTree:
-    """Return a layout tree with every object that has a host left. Hosts are children of the root, the floor."""
-    rng = np.random.default_rng((brief.seed, len(brief.failures), 7))
-    contents = {host.name: Counter(host.contents) for host in brief.hosts}
-    hung: dict[str, Branch] = {
-        host.name: Branch(brief.room.name, LayoutRelation.ONTOP, host.name) for host in brief.hosts
-    }
-    for thing in hosts_first(brief.objects):
-        options = list(choices(brief, thing, hung))
-        if not options:
-            continue
-        worths = [_branch_score(brief, thing, branch, contents) for branch in options]
-        best = options[int(np.argmax(np.asarray(worths) + RANDOM_SCORE * rng.random(len(options))))]
-        hung[thing.name] = best
-        contents.setdefault(best.parent, Counter())[thing.category] += 1
-    return LayoutTree.of(brief.room.name, hung.values())
-
-
-def hosts_first(objects: Sequence[ObjectBrief]) -> list[ObjectBrief]:
-    """Return the objects with hosts before the objects at them, otherwise in the given order."""
-    order: list[ObjectBrief] = []
-    waiting = list(objects)
-    while waiting:
-        names = {thing.name for thing in waiting}
-        ready = next((thing for thing in waiting if not names & {thing.host, *thing.beside}), waiting[0])
-        waiting.remove(ready)
-        order.append(ready)
-    return order
-
-
-def choices(brief: RoomBrief, thing: ObjectBrief, hung: Mapping[str, Branch]) -> Iterator[Branch]:
-    """Yield the branches that an object may take: the task's demand, or every host with room for it. Failed branches
-    are left out.
-
-    ``hung`` holds the branches of the tree so far, by child.
-    """
-    failed = Counter((item.host, item.relation) for item in brief.failures if item.object_name == thing.name)
-    for branch in _open_choices(brief, thing, hung):
-        here = branch.parent == brief.room.name or branch.parent in hung
-        if here and failed[branch.parent, branch.relation] < _max_attempts(branch, brief):
-            yield branch
-
-
-def _max_attempts(branch: Branch, brief: RoomBrief) -> int:
-    """Return the number of attempts at a host. An object that failed after its placement may be stable elsewhere on
-    the host.
-    """
-    reasons = {
-        item.reason
-        for item in brief.failures
-        if (item.object_name, item.host, item.relation) == (branch.child, branch.parent, branch.relation)
-    }
-    return MAX_ATTEMPTS if reasons and reasons <= SPOT_REASONS else 1
-
-
-def _open_choices(brief: RoomBrief, thing: ObjectBrief, hung: Mapping[str, Branch]) -> Iterator[Branch]:
-    floor = Branch(brief.room.name, LayoutRelation.ONTOP, thing.name)
-    if thing.relation is not None:
-        if RELATION_METHODS[thing.relation] is not RelationMethod.NONE:
-            yield Branch(thing.host or brief.room.name, thing.relation, thing.name)
-        return
-    beside = next((hung[other] for other in thing.beside if other in hung), None)
-    if beside is not None:
-        yield replace(beside, child=thing.name)
-        return
-    if thing.kind in (PlacementClass.HUNG, PlacementClass.OVERHEAD):
-        yield replace(floor, relation=LayoutRelation.ATTACHED)
-        return
-    if thing.kind is PlacementClass.GOODS:
-        for host in brief.hosts:
-            for offer in host.offers:
-                if offer.relation is not LayoutRelation.UNDER and fits_offer(offer, thing.size_m):
-                    yield Branch(host.name, offer.relation, thing.name)
-    yield floor
-
-
-def fits_offer(offer: HostOffer, size_m: Size3) -> bool:
-    """True if a space of the offer is larger than the object, in either orientation, and at a permitted height."""
-    if not LOWEST_M <= offer.height_m <= HIGHEST_M:
-        return False
-    short, long = sorted(size_m[:2])
-    return any(
-        short <= min(space[:2]) and long <= max(space[:2]) and size_m[2] <= space[2]
-        for space in offer.spaces_m
-    )
-
-
-def _branch_score(
-    brief: RoomBrief, thing: ObjectBrief, branch: Branch, contents: Mapping[str, Counter[str]]
-) -> float:
-    host = next((item for item in brief.hosts if item.name == branch.parent), None)
-    if host is None:
-        return (
-            PREFERRED_SCORE
-            if thing.kind is not PlacementClass.GOODS or thing.category in FLOOR_OBJECTS
-            else FLOOR_SCORE
-        )
-    there = contents[host.name]
-    crowd = CROWD_PENALTY * sum(there.values()) - SAME_CATEGORY_BONUS * (there[thing.category] > 0)
-    tired = sum(item.host == host.name for item in brief.failures)
-    return host_score(thing.category, host, branch.relation) - crowd - 0.5 * tired
-
-
-def host_score(category: str, host: HostFacts, relation: LayoutRelation) -> float:
-    """Return how well a host suits a category."""
-    if category in FLOOR_OBJECTS or not suits(category, host.category):
-        return UNSUITABLE_SCORE
-    wanted = preferred_hosts(category)
-    if relation is LayoutRelation.ONTOP and is_appliance_top(host.category):
-        worth = AVOIDED_SCORE
-    elif host.category in wanted:
-        worth = PREFERRED_SCORE - RANK_PENALTY * wanted.index(host.category)
-    else:
-        worth = AVOIDED_SCORE if host.category in NO_HOSTS else UNKNOWN_SCORE
-    if relation is LayoutRelation.INSIDE and not kept_behind_doors(category, host.category):
-        worth += (
-            UNSUITABLE_SCORE
-            if is_appliance_top(host.category) and host.category not in wanted
-            else CLOSED_SCORE
-        )
-    return worth
-
-
-def describe_failures(failures: Sequence[LayoutFailure]) -> str:
-    """Return the failures as text, one per line."""
-    return "\n".join(
-        f"- {item.object_name} {item.relation.value} {item.host}: {item.reason.value}, {item.detail}"
-        for item in failures
-    )
-
-
 class TreeError(ValueError):
     """Branches that form no tree. The message names the branch and the remedy."""
 
@@ -228,9 +65,7 @@ class LayoutTree:
 
     @staticmethod
     def of(root: str, branches: Iterable[Branch]) -> LayoutTree:
-        """Build a tree from branches in their order. Raise TreeError for a second parent, a cycle or an unconnected
-        branch.
-        """
+        """Build a tree from branches in their order. Raise TreeError for a second parent, a cycle or an unconnected branch."""
         children: defaultdict[str, dict[LayoutRelation, list[str]]] = defaultdict(dict)
         parents: dict[str, str] = {}
         for branch in branches:
@@ -322,3 +157,168 @@ def _nested(node: ObjectNode) -> dict[str, Any]:
         group.relation.value: {child.name: _nested(child) for child in group.children}
         for group in node.relations
     }
+
+
+MAX_ATTEMPTS: Final = 3
+SPOT_REASONS: Final = frozenset({LayoutReason.UNSTABLE, LayoutReason.INACCESSIBLE})
+"""Reasons that exclude a spot but not its host."""
+HIGHEST_M: Final = 1.5
+"""Maximum height for objects, from the paper."""
+LOWEST_M: Final = 0.15
+"""Lower furniture surfaces count as floor."""
+PREFERRED_SCORE: Final = 1.2
+RANK_PENALTY: Final = 0.12
+"""Score of an object's preferred host, and its decrease for each further host in the list."""
+UNKNOWN_SCORE: Final = 0.2
+"""Score of a host without a known convention."""
+AVOIDED_SCORE: Final = -0.6
+"""Score of a host that people avoid."""
+UNSUITABLE_SCORE: Final = -2.0
+FLOOR_SCORE: Final = -2.5
+"""Score of the floor for objects that don't belong there."""
+_FLOOR_GOODS: Final = (
+    "wicker_basket storage_box bucket hamper shopping_basket carton toolbox toy_box suitcase backpack duffel_bag "
+    "tote_bag ashcan recycling_bin trash_can plastic_bin broom mop vacuum watering_can basketball soccer_ball cage "
+    "cooler crate"
+)
+FLOOR_OBJECTS: Final = frozenset(_FLOOR_GOODS.split())
+"""Categories that people put on the floor."""
+CLOSED_SCORE: Final = -0.5
+"""Score of a closed cavity, unless the object is usually stored there."""
+CROWD_PENALTY: Final = 0.12
+SAME_CATEGORY_BONUS: Final = 0.35
+"""Bonus for standing with an object of the same category."""
+RANDOM_SCORE: Final = 0.45
+
+
+def organize(brief: RoomBrief) -> LayoutTree:
+    """Return a layout tree with every object that has a host left. Hosts are children of the root, the floor."""
+    rng = np.random.default_rng((brief.seed, len(brief.failures), 7))
+    contents = {host.name: Counter(host.contents) for host in brief.hosts}
+    hung: dict[str, Branch] = {
+        host.name: Branch(brief.room.name, LayoutRelation.ONTOP, host.name) for host in brief.hosts
+    }
+    for thing in hosts_first(brief.objects):
+        options = list(choices(brief, thing, hung))
+        if not options:
+            continue
+        scores = [_branch_score(brief, thing, branch, contents) for branch in options]
+        best = options[int(np.argmax(np.asarray(scores) + RANDOM_SCORE * rng.random(len(options))))]
+        hung[thing.name] = best
+        contents.setdefault(best.parent, Counter())[thing.category] += 1
+    return LayoutTree.of(brief.room.name, hung.values())
+
+
+def hosts_first(objects: Sequence[ObjectBrief]) -> list[ObjectBrief]:
+    """Return the objects with hosts before the objects at them, otherwise in the given order."""
+    order: list[ObjectBrief] = []
+    waiting = list(objects)
+    while waiting:
+        names = {thing.name for thing in waiting}
+        ready = next((thing for thing in waiting if not names & {thing.host, *thing.beside}), waiting[0])
+        waiting.remove(ready)
+        order.append(ready)
+    return order
+
+
+def choices(brief: RoomBrief, thing: ObjectBrief, hung: Mapping[str, Branch]) -> Iterator[Branch]:
+    """Yield the branches that an object may take: the task's demand, or every host with room for it.
+
+    Failed branches are left out.
+
+    ``hung`` holds the branches of the tree so far, by child.
+    """
+    failed = Counter((item.host, item.relation) for item in brief.failures if item.object_name == thing.name)
+    for branch in _open_choices(brief, thing, hung):
+        here = branch.parent == brief.room.name or branch.parent in hung
+        if here and failed[branch.parent, branch.relation] < _max_attempts(branch, brief):
+            yield branch
+
+
+def _max_attempts(branch: Branch, brief: RoomBrief) -> int:
+    """Return the number of attempts at a host.
+
+    An object that failed after its placement may be stable elsewhere on the host.
+    """
+    reasons = {
+        item.reason
+        for item in brief.failures
+        if (item.object_name, item.host, item.relation) == (branch.child, branch.parent, branch.relation)
+    }
+    return MAX_ATTEMPTS if reasons and reasons <= SPOT_REASONS else 1
+
+
+def _open_choices(brief: RoomBrief, thing: ObjectBrief, hung: Mapping[str, Branch]) -> Iterator[Branch]:
+    floor = Branch(brief.room.name, LayoutRelation.ONTOP, thing.name)
+    if thing.relation is not None:
+        if RELATION_METHODS[thing.relation] is not RelationMethod.NONE:
+            yield Branch(thing.host or brief.room.name, thing.relation, thing.name)
+        return
+    beside = next((hung[other] for other in thing.beside if other in hung), None)
+    if beside is not None:
+        yield replace(beside, child=thing.name)
+        return
+    if thing.kind in (PlacementClass.HUNG, PlacementClass.OVERHEAD):
+        yield replace(floor, relation=LayoutRelation.ATTACHED)
+        return
+    if thing.kind is PlacementClass.GOODS:
+        for host in brief.hosts:
+            for offer in host.offers:
+                if offer.relation is not LayoutRelation.UNDER and fits_offer(offer, thing.size_m):
+                    yield Branch(host.name, offer.relation, thing.name)
+    yield floor
+
+
+def fits_offer(offer: HostOffer, size_m: Size3) -> bool:
+    """True if a space of the offer is larger than the object, in either orientation, and at a permitted height."""
+    if not LOWEST_M <= offer.height_m <= HIGHEST_M:
+        return False
+    short, long = sorted(size_m[:2])
+    return any(
+        short <= min(space[:2]) and long <= max(space[:2]) and size_m[2] <= space[2]
+        for space in offer.spaces_m
+    )
+
+
+def _branch_score(
+    brief: RoomBrief, thing: ObjectBrief, branch: Branch, contents: Mapping[str, Counter[str]]
+) -> float:
+    host = next((item for item in brief.hosts if item.name == branch.parent), None)
+    if host is None:
+        return (
+            PREFERRED_SCORE
+            if thing.kind is not PlacementClass.GOODS or thing.category in FLOOR_OBJECTS
+            else FLOOR_SCORE
+        )
+    there = contents[host.name]
+    crowd = CROWD_PENALTY * sum(there.values()) - SAME_CATEGORY_BONUS * (there[thing.category] > 0)
+    tired = sum(item.host == host.name for item in brief.failures)
+    return host_score(thing.category, host, branch.relation) - crowd - 0.5 * tired
+
+
+def host_score(category: str, host: HostFacts, relation: LayoutRelation) -> float:
+    """Return how well a host suits a category."""
+    if category in FLOOR_OBJECTS or not suits(category, host.category):
+        return UNSUITABLE_SCORE
+    wanted = preferred_hosts(category)
+    if relation is LayoutRelation.ONTOP and is_appliance_top(host.category):
+        score = AVOIDED_SCORE
+    elif host.category in wanted:
+        score = PREFERRED_SCORE - RANK_PENALTY * wanted.index(host.category)
+    else:
+        score = AVOIDED_SCORE if host.category in NO_HOSTS else UNKNOWN_SCORE
+    if relation is LayoutRelation.INSIDE and not kept_behind_doors(category, host.category):
+        score += (
+            UNSUITABLE_SCORE
+            if is_appliance_top(host.category) and host.category not in wanted
+            else CLOSED_SCORE
+        )
+    return score
+
+
+def describe_failures(failures: Sequence[LayoutFailure]) -> str:
+    """Return the failures as text, one per line."""
+    return "\n".join(
+        f"- {item.object_name} {item.relation.value} {item.host}: {item.reason.value}, {item.detail}"
+        for item in failures
+    )

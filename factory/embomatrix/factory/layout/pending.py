@@ -97,9 +97,7 @@ class PendingObject:
 
 
 class PendingObjects:
-    """Requested objects of one room: ``waiting`` and ``placed`` by name, scene ``names`` of the placed ones, and
-    failures.
-    """
+    """Requested objects of one room: ``waiting`` and ``placed`` by name, scene ``names`` of the placed ones, and failures."""
 
     def __init__(self, editor: SceneEditor, room: str, items: Sequence[RequestedObject]) -> None:
         self.names: dict[str, str] = {}
@@ -116,8 +114,9 @@ class PendingObjects:
         return {there: name for name, there in self.names.items()}
 
     def place(self, name: str, pose: Pose, rests: tuple[Relation | None, str], at: Support) -> str:
-        """Insert a waiting object into the scene and return its scene name. ``rests`` is the relation and host that
-        support it.
+        """Insert a waiting object into the scene and return its scene name.
+
+        ``rests`` is the relation and host that support it.
         """
         pending = self.placed[name] = self.waiting.pop(name)
         pending.support = at
@@ -146,8 +145,9 @@ class PendingObjects:
         self.record_failure(name, relation, host, reason, detail)
 
     def next_model(self, name: str) -> None:
-        """Switch an object to its next model and clear its failures. After the last model, try the fallbacks, then
-        abandon it.
+        """Switch an object to its next model and clear its failures.
+
+        After the last model, try the fallbacks, then abandon it.
         """
         pending = self.waiting[name]
         if pending.choice + 1 < len(pending.item.models):
@@ -163,9 +163,7 @@ class PendingObjects:
             self.abandoned.append(pending.failure(self._room))
 
     def replace_host(self, pending: PendingObject) -> bool:
-        """Switch the object's host to its next model, or move the host. Return False if the task doesn't bring the
-        host.
-        """
+        """Switch the object's host to its next model, or move the host. Return False if the task doesn't bring the host."""
         host = self.placed.get(pending.item.host)
         if host is None:
             return False
@@ -212,9 +210,7 @@ class PendingObjects:
         return True
 
     def clear_floor(self, pending: PendingObject) -> bool:
-        """Remove the largest spare furniture from a floor on which the object is unreachable. Return False if there
-        is none.
-        """
+        """Remove the largest spare furniture from a floor on which the object is unreachable. Return False if there is none."""
         if not self._is_on_floor(pending):
             return False
         pending.crowded = True
@@ -269,9 +265,7 @@ class PendingObjects:
         ]
 
     def _allow_blocking(self, pending: PendingObject) -> bool:
-        """Let a floor object block the path to objects that the task doesn't name. Return False if that is already
-        allowed.
-        """
+        """Let a floor object block the path to objects that the task doesn't name. Return False if that is already allowed."""
         if (
             pending.last_failure is None
             or pending.last_failure.reason is not LayoutReason.BLOCKS_PATH

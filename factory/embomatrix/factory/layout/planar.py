@@ -48,9 +48,7 @@ RESULTS: Final = 8
 SURFACE_CELLS: Final = 900
 FLOOR_CELLS: Final = 1800
 STEP_M: Final = (0.01, 0.05)
-"""Finest grid step on furniture and on floors. Larger planes get coarser steps, so that the number of cells is
-bounded.
-"""
+"""Finest grid step on furniture and on floors. Larger planes get coarser steps, so that the number of cells is bounded."""
 GAP_M: Final = 0.01
 """Free strip around an object."""
 CLEARANCE_M: Final = 0.06
@@ -80,9 +78,7 @@ class _Beam:
 
 
 def arrange(brief: PlaneBrief) -> tuple[PlaneArrangement, ...]:
-    """Return joint arrangements of the brief's objects, the best first, at least one. Each lists the objects left
-    out.
-    """
+    """Return joint arrangements of the brief's objects, the best first, at least one. Each lists the objects left out."""
     grown = [_Beam()]
     for thing in _in_order(brief.objects):
         grown = sorted(
@@ -164,8 +160,9 @@ class _Search:
         return self._chosen(spots, held, self._scores(spots, held))
 
     def _candidates(self) -> SpotCandidates:
-        """Return grid points with all yaws. Lines through the objects that constraints name, and yaws that face them,
-        are added.
+        """Return grid points with all yaws.
+
+        Lines through the objects that constraints name, and yaws that face them, are added.
         """
         brief = self._brief
         width, depth = brief.size_m
@@ -231,8 +228,9 @@ class _Search:
     def _chosen(
         self, spots: SpotCandidates, held: Sequence[BoolArray], scores: FloatArray
     ) -> list[tuple[PlaneSpot, float]] | LayoutReason:
-        """Return the best reachable spots. Spots closer than a quarter of the plane's shorter side to a better one
-        are skipped.
+        """Return the best reachable spots.
+
+        Spots closer than a quarter of the plane's shorter side to a better one are skipped.
         """
         apart = 0.25 * min(self._brief.size_m)
         chosen: list[tuple[PlaneSpot, float]] = []

@@ -38,8 +38,7 @@ _IDENTITY: Final = Pose((0.0, 0.0, 0.0))
 
 @dataclass(frozen=True, slots=True)
 class Plane:
-    """Rectangle that objects can stand on. ``pose`` is the pose of its centre in the world, with x and y along its
-    sides.
+    """Rectangle that objects can stand on. ``pose`` is the pose of its centre in the world, with x and y along its sides.
 
     ``host`` is the object that the surface belongs to; it is empty for the floor of ``room``.
     """
@@ -57,8 +56,9 @@ class Plane:
 
 
 def planes_of(editor: SceneEditor, host: str) -> list[Plane]:
-    """Return the floor of a room, or the open surfaces of an object, the largest at a preferred height first. Raise
-    PlacementError.
+    """Return the floor of a room, or the open surfaces of an object, the largest at a preferred height first.
+
+    Raise PlacementError.
     """
     if host in editor.rooms:
         room = editor.rooms[host]
@@ -183,9 +183,7 @@ def _zones(editor: SceneEditor, plane: Plane) -> Iterator[tuple[float, float, fl
 
 
 def _stands(editor: SceneEditor, plane: Plane) -> tuple[Size2, ...]:
-    """Return evenly thinned robot positions near the plane, in its frame. Furniture with doors is served from its
-    front.
-    """
+    """Return evenly thinned robot positions near the plane, in its frame. Furniture with doors is served from its front."""
     x, y, _ = plane.pose.position_m
     away = math.hypot(*plane.size_m) / 2 + ROBOT.reach_m
     cells = editor.floor.cells((x - away, y - away), (x + away, y + away))  # (n, 2)

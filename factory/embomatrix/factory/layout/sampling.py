@@ -1,5 +1,6 @@
-"""Object-level Sampling Agent: continuous poses on, in, under and beside objects. Each pose is free, reachable and
-blocks no path.
+"""Object-level Sampling Agent: continuous poses on, in, under and beside objects.
+
+Each pose is free, reachable and blocks no path.
 """
 
 from __future__ import annotations
@@ -32,9 +33,7 @@ PACKING_GAP_M: Final = 0.004
 FLOOR_TRIES: Final = 200
 EDGE_POSES: Final = 24
 EDGE_SHARE: Final = 0.15
-"""Number of poses tried under a carrier's edges, and distance of the object's centre behind the edge as a share of
-its width.
-"""
+"""Number of poses tried under a carrier's edges, and the share of an object's width that lies behind the edge."""
 MAX_BLOCKING: Final = 16
 """Number of poses that block the robot's path after which a search ends. Each costs a check of all paths."""
 MODELS: Final = 8

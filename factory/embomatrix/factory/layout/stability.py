@@ -9,7 +9,7 @@ import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.scenes.rehearsal import SimulatedRobot
+from embomatrix.factory.scenes.feasibility import SimulatedRobot
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.geometry.statics import base_of, is_level, rest_pose
@@ -133,8 +133,8 @@ def _untakeable(editor: SceneEditor, names: Sequence[str]) -> tuple[str, ...]:
     ]
     if not behind:
         return ()
-    with SimulatedRobot(editor.freeze(editor.base.scene_id)) as rehearsal:
-        return tuple(name for name in behind if not rehearsal.can_pick_up(name))
+    with SimulatedRobot(editor.freeze(editor.base.scene_id)) as robot:
+        return tuple(name for name in behind if not robot.can_pick_up(name))
 
 
 def _is_behind_door(editor: SceneEditor, name: str) -> bool:

@@ -7,11 +7,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import ClassVar, Final
+from typing import Final, TypeVar, dataclass_transform
 
 from embomatrix.factory.scenes.editor import LayoutReason  # noqa: TC001  pydantic reads the annotation
 
-_STRICT: Final = {"extra": "forbid"}
+T = TypeVar("T")
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(field,))
+def _value(cls: type[T]) -> type[T]:
+    """Make a class a frozen dataclass whose JSON form rejects unknown fields."""
+    made = dataclass(frozen=True, slots=True)(cls)
+    made.__pydantic_config__ = {"extra": "forbid"}  # type: ignore[attr-defined]
+    return made
+
 
 Size2 = tuple[float, float]
 Size3 = tuple[float, float, float]
@@ -61,7 +70,7 @@ class PlacementClass(StrEnum):
     OVERHEAD = "overhead"  # under the ceiling
 
 
-@dataclass(frozen=True, slots=True)
+@_value
 class LayoutFailure:
     """Object that could not be placed as a tree demands. The organizer gets it in the brief of its next round."""
 
@@ -70,27 +79,23 @@ class LayoutFailure:
     host: str
     reason: LayoutReason
     detail: str
-    __pydantic_config__: ClassVar = _STRICT
 
 
-@dataclass(frozen=True, slots=True)
+@_value
 class LayoutRoomFacts:
-    """Facts about a room: floor size along the world's x and y axes, and the category of each object that can hold
-    others.
-    """
+    """Facts about a room: floor size along the world's x and y axes, and the category of each object that can hold others."""
 
     name: str
     type: str
     size_m: Size2
     furniture: tuple[str, ...] = ()
-    __pydantic_config__: ClassVar = _STRICT
 
     @property
     def area_m2(self) -> float:
         return self.size_m[0] * self.size_m[1]
 
 
-@dataclass(frozen=True, slots=True)
+@_value
 class ObjectBrief:
     """Object that a task adds to the scene. Empty fields are decided by the agents.
 
@@ -108,32 +113,27 @@ class ObjectBrief:
     beside: tuple[str, ...] = ()
     has_front: bool = False
     kind: PlacementClass = PlacementClass.GOODS
-    __pydantic_config__: ClassVar = _STRICT
 
 
-@dataclass(frozen=True, slots=True)
+@_value
 class DistributionBrief:
-    """Brief of the Scene-level Distribution Agent. ``homes`` gives the rooms of the scene's own objects that the task
-    names.
-    """
+    """Brief of the Scene-level Distribution Agent. ``homes`` gives the rooms of the scene's own objects that the task names."""
 
     rooms: tuple[LayoutRoomFacts, ...]
     objects: tuple[ObjectBrief, ...]
     homes: dict[str, str] = field(default_factory=dict)
     seed: int = 0
-    __pydantic_config__: ClassVar = _STRICT
 
 
-@dataclass(frozen=True, slots=True)
+@_value
 class Distribution:
     """Room of each object, and a short reason for it."""
 
     rooms: dict[str, str]
     reasons: dict[str, str] = field(default_factory=dict)
-    __pydantic_config__: ClassVar = _STRICT
 
 
-@dataclass(frozen=True, slots=True)
+@_value
 class HostOffer:
     """Relation that a piece of furniture offers to objects: on its open surfaces, in its cavities, or under it.
 
@@ -144,10 +144,9 @@ class HostOffer:
     relation: LayoutRelation
     spaces_m: tuple[Size3, ...]
     height_m: float
-    __pydantic_config__: ClassVar = _STRICT
 
 
-@dataclass(frozen=True, slots=True)
+@_value
 class HostFacts:
     """Object of a room that can hold others. ``contents`` lists the categories of the objects that it holds."""
 
@@ -155,11 +154,10 @@ class HostFacts:
     category: str
     offers: tuple[HostOffer, ...]
     contents: tuple[str, ...] = ()
-    shut: bool = False
-    __pydantic_config__: ClassVar = _STRICT
+    closed: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@_value
 class RoomBrief:
     """Brief of the Room-level Organization Agent: objects of a room, possible hosts, and earlier failures."""
 
@@ -168,22 +166,21 @@ class RoomBrief:
     objects: tuple[ObjectBrief, ...]
     failures: tuple[LayoutFailure, ...] = ()
     seed: int = 0
-    __pydantic_config__: ClassVar = _STRICT
 
 
-@dataclass(frozen=True, slots=True)
+@_value
 class Branch:
     """Edge of a layout tree: the child is in the relation to the parent, as in ``ontop(child, parent)``."""
 
     parent: str
     relation: LayoutRelation
     child: str
-    __pydantic_config__: ClassVar = _STRICT
 
 
 class ConstraintKind(StrEnum):
-    """Kind of a placement constraint (EmboMatrix, appendix A, after Holodeck). ``edge`` and ``middle`` refer to the
-    plane alone.
+    """Kind of a placement constraint (EmboMatrix, appendix A, after Holodeck).
+
+    ``edge`` and ``middle`` refer to the plane alone.
     """
 
     EDGE = "edge"
@@ -200,20 +197,18 @@ class ConstraintKind(StrEnum):
 PLANE_CONSTRAINTS: Final = frozenset({ConstraintKind.EDGE, ConstraintKind.MIDDLE})
 
 
-@dataclass(frozen=True, slots=True)
+@_value
 class PlacementConstraint:
     """Constraint on an object relative to another object of the plane. ``required`` constraints must hold."""
 
     kind: ConstraintKind
     other: str = ""
     required: bool = False
-    __pydantic_config__: ClassVar = _STRICT
 
 
-@dataclass(frozen=True, slots=True)
+@_value
 class ConstraintBrief:
-    """Brief for the choice of placement constraints: objects to place on a plane, and name and category of those on
-    it.
+    """Brief for the choice of placement constraints: objects to place on a plane, and name and category of those on it.
 
     ``host`` is the category of the furniture that the plane belongs to. ``on_floor`` is true for the floor of a room.
     """
@@ -224,21 +219,18 @@ class ConstraintBrief:
     others: tuple[tuple[str, str], ...] = ()
     on_floor: bool = False
     seed: int = 0
-    __pydantic_config__: ClassVar = _STRICT
 
 
-@dataclass(frozen=True, slots=True)
+@_value
 class PlacementConstraints:
     """Placement constraints by object, the most important first."""
 
     of: dict[str, tuple[PlacementConstraint, ...]]
-    __pydantic_config__: ClassVar = _STRICT
 
 
-@dataclass(frozen=True, slots=True)
+@_value
 class PlaneFootprint:
-    """Box on a plane, in the plane's frame: centre, yaw, extents along its own x and y axes, and heights above the
-    plane.
+    """Box on a plane, in the plane's frame: centre, yaw, extents along its own x and y axes, and heights above the plane.
 
     Its front points along its own +x axis.
     """
@@ -249,10 +241,9 @@ class PlaneFootprint:
     size_m: Size2
     low_m: float
     high_m: float
-    __pydantic_config__: ClassVar = _STRICT
 
 
-@dataclass(frozen=True, slots=True)
+@_value
 class PlaneObject:
     """Object to place on a plane, with its constraints, the most important first."""
 
@@ -260,10 +251,9 @@ class PlaneObject:
     size_m: Size3
     constraints: tuple[PlacementConstraint, ...] = ()
     has_front: bool = False
-    __pydantic_config__: ClassVar = _STRICT
 
 
-@dataclass(frozen=True, slots=True)
+@_value
 class PlaneBrief:
     """Brief of the planar solver, in the plane's frame: origin in the middle, metres, radians.
 
@@ -281,10 +271,9 @@ class PlaneBrief:
     rim_m: float = 0.01
     on_floor: bool = False
     seed: int = 0
-    __pydantic_config__: ClassVar = _STRICT
 
 
-@dataclass(frozen=True, slots=True)
+@_value
 class PlaneSpot:
     """Centre and yaw of an object on a plane, with the constraints that hold there."""
 
@@ -292,10 +281,9 @@ class PlaneSpot:
     center_m: Size2
     yaw: float
     held: tuple[PlacementConstraint, ...] = ()
-    __pydantic_config__: ClassVar = _STRICT
 
 
-@dataclass(frozen=True, slots=True)
+@_value
 class SampleBrief:
     """Brief of the Object-level Sampling Agent: a model of a category, to place at a host of a base scene.
 
@@ -308,10 +296,9 @@ class SampleBrief:
     relation: LayoutRelation | None = None
     model: str = ""
     seed: int = 0
-    __pydantic_config__: ClassVar = _STRICT
 
 
-@dataclass(frozen=True, slots=True)
+@_value
 class SampledPose:
     """Pose in the world frame, or the reason for its absence."""
 
@@ -321,14 +308,12 @@ class SampledPose:
     room: str = ""
     reason: LayoutReason | None = None
     detail: str = ""
-    __pydantic_config__: ClassVar = _STRICT
 
 
-@dataclass(frozen=True, slots=True)
+@_value
 class PlaneArrangement:
     """Joint arrangement of a plane's objects with its score, and the reason for each object left out."""
 
     spots: tuple[PlaneSpot, ...]
     score: float
     left_out: dict[str, LayoutReason] = field(default_factory=dict)
-    __pydantic_config__: ClassVar = _STRICT

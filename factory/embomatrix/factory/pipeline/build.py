@@ -81,17 +81,17 @@ def split_rooms(scenes: Sequence[Scene], seed: int) -> dict[str, dict[str, tuple
     for scene in scenes:
         for room in scene.rooms:
             by_type[room.type].append((scene.base, room.name))
-    spared = _HeldOutRooms(scenes)
+    held_out_rooms = _HeldOutRooms(scenes)
     for rank, (_, rooms) in enumerate(sorted(by_type.items())):
         if len(rooms) > 1:
             first = (rank + seed) % len(rooms)
-            spared.hold_out(rooms[first:] + rooms[:first], max(1, len(rooms) // 3))
+            held_out_rooms.hold_out(rooms[first:] + rooms[:first], max(1, len(rooms) // 3))
     return {
         split: {
             scene.base: tuple(
                 room.name
                 for room in scene.rooms
-                if ((scene.base, room.name) in spared.heldout) is (split == "heldout")
+                if ((scene.base, room.name) in held_out_rooms.heldout) is (split == "heldout")
             )
             for scene in scenes
         }
@@ -156,8 +156,7 @@ def build_dataset(
     check: VariantCheck | None = None,
     layout: LayoutAgents | None = None,
 ) -> BuildSummary:
-    """Build a dataset, or resume an interrupted build. ``progress`` is called with each split's number of admitted
-    tasks.
+    """Build a dataset, or resume an interrupted build. ``progress`` is called with each split's number of admitted tasks.
 
     ``check`` is a second check of each variant, such as a cluster. ``writer`` and ``layout`` replace the writer of
     the settings and the rule-based layout agents; they run in this process. Otherwise ``jobs`` processes are used.
@@ -179,8 +178,8 @@ def build_dataset(
                 progress(split, orders.admitted)
                 if make is None:
                     make = stack.enter_context(variant_makers(settings, writer, layout, jobs))
-                for made in make(round_orders):
-                    orders.add(made if check is None else check(made))
+                for variant in make(round_orders):
+                    orders.add(variant if check is None else check(variant))
                     progress(split, orders.admitted)
             progress(split, orders.admitted)
     records = [record for result in store.results for record in result.records]
@@ -212,8 +211,7 @@ class _SplitOrders:
         return len(self._store.records_of(self._split))
 
     def next_round(self) -> list[VariantOrder]:
-        """Return the next variants to make, without those that the store already holds. Empty if the split is
-        complete.
+        """Return the next variants to make, without those that the store already holds. Empty if the split is complete.
 
         An incomplete round is repeated with the orders of its first start, which know no task of their own round.
         """
@@ -235,20 +233,24 @@ class _SplitOrders:
                 return orders
         return []
 
-    def add(self, made: VariantYield) -> None:
+    def add(self, variant: VariantYield) -> None:
         """Store a variant's result without duplicates of its round and without surplus tasks."""
-        number = made.result.number
+        number = variant.result.number
         left, known = self._missing(number), self._known(number)
         kept = []
-        for record in made.result.records:
+        for record in variant.result.records:
             if left[record.task.category] > 0 and _key(record) not in known:
                 left[record.task.category] -= 1
                 kept.append(record)
         names = {record.task.task_id for record in kept}
-        transcripts = {name: text for name, text in made.transcripts.items() if name in names}
-        trees = {name: tree for name, tree in made.trees.items() if name in names}
+        transcripts = {name: text for name, text in variant.transcripts.items() if name in names}
+        trees = {name: tree for name, tree in variant.trees.items() if name in names}
         self._store.add(
-            dataclasses.replace(made.result, records=tuple(kept)), made.bundle, transcripts, trees, made.cpu_s
+            dataclasses.replace(variant.result, records=tuple(kept)),
+            variant.bundle,
+            transcripts,
+            trees,
+            variant.cpu_s,
         )
 
     def _missing(self, before: int) -> dict[TaskCategory, int]:
@@ -306,8 +308,9 @@ def _summary(store: BuildStore, rooms: Mapping[str, Mapping[str, tuple[str, ...]
 def variant_makers(
     settings: BuildSettings, writer: TaskWriter | None, layout: LayoutAgents | None, jobs: int
 ) -> Iterator[MakeVariants]:
-    """Yield a function that makes variants. ``writer`` and ``layout`` stay in this process, since they may hold a
-    connection.
+    """Yield a function that makes variants.
+
+    ``writer`` and ``layout`` stay in this process, since they may hold a connection.
     """
     if writer is not None or layout is not None:
         with contextlib.closing(VariantMaker(settings, writer, layout)) as maker:

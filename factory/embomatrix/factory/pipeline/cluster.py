@@ -46,13 +46,14 @@ class ClusterCheck:
         finally:
             self._runner.close()
 
-    def check(self, made: VariantYield) -> VariantYield:
-        """Return the variant with the tasks that the cluster admits. Raise ClusterError, or DatasetError if a slot
-        can't execute a plan.
+    def check(self, variant: VariantYield) -> VariantYield:
+        """Return the variant with the tasks that the cluster admits.
+
+        Raise ClusterError, or DatasetError if a slot can't execute a plan.
         """
-        if not made.result.records:
-            return made
-        return admitted_by(made, self._runner.run(self._execute(made)))
+        if not variant.result.records:
+            return variant
+        return admitted_by(variant, self._runner.run(self._execute(variant)))
 
     async def _open(self) -> str:
         await self._client.__aenter__()
@@ -64,9 +65,9 @@ class ClusterCheck:
         finally:
             await self._client.__aexit__(None, None, None)
 
-    async def _execute(self, made: VariantYield) -> dict[str, RolloutResult]:
-        records = made.result.records
-        await self._client.put_bundles({records[0].bundle_digest: made.bundle})
+    async def _execute(self, variant: VariantYield) -> dict[str, RolloutResult]:
+        records = variant.result.records
+        await self._client.put_bundles({records[0].bundle_digest: variant.bundle})
         rollouts = tuple(
             Rollout(
                 rollout_id=record.task.task_id,
@@ -78,26 +79,28 @@ class ClusterCheck:
             )
             for record in records
         )
-        batch = Batch(self._run_id, f"{made.result.split}-{made.result.number}", made.result.number, rollouts)
+        batch = Batch(
+            self._run_id, f"{variant.result.split}-{variant.result.number}", variant.result.number, rollouts
+        )
         return {result.rollout_id: result async for result in self._client.execute(batch)}
 
 
-def admitted_by(made: VariantYield, results: Mapping[str, RolloutResult]) -> VariantYield:
+def admitted_by(variant: VariantYield, results: Mapping[str, RolloutResult]) -> VariantYield:
     """Return the variant without the tasks whose plans failed. ``results`` are keyed by task id.
 
     Raise DatasetError if a plan was not executed, since that says nothing about its task.
     """
     kept: list[TaskRecord] = []
     rejected: list[Rejection] = []
-    for record in made.result.records:
+    for record in variant.result.records:
         sentence = _cluster_objection(results[record.task.task_id])
         if sentence:
             rejected.append(_rejection(record, sentence))
         else:
             kept.append(record)
-    rejections = (*made.result.rejections, *rejected)
-    result = dataclasses.replace(made.result, records=tuple(kept), rejections=rejections)
-    return dataclasses.replace(made, result=result)
+    rejections = (*variant.result.rejections, *rejected)
+    result = dataclasses.replace(variant.result, records=tuple(kept), rejections=rejections)
+    return dataclasses.replace(variant, result=result)
 
 
 def _cluster_objection(result: RolloutResult) -> str:

@@ -42,8 +42,9 @@ UNSEEN_SHARE: Final = 0.6
 
 @dataclass(frozen=True, slots=True)
 class CorpusSettings:
-    """Settings of a corpus. ``scenes`` are those of training, ``unseen`` those of the second build. Equal settings
-    give equal corpora.
+    """Settings of a corpus.
+
+    ``scenes`` are those of training, ``unseen`` those of the second build. Equal settings give equal corpora.
     """
 
     train: int = 2_000

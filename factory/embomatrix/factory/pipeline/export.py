@@ -152,8 +152,8 @@ def _settings(folder: Path) -> str:
         settings = json.loads(path.read_text(encoding="utf-8").splitlines()[0])["settings"]
     except (OSError, ValueError, LookupError, TypeError):
         return "The folder holds no build settings: these tasks were imported."
-    told = ", ".join(f"{name} `{value}`" for name, value in settings.items() if name != "scenes")
-    return f"`embomatrix factory`, settings: {told}, {len(settings.get('scenes', ()))} scenes."
+    listed = ", ".join(f"{name} `{value}`" for name, value in settings.items() if name != "scenes")
+    return f"`embomatrix factory`, settings: {listed}, {len(settings.get('scenes', ()))} scenes."
 
 
 def _size(count: int) -> str:

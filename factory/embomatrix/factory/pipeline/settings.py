@@ -41,10 +41,11 @@ SCENE_EXTRACTOR: Final = "scene-extractor"
 EVERY_SCENE: Final = "all"
 
 
-def scene_ids(asked: list[str] | None) -> tuple[str, ...]:
-    """Return the requested scenes without repetition. "all" stands for every base scene; no request means the three
-    defaults.
+def scene_ids(requested: list[str] | None) -> tuple[str, ...]:
+    """Return the requested scenes without repetition.
+
+    "all" stands for every base scene. No request means the three defaults.
     """
-    if asked and EVERY_SCENE in asked:
+    if requested and EVERY_SCENE in requested:
         return Catalog.load().scene_ids
-    return tuple(dict.fromkeys(asked or DEFAULT_SCENES))
+    return tuple(dict.fromkeys(requested or DEFAULT_SCENES))

@@ -25,6 +25,76 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 
+T = TypeVar("T", bound="DataclassInstance")
+
+
+@dataclass
+class ResumableLog(Generic[T]):
+    """Outcomes of a long run as JSON lines, preceded by the settings that decide them. Without a path, memory only."""
+
+    path: Path | None = None
+    outcomes: list[T] = field(default_factory=list)
+
+    def resume(self, settings: Mapping[str, Any], read: Callable[[Any], T]) -> None:
+        """Read the outcomes of an earlier run, or start the file. Raise EvaluationError or OSError.
+
+        ``read`` converts the JSON value of a line. It raises ValueError, TypeError or KeyError for an invalid value.
+        """
+        if self.path is None:
+            return
+        lines = _read_or_start(self.path, settings)
+        wanted = json.loads(json.dumps(settings))
+        try:
+            found = json.loads(lines[0])
+        except (ValueError, IndexError) as error:
+            raise EvaluationError(
+                f"{self.path} is not a log of outcomes: expected its settings in the first line; name another file"
+            ) from error
+        if found != wanted:
+            raise EvaluationError(
+                f"{self.path} holds outcomes of {_in_words(found)}, not of {_in_words(wanted)}: name another file"
+            )
+        self.outcomes += _read_outcomes(self.path, lines, read, EvaluationError)
+
+    def add(self, outcome: T) -> None:
+        """Append an outcome. Raise OSError."""
+        if self.path is not None:
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(asdict(outcome)) + "\n")
+        self.outcomes.append(outcome)
+
+
+def _read_or_start(path: Path, head: Mapping[str, Any]) -> list[str]:
+    """Return the lines of a log. A missing log is created with ``head`` as its first line."""
+    if not path.exists():
+        write_whole(path, (json.dumps(head) + "\n").encode("ascii"))
+    return path.read_text(encoding="utf-8").splitlines()
+
+
+def _read_outcomes(
+    path: Path, lines: list[str], read: Callable[[Any], T], error_type: type[Exception]
+) -> list[T]:
+    """Return the outcomes after the first line. A truncated last line is removed from the file."""
+    outcomes: list[T] = []
+    for number, line in enumerate(lines[1:], start=2):
+        try:
+            outcomes.append(read(json.loads(line)))
+        except (ValueError, TypeError, KeyError) as error:
+            if number != len(lines):
+                raise error_type(
+                    f"{path}:{number} is not an outcome ({error}): remove the line, or name another path"
+                ) from error
+            write_whole(path, "".join(f"{kept}\n" for kept in lines[:-1]).encode("utf-8"))
+    return outcomes
+
+
+def _in_words(settings: object) -> str:
+    """Return settings as text, such as ``seed 0, method tree``."""
+    if not isinstance(settings, dict):
+        return repr(settings)
+    return ", ".join(f"{name} {value}" for name, value in settings.items())
+
+
 BUILD_FILE: Final = "build.jsonl"
 ATTEMPTS_FILE: Final = "attempts.jsonl"
 """Log with a line for every draft and the reason of each rejection."""
@@ -189,73 +259,3 @@ def _from_json(value: dict[str, Any]) -> VariantResult:
         tuple(record_from_json(record) for record in value["records"]),
         tuple(Rejection(**{**item, "reason": RefusalReason(item["reason"])}) for item in value["rejections"]),
     )
-
-
-T = TypeVar("T", bound="DataclassInstance")
-
-
-@dataclass
-class ResumableLog(Generic[T]):
-    """Outcomes of a long run as JSON lines, preceded by the settings that decide them. Without a path, memory only."""
-
-    path: Path | None = None
-    outcomes: list[T] = field(default_factory=list)
-
-    def resume(self, settings: Mapping[str, Any], read: Callable[[Any], T]) -> None:
-        """Read the outcomes of an earlier run, or start the file. Raise EvaluationError or OSError.
-
-        ``read`` converts the JSON value of a line. It raises ValueError, TypeError or KeyError for an invalid value.
-        """
-        if self.path is None:
-            return
-        lines = _read_or_start(self.path, settings)
-        wanted = json.loads(json.dumps(settings))
-        try:
-            found = json.loads(lines[0])
-        except (ValueError, IndexError) as error:
-            raise EvaluationError(
-                f"{self.path} is not a log of outcomes: expected its settings in the first line; name another file"
-            ) from error
-        if found != wanted:
-            raise EvaluationError(
-                f"{self.path} holds outcomes of {_in_words(found)}, not of {_in_words(wanted)}: name another file"
-            )
-        self.outcomes += _read_outcomes(self.path, lines, read, EvaluationError)
-
-    def add(self, outcome: T) -> None:
-        """Append an outcome. Raise OSError."""
-        if self.path is not None:
-            with self.path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(asdict(outcome)) + "\n")
-        self.outcomes.append(outcome)
-
-
-def _read_or_start(path: Path, head: Mapping[str, Any]) -> list[str]:
-    """Return the lines of a log. A missing log is created with ``head`` as its first line."""
-    if not path.exists():
-        write_whole(path, (json.dumps(head) + "\n").encode("ascii"))
-    return path.read_text(encoding="utf-8").splitlines()
-
-
-def _read_outcomes(
-    path: Path, lines: list[str], read: Callable[[Any], T], error_type: type[Exception]
-) -> list[T]:
-    """Return the outcomes after the first line. A truncated last line is removed from the file."""
-    outcomes: list[T] = []
-    for number, line in enumerate(lines[1:], start=2):
-        try:
-            outcomes.append(read(json.loads(line)))
-        except (ValueError, TypeError, KeyError) as error:
-            if number != len(lines):
-                raise error_type(
-                    f"{path}:{number} is not an outcome ({error}): remove the line, or name another path"
-                ) from error
-            write_whole(path, "".join(f"{kept}\n" for kept in lines[:-1]).encode("utf-8"))
-    return outcomes
-
-
-def _in_words(settings: object) -> str:
-    """Return settings as text, such as ``seed 0, method tree``."""
-    if not isinstance(settings, dict):
-        return repr(settings)
-    return ", ".join(f"{name} {value}" for name, value in settings.items())

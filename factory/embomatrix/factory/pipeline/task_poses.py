@@ -1,5 +1,4 @@
-"""Pose cache of a task's scene: verified poses for objects that goals bring together, and standing poses for all
-rows.
+"""Pose cache of a task's scene: verified poses for objects that goals bring together, and standing poses for all rows.
 
 Other pairs are left to the executor's live search, which takes milliseconds at run time. No skill aims at ``nextto``,
 so the cache holds only suitable poses for pairs that a goal wants next to each other. The neighbour stays where it
@@ -18,8 +17,8 @@ from embomatrix.factory.assets.solids import Solids, placed_parts
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.live_world import LiveWorld
-from embomatrix.sim.physical.prospects import Placing
-from embomatrix.sim.physical.survey import prospects
+from embomatrix.sim.physical.placement_reachability import PlacementQuery
+from embomatrix.sim.physical.survey import placement_reachability
 from embomatrix.sim.placing.pose_cache import PLACE_RELATIONS, footprint_placements, standing_poses
 from embomatrix.skills.appliances import cold_source, heat_source
 from embomatrix.world.bundle import Bundle
@@ -38,145 +37,9 @@ if TYPE_CHECKING:
     Poses = dict[PlacementKey, tuple[Pose, ...]]
     from collections.abc import Sequence
 
-    from embomatrix.sim.physical.survey import Foresight
+    from embomatrix.sim.physical.survey import ReachabilitySurvey
     from embomatrix.world.geometry import Pose
     from embomatrix.world.scene import Scene
-
-
-@dataclass(frozen=True, slots=True)
-class PoseNeeds:
-    """Requirements of one task for a pose cache.
-
-    ``about`` lists the objects that the goal brings together, ``table`` all rows, ``beside`` the pairs wanted next to
-    each other.
-    """
-
-    about: tuple[str, ...]
-    table: tuple[str, ...]
-    beside: tuple[NeighbourPair, ...] = ()
-
-
-class SceneSurvey:
-    """Standing poses of the robot for the objects of a scene, and the handlings that its arm can't do. Computed on
-    demand.
-
-    Context manager of an engine. The answers don't depend on the order of the queries.
-    """
-
-    def __init__(self, scene: Scene, foresight: Foresight | None) -> None:
-        """Load the scene. Without ``foresight``, the arm is not analysed. Raise EngineError if the scene can't be
-        loaded.
-        """
-        self._foresight = foresight
-        self._engine = BulletEngine(scene)
-        self._world = LiveWorld(Bundle(scene, {}, PoseCache()), self._engine)
-        self._stands: dict[str, tuple[StandPose, ...]] = {}
-        self._blocked: dict[Handling, dict[str, str]] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._engine.close()
-
-    def blocks(self, handled: Sequence[tuple[Handling, str]]) -> bool:
-        """True if the arm can't do one of the handlings in the initial scene."""
-        self._look_at(name for _, name in handled)
-        return any(name in self._blocked.get(handling, {}) for handling, name in handled)
-
-    def poses(self, names: Iterable[str]) -> PoseCache:
-        """Return standing poses and arm limits of these objects as a bundle carries them, without placements."""
-        wanted = dict.fromkeys(names)
-        self._look_at(wanted)
-        barred = {
-            handling: {name: found[name] for name in wanted if name in found}
-            for handling in Handling
-            if (found := self._blocked.get(handling, {})).keys() & wanted.keys()
-        }
-        return PoseCache({}, {name: self._stands[name] for name in wanted}, barred)
-
-    def prospects(self, poses: PoseCache, placings: Iterable[Placing]) -> PoseCache:
-        """Return the cache with the reachable poses of each placed object."""
-        return poses if self._foresight is None else prospects(self._world, poses, placings)
-
-    def _look_at(self, names: Iterable[str]) -> None:
-        fresh = [name for name in dict.fromkeys(names) if name not in self._stands]
-        if not fresh:
-            return
-        found = PoseCache({}, standing_poses(self._engine, fresh))
-        if self._foresight is not None:
-            found = self._foresight.survey(self._world, found, fresh)
-        self._stands.update(found.stands)
-        for handling, others in found.barred.items():
-            self._blocked.setdefault(handling, {}).update(others)
-
-
-def cache_poses(
-    view: SceneView, tasks: Iterable[PoseNeeds], library: PlacementLibrary, survey: SceneSurvey, seed: int
-) -> PoseCache:
-    """Return poses for the objects that each goal brings together, and the survey's results for all rows.
-
-    Pairs that a goal wants next to each other get poses beside each other. Other rows of a task's table get the poses
-    of their footprints.
-    """
-    scene, tasks = view.scene, tuple(tasks)
-    placements: dict[PlacementKey, tuple[Pose, ...]] = {}
-    rows: dict[str, None] = {}
-    for task in tasks:
-        rows.update(dict.fromkeys(task.table))
-        placements.update(poses_beside(view, task.beside, library))
-        if any(pair.host for pair in task.beside):
-            together = PairedPlacements(view, library, lambda name: survey.poses([name]).stands[name], seed)
-            placements.update(together.poses(task.beside))
-        for thing, host, relation in _pairs(view, task.about):
-            key = PlacementKey(view.item(thing).asset_id, view.item(host).asset_id, relation)
-            if key not in placements:
-                placements[key] = library.poses(view.asset(thing), view.asset(host), relation, seed)
-        placements.update(footprint_placements(scene, *_portable_and_holders(view, task), library, seed))
-    kept = {key: poses for key, poses in placements.items() if poses}
-    return survey.prospects(replace(survey.poses(rows), placements=kept), _placings(view, tasks))
-
-
-def _placings(view: SceneView, tasks: Sequence[PoseNeeds]) -> Iterator[Placing]:
-    """Yield possible placements: those of the goals first, then those at heat and cold sources, then the rest."""
-    for task in tasks:
-        yield from itertools.starmap(Placing, _pairs(view, task.about))
-    pairs = [
-        (thing, host)
-        for task in tasks
-        for thing, host in itertools.product(*_portable_and_holders(view, task))
-    ]
-    pairs.sort(key=lambda pair: not _is_source(view.asset(pair[1])))
-    for (thing, host), relation in itertools.product(pairs, PLACE_RELATIONS):
-        yield Placing(thing, host, relation)
-
-
-def _is_source(asset: Asset) -> bool:
-    return heat_source(asset) is not None or cold_source(asset) is not None
-
-
-def _portable_and_holders(view: SceneView, task: PoseNeeds) -> tuple[list[str], list[str]]:
-    """Return the rows of a task that can be carried, and the rows that can hold objects."""
-    portable = [name for name in task.table if view.is_portable(name)]
-    holders = [
-        name
-        for name in task.table
-        if view.is_surface(name) or view.is_container(name) or view.is_basket(name)
-    ]
-    return portable, holders
-
-
-def _pairs(view: SceneView, about: tuple[str, ...]) -> Iterator[tuple[str, str, Relation]]:
-    for thing in about:
-        if not view.is_portable(thing):
-            continue
-        for host in about:
-            if host == thing:
-                continue
-            if view.is_surface(host):
-                yield thing, host, Relation.ONTOP
-            if view.is_container(host) or view.is_basket(host):
-                yield thing, host, Relation.INSIDE
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,8 +87,9 @@ class PairedPlacements:
         self._at: dict[tuple[str, str, Relation], Pose] = {}
 
     def poses(self, pairs: Iterable[NeighbourPair]) -> Poses:
-        """Return one pose of each neighbour, and the poses of the other object beside it. For two equal models, one
-        pose each.
+        """Return one pose of each neighbour, and the poses of the other object beside it.
+
+        For two equal models, one pose each.
         """
         found: Poses = {}
         for pair in pairs:
@@ -277,3 +141,136 @@ class PairedPlacements:
 
     def _world_box(self, host: str, asset: Asset, pose: Pose) -> Aabb:
         return bounds_of(asset).box(self._view.item(host).pose_world_asset @ pose)
+
+
+@dataclass(frozen=True, slots=True)
+class PoseNeeds:
+    """Requirements of one task for a pose cache.
+
+    ``about`` lists the objects that the goal brings together, ``table`` all rows, ``beside`` the pairs wanted next to
+    each other.
+    """
+
+    about: tuple[str, ...]
+    table: tuple[str, ...]
+    beside: tuple[NeighbourPair, ...] = ()
+
+
+class SceneSurvey:
+    """Standing poses of the robot for the objects of a scene, and the handlings that its arm can't do. Computed on demand.
+
+    Context manager of an engine. The answers don't depend on the order of the queries.
+    """
+
+    def __init__(self, scene: Scene, foresight: ReachabilitySurvey | None) -> None:
+        """Load the scene. Without ``foresight``, the arm is not analysed. Raise EngineError if the scene can't be loaded."""
+        self._foresight = foresight
+        self._engine = BulletEngine(scene)
+        self._world = LiveWorld(Bundle(scene, {}, PoseCache()), self._engine)
+        self._stands: dict[str, tuple[StandPose, ...]] = {}
+        self._blocked: dict[Handling, dict[str, str]] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._engine.close()
+
+    def blocks(self, handled: Sequence[tuple[Handling, str]]) -> bool:
+        """True if the arm can't do one of the handlings in the initial scene."""
+        self._compute(name for _, name in handled)
+        return any(name in self._blocked.get(handling, {}) for handling, name in handled)
+
+    def poses(self, names: Iterable[str]) -> PoseCache:
+        """Return standing poses and arm limits of these objects as a bundle carries them, without placements."""
+        wanted = dict.fromkeys(names)
+        self._compute(wanted)
+        barred = {
+            handling: {name: found[name] for name in wanted if name in found}
+            for handling in Handling
+            if (found := self._blocked.get(handling, {})).keys() & wanted.keys()
+        }
+        return PoseCache({}, {name: self._stands[name] for name in wanted}, barred)
+
+    def placement_reachability(self, poses: PoseCache, placings: Iterable[PlacementQuery]) -> PoseCache:
+        """Return the cache with the reachable poses of each placed object."""
+        return poses if self._foresight is None else placement_reachability(self._world, poses, placings)
+
+    def _compute(self, names: Iterable[str]) -> None:
+        fresh = [name for name in dict.fromkeys(names) if name not in self._stands]
+        if not fresh:
+            return
+        found = PoseCache({}, standing_poses(self._engine, fresh))
+        if self._foresight is not None:
+            found = self._foresight.survey(self._world, found, fresh)
+        self._stands.update(found.stands)
+        for handling, others in found.barred.items():
+            self._blocked.setdefault(handling, {}).update(others)
+
+
+def cache_poses(
+    view: SceneView, tasks: Iterable[PoseNeeds], library: PlacementLibrary, survey: SceneSurvey, seed: int
+) -> PoseCache:
+    """Return poses for the objects that each goal brings together, and the survey's results for all rows.
+
+    Pairs that a goal wants next to each other get poses beside each other. Other rows of a task's table get the poses
+    of their footprints.
+    """
+    scene, tasks = view.scene, tuple(tasks)
+    placements: dict[PlacementKey, tuple[Pose, ...]] = {}
+    rows: dict[str, None] = {}
+    for task in tasks:
+        rows.update(dict.fromkeys(task.table))
+        placements.update(poses_beside(view, task.beside, library))
+        if any(pair.host for pair in task.beside):
+            together = PairedPlacements(view, library, lambda name: survey.poses([name]).stands[name], seed)
+            placements.update(together.poses(task.beside))
+        for thing, host, relation in _pairs(view, task.about):
+            key = PlacementKey(view.item(thing).asset_id, view.item(host).asset_id, relation)
+            if key not in placements:
+                placements[key] = library.poses(view.asset(thing), view.asset(host), relation, seed)
+        placements.update(footprint_placements(scene, *_portable_and_holders(view, task), library, seed))
+    kept = {key: poses for key, poses in placements.items() if poses}
+    return survey.placement_reachability(replace(survey.poses(rows), placements=kept), _placings(view, tasks))
+
+
+def _placings(view: SceneView, tasks: Sequence[PoseNeeds]) -> Iterator[PlacementQuery]:
+    """Yield possible placements: those of the goals first, then those at heat and cold sources, then the rest."""
+    for task in tasks:
+        yield from itertools.starmap(PlacementQuery, _pairs(view, task.about))
+    pairs = [
+        (thing, host)
+        for task in tasks
+        for thing, host in itertools.product(*_portable_and_holders(view, task))
+    ]
+    pairs.sort(key=lambda pair: not _is_source(view.asset(pair[1])))
+    for (thing, host), relation in itertools.product(pairs, PLACE_RELATIONS):
+        yield PlacementQuery(thing, host, relation)
+
+
+def _is_source(asset: Asset) -> bool:
+    return heat_source(asset) is not None or cold_source(asset) is not None
+
+
+def _portable_and_holders(view: SceneView, task: PoseNeeds) -> tuple[list[str], list[str]]:
+    """Return the rows of a task that can be carried, and the rows that can hold objects."""
+    portable = [name for name in task.table if view.is_portable(name)]
+    holders = [
+        name
+        for name in task.table
+        if view.is_surface(name) or view.is_container(name) or view.is_basket(name)
+    ]
+    return portable, holders
+
+
+def _pairs(view: SceneView, about: tuple[str, ...]) -> Iterator[tuple[str, str, Relation]]:
+    for thing in about:
+        if not view.is_portable(thing):
+            continue
+        for host in about:
+            if host == thing:
+                continue
+            if view.is_surface(host):
+                yield thing, host, Relation.ONTOP
+            if view.is_container(host) or view.is_basket(host):
+                yield thing, host, Relation.INSIDE

@@ -16,14 +16,14 @@ from embomatrix.factory.pipeline.settings import WriterKind
 from embomatrix.factory.pipeline.store import Rejection, VariantResult
 from embomatrix.factory.pipeline.task_poses import PoseNeeds, SceneSurvey, cache_poses
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.scenes.rehearsal import SimulatedRobot
+from embomatrix.factory.scenes.feasibility import SimulatedRobot
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.factory.writer.tasks import BatchTaskWriter, DraftOrder, PlainWriter, is_heldout_signature
 from embomatrix.factory.writer.variant import Variant, build_variant
 from embomatrix.sim.live_world import prepare
 from embomatrix.sim.physical.actor import physical_simulator
-from embomatrix.sim.physical.survey import Foresight
+from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.sim.simulation import load_simulator
@@ -55,9 +55,7 @@ FOCUS_ROOMS: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class VariantOrder:
-    """Order for one variant of a base scene. ``rooms`` are those of its split; ``known`` holds keys of existing
-    tasks.
-    """
+    """Order for one variant of a base scene. ``rooms`` are those of its split; ``known`` holds keys of existing tasks."""
 
     split: str
     number: int
@@ -96,15 +94,15 @@ class VariantMaker:
     ) -> None:
         if writer is None:
             writer = SocialWriter(settings.seed) if settings.writer is WriterKind.SOCIAL else PlainWriter()
-        foresight = Foresight() if settings.look_ahead else None
-        self._bench = _SharedTools(settings, writer, PlacementLibrary(), foresight)
+        foresight = ReachabilitySurvey() if settings.look_ahead else None
+        self._tools = _SharedTools(settings, writer, PlacementLibrary(), foresight)
         self._layout = layout
         self._bases: dict[str, Scene] = {}
 
     def make(self, order: VariantOrder) -> VariantYield:
         """Write and judge the tasks of one variant."""
         began = time.process_time()
-        seed = self._bench.settings.seed
+        seed = self._tools.settings.seed
         if order.base not in self._bases:
             self._bases[order.base] = build_base_scene(order.base, seed=seed)
         base = self._bases[order.base]
@@ -115,11 +113,11 @@ class VariantMaker:
         variant = build_variant(
             base, focus, f"{base.base}-{order.split}-{order.number:03d}", rng, self._layout
         )
-        made = _VariantJob(variant, order, self._bench).run(rng)
-        return replace(made, cpu_s=time.process_time() - began)
+        result = _VariantJob(variant, order, self._tools).run(rng)
+        return replace(result, cpu_s=time.process_time() - began)
 
     def close(self) -> None:
-        self._bench.library.close()
+        self._tools.library.close()
 
 
 def uniqueness_key(signature: str, instruction: str) -> str:
@@ -134,7 +132,7 @@ class _SharedTools:
     settings: BuildSettings
     writer: TaskWriter
     library: PlacementLibrary
-    foresight: Foresight | None
+    foresight: ReachabilitySurvey | None
 
 
 def _focus(
@@ -151,14 +149,14 @@ def _focus(
 class _VariantJob:
     """Writing and judging of one variant's tasks."""
 
-    def __init__(self, variant: Variant, order: VariantOrder, bench: _SharedTools) -> None:
+    def __init__(self, variant: Variant, order: VariantOrder, tools: _SharedTools) -> None:
         self._variant = variant
         self._order = order
-        self._seed = bench.settings.seed
-        self._writer = bench.writer
-        self._library = bench.library
-        self._foresight = bench.foresight
-        self._physical = bench.settings.physical
+        self._seed = tools.settings.seed
+        self._writer = tools.writer
+        self._library = tools.library
+        self._foresight = tools.foresight
+        self._physical = tools.settings.physical
         self._known = set(order.known)
         self._admitted: list[tuple[Draft, Plan]] = []
         self._rejections: list[Rejection] = []
@@ -168,15 +166,15 @@ class _VariantJob:
         missing = self._order.missing
         scene = self._variant.scene
         with SceneSurvey(scene, self._foresight) as survey:
-            with SimulatedRobot(scene, survey.blocks) as rehearsal:
-                drafts = self._write(missing, SceneView(scene, rehearsal), rng)
+            with SimulatedRobot(scene, survey.blocks) as robot:
+                drafts = self._write(missing, SceneView(scene, robot), rng)
             needs = [PoseNeeds(draft.about, draft.task.table) for draft in drafts]
             poses = cache_poses(SceneView(scene), needs, self._library, survey, self._seed)
         left = dict(missing)
         bundle = Bundle(scene, {}, poses)
         with contextlib.ExitStack() as stack:
-            stage = stack.enter_context(contextlib.closing(load_simulator(bundle)))
-            robot = (
+            simulator = stack.enter_context(contextlib.closing(load_simulator(bundle)))
+            physics = (
                 stack.enter_context(contextlib.closing(physical_simulator(bundle)))
                 if self._physical
                 else None
@@ -184,10 +182,10 @@ class _VariantJob:
             for draft in drafts:
                 if len(self._admitted) == TASKS_PER_VARIANT:
                     break
-                if left[draft.task.category] > 0 and self._judge(stage, robot, draft):
+                if left[draft.task.category] > 0 and self._judge(simulator, physics, draft):
                     left[draft.task.category] -= 1
             tasks = {draft.task.task_id: draft.task for draft, _ in self._admitted}
-            data = encode_bundle(prepare(Bundle(scene, tasks, poses), stage.world))
+            data = encode_bundle(prepare(Bundle(scene, tasks, poses), simulator.world))
         return VariantYield(self._result(bundle_digest(data)), data, self._transcripts(), self._trees())
 
     def _write(
@@ -213,7 +211,10 @@ class _VariantJob:
         """Write the next draft, or several at once if the writer waits for answers. Empty after the last turn."""
         if not isinstance(self._writer, BatchTaskWriter):
             return [
-                (category, self._writer.write(self._variant, view, category, self._task_id(known), rng))
+                (
+                    category,
+                    self._writer.write(self._variant, view, DraftOrder(category, self._task_id(known), rng)),
+                )
                 for category in itertools.islice(turns, 1)
             ]
         categories = list(itertools.islice(turns, min(self._writer.at_once, MAX_DRAFTS - known)))
@@ -249,11 +250,11 @@ class _VariantJob:
     def _is_new(self, draft: Draft) -> bool:
         """True if the signature belongs to this split and the task is not known yet."""
         key = uniqueness_key(draft.signature, draft.task.instruction)
-        mine = is_heldout_signature(draft.signature, self._seed) is (self._order.split == "heldout")
-        return mine and key not in self._known
+        in_split = is_heldout_signature(draft.signature, self._seed) is (self._order.split == "heldout")
+        return in_split and key not in self._known
 
-    def _judge(self, stage: Simulator, robot: Simulator | None, draft: Draft) -> bool:
-        verdict = admit(stage, draft.task, find_plan, physics=robot)
+    def _judge(self, simulator: Simulator, physics: Simulator | None, draft: Draft) -> bool:
+        verdict = admit(simulator, draft.task, find_plan, physics=physics)
         if isinstance(verdict, Admitted):
             self._admitted.append((draft, verdict.plan))
             return True

@@ -173,9 +173,7 @@ class SceneEditor:
         self._objects[name] = replace(self.known(name), fixed=False)
 
     def remove(self, name: str) -> tuple[str, ...]:
-        """Remove an object with all objects on or in it, and return their names. Raise PlacementError for an unknown
-        name.
-        """
+        """Remove an object with all objects on or in it, and return their names. Raise PlacementError for an unknown name."""
         self.known(name)
         gone = {name: None}
         for item in self._objects.values():  # hosts precede the objects on them

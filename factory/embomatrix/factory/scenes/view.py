@@ -23,6 +23,49 @@ if TYPE_CHECKING:
     from embomatrix.world.state import Relation
 
 
+class RobotFeasibility(Protocol):
+    """Feasibility of single actions from the start of a scene. Names are those of scene objects."""
+
+    def can_pick_up(self, thing: str) -> bool:
+        """True if the robot can pick the object up."""
+        ...
+
+    def can_place(self, thing: str, relation: Relation, host: str) -> bool:
+        """True if the robot can place the object on or in the host."""
+        ...
+
+    def can_swing(self, name: str, *, shut: bool) -> bool:
+        """True if the robot can open, or close, all doors and drawers of the object."""
+        ...
+
+    def can_switch(self, name: str, *, on: bool) -> bool:
+        """True if the robot can switch the object on, or off."""
+        ...
+
+    def can_treat(self, thing: str, source: str, state: State) -> bool:
+        """True if the object can become hot, cooked or frozen at the source and is not so yet."""
+        ...
+
+
+class CapableRobot:
+    """Feasibility without a check: every action is possible."""
+
+    def can_pick_up(self, thing: str) -> bool:
+        return True
+
+    def can_place(self, thing: str, relation: Relation, host: str) -> bool:
+        return True
+
+    def can_swing(self, name: str, *, shut: bool) -> bool:
+        return True
+
+    def can_switch(self, name: str, *, on: bool) -> bool:
+        return True
+
+    def can_treat(self, thing: str, source: str, state: State) -> bool:
+        return True
+
+
 MIN_SURFACE_M: Final = 0.18
 """Minimum extents of a surface for placement requests."""
 MIN_CAVITY_M: Final = 0.12
@@ -84,9 +127,7 @@ class SceneView:
         return tuple(room.name for room in self.scene.rooms if (category, room.name) in self._of_kind)
 
     def whereabouts(self, name: str) -> str:
-        """Return the place of an object: ``ontop stove_1``, ``on the floor``, ``on the wall`` or ``under the
-        ceiling``.
-        """
+        """Return the place of an object: ``ontop stove_1``, ``on the floor``, ``on the wall`` or ``under the ceiling``."""
         item = self.item(name)
         if item.host and item.relation is not None:
             return f"{item.relation.value} {item.host}"
@@ -213,46 +254,3 @@ class SceneView:
 def is_liftable(size_m: tuple[float, float, float], mass_kg: float) -> bool:
     """True if the arm can lift the object and the gripper can grasp it."""
     return mass_kg <= ROBOT.mass_kg and min(size_m) <= ROBOT.grip_m and max(size_m) <= ROBOT.extent_m
-
-
-class RobotFeasibility(Protocol):
-    """Feasibility of single actions from the start of a scene. Names are those of scene objects."""
-
-    def can_pick_up(self, thing: str) -> bool:
-        """True if the robot can pick the object up."""
-        ...
-
-    def can_place(self, thing: str, relation: Relation, host: str) -> bool:
-        """True if the robot can place the object on or in the host."""
-        ...
-
-    def can_swing(self, name: str, *, shut: bool) -> bool:
-        """True if the robot can open, or close, all doors and drawers of the object."""
-        ...
-
-    def can_switch(self, name: str, *, on: bool) -> bool:
-        """True if the robot can switch the object on, or off."""
-        ...
-
-    def can_treat(self, thing: str, source: str, state: State) -> bool:
-        """True if the object can become hot, cooked or frozen at the source and is not so yet."""
-        ...
-
-
-class CapableRobot:
-    """Feasibility without a check: every action is possible."""
-
-    def can_pick_up(self, thing: str) -> bool:
-        return True
-
-    def can_place(self, thing: str, relation: Relation, host: str) -> bool:
-        return True
-
-    def can_swing(self, name: str, *, shut: bool) -> bool:
-        return True
-
-    def can_switch(self, name: str, *, on: bool) -> bool:
-        return True
-
-    def can_treat(self, thing: str, source: str, state: State) -> bool:
-        return True

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from embomatrix.factory.social.model_agents import SocialModelAgents
-    from embomatrix.factory.social.values import Cast
     from embomatrix.factory.writer.variant import Variant
     from embomatrix.world.scene import Scene
 
@@ -49,16 +48,6 @@ class SocialAgent(StrEnum):
     SUMMARIZER = "summarizer"
 
 
-class _FixedCast:
-    """Role-Playing Agent that returns a given cast."""
-
-    def __init__(self, cast: Cast) -> None:
-        self._cast = cast
-
-    def cast(self, scene: Scene, rng: np.random.Generator) -> Cast:
-        return self._cast
-
-
 def extract(brief: SceneBrief) -> SceneFacts:
     """Extract scene information from the inventory. Raise CatalogError."""
     return _facts(build_base_scene(brief.scene, seed=brief.seed))
@@ -71,12 +60,10 @@ def play(brief: SceneBrief) -> TalkBrief:
 
 
 def simulate(brief: TalkBrief) -> SummaryBrief:
-    """Social Simulation Agent. Raise CatalogError, or BriefError if no conversation leads to a request of the
-    category.
-    """
+    """Social Simulation Agent. Raise CatalogError, or BriefError if no conversation leads to a request of the category."""
     rng = _rng(brief.scene, brief.seed)
     variant = _variant(brief.scene, brief.seed, rng)
-    writer, view = SocialWriter(brief.seed, _FixedCast(brief.cast)), SceneView(variant.scene)
+    writer, view = SocialWriter(brief.seed, brief.cast), SceneView(variant.scene)
     for _ in range(MAX_CONVERSATIONS):
         talked = writer.talk(variant, view, brief.category, rng)
         if talked is not None:

@@ -35,6 +35,42 @@ if TYPE_CHECKING:
     from embomatrix.factory.writer.words import Voice
 
 
+_ANYWHERE: Final = (
+    ("vacuum the floor", "I have one arm with a gripper, and no vacuum cleaner"),
+    ("answer the door and sign for the parcel", "I don't write"),
+    ("take the bags upstairs", "stairs are not for my wheels"),
+    ("change the light bulb", "my gripper can't screw one in"),
+)
+_BY_ROOM: Final[Mapping[str, tuple[tuple[str, str], ...]]] = {
+    "kitchen": (
+        ("peel the potatoes", "peeling takes two hands, and I have one"),
+        ("taste whether it is salty enough", "I can't taste"),
+    ),
+    "bathroom": (("unblock the drain", "I don't reach into pipes"),),
+    "bedroom": (("make the bed", "sheets slip out of my gripper"),),
+    "garden": (("mow the lawn", "I stay on the paths"),),
+    "classroom": (("wipe the board", "I don't wipe"),),
+    "private_office": (("call them back", "I don't use the telephone"),),
+}
+HEAVY_LOADS: Final = 2.0
+"""Multiple of the arm's load from which on an object is obviously too heavy."""
+
+
+def impossible_request(view: SceneView, room: str, rng: np.random.Generator) -> tuple[str, str]:
+    """Return a request and the reason why the robot can't fulfil it. Heavy furniture of the room is a candidate."""
+    types = {item.name: item.type for item in view.scene.rooms}
+    options = [*_ANYWHERE, *_BY_ROOM.get(types.get(room, ""), ())]
+    options += [
+        (
+            f"push the {spoken_category(view.category(name))} to the other wall",
+            f"it weighs more than the {ROBOT_LIMITS.mass_kg:g} kg that my arm lifts",
+        )
+        for name in view.in_room.get(room, ())
+        if view.asset(name).mass_kg > HEAVY_LOADS * ROBOT_LIMITS.mass_kg and len(view.alike(name)) == 1
+    ]
+    return options[int(rng.integers(len(options)))]
+
+
 REFUSED_SHARE: Final = 0.35
 AMENDED_SHARE: Final = 0.7
 PLACES_TRIED: Final = 5
@@ -63,9 +99,7 @@ class GrammarConversation:
         self._turns: list[DialogueTurn] = []
 
     def run(self) -> Conversation:
-        """Return the conversation: need, question, answer, changes, refusal with a proposal, further wishes,
-        confirmation.
-        """
+        """Return the conversation: need, question, answer, changes, refusal with a proposal, further wishes, confirmation."""
         slot, conjuncts = self._scenario.slot, self._scenario.conjuncts
         first, further = conjuncts[0], list(conjuncts[1:])
         self._open(first)
@@ -147,39 +181,3 @@ def starting_slots(cast: Cast, rooms: Sequence[str], rng: np.random.Generator) -
     """Return the day's slots in random order, those in the given rooms first."""
     order = [cast.day[int(at)] for at in rng.permutation(len(cast.day))]
     return sorted(order, key=lambda slot: slot.room not in rooms)
-
-
-_ANYWHERE: Final = (
-    ("vacuum the floor", "I have one arm with a gripper, and no vacuum cleaner"),
-    ("answer the door and sign for the parcel", "I don't write"),
-    ("take the bags upstairs", "stairs are not for my wheels"),
-    ("change the light bulb", "my gripper can't screw one in"),
-)
-_BY_ROOM: Final[Mapping[str, tuple[tuple[str, str], ...]]] = {
-    "kitchen": (
-        ("peel the potatoes", "peeling takes two hands, and I have one"),
-        ("taste whether it is salty enough", "I can't taste"),
-    ),
-    "bathroom": (("unblock the drain", "I don't reach into pipes"),),
-    "bedroom": (("make the bed", "sheets slip out of my gripper"),),
-    "garden": (("mow the lawn", "I stay on the paths"),),
-    "classroom": (("wipe the board", "I don't wipe"),),
-    "private_office": (("call them back", "I don't use the telephone"),),
-}
-HEAVY_LOADS: Final = 2.0
-"""Multiple of the arm's load from which on an object is obviously too heavy."""
-
-
-def impossible_request(view: SceneView, room: str, rng: np.random.Generator) -> tuple[str, str]:
-    """Return a request and the reason why the robot can't fulfil it. Heavy furniture of the room is a candidate."""
-    types = {item.name: item.type for item in view.scene.rooms}
-    options = [*_ANYWHERE, *_BY_ROOM.get(types.get(room, ""), ())]
-    options += [
-        (
-            f"push the {spoken_category(view.category(name))} to the other wall",
-            f"it weighs more than the {ROBOT_LIMITS.mass_kg:g} kg that my arm lifts",
-        )
-        for name in view.in_room.get(room, ())
-        if view.asset(name).mass_kg > HEAVY_LOADS * ROBOT_LIMITS.mass_kg and len(view.alike(name)) == 1
-    ]
-    return options[int(rng.integers(len(options)))]

@@ -195,9 +195,7 @@ NEVER_REQUESTED: Final = frozenset(
     }
 )
 _NEVER_REQUESTED_ENDINGS: Final = ("_shaker", "_atomizer", "_bottle", "_grinder", "_dispenser", "_can")
-"""Categories, and endings of categories, that nobody asks to open or switch. In the catalog, a salt shaker has a
-switch.
-"""
+"""Categories, and endings of categories, that nobody asks to open or switch. In the catalog, a salt shaker has a switch."""
 STORAGE_THEMES: Final[Mapping[str, frozenset[Theme]]] = {
     **dict.fromkeys(_KITCHEN, _themes("cooking meals tidying stock guests")),
     **dict.fromkeys(
@@ -286,7 +284,7 @@ def is_plausible(thing: str, host: str, room_type: str, *, inside: bool) -> bool
 
 
 def best_slot(
-    cast: Cast, conjuncts: Sequence[GoalConjunct], view: SceneView, asked: Mapping[str, int]
+    cast: Cast, conjuncts: Sequence[GoalConjunct], view: SceneView, request_counts: Mapping[str, int]
 ) -> tuple[float, DaySlot] | None:
     """Return the slot that suits all wishes best, with its score; None if none does.
 
@@ -301,7 +299,13 @@ def best_slot(
         owned = sum(bool({*each} & {*cast.of(slot.person).rooms}) for each in rooms) / len(conjuncts)
         if here or owned:
             found.append(
-                (2 * here + owned - 0.5 * asked.get(slot.person, 0) - asked.get(slot.activity, 0), slot)
+                (
+                    2 * here
+                    + owned
+                    - 0.5 * request_counts.get(slot.person, 0)
+                    - request_counts.get(slot.activity, 0),
+                    slot,
+                )
             )
     return max(found, key=lambda item: item[0]) if found else None
 

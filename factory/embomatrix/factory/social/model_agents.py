@@ -21,6 +21,7 @@ from embomatrix.factory.social.prompts import (
     SUMMARY_USER,
     TALK_SYSTEM,
     TALK_USER,
+    answer_schema,
 )
 from embomatrix.factory.social.requests import TaskRequest, check_request
 from embomatrix.factory.social.values import ROBOT, Act, Cast, Conversation, DialogueTurn
@@ -157,4 +158,6 @@ class SocialModelAgents:
 
     def _request(self, purpose: str, system: str, user: str, seed: int) -> ChatRequest:
         messages = (Message(Speaker.SYSTEM, system), Message(Speaker.USER, user))
-        return ChatRequest(purpose, messages, self._max_tokens, self._temperature, seed)
+        return ChatRequest(
+            purpose, messages, self._max_tokens, self._temperature, seed, answer_schema(purpose)
+        )

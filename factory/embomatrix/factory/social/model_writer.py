@@ -13,15 +13,12 @@ from embomatrix.factory.social.requests import conjunct_of
 from embomatrix.factory.social.summary import transcript_of
 from embomatrix.factory.writer.goals import GoalContext
 from embomatrix.factory.writer.tasks import Draft, DraftOrder, draft_of
-from embomatrix.llm.loop import OnOneLoop
-from embomatrix.llm.patience import FailureLimit
+from embomatrix.llm.batch import FailureLimit, OnOneLoop
 from embomatrix.llm.values import EndpointError, LlmError, UnusableReplyError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from contextlib import AbstractAsyncContextManager
-
-    import numpy as np
 
     from embomatrix.factory.scenes.view import SceneView
     from embomatrix.factory.social.facts import SceneFacts
@@ -29,7 +26,6 @@ if TYPE_CHECKING:
     from embomatrix.factory.social.values import Cast
     from embomatrix.factory.writer.variant import Variant
     from embomatrix.world.scene import Scene
-    from embomatrix.world.task import TaskCategory
 
 logger = logging.getLogger(__name__)
 SEEDS = 2**31
@@ -58,16 +54,9 @@ class ModelWriter(OnOneLoop):
         self._casts: dict[str, Cast] = {}
         self._sights: dict[str, Mapping[str, str]] = {}
 
-    def write(
-        self,
-        variant: Variant,
-        view: SceneView,
-        category: TaskCategory,
-        task_id: str,
-        rng: np.random.Generator,
-    ) -> Draft | TaskRefusal:
+    def write(self, variant: Variant, view: SceneView, order: DraftOrder) -> Draft | TaskRefusal:
         """Return a draft, or the reason for its absence. Raise EndpointError after several missing answers in a row."""
-        return self.write_all(variant, view, [DraftOrder(category, task_id, rng)])[0]
+        return self.write_all(variant, view, [order])[0]
 
     def write_all(
         self, variant: Variant, view: SceneView, orders: Sequence[DraftOrder]
@@ -125,7 +114,7 @@ class ModelWriter(OnOneLoop):
         conjuncts = [conjunct_of(wish, view) for wish in request.wishes]
         transcript = transcript_of(cast, conversation, request.instruction, conjuncts)
         context = GoalContext(view, variant, order.rng)
-        return draft_of(context, order.category, order.task_id, conjuncts, request.instruction, transcript)
+        return draft_of(context, order, conjuncts, request.instruction, transcript)
 
     async def _sights_of(self, scene: Scene, facts: SceneFacts, seed: int) -> Mapping[str, str]:
         """Return the appearance of each room; empty without ``look`` or after an unusable answer."""

@@ -1,8 +1,13 @@
-"""Prompts of the social agents, filled with str.format."""
+"""Prompts of the social agents, filled with str.format, and the JSON schemas of their answers.
+
+Cassettes are keyed by prompt and schema. A change of either invalidates recorded answers.
+"""
 
 from __future__ import annotations
 
-from typing import Final
+import json
+from importlib import resources
+from typing import Any, Final
 
 ROBOT_LIMITS: Final = """\
 The robot has one arm and holds one thing at a time. It drives through rooms, takes and puts down small things, opens and closes
@@ -64,4 +69,11 @@ CATEGORY_HINTS: Final = {
     "kitchen_operation": "food is to be heated, cooked or frozen",
     "compound": "two or three of these are wanted: things put somewhere, something switched or opened, food prepared",
 }
-"""Required result of a conversation by task category."""
+"""Required result of a conversation, by task category."""
+
+
+def answer_schema(purpose: str) -> dict[str, Any]:
+    """Return the JSON schema for the answer of an agent, from ``answer_schemas.json``."""
+    text = (resources.files("embomatrix.factory.social") / "answer_schemas.json").read_text(encoding="utf-8")
+    schema: dict[str, Any] = json.loads(text)[purpose]
+    return schema

@@ -17,8 +17,9 @@ class _Value(BaseModel):
 
 
 class Person(_Value):
-    """Member of a cast. ``ties`` maps other people to this person's relation to them: {"Mia": "mother"}. ``rooms``
-    are their own rooms.
+    """Member of a cast.
+
+    ``ties`` maps other people to this person's relation to them: {"Mia": "mother"}. ``rooms`` are their own rooms.
     """
 
     name: str = Field(min_length=1, max_length=40)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.social.casting import GrammarRolePlayer
+from embomatrix.factory.social.casting import draw_cast
 from embomatrix.factory.social.conversing import ConversationScenario, GrammarConversation
 from embomatrix.factory.social.fitting import best_slot, reasons_for
 from embomatrix.factory.social.phrases import (
@@ -23,14 +23,13 @@ from embomatrix.factory.social.phrases import (
 )
 from embomatrix.factory.social.summary import instruction_of, transcript_of
 from embomatrix.factory.writer.goals import GoalContext
-from embomatrix.factory.writer.tasks import Draft, draft_of, draw_conjuncts
+from embomatrix.factory.writer.tasks import Draft, DraftOrder, draft_of, draw_conjuncts
 from embomatrix.factory.writer.words import FreshVoice
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from embomatrix.factory.scenes.view import SceneView
-    from embomatrix.factory.social.casting import RolePlayingAgent
     from embomatrix.factory.social.values import Cast, Conversation, DaySlot
     from embomatrix.factory.writer.goals import GoalConjunct
     from embomatrix.factory.writer.variant import Variant
@@ -56,44 +55,41 @@ class Talk:
 class SocialWriter:
     """Task writer that simulates the people of a scene. Equal seeds give a base scene the same cast in all variants."""
 
-    def __init__(self, seed: int, role_player: RolePlayingAgent | None = None) -> None:
+    def __init__(self, seed: int, cast: Cast | None = None) -> None:
+        """``cast`` replaces the drawn casts of all scenes."""
         self._seed = seed
-        self._role_player = role_player or GrammarRolePlayer()
+        self._given_cast = cast
         self._casts: dict[str, Cast] = {}
         self._said: tuple[str, Counter[str]] = ("", Counter())
 
     def cast_of(self, scene: Scene) -> Cast:
         """Return the cast of a base scene."""
+        if self._given_cast is not None:
+            return self._given_cast
         if scene.base not in self._casts:
             sequence = np.random.SeedSequence((self._seed, zlib.crc32(scene.base.encode())))
-            self._casts[scene.base] = self._role_player.cast(scene, np.random.default_rng(sequence))
+            self._casts[scene.base] = draw_cast(scene, np.random.default_rng(sequence))
         return self._casts[scene.base]
 
     def _said_in(self, variant: Variant) -> Counter[str]:
-        """Return the phrases used in this variant. Other variants don't count, so that a resumed build writes the
-        same tasks.
+        """Return the phrases used in this variant.
+
+        Other variants don't count, so that a resumed build writes the same tasks.
         """
         if self._said[0] != variant.scene.scene_id:
             self._said = (variant.scene.scene_id, Counter())
         return self._said[1]
 
-    def write(
-        self,
-        variant: Variant,
-        view: SceneView,
-        category: TaskCategory,
-        task_id: str,
-        rng: np.random.Generator,
-    ) -> Draft | None:
+    def write(self, variant: Variant, view: SceneView, order: DraftOrder) -> Draft | None:
         """Return a draft of a request by one of the people."""
-        talked = self.talk(variant, view, category, rng)
+        talked = self.talk(variant, view, order.category, order.rng)
         if talked is None:
             return None
         context, cast, talk = talked.context, talked.scenario.cast, talked.conversation
         conjuncts = talked.scenario.conjuncts
         instruction = instruction_of(talk, cast, view, talked.voice, talked.scenario.why)
         transcript = transcript_of(cast, talk, instruction, conjuncts)
-        return draft_of(context, category, task_id, conjuncts, instruction, transcript)
+        return draft_of(context, order, conjuncts, instruction, transcript)
 
     def talk(
         self, variant: Variant, view: SceneView, category: TaskCategory, rng: np.random.Generator

@@ -1,6 +1,4 @@
-"""Import of problems over many scenes: each problem is bound to the first suitable scene and verified in the
-simulator.
-"""
+"""Import of problems over many scenes: each problem is bound to the first suitable scene and verified in the simulator."""
 
 from __future__ import annotations
 
@@ -29,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from embomatrix.factory.task_import.sources import SourceText
-    from embomatrix.sim.physical.survey import Foresight
+    from embomatrix.sim.physical.survey import ReachabilitySurvey
     from embomatrix.sim.placing.pose_cache import PlacementLibrary
     from embomatrix.world.poses import PoseCache
     from embomatrix.world.scene import Scene
@@ -84,8 +82,7 @@ def bind_first(
 def imports(
     source: SourceText, bases: Sequence[Scene], *, seed: int, options: ImportOptions, draws: int = 1
 ) -> Iterator[ImportedTask | TaskRefusal]:
-    """Yield imports of the problem into each scene as it is, and with missing furniture added if the options allow
-    it.
+    """Yield imports of the problem into each scene as it is, and with missing furniture added if the options allow it.
 
     The problem's own scene is tried ``draws`` times before all others. The last round renumbers rooms. Refusals that
     do not depend on the scene end the search.
@@ -122,18 +119,17 @@ def verify_first(
     source: SourceText,
     bases: Sequence[Scene],
     library: PlacementLibrary,
-    foresight: Foresight | None,
+    foresight: ReachabilitySurvey | None,
     *,
     seed: int = 0,
     options: ImportOptions | None = None,
 ) -> Verified | TaskRefusal:
-    """Import the problem into the first scene in which it is admitted. Otherwise return the refusal that came
-    furthest.
+    """Import the problem into the first scene in which it is admitted. Otherwise return the refusal that came furthest.
 
     The order of the scenes is that of `bind_first`. Raise BddlError.
     """
 
-    def judged() -> Iterator[Verified | TaskRefusal]:
+    def outcomes() -> Iterator[Verified | TaskRefusal]:
         given = options or ImportOptions()
         for tried in (given, replace(given, compact=True)) if has_shared_host(source) else (given,):
             laid_out, misfits, sentences = 0, 0, list[str]()
@@ -142,17 +138,17 @@ def verify_first(
                     misfits += imported.reason is RefusalReason.DOES_NOT_FIT
                     yield imported
                     continue
-                judged = verify(imported, library, foresight, seed=seed)
-                yield judged
+                outcome = verify(imported, library, foresight, seed=seed)
+                yield outcome
                 laid_out += 1
-                sentences.append(judged.sentence if isinstance(judged, TaskRefusal) else "")
+                sentences.append(outcome.sentence if isinstance(outcome, TaskRefusal) else "")
                 repeated = sentences[-MAX_SAME_REFUSAL:].count(sentences[-1])
                 if laid_out == MAX_UNSOLVED or repeated == MAX_SAME_REFUSAL:
                     break
             if not laid_out and not misfits:
                 return
 
-    return _first(judged())
+    return _first(outcomes())
 
 
 def has_shared_host(source: SourceText) -> bool:
@@ -177,18 +173,18 @@ def _first(outcomes: Iterable[T | TaskRefusal]) -> T | TaskRefusal:
 
 
 def verify(
-    imported: ImportedTask, library: PlacementLibrary, foresight: Foresight | None, *, seed: int = 0
+    imported: ImportedTask, library: PlacementLibrary, foresight: ReachabilitySurvey | None, *, seed: int = 0
 ) -> Verified | TaskRefusal:
     """Verify an imported task by execution, and pack its bundle. Without ``foresight``, the arm is not analysed."""
     poses = poses_for(imported, SceneView(imported.scene), library, foresight, seed)
-    with contextlib.closing(load_simulator(Bundle(imported.scene, {}, poses))) as stage:
+    with contextlib.closing(load_simulator(Bundle(imported.scene, {}, poses))) as simulator:
         verdict = admit(
-            stage, imported.task, find_plan, imported.init, most_held=max_held_share(imported.task)
+            simulator, imported.task, find_plan, imported.init, most_held=max_held_share(imported.task)
         )
         if not isinstance(verdict, Admitted):
             return verdict
         bundle = Bundle(imported.scene, {imported.task.task_id: imported.task}, poses)
-        data = encode_bundle(prepare(bundle, stage.world))
+        data = encode_bundle(prepare(bundle, simulator.world))
     record = TaskRecord(
         task=imported.task,
         bundle_digest=bundle_digest(data),
@@ -201,7 +197,11 @@ def verify(
 
 
 def poses_for(
-    imported: ImportedTask, view: SceneView, library: PlacementLibrary, foresight: Foresight | None, seed: int
+    imported: ImportedTask,
+    view: SceneView,
+    library: PlacementLibrary,
+    foresight: ReachabilitySurvey | None,
+    seed: int,
 ) -> PoseCache:
     """Return the pose cache of an imported task's scene."""
     task = imported.task

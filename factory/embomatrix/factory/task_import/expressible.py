@@ -1,6 +1,4 @@
-"""Checks of a problem before any scene is considered: known types, representable state, and goals within the skills'
-reach.
-"""
+"""Checks of a problem before any scene is considered: known types, representable state, and goals within the skills' reach."""
 
 from __future__ import annotations
 

@@ -110,8 +110,7 @@ def with_sizes(
     *,
     compact: bool = False,
 ) -> dict[str, list[Model]]:
-    """Return the models to try for each addition. Models that meet the requirements come first, otherwise scaled
-    ones.
+    """Return the models to try for each addition. Models that meet the requirements come first, otherwise scaled ones.
 
     ``requirements`` are those of each object of the problem; ``found`` holds the assets of bound scene objects. Hosts
     are chosen before the objects on them. With ``compact``, objects that share a host are scaled to fit side by side.
@@ -167,8 +166,9 @@ def _ordered(models: list[Model], requirement: Requirement, places: Sequence[Hos
 def _enlarged(
     models: Sequence[Model], requirement: Requirement, places: Sequence[HostPlacement]
 ) -> list[Model]:
-    """Return the models at the largest scale, for more contents than any model has space for. The contents are scaled
-    down too.
+    """Return the models at the largest scale, for more contents than any model has space for.
+
+    The contents are scaled down too.
     """
     largest = [model.at(LARGER[-1]) for model in models if model.share == 1]
     less = replace(requirement, contents=(), burden=())

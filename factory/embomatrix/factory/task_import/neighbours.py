@@ -65,5 +65,5 @@ def _grounded(goal: Formula, types: Mapping[str, tuple[str, ...]]) -> Iterator[t
     for atom, positive, scope in literals(goal, True, {}):
         if positive:
             for names in itertools.product(*(types[kind] for kind in scope.values())):
-                told = dict(zip(scope, names, strict=True))
-                yield atom.predicate, tuple(told.get(arg, arg) for arg in atom.args)
+                values = dict(zip(scope, names, strict=True))
+                yield atom.predicate, tuple(values.get(arg, arg) for arg in atom.args)

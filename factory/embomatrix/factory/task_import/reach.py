@@ -213,8 +213,9 @@ class Reachability:
                 return False, True
 
     def _flows(self, fact: SubstanceFact, name: str) -> tuple[bool, bool]:
-        """Return the changes to a substance. Cleaning removes a covering; soaking adds a liquid to an absorbent
-        object or a vessel.
+        """Return the changes to a substance.
+
+        Cleaning removes a covering; soaking adds a liquid to an absorbent object or a vessel.
         """
         if fact.relation is SubstanceRelation.COVERED:
             return False, comes_off(fact.substance)
@@ -247,9 +248,7 @@ def _type_can(type_name: str, ability: str) -> bool:
 
 
 def _canonical(atom: Atom, problem: BddlProblem) -> Atom:
-    """Return the atom in canonical form: substances by synset, ``dusty`` and similar states as facts, sources as
-    containers.
-    """
+    """Return the atom in canonical form: substances by synset, ``dusty`` and similar states as facts, sources as containers."""
     names = tuple(
         problem.objects[arg] if is_substance(problem.objects.get(arg, "")) and index else arg
         for index, arg in enumerate(atom.args)

@@ -33,8 +33,9 @@ SOLVED_GOAL: Final = 0.95
 
 @dataclass(frozen=True, slots=True)
 class ProblemOutcome:
-    """Outcome of one problem. ``scene`` is its base scene; if the problem is refused, ``reason`` and ``sentence`` are
-    set instead.
+    """Outcome of one problem.
+
+    ``scene`` is its base scene; if the problem is refused, ``reason`` and ``sentence`` are set instead.
 
     ``unreachable`` lists the goal's literals that no skill achieves, by profile. ``notes`` lists changes made to the
     problem.
@@ -59,18 +60,20 @@ def outcome_from_json(value: dict[str, Any]) -> ProblemOutcome:
     return ProblemOutcome(**{**value, "unreachable": unreachable, "notes": tuple(value["notes"])})
 
 
-def outcome_of(source: SourceText, judged: ImportedTask | Verified | TaskRefusal) -> ProblemOutcome:
+def outcome_of(source: SourceText, imported: ImportedTask | Verified | TaskRefusal) -> ProblemOutcome:
     """Return the outcome of a problem for the report. Raise BddlError."""
     problem, notes = read_problem(source)
     unreachable = {profile.value: unreachable_atoms(problem, profile) for profile in Profile}
-    if isinstance(judged, TaskRefusal):
+    if isinstance(imported, TaskRefusal):
         return ProblemOutcome(
-            source.name, source.source, "", judged.reason.value, judged.sentence, unreachable, notes
+            source.name, source.source, "", imported.reason.value, imported.sentence, unreachable, notes
         )
-    if isinstance(judged, Verified):
-        scene = judged.record.task.scene_id.split("-")[0]
-        return ProblemOutcome(source.name, source.source, scene, "", "", unreachable, judged.notes)
-    return ProblemOutcome(source.name, source.source, judged.scene.base, "", "", unreachable, judged.notes)
+    if isinstance(imported, Verified):
+        scene = imported.record.task.scene_id.split("-")[0]
+        return ProblemOutcome(source.name, source.source, scene, "", "", unreachable, imported.notes)
+    return ProblemOutcome(
+        source.name, source.source, imported.scene.base, "", "", unreachable, imported.notes
+    )
 
 
 def report_to_json(outcomes: Sequence[ProblemOutcome]) -> dict[str, Any]:
@@ -115,13 +118,13 @@ def evaluation_of(outcomes: Sequence[ProblemOutcome], seed: int) -> EvaluationFi
     """Return import rates by source, and the share of goals that each profile reaches."""
     figures: list[Figure] = []
     for source, (name, goal) in FIGURES.items():
-        mine = [outcome for outcome in outcomes if outcome.source == source]
-        if not mine:
+        selected = [outcome for outcome in outcomes if outcome.source == source]
+        if not selected:
             continue
-        n = len(mine)
-        figures.append(Figure(name, sum(each.is_bound for each in mine) / n, "", Better.HIGHER, n, goal))
+        n = len(selected)
+        figures.append(Figure(name, sum(each.is_bound for each in selected) / n, "", Better.HIGHER, n, goal))
         for profile in Profile:
-            reached = sum(not each.unreachable[profile.value] for each in mine)
+            reached = sum(not each.unreachable[profile.value] for each in selected)
             figures.append(Figure(f"{name} reached by {profile.value}", reached / n, "", Better.NEITHER, n))
     return EvaluationFigures("imports", {"seed": seed}, tuple(figures))
 
@@ -135,14 +138,14 @@ def solved_of(outcomes: Sequence[ProblemOutcome], seed: int, *, solids: bool = F
     figures: list[Figure] = []
     for source, (name, _) in FIGURES.items():
         for profile in Profile:
-            mine = [
+            selected = [
                 each for each in outcomes if each.source == source and not each.unreachable[profile.value]
             ]
-            if mine:
-                told = (
+            if selected:
+                title = (
                     f"{name.replace('import_rate', 'oracle_solved')} of what {profile.value} reaches{without}"
                 )
                 goal = SOLVED_GOAL if profile is Profile.PAPER else None
-                share = sum(each.is_bound for each in mine) / len(mine)
-                figures.append(Figure(told, share, "", Better.HIGHER, len(mine), goal))
+                share = sum(each.is_bound for each in selected) / len(selected)
+                figures.append(Figure(title, share, "", Better.HIGHER, len(selected), goal))
     return EvaluationFigures("imports", {"seed": seed}, tuple(figures))

@@ -65,9 +65,8 @@ def search(
     best: tuple[int, dict[str, str], dict[str, str]] | None = None
     lacking = ""
     for rooms in itertools.islice(_room_choices(words, options), MAX_CHOICES):
-        found, missing = _assign(
-            problem, view, {name: rooms[inroom[name]] for name in fixtures}, needs, rng, excluded
-        )
+        wanted = {name: rooms[inroom[name]] for name in fixtures}
+        found, missing = _assign(*_domains(problem, view, wanted, needs, rng, excluded))
         if not missing:
             return rooms, found
         first = missing[0]
@@ -123,28 +122,6 @@ def abilities_needed(problem: BddlProblem) -> Mapping[str, frozenset[str]]:
         elif atom.predicate == Relation.INSIDE:
             needs[atom.args[1]].add("container")
     return {name: frozenset(values) for name, values in needs.items()}
-
-
-def _assign(
-    problem: BddlProblem,
-    view: SceneView,
-    wanted: Mapping[str, str],
-    needs: Mapping[str, frozenset[str]],
-    rng: np.random.Generator,
-    excluded: Container[str],
-) -> tuple[dict[str, str], list[str]]:
-    """Assign distinct scene objects to as many names as possible, and return the names of missing furniture.
-
-    Small objects that the scene lacks are in neither result.
-    """
-    domains, missing = _domains(problem, view, wanted, needs, rng, excluded)
-    while True:
-        found: dict[str, str] = {}
-        failed = _backtrack(sorted(domains, key=lambda name: len(domains[name])), domains, found, [0])
-        if not failed:
-            return found, missing
-        missing.append(failed)
-        del domains[failed]
 
 
 def _domains(
@@ -210,6 +187,20 @@ def _spare_m2(view: SceneView, name: str) -> float:
             ):
                 return -1.0
     return max((math.prod(surface.size_m) for surface in asset.supports), default=0.0) - taken
+
+
+def _assign(domains: dict[str, list[str]], missing: list[str]) -> tuple[dict[str, str], list[str]]:
+    """Assign distinct scene objects to as many names as possible, and return the names of missing furniture.
+
+    Small objects that the scene lacks are in neither result.
+    """
+    while True:
+        found: dict[str, str] = {}
+        failed = _backtrack(sorted(domains, key=lambda name: len(domains[name])), domains, found, [0])
+        if not failed:
+            return found, missing
+        missing.append(failed)
+        del domains[failed]
 
 
 def _backtrack(

@@ -129,9 +129,7 @@ def floor_needed_m2(contents: tuple[str, ...]) -> float:
 
 
 def _fits(size_m: Vec3, floor: SupportSurface) -> bool:
-    """True if the footprint fits on the floor in either orientation and the height fits below the ceiling of the
-    cavity.
-    """
+    """True if the footprint fits on the floor in either orientation and the height fits below the ceiling of the cavity."""
     footprint = sorted(size_m[:2])
     return all(map(operator.le, footprint, sorted(floor.size_m))) and size_m[2] <= floor.clearance_m
 
@@ -156,10 +154,10 @@ def smallest_m(type_name: str) -> Vec3 | None:
 def _holds_at_start(problem: BddlProblem, atom: Atom) -> bool:
     """True if the atom holds at the start for everything that its names stand for."""
     first, second = (problem.types.get(name.lstrip("?"), (name.lstrip("?"),)) for name in atom.args)
-    told = {
+    at_start = {
         item.atom.args for item in problem.init if item.positive and item.atom.predicate == atom.predicate
     }
-    return all(any((one, other) in told for other in second) for one in first)
+    return all(any((one, other) in at_start for other in second) for one in first)
 
 
 def _share(problem: BddlProblem, thing: str, host: str) -> list[str]:

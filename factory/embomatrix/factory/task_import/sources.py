@@ -89,8 +89,9 @@ def read_file(path: Path) -> SourceText:
 
 
 def read_jsonl(path: Path) -> Iterator[SourceText]:
-    """Yield the problems of a JSON lines file with the fields ``name`` and ``bddl``. Raise ProblemSourceError that
-    names the line.
+    """Yield the problems of a JSON lines file with the fields ``name`` and ``bddl``.
+
+    Raise ProblemSourceError that names the line.
     """
     for number, line in enumerate(_read(path).splitlines(), start=1):
         if not line.strip():

@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 
 
 def with_robot_in(scene: Scene, room_name: str) -> Scene:
-    """Return the scene with the robot on the free floor nearest to the room's centre. Raise RefusedError if there is
-    none.
-    """
+    """Return the scene with the robot on the free floor nearest to the room's centre. Raise RefusedError if there is none."""
     if scene.robot.room == room_name:
         return scene
     room = next(room for room in scene.rooms if room.name == room_name)

@@ -51,7 +51,6 @@ if TYPE_CHECKING:
     from embomatrix.factory.layout.values import LayoutFailure
     from embomatrix.factory.task_import.binding import Addition, Binding
     from embomatrix.factory.task_import.sources import SourceText
-    from embomatrix.world.asset import Asset
     from embomatrix.world.bddl import BddlProblem
     from embomatrix.world.catalog import Model
     from embomatrix.world.scene import Scene
@@ -135,7 +134,7 @@ class _Binder:
         self._substances = {name: synset for name, synset in problem.objects.items() if is_substance(synset)}
         self._base = base
         self._rng = rng
-        self._manner = options
+        self._options = options
         self._scene_id = f"{base.base}-{_slug(source.name)}-{key}"
         self._requirements = requirements_of(problem)
 
@@ -153,19 +152,27 @@ class _Binder:
         return self._task(scene, names, binding, start)
 
     def _bound(self) -> tuple[Binding, SceneEditor, dict[str, str]]:
-        """Bind the problem and lay it out. Furniture that can't hold the problem's objects is excluded in further
-        attempts.
+        """Bind the problem and lay it out. Furniture that can't hold the problem's objects is excluded in further attempts.
 
         Furniture whose contents the robot can't reach is excluded too, while other furniture is left. After that, the
         layout is redrawn, and the layout with the fewest unreachable objects is used.
         """
+        options = self._options
         excluded, redrawn = set[str](), 0
         first: RefusedError | None = None
         fallback: tuple[Binding, SceneEditor, dict[str, str]] | None = None
         fewest = math.inf
         while True:
             try:
-                binding = self._bind(excluded)
+                binding = bind(
+                    self._problem,
+                    self._base,
+                    self._rng,
+                    furnishing=options.furnishing,
+                    reachable=options.reachable,
+                    renumbering=options.renumbering,
+                    excluded=excluded,
+                )
             except RefusedError as error:
                 if fallback is not None:
                     return fallback
@@ -188,19 +195,6 @@ class _Binder:
                 return fallback
             else:
                 raise first
-
-    def _bind(self, excluded: set[str]) -> Binding:
-        """Bind the problem without the excluded furniture. Raise RefusedError."""
-        options = self._manner
-        return bind(
-            self._problem,
-            self._base,
-            self._rng,
-            furnishing=options.furnishing,
-            reachable=options.reachable,
-            renumbering=options.renumbering,
-            excluded=excluded,
-        )
 
     def _add_floor(self, editor: SceneEditor, floor: str, binding: Binding) -> str:
         if floor not in binding.floors:
@@ -232,14 +226,17 @@ class _Binder:
         )
 
     def _is_portable(self, editor: SceneEditor, name: str) -> bool:
-        return name in editor.objects and not editor.known(name).fixed and _is_liftable(editor.asset_of(name))
+        if name not in editor.objects or editor.known(name).fixed:
+            return False
+        asset = editor.asset_of(name)
+        return is_liftable(asset.size_m, asset.mass_kg)
 
     def _portable_fixtures(self, editor: SceneEditor, names: Mapping[str, str]) -> Iterator[str]:
         """Yield portable appliances, such as a kettle, that the scene treats as fixed but this problem wants carried."""
         for name, type_name in self._problem.objects.items():
             if requirement_on(self._requirements, name, type_name).carried and name in names:
                 asset = editor.asset_of(names[name])
-                if _is_liftable(asset) and not is_portable(asset):
+                if is_liftable(asset.size_m, asset.mass_kg) and not is_portable(asset):
                     yield names[name]
 
     def _lay(self, editor: SceneEditor, binding: Binding) -> Layout:
@@ -247,7 +244,7 @@ class _Binder:
         editor.keep(binding.found.values())
         models = self._models(binding, editor)
         items = [self._item(addition, binding, models[addition.name]) for addition in binding.additions]
-        return self._manner.lay(editor, items, int(self._rng.integers(2**31)))
+        return self._options.lay(editor, items, int(self._rng.integers(2**31)))
 
     def _models(self, binding: Binding, editor: SceneEditor) -> Mapping[str, Sequence[Model]]:
         """Return the models to try for each addition, the best first. Some are scaled."""
@@ -266,7 +263,7 @@ class _Binder:
                     f"{addition.name!r} has no place: its type has no model{abilities if addition.needs else ''}",
                 )
         found = {name: editor.asset_of(there) for name, there in binding.found.items()}
-        return with_sizes(orders, binding.additions, requirements, found, compact=self._manner.compact)
+        return with_sizes(orders, binding.additions, requirements, found, compact=self._options.compact)
 
     def _item(self, addition: Addition, binding: Binding, models: Sequence[Model]) -> RequestedObject:
         rooms = (addition.room,) if addition.room else tuple(dict.fromkeys(binding.rooms.values()))
@@ -378,10 +375,6 @@ class _Binder:
         if atom.predicate == INSOURCE:
             return self._substances.get(atom.args[1], "") in flows_from(type_name)
         return atom.predicate in (REAL, FUTURE) and is_substance(type_name)
-
-
-def _is_liftable(asset: Asset) -> bool:
-    return is_liftable(asset.size_m, asset.mass_kg)
 
 
 def _renamed(literal: InitLiteral, names: dict[str, str]) -> Atom:

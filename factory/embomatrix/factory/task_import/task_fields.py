@@ -103,8 +103,8 @@ def taps_for(view: SceneView, goal: Formula, known: Iterable[str]) -> Iterator[s
 
     EAI's tasks soak objects in a teapot, which is empty here.
     """
-    asked = {atom.predicate for atom in atoms_of(goal)}
-    if not asked & {State.SOAKED, State.STAINED}:
+    predicates = {atom.predicate for atom in atoms_of(goal)}
+    if not predicates & {State.SOAKED, State.STAINED}:
         return
     rooms = {view.room(name) for name in known}
     if any(_gives_water(view, name) for name in known):

@@ -125,9 +125,7 @@ def placement_goal(context: GoalContext) -> GoalConjunct | None:
 
 
 def _place_goal(context: GoalContext, thing: str, called: str) -> GoalConjunct | None:
-    """Put the object on or in a sufficiently large host other than its current one. ``called`` names it in the
-    request.
-    """
+    """Put the object on or in a sufficiently large host other than its current one. ``called`` names it in the request."""
     view, rng = context.view, context.rng
     inside = rng.random() < 0.5
     baskets = [name for name in context.variant.added if view.is_basket(name) and name != thing]
@@ -175,9 +173,7 @@ def placed_elsewhere(context: GoalContext, conjunct: GoalConjunct) -> GoalConjun
 def _any_alike(
     context: GoalContext, target: str, atom: Callable[[str], Formula]
 ) -> tuple[Formula, Mapping[str, tuple[str, ...]], tuple[str, ...], str]:
-    """Return the atom about the target, or about any object that the same words describe, with its types, objects and
-    words.
-    """
+    """Return the atom about the target, or about any object that the same words describe, with its types, objects and words."""
     view = context.view
     alike = view.alike(target)
     if len(alike) == 1:

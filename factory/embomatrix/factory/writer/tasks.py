@@ -88,16 +88,8 @@ class DraftOrder:
 class TaskWriter(Protocol):
     """Writer of tasks about the objects of a variant."""
 
-    def write(
-        self,
-        variant: Variant,
-        view: SceneView,
-        category: TaskCategory,
-        task_id: str,
-        rng: np.random.Generator,
-    ) -> Draft | TaskRefusal | None:
-        """Return a task of the category, or None if the variant's rooms hold nothing for one. The generator decides
-        all draws.
+    def write(self, variant: Variant, view: SceneView, order: DraftOrder) -> Draft | TaskRefusal | None:
+        """Return a task of the category, or None if the variant's rooms hold nothing for one. The generator decides all draws.
 
         A refusal gives the reason why a language model produced no draft.
         """
@@ -121,20 +113,13 @@ class BatchTaskWriter(Protocol):
 class PlainWriter:
     """Writer that states the goal in a bounded vocabulary."""
 
-    def write(
-        self,
-        variant: Variant,
-        view: SceneView,
-        category: TaskCategory,
-        task_id: str,
-        rng: np.random.Generator,
-    ) -> Draft | None:
-        context = GoalContext(view, variant, rng)
-        conjuncts = draw_conjuncts(context, category)
+    def write(self, variant: Variant, view: SceneView, order: DraftOrder) -> Draft | None:
+        context = GoalContext(view, variant, order.rng)
+        conjuncts = draw_conjuncts(context, order.category)
         if not conjuncts:
             return None
         return draft_of(
-            context, category, task_id, conjuncts, sentence([conjunct.clause for conjunct in conjuncts], rng)
+            context, order, conjuncts, sentence([conjunct.clause for conjunct in conjuncts], order.rng)
         )
 
 
@@ -164,8 +149,7 @@ def _drawn(context: GoalContext, recipe: Sequence[Maker]) -> list[GoalConjunct]:
 
 def draft_of(
     context: GoalContext,
-    category: TaskCategory,
-    task_id: str,
+    order: DraftOrder,
     conjuncts: Sequence[GoalConjunct],
     instruction: str,
     transcript: str = "",
@@ -176,10 +160,10 @@ def draft_of(
     types = {key: names for conjunct in conjuncts for key, names in conjunct.types.items()}
     needed = dict.fromkeys(name for conjunct in conjuncts for name in conjunct.objects)
     task = Task(
-        task_id=task_id,
+        task_id=order.task_id,
         scene_id=context.variant.scene.scene_id,
         instruction=instruction,
-        category=category,
+        category=order.category,
         goal=goal,
         goal_bddl=render(goal),
         table=object_table(view, tuple(needed), context.rng),

@@ -35,6 +35,67 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 
+SWEEP: Final = (1 / 3, 2 / 3, 1.0)
+"""Fractions of a door's travel at which its swing is checked."""
+
+
+class DoorOpener:
+    """Opener of doors in an editor's scene. ``doors`` are those that tasks may ask to open."""
+
+    def __init__(self, editor: SceneEditor, doors: Iterable[str]) -> None:
+        self._editor = editor
+        self._doors = tuple(doors)
+        self._scene = editor.freeze(editor.base.scene_id)
+        self._solids = Solids.of_scene(self._scene)
+        self._lost = _out_of_reach(self._scene)
+
+    def open(self, name: str) -> bool:
+        """Open an object's doors and drawers fully. Return False if that would obstruct something."""
+        item = self._scene.by_name[name]
+        asset = self._scene.asset_of(name)
+        wide = (1.0,) * len(asset.joints)
+        if bumped_into(self._scene, self._solids, name, wide):
+            return False
+        changed = with_joints(self._scene.by_name, self._scene.assets, name, wide)
+        objects = tuple(changed.get(other.name, other) for other in self._scene.objects)
+        trial = replace(self._scene, objects=objects)
+        if self._in_the_way_of_doors(name, trial) or not _out_of_reach(trial) <= self._lost:
+            return False
+        self._editor.set_joints(name, wide)
+        self._solids.add(name, placed_parts(asset, item.pose_world_asset, wide))
+        self._scene = trial
+        return True
+
+    def _in_the_way_of_doors(self, name: str, trial: Scene) -> bool:
+        item = trial.by_name[name]
+        panel = Solids()
+        panel.add(name, placed_parts(trial.asset_of(name), item.pose_world_asset, item.joints))
+        for other in self._doors:
+            swinging = trial.by_name[other]
+            if other == name or any(swinging.joints):
+                continue
+            asset = trial.asset_of(other)
+            sweep = (placed_parts(asset, swinging.pose_world_asset, [s] * len(asset.joints)) for s in SWEEP)
+            if any(panel.overlaps(parts) for parts in sweep):
+                return True
+        return False
+
+
+def _out_of_reach(scene: Scene) -> frozenset[str]:
+    """Return rooms and furniture that the robot can't reach, and loose objects out of its reach."""
+    floor = ReachableFloor(scene)
+    found = {name for problem in reach_problems(scene) for name in problem.names}
+    for item in scene.objects:
+        if item.fixed or item.absent:
+            continue
+        host = scene.by_name.get(item.host)
+        doored = host is not None and bool(scene.asset_of(host.name).joints)
+        front = host.pose_world_asset if host is not None and doored else None
+        if not len(floor.spots(box_of(scene, item), front_of=front)):
+            found.add(item.name)
+    return frozenset(found)
+
+
 SMALL_OBJECTS: Final = 12
 """Number of small objects that a variant adds over all its rooms."""
 TRIES: Final = 3
@@ -131,9 +192,7 @@ def _models(category: str, rng: np.random.Generator) -> tuple[tuple[str, str], .
 def _set_doors_and_lights(
     editor: SceneEditor, view: SceneView, rooms: Sequence[str], rng: np.random.Generator
 ) -> None:
-    """Open some doors that have space and switch some devices on. Devices with doors stay off, since they only run
-    closed.
-    """
+    """Open some doors that have space and switch some devices on. Devices with doors stay off, since they only run closed."""
     names = [name for room in rooms for name in view.in_room[room]]
     starts = DoorOpener(editor, filter(view.is_openable, names))
     for name in names:
@@ -141,64 +200,3 @@ def _set_doors_and_lights(
             starts.open(name)
         elif view.is_toggleable(name) and not view.asset(name).joints and rng.random() < ON_SHARE:
             editor.set_states(name, view.item(name).states | {State.TOGGLED_ON})
-
-
-SWEEP: Final = (1 / 3, 2 / 3, 1.0)
-"""Fractions of a door's travel at which its swing is checked."""
-
-
-class DoorOpener:
-    """Opener of doors in an editor's scene. ``doors`` are those that tasks may ask to open."""
-
-    def __init__(self, editor: SceneEditor, doors: Iterable[str]) -> None:
-        self._editor = editor
-        self._doors = tuple(doors)
-        self._scene = editor.freeze(editor.base.scene_id)
-        self._solids = Solids.of_scene(self._scene)
-        self._lost = _out_of_reach(self._scene)
-
-    def open(self, name: str) -> bool:
-        """Open an object's doors and drawers fully. Return False if that would obstruct something."""
-        item = self._scene.by_name[name]
-        asset = self._scene.asset_of(name)
-        wide = (1.0,) * len(asset.joints)
-        if bumped_into(self._scene, self._solids, name, wide):
-            return False
-        changed = with_joints(self._scene.by_name, self._scene.assets, name, wide)
-        objects = tuple(changed.get(other.name, other) for other in self._scene.objects)
-        trial = replace(self._scene, objects=objects)
-        if self._in_the_way_of_doors(name, trial) or not _out_of_reach(trial) <= self._lost:
-            return False
-        self._editor.set_joints(name, wide)
-        self._solids.add(name, placed_parts(asset, item.pose_world_asset, wide))
-        self._scene = trial
-        return True
-
-    def _in_the_way_of_doors(self, name: str, trial: Scene) -> bool:
-        item = trial.by_name[name]
-        leaf = Solids()
-        leaf.add(name, placed_parts(trial.asset_of(name), item.pose_world_asset, item.joints))
-        for other in self._doors:
-            swinging = trial.by_name[other]
-            if other == name or any(swinging.joints):
-                continue
-            asset = trial.asset_of(other)
-            sweep = (placed_parts(asset, swinging.pose_world_asset, [s] * len(asset.joints)) for s in SWEEP)
-            if any(leaf.overlaps(parts) for parts in sweep):
-                return True
-        return False
-
-
-def _out_of_reach(scene: Scene) -> frozenset[str]:
-    """Return rooms and furniture that the robot can't reach, and loose objects out of its reach."""
-    floor = ReachableFloor(scene)
-    found = {name for problem in reach_problems(scene) for name in problem.names}
-    for item in scene.objects:
-        if item.fixed or item.absent:
-            continue
-        host = scene.by_name.get(item.host)
-        doored = host is not None and bool(scene.asset_of(host.name).joints)
-        front = host.pose_world_asset if host is not None and doored else None
-        if not len(floor.spots(box_of(scene, item), front_of=front)):
-            found.add(item.name)
-    return frozenset(found)

@@ -10,7 +10,7 @@ import itertools
 import logging
 from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.manager.histogram import Histogram, merged
 from embomatrix.manager.observe.run_figures import RunFigures
@@ -210,7 +210,7 @@ class RunEventLog:
         run.ring.append(event)
         if code:
             run.figures.failures.append(event)
-            _say_failed(event)
+            _log_failed(event)
 
     def _end(self, command: DeliverResult, now_s: float, code: str, message: str, worker_id: str) -> RunEvent:
         return self._note(
@@ -222,43 +222,18 @@ class RunEventLog:
             worker_id=worker_id,
             attempt=command.result.attempt,
             code=code,
-            message=message,
+            message=message[:MESSAGE_CHARS],
         )
 
-    def _note(
-        self,
-        kind: EventKind,
-        run_id: str,
-        *,
-        now_s: float,
-        batch_id: str = "",
-        rollout_id: str = "",
-        worker_id: str = "",
-        attempt: int = 0,
-        code: str = "",
-        message: str = "",
-        size: int = 0,
-    ) -> RunEvent:
+    def _note(self, kind: EventKind, run_id: str, *, now_s: float, **fields: Any) -> RunEvent:
         """Log an infrequent event."""
-        event = RunEvent(
-            next(self._sequences),
-            self.epoch_s + now_s,
-            kind,
-            run_id,
-            batch_id,
-            rollout_id,
-            worker_id,
-            attempt=attempt,
-            code=code,
-            message=message[:MESSAGE_CHARS],
-            size=size,
-        )
+        event = RunEvent(next(self._sequences), self.epoch_s + now_s, kind, run_id, **fields)
         if run_id in self._runs:
             self._runs[run_id].ring.append(event)
         return event
 
 
-def _say_failed(event: RunEvent) -> None:
+def _log_failed(event: RunEvent) -> None:
     logger.warning(
         "lease failed run=%s batch=%s rollout=%s attempt=%d worker=%s slot=%d scene=%s code=%s: %s",
         event.run_id,
@@ -322,7 +297,7 @@ class FleetLog:
 
     def lost(self, worker_id: str, reason: str, *, now_s: float) -> None:
         self._residents.pop(worker_id, None)
-        self._note(EventKind.WORKER_LOST, worker_id, now_s=now_s, message=reason)
+        self._note(EventKind.WORKER_LOST, worker_id, now_s=now_s, message=reason[:MESSAGE_CHARS])
 
     def residents(self, worker_id: str, residents: Sequence[Resident], *, now_s: float) -> None:
         """Log the changes of a worker's scenes since its last report."""
@@ -336,33 +311,13 @@ class FleetLog:
                 continue
             if resident.state is ResidentState.WARM:
                 self.scene_load.observe(resident.load_s)
-                note(EventKind.SCENE_WARM, scene=scene, held_s=resident.load_s)
+                note(EventKind.SCENE_WARM, bundle_digest=scene, held_s=resident.load_s)
             elif resident.state is ResidentState.FAILED:
-                note(EventKind.SCENE_FAILED, scene=scene, message=resident.error)
+                note(EventKind.SCENE_FAILED, bundle_digest=scene, message=resident.error[:MESSAGE_CHARS])
         for scene, state in before.items():
             if scene not in after and state is ResidentState.WARM:
-                note(EventKind.SCENE_EVICTED, scene=scene)
+                note(EventKind.SCENE_EVICTED, bundle_digest=scene)
 
-    def _note(
-        self,
-        kind: EventKind,
-        worker_id: str,
-        *,
-        now_s: float,
-        scene: str = "",
-        message: str = "",
-        held_s: float = 0.0,
-        size: int = 0,
-    ) -> None:
-        self.ring.append(
-            RunEvent(
-                next(self._sequences),
-                self._epoch_s + now_s,
-                kind,
-                worker_id=worker_id,
-                bundle_digest=scene,
-                message=message[:MESSAGE_CHARS],
-                held_s=held_s,
-                size=size,
-            )
-        )
+    def _note(self, kind: EventKind, worker_id: str, *, now_s: float, **fields: Any) -> None:
+        event = RunEvent(next(self._sequences), self._epoch_s + now_s, kind, worker_id=worker_id, **fields)
+        self.ring.append(event)

@@ -5,7 +5,9 @@ Labels have closed sets of values; none carries the id of a run, rollout, worker
 
 from __future__ import annotations
 
+import functools
 from collections import Counter
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
@@ -19,7 +21,7 @@ from embomatrix.manager.web.cluster_view import standing_counts
 from embomatrix.rpc.wire.values import InfraCode, ResidentState
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator
 
     from prometheus_client.metrics_core import Metric
 
@@ -47,7 +49,7 @@ class _Cluster(Collector):
         self._runtime = runtime
 
     def collect(self) -> Iterable[Metric]:
-        yield _gauges("embo_build_info", "Version of the manager.", "version", {manager_version(): 1})
+        yield _gauge("embo_build_info", "Version of the manager.", {manager_version(): 1}, "version")
         yield from self._fleet()
         yield from self._work()
         yield from self._prewarming()
@@ -57,14 +59,14 @@ class _Cluster(Collector):
         sessions = self._runtime.registry.sessions
         standings = standing_counts(self._runtime)
         states = {standing.value: standings[standing.value] for standing in WorkerStanding}
-        yield _gauges("embo_workers", "Workers by state.", "state", states)
-        yield _gauges("embo_slots", "Slots of connected workers by state.", "state", self._slot_states())
+        yield _gauge("embo_workers", "Workers by state.", states, "state")
+        yield _gauge("embo_slots", "Slots of connected workers by state.", self._slot_states(), "state")
         scheduler = self._runtime.cluster.scheduler
         residents = Counter(
             resident.state.value for name in sessions for resident in scheduler.residents(name)
         )
         found = {state.value: residents[state.value] for state in ResidentState}
-        yield _gauges("embo_residents", "Scenes on workers by state.", "state", found)
+        yield _gauge("embo_residents", "Scenes on workers by state.", found, "state")
         loads = self._runtime.event_log.fleet.scene_load
         yield _histograms(
             "embo_scene_load_seconds", "Time that workers took to load a scene.", "", {"": loads}
@@ -77,7 +79,7 @@ class _Cluster(Collector):
         yield _gauge("embo_queue_depth", "Queued rollouts.", dispatcher.queued)
         yield _gauge("embo_leases", "Live leases.", len(dispatcher.live_leases))
         outcomes = {name: runtime.meter.outcomes[name] for name in OUTCOMES}
-        yield _counters("embo_rollouts", "Rollouts by outcome.", "outcome", outcomes)
+        yield _counter("embo_rollouts", "Rollouts by outcome.", outcomes, "outcome")
         phases = {phase.value: histogram for phase, histogram in chronicle.phases().items()}
         yield _histograms("embo_rollout_seconds", "Time of completed rollouts by phase.", "phase", phases)
         yield _attempts(chronicle.attempts)
@@ -86,7 +88,7 @@ class _Cluster(Collector):
         yield _counter("embo_stale_results", "Late results that were rejected.", totals.stale_results)
         won = chronicle.hedges_won
         hedges = {"true": won, "false": max(0, totals.hedged - won)}
-        yield _counters("embo_hedges", "Hedge leases, by whether they delivered first.", "won", hedges)
+        yield _counter("embo_hedges", "Hedge leases, by whether they delivered first.", hedges, "won")
         yield _counter("embo_groups_failed", "Failed groups.", totals.groups_failed)
 
     def _prewarming(self) -> Iterator[Metric]:
@@ -131,26 +133,24 @@ class _Cluster(Collector):
         return "warming" if ResidentState.LOADING in states else "idle"
 
 
-def _gauge(name: str, text: str, value: float) -> Metric:
-    return GaugeMetricFamily(name, text, value=value)
-
-
-def _gauges(name: str, text: str, label: str, values: Mapping[str, float]) -> Metric:
-    family = GaugeMetricFamily(name, text, labels=[label])
+def _family(
+    kind: type[GaugeMetricFamily | CounterMetricFamily],
+    name: str,
+    text: str,
+    values: float | Mapping[str, float],
+    label: str = "",
+) -> Metric:
+    """Return a family with one value, or with a value per label value."""
+    if not isinstance(values, Mapping):
+        return kind(name, text, value=values)
+    family = kind(name, text, labels=[label])
     for key, value in values.items():
         family.add_metric([key], value)
     return family
 
 
-def _counter(name: str, text: str, value: float) -> Metric:
-    return CounterMetricFamily(name, text, value=value)
-
-
-def _counters(name: str, text: str, label: str, values: Mapping[str, float]) -> Metric:
-    family = CounterMetricFamily(name, text, labels=[label])
-    for key, value in values.items():
-        family.add_metric([key], value)
-    return family
+_gauge = functools.partial(_family, GaugeMetricFamily)
+_counter = functools.partial(_family, CounterMetricFamily)
 
 
 def _histograms(name: str, text: str, label: str, values: Mapping[str, Histogram]) -> Metric:

@@ -1,4 +1,4 @@
-"""`embomatrix worker`: lend this machine to a manager, or check that it can be lent."""
+"""`embomatrix worker`: run a worker on this machine, or check whether the machine is fit."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Lend this machine's cores to a manager.",
+    help="Run a worker that lends this machine's cores to a manager.",
 )
 console = Console()
 
@@ -44,7 +44,7 @@ app.command("ray", context_settings={"ignore_unknown_options": True, "allow_extr
 
 @app.command()
 def doctor(manager: Manager = DEFAULT_ADDRESS, token: Token = "", ca: Ca = None) -> None:
-    """Check what a worker needs: the engine, its processes, memory, and a manager that answers."""
+    """Check the engine, its processes, memory, and the connection to the manager."""
     check_engine()
     settings = parse({"manager": manager, "token": token, "ca": ca})
     resources = measure(settings)
@@ -56,11 +56,9 @@ def doctor(manager: Manager = DEFAULT_ADDRESS, token: Token = "", ca: Ca = None)
     table.add_row("free for bundles", f"{resources.disk_mb} MB")
     table.add_row("memory for scenes", f"{resources.memory_mb} MB")
     table.add_row("speed", f"{resources.score:.2f} of the reference")
-    table.add_row(
-        "gpu", f"{resources.gpu}, {resources.vram_mb} MB" if resources.gpu else "none (none is needed)"
-    )
+    table.add_row("gpu", f"{resources.gpu}, {resources.vram_mb} MB" if resources.gpu else "none (not needed)")
     try:
-        started_s, memory_mb = asyncio.run(_try_simulator())
+        started_s, memory_mb = asyncio.run(_start_simulator())
     except ProcessGoneError as error:
         console.print(table)
         fail(str(error))
@@ -71,13 +69,13 @@ def doctor(manager: Manager = DEFAULT_ADDRESS, token: Token = "", ca: Ca = None)
         console.print(table)
         fail(str(error))
     except ClusterError as error:
-        # A worker's token may not list the workers: the manager answered, which is what was asked.
+        # A worker's token may not list workers, but the manager has answered.
         workers = f"answers ({error})"
     table.add_row("manager", workers)
     console.print(table)
 
 
-async def _try_simulator() -> tuple[float, float]:
+async def _start_simulator() -> tuple[float, float]:
     started_s = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         root = await start_root(Path(folder) / "simulator.log")

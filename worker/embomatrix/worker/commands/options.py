@@ -1,4 +1,4 @@
-"""What the subcommands of `embomatrix worker` share: options, and sentences instead of tracebacks."""
+"""Options of the subcommands of `embomatrix worker`, and one-sentence errors instead of tracebacks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from rich.console import Console
 
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
-from embomatrix.worker.host.preferences import Preferences
+from embomatrix.worker.host.owner_policy import Preferences
 from embomatrix.worker.host.settings import WorkerSettings
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ EXPECTED: Final[Mapping[str, str]] = {
     "manager": f"expected HOST:PORT, as in {DEFAULT_ADDRESS}",
     "name": "expected up to 64 letters, digits, '.', '_' and '-'",
 }
-"""What to say of a wrong value where the validator only knows a pattern."""
+"""Expected values of settings whose validator only knows a pattern."""
 
 Manager = Annotated[
     str, typer.Option(help="HOST:PORT of the manager, or of several: A,B.", envvar="EMBOMATRIX_MANAGER")
@@ -30,7 +30,9 @@ Manager = Annotated[
 Token = Annotated[
     str,
     typer.Option(
-        envvar="EMBOMATRIX_TOKEN", help="Token of a worker, or @FILE that holds it.", show_default=False
+        envvar="EMBOMATRIX_TOKEN",
+        help="Token of the worker role, or @FILE that contains it.",
+        show_default=False,
     ),
 ]
 Ca = Annotated[
@@ -41,12 +43,12 @@ Ca = Annotated[
 ]
 StateDir = Annotated[
     Path | None,
-    typer.Option(help="Folder of this machine's credentials and of its workers' status.", show_default=False),
+    typer.Option(help="Folder of this machine's credentials and its workers' status.", show_default=False),
 ]
 
 
 def parse(values: dict[str, Any]) -> WorkerSettings:
-    """The settings, or the end of the program with a sentence about the first that is wrong."""
+    """Validate the settings, or exit with a sentence about the first wrong one."""
     try:
         return WorkerSettings.model_validate(
             {key: value for key, value in values.items() if value is not None}
@@ -55,19 +57,19 @@ def parse(values: dict[str, Any]) -> WorkerSettings:
         first = error.errors()[0]
         name = str(first["loc"][-1])
         if first["type"] == "extra_forbidden":
-            fields = Preferences if first["loc"][0] == "preferences" else WorkerSettings
-            key, known = ".".join(map(str, first["loc"])), ", ".join(sorted(fields.model_fields))
+            model = Preferences if first["loc"][0] == "preferences" else WorkerSettings
+            key, known = ".".join(map(str, first["loc"])), ", ".join(sorted(model.model_fields))
             fail(f"--config: {key} is no setting: expected one of {known}")
         if name in {"token", "join"}:
-            # What was found stays untold: it may be nearly the secret.
+            # The value is not shown: it may be almost the secret.
             fail(f"--{name}: expected visible ASCII characters without spaces")
-        said = first["msg"].removeprefix("Value error, ")
-        expected = EXPECTED.get(name) or said[:1].lower() + said[1:]
+        message = first["msg"].removeprefix("Value error, ")
+        expected = EXPECTED.get(name) or message[:1].lower() + message[1:]
         fail(f"--{name.replace('_', '-')} {first['input']!r}: {expected}")
 
 
 def check_engine() -> None:
-    """End with a sentence where the engine is not installed; it is not imported here."""
+    """Exit with a sentence if the engine is not installed, without importing it."""
     if importlib.util.find_spec("pybullet") is None:
         fail(
             f"a worker needs the physics engine pybullet, and this Python {platform.python_version()} on "
@@ -77,7 +79,7 @@ def check_engine() -> None:
 
 
 def fail(sentence: str) -> NoReturn:
-    """End the program with status 2 and a sentence on standard error."""
+    """Print a sentence to standard error and exit with status 2."""
     Console(stderr=True, soft_wrap=True).print(
         f"embomatrix worker: {sentence}", highlight=False, markup=False
     )

@@ -1,7 +1,7 @@
-"""`embomatrix worker ray`: worker daemons as actors on a Ray cluster that is there already.
+"""`embomatrix worker ray`: worker daemons as actors on an existing Ray cluster.
 
-Ray places them by cores and memory and starts them again where a node is lost; leases, scenes and results are the manager's
-affair, as with any worker.
+Ray places them by cores and memory and restarts them if a node is lost. The manager handles leases, scenes and results as with
+any worker.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from embomatrix.host.parent import with_this_process
 from embomatrix.worker.commands.options import fail
 
 DRAIN_S: Final = 90.0
-"""Longer than running rollouts may take to end."""
+"""Longer than the time that running rollouts have to end."""
 FINAL: Final = frozenset({0, 2})
-"""The daemon left, or a person must mend something: Ray does not start it again."""
+"""Exit statuses without a restart: the daemon left, or a user must mend something."""
 
 
 class PlacedWorker:
-    """What becomes an actor: one daemon, its child, which dies with it."""
+    """Actor with one daemon as its child process, which dies with it."""
 
     def __init__(self, name: str, arguments: list[str]) -> None:
         folder = Path(tempfile.gettempdir()) / f"embomatrix-{os.getuid()}" / name
@@ -36,14 +36,14 @@ class PlacedWorker:
         self._child = subprocess.Popen([*command, *folders, *arguments], preexec_fn=with_this_process())
 
     def ended(self) -> int:
-        """Exit status of the daemon, once it is over. Any other than a final one ends the actor: Ray makes it anew."""
+        """Wait for the daemon and return its exit status. A status that is not final ends the actor, and Ray restarts it."""
         status = self._child.wait()
         if status not in FINAL:
             os._exit(1)
         return status
 
     def drain(self) -> None:
-        """What runs ends, and is delivered; then the daemon leaves."""
+        """Drain the daemon: running rollouts end and are delivered."""
         self._child.terminate()
         try:
             self._child.wait(DRAIN_S)
@@ -53,13 +53,15 @@ class PlacedWorker:
 
 def ray_workers(
     context: typer.Context,
-    workers: Annotated[int, typer.Option(min=1, help="Daemons.")] = 1,
-    cpus: Annotated[int, typer.Option(min=1, help="Cores of each, and rollouts at the same time.")] = 1,
-    memory_mb: Annotated[int, typer.Option(min=256, help="Memory of each.")] = 4096,
-    address: Annotated[str, typer.Option(help="Of the Ray cluster; `local` starts one here.")] = "auto",
-    prefix: Annotated[str, typer.Option(help="Workers are called PREFIX-0, PREFIX-1 and so on.")] = "ray",
+    workers: Annotated[int, typer.Option(min=1, help="Number of daemons.")] = 1,
+    cpus: Annotated[int, typer.Option(min=1, help="Cores and concurrent rollouts of each.")] = 1,
+    memory_mb: Annotated[int, typer.Option(min=256, help="Memory of each, in MB.")] = 4096,
+    address: Annotated[
+        str, typer.Option(help="Address of the Ray cluster; `local` starts one on this machine.")
+    ] = "auto",
+    prefix: Annotated[str, typer.Option(help="Prefix of the workers' names: PREFIX-0, PREFIX-1 …")] = "ray",
 ) -> None:
-    """Place workers on a Ray cluster until interrupted; options of `worker run`, as --manager, follow `--`."""
+    """Run workers on a Ray cluster until interrupted; options of `worker run`, such as --manager, follow `--`."""
     try:
         ray: Any = importlib.import_module("ray")
     except ModuleNotFoundError:
@@ -69,7 +71,7 @@ def ray_workers(
         ray.init(address=address, log_to_driver=True, include_dashboard=False if address == "local" else None)
     except ConnectionError as error:
         fail(f"no Ray cluster answers at {address!r} ({error}): start one with `ray start --head`")
-    # Two methods at once: one waits for the end, the other asks for it.
+    # Two concurrent methods: one waits for the end, the other requests it.
     actor = ray.remote(
         num_cpus=cpus,
         memory=memory_mb * 1_000_000,
@@ -88,9 +90,9 @@ def ray_workers(
 
 
 def _watch(ray: Any, placed: dict[str, Any], console: Console) -> None:
-    """Tell of every daemon that is over for good, until all are."""
+    """Report every daemon that has ended for good, until all have."""
     waiting = {each.ended.remote(): name for name, each in placed.items()}
-    console.print(f"{len(placed)} workers are with Ray; Ctrl-C drains them", highlight=False)
+    console.print(f"{len(placed)} workers run on Ray; Ctrl-C drains them", highlight=False)
     while waiting:
         for over in ray.wait(list(waiting), timeout=1.0)[0]:
             console.print(f"{waiting.pop(over)} ended with status {ray.get(over)}", highlight=False)

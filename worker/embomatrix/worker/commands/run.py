@@ -1,4 +1,4 @@
-"""`embomatrix worker run`: its options, put over what a file says, and the daemon that they make."""
+"""`embomatrix worker run`: options over a settings file, and the daemon that they configure."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from embomatrix.rpc.logs import LogFormat, bind, hide, log_to_stderr
 from embomatrix.rpc.status import ClusterError
 from embomatrix.worker.commands.options import Ca, Manager, StateDir, Token, check_engine, fail, parse
 from embomatrix.worker.host.machine import HostMachine
-from embomatrix.worker.host.preferences import Preferences
+from embomatrix.worker.host.owner_policy import Preferences
 from embomatrix.worker.host.resources import measure
-from embomatrix.worker.host.status import daemon_pids
 from embomatrix.worker.link.daemon import Daemon, serve
 from embomatrix.worker.link.membership import membership_of
+from embomatrix.worker.link.status import daemon_pids
 from embomatrix.worker.slots.processes import ProcessGoneError
 
 if TYPE_CHECKING:
@@ -38,41 +38,38 @@ logger = logging.getLogger(__name__)
 
 PREFERENCES: Final = frozenset(Preferences.model_fields)
 NOT_SETTINGS: Final = frozenset({"config", "labels", "verbose", "log_format"})
-"""Options that are no setting of the daemon, or not by that name."""
+"""Options that are no settings of the daemon, or have another name there."""
 
-
-Slots = Annotated[int, typer.Option(help="Rollouts at the same time; 0: one for each core.")]
+Slots = Annotated[int, typer.Option(help="Concurrent rollouts; 0: one for each core.")]
 Join = Annotated[
     str,
     typer.Option(
         envvar="EMBOMATRIX_JOIN",
-        help="TOKEN@HOST:PORT as the operator got it: all that joining takes.",
+        help="Invitation TOKEN@HOST:PORT of the operator, instead of --manager and --token.",
         show_default=False,
     ),
 ]
 Name = Annotated[str, typer.Option(help="Worker id; by default the host's name and a random part.")]
-Labels = Annotated[
-    list[str] | None, typer.Option("--label", help="KEY=VALUE, for operators; may be given again.")
-]
-WorkHours = Annotated[str, typer.Option(help="Work only then: 18:00-08:00, local time.")]
-IdleS = Annotated[float, typer.Option(help="Work only when nobody used this machine for so many seconds.")]
+Labels = Annotated[list[str] | None, typer.Option("--label", help="KEY=VALUE, for operators; repeatable.")]
+WorkHours = Annotated[str, typer.Option(help="Work only in these hours: 18:00-08:00, local time.")]
+IdleS = Annotated[float, typer.Option(help="Work only after this many seconds without a sign of a user.")]
 MainsOnly = Annotated[bool, typer.Option("--mains-only", help="Pause on battery.")]
 MaxLoad = Annotated[
-    float, typer.Option(help="Pause when other programs use more than this share of all cores, as 0.5.")
+    float, typer.Option(help="Pause if other programs use more than this share of all cores, such as 0.5.")
 ]
-MemoryMb = Annotated[int, typer.Option(help="Memory for scenes; 0: a share of what is free.")]
-MemoryShare = Annotated[float, typer.Option(help="That share.")]
-CacheDir = Annotated[Path | None, typer.Option(help="Folder for bundles and the simulator's log.")]
-CacheMb = Annotated[int, typer.Option(help="Disk space for bundles.")]
-Nice = Annotated[int, typer.Option(help="Politeness, 0 to 19; above 0 the disk is left to others too.")]
+MemoryMb = Annotated[int, typer.Option(help="Memory for scenes in MB; 0: a share of the free memory.")]
+MemoryShare = Annotated[float, typer.Option(help="Share of the free memory for scenes.")]
+CacheDir = Annotated[Path | None, typer.Option(help="Folder of bundles and the simulator's log.")]
+CacheMb = Annotated[int, typer.Option(help="Disk space for bundles in MB.")]
+Nice = Annotated[
+    int, typer.Option(help="Nice value of the CPU, 0 to 19; above 0 the disk has idle priority, too.")
+]
 Config = Annotated[
-    Path | None, typer.Option(help="TOML file of these options; what is given here goes before it.")
+    Path | None, typer.Option(help="TOML file of these options; options on the command line take precedence.")
 ]
-Once = Annotated[bool, typer.Option("--once", help="End when the manager can't be reached.")]
+Once = Annotated[bool, typer.Option("--once", help="Exit if the manager can't be reached.")]
 Verbose = Annotated[bool, typer.Option("--verbose", help="Log every rollout.")]
-LogLines = Annotated[
-    LogFormat, typer.Option(help="Log lines for people, or as JSON.", envvar="EMBOMATRIX_LOG_FORMAT")
-]
+LogLines = Annotated[LogFormat, typer.Option(help="Format of log lines.", envvar="EMBOMATRIX_LOG_FORMAT")]
 
 
 def run(
@@ -99,13 +96,13 @@ def run(
     verbose: Verbose = False,
     log_format: LogLines = LogFormat.HUMAN,
 ) -> None:
-    """Join the manager and execute rollouts until stopped: Ctrl-C drains, a second one leaves at once."""
+    """Join the manager and execute rollouts until stopped. Ctrl-C drains; a second Ctrl-C exits at once."""
     check_engine()
     settings = parse(values_of(context, config, labels or []))
     log_to_stderr("debug" if verbose else "info", log_format)
     hide(settings.token)
     hide(settings.join)
-    be_polite(settings.nice)
+    lower_priority(settings.nice)
     try:
         asyncio.run(_serve(settings))
     except (ClusterError, ProcessGoneError) as error:
@@ -116,7 +113,7 @@ def run(
 
 
 class CommandLine(Protocol):
-    """What was typed: values by the names of options, and where each of them comes from."""
+    """Parsed command line: values by option name, and the source of each."""
 
     params: dict[str, Any]
 
@@ -124,7 +121,7 @@ class CommandLine(Protocol):
 
 
 def settings_of(words: Sequence[str]) -> WorkerSettings:
-    """What `worker run` makes of these words; where one is wrong, the program ends with a sentence."""
+    """Parse the options of `worker run`, or exit with a sentence about a wrong one."""
     parser = typer.Typer()
     parser.command()(run)
     context = typer.main.get_command(parser).make_context("embomatrix worker run", list(words))
@@ -132,25 +129,23 @@ def settings_of(words: Sequence[str]) -> WorkerSettings:
 
 
 def values_of(context: CommandLine, config: Path | None, labels: list[str]) -> dict[str, Any]:
-    """What the file says, and over it what was given as an option or in the environment."""
+    """Merge the file with options and environment variables, which take precedence."""
     values = read_config(config) if config is not None else {}
-    wishes = values.setdefault("preferences", {})
+    preferences = values.setdefault("preferences", {})
     for name, value in context.params.items():
         source = context.get_parameter_source(name)
         if name in NOT_SETTINGS or source is None or source.name.startswith("DEFAULT"):
             continue
         if name == "join" and not value:
-            fail(
-                "--join is empty, perhaps a variable that is not set: expected TOKEN@HOST:PORT, as the operator gave it"
-            )
-        (wishes if name in PREFERENCES else values)[name] = value
+            fail("--join is empty, perhaps an unset variable: expected TOKEN@HOST:PORT from the operator")
+        (preferences if name in PREFERENCES else values)[name] = value
     if labels:
         values["labels"] = {**values.get("labels", {}), **dict(map(split_label, labels))}
     return values
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """The options that a TOML file holds; what they may be is checked with the others."""
+    """Read a TOML file of options. Its values are validated with the others."""
     try:
         values = tomllib.loads(path.expanduser().read_text(encoding="utf-8"))
     except OSError as error:
@@ -169,11 +164,11 @@ def split_label(text: str) -> tuple[str, str]:
     return key, value
 
 
-def be_polite(nice: int) -> None:
-    """Leave processor and disk to others, in this process and in those that it starts."""
+def lower_priority(nice: int) -> None:
+    """Lower the CPU and disk priority of this process and its children."""
     os.nice(nice)
     if nice and sys.platform == "linux":
-        # Some containers forbid it, and it is a courtesy only.
+        # Some containers forbid it, and it is optional.
         with contextlib.suppress(psutil.Error, OSError):
             psutil.Process().ionice(psutil.IOPRIO_CLASS_IDLE)
 
@@ -182,8 +177,8 @@ async def _serve(settings: WorkerSettings) -> None:
     membership = await membership_of(settings)
     bind("worker", membership.name)
     machine = HostMachine(lambda: daemon_pids(settings.state_dir))
-    if not settings.preferences.indifferent:
-        for sentence in machine.blind_to(settings.preferences, await asyncio.to_thread(machine.observe)):
+    if not settings.preferences.always:
+        for sentence in machine.unsupported(settings.preferences, await asyncio.to_thread(machine.observe)):
             logger.warning("%s", sentence)
     daemon = Daemon(
         settings, measure(settings), np.random.default_rng(), membership=membership, probe=machine

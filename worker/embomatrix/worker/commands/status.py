@@ -1,4 +1,4 @@
-"""`embomatrix worker status`: what the daemons of this machine do at present, in words."""
+"""`embomatrix worker status`: current state of the daemons of this machine."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from rich.console import Console
 
 from embomatrix.worker.commands.options import StateDir, fail
 from embomatrix.worker.host.settings import WorkerSettings
-from embomatrix.worker.host.status import running_daemons
+from embomatrix.worker.link.status import running_daemons
 
 if TYPE_CHECKING:
-    from embomatrix.worker.host.status import WorkerStatus
+    from embomatrix.worker.link.status import WorkerStatus
 
 
 def status(
     state_dir: StateDir = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON list, for programs.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON list.")] = False,
 ) -> None:
-    """Tell what the workers of this machine do: whom they work for, what runs, and why they pause."""
+    """Show the workers of this machine: their manager, running rollouts, and pauses."""
     folder = state_dir or WorkerSettings.model_fields["state_dir"].default
     daemons = running_daemons(folder)
     if as_json:
         typer.echo(json.dumps([asdict(daemon) for daemon in daemons], indent=2))
         return
     if not daemons:
-        fail(f"no worker runs here (by {folder}): start one with `embomatrix worker run`")
+        fail(f"no worker of {folder} runs on this machine: start one with `embomatrix worker run`")
     console = Console(soft_wrap=True)
     for daemon in daemons:
         for line in describe(daemon, time.time()):
@@ -37,13 +37,13 @@ def status(
 
 
 def describe(status: WorkerStatus, now_s: float) -> list[str]:
-    """The status in sentences; ``now_s`` is wall time."""
+    """Describe the status in lines; ``now_s`` is wall time."""
     if status.connected_since_s:
-        reach = f"connected to {status.manager} for {spell(now_s - status.connected_since_s)}"
+        reach = f"connected to {status.manager} for {format_duration(now_s - status.connected_since_s)}"
     else:
         reach = f"not connected to {status.manager or 'a manager'} at present; it keeps trying"
     state = (
-        "draining: leaves when what runs has ended"
+        "draining: leaves after the running rollouts"
         if status.draining
         else f"paused: {status.paused}"
         if status.paused
@@ -52,7 +52,7 @@ def describe(status: WorkerStatus, now_s: float) -> list[str]:
         else "waiting for work"
     )
     return [
-        f"{status.name} (process {status.pid}), running for {spell(now_s - status.started_s)}",
+        f"{status.name} (process {status.pid}), running for {format_duration(now_s - status.started_s)}",
         f"  {reach}",
         f"  {state}",
         f"  {status.running} of {status.slots} slots run a rollout, {status.waiting} more wait",
@@ -63,8 +63,8 @@ def describe(status: WorkerStatus, now_s: float) -> list[str]:
     ]
 
 
-def spell(seconds: float) -> str:
-    """A duration in its two largest units: ``3 h 12 min``."""
+def format_duration(seconds: float) -> str:
+    """Format a duration in its two largest units: ``3 h 12 min``."""
     whole = max(0, int(seconds))
     days, hours, minutes = whole // 86400, whole // 3600 % 24, whole // 60 % 60
     if days:

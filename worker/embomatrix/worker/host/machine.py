@@ -1,4 +1,4 @@
-"""What this machine shows of its owner, its power and its load. It needs no root, and says what it can't see."""
+"""Observation of this machine: its owner's activity, its power and the load of other programs. It needs no root."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import psutil
 
-from embomatrix.worker.host.pausing import Observation
+from embomatrix.worker.host.owner_policy import Observation
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from embomatrix.worker.host.preferences import Preferences
+    from embomatrix.worker.host.owner_policy import Preferences
 
 SESSIONS_ASKED_S: Final = 10.0
-"""Asking for the desktop's sessions starts two processes: not more often than this."""
+"""Interval between two queries of the desktop sessions, which start two processes each."""
 SESSIONS_ANSWER_S: Final = 5.0
 GRAPHICAL: Final = frozenset({"x11", "wayland", "mir"})
 NEVER_S: Final = 1e9
-"""Since a sign of a person, where nobody is logged in at all."""
+"""Idle time if no user is logged in."""
 DEVICES: Final = Path("/dev")
 
 
 class Probe(Protocol):
-    """Looks at a machine; it may take some milliseconds, and raises nothing."""
+    """Observes a machine within some milliseconds, without raising."""
 
     def observe(self) -> Observation: ...
 
 
 class HostMachine:
-    """The machine that this runs on. ``ours`` gives the process ids of all worker daemons here: theirs is no load of others."""
+    """This machine. ``ours`` returns the process ids of all worker daemons here, whose load is not that of others."""
 
     def __init__(self, ours: Callable[[], Iterable[int]], owner: Owner | None = None) -> None:
         self._owner = owner or (Owner() if sys.platform == "linux" else None)
@@ -52,47 +52,47 @@ class HostMachine:
             free_memory=memory.available / memory.total,
         )
 
-    def blind_to(self, wishes: Preferences, seen: Observation) -> list[str]:
-        """What the preferences ask for and this machine does not show, in sentences."""
+    def unsupported(self, preferences: Preferences, seen: Observation) -> list[str]:
+        """One sentence for each preference that this machine can't support."""
         sentences = []
-        if wishes.idle_s and seen.owner_idle_s is None:
+        if preferences.idle_s and seen.owner_idle_s is None:
             sentences.append(
-                "on this system nobody can be seen at work: idle_s has no effect, use hours or max_load"
+                "this system does not show its users' activity: idle_s has no effect, use hours or max_load"
             )
-        if wishes.mains_only and seen.on_mains is None:
+        if preferences.mains_only and seen.on_mains is None:
             sentences.append("no battery was found: mains_only has no effect")
         return sentences
 
 
 def on_mains() -> bool | None:
-    """Whether the machine has power from outside; None where no battery is known."""
+    """Return whether the machine is on mains power; None if it has no known battery."""
     ask = getattr(psutil, "sensors_battery", None)
     battery = ask() if ask is not None else None
     return None if battery is None else battery.power_plugged
 
 
 class Owner:
-    """The last sign of a person: what was typed in a terminal, and what the desktop tells logind."""
+    """Last activity of a user: typing in a terminal, and what the desktop reports to logind."""
 
     def __init__(self, devices: Path = DEVICES, sessions: Callable[[], str] | None = None) -> None:
         self._devices = devices
         self._sessions = sessions or ask_sessions
         self._desktop_active_s: float | None = None
-        self._asked_s = float("-inf")
+        self._queried_s = float("-inf")
 
     def idle_s(self, now_s: float) -> float:
-        """Seconds since the last sign; ``now_s`` is wall time. Where nobody is logged in, very many."""
-        if now_s - self._asked_s >= SESSIONS_ASKED_S:
-            self._asked_s = now_s
+        """Seconds since the last activity at the wall time ``now_s``; very many if no user is logged in."""
+        if now_s - self._queried_s >= SESSIONS_ASKED_S:
+            self._queried_s = now_s
             self._desktop_active_s = desktop_active_s(self._sessions(), now_s)
         signs = [terminal_active_s(self._devices), self._desktop_active_s]
         return max(0.0, now_s - max((sign for sign in signs if sign is not None), default=now_s - NEVER_S))
 
 
 def terminal_active_s(devices: Path = DEVICES) -> float | None:
-    """Wall time at which somebody last typed in any terminal, local or remote: reading moves a terminal's access time.
+    """Wall time of the last typing in any terminal, local or remote, from the terminals' access times.
 
-    It is what `w` shows as idle. The kernel rounds it to eight seconds.
+    `w` shows the same as idle time. The kernel rounds it to eight seconds.
     """
     times = []
     for path in (*devices.glob("pts/[0-9]*"), *devices.glob("tty[0-9]*")):
@@ -104,7 +104,7 @@ def terminal_active_s(devices: Path = DEVICES) -> float | None:
 
 
 def ask_sessions() -> str:
-    """Properties of all of logind's sessions, as ``loginctl`` prints them; empty where there is no logind."""
+    """Properties of all sessions as ``loginctl`` prints them; empty without logind."""
     program = shutil.which("loginctl")
     if program is None:
         return ""
@@ -129,10 +129,10 @@ def _answer_of(*command: str) -> str:
 
 
 def desktop_active_s(sessions: str, now_s: float) -> float | None:
-    """Wall time at which a desktop was last used; None when no person has one.
+    """Wall time of the last use of a desktop; None if no user has one.
 
-    A desktop sets its hint when the screen falls idle. One that never does counts as used for as long as it is there.
-    Sessions in terminals are left to the terminals: logind itself takes half an hour to call them idle.
+    A desktop sets a hint when its screen becomes idle. A desktop without a hint counts as in use. Sessions in terminals are
+    ignored here, because logind takes half an hour to call them idle.
     """
     times = []
     for block in sessions.strip().split("\n\n"):
@@ -149,29 +149,29 @@ def desktop_active_s(sessions: str, now_s: float) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class CpuTimes:
-    """Processor seconds since boot: of all, of those that were busy, and of those that were busy for us."""
+    """CPU seconds since boot: all, busy ones, and busy ones of our processes."""
 
     total_s: float
     busy_s: float
     ours_s: float
 
     def others_share_since(self, before: CpuTimes) -> float:
-        """Share of all cores that others kept busy in between, 0 to 1."""
+        """Share of all cores that other programs used in between, 0 to 1."""
         total_s = self.total_s - before.total_s
-        # A process of ours that dies with its parent takes its count along: less than before means nothing.
+        # The count falls if one of our processes dies together with its parent.
         ours_s = max(0.0, self.ours_s - before.ours_s)
         return min(1.0, max(0.0, self.busy_s - before.busy_s - ours_s) / total_s) if total_s > 0 else 0.0
 
 
 class OthersLoad:
-    """How busy others keep the processor, between one question and the next."""
+    """CPU load of other programs between two queries."""
 
     def __init__(self, ours: Callable[[], Iterable[int]]) -> None:
         self._ours = ours
         self._before = self._times()
 
     def share(self) -> float:
-        """Share of all cores since the last question, 0 to 1."""
+        """Share of all cores since the last query, 0 to 1."""
         now = self._times()
         share = now.others_share_since(self._before)
         self._before = now
@@ -179,14 +179,14 @@ class OthersLoad:
 
     def _times(self) -> CpuTimes:
         whole = psutil.cpu_times()
-        # Guests are counted among the users already.
+        # User time includes guest time already.
         total_s = sum(whole) - getattr(whole, "guest", 0.0) - getattr(whole, "guest_nice", 0.0)
         idle_s = whole.idle + getattr(whole, "iowait", 0.0)
         return CpuTimes(total_s, total_s - idle_s, sum(map(family_cpu_s, set(self._ours()))))
 
 
 def family_cpu_s(pid: int) -> float:
-    """Processor seconds of a process and of all below it, those that ended and were collected included."""
+    """CPU seconds of a process and its descendants, including those that were collected."""
     try:
         root = psutil.Process(pid)
         family = [root, *root.children(recursive=True)]

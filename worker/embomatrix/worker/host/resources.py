@@ -1,4 +1,4 @@
-"""What this machine offers: cores, memory, GPU, versions, and how fast it is."""
+"""Resources of this machine: cores, memory, GPU, versions, and speed."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from embomatrix.worker.host.settings import WorkerSettings
 
 REFERENCE_S: Final = 0.0065
-"""Seconds that the probe takes on a machine of score 1: a core of a cloud machine of 2026."""
+"""Seconds of the probe on a machine of score 1, a core of a cloud machine of 2026."""
 
 
 def measure(settings: WorkerSettings) -> Resources:
-    """Resources of this machine; what the settings name is taken from there."""
+    """Measure this machine; values in the settings take precedence."""
     limits = find_limits()
     cores = usable_cores(limits)
     slots = settings.slots or cores
@@ -49,13 +49,13 @@ def measure(settings: WorkerSettings) -> Resources:
 
 
 def free_disk_mb(folder: Path) -> int:
-    """Free space where this folder is, or will be."""
+    """Free disk space in MB at this folder, which may not exist yet."""
     existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
     return shutil.disk_usage(existing).free // MIB
 
 
 def measure_score() -> float:
-    """Speed of one core, 1 for the reference machine: the best of three short probes of plain Python."""
+    """Speed of one core relative to the reference machine: the best of three short probes in Python."""
     seconds = []
     for _ in range(3):
         started_s = time.perf_counter()
@@ -67,7 +67,7 @@ def measure_score() -> float:
 
 
 def versions() -> dict[str, str]:
-    """Versions that results depend on, and the platform's fingerprint."""
+    """Versions that affect results, and the platform's fingerprint."""
     return {
         "embomatrix": _version_of("embomatrix"),
         "python": platform.python_version(),
@@ -78,7 +78,7 @@ def versions() -> dict[str, str]:
 
 
 def fingerprint() -> str:
-    """Equal on machines where equal rollouts have bit-equal traces: engine wheel, libm and numpy are probed."""
+    """Fingerprint of engine wheel, libm and numpy: where it is equal, equal rollouts have bit-equal traces."""
     probe = hashlib.sha256()
     probe.update(f"{platform.machine()} {_version_of('pybullet')} {np.__version__}".encode())
     for number in (0.1, 0.7, 1.3, 2.9, 1e5):

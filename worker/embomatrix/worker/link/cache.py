@@ -1,4 +1,4 @@
-"""Bundles on disk, by digest: checked at every use, bounded in size, the longest unused evicted first."""
+"""Bundle cache on disk by digest: verified at every use, bounded in size, evicted by last use."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ _DIGEST: Final = re.compile(r"sha256:[0-9a-f]{64}")
 SUFFIX: Final = ".bundle"
 PART: Final = ".part-"
 ABANDONED_S: Final = 3600.0
-"""A part of a bundle that nobody has written to for so long was left by a daemon that was killed."""
+"""Age after which a partial file counts as left by a killed daemon."""
 FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
 class BundleCache:
-    """Brings bundles to disk; several daemons may share the folder, and what is there outlives them.
+    """Bundle files of one folder, which several daemons may share and which outlives them.
 
-    ``fetch`` gets a bundle's bytes from the manager and raises LoadError when it can't.
+    ``fetch`` returns a bundle's bytes from the manager, or raises LoadError.
     """
 
     def __init__(self, folder: Path, *, limit_bytes: int, fetch: Callable[[str], Awaitable[bytes]]) -> None:
@@ -43,7 +43,7 @@ class BundleCache:
         self._fetch = fetch
 
     async def path_of(self, digest: str) -> Path:
-        """The file of this bundle, fetched if need be. Damaged twice in a row, it is a LoadError (bundle_corrupt)."""
+        """Return the bundle's file, fetched if it is missing. Raise LoadError (bundle_corrupt) if it is damaged twice."""
         if not _DIGEST.fullmatch(digest):
             raise LoadError(
                 InfraCode.BUNDLE_CORRUPT, f"{digest!r} is no digest: expected sha256: and 64 digits"
@@ -56,9 +56,10 @@ class BundleCache:
             found = bundle_digest(data)
             if found == digest:
                 return await asyncio.to_thread(self._keep, digest, data)
-            logger.warning("bundle damaged on its way bundle=%s found=%s", digest, found)
+            logger.warning("bundle damaged in transit bundle=%s found=%s", digest, found)
         raise LoadError(
-            InfraCode.BUNDLE_CORRUPT, f"fetched twice, and twice its digest was another, last {found}"
+            InfraCode.BUNDLE_CORRUPT,
+            f"the bundle was fetched twice with a wrong digest, last {found}: expected {digest}",
         )
 
     def _path(self, digest: str) -> Path:
@@ -68,7 +69,7 @@ class BundleCache:
         path = self._path(digest)
         try:
             if bundle_digest(path.read_bytes()) == digest:
-                # The time of last use: evictions go by it.
+                # The time of last use orders evictions.
                 os.utime(path)
                 return path
         except FileNotFoundError:
@@ -80,7 +81,7 @@ class BundleCache:
     def _keep(self, digest: str, data: bytes) -> Path:
         path = self._path(digest)
         self._folder.mkdir(parents=True, exist_ok=True)
-        # Written aside and renamed: a daemon killed in between leaves no half bundle under the digest's name.
+        # Written beside and renamed: a killed daemon leaves no partial bundle under the digest's name.
         part = path.with_suffix(f"{PART}{os.getpid()}-{secrets.token_hex(4)}")
         try:
             self._write(part, data)
@@ -91,18 +92,18 @@ class BundleCache:
         return path
 
     def _write(self, part: Path, data: bytes) -> None:
-        """On a full disk everything else in the cache makes way, once."""
+        """Write the file; on a full disk evict all other bundles and try once more."""
         try:
             part.write_bytes(data)
         except OSError as error:
             if error.errno not in FULL:
                 raise
-            logger.warning("the disk is full: all other bundles leave %s", self._folder)
+            logger.warning("the disk is full: evicting all other bundles folder=%s", self._folder)
             self._evict(keep=part, limit_bytes=0)
             part.write_bytes(data)
 
     def used_mb(self) -> float:
-        """What the bundles take on disk."""
+        """Disk space of the bundles in MB."""
         return round(sum(size for _, size, _ in self._files()) / MIB, 1)
 
     def _evict(self, *, keep: Path, limit_bytes: int) -> None:
@@ -115,11 +116,11 @@ class BundleCache:
                 total -= size
 
     def _files(self) -> list[tuple[Path, int, float]]:
-        """Bundles and parts of bundles, each with its bytes and the wall time of its last use."""
+        """Bundle files and partial files, each with its size in bytes and the wall time of its last use."""
         files = []
         for path in self._folder.glob("*"):
             if path.suffix == SUFFIX or PART in path.name:
-                # Another daemon that shares the folder may have removed it meanwhile.
+                # Another daemon may have removed it meanwhile.
                 with contextlib.suppress(FileNotFoundError):
                     stat = path.stat()
                     files.append((path, stat.st_size, stat.st_mtime))

@@ -1,4 +1,4 @@
-"""The worker daemon: keeps a session with the manager through its restarts, and the slots at work meanwhile."""
+"""Worker daemon: it keeps a session with the manager across restarts, and the slots busy meanwhile."""
 
 from __future__ import annotations
 
@@ -26,18 +26,16 @@ from embomatrix.rpc.status import (
     UnknownSessionError,
 )
 from embomatrix.rpc.wire.values import Completed, InfraCode
-from embomatrix.worker.host.courtesy import Courtesy
 from embomatrix.worker.host.machine import HostMachine
-from embomatrix.worker.host.spare_memory import SpareMemory
-from embomatrix.worker.host.status import StatusReport, daemon_pids
 from embomatrix.worker.link.cache import BundleCache
-from embomatrix.worker.link.membership import Membership, MembershipFile
+from embomatrix.worker.link.membership import Membership, MembershipFile, SessionConflicts
 from embomatrix.worker.link.outbox import ResultOutbox
 from embomatrix.worker.link.session import ManagerSession, register
-from embomatrix.worker.link.takeovers import Takeovers
+from embomatrix.worker.link.status import StatusReport, daemon_pids
 from embomatrix.worker.slots.pool import SlotPool
 from embomatrix.worker.slots.processes import SIMULATOR_PROGRAM
 from embomatrix.worker.slots.residents import LoadError, SlotLimits
+from embomatrix.worker.slots.yielding import MemoryWatch, OwnerWatch
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -54,20 +52,20 @@ logger = logging.getLogger(__name__)
 
 FIRST_WAIT_S: Final = 0.2
 LONGEST_WAIT_S: Final = 3.0
-"""Between two attempts to connect: a manager that comes back has its workers within five seconds."""
+"""Longest wait between two attempts to connect: a restarted manager has its workers within five seconds."""
 SESSION_SHOWN: Final = 6
-"""Letters of a session's id in log lines: whoever knows all of them could speak for this worker."""
+"""Characters of a session id in log lines. The full id would let a reader impersonate this worker."""
 FENCE_CHECK_S: Final = 0.5
 FETCH_AGAIN_S: Final = 0.25
-"""Before a bundle is asked for a second time: the connection broke, and a next one may be there by then."""
+"""Wait before a bundle is requested again after a broken connection."""
 DRAIN_RETRY_S: Final = 1.0
-"""While it drains, a worker tries to deliver its last results at least this often."""
+"""Longest wait between attempts to deliver the last results of a draining worker."""
 _PASSING: Final = (UnavailableError, DeadlineError, OverloadedError, InternalError)
-"""Errors after which the daemon connects again. Others need a person."""
+"""Errors after which the daemon connects again. Others need a user."""
 
 
 class Daemon:
-    """One worker. ``run`` returns when it has left; it raises ClusterError for what trying again can't mend."""
+    """One worker. ``run`` returns after it has left, and raises ClusterError for errors that no retry can mend."""
 
     def __init__(
         self,
@@ -84,14 +82,14 @@ class Daemon:
         self._resources = resources
         self._boot_id = secrets.token_hex(8)
         self._managers = Managers(self._membership.manager)
-        # Each of several managers is asked as often as one would be.
+        # Each of several managers is tried as often as a single one would be.
         self._backoff = Backoff(
             FIRST_WAIT_S, LONGEST_WAIT_S / self._managers.count, jitter=lambda: float(rng.uniform(0.8, 1.2))
         )
         self._outbox = ResultOutbox()
         self._cache = self._opened_cache()
         self._pool = self._new_pool(program)
-        self._courtesy = Courtesy(
+        self._owner_watch = OwnerWatch(
             settings.preferences,
             probe or HostMachine(lambda: daemon_pids(settings.state_dir)),
             self._pool,
@@ -105,7 +103,7 @@ class Daemon:
         self._renewed_s = time.monotonic()
         self._lease_ttl_s = math.inf
         self._registration: Registration | None = None
-        self._takeovers = Takeovers()
+        self._conflicts = SessionConflicts()
         self._draining = asyncio.Event()
         self._forced = asyncio.Event()
 
@@ -131,18 +129,18 @@ class Daemon:
 
     @property
     def held(self) -> int:
-        """Leases that wait or run here."""
+        """Number of leases that wait or run here."""
         return len(self._pool.held())
 
     def stop(self) -> None:
-        """Drain: finish what runs, then leave. Called again, leave at once."""
+        """Drain: finish the running leases, then leave. A second call leaves at once."""
         if self._draining.is_set():
             logger.info("leaving at once")
             self._forced.set()
             return
-        logger.info("draining: %d leases are held", self.held)
+        logger.info("draining held_leases=%d", self.held)
         self._draining.set()
-        self._report.draining()
+        self._report.update(draining=True)
         if self._session is not None:
             self._session.drain()
 
@@ -150,18 +148,18 @@ class Daemon:
         """Start the simulator, join the manager and work until stopped."""
         await self._pool.start()
         name, offers = self._membership.name, self._resources
-        told = "worker %s: %d slots, %d MB for scenes, score %.2f"
-        logger.info(told, name, offers.slots, offers.memory_mb, offers.score)
-        works = (
+        message = "worker %s: %d slots, %d MB for scenes, score %.2f"
+        logger.info(message, name, offers.slots, offers.memory_mb, offers.score)
+        activities = (
             self._pool.run(),
             self._stay_connected(),
             self._fence(),
-            self._courtesy.run(),
-            SpareMemory(self._pool).run(),
+            self._owner_watch.run(),
+            MemoryWatch(self._pool).run(),
             self._report.run(),
             self._until_left(),
         )
-        tasks = [asyncio.create_task(work) for work in works]
+        tasks = [asyncio.create_task(activity) for activity in activities]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
@@ -173,15 +171,15 @@ class Daemon:
         logger.info("left")
 
     async def _until_left(self) -> None:
-        """Ends when a drain took too long, or when it was forced."""
+        """Return after a drain took too long or was forced."""
         await self._draining.wait()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._settings.drain_s):
                 await self._forced.wait()
 
     async def _stay_connected(self) -> None:
-        """Connect, and connect again, until the worker has drained."""
-        while not (self._draining.is_set() and self._owes_nothing()):
+        """Connect and reconnect until the worker has drained."""
+        while not (self._draining.is_set() and self._is_done()):
             try:
                 if self._registration is None:
                     self._registration = await self._register()
@@ -190,13 +188,13 @@ class Daemon:
                     await self._session.leave()
                 return
             except UnknownSessionError as error:
-                # A manager took over. It takes up what is held here once this worker has said what that is.
+                # Another manager took over. It adopts the held leases once this worker has reported them.
                 self._registration = None
                 self._backoff.reset()
                 await self._wait_before_next(error)
             except SupersededError as error:
                 self._give_up_leases(str(error))
-                self._count_takeover(error)
+                self._note_conflict(error)
             except _PASSING as error:
                 if self._settings.once:
                     raise
@@ -204,7 +202,7 @@ class Daemon:
                 await self._wait_before_next(error)
 
     async def _wait_before_next(self, error: ClusterError) -> None:
-        """Wait, longer each time; a drain ends the wait."""
+        """Wait with backoff; a drain ends the wait."""
         wait_s = self._backoff.next_s()
         if self._draining.is_set():
             await asyncio.sleep(min(wait_s, DRAIN_RETRY_S))
@@ -214,7 +212,7 @@ class Daemon:
             async with asyncio.timeout(wait_s):
                 await self._draining.wait()
 
-    def _owes_nothing(self) -> bool:
+    def _is_done(self) -> bool:
         return not self._pool.held() and not len(self._outbox)
 
     async def _register(self) -> Registration:
@@ -231,11 +229,11 @@ class Daemon:
         return registration
 
     def _present_membership(self) -> Membership:
-        """The membership with the manager that this worker turns to at present, where there are several."""
+        """Membership with the current one of several managers."""
         return replace(self._membership, manager=self._managers.current)
 
     def _join(self, credential: str) -> None:
-        """From here on this worker shows the credential, in this process and in those after it."""
+        """Use the credential from now on, in this process and in later ones."""
         hide(credential)
         before = self._membership
         self._membership = replace(before, token=credential, joining=False)
@@ -254,23 +252,23 @@ class Daemon:
         )
         if self._draining.is_set():
             session.drain()
-        if self._courtesy.reason:
-            session.pause(self._courtesy.reason)
+        if self._owner_watch.reason:
+            session.pause(self._owner_watch.reason)
         self._session = session
         attached = asyncio.create_task(self._note_attached(session))
         try:
             await session.serve()
         finally:
             attached.cancel()
-            self._report.disconnected()
+            self._report.update(connected_since_s=0.0)
 
     async def _note_attached(self, session: ManagerSession) -> None:
         await session.attached.wait()
-        self._report.connected(self._managers.current)
+        self._report.update(manager=self._managers.current, connected_since_s=time.time())
         self._backoff.reset()
 
     async def _fence(self) -> None:
-        """Stop executing what can't be renewed: the manager has given it to others by then."""
+        """Drop leases that could not be renewed: the manager has re-dispatched them by then."""
         while True:
             await asyncio.sleep(FENCE_CHECK_S)
             silent_s = time.monotonic() - self._renewed()
@@ -278,7 +276,7 @@ class Daemon:
                 self._give_up_leases(f"no heartbeat was answered for {silent_s:.0f} s")
 
     def _renewed(self) -> float:
-        """When a manager last renewed what is held here, in whichever session."""
+        """Time of the last renewal of the held leases, in any session."""
         if self._session is not None:
             self._renewed_s = max(self._renewed_s, self._session.renewed_s)
         return self._renewed_s
@@ -286,13 +284,13 @@ class Daemon:
     def _give_up_leases(self, reason: str) -> None:
         held = self._pool.held()
         if held:
-            logger.warning("%d leases given up: %s", len(held), reason)
+            logger.warning("leases given up count=%d: %s", len(held), reason)
         self._pool.cancel(held)
 
-    def _count_takeover(self, error: SupersededError) -> None:
-        """Register again, unless another daemon of this name would do the same, for ever."""
+    def _note_conflict(self, error: SupersededError) -> None:
+        """Register again, unless another worker of this name keeps doing the same."""
         self._registration = None
-        if self._takeovers.add(time.monotonic()):
+        if self._conflicts.add(time.monotonic()):
             raise SupersededError(
                 f"the session of worker {self._membership.name!r} is taken over again and again: another worker of "
                 "that name is running; stop it, or give one of them another --name"
@@ -300,14 +298,14 @@ class Daemon:
         logger.info("registering again: %s", error)
 
     def _take_result(self, result: LeaseResult) -> None:
-        """Keep a result for the manager, signed with this worker's name."""
-        self._report.finished(result)
+        """Queue a result for the manager, with this worker's name."""
+        self._report.count(result)
         self._outbox.put(signed(result, self._membership.name))
         if self._session is not None:
-            self._session.tell()
+            self._session.notify()
 
     def _pause(self, reason: str) -> None:
-        self._report.paused(reason)
+        self._report.update(paused=reason)
         if self._session is not None:
             self._session.pause(reason)
 
@@ -317,11 +315,11 @@ class Daemon:
 
     def _residents_changed(self) -> None:
         if self._session is not None:
-            self._session.tell_state()
+            self._session.notify_state()
 
 
 def signed(result: LeaseResult, name: str) -> LeaseResult:
-    """The result with the name of the worker that it is from."""
+    """Return the result with the worker's name."""
     outcome: Completed | InfraFailure
     if isinstance(result.outcome, Completed):
         outcome = result.outcome.noted(worker_id=name)
@@ -333,7 +331,7 @@ def signed(result: LeaseResult, name: str) -> LeaseResult:
 
 
 async def fetch(session_now: Callable[[], ManagerSession | None], digest: str) -> bytes:
-    """Fetch a bundle over the present session; a broken connection is tried once more on the next. Raises LoadError."""
+    """Fetch a bundle over the current session, and once more over the next if it breaks. Raise LoadError."""
     for last in (False, True):
         session = session_now()
         if session is None:
@@ -348,7 +346,7 @@ async def fetch(session_now: Callable[[], ManagerSession | None], digest: str) -
 
 
 async def serve(daemon: Daemon, signals: tuple[int, ...]) -> None:
-    """Run the daemon; each of the signals stops it, the second time at once."""
+    """Run the daemon. The first of the signals drains it, the second stops it at once."""
     loop = asyncio.get_running_loop()
     for number in signals:
         loop.add_signal_handler(number, daemon.stop)

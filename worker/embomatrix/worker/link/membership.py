@@ -1,13 +1,12 @@
-"""As whom a worker speaks to which manager, and the file that remembers it: a spare PC joins once and is known from then on."""
+"""Membership of a worker: its manager, name and credential, and the file that keeps them after joining once."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import os
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.rpc.trust import Invitation, fetch_ca, read_ca, read_token
@@ -17,12 +16,14 @@ if TYPE_CHECKING:
 
     from embomatrix.worker.host.settings import WorkerSettings
 
-logger = logging.getLogger(__name__)
+CONFLICTS_ALLOWED: Final = 3
+"""More session conflicts than this within the window mean that another worker has the same name."""
+CONFLICT_WINDOW_S: Final = 60.0
 
 
 @dataclass(frozen=True, slots=True)
 class Membership:
-    """``ca`` is the certificate (PEM) of the authority to trust; empty without TLS."""
+    """Identity at a manager. ``ca`` is the certificate (PEM) of the authority to trust; empty without TLS."""
 
     manager: str
     """HOST:PORT, or several with commas between them."""
@@ -30,19 +31,19 @@ class Membership:
     token: str = field(default="", repr=False)
     ca: bytes = b""
     joining: bool = False
-    """The token is one to join with: the manager will answer with a credential to show instead."""
+    """True if the token is for joining: the manager answers with a credential that replaces it."""
 
 
 class MembershipFile:
-    """Remembers what became of one token: the credential that the manager gave for it, for the owner's eyes only."""
+    """File with the credential that a manager gave for one token, readable by its owner only."""
 
     def __init__(self, folder: Path, token: str) -> None:
-        # The file's name must not betray the token, and a token may hold any character.
+        # The file name must not reveal the token, and a token may contain any character.
         name = hashlib.sha256(token.encode()).hexdigest()[:16]
         self._path = folder.expanduser() / f"member-{name}.json"
 
     def read(self) -> Membership | None:
-        """What was kept, if anything was. Raises InvalidRequestError for a file that can't be read."""
+        """Read the membership; None without a file. Raise InvalidRequestError for an unreadable file."""
         try:
             kept = json.loads(self._path.read_bytes())
             return Membership(kept["manager"], kept["name"], kept["credential"], kept["ca"].encode("ascii"))
@@ -54,7 +55,7 @@ class MembershipFile:
             ) from error
 
     def keep(self, membership: Membership) -> None:
-        """Written aside and renamed; readable by the owner alone from its first byte on."""
+        """Write the file beside and rename it; only its owner can read it from the first byte."""
         self._path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         part = self._path.with_suffix(".part")
         part.unlink(missing_ok=True)
@@ -70,9 +71,9 @@ class MembershipFile:
 
 
 async def membership_of(settings: WorkerSettings) -> Membership:
-    """As whom these settings say that the worker speaks; what it was given for its token before comes first.
+    """Return the membership of these settings; an earlier credential for the same token takes precedence.
 
-    Raises ClusterError: an invitation that is none, a manager that can't be reached or is not the one of the invitation.
+    Raise ClusterError for an invalid invitation, and for a manager that can't be reached or does not match the invitation.
     """
     if settings.join:
         invitation = Invitation.parse(settings.join)
@@ -84,3 +85,15 @@ async def membership_of(settings: WorkerSettings) -> Membership:
     token = read_token(settings.token)
     kept = MembershipFile(settings.state_dir, token).read() if token else None
     return kept or Membership(settings.manager, settings.name, token, read_ca(settings.ca))
+
+
+class SessionConflicts:
+    """Times at which another worker of the same name took the session over."""
+
+    def __init__(self) -> None:
+        self._at_s: list[float] = []
+
+    def add(self, now_s: float) -> bool:
+        """Record a conflict; return whether there were too many within the window."""
+        self._at_s = [at_s for at_s in self._at_s if now_s - at_s < CONFLICT_WINDOW_S] + [now_s]
+        return len(self._at_s) > CONFLICTS_ALLOWED

@@ -1,4 +1,4 @@
-"""Results that the manager has not acknowledged yet: kept across broken streams, sent again on the next one."""
+"""Outbox of unacknowledged results: they survive broken streams and are sent again on the next one."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 LIMIT: Final = 10_000
-"""Results kept at most: more means that nobody has listened for very long."""
+"""Most results kept: more mean that no manager has listened for very long."""
 
 
 class ResultOutbox:
-    """Results in the order in which they came."""
+    """Results in order of arrival."""
 
     def __init__(self) -> None:
         self._results: dict[LeaseRef, LeaseResult] = {}
@@ -27,22 +27,22 @@ class ResultOutbox:
         return len(self._results)
 
     def put(self, result: LeaseResult) -> None:
-        """Keep a result until it is acknowledged. Past the limit the oldest is dropped: its lease has long expired."""
+        """Keep a result until it is acknowledged. Beyond the limit drop the oldest, whose lease has long expired."""
         if len(self._results) >= LIMIT:
             oldest = next(iter(self._results))
             del self._results[oldest]
             self._unsent.pop(oldest, None)
-            logger.warning("result dropped, nobody took it lease=%s", oldest.lease_id)
+            logger.warning("unacknowledged result dropped lease=%s", oldest.lease_id)
         self._results[result.ref] = result
         self._unsent[result.ref] = result
 
     def acknowledge(self, ref: LeaseRef) -> None:
-        """Forget a result; one that is not kept is ignored."""
+        """Drop a result; an unknown one is ignored."""
         self._results.pop(ref, None)
         self._unsent.pop(ref, None)
 
     def claims(self) -> tuple[LeaseClaim, ...]:
-        """What the results that are kept are for."""
+        """Origins of the kept results."""
         return tuple(
             LeaseClaim(result.ref, result.origin)
             for result in self._results.values()
@@ -50,7 +50,7 @@ class ResultOutbox:
         )
 
     def take_unsent(self, count: int) -> tuple[LeaseResult, ...]:
-        """Up to ``count`` results that this stream has not carried yet."""
+        """Take up to ``count`` results that this stream has not sent yet."""
         refs = list(self._unsent)[:count]
         return tuple(self._unsent.pop(ref) for ref in refs)
 
@@ -59,5 +59,5 @@ class ResultOutbox:
         return bool(self._unsent)
 
     def begin_stream(self) -> None:
-        """Nothing has been carried by the new stream."""
+        """Mark all results as unsent for a new stream."""
         self._unsent = dict(self._results)

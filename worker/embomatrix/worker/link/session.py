@@ -1,4 +1,4 @@
-"""One registration with the manager: the session stream, the heartbeat beside it, and bundles fetched under it."""
+"""One registration with the manager: its session stream, its heartbeats, and the bundles fetched with it."""
 
 from __future__ import annotations
 
@@ -53,28 +53,28 @@ HEARTBEAT_S: Final = 2.0
 FETCH_S: Final = 30.0
 """Limits for the answers to a registration, a heartbeat and a request for a bundle."""
 HEARTBEATS_MISSED: Final = 3
-"""So many heartbeats in a row without an answer mean that the connection is dead."""
+"""Consecutive unanswered heartbeats after which the connection counts as dead."""
 RESULTS_PER_MESSAGE: Final = 256
 LINGER_S: Final = 0.09
-"""A message costs more than what it carries: while every slot has enough ahead, there is one in this time at most …"""
+"""Shortest interval between result messages while every slot has enough leases ahead; a message costs more than its results."""
 SPACING_S: Final = 0.003
-"""… and in this time while slots run short: whoever comes first goes at once."""
+"""Shortest interval while slots run short of leases."""
 
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """What the manager knows this worker by, and the intervals it asked for."""
+    """Identity of this worker at the manager, and the intervals that the manager asked for."""
 
     session_id: str
     epoch: int
     heartbeat_s: float
     lease_ttl_s: float
     credential: str = field(default="", repr=False)
-    """What this worker shows from here on; empty when that does not change."""
+    """Credential to use from now on; empty if it does not change."""
 
 
 async def register(membership: Membership, *, boot_id: str, resources: Resources) -> Registration:
-    """Announce this worker; an older session of the same worker id ends. Raises ClusterError."""
+    """Register this worker; an older session of the same worker id ends. Raise ClusterError."""
     request = pb.RegisterRequest(
         worker_id=membership.name,
         boot_id=boot_id,
@@ -98,7 +98,7 @@ async def register(membership: Membership, *, boot_id: str, resources: Resources
 
 
 class ManagerSession:
-    """The streams of one connection. ``serve`` ends with a ClusterError, or without one once the worker has drained."""
+    """Streams of one connection. ``serve`` raises ClusterError, or returns once the worker has drained."""
 
     def __init__(
         self,
@@ -115,78 +115,78 @@ class ManagerSession:
         self._pool = pool
         self._outbox = outbox
         self._leaving = False
-        self._told_to_drain = False
+        self._drain_requested = False
         self._paused = ""
         self._state_due = False
         self._resync_due = False
-        self._news = asyncio.Event()
+        self._due = asyncio.Event()
         self._lingering: asyncio.TimerHandle | None = None
         self._sent_s = -math.inf
-        """When results went last, on the loop's clock."""
+        """Time of the last message with results, on the loop's clock."""
         self._data_channel: grpc.aio.Channel | None = None
         self.attached = asyncio.Event()
-        """Set once the manager was heard on the stream."""
+        """Set after the first message of the manager."""
         self.renewed_s = renewed_s
-        """When a manager last renewed the leases, in this session or before it."""
+        """Time of the last renewal of the leases, in this session or an earlier one."""
 
-    def tell(self) -> None:
-        """There are results to send: now, or gathered with others until the next message is due."""
-        due_s = self._sent_s + (LINGER_S if self._pool.ahead else SPACING_S)
+    def notify(self) -> None:
+        """Send results: now, or with others when the next message is due."""
+        due_s = self._sent_s + (LINGER_S if self._pool.is_saturated else SPACING_S)
         loop = asyncio.get_running_loop()
         if due_s <= loop.time():
-            self._news.set()
+            self._due.set()
         elif self._lingering is None or self._lingering.when() > due_s:
-            self._linger_no_more()
-            self._lingering = loop.call_at(due_s, self._news.set)
+            self._stop_lingering()
+            self._lingering = loop.call_at(due_s, self._due.set)
 
-    def tell_state(self) -> None:
-        """Residents changed: the state is due."""
+    def notify_state(self) -> None:
+        """Send the state, because residents changed."""
         self._state_due = True
-        self._news.set()
+        self._due.set()
 
     def drain(self) -> None:
-        """Take nothing new; the session ends when everything held is finished and acknowledged."""
+        """Accept no new leases; the session ends once all held ones are finished and acknowledged."""
         self._leaving = True
-        self.tell_state()
+        self.notify_state()
 
     def pause(self, reason: str) -> None:
-        """Ask for nothing new and keep the scenes, for this reason; an empty one takes that back."""
+        """Request no new leases and keep the scenes, for this reason; an empty reason ends the pause."""
         self._paused = reason
-        self.tell_state()
+        self.notify_state()
 
     def resync(self) -> None:
-        """Open the stream anew: its first message tells which leases are held here no longer, so that others get them."""
+        """Reopen the stream: its first message lists the held leases, so that others get the dropped ones."""
         self._resync_due = True
-        self._news.set()
+        self._due.set()
 
     @property
     def _draining(self) -> bool:
-        return self._leaving or self._told_to_drain
+        return self._leaving or self._drain_requested
 
     async def serve(self) -> None:
         """Keep the session until the connection breaks, the manager ends it, or the worker has drained."""
         async with (
             self._open_channel() as channel,
-            # Its own connection: no bundle on its way delays a heartbeat.
+            # A separate connection, so that no bundle delays a heartbeat.
             self._open_channel() as heartbeat_channel,
         ):
             self._data_channel = channel
-            beating = asyncio.create_task(self._beat(heartbeat_channel))
-            talking = asyncio.create_task(self._talk(channel))
+            heartbeats = asyncio.create_task(self._beat(heartbeat_channel))
+            stream = asyncio.create_task(self._stream(channel))
             try:
-                done, _ = await asyncio.wait((beating, talking), return_when=asyncio.FIRST_COMPLETED)
+                done, _ = await asyncio.wait((heartbeats, stream), return_when=asyncio.FIRST_COMPLETED)
                 for task in done:
                     task.result()
             finally:
                 self._data_channel = None
-                self._linger_no_more()
-                for task in (beating, talking):
+                self._stop_lingering()
+                for task in (heartbeats, stream):
                     task.cancel()
                     with contextlib.suppress(asyncio.CancelledError, Exception):
                         await task
 
     async def leave(self) -> None:
-        """Say that this worker is gone for good, so that nobody waits for it; a manager that can't hear it will find out."""
+        """Deregister, so that the manager does not wait for this worker; errors are ignored."""
         request = pb.DeregisterRequest(
             session_id=self._registration.session_id, session_epoch=self._registration.epoch
         )
@@ -199,7 +199,7 @@ class ManagerSession:
         return open_channel(self._address, self._membership.token, self._membership.ca)
 
     async def fetch(self, digest: str) -> bytes:
-        """The bundle's bytes as the manager sends them. Raises LoadError."""
+        """Fetch a bundle's bytes from the manager. Raise LoadError."""
         async with asyncio.timeout(FETCH_S):
             await self.attached.wait()
         if self._data_channel is None:
@@ -218,7 +218,7 @@ class ManagerSession:
             raise LoadError(InfraCode.SCENE_LOAD_FAILED, str(error)) from error
         return bytes(data)
 
-    async def _talk(self, channel: grpc.aio.Channel) -> None:
+    async def _stream(self, channel: grpc.aio.Channel) -> None:
         stub = worker_service_pb2_grpc.WorkerServiceStub(channel)
         self._resync_due = True
         with cluster_errors(self._address):
@@ -226,15 +226,15 @@ class ManagerSession:
                 self._resync_due = False
                 async for response in stub.Session(self._requests()):
                     if not self.attached.is_set():
-                        # The manager answers once it has heard the full state, which renews what it names.
+                        # The manager answers after the full state, which renews the leases that it lists.
                         self.renewed_s = time.monotonic()
                         self.attached.set()
-                    self._take(response)
+                    self._handle(response)
         if not self._drained():
             raise UnavailableError(f"the manager at {self._address} ended the session")
 
     async def _requests(self) -> AsyncGenerator[pb.SessionRequest]:
-        """Full state first; then results as they come, and the state again whenever it changed."""
+        """Yield the full state first, then results as they come, and the state after each change."""
         self._outbox.begin_stream()
         finished = self._outbox.take_unsent(len(self._outbox))
         claims = (*self._pool.claims(), *self._outbox.claims())
@@ -249,9 +249,9 @@ class ManagerSession:
             )
         )
         while not self._drained() and not self._resync_due:
-            await self._news.wait()
-            self._news.clear()
-            self._linger_no_more()
+            await self._due.wait()
+            self._due.clear()
+            self._stop_lingering()
             while not self._resync_due and (self._state_due or self._outbox.has_unsent):
                 results = self._outbox.take_unsent(RESULTS_PER_MESSAGE)
                 message = self._request(state=self._state() if self._state_due else None)
@@ -262,7 +262,7 @@ class ManagerSession:
                 self._state_due = False
                 yield message
 
-    def _linger_no_more(self) -> None:
+    def _stop_lingering(self) -> None:
         if self._lingering is not None:
             self._lingering.cancel()
             self._lingering = None
@@ -280,13 +280,13 @@ class ManagerSession:
     def _drained(self) -> bool:
         return self._draining and not self._pool.held() and not len(self._outbox)
 
-    def _take(self, response: pb.SessionResponse) -> None:
-        if response.drain != response.resume and response.drain != self._told_to_drain:
+    def _handle(self, response: pb.SessionResponse) -> None:
+        if response.drain != response.resume and response.drain != self._drain_requested:
             logger.info(
-                "the manager %s", "asks this worker to drain" if response.drain else "takes its drain back"
+                "the manager %s", "asks this worker to drain" if response.drain else "cancels the drain"
             )
-            self._told_to_drain = response.drain
-            self.tell_state()
+            self._drain_requested = response.drain
+            self.notify_state()
         if response.HasField("desired"):
             self._pool.want(response.desired.bundle_digests)
         for ref in each("acknowledged", lease_ref_from_proto, response.acknowledged):
@@ -298,9 +298,9 @@ class ManagerSession:
         for lease in each("leases", lease_from_proto, response.leases):
             self._pool.submit(lease)
         if self._outbox.has_unsent:
-            self.tell()
+            self.notify()
         if self._drained():
-            self._news.set()
+            self._due.set()
 
     async def _beat(self, channel: grpc.aio.Channel) -> None:
         stub = worker_service_pb2_grpc.WorkerServiceStub(channel)

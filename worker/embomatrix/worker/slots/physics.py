@@ -1,4 +1,4 @@
-"""The real simulation: bundles loaded into the physics engine, plans executed and scored there.
+"""Simulation backend on the physics engine: it loads bundles, executes plans and scores them.
 
 The daemon starts it as ``python -m embomatrix.worker.slots.physics FD PARENT``.
 """
@@ -16,8 +16,8 @@ from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.floor.prepared import PreparedScene
-from embomatrix.worker.slots.rehearsal import PLANS, REHEARSAL, TIMES, rehearsal_bundle
 from embomatrix.worker.slots.slot_program import BundleCorruptError, run_program
+from embomatrix.worker.slots.warm_up import PLANS, TIMES, WARM_UP, warm_up_bundle
 from embomatrix.world.bundle import decode_bundle, encode_bundle, read_bundle
 from embomatrix.world.inflation import BundleError, bundle_digest
 
@@ -28,20 +28,20 @@ if TYPE_CHECKING:
     from embomatrix.world.bundle import Bundle
 
 CLIENTS_PER_SCENE: Final = 2
-"""An engine holds its scene in one client and settles objects in another."""
+"""Physics clients of one engine: one holds the scene, another settles objects."""
 
 
 class UnknownTaskError(Exception):
-    """A rollout names a task that its bundle lacks."""
+    """Rollout of a task that its bundle lacks."""
 
 
 class Physics:
-    """Loads bundles with PyBullet."""
+    """Backend that loads bundles with PyBullet."""
 
     def prepare(self) -> None:
-        """Import the engine and connect the clients that every scene needs; raises EngineError where it is missing."""
+        """Connect the physics clients and warm up. Raise EngineError if the engine is missing."""
         self._clients = ClientPool(spare=CLIENTS_PER_SCENE)
-        self._rehearse()
+        self._warm_up()
 
     def load(self, path: Path, digest: str) -> PhysicsScene:
         try:
@@ -50,32 +50,32 @@ class Physics:
             raise BundleCorruptError(str(error)) from error
         return PhysicsScene(bundle, self._clients)
 
-    def _rehearse(self) -> None:
-        """Load and execute something small, and forget it: see ``rehearsal``."""
-        data = encode_bundle(rehearsal_bundle())
+    def _warm_up(self) -> None:
+        """Load and execute a small scene and forget it: see ``warm_up``."""
+        data = encode_bundle(warm_up_bundle())
         for _ in range(TIMES):
             scene = PhysicsScene(decode_bundle(data), self._clients)
             for plan in PLANS:
-                rollout = Rollout(REHEARSAL, REHEARSAL, bundle_digest(data), REHEARSAL, plan, 0)
+                rollout = Rollout(WARM_UP, WARM_UP, bundle_digest(data), WARM_UP, plan, 0)
                 completed = scene.execute(rollout_from_proto(rollout_to_proto(rollout)))
                 completed_to_proto(completed).SerializeToString()
             scene.close()
 
 
 class PhysicsScene:
-    """A bundle's scene in the engine. Every execution starts from the scene as it was loaded."""
+    """Scene of a bundle in the engine. Every execution starts from the scene as it was loaded."""
 
     def __init__(self, bundle: Bundle, clients: ClientPool) -> None:
         self._tasks = bundle.tasks
         self._engine = BulletEngine(bundle.scene, clients, PreparedScene.of(bundle))
         self._simulator = Simulator(bundle, self._engine)
         for task in list(bundle.tasks.values())[:1]:
-            # An empty plan: what the simulator makes when it is first needed is made before the slots are forked.
+            # An empty plan completes lazy initialisation before slots are forked.
             self._simulator.execute(task, (), 0)
             score(task, frozenset(), self._simulator.facts)
 
     def complete(self) -> Iterator[None]:
-        """Make what executions would make when they first need it."""
+        """Complete deferred work of later executions."""
         navigator = self._simulator.world.navigator
         navigator.reachable(navigator.start, navigator.start)
         yield
@@ -83,7 +83,7 @@ class PhysicsScene:
         yield from self._simulator.warm_up()
 
     def close(self) -> None:
-        """Give the clients back. The scene can't be used afterwards."""
+        """Return the physics clients. The scene can't be used afterwards."""
         self._simulator.close()
 
     def execute(

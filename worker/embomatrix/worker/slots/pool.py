@@ -1,4 +1,4 @@
-"""The worker's slots: leases wait for their scene and a free permit, run in a process, and end in one result."""
+"""Slot pool of a worker: leases wait for their scene and a permit, run in a process, and end in one result."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from embomatrix.rpc.wire.values import (
     InfraFailure,
     ResidentState,
 )
-from embomatrix.worker.slots.execution import Shift, Ticket
+from embomatrix.worker.slots.execution import HeldLease, SlotRun
 from embomatrix.worker.slots.processes import SIMULATOR_PROGRAM, ProcessGoneError
-from embomatrix.worker.slots.progress import ProgressBoard
 from embomatrix.worker.slots.residents import Residents
+from embomatrix.worker.slots.slot_program import ProgressBoard
 from embomatrix.worker.slots.waiting import WaitingLeases
 
 if TYPE_CHECKING:
@@ -35,14 +35,14 @@ logger = logging.getLogger(__name__)
 
 RETRY_CHECK_S: Final = 1.0
 AHEAD: Final = 2
-"""Leases that wait behind each slot while others are asked for."""
+"""Leases that wait behind each slot while more are requested."""
 
 
 class SlotPool:
-    """Executes leases. Each one that is submitted ends in exactly one result, unless it is cancelled.
+    """Executes leases. Each submitted lease ends in exactly one result, unless it is cancelled.
 
-    ``bundle_path`` brings a bundle to disk and raises LoadError when it can't; ``on_result`` takes the results;
-    ``on_change`` is called when residents changed.
+    ``bundle_path`` returns a bundle's file, or raises LoadError; ``on_result`` gets the results; ``on_change`` is called after
+    residents changed.
     """
 
     def __init__(
@@ -68,30 +68,30 @@ class SlotPool:
             board=self._board,
         )
         self._budget_mb = limits.memory_mb
-        """What scenes may hold now: the limit, or less while memory is scarce."""
+        """Memory of all scenes: the limit, or less while memory is scarce."""
         self._wanted: tuple[str, ...] = ()
         self._waiting = WaitingLeases(limits.slots, self._residents.warm)
-        self._tickets: dict[LeaseRef, Ticket] = {}
+        self._leases: dict[LeaseRef, HeldLease] = {}
         self._free = list(range(1, limits.slots + 1))
-        """Permits that nobody has, as a heap: the lowest is given first, so that a little work stays on few."""
-        self._at_work: dict[int, Shift] = {}
-        """What each occupied permit executes."""
+        """Free permits as a heap: the lowest is given first, so that a little work stays on few slots."""
+        self._runs: dict[int, SlotRun] = {}
+        """Runs by occupied permit."""
         self._tasks: asyncio.TaskGroup | None = None
         self._clock = 0
-        self._resting = False
+        self._paused = False
         self._wake = asyncio.Event()
         self._unsettled = False
-        """A wanted scene is not warm, or too much is held: when a scene falls idle, more can be done about it."""
+        """True if a wanted scene is not warm or too much memory is held: the next idle scene may help."""
 
     @property
     def load(self) -> float:
-        """Share of the slots that execute something, 0 to 1."""
+        """Share of busy slots, 0 to 1."""
         return 1.0 - len(self._free) / self._limits.slots
 
     @property
-    def ahead(self) -> bool:
-        """Whether every slot executes something, and enough waits behind it until more can come."""
-        return not self._free and len(self._tickets) >= (1 + AHEAD) * self._limits.slots
+    def is_saturated(self) -> bool:
+        """True if every slot is busy and enough leases wait until more can come."""
+        return not self._free and len(self._leases) >= (1 + AHEAD) * self._limits.slots
 
     @property
     def memory_used_mb(self) -> float:
@@ -101,97 +101,99 @@ class SlotPool:
         return self._residents.report()
 
     def held(self) -> tuple[LeaseRef, ...]:
-        """Leases that wait or run here: those to renew."""
-        return tuple(self._tickets)
+        """Leases that wait or run here, to be renewed."""
+        return tuple(self._leases)
 
     def progress(self) -> tuple[LeaseProgress, ...]:
-        """How far the leases are that run."""
-        running = ((shift.given[0], permit) for permit, shift in self._at_work.items() if shift.given)
+        """Progress of the running leases."""
+        running = ((run.queue[0], permit) for permit, run in self._runs.items() if run.queue)
         return tuple(
-            LeaseProgress(ticket.lease.ref, self._board.steps(permit))
-            for ticket, permit in running
-            if not ticket.called_off
+            LeaseProgress(held.lease.ref, self._board.steps(permit))
+            for held, permit in running
+            if not held.cancelled
         )
 
     def claims(self) -> tuple[LeaseClaim, ...]:
-        """What these leases are for."""
-        leases = (ticket.lease for ticket in self._tickets.values())
+        """Origins of the held leases."""
+        leases = (held.lease for held in self._leases.values())
         return tuple(LeaseClaim(lease.ref, lease.origin) for lease in leases if lease.origin is not None)
 
     def want(self, digests: Iterable[str]) -> None:
-        """Replace the scenes that should be resident, the most urgent first."""
+        """Replace the list of scenes that should be resident, the most urgent first."""
         self._wanted = tuple(dict.fromkeys(digests))
         self._wake.set()
 
     def submit(self, lease: Lease) -> None:
-        """Execute this lease when a slot is free and its scene is warm. One that is held already is left alone."""
-        if lease.ref in self._tickets:
+        """Execute this lease once a slot is free and its scene is warm. A lease that is held already is ignored."""
+        if lease.ref in self._leases:
             return
         digest = lease.rollout.bundle_digest
         warm = self._residents.warm(digest) is not None
-        ticket = Ticket(lease, time.monotonic(), warm)
+        held = HeldLease(lease, time.monotonic(), warm)
         self._residents.retry(digest)
-        self._tickets[lease.ref] = ticket
-        self._waiting.add(ticket)
+        self._leases[lease.ref] = held
+        self._waiting.add(held)
         if warm:
             self._start_leases()
         else:
             self._wake.set()
 
     def cancel(self, refs: Iterable[LeaseRef]) -> None:
-        """Forget these leases; what runs is killed, and none of them gives a result."""
+        """Drop these leases without results; running ones are killed."""
         for ref in refs:
-            ticket = self._tickets.pop(ref, None)
-            if ticket is None:
+            held = self._leases.pop(ref, None)
+            if held is None:
                 continue
-            shift = self._at_work.get(ticket.slot)
-            if shift is None:
-                self._waiting.remove(ticket)
+            run = self._runs.get(held.slot)
+            if run is None:
+                self._waiting.remove(held)
             else:
-                shift.call_off(ticket)
+                run.cancel(held)
         self._wake.set()
 
-    def rest(self) -> None:
-        """Begin nothing from now on, neither leases nor loading; what slots were given goes on, and scenes stay."""
-        self._resting = True
+    def pause(self) -> None:
+        """Begin no more leases and no more loading. Running leases continue, and scenes stay."""
+        self._paused = True
 
-    def go_on(self) -> None:
-        """Take a rest back."""
-        self._resting = False
+    def resume(self) -> None:
+        """End a pause."""
+        self._paused = False
         self._start_leases()
         self._wake.set()
 
-    def allow(self, memory_mb: float) -> None:
-        """Scenes may hold so much from now on, and what the limits say at most: what is more is evicted, the most urgent
-        one excepted, and what then fits is loaded."""
+    def limit_memory(self, memory_mb: float) -> None:
+        """Set the memory of all scenes, up to the configured limit.
+
+        Scenes beyond it are evicted except the most urgent one; wanted scenes that fit are loaded.
+        """
         before, self._budget_mb = self._budget_mb, min(memory_mb, self._limits.memory_mb)
         over = self._residents.memory_used_mb > self._budget_mb
         if over and self._residents.memory_used_mb <= before:
-            logger.info("memory is scarce: scenes may hold %d MB now", self._budget_mb)
+            logger.info("memory is scarce: scenes may hold %d MB", self._budget_mb)
         if over or self._unsettled:
             self._wake.set()
 
     def shed(self) -> None:
-        """Give up the scenes in which nothing runs, for the memory that they hold."""
+        """Evict the scenes in which nothing runs, to free their memory."""
         self._residents.shed()
 
     async def start(self) -> None:
-        """Start the simulator. Raises ProcessGoneError with the reason when that can't be."""
+        """Start the simulator. Raise ProcessGoneError with the reason if it does not start."""
         await self._residents.start()
 
     async def run(self) -> None:
-        """Load, evict and execute until cancelled; then every process is ended."""
+        """Load, evict and execute until cancelled; then end every process."""
         try:
             async with asyncio.TaskGroup() as self._tasks:
-                await self._work(self._tasks)
+                await self._schedule(self._tasks)
         finally:
             await self._residents.close()
 
-    async def _work(self, tasks: asyncio.TaskGroup) -> None:
+    async def _schedule(self, tasks: asyncio.TaskGroup) -> None:
         try:
             while True:
                 await self._wait_for_work()
-                self._settle(tasks)
+                self._update_residents(tasks)
                 self._start_leases()
         finally:
             self._tasks = None
@@ -202,113 +204,113 @@ class SlotPool:
                 await self._wake.wait()
         self._wake.clear()
 
-    def _settle(self, tasks: asyncio.TaskGroup) -> None:
-        if self._resting:
+    def _update_residents(self, tasks: asyncio.TaskGroup) -> None:
+        if self._paused:
             return
-        # Scenes of leases that wait come before those that are only announced.
-        wanted = tuple(dict.fromkeys((*(ticket.digest for ticket in self._waiting), *self._wanted)))
-        self._residents.settle(wanted, tasks, budget_mb=self._budget_mb)
+        # Scenes of waiting leases come before scenes that are only announced.
+        wanted = tuple(dict.fromkeys((*(held.digest for held in self._waiting), *self._wanted)))
+        self._residents.update(wanted, tasks, budget_mb=self._budget_mb)
         over = self._residents.memory_used_mb > self._budget_mb
         self._unsettled = over or any(self._residents.warm(digest) is None for digest in wanted)
 
     def _scene_changed(self, scene: ResidentScene) -> None:
         if scene.state is ResidentState.FAILED:
-            for ticket in self._waiting.take_of(scene.digest):
-                self._finish(ticket, InfraFailure(scene.code, f"scene {scene.digest}: {scene.error}"))
+            for held in self._waiting.take_of(scene.digest):
+                self._finish(held, InfraFailure(scene.code, f"scene {scene.digest}: {scene.error}"))
         self._on_change()
         self._wake.set()
 
     def _start_leases(self) -> None:
-        """Occupy free permits as long as a lease waits whose scene is warm."""
+        """Occupy free permits while a lease of a warm scene waits."""
         while self._tasks is not None and self._free and (found := self._next_lease()) is not None:
             permit = heapq.heappop(self._free)
-            shift = self._occupy(permit, *found)
-            shift.task = self._tasks.create_task(self._serve(shift))
-            # A task that is cancelled before its first step runs no `finally` of its own.
-            shift.task.add_done_callback(functools.partial(self._vacate, permit))
+            run = self._occupy(permit, *found)
+            run.task = self._tasks.create_task(self._serve(run))
+            # A task that is cancelled before its first step never reaches its own `finally`.
+            run.task.add_done_callback(functools.partial(self._free_permit, permit))
 
-    def _next_lease(self) -> tuple[Ticket, ResidentScene] | None:
-        return None if self._resting else self._waiting.take(time.monotonic())
+    def _next_lease(self) -> tuple[HeldLease, ResidentScene] | None:
+        return None if self._paused else self._waiting.take(time.monotonic())
 
-    def _more_for(self, shift: Shift, count: int) -> list[Ticket]:
-        tickets = [] if self._resting else self._waiting.take_more(shift.scene, count, time.monotonic())
-        for ticket in tickets:
-            shift.give(ticket)
-        return tickets
+    def _add_leases(self, run: SlotRun, count: int) -> list[HeldLease]:
+        leases = [] if self._paused else self._waiting.take_more(run.scene, count, time.monotonic())
+        for held in leases:
+            run.add(held)
+        return leases
 
-    def _occupy(self, permit: int, ticket: Ticket, scene: ResidentScene) -> Shift:
+    def _occupy(self, permit: int, held: HeldLease, scene: ResidentScene) -> SlotRun:
         self._clock += 1
         scene.last_used = self._clock
         scene.running += 1
         self._board.set(permit, 0)
-        shift = self._at_work[permit] = Shift(permit, scene)
-        shift.give(ticket)
-        return shift
+        run = self._runs[permit] = SlotRun(permit, scene)
+        run.add(held)
+        return run
 
-    def _leave(self, permit: int) -> None:
-        """The shift is over; what was not begun in it waits again, in front."""
-        shift = self._at_work.pop(permit)
-        unbegun = [ticket for ticket in shift.given if not ticket.called_off]
-        for ticket in unbegun:
-            ticket.slot = 0
-        self._waiting.give_back(unbegun)
-        self._residents.release(shift.scene)
-        if self._unsettled and not shift.scene.running:
+    def _end_run(self, permit: int) -> None:
+        """End a run; its leases that were not begun wait again, in front."""
+        run = self._runs.pop(permit)
+        unbegun = [held for held in run.queue if not held.cancelled]
+        for held in unbegun:
+            held.slot = 0
+        self._waiting.put_back(unbegun)
+        self._residents.release(run.scene)
+        if self._unsettled and not run.scene.running:
             self._wake.set()
 
-    def _vacate(self, permit: int, _: asyncio.Task[None]) -> None:
-        if permit in self._at_work:
-            self._leave(permit)
+    def _free_permit(self, permit: int, _: asyncio.Task[None]) -> None:
+        if permit in self._runs:
+            self._end_run(permit)
         heapq.heappush(self._free, permit)
         self._start_leases()
 
-    async def _serve(self, shift: Shift) -> None:
-        """Work this shift off, and under the same permit the leases that wait behind it."""
-        permit, task = shift.permit, shift.task
+    async def _serve(self, run: SlotRun) -> None:
+        """Execute this run and, under the same permit, runs of the leases that wait."""
+        permit, task = run.permit, run.task
         while True:
-            await self._work_off(shift)
-            self._leave(permit)
+            await self._execute(run)
+            self._end_run(permit)
             found = self._next_lease()
             if found is None:
                 return
-            shift = self._occupy(permit, *found)
-            shift.task = task
+            run = self._occupy(permit, *found)
+            run.task = task
 
-    async def _work_off(self, shift: Shift) -> None:
+    async def _execute(self, run: SlotRun) -> None:
         try:
-            slot = await shift.scene.take_slot(self._limits.fork_s)
+            slot = await run.scene.take_slot(self._limits.fork_s)
         except ProcessGoneError as error:
-            self._scene_died(shift, str(error))
+            self._scene_died(run, str(error))
             return
         try:
-            more = functools.partial(self._more_for, shift)
-            await shift.work(slot, self._residents, more=more, done=self._finish)
+            more = functools.partial(self._add_leases, run)
+            await run.execute(slot, self._residents, more=more, finish=self._finish)
         except Exception as error:
-            if not shift.given:
+            if not run.queue:
                 raise
-            ticket = shift.given.popleft()
-            logger.exception("defect while executing lease=%s", ticket.lease.ref.lease_id)
+            held = run.queue.popleft()
+            logger.exception("defect while executing lease=%s", held.lease.ref.lease_id)
             defect = f"{type(error).__name__}: {error}"[:500]
-            self._finish(ticket, InfraFailure(InfraCode.SLOT_CRASHED, defect))
+            self._finish(held, InfraFailure(InfraCode.SLOT_CRASHED, defect))
 
-    def _scene_died(self, shift: Shift, reason: str) -> None:
-        """Have the scene loaded anew for this lease, once."""
-        self._residents.lost(shift.scene, reason)
-        ticket = shift.given[0]
-        if ticket.requeued:
-            shift.given.popleft()
+    def _scene_died(self, run: SlotRun, reason: str) -> None:
+        """Load the scene again for the first lease, once."""
+        self._residents.lost(run.scene, reason)
+        held = run.queue[0]
+        if held.requeued:
+            run.queue.popleft()
             died = "the scene's process died twice before the rollout began"
-            self._finish(ticket, InfraFailure(InfraCode.SLOT_CRASHED, died))
-        ticket.requeued, ticket.found_warm = True, False
+            self._finish(held, InfraFailure(InfraCode.SLOT_CRASHED, died))
+        held.requeued, held.found_warm = True, False
 
-    def _finish(self, ticket: Ticket, outcome: Completed | InfraFailure) -> None:
-        lease = ticket.lease
-        if self._tickets.get(lease.ref) is not ticket:
+    def _finish(self, held: HeldLease, outcome: Completed | InfraFailure) -> None:
+        lease = held.lease
+        if self._leases.get(lease.ref) is not held:
             return
-        del self._tickets[lease.ref]
+        del self._leases[lease.ref]
         if isinstance(outcome, Completed):
-            # What the slot says: of answers that are read together the first would be given the time of all.
+            # The slot's own time: of answers that are read together, the first would count the time of all.
             held_s = outcome.timings.execute_s
         else:
-            held_s = time.monotonic() - ticket.turn_s if ticket.slot else 0.0
-        self._on_result(LeaseResult(lease.ref, outcome, lease.origin, ticket.slot, held_s))
+            held_s = time.monotonic() - held.first_since_s if held.slot else 0.0
+        self._on_result(LeaseResult(lease.ref, outcome, lease.origin, held.slot, held_s))

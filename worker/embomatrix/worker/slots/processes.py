@@ -1,4 +1,4 @@
-"""The daemon's view of the simulator's processes: start the root, have children forked, ask them, end them."""
+"""Simulator processes as the daemon sees them: start the root, fork children, exchange messages, end them."""
 
 from __future__ import annotations
 
@@ -17,122 +17,122 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
-    from embomatrix.worker.slots.progress import ProgressBoard
+    from embomatrix.worker.slots.slot_program import ProgressBoard
 
 SIMULATOR_PROGRAM: Final = (sys.executable, "-m", "embomatrix.worker.slots.physics")
 START_S: Final = 60.0
-"""Limit for a root to import the engine, on a machine that is busy."""
+"""Limit for a root to import the engine on a busy machine."""
 ENVIRONMENT: Final = {
     "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
 }
-"""Huge pages halve the time of a fork; the C library reads this before the first line of Python runs."""
+"""Without huge pages a respawn takes 1.5 times as long. The C library reads the variable before Python starts."""
 FORK_S: Final = 10.0
 REAP_S: Final = 5.0
 READ_BYTES: Final = 64 * 1024
-"""Taken from a process's stream at once: more than most answers have."""
+"""Bytes read from a stream at once: more than most answers have."""
 
 
 class ProcessGoneError(Exception):
-    """The process at the other end has died."""
+    """Process at the other end of a stream that has died."""
 
 
 class ProcessChannel:
-    """Asks one process, one question at a time. Made and used on one event loop, which it stays registered with."""
+    """Message stream to one process. It is made and used on one event loop and stays registered with it."""
 
     def __init__(self, connection: socket.socket) -> None:
         connection.setblocking(False)
         self._connection = connection
         self._turn = asyncio.Lock()
-        self._heard = bytearray()
+        self._buffer = bytearray()
         self._gone = ""
         self._listener: asyncio.Future[None] | None = None
         self._listening = False
         self._listen()
 
     async def ask(self, frame: PipeMessage) -> PipeMessage:
-        """Send the frame with its descriptors and wait for the answer. Raises ProcessGoneError.
+        """Send a request with its descriptors and wait for the answer. Raise ProcessGoneError.
 
-        After a cancelled question the stream is out of step: the process must be ended.
+        After a cancelled request the stream is out of step, and the process must be ended.
         """
         async with self._turn:
             try:
                 await self._send(frame)
             except OSError as error:
                 raise ProcessGoneError(str(error)) from error
-            return await self.hear()
+            return await self.receive()
 
-    async def hear(self) -> PipeMessage:
-        """The next frame that comes unasked."""
+    async def receive(self) -> PipeMessage:
+        """Wait for the next frame."""
         header_bytes, body_bytes = frame_lengths(await self._take(PREFIX_BYTES))
         return unpack(await self._take(header_bytes + body_bytes), header_bytes)
 
     async def post(self, frames: Iterable[PipeMessage]) -> None:
-        """Send questions whose answers are ``gathered``, in one write. Raises ProcessGoneError."""
+        """Send requests in one write; their answers are read by ``gathered``. Raise ProcessGoneError."""
         try:
             await self._send_all(b"".join(map(pack, frames)))
         except OSError as error:
             raise ProcessGoneError(str(error)) from error
 
     async def gathered(self, pause_s: float) -> list[PipeMessage]:
-        """All that came when the pause is over: none perhaps; without a pause, one frame at least is waited for.
+        """Return the frames that came during the pause; without a pause wait for at least one.
 
-        Raises ProcessGoneError when nothing came and nothing can come.
+        Raise ProcessGoneError if none came and none can come.
         """
         if pause_s > 0:
-            # Not listened to meanwhile: each answer would wake this process for itself.
-            self._listen_no_more()
+            # Without a reader during the pause: each answer would wake this process.
+            self._stop_listening()
             await asyncio.sleep(pause_s)
             return self.arrived()
-        # However fast the process answers, others have their turn between two answers.
+        # Let other tasks run between two answers, however fast the process is.
         await asyncio.sleep(0)
         while not (frames := self.arrived()):
             self._listen()
-            await self._news()
+            await self._wait_for_data()
         return frames
 
     def arrived(self) -> list[PipeMessage]:
-        """All whole frames that have come. Raises ProcessGoneError when there is none and the stream has ended."""
-        while not self._gone and self._receive() == READ_BYTES:
+        """Return all complete frames. Raise ProcessGoneError if there is none and the stream has ended."""
+        while not self._gone and self._read() == READ_BYTES:
             pass
         frames, at = [], 0
-        while len(self._heard) - at >= PREFIX_BYTES:
+        while len(self._buffer) - at >= PREFIX_BYTES:
             begin = at + PREFIX_BYTES
-            header_bytes, body_bytes = frame_lengths(bytes(self._heard[at:begin]))
+            header_bytes, body_bytes = frame_lengths(bytes(self._buffer[at:begin]))
             end = begin + header_bytes + body_bytes
-            if end > len(self._heard):
+            if end > len(self._buffer):
                 break
-            frames.append(unpack(bytes(self._heard[begin:end]), header_bytes))
+            frames.append(unpack(bytes(self._buffer[begin:end]), header_bytes))
             at = end
-        del self._heard[:at]
+        del self._buffer[:at]
         if self._gone and not frames:
             raise ProcessGoneError(self._gone)
         return frames
 
     def close(self) -> None:
-        """Close the stream. Whoever still waits for an answer on it must be cancelled."""
+        """Close the stream. Tasks that wait for an answer on it must be cancelled."""
         if self._connection.fileno() >= 0:
-            # Left behind, these would hear what comes on the next socket that is given this one's number.
-            self._listen_no_more()
+            # Callbacks left behind would fire for the next socket with the same descriptor number.
+            self._stop_listening()
             asyncio.get_running_loop().remove_writer(self._connection)
         self._connection.close()
 
     def _listen(self) -> None:
-        """For good, not for each answer: taking it out and in again costs more than the answer itself."""
+        """Register the reader for good: doing so for each answer costs more than the answer."""
         if not self._listening and not self._gone:
             asyncio.get_running_loop().add_reader(self._connection, self._readable)
             self._listening = True
 
-    def _listen_no_more(self) -> None:
+    def _stop_listening(self) -> None:
         if self._listening:
             asyncio.get_running_loop().remove_reader(self._connection)
             self._listening = False
 
     async def _send(self, frame: PipeMessage) -> None:
         data = pack(frame)
-        # A question finds the buffer empty: all but the largest are taken at once. Descriptors go with the first byte.
+        # A request finds the buffer empty, so most are sent at once. Descriptors go with the first byte.
         sent = socket.send_fds(self._connection, [data], list(frame.fds)) if frame.fds else 0
         await self._send_all(data[sent:])
 
@@ -148,18 +148,18 @@ class ProcessChannel:
             return 0
 
     async def _take(self, count: int) -> bytes:
-        """The next so many bytes, waited for. Raises ProcessGoneError when the stream ends before."""
-        while len(self._heard) < count:
+        """Wait for ``count`` bytes. Raise ProcessGoneError if the stream ends before."""
+        while len(self._buffer) < count:
             if self._gone:
                 raise ProcessGoneError(self._gone)
             self._listen()
-            await self._news()
-        taken = bytes(memoryview(self._heard)[:count])
-        del self._heard[:count]
+            await self._wait_for_data()
+        taken = bytes(memoryview(self._buffer)[:count])
+        del self._buffer[:count]
         return taken
 
-    async def _news(self) -> None:
-        """Wait until more was heard, or the stream ended."""
+    async def _wait_for_data(self) -> None:
+        """Wait until data has come or the stream has ended."""
         self._listener = asyncio.get_running_loop().create_future()
         try:
             await self._listener
@@ -167,12 +167,12 @@ class ProcessChannel:
             self._listener = None
 
     def _readable(self) -> None:
-        self._receive()
+        self._read()
         if self._listener is not None and not self._listener.done():
             self._listener.set_result(None)
 
-    def _receive(self) -> int:
-        """Take what is there, up to a limit; tells how many bytes."""
+    def _read(self) -> int:
+        """Read available bytes up to a limit and return their number."""
         try:
             part = self._connection.recv(READ_BYTES)
             self._gone = "" if part else "its stream ended"
@@ -180,21 +180,21 @@ class ProcessChannel:
             return 0
         except OSError as error:
             part, self._gone = b"", str(error)
-        self._heard += part
+        self._buffer += part
         if self._gone:
-            self._listen_no_more()
+            self._stop_listening()
         return len(part)
 
 
 class Zygote:
-    """A process that forks children: the root, or one that holds a scene."""
+    """Process that forks children: the root, or one that holds a scene."""
 
     def __init__(self, peer: ProcessChannel) -> None:
         self.peer = peer
-        self._questions: set[asyncio.Task[PipeMessage]] = set()
+        self._requests: set[asyncio.Task[PipeMessage]] = set()
 
     async def fork(self, limit_s: float = FORK_S) -> Child:
-        """Have a child forked and speak to it. Raises ProcessGoneError when the zygote has died or does not answer."""
+        """Fork a child and connect to it. Raise ProcessGoneError if the zygote has died or does not answer."""
         ours, theirs = socket.socketpair()
         try:
             with theirs:
@@ -205,41 +205,41 @@ class Zygote:
         return Child(self, ProcessChannel(ours), int(answer.header["pid"]))
 
     async def reap(self, pid: int) -> str:
-        """Collect a child that has ended and say how."""
+        """Collect a child that has ended and return how it ended."""
         answer = await self._ask(PipeMessage({"op": "reap", "pid": pid}), REAP_S)
         return describe_status(int(answer.header["status"]))
 
     def close(self) -> None:
-        """Close the stream to a process that is given up: what was asked of it is never answered."""
-        for question in self._questions:
-            question.cancel()
+        """Close the stream to a process that is given up, and cancel its open requests."""
+        for request in self._requests:
+            request.cancel()
         self.peer.close()
 
     async def _ask(self, frame: PipeMessage, limit_s: float) -> PipeMessage:
-        """Ask to the end even when the caller is cancelled: other slots depend on this stream staying in step."""
-        question = asyncio.create_task(self.peer.ask(frame))
-        self._questions.add(question)
-        question.add_done_callback(functools.partial(self._answered, frame))
+        """Complete the request even if the caller is cancelled, because other slots need this stream in step."""
+        request = asyncio.create_task(self.peer.ask(frame))
+        self._requests.add(request)
+        request.add_done_callback(functools.partial(self._answered, frame))
         try:
             async with asyncio.timeout(limit_s):
-                # Not awaited itself: when the process is given up, that cancels the question and not the asker.
-                await asyncio.wait((question,))
+                # Not awaited directly: giving the process up cancels the request and not the caller.
+                await asyncio.wait((request,))
         except TimeoutError as error:
             raise ProcessGoneError(f"it did not answer within {limit_s:g} s") from error
-        if question.cancelled():
+        if request.cancelled():
             raise ProcessGoneError("it was ended")
-        return question.result()
+        return request.result()
 
-    def _answered(self, frame: PipeMessage, question: asyncio.Task[PipeMessage]) -> None:
-        self._questions.discard(question)
+    def _answered(self, frame: PipeMessage, request: asyncio.Task[PipeMessage]) -> None:
+        self._requests.discard(request)
         for fd in frame.fds:
             os.close(fd)
-        if not question.cancelled():
-            question.exception()  # nobody may be left to look at it
+        if not request.cancelled():
+            request.exception()  # the caller may be gone: retrieve the exception here
 
 
 class Child(Zygote):
-    """A forked process: it answers, and it may fork children of its own."""
+    """Forked process that answers requests and may fork children."""
 
     def __init__(self, parent: Zygote, peer: ProcessChannel, pid: int) -> None:
         super().__init__(peer)
@@ -247,13 +247,13 @@ class Child(Zygote):
         self._parent = parent
 
     def kill(self) -> None:
-        """Have the process die, whatever it does. It must be ended later, or its id is never free again."""
+        """Kill the process. It must be ended later, or its process id is never free again."""
         self.close()
         with contextlib.suppress(ProcessLookupError):
             os.kill(self.pid, signal.SIGKILL)
 
     async def end(self) -> str:
-        """Kill the process and say how it ended; one that had died before keeps its own reason."""
+        """Kill the process and return how it ended; a process that had died before keeps its reason."""
         self.kill()
         try:
             return await self._parent.reap(self.pid)
@@ -262,7 +262,7 @@ class Child(Zygote):
 
 
 class Root(Zygote):
-    """The process that imported the engine, spawned afresh: nothing of the daemon's threads or locks is in it."""
+    """Spawned process that imported the engine, without any thread or lock of the daemon."""
 
     def __init__(self, peer: ProcessChannel, process: asyncio.subprocess.Process, memory_mb: float) -> None:
         super().__init__(peer)
@@ -274,7 +274,7 @@ class Root(Zygote):
         return self._process.pid
 
     async def end(self) -> None:
-        """Kill it; its children die with it."""
+        """Kill the process; its children die with it."""
         self.close()
         with contextlib.suppress(ProcessLookupError):
             self._process.kill()
@@ -284,10 +284,10 @@ class Root(Zygote):
 async def start_root(
     log: Path, program: tuple[str, ...] = SIMULATOR_PROGRAM, board: ProgressBoard | None = None
 ) -> Root:
-    """Spawn the root and wait until it has imported the engine. Raises ProcessGoneError with the reason.
+    """Spawn the root and wait until it has imported the engine. Raise ProcessGoneError with the reason.
 
-    Its slots tell on the ``board`` how far they are; without one they tell nobody.
-    What the engine prints goes to ``log``: Bullet writes warnings to standard output.
+    Slots write their progress to the ``board``, if there is one. The output of the engine goes to ``log``, because Bullet
+    writes warnings to standard output.
     """
     ours, theirs = socket.socketpair()
     shared = () if board is None else (board.fd,)
@@ -302,13 +302,13 @@ async def start_root(
             stdin=asyncio.subprocess.DEVNULL,
             stdout=output,
             stderr=output,
-            # Ctrl-C reaches every process of the terminal's group: the simulator must outlive a drain.
+            # Ctrl-C reaches every process of the terminal's group, but the simulator must outlive a drain.
             start_new_session=True,
         )
     peer = ProcessChannel(ours)
     try:
         async with asyncio.timeout(START_S):
-            answer = await peer.hear()
+            answer = await peer.receive()
     except (ProcessGoneError, TimeoutError, OSError) as error:
         await Root(peer, process, 0.0).end()
         said = (await asyncio.to_thread(_last_line, log)) or str(error)
@@ -325,7 +325,7 @@ def _last_line(log: Path) -> str:
 
 
 def describe_status(status: int) -> str:
-    """A wait status in words."""
+    """Describe a wait status."""
     if os.WIFSIGNALED(status):
         return f"killed by {signal.Signals(os.WTERMSIG(status)).name}"
     return f"exited with status {os.WEXITSTATUS(status)}"

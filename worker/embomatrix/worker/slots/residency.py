@@ -1,4 +1,4 @@
-"""Which scenes a worker loads and evicts: decided from what is wanted, what is held and the memory there is."""
+"""Residency decisions: the scenes to load and evict, from the wanted ones, the held ones and the memory."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
 UNKNOWN_MB: Final = 60.0
-"""Memory that a scene is expected to take before it was ever loaded here."""
+"""Expected memory of a scene that was never loaded here."""
 
 
 @dataclass(frozen=True, slots=True)
 class HeldScene:
-    """A scene that is held or being loaded. ``last_used`` grows with every use; ``busy`` ones can't be evicted."""
+    """Scene that is held or being loaded. ``last_used`` grows with every use; busy scenes can't be evicted."""
 
     memory_mb: float
     last_used: int
@@ -23,7 +23,7 @@ class HeldScene:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """Evict these, then load that one. Nothing to load: ``load`` is empty."""
+    """Scenes to evict, and then the scene to load; an empty ``load`` loads none."""
 
     load: str = ""
     evict: tuple[str, ...] = ()
@@ -40,11 +40,11 @@ def decide(
     known_mb: Mapping[str, float],
     refused: Collection[str] = (),
 ) -> Decision:
-    """The next scene to load and what must go for it.
+    """Return the next scene to load and the scenes to evict for it.
 
-    ``wanted`` has the most urgent first; the first that is missing is next, unless it is ``refused`` (its loading failed).
-    Scenes that nobody wants make room first, the longest unused before others, then wanted ones that are less urgent.
-    A scene is loaded over budget only when nothing else is held: it could never be executed otherwise.
+    ``wanted`` has the most urgent scene first. The first missing one is next, unless it is ``refused`` (its loading failed).
+    Unwanted scenes are evicted first, the least recently used before others, then less urgent wanted ones. A scene is loaded
+    over budget only if no other is held, because it could never execute otherwise.
     """
     used_mb = sum(scene.memory_mb for scene in held.values())
     for place, digest in enumerate(wanted):
@@ -64,7 +64,7 @@ def decide(
 
 
 def surplus(wanted: Sequence[str], held: Mapping[str, HeldScene], *, budget_mb: float) -> tuple[str, ...]:
-    """What to evict because the scenes held turned out larger than the budget; the most urgent one always stays."""
+    """Return the scenes to evict if the held ones exceed the budget; the most urgent one always stays."""
     used_mb = sum(scene.memory_mb for scene in held.values())
     evict: list[str] = []
     for victim in _victims(wanted, 0, held):
@@ -76,7 +76,7 @@ def surplus(wanted: Sequence[str], held: Mapping[str, HeldScene], *, budget_mb: 
 
 
 def _victims(wanted: Sequence[str], place: int, held: Mapping[str, HeldScene]) -> list[str]:
-    """Scenes that may go for the one at ``place``, the most dispensable first."""
+    """Scenes that may be evicted for the one at ``place``, the least important first."""
     kept = set(wanted)
     unwanted = [digest for digest in held if digest not in kept and not held[digest].busy]
     unwanted.sort(key=lambda digest: held[digest].last_used)

@@ -1,4 +1,4 @@
-"""The scenes that a worker holds: fetched, loaded into processes of their own, evicted when memory is short."""
+"""Resident scenes of a worker: fetched, loaded into dedicated processes, evicted if memory is short."""
 
 from __future__ import annotations
 
@@ -18,26 +18,24 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from embomatrix.worker.slots.processes import Child, Root
-    from embomatrix.worker.slots.progress import ProgressBoard
+    from embomatrix.worker.slots.slot_program import ProgressBoard
 
 logger = logging.getLogger(__name__)
 
 COLLECT_S: Final = 0.05
-"""How long the system may take to tear a killed process down before its parent is asked to collect it."""
+"""Time for the system to tear down a killed process before its parent collects it."""
 LOAD_S: Final = 60.0
 """Limit for fetching and loading one scene."""
 RETRY_LOAD_S: Final = 5.0
-"""A scene that could not be loaded is tried again after this long, while it is still wanted."""
-
-
+"""Interval between attempts to load a failing scene that is still wanted."""
 SLOT_MB: Final = 8.0
 IDLE_MEMORY_SHARE: Final = 0.25
-"""Idle processes may hold this share of the worker's memory, at about 8 MB each. A step's scenes come back step after step,
-and a process that is kept is spared a fork and its page faults."""
+"""Share of the worker's memory for idle processes of about 8 MB each. Scenes return step after step, and a kept process saves a
+fork and its page faults."""
 
 
 class LoadError(Exception):
-    """A scene that can't be loaded, with the code that tells the manager why."""
+    """Scene that can't be loaded, with the reason as a code for the manager."""
 
     def __init__(self, code: InfraCode, message: str) -> None:
         super().__init__(message)
@@ -46,7 +44,7 @@ class LoadError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class SlotLimits:
-    """What a worker may use. ``memory_mb`` is for all residents; one rollout may allocate ``slot_memory_mb``.
+    """Limits of a worker. ``memory_mb`` is for all residents; one rollout may allocate ``slot_memory_mb``.
 
     A scene's process that takes longer than ``fork_s`` to fork a slot is given up.
     """
@@ -58,24 +56,23 @@ class SlotLimits:
 
     @property
     def idle_slots(self) -> int:
-        """Processes that may wait for a next rollout, over all scenes: as many as there are slots at least."""
+        """Most idle processes over all scenes: at least one for each slot."""
         return max(self.slots, int(self.memory_mb * IDLE_MEMORY_SHARE / SLOT_MB))
 
 
 @dataclass(slots=True)
 class Slot:
-    """A forked process that executes rollouts."""
+    """Forked process that executes rollouts. A worn one has executed enough or has grown, and is replaced."""
 
     child: Child
     rollouts: int = 0
     first_mb: float = 0.0
     worn: bool = False
-    """It has done enough, or has grown: another one takes its place."""
 
 
 @dataclass(slots=True, eq=False)
 class ResidentScene:
-    """A scene that is loading, warm or failed. ``idle`` are slots that wait for its next rollout."""
+    """Scene that is loading, warm or failed. ``idle`` are slots that wait for its next rollout."""
 
     digest: str
     state: ResidentState = ResidentState.LOADING
@@ -86,20 +83,20 @@ class ResidentScene:
     code: InfraCode = InfraCode.SCENE_LOAD_FAILED
     failed_s: float = 0.0
     last_used: int = 0
-    pace_s: float = 0.0
-    """What a rollout took of late, on average; 0 before the first."""
+    execute_mean_s: float = 0.0
+    """Moving average of the execution time; 0 before the first rollout."""
     running: int = 0
     idle: list[Slot] = field(default_factory=list)
 
     @property
-    def at_hand(self) -> bool:
-        """Whether a slot waits for a rollout, or none is at work: nothing must be forked beside another."""
+    def needs_no_fork(self) -> bool:
+        """True if a slot is idle, or none is busy: no process must be forked beside a busy one."""
         return bool(self.idle) or not self.running
 
     async def take_slot(self, fork_s: float) -> Slot:
-        """An idle slot, or a new fork of the scene, which may take ``fork_s`` seconds.
+        """Return an idle slot, or a new fork of the scene within ``fork_s`` seconds.
 
-        Raises ProcessGoneError when the scene's process has died, or does not answer.
+        Raise ProcessGoneError if the scene's process has died or does not answer.
         """
         if self.idle:
             return self.idle.pop()
@@ -109,10 +106,10 @@ class ResidentScene:
 
 
 class Residents:
-    """Owns the simulator's root and the scenes' processes.
+    """Owner of the simulator's root and the scenes' processes.
 
-    ``bundle_path`` brings a bundle to disk and raises LoadError when it can't. ``on_change`` is called with each scene
-    that was loaded, failed, evicted or lost.
+    ``bundle_path`` returns a bundle's file, or raises LoadError. ``on_change`` gets each scene that was loaded, failed, evicted
+    or lost.
     """
 
     def __init__(
@@ -149,22 +146,22 @@ class Residents:
         )
 
     def warm(self, digest: str) -> ResidentScene | None:
-        """The scene, if rollouts can be executed in it now."""
+        """Return the scene if it can execute rollouts now."""
         scene = self._scenes.get(digest)
         return scene if scene is not None and scene.state is ResidentState.WARM else None
 
     def failed(self) -> bool:
-        """Whether a scene waits to be tried again."""
+        """Return whether a scene waits for another attempt to load it."""
         return any(scene.state is ResidentState.FAILED for scene in self._scenes.values())
 
     def retry(self, digest: str) -> None:
-        """Forget that this scene could not be loaded."""
+        """Forget a failure to load this scene."""
         scene = self._scenes.get(digest)
         if scene is not None and scene.state is ResidentState.FAILED:
             del self._scenes[digest]
 
     async def start(self) -> None:
-        """Start the root. Raises ProcessGoneError with the reason when the engine can't be imported."""
+        """Start the root. Raise ProcessGoneError with the reason if the engine can't be imported."""
         await self._ready_root()
 
     async def close(self) -> None:
@@ -173,8 +170,8 @@ class Residents:
             await self._root.end()
         await asyncio.gather(*self._ending)
 
-    def settle(self, wanted: Sequence[str], tasks: asyncio.TaskGroup, *, budget_mb: float) -> None:
-        """Evict what is more than ``budget_mb``, and begin to load what is wanted: as many at a time as there are slots."""
+    def update(self, wanted: Sequence[str], tasks: asyncio.TaskGroup, *, budget_mb: float) -> None:
+        """Evict scenes beyond ``budget_mb``, and begin to load wanted ones, one for each slot at a time."""
         now_s = time.monotonic()
         for scene in list(self._scenes.values()):
             over = scene.digest not in wanted or now_s - scene.failed_s > RETRY_LOAD_S
@@ -203,29 +200,28 @@ class Residents:
                 self._evict(digest)
 
     def lost(self, scene: ResidentScene, reason: str) -> None:
-        """The scene's process forks no more: forget the scene, so that it is loaded anew when it is wanted.
+        """Forget a scene whose process forks no more, so that it is loaded again if it is wanted.
 
-        It may be stopped and not dead, and rollouts may run in slots that it forked before and that would die with it: it is
-        ended when the last of them is done.
+        The process may only be stopped. Its slots would die with it, so it is ended after their last rollout.
         """
         if self.keeps(scene):
             logger.warning("scene lost scene=%s: %s", scene.digest, reason)
             self._forget(scene)
 
     def release(self, scene: ResidentScene) -> None:
-        """A rollout in the scene is done."""
+        """Note the end of a run in the scene."""
         scene.running -= 1
         if not scene.running and not self.keeps(scene):
             self._end(scene)
 
     def keeps(self, scene: ResidentScene) -> bool:
-        """Whether this very scene is still held, not evicted or loaded anew."""
+        """Return whether this very scene is still held, neither evicted nor loaded again."""
         return self._scenes.get(scene.digest) is scene
 
     def keep_slot(self, scene: ResidentScene, slot: Slot) -> None:
         """Keep a slot for its scene's next rollout, unless the scene was dropped meanwhile.
 
-        When too many are idle, the scene that was not used for longest gives one up.
+        If too many slots are idle, the least recently used scene gives one up.
         """
         if not self.keeps(scene):
             self.end_later(slot.child)
@@ -239,7 +235,7 @@ class Residents:
     def end_later(self, child: Child) -> None:
         """Kill a process without waiting for its end.
 
-        It is collected a little later: whom its parent waits for, it can't fork another one meanwhile.
+        It is collected a little later, because its parent can't fork while it waits for a child.
         """
         child.kill()
         task = asyncio.create_task(_collect(child))
@@ -304,7 +300,7 @@ class Residents:
         try:
             return await root.fork()
         except ProcessGoneError:
-            logger.warning("the simulator's root process died: starting it anew")
+            logger.warning("the simulator's root process died: starting it again")
             async with self._root_turn:
                 if self._root is root:
                     await root.end()
@@ -322,7 +318,7 @@ class Residents:
         self._drop(self._scenes[digest])
 
     def _drop(self, scene: ResidentScene) -> None:
-        """Forget a scene and end its process; its slots die with it."""
+        """Forget a scene and end its process with its slots."""
         self._forget(scene)
         self._end(scene)
 

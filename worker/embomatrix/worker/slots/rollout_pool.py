@@ -1,7 +1,7 @@
-"""Rollouts in processes of this machine, without a cluster: a scene at a time, with the code that workers run.
+"""Rollouts in local processes without a cluster, scene by scene, with the code of the workers.
 
-Processes are spawned, never forked: the parent may hold threads. One that dies takes its scene's rollouts along; that scene is
-tried once more by itself, and then given up.
+Processes are spawned, never forked, because the parent may hold threads. If one dies, its scene is executed once more alone and
+then given up.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ if TYPE_CHECKING:
 
 
 class RolloutPool:
-    """Executes rollouts in the bundles of a dataset's folder."""
+    """Executes rollouts of a dataset's bundles."""
 
     def __init__(self, folder: Path, processes: int) -> None:
         self._folder = folder
         self._processes = processes
 
     def execute(self, rollouts: Sequence[Rollout], on_result: OnResult) -> None:
-        """Execute each once; ``on_result`` gets a rollout's id and its outcome, scene by scene in the order of their end.
+        """Execute each rollout once; ``on_result`` gets id and outcome, scene by scene in the order of completion.
 
-        Raises EngineMissingError.
+        Raise EngineMissingError.
         """
         scenes: dict[str, list[Rollout]] = {}
         for rollout in rollouts:
@@ -49,13 +49,13 @@ class RolloutPool:
             if self._run([scene], 1, on_result):
                 for rollout in scene:
                     on_result(
-                        rollout.rollout_id, _failure(InfraCode.SLOT_CRASHED, "the simulator died, twice")
+                        rollout.rollout_id, InfraFailure(InfraCode.SLOT_CRASHED, "the simulator died, twice")
                     )
 
     def _run(
         self, scenes: Sequence[list[Rollout]], processes: int, on_result: OnResult
     ) -> list[list[Rollout]]:
-        """Execute scenes; returns those whose process died, or that waited behind it."""
+        """Execute scenes and return those whose process died, or that waited behind it."""
         broken: list[list[Rollout]] = []
         with process_pool(processes) as pool:
             waiting: Waiting = {pool.submit(execute_scene, self._folder, scene): scene for scene in scenes}
@@ -71,9 +71,9 @@ class RolloutPool:
 
 
 def execute_scene(folder: Path, rollouts: Sequence[Rollout]) -> Results:
-    """Execute rollouts of one bundle in this process; a scene that can't be loaded is the outcome of each of them.
+    """Execute rollouts of one bundle in this process; if the scene can't be loaded, each of them fails.
 
-    Raises EngineMissingError where there is no physics engine.
+    Raise EngineMissingError if there is no physics engine.
     """
     try:
         bundle = Dataset(folder, ()).read_bundle(rollouts[0].bundle_digest)
@@ -81,7 +81,7 @@ def execute_scene(folder: Path, rollouts: Sequence[Rollout]) -> Results:
     except EngineMissingError:
         raise
     except (DatasetError, EngineError) as error:
-        failure = _failure(InfraCode.SCENE_LOAD_FAILED, str(error))
+        failure = InfraFailure(InfraCode.SCENE_LOAD_FAILED, str(error))
         return [(rollout.rollout_id, failure) for rollout in rollouts]
     try:
         return [(rollout.rollout_id, scene.execute(rollout)) for rollout in rollouts]
@@ -91,9 +91,5 @@ def execute_scene(folder: Path, rollouts: Sequence[Rollout]) -> Results:
 
 @functools.cache
 def _clients() -> ClientPool:
-    """Of this process, for one scene after another."""
+    """Physics clients of this process, for one scene after another."""
     return ClientPool(spare=CLIENTS_PER_SCENE)
-
-
-def _failure(code: InfraCode, message: str) -> InfraFailure:
-    return InfraFailure(code, message)

@@ -1,8 +1,8 @@
-"""What runs in the simulator's processes: a root that imported the engine, forks of it that hold one scene each, and
-forks of those, the slots, that execute rollouts.
+"""Program of the simulator's processes: a root that imported the engine, forks of it that hold one scene each, and forks of
+those, the slots, that execute rollouts.
 
-``embomatrix.worker.slots.physics`` runs it with the real engine. It imports neither gRPC nor anything else that starts
-threads: a thread does not survive a fork, but the locks that it held do.
+``embomatrix.worker.slots.physics`` runs it with the real engine. It imports nothing that starts threads, such as gRPC: a thread
+does not survive a fork, but the locks that it held do.
 """
 
 from __future__ import annotations
@@ -10,14 +10,19 @@ from __future__ import annotations
 import functools
 import gc
 import itertools
+import mmap
+import os
 import select
 import signal
 import socket
+import struct
 import sys
 import time
+import weakref
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
+from embomatrix.host.anonymous_memory import nameless_file
 from embomatrix.host.parent import die_with_parent
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.settings import PAPER, RewardSettings
@@ -35,7 +40,6 @@ from embomatrix.sim.zygote import (
     serve_forks,
     take_small_pages,
 )
-from embomatrix.worker.slots.progress import ProgressBoard
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -44,50 +48,74 @@ if TYPE_CHECKING:
 
 MAX_ERROR_CHARS: Final = 500
 IDLE_S: Final = 0.1
-"""A slot that waits this long for its next rollout gives free memory back, which takes some milliseconds."""
-
+"""A slot that is idle this long returns free memory to the system, which takes some milliseconds."""
 COLLECT_EVERY: Final = 32
-"""Rollouts between two collections of garbage in a slot that never waits."""
+"""Rollouts between two garbage collections in a busy slot."""
+_COUNTER: Final = struct.Struct("=Q")
 
 
 class LoadedScene(Protocol):
-    """A scene in memory, ready to execute plans. It leaves nothing behind from one rollout to the next."""
+    """Scene in memory that executes plans. No state carries over from one rollout to the next."""
 
     def execute(self, rollout: Rollout, on_step: Callable[[int], None], reward: RewardSettings) -> Completed:
-        """Execute the plan and score it; ``on_step`` is told after each step how many are done."""
+        """Execute the plan and score it; ``on_step`` gets the number of finished steps after each step."""
 
     def complete(self) -> Iterator[None]:
-        """Steps of a millisecond or two that make later executions faster and change nothing else."""
+        """Complete deferred work in steps of a millisecond or two; it only makes later executions faster."""
 
 
 class SimulationBackend(Protocol):
-    """Where scenes come from: the physics engine, or a test's stand-in."""
+    """Source of scenes: the physics engine, or a stand-in of a test."""
 
     def prepare(self) -> None:
-        """Import and connect whatever every scene needs, before the first fork."""
+        """Import and connect everything that scenes share, before the first fork."""
 
     def load(self, path: Path, digest: str) -> LoadedScene:
-        """Load the bundle in this file. Raises BundleCorruptError when the content is not what the digest says."""
+        """Load the bundle in this file. Raise BundleCorruptError if the content does not match the digest."""
 
 
 class BundleCorruptError(Exception):
-    """The bundle's content is damaged: fetch it again."""
+    """Bundle with damaged content that must be fetched again."""
+
+
+class ProgressBoard:
+    """Counters of finished steps of the slots 1 to ``slots``, in memory that the daemon shares with its simulator.
+
+    Counting a step writes eight bytes: no message, no system call, no wake-up of the daemon. Counter 0 belongs to no slot.
+    """
+
+    def __init__(self, fd: int) -> None:
+        """Map the board behind the descriptor, which stays open for inheritance until the board is collected."""
+        self.fd = fd
+        weakref.finalize(self, os.close, fd)
+        self._memory = mmap.mmap(fd, os.fstat(fd).st_size)
+
+    @classmethod
+    def create(cls, slots: int) -> ProgressBoard:
+        """Create a board, in memory only where the system supports that."""
+        return cls(nameless_file("progress", (slots + 1) * _COUNTER.size))
+
+    def set(self, slot: int, steps: int) -> None:
+        _COUNTER.pack_into(self._memory, slot * _COUNTER.size, steps)
+
+    def steps(self, slot: int) -> int:
+        """Return the finished steps of the slot's rollout."""
+        return int(_COUNTER.unpack_from(self._memory, slot * _COUNTER.size)[0])
 
 
 def run_program(simulation: SimulationBackend) -> None:
-    """Serve as root until the daemon goes away.
+    """Serve as root until the daemon ends.
 
-    Arguments: the control socket's descriptor, the daemon's process id, and the descriptor of a board of progress, if
-    anybody reads one.
+    Arguments: the control socket's descriptor, the daemon's process id, and optionally the descriptor of a progress board.
     """
     die_with_parent(int(sys.argv[2]))
-    # Ctrl-C is for the daemon: it drains first, and ends this process when it is done.
+    # Ctrl-C is for the daemon: it drains first and then ends this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     control = socket.socket(fileno=int(sys.argv[1]))
     board = ProgressBoard(int(sys.argv[3])) if len(sys.argv) > 3 else ProgressBoard.create(0)
     try:
         simulation.prepare()
-    except Exception as error:  # noqa: BLE001  # the daemon tells the person
+    except Exception as error:  # noqa: BLE001  # the daemon reports it
         send(control, PipeMessage(_failure(InfraCode.SCENE_LOAD_FAILED, error)))
         return
     send(control, PipeMessage({"memory_mb": private_mb()}))
@@ -96,11 +124,11 @@ def run_program(simulation: SimulationBackend) -> None:
 
 
 def _hold_scene(simulation: SimulationBackend, connection: socket.socket, board: ProgressBoard) -> None:
-    """Load the scene that the first frame names, then fork slots from it. It executes nothing itself: it stays pristine."""
+    """Load the scene that the first frame names, then fork slots. This process executes no rollout and stays pristine."""
     request = receive(connection)
     if request is None:
         return
-    # A scene is a hundred thousand objects and no garbage: looking through them again and again would cost half of loading.
+    # A scene is a hundred thousand objects without garbage: collections would take half of the loading time.
     gc.disable()
     started_s, core_s = time.perf_counter(), time.thread_time()
     try:
@@ -108,7 +136,7 @@ def _hold_scene(simulation: SimulationBackend, connection: socket.socket, board:
     except BundleCorruptError as error:
         send(connection, PipeMessage(_failure(InfraCode.BUNDLE_CORRUPT, error)))
         return
-    except Exception as error:  # noqa: BLE001  # a scene that can't be loaded is a result
+    except Exception as error:  # noqa: BLE001  # a failure to load is a result
         send(connection, PipeMessage(_failure(InfraCode.SCENE_LOAD_FAILED, error)))
         return
     load_s, cpu_s = time.perf_counter() - started_s, time.thread_time() - core_s
@@ -119,13 +147,13 @@ def _hold_scene(simulation: SimulationBackend, connection: socket.socket, board:
 
 
 def _run_slot(scene: LoadedScene, connection: socket.socket, memory_mb: int, board: ProgressBoard) -> None:
-    """Execute rollouts, one after another, until the daemon closes the stream or one fails.
+    """Execute rollouts one after another, until the daemon closes the stream or one fails.
 
-    The next ones may lie in the stream already: what an exception left behind in this process must not execute them.
+    More rollouts may wait in the stream. After an exception the state of this process is unknown, so it must not execute them.
     """
     limit_memory(memory_mb)
     take_small_pages()
-    # A rollout leaves few cycles behind: they are looked for between rollouts, not many times within each.
+    # A rollout leaves few reference cycles, so they are collected between rollouts only.
     gc.disable()
     for number in itertools.count(1):
         if number % COLLECT_EVERY == 0:
@@ -154,7 +182,7 @@ def _answer(scene: LoadedScene, request: PipeMessage, on_step: Callable[[int], N
         result = completed_to_proto(completed).SerializeToString()
     except MemoryError as error:
         return PipeMessage(_failure(InfraCode.SLOT_OOM, error))
-    except Exception as error:  # noqa: BLE001  # a defect is a failure of the infrastructure, never a reward
+    except Exception as error:  # noqa: BLE001  # a defect is an infrastructure failure, never a reward
         return PipeMessage(_failure(InfraCode.SLOT_CRASHED, error))
     header = {
         "execute_s": time.perf_counter() - started_s,

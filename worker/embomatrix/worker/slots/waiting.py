@@ -1,4 +1,4 @@
-"""Leases that wait for a slot, in the order in which they came but for those whose scene a slot has at hand."""
+"""Queue of leases that wait for a slot, in order of arrival except that leases of a scene with an idle slot may overtake."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import itertools
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.worker.slots.execution import Ticket
+from embomatrix.worker.slots.execution import HeldLease
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -15,69 +15,66 @@ if TYPE_CHECKING:
     from embomatrix.worker.slots.residents import ResidentScene
 
 OVERTAKEN_S: Final = 0.5
-"""A lease that has waited for this long is not overtaken by one whose scene a slot has at hand."""
+"""A lease that has waited this long is not overtaken."""
 
 
 class WaitingLeases:
-    """``slots`` share what waits; ``warm`` tells the scene of a bundle digest that can execute."""
+    """Waiting leases of ``slots`` slots; ``warm`` returns the scene of a bundle digest if it can execute."""
 
     def __init__(self, slots: int, warm: Callable[[str], ResidentScene | None]) -> None:
         self._slots = slots
         self._warm = warm
-        self._tickets: deque[Ticket] = deque()
+        self._queue: deque[HeldLease] = deque()
 
-    def __iter__(self) -> Iterator[Ticket]:
-        """From the one whose turn it is."""
-        return iter(self._tickets)
+    def __iter__(self) -> Iterator[HeldLease]:
+        """Iterate from the first lease of the queue."""
+        return iter(self._queue)
 
-    def add(self, ticket: Ticket) -> None:
-        self._tickets.append(ticket)
+    def add(self, held: HeldLease) -> None:
+        self._queue.append(held)
 
-    def give_back(self, tickets: Iterable[Ticket]) -> None:
-        """These wait again, in their order, before all others."""
-        self._tickets.extendleft(reversed(list(tickets)))
+    def put_back(self, leases: Iterable[HeldLease]) -> None:
+        """Put leases back in front of the queue, in their order."""
+        self._queue.extendleft(reversed(list(leases)))
 
-    def remove(self, ticket: Ticket) -> None:
-        """Raises ValueError for one that does not wait."""
-        self._tickets.remove(ticket)
+    def remove(self, held: HeldLease) -> None:
+        """Remove a lease. Raise ValueError if it does not wait."""
+        self._queue.remove(held)
 
-    def take_of(self, digest: str) -> list[Ticket]:
-        """All of one scene wait no longer."""
-        return self._take([ticket for ticket in self._tickets if ticket.digest == digest])
+    def take_of(self, digest: str) -> list[HeldLease]:
+        """Take all leases of one scene."""
+        return self._take([held for held in self._queue if held.digest == digest])
 
-    def take(self, now_s: float) -> tuple[Ticket, ResidentScene] | None:
-        """One whose scene is warm, with this.
+    def take(self, now_s: float) -> tuple[HeldLease, ResidentScene] | None:
+        """Take the next lease of a warm scene, with the scene.
 
-        It is the first, or, until that has waited for long, the first for which no process must be forked beside one that is
-        at work: what a process needs is copied and found out in its first rollouts, so few processes with many rollouts each
-        spend less on it than many with few.
+        It is the first one. Until that has waited long, it is the first one that needs no fork beside a busy slot: a process
+        spends most on copied pages and adaptation in its first rollouts, so few processes with many rollouts are cheaper.
         """
-        warm = (
-            (ticket, scene) for ticket in self._tickets if (scene := self._warm(ticket.digest)) is not None
-        )
+        warm = ((held, scene) for held in self._queue if (scene := self._warm(held.digest)) is not None)
         first = next(warm, None)
         if first is None:
             return None
         found = first
-        if not first[1].at_hand and now_s - first[0].taken_s <= OVERTAKEN_S:
-            found = next((pair for pair in warm if pair[1].at_hand), first)
-        self._tickets.remove(found[0])
+        if not first[1].needs_no_fork and now_s - first[0].taken_s <= OVERTAKEN_S:
+            found = next((pair for pair in warm if pair[1].needs_no_fork), first)
+        self._queue.remove(found[0])
         return found
 
-    def take_more(self, scene: ResidentScene, count: int, now_s: float) -> list[Ticket]:
-        """Leases of this scene, up to a count, while it is warm: no more than a slot's share of all that wait.
+    def take_more(self, scene: ResidentScene, count: int, now_s: float) -> list[HeldLease]:
+        """Take up to ``count`` leases of this warm scene, at most a slot's share of the queue.
 
-        They may overtake those of other scenes, until one of these has waited for long.
+        They may overtake leases of other scenes, until one of these has waited long.
         """
-        count = min(count, len(self._tickets) // self._slots)
+        count = min(count, len(self._queue) // self._slots)
         if count <= 0 or self._warm(scene.digest) is not scene:
             return []
-        late = now_s - self._tickets[0].taken_s > OVERTAKEN_S
-        fits = functools.partial(Ticket.fits, digest=scene.digest)
-        found = itertools.takewhile(fits, self._tickets) if late else filter(fits, self._tickets)
+        late = now_s - self._queue[0].taken_s > OVERTAKEN_S
+        fits = functools.partial(HeldLease.fits, digest=scene.digest)
+        found = itertools.takewhile(fits, self._queue) if late else filter(fits, self._queue)
         return self._take(list(itertools.islice(found, count)))
 
-    def _take(self, tickets: list[Ticket]) -> list[Ticket]:
-        for ticket in tickets:
-            self._tickets.remove(ticket)
-        return tickets
+    def _take(self, leases: list[HeldLease]) -> list[HeldLease]:
+        for held in leases:
+            self._queue.remove(held)
+        return leases

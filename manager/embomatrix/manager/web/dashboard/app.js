@@ -1,15 +1,15 @@
-// The dashboard: one snapshot a second feeds whichever page is shown.
+// Dashboard: one snapshot a second feeds the page that is open.
 import {ask} from "./ask.js";
 import {at, clock, seconds} from "./dom.js";
 import {learn} from "./names.js";
 
-// A page's code comes when it is opened, and the first snapshot with it: nobody waits for what isn't shown.
+// The code of a page is loaded when it is opened, together with the first snapshot.
 const PAGES = {
   overview: () => import("./overview.js"), workers: () => import("./workers.js"), lookahead: () => import("./lookahead.js"), timeline: () => import("./timeline.js"),
   failures: () => import("./failures.js"), training: () => import("./training.js"), tasks: () => import("./tasks.js"),
 };
 const REFRESH_MS = 1000;
-/** Rows of workers that the page shows at once; the others show none. */
+/** Rows of workers in the snapshot, by page; other pages need none. */
 const ROWS = {workers: 50};
 let page = null, told_s = 0;
 let waiting = 0;
@@ -19,13 +19,13 @@ async function open() {
   const asked = location.hash.slice(1).split("?")[0], name = Object.hasOwn(PAGES, asked) ? asked : "overview", turn = ++opened;
   clearTimeout(waiting);
   const first = ask(`snapshot?${new URLSearchParams({limit: ROWS[name] ?? 1})}`);
-  first.catch(() => {}); // it is asked for again
+  first.catch(() => {}); // the next refresh repeats the request
   let code;
   try {
     code = await PAGES[name]();
   } catch {
     at("dot").className = "dot lost";
-    tell("a part of the page did not come: load it again");
+    tell("a part of the dashboard failed to load: reload the page");
     return;
   }
   if (turn !== opened) return;
@@ -38,11 +38,11 @@ async function open() {
   document.title = `${name[0].toUpperCase()}${name.slice(1)} · EmboMatrix cluster`;
   page.open(at("main"));
   await refresh(page.asksMore?.() ? null : first);
-  // The other pages while there is time: they open at once then, and also while the manager is away.
+  // Load the other pages in the background, so that they open at once, even while the manager is away.
   setTimeout(() => Promise.allSettled(Object.values(PAGES).map(load => load())), REFRESH_MS);
 }
 
-/** Ask, and show what is told; `first` is an answer that is on its way. */
+/** Request a snapshot and show it; `first` is a request already under way. */
 async function refresh(first = null) {
   clearTimeout(waiting);
   if (!page) return;
@@ -53,30 +53,30 @@ async function refresh(first = null) {
       await page.show(told);
       at("dot").className = "dot ready";
       at("main").classList.remove("old");
-      learn(); // what is shown first waits for no names
+      learn(); // scene names must not delay the first view
     }
   } catch (error) {
     at("dot").className = "dot lost";
-    tell(error.name === "TimeoutError" || error instanceof TypeError ? "the manager does not answer; trying again" : error.message);
+    tell(error.name === "TimeoutError" || error instanceof TypeError ? "the manager does not answer; retrying" : error.message);
     age();
   }
   clearTimeout(waiting);
-  // A page that nobody sees asks for nothing.
+  // A hidden page refreshes rarely.
   waiting = setTimeout(refresh, document.hidden ? 10 * REFRESH_MS : REFRESH_MS);
 }
 
-/** Screen readers hear the words when they change; how long it is up changes every second, and is left out of that. */
+/** Screen readers announce changed text. The uptime changes every second and is kept out of it. */
 function tell(words, up = "") {
   at("up").textContent = up;
   if (at("states").textContent !== words) at("states").textContent = words;
 }
 
-/** What stands there is no longer so: it says from when it is. */
+/** Mark the page as outdated, with the time of its data. */
 function age() {
   if (!told_s) return;
   at("main").classList.add("old");
   at("health").className = "health bad";
-  const words = `What stands here is of ${clock(told_s)}: the manager has told nothing since.`;
+  const words = `This page shows the state of ${clock(told_s)}: the manager has not answered since.`;
   if (at("health").textContent !== words) at("health").textContent = words;
 }
 
@@ -95,7 +95,7 @@ at("ask").addEventListener("submit", event => {
   sessionStorage.setItem("token", at("token").value);
   refresh();
 });
-// The address names the page: a jump within it must not.
+// The URL's fragment names the page, so the skip link must not change it.
 at("skip").addEventListener("click", event => { event.preventDefault(); at("main").focus(); });
 addEventListener("hashchange", open);
 addEventListener("embomatrix-changed", () => refresh());

@@ -1,13 +1,13 @@
-// Questions to the manager, with the token that the viewer gave.
+// Requests to the manager, with the viewer's token.
 
 export class Refused extends Error {}
 
-/** JSON of a path below /api/v1; throws Refused with a sentence. */
+/** JSON of a path below /api/v1. Throws Refused with a message. */
 export async function ask(path, options = {}) {
   return (await answer(path, options)).json();
 }
 
-/** A picture as a URL that the page may show: an image of its own would carry no token. */
+/** A picture as a data URL, since an image element sends no token. */
 export async function picture(path) {
   const reader = new FileReader(), read = new Promise(done => reader.addEventListener("load", done));
   reader.readAsDataURL(await (await answer(path)).blob());
@@ -26,8 +26,8 @@ async function answer(path, options = {}) {
   if (!told.ok) {
     const text = await told.text();
     let why = text;
-    try { why = JSON.parse(text).detail ?? text; } catch { /* a sentence already */ }
-    throw new Refused(typeof why === "string" && why ? why : `the manager answers ${told.status}`);
+    try { why = JSON.parse(text).detail ?? text; } catch { /* plain text */ }
+    throw new Refused(typeof why === "string" && why ? why : `the manager answered with status ${told.status}`);
   }
   document.getElementById("ask").hidden = true;
   return told;

@@ -1,16 +1,16 @@
-// Lines over steps or seconds, by the one library of charts: colours follow the theme, the width follows the page.
+// Line charts over steps or seconds. Colours follow the theme, the width follows the page.
 import {colour, h, signed} from "./dom.js";
 
-/** The library is no module: it comes when the first page with a chart does. */
+/** uPlot is no module: it is loaded with the first page that has a chart. */
 await Promise.all([
-  new Promise((done, failed) => document.head.append(h("script", {src: "/static/vendor/uPlot.iife.min.js", onload: done, onerror: () => failed(new TypeError("the charts did not come"))}))),
+  new Promise((done, failed) => document.head.append(h("script", {src: "/static/vendor/uPlot.iife.min.js", onload: done, onerror: () => failed(new TypeError("the chart library failed to load"))}))),
   new Promise(done => document.head.append(h("link", {rel: "stylesheet", href: "/static/vendor/uPlot.min.css", onload: done, onerror: done}))),
 ]);
 
 const DASHES = [[], [6, 3], [2, 2], [9, 3, 2, 3], [1, 4]];
-/** Steps and seconds are whole numbers. */
+/** Tick intervals: steps and seconds are whole numbers. */
 const WHOLE = [1, 2, 5].flatMap(n => [0, 1, 2, 3, 4, 5, 6].map(power => n * 10 ** power)).sort((a, b) => a - b);
-/** What is smaller is nothing: the difference of two sums. */
+/** Smaller values are rounding errors and shown as 0. */
 const LEAST = 1e-6;
 const TINTS = ["c1", "c2", "c3", "c4", "c5"];
 
@@ -19,12 +19,12 @@ function latest(drawn) {
   if (drawn.cursor.idx == null && last >= 0) drawn.setLegend({idx: last});
 }
 
-/** A chart in a place of its own. `lines` are their names; `words` turns a value at the foot into text; `fill` for one line. */
+/** A chart in an element. `lines` are the names of the series; `words` formats the ticks of the x axis; `fill` fills a single line. */
 export function chart(place, lines, {high = 190, words, fill = false, legend = true} = {}) {
   const axis = {stroke: () => colour("faint"), grid: {stroke: () => colour("line"), width: 1}, ticks: {show: false}, font: "11px system-ui"};
   const series = lines.map((label, i) => ({
     label, width: 1.6, dash: DASHES[Math.floor(i / TINTS.length) % DASHES.length], spanGaps: true,
-    // One value makes no line.
+    // A single value is shown as a point.
     points: {show: (drawn, number) => drawn.data[number].filter(value => value !== null && value !== undefined).length === 1, size: 6},
     stroke: () => colour(TINTS[i % TINTS.length]), ...(fill ? {fill: () => `${colour(TINTS[i])}22`} : {}),
     value: (_, value) => value === null || value === undefined ? "–" : signed(Math.abs(value) < LEAST ? 0 : Number(value.toPrecision(3))),
@@ -39,7 +39,7 @@ export function chart(place, lines, {high = 190, words, fill = false, legend = t
     width: box.clientWidth, height: high, legend: {show: legend}, cursor: {y: false}, scales: {x: {time: false}, y: {range}},
     axes: [{...axis, size: 28, incrs: WHOLE, ...(words ? {values: (_, ticks) => ticks.map(words)} : {})}, {...axis, size: 52}],
     series: [{label: "step", value: (_, value) => value ?? "–"}, ...series],
-    // Where nobody points, the legend tells the latest values.
+    // Without a cursor, the legend shows the latest values.
     hooks: {setCursor: [latest]},
   }, [[], ...lines.map(() => [])], box);
   const watcher = new ResizeObserver(() => drawn.setSize({width: box.clientWidth, height: high}));

@@ -1,4 +1,4 @@
-// Elements and words. Text never becomes markup: whatever a worker or a task is called, it stays text.
+// Elements and number formats. Names of workers and tasks never become markup.
 
 /** An element: h("td", {class: "n"}, "3"). Children are elements, text, or nothing. */
 export function h(tag, attributes = {}, ...children) {
@@ -12,7 +12,7 @@ export function h(tag, attributes = {}, ...children) {
   return element;
 }
 
-/** The same for a shape of a picture. */
+/** An SVG element. */
 export function shape(tag, attributes = {}, ...children) {
   const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
   for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
@@ -23,16 +23,16 @@ export function shape(tag, attributes = {}, ...children) {
 export const at = id => document.getElementById(id);
 export const brief = digest => digest.replace(/^sha256:/, "").slice(0, 8);
 export const count = number => Number(number).toLocaleString("en");
-/** A number and its unit never part at the end of a line. */
+/** Number and unit with a no-break space. */
 const unit = (number, of) => `${number}\u00a0${of}`;
 export const share = (part, all) => all ? unit(Math.round(100 * part / all), "%") : "–";
 export const counted = (number, thing) => `${count(number)} ${thing}${number === 1 ? "" : "s"}`;
-/** A time of today; of another day with its date. */
+/** Time of day; with the date unless it is today. */
 export function clock(seconds) {
   const moment = new Date(seconds * 1000), today = moment.toDateString() === new Date().toDateString();
   return today ? moment.toLocaleTimeString() : moment.toLocaleString([], {month: "short", day: "numeric", hour: "2-digit", minute: "2-digit"});
 }
-/** With a true minus: a hyphen would stand for a dash. */
+/** Text with a minus sign instead of a hyphen. */
 export const signed = text => String(text).replace("-", "\u2212");
 export const splitWords = split => split === "heldout" ? "held out" : split;
 export const none = text => h("div", {class: "none"}, text);
@@ -46,14 +46,14 @@ export function seconds(s) {
   return s < 172800 ? unit((s / 3600).toFixed(1), "h") : unit(Math.round(s / 86400), "days");
 }
 
-/** How full something is. */
+/** Fill level. */
 export function gauge(used, all, label) {
   const part = Math.min(100, 100 * used / Math.max(1, all));
   return h("span", {class: "gauge", role: "meter", "aria-valuemin": 0, "aria-valuemax": all, "aria-valuenow": Math.round(used), "aria-label": label, title: label},
     h("span", {style: `width:${part.toFixed(1)}%`}));
 }
 
-/** A table of rows; a heading is its text, or [text, class]. One of the kind "loose" flows on a narrow page. */
+/** Table; a heading is its text, or [text, class]. Tables of kind "loose" wrap on narrow pages. */
 export function table(headings, rows, caption, kind = "") {
   const head = headings.map(heading => {
     const [text, kind] = Array.isArray(heading) ? heading : [heading, ""];
@@ -66,7 +66,7 @@ export function table(headings, rows, caption, kind = "") {
 const last = new WeakMap();
 const nameOf = part => part.getAttribute("aria-label") ?? part.getAttribute("href") ?? part.textContent;
 
-/** What somebody has in hand in a place: gives the focus, and how far its parts are scrolled, to what comes after it. */
+/** Save the focus and scroll positions inside an element; the returned function restores them. */
 function held(place) {
   const parts = [...place.querySelectorAll("a, button, [tabindex]")], focused = parts.indexOf(document.activeElement);
   const name = focused < 0 ? "" : nameOf(parts[focused]), ways = [...place.querySelectorAll(".scroll, pre")].map(part => [part.scrollLeft, part.scrollTop]);
@@ -78,7 +78,7 @@ function held(place) {
   };
 }
 
-/** What the page shows in a place, replaced only when it differs: selections outlive a refresh, the focus a change too. */
+/** Replace the content of an element if it differs. Selections survive a refresh, and the focus also a change. */
 export function put(place, ...children) {
   const fresh = h("div", {}, ...children), told = fresh.innerHTML;
   const before = last.get(place);

@@ -1,4 +1,4 @@
-// What the infrastructure lost: reason, worker, scene, attempt, and the worker's own words.
+// Infrastructure failures: reason, worker, scene, attempt, and the worker's message.
 import {ask} from "./ask.js";
 import {at, clock, count, h, none, put, table} from "./dom.js";
 import {named, worded} from "./names.js";
@@ -14,8 +14,8 @@ export function open(main) {
   main.replaceChildren(
     h("section", {class: "half"}, h("h2", {}, "By reason"), h("div", {id: "reasons"})),
     h("section", {class: "half"}, h("h2", {}, "By worker"), h("div", {id: "blamed"})),
-    h("section", {}, h("h2", {}, "Rollouts that were given up ", h("small", {}, "never scored as a reward")), h("div", {id: "failures"})),
-    h("section", {}, h("h2", {}, "What was lost on the way ", h("small", {}, "attempts, scenes and workers: their rollouts were given to others")), h("div", {id: "attempts"})));
+    h("section", {}, h("h2", {}, "Failed rollouts ", h("small", {}, "infrastructure failures, never scored as a reward")), h("div", {id: "failures"})),
+    h("section", {}, h("h2", {}, "Failed attempts ", h("small", {}, "failed leases, scenes and lost workers: their rollouts were re-dispatched")), h("div", {id: "attempts"})));
 }
 
 export async function show({overview, runs}) {
@@ -24,13 +24,13 @@ export async function show({overview, runs}) {
   put(at("reasons"), tally("reason", given.map(note => note.code), lost.map(event => event.code || event.kind)));
   put(at("blamed"), tally("worker", given.map(note => note.worker_id || "none"), lost.map(event => event.worker_id || "none")));
   const rows = given.map(note => h("tr", {}, h("td", {class: "muted fit"}, clock(note.at_s)), h("td", {class: "fit"}, h("code", {class: "bad"}, note.code)), h("td", {class: "named"}, note.worker_id), h("td", {class: "named"}, note.rollout_id), h("td", {class: "message"}, worded(note.message))));
-  put(at("failures"), rows.length ? table(["when", "reason", "worker", "rollout", "what it said"], rows, "failures", "loose") : none("None. Lost rollouts are executed again before they count as failed."));
+  put(at("failures"), rows.length ? table(["when", "reason", "worker", "rollout", "message"], rows, "failures", "loose") : none("None. A rollout counts as failed only after its last attempt."));
   const every = fold(lost);
   const folded = every.slice(0, ROWS).map(({event, times}) =>
     h("tr", {}, h("td", {class: "muted fit"}, clock(event.at_s)), h("td", {class: "fit"}, h("code", {class: "bad"}, event.code || event.kind), times > 1 && ` × ${count(times)}`), h("td", {class: "named"}, event.worker_id),
       h("td", {class: "named"}, event.bundle_digest && h("code", {title: event.bundle_digest}, named(event.bundle_digest))), h("td", {class: "fit n", "data-name": event.attempt ? "attempt" : false}, event.attempt || ""), h("td", {class: "message"}, worded(event.message ?? ""))));
-  put(at("attempts"), folded.length ? table(["latest", "reason", "worker", "scene", ["attempt", "n"], "what it said"], folded, "attempts that failed", "loose") : none("None."),
-    every.length > ROWS ? none(`${count(every.length - ROWS)} more of the latest ${count(KEPT)}; all of them: embomatrix cluster events`) : "");
+  put(at("attempts"), folded.length ? table(["latest", "reason", "worker", "scene", ["attempt", "n"], "message"], folded, "attempts that failed", "loose") : none("None."),
+    every.length > ROWS ? none(`${count(every.length - ROWS)} more of the latest ${count(KEPT)}; list all with: embomatrix cluster events`) : "");
 }
 
 /** The latest events of the cluster and of the latest runs, newest first. */
@@ -42,7 +42,7 @@ async function look(runs) {
   return [...log, ...pages.slice(1).flatMap(page => page.events)].sort((a, b) => b.at_s - a.at_s).slice(0, KEPT);
 }
 
-/** What a worker says again and again is one row. */
+/** Merge repeated events into one row. */
 function fold(events) {
   const rows = new Map();
   for (const event of events) {
@@ -57,5 +57,5 @@ function tally(heading, given, lost) {
   const counts = {};
   for (const [i, names] of [given, lost].entries()) for (const name of names) (counts[name] ??= [0, 0])[i] += 1;
   const rows = Object.entries(counts).sort(([, a], [, b]) => b[0] - a[0] || b[1] - a[1]).map(([name, numbers]) => h("tr", {}, h("td", {class: "named"}, h("code", {}, name)), numbers.map(n => h("td", {class: "n"}, count(n)))));
-  return rows.length ? table([heading, ["given up", "n"], ["on the way", "n"]], rows, `latest failures by ${heading}`) : none("None.");
+  return rows.length ? table([heading, ["rollouts", "n"], ["attempts", "n"]], rows, `latest failures by ${heading}`) : none("None.");
 }

@@ -1,14 +1,14 @@
-// Coming steps by scenes: how far each scene is, and who holds it. A cell that somebody points at, taps or walks to says so in words.
+// Look-ahead grid: coming steps by scenes, with loading states. The selected cell is described in words.
 import {at, counted, h, none, put} from "./dom.js";
 import {named, worded} from "./names.js";
 
 const STEPS = 24;
 const COLUMNS = 60;
-const KINDS = [["warm", "warm"], ["warming", "warming"], ["queued", "cold"], ["unplaceable", "no worker can hold it"]];
+const KINDS = [["warm", "warm"], ["warming", "warming"], ["queued", "cold"], ["unplaceable", "fits on no worker"]];
 const WORDS = Object.fromEntries(KINDS);
 const SWATCH = {warm: "warm", warming: "warming", queued: "queued", unplaceable: "bad"};
 
-const HINT = "Each cell: rollouts, and ×2 where two workers hold the scene. Point at one, or walk there by Tab and the arrows, to see which.";
+const HINT = "Each cell shows the number of rollouts, and ×2 if two workers hold the scene. Point at a cell, or move there with Tab and the arrow keys, for details.";
 const MOVES = {ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowUp: [-1, 0], ArrowDown: [1, 0]};
 let chosen = "", told = {};
 
@@ -16,7 +16,7 @@ export function open(main) {
   chosen = "";
   const legend = KINDS.map(([kind, word]) => [h("i", {style: `background:var(--${SWATCH[kind]})`}), word]);
   main.replaceChildren(
-    h("section", {}, h("h2", {}, "What coming steps need ", h("small", {id: "sum"}), h("span", {class: "legend"}, legend)), h("p", {id: "cell", class: "muted", role: "status"}), h("div", {id: "ahead"})));
+    h("section", {}, h("h2", {}, "Scenes of coming steps ", h("small", {id: "sum"}), h("span", {class: "legend"}, legend)), h("p", {id: "cell", class: "muted", role: "status"}), h("div", {id: "ahead"})));
   at("ahead").addEventListener("keydown", walk);
   for (const kind of ["pointerover", "click", "focusin"]) at("ahead").addEventListener(kind, choose);
 }
@@ -28,7 +28,7 @@ export function show({lookahead, runs}) {
   const byRun = Map.groupBy ? Map.groupBy(lookahead, step => step.run_id) : new Map([["", lookahead]]);
   told = {};
   const parts = [...byRun].map(([run, steps]) => [h("h3", {}, names[run] ?? run), grid(run, steps), problems(steps)]);
-  put(at("ahead"), parts.length && lookahead.length ? parts : none("Nothing announced. A trainer announces the scenes of its coming steps."));
+  put(at("ahead"), parts.length && lookahead.length ? parts : none("No scenes announced. A trainer announces the scenes of its coming steps."));
   say(lookahead.length > 0);
 }
 
@@ -44,7 +44,7 @@ function say(any) {
   if (at("cell").textContent !== words) at("cell").textContent = words;
 }
 
-/** The arrows go from cell to cell; Tab enters a grid once. */
+/** Arrow keys move between cells; Tab enters a grid once. */
 function walk(event) {
   const place = event.target.closest("td"), move = MOVES[event.key];
   if (!place || !move) return;

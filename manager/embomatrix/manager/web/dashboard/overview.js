@@ -1,12 +1,12 @@
-// How the cluster does: throughput, latency, hits, failures, runs.
+// Overview: throughput, latency, prewarm hits, failures, runs.
 import {chart} from "./charts.js";
 import {at, count, h, none, put, seconds, share, signed, table} from "./dom.js";
 
 const TILES = [
-  ["rate", "Throughput", "rollouts/s, mean of 10\u00a0s"], ["p50", "Latency", ""], ["hits", "Prewarm hits", ""],
-  ["slots", "Slots busy", ""], ["overhead", "Overhead", "the manager's share of CPU time"], ["bad", "Failures", ""],
+  ["rate", "Throughput", "rollouts/s, 10\u00a0s mean"], ["p50", "Latency", ""], ["hits", "Prewarm hits", ""],
+  ["slots", "Slots busy", ""], ["overhead", "Overhead", "manager's share of CPU time"], ["bad", "Failures", ""],
 ];
-const PHASES = {queue: "waits for a lease", lease: "on the way, and behind another", load: "its scene is loaded", execute: "its plan is executed", deliver: "into the log"};
+const PHASES = {queue: "waiting for a lease", lease: "network and waiting for a slot", load: "loading the scene", execute: "executing the plan", deliver: "writing the result"};
 let drawn = null;
 
 export function open(main) {
@@ -29,12 +29,12 @@ export function show({overview: o, runs}) {
   const recent = o.throughput.slice(-10), mean = recent.reduce((a, b) => a + b, 0) / recent.length;
   const failed = Object.entries(o.outcomes).filter(([name]) => name !== "completed" && name !== "cancelled").reduce((sum, [, n]) => sum + n, 0);
   const told = {
-    rate: mean >= 100 ? count(Math.round(mean)) : mean.toFixed(1), p50: seconds(o.latency_p50_s), p50note: o.latency_p95_s ? `median; 95 % within ${seconds(o.latency_p95_s)}` : "submitted to result",
+    rate: mean >= 100 ? count(Math.round(mean)) : mean.toFixed(1), p50: seconds(o.latency_p50_s), p50note: o.latency_p95_s ? `median; 95th percentile ${seconds(o.latency_p95_s)}` : "from submission to result",
     overhead: o.overhead ? `${(100 * o.overhead).toFixed(o.overhead < 0.1 ? 1 : 0)}\u00a0%` : "–",
     hits: share(o.prewarm_hits, o.prewarm_hits + o.prewarm_misses), hitsnote: o.prewarm_hits ? `lead ${seconds(o.prewarm_lead_s)}, ${count(o.prewarm_wasted)} wasted` : "of announced scenes",
-    slots: `${o.slots_busy}/${o.slots}`, slotsnote: `${count(o.queued)} rollouts waiting`,
-    bad: count(failed), badnote: `${count(o.redispatched)} given again, ${count(o.stale_results)} late`,
-    peak: `peak ${count(Math.max(...o.throughput))}, ${count(o.outcomes.completed || 0)} in all`,
+    slots: `${o.slots_busy}/${o.slots}`, slotsnote: `${count(o.queued)} rollouts queued`,
+    bad: count(failed), badnote: `${count(o.redispatched)} re-dispatched, ${count(o.stale_results)} late`,
+    peak: `peak ${count(Math.max(...o.throughput))}, ${count(o.outcomes.completed || 0)} in total`,
   };
   for (const [id, text] of Object.entries(told)) at(id).textContent = text;
   at("bad").className = failed ? "bad" : "";
@@ -43,12 +43,12 @@ export function show({overview: o, runs}) {
   put(at("runs"), runs.length ? table(["run", ["done", "n"], ["open", "n"], ["warm", "n"], ["failed", "n"]], runs.slice(-8).reverse().map(run), "open runs") : none("No open runs."));
   put(at("phases"), phases(o.phases));
   const rows = Object.entries(o.outcomes).sort((a, b) => b[1] - a[1]).map(([name, n]) => h("tr", {}, h("td", {}, h("code", {}, name)), h("td", {class: "n"}, count(n))));
-  put(at("outcomes"), rows.length ? table(["outcome", ["rollouts", "n"]], rows, "outcomes") : none("Nothing has been executed yet."));
+  put(at("outcomes"), rows.length ? table(["outcome", ["rollouts", "n"]], rows, "outcomes") : none("No rollout has been executed yet."));
 }
 
 function phases(told) {
   const all = Object.values(told).reduce((sum, one) => sum + one.sum_s, 0);
-  if (!all) return none("Nothing has been executed yet.");
+  if (!all) return none("No rollout has been executed yet.");
   const rows = Object.entries(told).map(([name, one]) => h("tr", {}, h("td", {class: "fit"}, name, h("span", {class: "muted wideonly"}, ` ${PHASES[name] ?? ""}`)),
     h("td", {}, h("span", {class: "share", style: `width:${(100 * one.sum_s / all).toFixed(1)}%`})), h("td", {class: "n fit"}, share(one.sum_s, all)),
     [one.p50_s, one.p95_s, one.p99_s].map(s => h("td", {class: "n fit"}, s ? seconds(s) : "0\u00a0ms"))));

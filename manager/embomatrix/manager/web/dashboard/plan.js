@@ -1,17 +1,17 @@
-// A scene from above, north up, and what a plan does in it.
+// Floor plan of a scene, north up, with the course of a plan.
 import {h, shape} from "./dom.js";
 
-const KEY = [["robot", "robot"], ["way", "its way"], ["goal", "the goal is about it"], ["thing", "other small things"], ["held", "held"], ["active", "open or on"]];
+const KEY = [["robot", "robot"], ["way", "path"], ["goal", "goal object"], ["thing", "other small object"], ["held", "held"], ["active", "open or on"]];
 const MARGIN_M = 0.3, UNIT = 100, ROBOT_M = 0.22, DOT_M = 0.09;
 
-/** A picture of the rooms named, or of all. `about` are names that the goal is about, `things` small ones with their places. */
+/** Drawing of the named rooms, or of all. `about` are goal objects, `things` small objects with their positions. */
 export function drawn(floor, {rooms, about = new Set(), things = {}, label: words}) {
   const shown = floor.rooms.filter(([name]) => !rooms || rooms.includes(name)), seen = shown.length ? shown : floor.rooms;
   const west = Math.min(...seen.map(r => r[1])) - MARGIN_M, south = Math.min(...seen.map(r => r[2])) - MARGIN_M;
   const east = Math.max(...seen.map(r => r[3])) + MARGIN_M, north = Math.max(...seen.map(r => r[4])) + MARGIN_M;
   const x = metres => Math.round((metres - west) * UNIT), y = metres => Math.round((north - metres) * UNIT);
   const box = (kind, [name, left, low, right, high]) => shape("rect", {class: kind, x: x(left), y: y(high), width: Math.max(2, x(right) - x(left)), height: Math.max(2, y(low) - y(high))}, name && shape("title", {}, name));
-  /** A room's name, in the corner where it hides the fewest things. */
+  /** A room's name, in the corner where it covers the fewest objects. */
   const label = ([name, left, low, right, high]) => {
     const wide = name.length * large * 0.6, spots = Object.values(things).map(([east_m, north_m]) => [x(east_m), y(north_m)]);
     const corners = [[x(left) + 8, y(high) + large + 6], [x(left) + 8, y(low) - 8], [x(right) - 8 - wide, y(high) + large + 6], [x(right) - 8 - wide, y(low) - 8]];
@@ -32,9 +32,9 @@ export function drawn(floor, {rooms, about = new Set(), things = {}, label: word
   const put = (mark, [east_m, north_m]) => { mark.setAttribute("cx", x(east_m)); mark.setAttribute("cy", y(north_m)); };
   return {
     picture,
-    /** What its marks mean. */
+    /** Legend of the marks. */
     key,
-    /** The plan up to that moment. */
+    /** Show the plan up to that moment. */
     show(moments, number) {
       const moment = moments[number];
       put(robot, moment.robot);

@@ -1,4 +1,4 @@
-// One task: what is asked, its objects, who said what, and the oracle's plan played on the plan view.
+// One task: instruction, objects, transcript, and the oracle's plan on the floor plan.
 import {ask, picture} from "./ask.js";
 import {at, h, put, splitWords, table} from "./dom.js";
 import {drawn} from "./plan.js";
@@ -15,24 +15,24 @@ export function close() {
 export async function open(place, task_id) {
   const told = await ask(`tasks/${encodeURIComponent(task_id)}`), {card} = told, about = new Set(told.objects.filter(row => row.goal).map(row => row.name));
   ({moments} = told);
-  view = drawn(told.floor, {rooms: told.rooms, about, things: told.things, label: `plan view of ${card.scene_id}`});
-  const facts = [["scene", card.scene_id], ["category", card.category.replaceAll("_", " ")], ["split", splitWords(card.split)], ["source", told.source], ["profile", told.profile], ["kind of goal", told.signature]];
-  const steps = moments.map((moment, i) => h("li", {}, h("button", {type: "button", class: "step", onclick: () => { close(); go(i); }}, moment.call || "the start")));
+  view = drawn(told.floor, {rooms: told.rooms, about, things: told.things, label: `floor plan of ${card.scene_id}`});
+  const facts = [["scene", card.scene_id], ["category", card.category.replaceAll("_", " ")], ["split", splitWords(card.split)], ["source", told.source], ["profile", told.profile], ["goal type", told.signature]];
+  const steps = moments.map((moment, i) => h("li", {}, h("button", {type: "button", class: "step", onclick: () => { close(); go(i); }}, moment.call || "start")));
   const button = (id, words, act) => h("button", {type: "button", id, onclick: act}, words);
   place.replaceChildren(
     h("section", {}, h("h2", {}, h("a", {href: "#tasks"}, "All tasks"), h("small", {}, card.task_id)), h("p", {class: "instruction"}, card.instruction),
       h("dl", {class: "facts"}, facts.filter(([, value]) => value).map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))))),
-    h("section", {class: "most"}, h("h2", {}, "The oracle's plan ", h("small", {}, "things are drawn where a call puts them, not at their verified poses")), view.picture, view.key,
+    h("section", {class: "most"}, h("h2", {}, "The oracle's plan ", h("small", {}, "moved objects are drawn at their targets, not at their verified poses")), view.picture, view.key,
       h("div", {class: "bar"}, button("first", "Start", () => { close(); go(0); }), button("back", "Back", () => { close(); go(number - 1); }), button("play", "Play", play), button("next", "Next", () => { close(); go(number + 1); }),
         h("span", {id: "said", role: "status"}))),
     h("section", {class: "third"}, h("h2", {}, "Steps ", h("small", {}, told.problem)), h("ol", {class: "calls", start: "0", onkeydown: key}, steps)),
     card.picture ? h("section", {class: "half"}, h("h2", {}, "Picture"), h("div", {id: "picture"})) : "",
     h("section", {class: card.picture ? "half" : ""}, h("h2", {}, "Goal"), h("pre", {class: "told", tabindex: "0"}, told.goal)),
-    h("section", {}, h("h2", {}, "Objects ", h("small", {}, "rows of the table that plans name; those of the goal in bold")), objects(told.objects)),
+    h("section", {}, h("h2", {}, "Objects ", h("small", {}, "object table of the plans; goal objects in bold")), objects(told.objects)),
     told.transcript ? h("section", {class: told.tree ? "half" : ""}, h("h2", {}, "Transcript"), transcript(told.transcript)) : "",
     told.tree ? h("section", {class: told.transcript ? "half" : ""}, h("h2", {}, "Layout tree"), tree(told.tree)) : "");
   go(0);
-  if (card.picture) put(at("picture"), h("img", {alt: `the scene ${card.scene_id} at an angle`, src: await picture(`scenes/${card.bundle_digest}/picture`)}));
+  if (card.picture) put(at("picture"), h("img", {alt: `rendered picture of ${card.scene_id}`, src: await picture(`scenes/${card.bundle_digest}/picture`)}));
 }
 
 function go(to) {
@@ -67,7 +67,7 @@ function objects(rows) {
     h("td", {class: "n fit"}, i), h("td", {}, row.name), h("td", {}, row.room), h("td", {}, row.where), h("td", {class: "wideonly"}, row.size_m.map(m => m.toFixed(2)).join(" × ")), h("td", {class: "n wideonly"}, row.mass_kg), h("td", {}, row.states))), "objects of the task", "loose");
 }
 
-/** Markdown as the social agents leave it: headings, lists, strong words; anything else stays text. */
+/** Markdown of the social agents: headings, lists, bold; everything else stays text. */
 function transcript(text) {
   const strong = line => line.split(/\*\*(.+?)\*\*/).map((part, i) => i % 2 ? h("strong", {}, part) : part);
   return h("div", {class: "talk"}, text.trim().split(/\n\s*\n/).filter(block => !block.startsWith("# ")).map(block => {

@@ -1,4 +1,4 @@
-// The dataset's tasks: a gallery with pictures of their scenes, and one of them.
+// Tasks of the dataset: a gallery with pictures of their scenes, and a page for each task.
 import {Refused, ask, picture} from "./ask.js";
 import {at, count, counted, h, none, put, splitWords} from "./dom.js";
 import {drawn} from "./plan.js";
@@ -11,19 +11,19 @@ let pictures = new Map(), watcher = null, typed = 0, total = 0;
 export function open(main) {
   const chosen = location.hash.split("?")[1];
   if (chosen) {
-    main.replaceChildren(h("section", {}, none("Reading the task…")));
+    main.replaceChildren(h("section", {}, none("Loading the task…")));
     task.open(main, decodeURIComponent(chosen)).catch(error => main.replaceChildren(h("section", {}, h("p", {}, h("a", {href: "#tasks"}, "All tasks")), refused(error))));
     return;
   }
   watcher = new IntersectionObserver(seen => seen.filter(one => one.isIntersecting).forEach(({target}) => { watcher.unobserve(target); look(target); }), {rootMargin: "200px"});
   main.replaceChildren(h("section", {}, h("h2", {}, "Scenes and tasks ", h("small", {id: "total"})),
     h("div", {class: "bar"},
-      h("input", {type: "search", placeholder: "words of an instruction", "aria-label": "search", value: wish.search, oninput: event => { clearTimeout(typed); typed = setTimeout(() => turn({search: event.target.value}), TYPING_MS); }}),
+      h("input", {type: "search", placeholder: "words of the instruction", "aria-label": "search", value: wish.search, oninput: event => { clearTimeout(typed); typed = setTimeout(() => turn({search: event.target.value}), TYPING_MS); }}),
       h("select", {id: "scene", "aria-label": "scene", onchange: event => turn({scene: event.target.value})}),
       h("select", {id: "category", "aria-label": "category", onchange: event => turn({category: event.target.value})}),
-      h("button", {id: "before", type: "button", onclick: () => turn({offset: Math.max(0, wish.offset - CARDS)})}, "Before"),
-      h("button", {id: "after", type: "button", onclick: () => turn({offset: wish.offset + CARDS})}, "After")),
-    h("div", {id: "cards", class: "cards"}, none("Reading the dataset…"))));
+      h("button", {id: "before", type: "button", onclick: () => turn({offset: Math.max(0, wish.offset - CARDS)})}, "Previous"),
+      h("button", {id: "after", type: "button", onclick: () => turn({offset: wish.offset + CARDS})}, "Next")),
+    h("div", {id: "cards", class: "cards"}, none("Loading the dataset…"))));
   turn({offset: wish.offset});
 }
 
@@ -34,7 +34,7 @@ export function close() {
   watcher = null;
 }
 
-/** Tasks are files: nothing of them comes with the snapshot. */
+/** Tasks are read from files and are not part of the snapshot. */
 export function show() {}
 
 async function turn(changes) {
@@ -53,9 +53,9 @@ function list(page) {
   at("total").textContent = total ? `${count(page.offset + 1)} to ${count(last)} of ${counted(total, "task")}, ${counted(page.scenes.length, "scene")}` : "";
   at("before").disabled = page.offset === 0;
   at("after").disabled = last >= total;
-  choices("scene", "every scene", page.scenes.map(one => [one.scene_id, `${one.scene_id} (${count(one.tasks)})`]));
-  choices("category", "every category", page.categories.map(name => [name, name.replaceAll("_", " ")]));
-  put(at("cards"), page.items.length ? page.items.map(card) : none(page.notice || "No task is like that."));
+  choices("scene", "all scenes", page.scenes.map(one => [one.scene_id, `${one.scene_id} (${count(one.tasks)})`]));
+  choices("category", "all categories", page.categories.map(name => [name, name.replaceAll("_", " ")]));
+  put(at("cards"), page.items.length ? page.items.map(card) : none(page.notice || "No task matches."));
   for (const place of at("cards").querySelectorAll(".thumb:empty")) watcher.observe(place);
 }
 
@@ -72,16 +72,16 @@ async function look(place) {
   const {digest, scene} = place.dataset;
   try {
     if (place.dataset.picture === "true") {
-      place.replaceChildren(h("img", {alt: `the scene ${scene}`, src: await once(`scenes/${digest}/picture`, picture)}));
+      place.replaceChildren(h("img", {alt: `picture of ${scene}`, src: await once(`scenes/${digest}/picture`, picture)}));
     } else {
-      place.replaceChildren(drawn(await once(`scenes/${digest}/floor`, ask), {label: `plan of ${scene}`}).picture);
+      place.replaceChildren(drawn(await once(`scenes/${digest}/floor`, ask), {label: `floor plan of ${scene}`}).picture);
     }
   } catch (error) {
     place.replaceChildren(refused(error));
   }
 }
 
-/** The same scene is asked for once, however many of its tasks are shown. */
+/** Each scene is requested once, however many of its tasks are shown. */
 function once(path, how) {
   if (pictures.size > 4 * CARDS) pictures = new Map();
   if (!pictures.has(path)) pictures.set(path, how(path).catch(error => { pictures.delete(path); throw error; }));

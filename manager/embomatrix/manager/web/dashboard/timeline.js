@@ -1,4 +1,4 @@
-// What each slot did: load, execute, deliver, idle; zoom to one rollout.
+// Timeline of slots: loading, executing, delivering, idle. Zooms down to one rollout.
 import {ask} from "./ask.js";
 import {at, colour, count, h, none, put, seconds, signed} from "./dom.js";
 import {named} from "./names.js";
@@ -17,7 +17,7 @@ export function open(main) {
     h("div", {class: "bar"},
       h("select", {id: "run", "aria-label": "run", onchange: event => { run = event.target.value; told = view = null; live = true; dispatchEvent(new Event("embomatrix-changed")); }}),
       h("input", {type: "search", placeholder: "worker", "aria-label": "search by worker", value: search, oninput: event => { clearTimeout(typed); typed = setTimeout(() => { search = event.target.value; follow(); }, TYPING_MS); }}),
-      h("select", {"aria-label": "how far back", onchange: event => { span = Number(event.target.value); live = true; view = null; dispatchEvent(new Event("embomatrix-changed")); }}, SPANS.map(s => h("option", {value: s, selected: s === span}, `last ${seconds(s)}`))),
+      h("select", {"aria-label": "time range", onchange: event => { span = Number(event.target.value); live = true; view = null; dispatchEvent(new Event("embomatrix-changed")); }}, SPANS.map(s => h("option", {value: s, selected: s === span}, `last ${seconds(s)}`))),
       h("button", {type: "button", onclick: () => zoom(0.5, live ? 1 : 0.5)}, "Zoom in"), h("button", {type: "button", onclick: () => zoom(2, live ? 1 : 0.5)}, "Zoom out"),
       h("button", {type: "button", onclick: () => pan(-0.25)}, "Earlier"), h("button", {type: "button", onclick: () => pan(0.25)}, "Later"),
       h("button", {type: "button", id: "live", onclick: follow}, "Follow")),
@@ -29,7 +29,7 @@ export async function show({runs}) {
   const known = runs.map(r => r.run_id);
   if (!run) run = (runs.findLast(r => r.pending || r.stats.delivered) ?? runs.at(-1))?.run_id ?? "";
   put(at("run"), (known.includes(run) || !run ? known : [run, ...known]).map(id => h("option", {value: id, selected: id === run}, runs.find(r => r.run_id === id)?.name || id)));
-  if (!run) { put(at("tracks"), none("No open run. A closed one: embomatrix cluster report RUN")); return; }
+  if (!run) { put(at("tracks"), none("No open run. For a closed run: embomatrix cluster report RUN")); return; }
   if (!live && told) { draw(); return; } // the window or the theme may be another by now
   told = await ask(`runs/${encodeURIComponent(run)}/timeline?${new URLSearchParams({seconds: span, search})}`);
   if (live) {
@@ -42,9 +42,9 @@ export async function show({runs}) {
 function draw() {
   const place = at("tracks");
   if (!place || !told) return;
-  if (!told.tracks.length) { put(place, none(search ? "No worker of that name executed anything in this time." : "Nothing was executed in this time.")); at("one").textContent = ""; return; }
-  if (!at("one").textContent) at("one").textContent = matchMedia("(pointer: coarse)").matches ? "Tap a span to see what it was; drag to go along." :
-    "Point at a span. Zoom by Ctrl and the wheel, by a double click on a rollout, or by plus and minus; drag, or press the arrows, to go along; Escape follows the latest again.";
+  if (!told.tracks.length) { put(place, none(search ? "No matching worker executed a rollout in this time." : "No rollout was executed in this time.")); at("one").textContent = ""; return; }
+  if (!at("one").textContent) at("one").textContent = matchMedia("(pointer: coarse)").matches ? "Tap a span for details; drag to move along the time axis." :
+    "Point at a span for details. Zoom with Ctrl and the wheel, with a double click on a rollout, or with plus and minus. Drag or press the arrow keys to move; Escape follows the latest again.";
   let canvas = place.querySelector("canvas");
   if (!canvas) {
     canvas = h("canvas", {class: "gantt", tabindex: "0", role: "img", onwheel: wheel, onpointermove: point, onpointerdown: grab, onpointerup: release, onpointercancel: release, ondblclick: nearer, onkeydown: key});
@@ -75,14 +75,14 @@ function draw() {
     pen.fillStyle = tint.soft; pen.fillText(`${short(pen, track.worker_id, edge - 28)} ${track.slot}`, 0, top + ROW / 2 + 4, edge - 8);
   });
   const more = told.slots > told.tracks.length ? `; the first ${count(told.tracks.length)} of ${count(told.slots)} slots` : "";
-  at("range").textContent = `${seconds(view.until - view.from)} shown${more}${told.dropped ? `; ${told.dropped} older events were dropped` : ""}`;
+  at("range").textContent = `${seconds(view.until - view.from)} shown${more}${told.dropped ? `; ${told.dropped} older events were discarded` : ""}`;
 }
 
 function bar(pen, x, begin, end, top, fill, always) {
   const left = Math.max(edge, x(begin)), wide = x(end) - left;
   if (wide <= 0 && !always) return;
   pen.fillStyle = fill;
-  // A hair's breadth between neighbours, where there is room for it.
+  // A thin gap between neighbours, if there is room.
   pen.fillRect(left, top + 3, Math.max(LEAST_PX, wide > 3 ? wide - 0.5 : wide), ROW - 6);
 }
 
@@ -98,14 +98,14 @@ function scale(pen, tint, x, wide, high) {
   }
 }
 
-/** Back to the latest, and on with it. */
+/** Follow the latest events again. */
 function follow() {
   live = true;
   view = null;
   dispatchEvent(new Event("embomatrix-changed"));
 }
 
-/** A worker's name as far as there is room for it: both its ends, which tell it from others. */
+/** Shorten a worker's name in the middle to the available width. */
 function short(pen, name, room) {
   if (pen.measureText(name).width <= room) return name;
   let kept = Math.floor(name.length / 2);
@@ -113,7 +113,7 @@ function short(pen, name, room) {
   return `${name.slice(0, kept)}…${name.slice(-kept)}`;
 }
 
-/** Show this part of what was asked for; before and after it nothing is known. */
+/** Show this interval, limited to the loaded data. */
 function look(from, until) {
   const long = Math.min(span, Math.max(LEAST_VIEW_S, until - from)), begin = Math.max(told.until_s - span, Math.min(from, told.until_s - long));
   live = false;
@@ -170,7 +170,7 @@ function release() {
   grabbed = null;
 }
 
-/** One rollout, and as much again on both sides of it. */
+/** Zoom to one rollout, with the same duration on both sides. */
 function nearer(event) {
   const found = hit(event);
   if (!found) return;
@@ -179,6 +179,6 @@ function nearer(event) {
 }
 
 function describe({one, track}) {
-  const long = seconds(one.end_s - one.begin_s), load = one.load_s ? `, loading ${seconds(one.load_s)}` : "";
-  return `${one.rollout_id} on ${track.worker_id} slot ${track.slot}: ${one.outcome}, executing ${long}${load}, scene ${named(one.bundle_digest)}, attempt ${one.attempt || 1}`;
+  const long = seconds(one.end_s - one.begin_s), load = one.load_s ? `, loaded for ${seconds(one.load_s)}` : "";
+  return `${one.rollout_id} on ${track.worker_id} slot ${track.slot}: ${one.outcome}, executed for ${long}${load}, scene ${named(one.bundle_digest)}, attempt ${one.attempt || 1}`;
 }

@@ -1,17 +1,17 @@
-// How a policy learns: reward by tier, success, what carries no signal, where the time goes, and plans with what became of them.
+// Training: reward by tier, success, zero-variance groups, time, and sampled plans with their results.
 import {ask} from "./ask.js";
 import {chart} from "./charts.js";
 import {at, clock, count, h, none, put, seconds, share, signed, table} from "./dom.js";
 
 const CHARTS = [
-  ["tiers", "Reward by tier", "mean of a step", {reward: "all", reward_goal: "goal", reward_relevance: "relevance", reward_format: "form"}],
+  ["tiers", "Reward by tier", "mean per step", {reward: "all", reward_goal: "goal", reward_relevance: "relevance", reward_format: "format"}],
   ["success", "Success", "share of rollouts", {success: "all"}, "success_by_category/"],
-  ["dead", "Groups and plans", "shares", {zero_variance_groups: "zero-variance groups", well_formed: "well formed", clipped: "clipped tokens"}],
-  ["spread", "Entropy and distance", "nats of a token", {entropy: "entropy", kl: "from the reference", kl_to_old: "from the sampler"}],
-  ["plans", "Plan length", "executed steps", {plan_steps: "steps of a plan"}],
-  ["loss", "Imitation", "loss of a token", {loss: "loss", validation: "of tasks set aside"}],
+  ["groups", "Groups and plans", "shares", {zero_variance_groups: "zero-variance groups", well_formed: "well formed", clipped: "clipped tokens"}],
+  ["spread", "Entropy and distance", "nats per token", {entropy: "entropy", kl: "KL to the reference", kl_to_old: "KL to the sampling policy"}],
+  ["plans", "Plan length", "executed steps", {plan_steps: "steps per plan"}],
+  ["loss", "Imitation", "loss per token", {loss: "loss", validation: "validation loss"}],
 ];
-const TILES = [["step", "Step"], ["reward", "Reward"], ["solved", "Success"], ["deadnow", "Dead groups"], ["entropy", "Entropy"], ["long", "Plan length"]];
+const TILES = [["step", "Step"], ["reward", "Reward"], ["solved", "Success"], ["flat", "Zero-variance groups"], ["entropy", "Entropy"], ["long", "Plan length"]];
 const LATEST = 10;
 let run = "", seen = "", drawn = {}, told = null;
 
@@ -24,7 +24,7 @@ export function open(main) {
     h("div", {id: "nothing", class: "wide"}),
     ...TILES.map(([id, title]) => h("section", {class: "tile", hidden: true}, h("h2", {}, title), h("b", {id}, "–"), h("span", {id: `${id}note`}, ""))),
     ...CHARTS.map(([id, title, note]) => h("section", {class: "half", hidden: true}, h("h2", {}, `${title} `, h("small", {}, note)), h("div", {id, role: "img", "aria-label": `${title}, ${note}`}))),
-    h("section", {class: "half", hidden: true}, h("h2", {}, "Where the time went"), h("div", {id: "spent"})),
+    h("section", {class: "half", hidden: true}, h("h2", {}, "Time by activity"), h("div", {id: "spent"})),
     h("section", {class: "half", hidden: true}, h("h2", {}, "Success on held-out tasks"), h("div", {id: "heldout"})),
     h("section", {hidden: true}, h("h2", {}, "Plans of one task ", h("small", {id: "which"})), h("div", {id: "sampled"})));
 }
@@ -36,13 +36,13 @@ export function close() {
 
 export async function show({training}) {
   if (!training.some(one => one.run_id === run)) run = training[0]?.run_id ?? "";
-  if (!run && told) {  // another manager leads, to whom nobody reported yet
+  if (!run && told) {  // another manager leads, and no trainer has reported to it yet
     close();
     open(at("main"));
   }
   put(at("run"), training.map(one => h("option", {value: one.run_id, selected: one.run_id === run}, one.name || one.run_id)));
   at("run").hidden = !run;
-  put(at("nothing"), run ? [] : h("section", {}, none("No trainer has reported yet. Train one: embomatrix train, with --manager where it is not on this machine.")));
+  put(at("nothing"), run ? [] : h("section", {}, none("No trainer has reported yet. Start one with embomatrix train, and --manager if the manager is on another machine.")));
   const view = training.find(one => one.run_id === run);
   if (!view || seen === `${run} ${view.revision}`) return;
   const fresh = await ask(`training/${encodeURIComponent(run)}`);
@@ -57,7 +57,7 @@ function draw({run: view, phases, plans, plans_step}) {
   for (const section of at("main").querySelectorAll("section[hidden]")) section.hidden = false;
   const named = Object.fromEntries(phases.map(phase => [phase.phase, phase]));
   const grpo = named.grpo ?? {steps: [], figures: {}};
-  at("when").textContent = `${view.phase.replace("grpo", "GRPO")}, step ${count(view.step)}, told at ${clock(view.reported_s)}`;
+  at("when").textContent = `${view.phase.replace("grpo", "GRPO")}, step ${count(view.step)}, reported at ${clock(view.reported_s)}`;
   tiles(grpo);
   for (const [id, , , names, prefix] of CHARTS) {
     const phase = id === "loss" ? named.imitation : grpo;
@@ -65,7 +65,7 @@ function draw({run: view, phases, plans, plans_step}) {
   }
   spent(grpo.figures);
   heldout(named);
-  at("which").textContent = plans.length ? `that differ most in step ${count(plans_step)}: ${plans[0].instruction}` : "";
+  at("which").textContent = plans.length ? `with the largest reward differences in step ${count(plans_step)}: ${plans[0].instruction}` : "";
   put(at("sampled"), plans.length ? plans.map(plan) : none("No plans yet."));
 }
 
@@ -76,13 +76,13 @@ function tiles({steps, figures}) {
   };
   const fixed = (name, digits) => mean(name) === null ? "–" : mean(name).toFixed(digits);
   const part = name => mean(name) === null ? "–" : share(mean(name), 1);
-  const told = {step: steps.length ? count(steps.at(-1)) : "–", reward: fixed("reward", 2), solved: part("success"), deadnow: part("zero_variance_groups"), entropy: fixed("entropy", 3), long: fixed("plan_steps", 1)};
+  const told = {step: steps.length ? count(steps.at(-1)) : "–", reward: fixed("reward", 2), solved: part("success"), flat: part("zero_variance_groups"), entropy: fixed("entropy", 3), long: fixed("plan_steps", 1)};
   for (const [id, text] of Object.entries(told)) at(id).textContent = text;
   for (const [id] of TILES.slice(1)) at(`${id}note`).textContent = `mean of ${Math.min(LATEST, steps.length)} steps`;
   at("stepnote").textContent = mean("seconds") === null ? "" : `${seconds(mean("seconds"))} each`;
 }
 
-/** The chart is made anew when a line joins; else it only gets new points. */
+/** Rebuild the chart when a line is added; otherwise add points. */
 function lines(id, {steps, figures}, names, prefix = null) {
   const more = prefix ? Object.keys(figures).filter(name => name.startsWith(prefix)).sort() : [];
   const found = [...Object.keys(names).filter(name => name in figures), ...more];
@@ -102,7 +102,7 @@ function spent(figures) {
   const all = latest.reduce((sum, [, s]) => sum + s, 0);
   const rows = latest.map(([name, s]) => h("tr", {}, h("td", {class: "fit"}, name), h("td", {}, h("span", {class: "share", style: `width:${(100 * s / (all || 1)).toFixed(1)}%`})),
     h("td", {class: "n fit"}, share(s, all)), h("td", {class: "n fit"}, seconds(s))));
-  put(at("spent"), rows.length ? table(["activity", "", ["share", "n"], ["time", "n"]], rows, "time by activity") : none("Not told yet."));
+  put(at("spent"), rows.length ? table(["activity", "", ["share", "n"], ["time", "n"]], rows, "time by activity") : none("No data yet."));
 }
 
 function heldout(named) {
@@ -110,14 +110,14 @@ function heldout(named) {
   const groups = [...new Set(told.flatMap(figures => Object.keys(figures ?? {})))].sort((a, b) => (b === "all") - (a === "all") || a.localeCompare(b));
   const cell = (figures, group) => figures?.[group]?.at(-1) === undefined ? "–" : share(figures[group].at(-1), 1);
   const rows = groups.map(group => h("tr", {}, h("td", {}, group === "all" ? "all tasks" : group.replaceAll("_", " ")), told.map(figures => h("td", {class: "n"}, cell(figures, group)))));
-  put(at("heldout"), rows.length ? table(["tasks", ...times.map(when => [when, "n"])], rows, "held-out success") : none("Not evaluated: that is done before the first step and after the last, where the dataset holds tasks out."));
+  put(at("heldout"), rows.length ? table(["tasks", ...times.map(when => [when, "n"])], rows, "held-out success") : none("Not evaluated. Datasets with held-out tasks are evaluated before the first and after the last step."));
 }
 
 const points = number => signed(number.toFixed(2));
 
 function plan({text, reward, advantage, problem, steps, task_id}) {
   const verdict = reward ? [h("b", {class: reward.success ? "reached" : ""}, reward.success ? "reached the goal" : "did not reach the goal"),
-    ` · reward ${points(reward.format + reward.relevance + reward.goal)} (form ${points(reward.format)}, relevance ${points(reward.relevance)}, goal ${points(reward.goal)}) · advantage ${points(advantage)}`] : h("b", {class: "bad"}, "lost, not judged");
+    ` · reward ${points(reward.format + reward.relevance + reward.goal)} (format ${points(reward.format)}, relevance ${points(reward.relevance)}, goal ${points(reward.goal)}) · advantage ${points(advantage)}`] : h("b", {class: "bad"}, "infrastructure failure, no reward");
   return h("div", {class: "plan"}, h("p", {}, verdict, h("span", {class: "muted"}, ` · ${task_id}`)), problem && h("p", {class: "bad message"}, problem), h("pre", {tabindex: "0"}, text || "(nothing)"),
     steps.length > 0 && h("ol", {class: "steps"}, steps.map(step => h("li", {}, h("code", {class: step.ok ? "reached" : "bad"}, step.skill), ` ${step.message || (step.ok ? "done" : "failed")}`))));
 }

@@ -1,4 +1,4 @@
-// Every worker: what it holds, what it does, and why it doesn't; drain and resume for who may.
+// Workers: scenes, slots, state, and the commands drain and resume.
 import {Refused, change} from "./ask.js";
 import {at, count, gauge, h, none, put, seconds, table} from "./dom.js";
 import {named, worded} from "./names.js";
@@ -9,18 +9,18 @@ const GONE = ["lost", "left"];
 const wish = {state: "", search: "", offset: 0, limit: ROWS};
 
 export const query = () => wish;
-/** Whether the viewer chose some of them, before. */
+/** True if a filter or a later page is selected. */
 export const asksMore = () => Boolean(wish.state || wish.search || wish.offset);
 
 export function open(main) {
-  const options = STATES.map(state => h("option", {value: state, selected: state === wish.state}, state || "every state"));
+  const options = STATES.map(state => h("option", {value: state, selected: state === wish.state}, state || "all states"));
   main.replaceChildren(h("section", {},
     h("h2", {}, "Workers ", h("small", {id: "total"})),
     h("div", {class: "bar"},
       h("input", {type: "search", placeholder: "name or label", "aria-label": "search by name or label", value: wish.search, oninput: event => ask({search: event.target.value})}),
       h("select", {"aria-label": "state", onchange: event => ask({state: event.target.value})}, options),
-      h("button", {id: "before", type: "button", onclick: () => ask({offset: Math.max(0, wish.offset - ROWS)})}, "Before"),
-      h("button", {id: "after", type: "button", onclick: () => ask({offset: wish.offset + ROWS})}, "After"),
+      h("button", {id: "before", type: "button", onclick: () => ask({offset: Math.max(0, wish.offset - ROWS)})}, "Previous"),
+      h("button", {id: "after", type: "button", onclick: () => ask({offset: wish.offset + ROWS})}, "Next"),
       h("button", {id: "dispatch", type: "button"}, "Pause dispatch"),
       h("span", {id: "told", class: "bad", role: "alert"})),
     h("div", {id: "workers"})));
@@ -33,8 +33,8 @@ export function show({workers, paused}) {
   at("after").disabled = last >= workers.total;
   at("dispatch").textContent = paused ? "Resume dispatch" : "Pause dispatch";
   at("dispatch").onclick = () => steer(`dispatch/${paused ? "resume" : "pause"}`);
-  const headings = ["worker", "state", "slots", "scenes", ["scene memory", "wideonly"], ["completed", "n"], ["cores", "n wideonly"], ["heard", "n wideonly"], ""];
-  const nobody = wish.state || wish.search ? "No worker is like that." : "No workers yet. Lend a machine: embomatrix worker run";
+  const headings = ["worker", "state", "slots", "scenes", ["scene memory", "wideonly"], ["completed", "n"], ["cores", "n wideonly"], ["last heard", "n wideonly"], ""];
+  const nobody = wish.state || wish.search ? "No worker matches." : "No workers yet. Start one with: embomatrix worker run";
   put(at("workers"), workers.items.length ? table(headings, workers.items.map(row), "workers", "loose") : none(nobody));
   for (const button of at("workers").querySelectorAll("button")) button.onclick = () => steer(button.dataset.path);
 }
@@ -62,7 +62,7 @@ function slots(w) {
 function scenes(w) {
   const states = {};
   for (const r of w.residents) states[r.state] = (states[r.state] || 0) + 1;
-  if (w.loads.length) states["on the way"] = w.loads.length;
+  if (w.loads.length) states["requested"] = w.loads.length;
   const chips = [
     ...w.residents.map(r => h("span", {class: `chip ${r.state}`, title: r.error ? `${r.bundle_digest}: ${r.error}` : `${r.bundle_digest}, loaded in ${seconds(r.load_s)}`}, `${named(r.bundle_digest)}${r.load_s ? ` ${seconds(r.load_s)}` : ""}`)),
     ...w.loads.map(digest => h("span", {class: "chip", title: digest}, named(digest))),

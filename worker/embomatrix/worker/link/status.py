@@ -1,0 +1,173 @@
+"""Status file of a daemon, beside its credentials. `embomatrix worker status` reads it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import os
+import time
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any, Final
+
+import psutil
+
+from embomatrix.rpc.wire.values import Completed
+from embomatrix.world.whole_file import write_whole
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from embomatrix.rpc.wire.leases import LeaseResult
+    from embomatrix.rpc.wire.values import Resources
+    from embomatrix.worker.host.settings import WorkerSettings
+    from embomatrix.worker.link.cache import BundleCache
+    from embomatrix.worker.link.membership import Membership
+    from embomatrix.worker.link.outbox import ResultOutbox
+    from embomatrix.worker.slots.pool import SlotPool
+
+logger = logging.getLogger(__name__)
+
+STATUS_S: Final = 1.0
+"""Interval between two updates."""
+FOLDER: Final = "running"
+"""Subfolder of the credentials' folder."""
+CLOCK_STEP_S: Final = 60.0
+"""A process that began this much later than the file says is another one with the same process id."""
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerStatus:
+    """Status of one daemon. Times are wall clock; ``connected_since_s`` is 0 without a connection."""
+
+    name: str
+    pid: int
+    started_s: float
+    manager: str = ""
+    connected_since_s: float = 0.0
+    paused: str = ""
+    draining: bool = False
+    slots: int = 0
+    running: int = 0
+    waiting: int = 0
+    completed: int = 0
+    failed: int = 0
+    unacknowledged: int = 0
+    scenes: int = 0
+    memory_used_mb: float = 0.0
+    memory_mb: float = 0.0
+    cache_used_mb: float = 0.0
+    cache_mb: float = 0.0
+
+
+class StatusFile:
+    """Status file of one daemon. Errors of the disk are logged and otherwise ignored."""
+
+    def __init__(self, state_dir: Path, name: str) -> None:
+        self._path = state_dir.expanduser() / FOLDER / f"{name}.json"
+        self._last: WorkerStatus | None = None
+
+    def write(self, status: WorkerStatus) -> None:
+        """Write the status if it has changed."""
+        if status != self._last:
+            with self._errors_logged():
+                self._path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+                write_whole(self._path, json.dumps(asdict(status)).encode("utf-8"))
+                self._last = status
+
+    def remove(self) -> None:
+        """Remove the file after the daemon has left."""
+        with self._errors_logged():
+            self._path.unlink(missing_ok=True)
+
+    @contextlib.contextmanager
+    def _errors_logged(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            logger.debug("status file not updated path=%s: %s", self._path, error)
+
+
+class StatusReport:
+    """Keeps the file of a daemon up to date: some values are read from its parts, others are reported by it."""
+
+    def __init__(
+        self,
+        membership: Membership,
+        settings: WorkerSettings,
+        resources: Resources,
+        pool: SlotPool,
+        cache: BundleCache,
+        outbox: ResultOutbox,
+    ) -> None:
+        self._file = StatusFile(settings.state_dir, membership.name)
+        self._status = WorkerStatus(
+            membership.name,
+            os.getpid(),
+            time.time(),
+            membership.manager,
+            slots=resources.slots,
+            memory_mb=resources.memory_mb,
+            cache_mb=settings.cache_mb,
+        )
+        self._pool = pool
+        self._cache = cache
+        self._outbox = outbox
+
+    async def run(self) -> None:
+        """Write the file until cancelled; then remove it."""
+        try:
+            while True:
+                self._file.write(self._current(await asyncio.to_thread(self._cache.used_mb)))
+                await asyncio.sleep(STATUS_S)
+        finally:
+            self._file.remove()
+
+    def update(self, **changes: Any) -> None:
+        """Set fields of the status."""
+        self._status = replace(self._status, **changes)
+
+    def count(self, result: LeaseResult) -> None:
+        """Count a result as completed or failed."""
+        field = "completed" if isinstance(result.outcome, Completed) else "failed"
+        self.update(**{field: getattr(self._status, field) + 1})
+
+    def _current(self, cache_used_mb: float) -> WorkerStatus:
+        running = len(self._pool.progress())
+        return replace(
+            self._status,
+            running=running,
+            waiting=len(self._pool.held()) - running,
+            unacknowledged=len(self._outbox),
+            scenes=len(self._pool.residents()),
+            memory_used_mb=round(self._pool.memory_used_mb),
+            cache_used_mb=cache_used_mb,
+        )
+
+
+def running_daemons(state_dir: Path) -> list[WorkerStatus]:
+    """Running daemons of this folder by name; files of killed daemons are ignored."""
+    found = []
+    for path in sorted((state_dir.expanduser() / FOLDER).glob("*.json")):
+        try:
+            status = WorkerStatus(**json.loads(path.read_text(encoding="utf-8")))
+        except (OSError, ValueError, TypeError):
+            continue  # being removed, or of another version
+        if _runs(status):
+            found.append(status)
+    return found
+
+
+def daemon_pids(state_dir: Path) -> set[int]:
+    """Process ids of all daemons of this folder, and of this process."""
+    return {os.getpid(), *(status.pid for status in running_daemons(state_dir))}
+
+
+def _runs(status: WorkerStatus) -> bool:
+    try:
+        began_s: float = psutil.Process(status.pid).create_time()
+    except psutil.Error:
+        return False
+    return began_s < status.started_s + CLOCK_STEP_S
