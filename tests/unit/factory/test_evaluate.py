@@ -259,7 +259,7 @@ def test_ledger_gives_the_admitted_share(tmp_path):
 
 def a_build(folder, writer, times):
     """Write a build of two variants with three admitted tasks and one refused task, and its file of times."""
-    settings = {"settings": {"writer": writer, "look_ahead": True}}
+    settings = {"settings": {"writer": writer, "look_ahead": True, "physical": False}}
     drafts = [(0, "admitted"), (0, "admitted"), (0, "no_plan"), (1, "admitted")]
     lines = [
         {"split": "train", "variant": number, "scene": "Rs_int-train-000", "outcome": outcome}
@@ -300,7 +300,7 @@ def test_folder_that_is_no_build_is_reported_in_a_sentence(tmp_path):
     assert "has no ledger of drafts" in answer.output
     a_build(tmp_path, "social", [])
     (tmp_path / "build.jsonl").write_text("{}\n")
-    with pytest.raises(EvaluationError, match="does not tell the settings"):
+    with pytest.raises(EvaluationError, match="does not hold the settings"):
         evaluate_admissions(tmp_path)
 
 

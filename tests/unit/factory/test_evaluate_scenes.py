@@ -160,7 +160,7 @@ def test_truncated_last_line_is_repeated(tmp_path: "Path") -> None:
     ("content", "message"),
     [
         ('{"seed": 1}\n', "of seed 1, not of seed 0: name another file"),
-        ("", "no file of outcomes"),
+        ("", "not a log of outcomes"),
         ('{"seed": 0}\n{"task": 3}\n{}\n', "line 2, is no outcome"),
     ],
 )

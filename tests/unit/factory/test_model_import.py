@@ -166,7 +166,7 @@ def test_glb_is_read_with_the_poses_of_its_nodes(tmp_path: Path) -> None:
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0", "holds no face"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 inf 0\nf 1 2 3", "not a finite number"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3", "expected a solid, not a sheet"),
-        ("a.glb", b"glTF but not really", "no glb that can be read"),
+        ("a.glb", b"glTF but not really", "be read as glb"),
         ("a.blend", b"BLENDER", "ends in '.blend': expected one of .glb, .obj, .stl, .urdf"),
     ],
 )
@@ -270,7 +270,7 @@ def test_command_reports_a_mug_that_is_too_narrow(tmp_path: Path) -> None:
     assert "fillable: its largest cavity is 0.0" in done.output
 
 
-@pytest.mark.parametrize(("model", "words"), [("bamfsz", " Rs_int,"), ("songes", "in no base scene")])
+@pytest.mark.parametrize(("model", "words"), [("bamfsz", " Rs_int,"), ("songes", "no base scene uses it")])
 def test_command_names_the_scenes_that_use_the_model(tmp_path: Path, model: str, words: str) -> None:
     path = tmp_path / "cupboard.obj"
     path.write_text(obj_text(CUPBOARD))

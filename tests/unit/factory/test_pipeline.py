@@ -322,7 +322,7 @@ def test_invalid_bddl_exits_with_2_and_one_sentence(tmp_path: Path, old: str, ne
             "say which, as --agent room-organizer=llm",
         ),
         (["build", "--out", "OUT/a", "--agent", "object-sampler=llm"], "no form with a language model"),
-        (["build", "--out", "OUT/a", "--agent", "room-organizer=llm"], "give --llm URL and --model NAME"),
+        (["build", "--out", "OUT/a", "--agent", "room-organizer=llm"], "add --llm URL and --model NAME"),
     ],
 )
 def test_unknown_names_exit_with_2_and_one_sentence(

@@ -60,9 +60,9 @@ def test_file_is_checked_once_with_its_own_seed(flat: Scene, path: Path) -> None
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        (b"", "is no JSON"),
-        (b"\x00\xff\xfe", "is no JSON"),
-        (b"[" * 100_000, "is no JSON"),
+        (b"", "is not JSON"),
+        (b"\x00\xff\xfe", "is not JSON"),
+        (b"[" * 100_000, "is not JSON"),
         (b"[]", "scene"),
         (b'{"objects": []}', "scene"),
     ],
