@@ -122,4 +122,4 @@ def test_judging_layouts_without_a_model_is_an_error(tmp_path) -> None:
     ):
         answer = CliRunner().invoke(app, command)
         assert answer.exit_code == 2
-        assert "add --llm URL and --model NAME" in " ".join(answer.output.split())
+        assert "--llm URL and --model NAME" in " ".join(answer.output.split())

@@ -161,7 +161,7 @@ def test_truncated_last_line_is_repeated(tmp_path: "Path") -> None:
     [
         ('{"seed": 1}\n', "of seed 1, not of seed 0: name another file"),
         ("", "not a log of outcomes"),
-        ('{"seed": 0}\n{"task": 3}\n{}\n', "line 2, is no outcome"),
+        ('{"seed": 0}\n{"task": 3}\n{}\n', ":2 is not an outcome"),
     ],
 )
 def test_outcomes_of_another_seed_are_rejected(tmp_path: "Path", content: str, message: str) -> None:
