@@ -9,7 +9,7 @@ from tests.fakes.datasets import write_kitchen_dataset
 from typer.testing import CliRunner
 
 from embomatrix.factory.commands.app import app
-from embomatrix.factory.verification import Judgement, compared, evaluation_of, objections, sampled
+from embomatrix.factory.evaluate.verification import Judgement, compared, evaluation_of, objections, sampled
 from embomatrix.world.dataset import Dataset, write_dataset
 
 if TYPE_CHECKING:

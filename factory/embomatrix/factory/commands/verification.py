@@ -10,7 +10,7 @@ from rich.console import Console
 
 from embomatrix.factory.commands.options import Jobs, processes
 from embomatrix.factory.commands.terminal import fail, progress, report_evaluation, user_errors
-from embomatrix.factory.verification import evaluation_of, objections, sampled, verify_again
+from embomatrix.factory.evaluate.verification import evaluation_of, objections, sampled, verify_again
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.whole_file import check_writable
 
