@@ -74,7 +74,7 @@ def checkpoint(kitchen, tmp_path_factory):
         ("eval", "--baseline=oracle", "--bench=DATASET", "--out=OUT"),
         ("worker", "run", "--once", "--cache-dir=OUT"),
         ("worker", "doctor"),
-        ("manager", "status"),
+        ("status",),
     ],
     ids=lambda arguments: " ".join(arguments[:2]),
 )
@@ -95,8 +95,8 @@ def _placed(item, places):
     [
         (("train", "--dataset=DATASET", "--out=OUT"), "wrong"),
         (("worker", "run", "--cache-dir=OUT"), "wrong"),
-        (("manager", "status"), "wrong"),
-        (("manager", "status"), ""),
+        (("status",), "wrong"),
+        (("status",), ""),
     ],
     ids=str,
 )
@@ -120,7 +120,7 @@ def test_port_in_use_is_named_and_whoever_uses_it_is_left_alone(tmp_path, option
         remedy = f"stop the program that uses it, or pass another --{option}port"
         assert_told(told, 2, f"{taken} can't be bound (Address already in use): {remedy}")
         assert "add_port.cc" not in told.text
-        assert_told(run("manager", "status", f"--manager={address}"), 0, "no open runs")
+        assert_told(run("status", f"--manager={address}"), 0, "No worker has joined yet")
         assert first.process.poll() is None, first.text
 
 
@@ -195,7 +195,7 @@ def test_training_tells_how_it_was_interrupted_and_what_could_not_be_written(kit
         with background(tmp_path / "late.log", *common, *short, f"--out={tmp_path / 'late'}") as run_:
             run_.wait_for((tmp_path / "late" / "metrics.jsonl").exists)
             assert_told(
-                run_.interrupt(), 130, f"interrupted: go on with `--resume --out={tmp_path / 'late'}`"
+                run_.interrupt(), 130, f"interrupted: continue with `--resume --out={tmp_path / 'late'}`"
             )
         newest = max((tmp_path / "late" / "checkpoints").iterdir())
         assert newest.name.startswith("step-")
@@ -213,7 +213,7 @@ def test_interrupted_demo_ends_what_it_started(kitchen, tmp_path):
         demo.wait_for((out / "metrics.jsonl").exists)
         address = re.search(r"manager at (\S+),", demo.text)[1]
         told = demo.interrupt()
-    assert_told(told, 130, "interrupted: go on with `--resume --out=")
+    assert_told(told, 130, "interrupted: continue with `--resume --out=")
     assert list((out / "checkpoints").glob("step-*"))
     with socket.socket() as probe:
         host, _, port = address.rpartition(":")
