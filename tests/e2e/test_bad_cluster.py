@@ -120,7 +120,7 @@ def test_port_in_use_is_named_and_whoever_uses_it_is_left_alone(tmp_path, option
         remedy = f"stop the program that uses it, or pass another --{option}port"
         assert_told(told, 2, f"{taken} can't be bound (Address already in use): {remedy}")
         assert "add_port.cc" not in told.text
-        assert_told(run("status", f"--manager={address}"), 0, "No worker has joined yet")
+        assert_told(run("cluster", "runs", f"--manager={address}"), 0, "no open runs")
         assert first.process.poll() is None, first.text
 
 

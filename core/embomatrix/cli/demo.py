@@ -14,8 +14,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from embomatrix.cli.failure import fail
-from embomatrix.cli.foreground import cluster_problem, no_problem, run_command
-from embomatrix.cli.local_cluster import LocalCluster, local_cluster
+from embomatrix.cli.local_cluster import LocalCluster, cluster_problem, local_cluster, no_problem, run_command
 
 DEFAULT_OUT: Final = Path("runs/demo")
 TASKS: Final = 960

@@ -24,7 +24,7 @@ from embomatrix.bench.experiments.design import (
 )
 from embomatrix.bench.experiments.findings import Run, curve, figures_of, findings_of
 from embomatrix.bench.experiments.section import add_section, learning_section
-from embomatrix.cli.foreground import no_problem
+from embomatrix.cli.local_cluster import no_problem
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import read_settings
 from embomatrix.trainer.logging.outcome import RunOutcome, TaskRate, read_outcome, write_outcome

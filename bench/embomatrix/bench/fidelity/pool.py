@@ -13,8 +13,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.sim.fidelity.compare import FidelityTrial, compare
-from embomatrix.sim.fidelity.records import comparison_to_json, trial_to_json
+from embomatrix.sim.fidelity.compare import FidelityTrial, compare, comparison_to_json, trial_to_json
 from embomatrix.world.dataset import Dataset
 
 if TYPE_CHECKING:

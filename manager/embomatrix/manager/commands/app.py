@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from embomatrix.rpc.wire.tokens import AccessRole, TokenInfo
 
 app = typer.Typer(
-    help="Serve a manager, prepare its access folder, and manage tokens.",
+    help="Serve a manager, create its certificates, and manage its tokens.",
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -108,7 +108,10 @@ def serve(
     tls_ca: TlsCa = None,
     insecure_bind: InsecureBind = False,
     audit: Audit = None,
-    log_level: Annotated[str, typer.Option(help="debug, info, warning or error.")] = "info",
+    log_level: Annotated[
+        str,
+        typer.Option(help="debug, info, warning or error; debug also checks invariants."),
+    ] = "info",
     log_format: LogLines = LogFormat.HUMAN,
 ) -> None:
     """Serve until interrupted."""

@@ -238,6 +238,7 @@ async def _start_runtime(
         boot_id=secrets.token_hex(4),
         first_epoch=first_epoch,
         audit_key=secrets.token_bytes(32),
+        debug=logging.getLogger("embomatrix").isEnabledFor(logging.DEBUG),
     )
     archive = RunArchive(settings.data_dir / "runs")
     runtime = ManagerRuntime(

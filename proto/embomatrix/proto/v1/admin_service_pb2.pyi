@@ -665,6 +665,80 @@ class ReadEventsResponse(google.protobuf.message.Message):
 Global___ReadEventsResponse: typing_extensions.TypeAlias = ReadEventsResponse
 
 @typing.final
+class ExplainRolloutRequest(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    ROLLOUT_ID_FIELD_NUMBER: builtins.int
+    rollout_id: builtins.str
+    def __init__(
+        self,
+        *,
+        rollout_id: builtins.str = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["rollout_id", b"rollout_id"]) -> None: ...
+
+Global___ExplainRolloutRequest: typing_extensions.TypeAlias = ExplainRolloutRequest
+
+@typing.final
+class RolloutStep(google.protobuf.message.Message):
+    """One step in the history of a rollout."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    AT_S_FIELD_NUMBER: builtins.int
+    KIND_FIELD_NUMBER: builtins.int
+    RUN_ID_FIELD_NUMBER: builtins.int
+    BATCH_ID_FIELD_NUMBER: builtins.int
+    WORKER_ID_FIELD_NUMBER: builtins.int
+    REASON_FIELD_NUMBER: builtins.int
+    CAUSE_FIELD_NUMBER: builtins.int
+    at_s: builtins.float
+    """Seconds since the epoch, on the manager's clock."""
+    kind: builtins.str
+    """submitted, queued, leased, hedged, revoked, expired, returned, held or delivered."""
+    run_id: builtins.str
+    batch_id: builtins.str
+    worker_id: builtins.str
+    reason: builtins.str
+    """Reason, in words."""
+    cause: builtins.str
+    """Event of the manager that led to the step."""
+    def __init__(
+        self,
+        *,
+        at_s: builtins.float = ...,
+        kind: builtins.str = ...,
+        run_id: builtins.str = ...,
+        batch_id: builtins.str = ...,
+        worker_id: builtins.str = ...,
+        reason: builtins.str = ...,
+        cause: builtins.str = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["at_s", b"at_s", "batch_id", b"batch_id", "cause", b"cause", "kind", b"kind", "reason", b"reason", "run_id", b"run_id", "worker_id", b"worker_id"]) -> None: ...
+
+Global___RolloutStep: typing_extensions.TypeAlias = RolloutStep
+
+@typing.final
+class ExplainRolloutResponse(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    STEPS_FIELD_NUMBER: builtins.int
+    PLACE_FIELD_NUMBER: builtins.int
+    place: builtins.str
+    """Present place of a rollout without an outcome, in words; empty otherwise."""
+    @property
+    def steps(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___RolloutStep]: ...
+    def __init__(
+        self,
+        *,
+        steps: collections.abc.Iterable[Global___RolloutStep] | None = ...,
+        place: builtins.str = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["place", b"place", "steps", b"steps"]) -> None: ...
+
+Global___ExplainRolloutResponse: typing_extensions.TypeAlias = ExplainRolloutResponse
+
+@typing.final
 class GetRunRequest(google.protobuf.message.Message):
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 

@@ -100,6 +100,11 @@ class AdminServiceStub(object):
                 request_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ReadEventsRequest.SerializeToString,
                 response_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ReadEventsResponse.FromString,
                 _registered_method=True)
+        self.ExplainRollout = channel.unary_unary(
+                '/embomatrix.proto.v1.AdminService/ExplainRollout',
+                request_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ExplainRolloutRequest.SerializeToString,
+                response_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ExplainRolloutResponse.FromString,
+                _registered_method=True)
 
 
 class AdminServiceServicer(object):
@@ -191,6 +196,13 @@ class AdminServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def ExplainRollout(self, request, context):
+        """Recent decisions about one rollout, of whichever run.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_AdminServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -258,6 +270,11 @@ def add_AdminServiceServicer_to_server(servicer, server):
                     servicer.ReadEvents,
                     request_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ReadEventsRequest.FromString,
                     response_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ReadEventsResponse.SerializeToString,
+            ),
+            'ExplainRollout': grpc.unary_unary_rpc_method_handler(
+                    servicer.ExplainRollout,
+                    request_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ExplainRolloutRequest.FromString,
+                    response_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ExplainRolloutResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -612,6 +629,33 @@ class AdminService(object):
             '/embomatrix.proto.v1.AdminService/ReadEvents',
             embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ReadEventsRequest.SerializeToString,
             embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ReadEventsResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ExplainRollout(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/embomatrix.proto.v1.AdminService/ExplainRollout',
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ExplainRolloutRequest.SerializeToString,
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ExplainRolloutResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -233,7 +233,23 @@ _AdminServiceReadEventsType = typing_extensions.TypeVar(
     ],
 )
 
-class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServiceListRunsType, _AdminServiceDrainWorkerType, _AdminServiceResumeWorkerType, _AdminServiceRevokeWorkerType, _AdminServiceGetPlanType, _AdminServicePauseDispatchType, _AdminServiceResumeDispatchType, _AdminServiceIssueTokenType, _AdminServiceListTokensType, _AdminServiceRevokeTokenType, _AdminServiceGetRunType, _AdminServiceReadEventsType]):
+_AdminServiceExplainRolloutType = typing_extensions.TypeVar(
+    '_AdminServiceExplainRolloutType',
+    grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ExplainRolloutRequest,
+        embomatrix.proto.v1.admin_service_pb2.ExplainRolloutResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ExplainRolloutRequest,
+        embomatrix.proto.v1.admin_service_pb2.ExplainRolloutResponse,
+    ],
+    default=grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ExplainRolloutRequest,
+        embomatrix.proto.v1.admin_service_pb2.ExplainRolloutResponse,
+    ],
+)
+
+class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServiceListRunsType, _AdminServiceDrainWorkerType, _AdminServiceResumeWorkerType, _AdminServiceRevokeWorkerType, _AdminServiceGetPlanType, _AdminServicePauseDispatchType, _AdminServiceResumeDispatchType, _AdminServiceIssueTokenType, _AdminServiceListTokensType, _AdminServiceRevokeTokenType, _AdminServiceGetRunType, _AdminServiceReadEventsType, _AdminServiceExplainRolloutType]):
     """State of the cluster, logs, operator commands, and tokens."""
 
     @typing.overload
@@ -289,6 +305,10 @@ class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServic
         grpc.UnaryUnaryMultiCallable[
             embomatrix.proto.v1.admin_service_pb2.ReadEventsRequest,
             embomatrix.proto.v1.admin_service_pb2.ReadEventsResponse,
+        ],
+        grpc.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.ExplainRolloutRequest,
+            embomatrix.proto.v1.admin_service_pb2.ExplainRolloutResponse,
         ],
     ], channel: grpc.Channel) -> None: ...
 
@@ -346,6 +366,10 @@ class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServic
             embomatrix.proto.v1.admin_service_pb2.ReadEventsRequest,
             embomatrix.proto.v1.admin_service_pb2.ReadEventsResponse,
         ],
+        grpc.aio.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.ExplainRolloutRequest,
+            embomatrix.proto.v1.admin_service_pb2.ExplainRolloutResponse,
+        ],
     ], channel: grpc.aio.Channel) -> None: ...
 
     ListWorkers: _AdminServiceListWorkersType
@@ -380,6 +404,9 @@ class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServic
 
     ReadEvents: _AdminServiceReadEventsType
     """Page of the event log of a run, or of workers and scenes."""
+
+    ExplainRollout: _AdminServiceExplainRolloutType
+    """Recent decisions about one rollout, of whichever run."""
 
 AdminServiceAsyncStub: typing_extensions.TypeAlias = AdminServiceStub[
     grpc.aio.UnaryUnaryMultiCallable[
@@ -433,6 +460,10 @@ AdminServiceAsyncStub: typing_extensions.TypeAlias = AdminServiceStub[
     grpc.aio.UnaryUnaryMultiCallable[
         embomatrix.proto.v1.admin_service_pb2.ReadEventsRequest,
         embomatrix.proto.v1.admin_service_pb2.ReadEventsResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ExplainRolloutRequest,
+        embomatrix.proto.v1.admin_service_pb2.ExplainRolloutResponse,
     ],
 ]
 
@@ -536,5 +567,13 @@ class AdminServiceServicer(metaclass=abc.ABCMeta):
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.ReadEventsResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.ReadEventsResponse]]:
         """Page of the event log of a run, or of workers and scenes."""
+
+    @abc.abstractmethod
+    def ExplainRollout(
+        self,
+        request: embomatrix.proto.v1.admin_service_pb2.ExplainRolloutRequest,
+        context: _ServicerContext,
+    ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.ExplainRolloutResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.ExplainRolloutResponse]]:
+        """Recent decisions about one rollout, of whichever run."""
 
 def add_AdminServiceServicer_to_server(servicer: AdminServiceServicer, server: typing.Union[grpc.Server, grpc.aio.Server]) -> None: ...
