@@ -193,7 +193,7 @@ class _RoomJob:
             _at_neighbours_host(self._editor, self._brief_of(name)) for name in self._pending.waiting
         )
         named = {thing.host for thing in objects if thing.host in self._editor.objects}
-        hosts = hosts_in(self._editor, self._room.name, named)
+        hosts = tuple(hosts_in(self._editor, self._room.name, named))
         room = next(room for room in rooms_of(self._editor) if room.name == self._room.name)
         return RoomBrief(room, hosts, objects, tuple(self._pending.failures), self._seed * 31 + self._round)
 
