@@ -47,7 +47,10 @@ if TYPE_CHECKING:
     from embomatrix.llm.ledger import Ledger
 
 app = typer.Typer(
-    help="Build and inspect datasets of verified tasks.", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False
+    help="Build and inspect datasets of verified tasks.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
 )
 app.add_typer(assets_app, name="assets")
 app.add_typer(evaluate_app, name="evaluate")
