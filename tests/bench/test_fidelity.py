@@ -20,8 +20,7 @@ from embomatrix.bench.fidelity.suite import (
     write_all_trials,
 )
 from embomatrix.bench.report.figures import BenchError
-from embomatrix.sim.fidelity.compare import FidelityTrial, PlanKind
-from embomatrix.sim.fidelity.records import trial_from_json, trial_to_json
+from embomatrix.sim.fidelity.compare import FidelityTrial, PlanKind, trial_from_json, trial_to_json
 from embomatrix.sim.fidelity.sampler import SKILLS
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import parse_plan

@@ -74,7 +74,7 @@ def checkpoint(kitchen, tmp_path_factory):
         ("eval", "--baseline=oracle", "--bench=DATASET", "--out=OUT"),
         ("worker", "run", "--once", "--cache-dir=OUT"),
         ("worker", "doctor"),
-        ("manager", "status"),
+        ("status",),
     ],
     ids=lambda arguments: " ".join(arguments[:2]),
 )
@@ -95,8 +95,8 @@ def _placed(item, places):
     [
         (("train", "--dataset=DATASET", "--out=OUT"), "wrong"),
         (("worker", "run", "--cache-dir=OUT"), "wrong"),
-        (("manager", "status"), "wrong"),
-        (("manager", "status"), ""),
+        (("status",), "wrong"),
+        (("status",), ""),
     ],
     ids=str,
 )
@@ -120,7 +120,7 @@ def test_port_in_use_is_named_and_whoever_uses_it_is_left_alone(tmp_path, option
         remedy = f"stop the program that uses it, or pass another --{option}port"
         assert_told(told, 2, f"{taken} can't be bound (Address already in use): {remedy}")
         assert "add_port.cc" not in told.text
-        assert_told(run("manager", "status", f"--manager={address}"), 0, "no open runs")
+        assert_told(run("cluster", "runs", f"--manager={address}"), 0, "no open runs")
         assert first.process.poll() is None, first.text
 
 

@@ -128,5 +128,5 @@ async def test_a_worker_is_drained_and_taken_back_and_dispatch_is_paused(tmp_pat
         waiting = asyncio.create_task(outcomes(client, batch(4)))
         await asyncio.sleep(0.3)
         assert not waiting.done()
-        await told("resume-dispatch", there)
+        await told("resume", there)
         assert len(await waiting) == 4

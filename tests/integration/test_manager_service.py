@@ -152,6 +152,24 @@ async def test_a_killed_worker_costs_time_and_nothing_else(tmp_path):
         assert (await client.close_run("r1")).redispatched >= 4
 
 
+async def test_history_of_a_rollout_names_its_leases_and_an_unknown_one_is_refused(tmp_path):
+    async with manager(tmp_path) as at, open_run(at.address) as client:
+        victim = await FakeWorker(at.address, worker_id="victim", stuck={"t"}).__aenter__()
+        running_batch = asyncio.create_task(outcomes(client, batch(1)))
+        await until(lambda: victim.executed)
+        async with AdminClient(at.address) as admin:
+            assert (await admin.explain("b1-0")).place.startswith("leased: ")
+            async with FakeWorker(at.address, worker_id="other"):
+                await victim.kill()
+                await running_batch
+            found = await admin.explain("b1-0")
+            with pytest.raises(NotFoundError, match="no trace of rollout 'nothing'"):
+                await admin.explain("nothing")
+    leased = [step.worker_id for step in found.steps if step.kind == "leased"]
+    assert (leased, found.steps[-1].kind, found.place) == (["victim", "other"], "delivered", "")
+    assert abs(found.steps[0].at_s - time.time()) < 60
+
+
 async def test_a_late_result_is_acknowledged_and_never_delivered(tmp_path):
     async with manager(tmp_path) as at, open_run(at.address) as client:
         async with FakeWorker(at.address, worker_id="slow", stuck={"t"}) as slow:

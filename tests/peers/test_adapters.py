@@ -1,4 +1,4 @@
-"""Other trainers' own code on a real cluster: a manager, a worker with physics, and the examples of the docs."""
+"""Other trainers' own code on a real cluster: a manager, a worker with physics, and the examples in docs/."""
 
 import json
 
@@ -101,7 +101,7 @@ asyncio.run(main())
 """
 
 
-async def test_verifiers_scores_the_replies_of_its_tasks(cluster, dataset):
+async def test_verifiers_scores_replies(cluster, dataset):
     peer = Peer("verifiers", "verifiers==0.4.0")
     printed = peer.run("-c", VERIFIERS, dataset, EXAMPLES, EMBOMATRIX_MANAGER=cluster[0].address)
     told = [json.loads(line) for line in printed.splitlines()]

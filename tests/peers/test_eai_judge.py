@@ -88,13 +88,13 @@ def test_reconstructed_start_agrees_with_the_real_simulators(environment, publis
         ([], Cause.UNPARSABLE),
     ],
 )
-def test_plans_made_wrong_by_hand_get_their_verdicts(exam, steps, cause):
+def test_broken_plans_get_the_expected_errors(exam, steps, cause):
     found = verdict(exam, *steps)
     assert not found.success
     assert found.cause is cause
 
 
-def test_text_of_a_model_is_never_executed(exam, tmp_path):
+def test_model_text_is_never_executed(exam, tmp_path):
     """Handed over as it is, the published parser would run it."""
     trap = tmp_path / "trap"
     text = f'[__import__("pathlib").Path({str(trap)!r}).touch()]'
@@ -114,7 +114,7 @@ def test_even_raw_text_can_not_write_or_start_anything_in_the_judges_process(jud
     assert not trap.exists()
 
 
-def test_judge_that_an_answer_ends_is_started_again(judge):
+def test_crashed_judge_is_restarted(judge):
     assert (
         judge._asked({"op": "judge", "id": FRUIT, "demo": FRUIT, "text": '[__import__("os")._exit(1)]'})
         is None

@@ -1,4 +1,4 @@
-"""Losses and gradients are TRL's. Skipped where TRL is not installed: its pins clash, so it gets an environment of its own.
+"""Losses and gradients equal TRL's. Skipped without TRL, whose pinned versions need a separate environment:
 
 python3.11 -m venv trl && trl/bin/pip install "torch==2.13.0" "trl==1.16.0" pytest pytest-asyncio pytest-timeout hypothesis -e .
 HF_HUB_OFFLINE=1 trl/bin/python -m pytest tests/peers

@@ -1,4 +1,4 @@
-"""Weights & Biases and trackio themselves, without a network: what a run tells them arrives."""
+"""Weights & Biases and trackio offline: they receive a run's metrics."""
 
 import sqlite3
 

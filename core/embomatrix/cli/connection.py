@@ -1,11 +1,25 @@
-"""The options by which a command reaches a manager: where it is, who asks, and whose certificate to trust."""
+"""Commands that ask a manager: their common options, their client, and how its errors are shown."""
 
 from __future__ import annotations
 
+import asyncio
+import functools
+import inspect
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
+
+from embomatrix.cli.failure import fail
+from embomatrix.rpc.admin_client import AdminClient
+from embomatrix.rpc.channel import DEFAULT_ADDRESS
+from embomatrix.rpc.managers import FAILOVER_S
+from embomatrix.rpc.status import ClusterError
+from embomatrix.rpc.trust import read_ca, read_token
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine
+
 
 Manager = Annotated[str, typer.Option(help="HOST:PORT of the manager.", envvar="EMBOMATRIX_MANAGER")]
 Token = Annotated[
@@ -13,7 +27,49 @@ Token = Annotated[
 ]
 Ca = Annotated[
     Path | None,
-    typer.Option(
-        envvar="EMBOMATRIX_CA", help="The ca.pem of a manager that serves by TLS.", show_default=False
-    ),
+    typer.Option(envvar="EMBOMATRIX_CA", help="The ca.pem of a manager that uses TLS.", show_default=False),
 ]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+_OPTIONS: Final = (("manager", Manager, DEFAULT_ADDRESS), ("token", Token, ""), ("ca", Ca, None))
+
+
+def manager_command(
+    name: str,
+    *,
+    timeout_s: float = FAILOVER_S,
+    until_interrupted: bool = False,
+) -> Callable[[Callable[..., Coroutine[None, None, None]]], Callable[..., None]]:
+    """Make a typer command of an async function whose first parameter is an open client.
+
+    Adds --manager, --token and --ca. Errors are shown for `embomatrix NAME`. ``timeout_s`` bounds the wait for a manager
+    that is away. With ``until_interrupted``, Ctrl-C is the normal end.
+    """
+    expected = (KeyboardInterrupt, BrokenPipeError) if until_interrupted else ()
+
+    def decorate(function: Callable[..., Coroutine[None, None, None]]) -> Callable[..., None]:
+        @functools.wraps(function)
+        def run(*, manager: str, token: str = "", ca: Path | None = None, **arguments: object) -> None:
+            async def ask() -> None:
+                secret, trusted = read_token(token), read_ca(ca)
+                async with AdminClient(manager, secret, ca=trusted, failover_s=timeout_s) as connected:
+                    await function(connected, **arguments)
+
+            try:
+                asyncio.run(ask())
+            except ClusterError as error:
+                fail(name, str(error))
+            except expected:
+                return
+
+        own = list(inspect.signature(function, eval_str=True).parameters.values())[1:]
+        options = [
+            inspect.Parameter(option, inspect.Parameter.KEYWORD_ONLY, annotation=kind, default=default)
+            for option, kind, default in _OPTIONS
+        ]
+        parameters = [*(one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in own), *options]
+        del run.__wrapped__
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {one.name: one.annotation for one in parameters}
+        return run
+
+    return decorate

@@ -1,6 +1,7 @@
-"""`embomatrix eval`: how good a model is on a benchmark, with the answers kept, so that the table can be made again.
+"""`embomatrix eval`: success of a model, an endpoint or a baseline on a benchmark.
 
-torch is imported only where a policy runs in this process, the physics engine only where no manager is given.
+Answers are stored, so the report can be made again. torch is imported only for a policy in this process, the physics
+engine only without a manager.
 """
 
 from __future__ import annotations
@@ -11,24 +12,30 @@ import json
 import logging
 import re
 import time
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from embomatrix.cli.examinee import Chosen, Questions, asked_of
 from embomatrix.cli.failure import INTERRUPTED, fail
 from embomatrix.host.cores import usable_cores
+from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
-from embomatrix.trainer.cluster.executor import ClusterExecutor
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.eai.exam import CODEC as EAI_CODEC
 from embomatrix.trainer.eai.exam import NAME as NATIVE
 from embomatrix.trainer.eai.exam import NativeExam
-from embomatrix.trainer.evaluation.answer_sources import questions_digest
+from embomatrix.trainer.evaluation.answer_sources import (
+    EndpointSource,
+    PolicySource,
+    ScriptSource,
+    questions_digest,
+)
 from embomatrix.trainer.evaluation.answers import (
     FILE,
     MOST_SAMPLES,
@@ -38,19 +45,21 @@ from embomatrix.trainer.evaluation.answers import (
     ordered,
     read_answers,
 )
-from embomatrix.trainer.evaluation.baselines import BaselineName
+from embomatrix.trainer.evaluation.baselines import BaselineName, baseline_for
 from embomatrix.trainer.evaluation.benchmark import find_benchmark
 from embomatrix.trainer.evaluation.exam import WorldExam
 from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
-from embomatrix.world.task import Profile
+from embomatrix.world.task import MAX_TABLE, Profile
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from embomatrix.cli.examinee import EvaluationSubject
+    import numpy as np
+
     from embomatrix.trainer.cluster.executor import Executor
+    from embomatrix.trainer.evaluation.answer_sources import AnswerSource
     from embomatrix.trainer.evaluation.answers import Answer
     from embomatrix.trainer.evaluation.benchmark import Benchmark
     from embomatrix.trainer.evaluation.exam import Exam
@@ -58,84 +67,122 @@ if TYPE_CHECKING:
 
 DEFAULT_BENCH: Final = "build/dataset"
 DEFAULT_OUT: Final = Path("runs/eval")
-DEFAULT_SAMPLES: Final = 10
+ENDPOINT_TOKENS: Final = 1024
+"""Enough for a plan of 64 steps in JSON and some reasoning before it."""
 console = Console(highlight=False, markup=False, soft_wrap=True)
 
 
+class EvalSettings(BaseModel):
+    """Settings of an evaluation. Options of the command override those of the TOML file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    samples: int = Field(10, ge=1, le=MOST_SAMPLES)
+    """Plans per task."""
+    temperature: float = Field(1.0, ge=0)
+    """Sampling temperature. 0: greedy."""
+    seed: int = Field(0, ge=0)
+    """Seed of sampling and execution."""
+    tasks: int | None = Field(None, ge=1)
+    """Evaluate only the first tasks."""
+    max_tokens: int | None = Field(None, ge=1)
+    """Maximum tokens of an answer. None: as the model was trained, 1024 for an endpoint."""
+    codec: Codec | None = None
+    """Plan format of a language model. None: as it was trained here, else JSON."""
+    profile: Profile = Profile.HOUSEHOLD
+    """PAPER: tasks that need another household skill count as failed."""
+    concurrent: int = Field(8, ge=1)
+    """Concurrent requests to the endpoint."""
+    attempts: int = Field(6, ge=1)
+    """Attempts per request, with waits between."""
+    jobs: int | None = Field(None, ge=1)
+    """Simulator processes without a manager. None: one per core."""
+    threads: int | None = Field(None, ge=1)
+    """torch threads."""
+    device: str = "cpu"
+    """torch device of a policy in this process."""
+
+
 @dataclass(frozen=True, slots=True)
-class ExecutionTarget:
-    """Where plans are executed: on a cluster if ``manager`` is given, else in ``jobs`` processes of this machine."""
+class Subject:
+    """Model, endpoint or baseline to evaluate; one of the first three is given."""
 
-    manager: str
-    token: str
-    ca: Path | None
-    jobs: int | None
+    model: str
+    endpoint: str
+    baseline: BaselineName | None
+    model_name: str
+    key: str
 
-    def executor(self, bench: Benchmark) -> Executor:
-        if not self.manager:
-            from embomatrix.worker.slots.rollout_pool import RolloutPool
-
-            return RolloutPool(bench.folder, self.jobs or usable_cores())
-        from embomatrix.rpc.client import ClusterClient
-        from embomatrix.rpc.trust import read_ca, read_token
-
-        connect = functools.partial(ClusterClient, self.manager, read_token(self.token), ca=read_ca(self.ca))
-        return ClusterExecutor(connect, bench.dataset.bundle_bytes)
+    @property
+    def label(self) -> str:
+        return self.model or self.model_name or str(self.baseline)
 
 
-_Model = Annotated[str, typer.Option(help="Checkpoint folder, or a Hugging Face model by name or folder.")]
+@dataclass(frozen=True, slots=True)
+class OpenSubject:
+    """Subject that is ready to answer, with its codec, maximum table rows and maximum tokens."""
+
+    source: AnswerSource
+    codec: Codec = Codec.JSON
+    rows: int = MAX_TABLE
+    max_tokens: int = 1
+
+
+def _option(panel: str, *names: str, **options: Any) -> Any:
+    return typer.Option(*names, rich_help_panel=panel, show_default=False, **options)
+
+
+_SUBJECT: Final = "Subject (exactly one of --model, --endpoint, --baseline, --answers)"
+_BENCH: Final = "Benchmark"
+_QUESTIONS: Final = "Questions"
+_EXECUTION: Final = "Execution"
+_OUTPUT: Final = "Output"
+_Model = Annotated[str, _option(_SUBJECT, help="Checkpoint, or a Hugging Face model by name or folder.")]
 _Endpoint = Annotated[
-    str, typer.Option(help="Any OpenAI-compatible endpoint: what comes before /chat/completions.")
+    str, _option(_SUBJECT, help="URL of an OpenAI-compatible endpoint, before /chat/completions.")
 ]
-_ModelName = Annotated[str, typer.Option(help="The model's name at the endpoint.")]
-_Key = Annotated[str, typer.Option("--llm-key", envvar="EMBOMATRIX_LLM_KEY", help="Key of the endpoint.")]
-_Baseline = Annotated[
-    BaselineName | None, typer.Option(help="A baseline that needs no model.", show_default=False)
+_ModelName = Annotated[str, _option(_SUBJECT, help="Model name at the endpoint.")]
+_Key = Annotated[
+    str, _option(_SUBJECT, "--llm-key", envvar="EMBOMATRIX_LLM_KEY", help="API key of the endpoint.")
 ]
-_Answers = Annotated[
-    Path | None, typer.Option(help="Judge the stored answers of an evaluation; asks nobody.")
-]
+_Baseline = Annotated[BaselineName | None, _option(_SUBJECT, help="Baseline without a model.")]
+_Answers = Annotated[Path | None, _option(_SUBJECT, help="Stored answers to judge again.")]
 _Bench = Annotated[
     str,
-    typer.Option(help="eai-native, eai, internal-verified, a dataset folder, or a file of task records."),
+    _option(_BENCH, help="eai-native, eai, internal-verified, a dataset folder, or a file of task records."),
 ]
-_Split = Annotated[str, typer.Option(help="heldout, train or all; else heldout where the dataset has any.")]
+_Split = Annotated[str, _option(_BENCH, help="heldout, train or all. Default: heldout if there is one.")]
 _Profile = Annotated[
-    Profile,
-    typer.Option(help="paper: tasks that need one of the household's three skills more count as failed."),
+    Profile | None, _option(_BENCH, help="paper: tasks that need another household skill count as failed.")
 ]
-_Tasks = Annotated[int | None, typer.Option(min=1, help="The first so many tasks only.")]
-_Samples = Annotated[int, typer.Option(min=1, max=MOST_SAMPLES, help="Plans of each task.")]
-_Temperature = Annotated[float, typer.Option(min=0, help="0 takes the likeliest plan.")]
-_Seed = Annotated[int, typer.Option(min=0, help="Seed of sampling and of execution.")]
-_MaxTokens = Annotated[int | None, typer.Option(min=1, help="Tokens of an answer at most.")]
-_Codec = Annotated[
-    Codec | None,
-    typer.Option(
-        help="How a language model writes plans: json or lines. Default: as it was taught here, else json."
-    ),
+_Tasks = Annotated[int | None, _option(_BENCH, min=1, help="Evaluate only the first tasks.")]
+_Samples = Annotated[
+    int | None, _option(_QUESTIONS, min=1, max=MOST_SAMPLES, help="Plans per task. Default: 10.")
 ]
-_Concurrent = Annotated[int, typer.Option(min=1, help="Questions under way at the endpoint.")]
-_Attempts = Annotated[int, typer.Option(min=1, help="Attempts at a question, with waits between.")]
+_Temperature = Annotated[float | None, _option(_QUESTIONS, min=0, help="Sampling temperature. Default: 1.")]
+_MaxTokens = Annotated[int | None, _option(_QUESTIONS, min=1, help="Maximum tokens of an answer.")]
+_Codec = Annotated[Codec | None, _option(_QUESTIONS, help="Plan format of a language model: json or lines.")]
+_Settings = Annotated[
+    Path | None,
+    _option(_QUESTIONS, "--settings", help="TOML file with further settings (docs/evaluation.md)."),
+]
 _Manager = Annotated[
     str,
-    typer.Option(
-        help="HOST:PORT of a manager that executes; else this machine.", envvar="EMBOMATRIX_MANAGER"
-    ),
+    _option(_EXECUTION, envvar="EMBOMATRIX_MANAGER", help="HOST:PORT of a manager. Default: this machine."),
 ]
-_Token = Annotated[str, typer.Option(help="Token of the trainer role, or @FILE.", envvar="EMBOMATRIX_TOKEN")]
+_Token = Annotated[
+    str, _option(_EXECUTION, envvar="EMBOMATRIX_TOKEN", help="Token of the trainer role, or @FILE.")
+]
 _Ca = Annotated[
-    Path | None, typer.Option(help="The ca.pem of a manager that serves by TLS.", envvar="EMBOMATRIX_CA")
+    Path | None, _option(_EXECUTION, envvar="EMBOMATRIX_CA", help="ca.pem of a manager with TLS.")
 ]
-_Jobs = Annotated[int | None, typer.Option(min=1, help="Simulator processes without a manager.")]
+_Jobs = Annotated[int | None, _option(_EXECUTION, min=1, help="Simulator processes without a manager.")]
+_Threads = Annotated[int | None, _option(_EXECUTION, min=1, help="torch threads.")]
 _Out = Annotated[
-    Path | None, typer.Option(help=f"Folder of answers and report; else {DEFAULT_OUT}/BENCH-MODEL.")
+    Path | None, _option(_OUTPUT, help=f"Folder of answers and report. Default: {DEFAULT_OUT}/BENCH-MODEL.")
 ]
 _Beside = Annotated[
-    list[Path] | None, typer.Option(help="A report.json of the same tasks, as a row beside. Repeatable.")
+    list[Path] | None, _option(_OUTPUT, help="A report.json of the same tasks, as another row. Repeatable.")
 ]
-_Threads = Annotated[int | None, typer.Option(min=1, help="Threads of torch.")]
-_Device = Annotated[str, typer.Option(help="torch device of --model: cpu, cuda.")]
 
 
 def evaluate(
@@ -147,61 +194,76 @@ def evaluate(
     answers: _Answers = None,
     bench: _Bench = "",
     split: _Split = "",
-    profile: _Profile = Profile.HOUSEHOLD,
+    profile: _Profile = None,
     tasks: _Tasks = None,
-    samples: _Samples = DEFAULT_SAMPLES,
-    temperature: _Temperature = 1.0,
-    seed: _Seed = 0,
+    samples: _Samples = None,
+    temperature: _Temperature = None,
     max_tokens: _MaxTokens = None,
     codec: _Codec = None,
-    concurrent: _Concurrent = 8,
-    attempts: _Attempts = 6,
+    settings_file: _Settings = None,
     manager: _Manager = "",
     token: _Token = "",
     ca: _Ca = None,
     jobs: _Jobs = None,
+    threads: _Threads = None,
     out: _Out = None,
     beside: _Beside = None,
-    threads: _Threads = None,
-    device: _Device = "cpu",
 ) -> None:
-    """Measure a model, an endpoint or a baseline: success by category with intervals, and why plans fail.
+    """Evaluate a model, an endpoint or a baseline: success by category with intervals, and causes of failure.
 
-    Answers are kept as they come: the same command goes on where an earlier one ended.
+    Answers are stored as they arrive: the same command continues an interrupted evaluation.
     """
-    with _problems_shown():
-        _check((model, endpoint, baseline, answers), bench, in_part=bool(split or tasks))
+    with _report_errors():
+        if sum(map(bool, (model, endpoint, baseline, answers))) != 1:
+            raise TrainerError(
+                "expected one of --model, --endpoint, --baseline and --answers: give one of them"
+            )
+        options = {
+            "samples": samples,
+            "temperature": temperature,
+            "max_tokens": max_tokens,
+            "codec": codec,
+            "profile": profile,
+            "tasks": tasks,
+            "jobs": jobs,
+            "threads": threads,
+        }
+        settings = read_eval_settings(settings_file, options)
+        open_executor = functools.partial(_executor, manager, token, ca, settings.jobs)
         if answers is not None:
-            _judge_stored(answers, bench, out, ExecutionTarget(manager, token, ca, jobs), beside or [])
+            _judge_stored(answers, bench, out, open_executor, beside or [])
             return
-        chosen = Chosen(model, endpoint, baseline, model_name, key, concurrent, attempts, threads, device)
-        how = Questions(samples, temperature, seed, max_tokens, codec, profile)
-        with _exam(
-            ExecutionTarget(manager, token, ca, jobs), bench or DEFAULT_BENCH, split, tasks, profile
-        ) as exam:
-            _measure(exam, chosen, how, out, beside or [])
+        if bench == NATIVE and (split or settings.tasks):
+            raise TrainerError(f"{NATIVE} is measured as a whole: leave out --split and --tasks")
+        subject = Subject(model, endpoint, baseline, model_name, key)
+        with _exam(open_executor, bench or DEFAULT_BENCH, split, settings.tasks, settings.profile) as exam:
+            folder = out or DEFAULT_OUT / _file_name(f"{Path(exam.name).name}-{subject.label}")
+            rows = [read_row(path, exam.digest) for path in beside or []]
+            setup, given = _ask(exam, subject, settings, folder)
+            _judge(exam, setup, given, folder, rows)
 
 
-def _check(asked: Sequence[object], bench: str, *, in_part: bool) -> None:
-    """Raises TrainerError unless exactly one may answer, and what is measured in part may be."""
-    if sum(map(bool, asked)) != 1:
-        raise TrainerError("expected one of --model, --endpoint, --baseline and --answers: give one of them")
-    if bench == NATIVE and in_part:
-        raise TrainerError(f"{NATIVE} is measured as a whole: leave out --split and --tasks")
-
-
-def _measure(exam: Exam, chosen: Chosen, how: Questions, out: Path | None, beside: Sequence[Path]) -> None:
-    """Ask, judge, and write the report."""
-    label = chosen.model or chosen.model_name or str(chosen.baseline)
-    folder = out or DEFAULT_OUT / _file_name(f"{Path(exam.name).name}-{label}")
-    rows = [read_row(path, exam.digest) for path in beside]
-    setup, given = _ask(exam, asked_of(exam, chosen, how, folder), how, folder)
-    _judge(exam, setup, given, folder, rows)
+def read_eval_settings(path: Path | None, options: dict[str, Any]) -> EvalSettings:
+    """Merge a TOML file and the given options. Raises TrainerError."""
+    try:
+        values = {} if path is None else tomllib.loads(path.read_text(encoding="utf-8"))
+        values |= {name: value for name, value in options.items() if value is not None}
+        return EvalSettings.model_validate(values)
+    except OSError as error:
+        raise TrainerError(
+            f"the settings {path} can't be read ({error.strerror}): expected a TOML file"
+        ) from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise TrainerError(
+            f"setting {first['loc'][0]!r}: {first['msg']} (found {first['input']!r})"
+        ) from error
+    except ValueError as error:
+        raise TrainerError(f"the settings {path} are not valid TOML ({error}): fix the file") from error
 
 
 @contextlib.contextmanager
-def _problems_shown() -> Iterator[None]:
-    """What a person can mend is one sentence and status 2; an interrupt says what is kept."""
+def _report_errors() -> Iterator[None]:
     from embomatrix.rpc.status import ClusterError
     from embomatrix.sim.engine import EngineError
 
@@ -213,97 +275,157 @@ def _problems_shown() -> Iterator[None]:
     except KeyboardInterrupt:
         fail(
             "eval",
-            f"interrupted: answers so far are kept in {FILE}; the same command goes on from there",
+            f"interrupted: answers so far are kept in {FILE}; the same command continues from there",
             INTERRUPTED,
         )
 
 
+def _executor(manager: str, token: str, ca: Path | None, jobs: int | None, bench: Benchmark) -> Executor:
+    """Executor on the manager's cluster, or in processes of this machine."""
+    if not manager:
+        from embomatrix.worker.slots.rollout_pool import RolloutPool
+
+        return RolloutPool(bench.folder, jobs or usable_cores())
+    from embomatrix.rpc.client import ClusterClient
+    from embomatrix.rpc.trust import read_ca, read_token
+    from embomatrix.trainer.cluster.executor import ClusterExecutor
+
+    connect = functools.partial(ClusterClient, manager, read_token(token), ca=read_ca(ca))
+    return ClusterExecutor(connect, bench.dataset.bundle_bytes)
+
+
 @contextlib.contextmanager
 def _exam(
-    place: ExecutionTarget, named: str, split: str, limit: int | None, profile: Profile
+    open_executor: Callable[[Benchmark], Executor], name: str, split: str, limit: int | None, profile: Profile
 ) -> Iterator[Exam]:
-    """The benchmark of this name, ready to ask and to judge."""
-    if named == NATIVE:
+    if name == NATIVE:
         from embomatrix.trainer.eai.environment import JudgeEnvironment
         from embomatrix.trainer.eai.judge import NativeJudge
 
         with NativeJudge(JudgeEnvironment.find()) as judge:
             yield NativeExam(judge)
         return
-    bench = find_benchmark(named, split, limit, profile)
-    yield WorldExam(bench, place.executor(bench))
+    bench = find_benchmark(name, split, limit, profile)
+    yield WorldExam(bench, open_executor(bench))
+
+
+def _open_subject(exam: Exam, subject: Subject, settings: EvalSettings, folder: Path) -> OpenSubject:
+    """Load the model, or prepare the endpoint or baseline. Raises TrainerError."""
+    if subject.model:
+        from embomatrix.trainer.evaluation.models import load_model
+
+        loaded = load_model(subject.model, settings.codec, threads=settings.threads, device=settings.device)
+        codec = loaded.policy.codec
+        if isinstance(exam, NativeExam) and codec is Codec.NAMES:
+            raise TrainerError(
+                f"{subject.model} is a word-level policy, which can't read {NATIVE}'s prompts: pass another model"
+            )
+        return OpenSubject(
+            PolicySource(loaded.policy), codec, loaded.rows, settings.max_tokens or loaded.max_tokens
+        )
+    if subject.endpoint:
+        if not subject.model_name:
+            raise TrainerError("the endpoint's model has no name: pass --model-name as the endpoint calls it")
+        if settings.codec is Codec.NAMES:
+            raise TrainerError("the codec `names` is for word-level policies: pass --codec json or lines")
+        from embomatrix.llm.endpoint import Endpoint, EndpointLimits
+
+        limits = EndpointLimits(attempts=settings.attempts, concurrent=settings.concurrent)
+        connect = functools.partial(
+            Endpoint, subject.endpoint, subject.model_name, api_key=subject.key, limits=limits
+        )
+        source = EndpointSource(connect, folder / "ledger.jsonl")
+        return OpenSubject(
+            source, settings.codec or Codec.JSON, max_tokens=settings.max_tokens or ENDPOINT_TOKENS
+        )
+    return OpenSubject(ScriptSource(_baseline(exam, subject.baseline or BaselineName.ORACLE)))
+
+
+def _baseline(exam: Exam, name: BaselineName) -> Callable[[str, np.random.Generator], str]:
+    """Function that writes a baseline's answer: its plan in our world, the published human plan in EAI's."""
+    if isinstance(exam, NativeExam):
+        if name is not BaselineName.HUMAN:
+            raise TrainerError(
+                f"the baseline `{name}` is for our own tasks: on {NATIVE} pass --baseline human"
+            )
+        return lambda task_id, rng: exam.human(task_id)
+    if name is BaselineName.HUMAN or not isinstance(exam, WorldExam):
+        raise TrainerError(f"the human plans are of {NATIVE}: pass --bench {NATIVE}, or --baseline oracle")
+    plan, tasks = baseline_for(name), exam.bench.tasks
+    return lambda task_id, rng: json.dumps(plan_to_json(plan(tasks[task_id], rng)))
 
 
 def _ask(
-    exam: Exam, asked: EvaluationSubject, how: Questions, folder: Path
+    exam: Exam, subject: Subject, settings: EvalSettings, folder: Path
 ) -> tuple[EvaluationSetup, tuple[Answer, ...]]:
-    """Fill the answer sheet."""
-    questions = exam.questions(asked.codec, asked.rows)
+    """Collect the missing answers."""
+    opened = _open_subject(exam, subject, settings, folder)
+    questions = exam.questions(opened.codec, opened.rows)
     setup = EvaluationSetup(
         bench=exam.name,
         bench_digest=exam.digest,
         split=exam.split,
         tasks=len(exam.task_ids),
-        model=asked.label,
-        codec=asked.codec.value if isinstance(exam, WorldExam) else EAI_CODEC,
-        rows=asked.rows,
-        samples=how.samples,
-        temperature=how.temperature,
-        max_tokens=asked.max_tokens,
-        seed=how.seed,
+        model=subject.label,
+        codec=opened.codec.value if isinstance(exam, WorldExam) else EAI_CODEC,
+        rows=opened.rows,
+        samples=settings.samples,
+        temperature=settings.temperature,
+        max_tokens=opened.max_tokens,
+        seed=settings.seed,
         questions=questions_digest(questions),
         by_rule=exam.by_rule,
-        profile=how.profile.value,
+        profile=settings.profile.value,
     )
     began_s = time.monotonic()
     with AnswerSheet(folder / FILE, setup) as sheet:
         if len(sheet):
-            console.print(f"{len(sheet)} answers are there already")
-        with _bar("answers") as report:
-            asked.asker.ask(questions, sheet, report)
+            console.print(f"{len(sheet)} answers are already stored")
+        with _bar("answers") as on_progress:
+            opened.source.ask(questions, sheet, on_progress)
         given = sheet.ordered(exam.task_ids)
     console.print(f"{len(given)} answers in {time.monotonic() - began_s:.1f} s: {folder / FILE}")
     return setup, given
 
 
 def _judge_stored(
-    path: Path, bench: str, out: Path | None, place: ExecutionTarget, beside: Sequence[Path]
+    path: Path,
+    bench: str,
+    out: Path | None,
+    open_executor: Callable[[Benchmark], Executor],
+    beside: Sequence[Path],
 ) -> None:
     setup, stored = read_answers(path)
-    with _exam(place, bench or setup.bench, setup.split, setup.tasks, _profile(setup, path)) as exam:
-        if exam.digest != setup.bench_digest:
-            raise TrainerError(
-                f"{path} answers other tasks than {bench or setup.bench} holds now (digest {setup.bench_digest[:19]}…, now "
-                f"{exam.digest[:19]}…): pass the benchmark that was asked with --bench"
-            )
-        check_expected(stored, exam.task_ids, setup, path)
-        given = ordered(stored, exam.task_ids, setup.samples)
-        asked_for = len(exam.task_ids) * setup.samples
-        if len(given) < asked_for:
-            missing = asked_for - len(given)
-            console.print(f"{missing} of {asked_for} answers are missing: figures are over the others")
-        _judge(exam, setup, given, out or path.parent, [read_row(row, exam.digest) for row in beside])
-
-
-def _profile(setup: EvaluationSetup, path: Path) -> Profile:
     if setup.profile not in set(Profile):
         raise TrainerError(
             f"{path} names the unknown profile {setup.profile!r}: expected {' or '.join(Profile)}"
         )
-    return Profile(setup.profile)
+    with _exam(open_executor, bench or setup.bench, setup.split, setup.tasks, Profile(setup.profile)) as exam:
+        if exam.digest != setup.bench_digest:
+            raise TrainerError(
+                f"{path} answers other tasks than {bench or setup.bench} holds now (digest {setup.bench_digest[:19]}…, now "
+                f"{exam.digest[:19]}…): pass the benchmark of the answers with --bench"
+            )
+        check_expected(stored, exam.task_ids, setup, path)
+        given = ordered(stored, exam.task_ids, setup.samples)
+        expected = len(exam.task_ids) * setup.samples
+        if len(given) < expected:
+            missing = expected - len(given)
+            console.print(f"{missing} of {expected} answers are missing: the figures leave them out")
+        _judge(exam, setup, given, out or path.parent, [read_row(row, exam.digest) for row in beside])
 
 
 def _judge(
     exam: Exam, setup: EvaluationSetup, given: Sequence[Answer], folder: Path, rows: Sequence[ScoreRow]
 ) -> None:
     began_s = time.monotonic()
-    with _bar("plans judged") as report:
-        marked = exam.judge(setup, given, report)
-    value = report_of(setup, marked)
-    text = text_report(value, rows)
-    _write(folder / "report.json", json.dumps(value, indent=1) + "\n")
+    with _bar("judged plans") as on_progress:
+        result = exam.judge(setup, given, on_progress)
+    report = report_of(setup, result)
+    text = text_report(report, rows)
+    _write(folder / "report.json", json.dumps(report, indent=1) + "\n")
     _write(folder / "report.txt", text)
-    _write(folder / "report.html", evaluation_page(value, marked.pictures, rows))
+    _write(folder / "report.html", evaluation_page(report, result.pictures, rows))
     console.print(text)
     console.print(f"judged in {time.monotonic() - began_s:.1f} s: {folder / 'report.html'}, .json, .txt")
 

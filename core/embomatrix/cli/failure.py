@@ -1,4 +1,4 @@
-"""A person never sees a traceback: what escapes a command becomes one sentence, the rest goes to a log file."""
+"""Failures of commands: one sentence on standard error and an exit status; tracebacks go to a log file."""
 
 from __future__ import annotations
 
@@ -19,21 +19,20 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 MENDABLE: Final = 2
-"""Exit status for what a person can mend: trying again without a change gives the same."""
+"""Exit status of errors that the user can fix: an unchanged retry fails again."""
 DEFECT: Final = 70
-"""Exit status for what should not have happened."""
+"""Exit status of internal errors."""
 INTERRUPTED: Final = 130
 _STORAGE: Final = frozenset((errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS))
-"""What a file system refuses without any fault of the program."""
+"""File system errors that are no fault of the program."""
 
 
 @contextlib.contextmanager
 def shown(command: str) -> Iterator[None]:
-    """Turn what escapes a command into an exit status and a sentence: ``INTERRUPTED`` or ``DEFECT``.
+    """Turn escaping exceptions into a message and an exit status, ``INTERRUPTED`` or ``DEFECT``.
 
-    Errors that a person can mend are shown by the commands themselves, with status ``MENDABLE``; those of the file system
-    are shown here, since they may come from any of them. The trace of a defect is kept on disk; ``EMBOMATRIX_DEBUG=1`` lets
-    the exception through.
+    Commands report errors that the user can fix themselves, with status ``MENDABLE``. File system errors may come from any
+    command and are handled here. The traceback of a defect is written to disk; ``EMBOMATRIX_DEBUG=1`` lets it through.
     """
     try:
         yield
@@ -61,14 +60,14 @@ def shown(command: str) -> Iterator[None]:
 
 
 def fail(command: str, sentence: str, status: int = MENDABLE) -> NoReturn:
-    """Say what is wrong on standard error, and leave with the status."""
+    """Print the problem on standard error and exit with the status."""
     name = f"embomatrix {command}".strip()
     Console(stderr=True, soft_wrap=True).print(f"{name}: {sentence}", highlight=False, markup=False)
     raise SystemExit(status)
 
 
 def _is_silent_interrupt(leaving: SystemExit) -> bool:
-    """Whether typer has turned an interrupt into an exit without a word; a command that caught it has said its own."""
+    """True if typer turned Ctrl-C into an exit without a message."""
     return leaving.code == INTERRUPTED and isinstance(
         getattr(leaving.__context__, "__cause__", None), KeyboardInterrupt
     )

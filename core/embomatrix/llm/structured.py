@@ -1,4 +1,4 @@
-"""Typed answers: a reply is read as JSON, validated, and asked for again with the error quoted. Text is never evaluated."""
+"""Typed answers: a reply is read as JSON and validated; the model is asked again with the error. Text is never evaluated."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 T = TypeVar("T", bound=BaseModel)
 
 MAX_STARTS: Final = 256
-"""Brackets at which JSON is looked for: bounds the work on adversarial text."""
+"""Most brackets at which the reader looks for JSON: bounds the work on adversarial text."""
 SHOWN_PROBLEMS: Final = 5
 _FENCE: Final = re.compile(r"```(?:json)?\s*\n(.*?)```", re.DOTALL)
 _BRACKET: Final = re.compile(r"[{\[]")
@@ -27,7 +27,7 @@ _BRACKET: Final = re.compile(r"[{\[]")
 
 @dataclass(frozen=True, slots=True)
 class StructuredReply(Generic[T]):
-    """A valid answer, and every reply on the way to it."""
+    """A valid answer, with all replies that led to it."""
 
     value: T
     replies: tuple[Reply, ...]
@@ -41,9 +41,9 @@ async def ask(
     check: Callable[[T], None] | None = None,
     attempts: int = 3,
 ) -> StructuredReply[T]:
-    """Ask until the answer has the shape and passes ``check``, which raises ValueError with a sentence for the model.
+    """Ask until the answer has the shape and passes ``check``, which raises ValueError with a message for the model.
 
-    Raises UnusableReplyError after ``attempts`` answers, EndpointError where none came.
+    Raises UnusableReplyError after ``attempts`` answers, EndpointError without an answer.
     """
     request = replace(request, json_schema=request.json_schema or shape.model_json_schema())
     replies: list[Reply] = []
@@ -75,9 +75,9 @@ def _objection(reply: Reply, problem: str) -> tuple[Message, Message]:
 
 
 def read_json(text: str, shape: type[T]) -> T:
-    """The first JSON value of the text that has the shape. Raises ValueError with a sentence.
+    """Return the first JSON value in the text that has the shape. Raises ValueError with a sentence.
 
-    Looked for after any closed reasoning, in code fences first, then anywhere among prose.
+    The reader skips closed reasoning, then looks in code fences, then anywhere in the text.
     """
     answer = text.rpartition("</think>")[2]
     answer = answer if answer.strip() else text
@@ -86,7 +86,7 @@ def read_json(text: str, shape: type[T]) -> T:
         try:
             return shape.model_validate(value)
         except ValidationError as error:
-            # Of half an answer, the parts that are whole are not what was asked for.
+            # Complete parts of a damaged answer are not the answer.
             first_problem = first_problem or (
                 "its JSON is damaged, or breaks off" if damaged else _problems(error)
             )
@@ -94,9 +94,9 @@ def read_json(text: str, shape: type[T]) -> T:
 
 
 def _json_values(text: str) -> Iterator[tuple[Any, bool]]:
-    """JSON objects and arrays in the text, and whether brackets before them could not be read.
+    """Yield JSON objects and arrays in the text, with a flag for unreadable brackets before them.
 
-    Fenced ones come first; a value inside another that was read is not given.
+    Fenced values come first. A value inside another one is not yielded.
     """
     decoder = json.JSONDecoder()
     for part in (*(match[1] for match in _FENCE.finditer(text)), text):
@@ -112,7 +112,7 @@ def _json_values(text: str) -> Iterator[tuple[Any, bool]]:
 
 
 def _problems(error: ValidationError) -> str:
-    """What is wrong, field by field, in words that a model can act on."""
+    """Describe validation errors field by field, for the model."""
     found = [
         f"{'.'.join(map(str, problem['loc'])) or 'the value'}: {problem['msg'][:1].lower()}{problem['msg'][1:]}"
         for problem in error.errors(include_url=False)[:SHOWN_PROBLEMS]

@@ -1,4 +1,4 @@
-"""What is asked of a language model and what comes back, whatever serves it."""
+"""Questions to a language model and its answers, independent of the server."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Speaker(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One turn. ``images`` are PNG files, for models that see."""
+    """One turn. ``images`` are PNG files, for vision models."""
 
     speaker: Speaker
     text: str
@@ -27,9 +27,9 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class ChatRequest:
-    """One question. ``purpose`` names who asks, for ledger and errors; it is not sent.
+    """One question. ``purpose`` names the asking component, for ledger and errors; it is not sent.
 
-    ``json_schema`` asks endpoints that can constrain their output to do so; replies are validated all the same.
+    ``json_schema`` asks endpoints to constrain their output. Replies are validated in any case.
     """
 
     purpose: str
@@ -42,7 +42,7 @@ class ChatRequest:
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """Tokens as the endpoint counts them; 0 where it does not say."""
+    """Token counts of the endpoint; 0 where it reports none."""
 
     prompt_tokens: int = 0
     completion_tokens: int = 0
@@ -50,7 +50,7 @@ class Usage:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """``finish`` is the endpoint's word for why it stopped: "stop", or "length" where the text was cut off."""
+    """Answer of a model. ``finish`` is the endpoint's reason: "stop", or "length" for text that was cut off."""
 
     text: str
     model: str
@@ -61,21 +61,21 @@ class Reply:
 
 
 class ChatModel(Protocol):
-    """Whatever answers. Raises LlmError."""
+    """Anything that answers questions. Raises LlmError."""
 
     async def complete(self, request: ChatRequest) -> Reply: ...
 
 
 class LlmError(Exception):
-    """A language model gave no usable answer; one sentence for a person."""
+    """Raised when a language model gave no usable answer. The message is one sentence for people."""
 
 
 class EndpointError(LlmError):
-    """The endpoint can't be reached, refuses, or answers what is no chat completion."""
+    """Raised when the endpoint is unreachable, refuses, or answers with something other than a chat completion."""
 
 
 class UnusableReplyError(LlmError):
-    """The model answered, and never what was asked for. ``replies`` are its texts, first to last."""
+    """Raised when no answer had the requested form. ``replies`` are the answers, first to last."""
 
     def __init__(self, sentence: str, replies: tuple[str, ...]) -> None:
         super().__init__(sentence)
@@ -83,4 +83,4 @@ class UnusableReplyError(LlmError):
 
 
 class CassetteError(LlmError):
-    """A recording can't be read, or lacks the question."""
+    """Raised when a recording can't be read or lacks the question."""

@@ -9,13 +9,13 @@ from embomatrix.proto.v1 import admin_service_pb2_grpc
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.managers import FAILOVER_S, LeaderClient, of_the_leader
 from embomatrix.rpc.wire.codec import each, inside
-from embomatrix.rpc.wire.run_log import event_page_from_proto, run_summary_from_proto
+from embomatrix.rpc.wire.run_log import event_page_from_proto, explanation_from_proto, run_summary_from_proto
 from embomatrix.rpc.wire.session import plan_cell_from_proto, run_info_from_proto, worker_info_from_proto
 from embomatrix.rpc.wire.tokens import ROLE_NUMBERS, token_info_from_proto
 from embomatrix.rpc.wire.values import FleetStatus
 
 if TYPE_CHECKING:
-    from embomatrix.rpc.wire.run_log import EventPage, RunEvent, RunSummary
+    from embomatrix.rpc.wire.run_log import EventPage, RolloutExplanation, RunEvent, RunSummary
     from embomatrix.rpc.wire.tokens import AccessRole, TokenInfo
     from embomatrix.rpc.wire.values import PlanCell, RunInfo, WorkerInfo
 
@@ -73,6 +73,13 @@ class AdminClient(LeaderClient):
         return inside(
             "page", event_page_from_proto, await self._admin.ReadEvents(request, timeout=self._call_s)
         )
+
+    @of_the_leader
+    async def explain(self, rollout_id: str) -> RolloutExplanation:
+        """Return the recent history of a rollout. Raises NotFoundError."""
+        request = pb.ExplainRolloutRequest(rollout_id=rollout_id)
+        answer = await self._admin.ExplainRollout(request, timeout=self._call_s)
+        return inside("explanation", explanation_from_proto, answer)
 
     async def all_events(self, run_id: str = "") -> tuple[RunEvent, ...]:
         """Return the whole log of a run, or of the fleet."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from string import Formatter
 from typing import TYPE_CHECKING, Final, Protocol
 
-from embomatrix.skills.failure import SENTENCES, FailureReason
+from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import PlaceRelation
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ def _blocker_field(sentence: str) -> str:
     return next((name for name in _FIELDS_AT_FAULT if name in fields), "")
 
 
-_BLOCKER_FIELD: Final = {reason: _blocker_field(sentence) for reason, sentence in SENTENCES.items()}
+_BLOCKER_FIELD: Final = {reason: _blocker_field(reason.sentence) for reason in FailureReason}
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +108,7 @@ def refuse(reason: FailureReason, **values: str) -> SkillRefusal:
 
     Raises KeyError if the sentence needs a value that is not given.
     """
-    return SkillRefusal(reason, SENTENCES[reason].format(**values), values.get(_BLOCKER_FIELD[reason], ""))
+    return SkillRefusal(reason, reason.sentence.format(**values), values.get(_BLOCKER_FIELD[reason], ""))
 
 
 def target_of(world: WorldView, call: SkillCall) -> str:

@@ -107,7 +107,7 @@ def test_every_colour_of_a_chart_is_one_of_the_page():
 def test_figures_stand_on_the_page_as_they_were_counted():
     words = re.sub(r"<[^>]*>", " ", report_page(summary(), EVENTS))
     words = " ".join(words.split())
-    assert "Completed 3 1 failed, 2 leases given again" in words
+    assert "Completed 3 1 failed, 2 rollouts re-dispatched" in words
     assert "Prewarm hits 90 % 9 of 10 scenes" in words
     assert "Manager overhead 25 %" in words
     assert "lease failed slot_crashed 2 x9 office 01234567" in words
@@ -126,11 +126,11 @@ def test_a_run_without_anything_has_a_report_all_the_same():
     page = report_page(empty, ())
     assert Outline(page).open == []
     assert "No worker has finished anything." in page
-    assert "None. Every lease that was given came back with a result." in page
+    assert "None: every lease brought a result." in page
 
 
 def test_a_log_that_dropped_events_says_so():
-    assert "1,234 earlier ones made room" in report_page(summary(events_dropped=1234), EVENTS)
+    assert "1,234 earlier ones were dropped" in report_page(summary(events_dropped=1234), EVENTS)
 
 
 def test_durations_are_told_in_the_unit_that_suits_them():

@@ -5,13 +5,22 @@ import asyncio
 import pytest
 from tests.integration.test_manager_service import manager as a_manager
 
-from embomatrix.cli.doctor.findings import Finding, Level, verdict
-from embomatrix.cli.doctor.machine import NEEDED, disk, machine, memory, parts, port, python
+from embomatrix.cli.doctor.machine import (
+    NEEDED,
+    Finding,
+    Level,
+    disk,
+    machine,
+    memory,
+    parts,
+    port,
+    python,
+    verdict,
+)
 from embomatrix.cli.doctor.manager import (
     Visit,
     certificate,
     clock,
-    cluster,
     manager,
     mistrust,
     ports_held,
@@ -20,7 +29,6 @@ from embomatrix.cli.doctor.manager import (
 from embomatrix.manager.access.folder import prepare
 from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.versions import PROTOCOL_VERSION, Capabilities, VersionRange
-from embomatrix.rpc.wire.values import FleetStatus
 
 
 def levels(findings):
@@ -119,7 +127,6 @@ async def test_a_cluster_that_stands_still_is_worth_a_look_and_no_fault_of_this_
         found = await manager(Visit(endpoints.address, page_port=1))
     assert levels(found)["cluster"] is Level.NOTE
     assert "Dispatch is paused" in next(f.found for f in found if f.thing == "cluster")
-    assert cluster(FleetStatus(())) == [], "a manager of an earlier release says nothing of it"
 
 
 async def test_a_port_of_another_kind_is_told_once(tmp_path):

@@ -1,4 +1,4 @@
-"""`embomatrix eval` in this process: what it refuses, and that its files come out the same again."""
+"""`embomatrix eval` in this process: rejected input, and reproducible files."""
 
 import json
 
@@ -46,7 +46,7 @@ def told(*arguments):
             "expected one of --model, --endpoint, --baseline and --answers",
         ),
         (("--baseline=oracle", "--bench=nowhere"), "no benchmark at nowhere: pass a dataset folder"),
-        (("--baseline=oracle", "--bench=eai"), "make it with `embomatrix factory import`"),
+        (("--baseline=oracle", "--bench=eai"), "create it with `embomatrix factory import`"),
         (
             ("--endpoint=http://127.0.0.1:1/v1", "--bench=DATASET"),
             "pass --model-name as the endpoint calls it",
@@ -56,9 +56,10 @@ def told(*arguments):
             "is measured as a whole: leave out --split",
         ),
         (("--answers=OUT/none",), "none can't be read (No such file or directory)"),
+        (("--baseline=oracle", "--settings=OUT/none"), "none can't be read (No such file or directory)"),
     ],
 )
-def test_evaluation_that_can_not_be_made_is_told_why(kitchen, tmp_path, arguments, words):
+def test_invalid_evaluation_is_rejected_with_a_reason(kitchen, tmp_path, arguments, words):
     filled = [item.replace("DATASET", str(kitchen)).replace("OUT", str(tmp_path)) for item in arguments]
     status, text = told(*filled, f"--out={tmp_path / 'out'}")
     assert status == 2
@@ -66,31 +67,32 @@ def test_evaluation_that_can_not_be_made_is_told_why(kitchen, tmp_path, argument
     assert not (tmp_path / "out").exists()
 
 
-def test_endpoint_that_can_not_be_reached_is_named(kitchen, tmp_path):
-    asked = ("--endpoint=http://127.0.0.1:1/v1", "--model-name=m", "--attempts=1", f"--bench={kitchen}")
-    status, text = told(*asked, "--samples=2", f"--out={tmp_path}")
+def test_unreachable_endpoint_is_reported(kitchen, tmp_path):
+    (tmp_path / "settings.toml").write_text("attempts = 1\nsamples = 3\n")
+    asked = ("--endpoint=http://127.0.0.1:1/v1", "--model-name=m", f"--settings={tmp_path / 'settings.toml'}")
+    status, text = told(*asked, f"--bench={kitchen}", "--samples=2", f"--out={tmp_path}")
     assert status == 2
     assert "can't be reached" in text
     assert "0 of 2 answers are kept in" in text
 
 
-def test_stored_answers_give_the_same_files_again(measured, tmp_path):
+def test_stored_answers_give_identical_files(measured, tmp_path):
     status, text = told(f"--answers={measured / 'answers.jsonl'}", f"--out={tmp_path}", "--jobs=2")
     assert status == 0, text
     for name in ("report.json", "report.html", "report.txt"):
         assert (tmp_path / name).read_bytes() == (measured / name).read_bytes()
 
 
-def test_answers_that_are_missing_are_told(measured, tmp_path):
+def test_missing_answers_are_reported(measured, tmp_path):
     lines = (measured / "answers.jsonl").read_text().splitlines(keepends=True)
     (tmp_path / "answers.jsonl").write_text("".join(lines[:5]))
     status, text = told(f"--answers={tmp_path / 'answers.jsonl'}", "--jobs=1")
     assert status == 0
-    assert "8 of 12 answers are missing: figures are over the others" in text
+    assert "8 of 12 answers are missing: the figures leave them out" in text
     assert json.loads((tmp_path / "report.json").read_text())["samples"] == 4
 
 
-def test_answers_to_other_tasks_are_refused(measured, kitchen):
+def test_answers_to_other_tasks_are_rejected(measured, kitchen):
     status, text = told(f"--answers={measured / 'answers.jsonl'}", f"--bench={write_other(measured)}")
     assert status == 2
     assert "answers other tasks than" in text
@@ -101,14 +103,15 @@ def test_answers_to_other_tasks_are_refused(measured, kitchen):
     [("task_id", "elsewhere"), ("sample", 3), ("sample", -1)],
     ids=["task", "many", "negative"],
 )
-def test_an_answer_that_was_never_asked_for_is_named(measured, tmp_path, field, value):
+def test_unexpected_answer_is_rejected(measured, tmp_path, field, value):
     lines = (measured / "answers.jsonl").read_text().splitlines()
     stranger = {**json.loads(lines[1]), field: value}
     (tmp_path / "answers.jsonl").write_text("\n".join([*lines, json.dumps(stranger), ""]))
     status, text = told(f"--answers={tmp_path / 'answers.jsonl'}")
     assert status == 2
     assert (
-        f"answer to sample {stranger['sample']} of the task '{stranger['task_id']}', which was never" in text
+        f"answer to sample {stranger['sample']} of the task '{stranger['task_id']}', which is not part"
+        in text
     )
 
 
@@ -121,7 +124,7 @@ def write_other(folder):
     return other
 
 
-def test_another_report_stands_as_a_row_beside(measured, kitchen, tmp_path):
+def test_other_report_is_added_as_a_row(measured, kitchen, tmp_path):
     arguments = (f"--bench={kitchen}", "--split=all", "--baseline=oracle", "--samples=1", "--jobs=1")
     status, text = told(*arguments, f"--beside={measured / 'report.json'}", f"--out={tmp_path}")
     assert status == 0

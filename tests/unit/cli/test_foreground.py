@@ -2,8 +2,8 @@
 
 import pytest
 
-from embomatrix.cli import foreground
-from embomatrix.cli.foreground import no_problem, run_command
+from embomatrix.cli import local_cluster as foreground
+from embomatrix.cli.local_cluster import no_problem, run_command
 
 
 def leave_by(monkeypatch, script):

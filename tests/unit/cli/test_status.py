@@ -9,9 +9,7 @@ from tests.fakes.commands import run
 from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import manager
 
-from embomatrix.cli.status.app import status, top
-from embomatrix.cli.status.live import Glance, earliest, rate, screen
-from embomatrix.cli.status.words import sentences
+from embomatrix.cli.cluster.status import Glance, earliest, rate, screen, sentences, status, top
 from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.wire.values import (
     FleetStatus,
@@ -30,16 +28,9 @@ def worker(name="w1", state="ready", *, running=0, completed=0, reason="", resid
     return WorkerInfo(name, state, Resources(2, 4, 1024), residents, running, completed, 0.5, reason)
 
 
-def test_words_begin_with_the_verdict():
-    run_info = RunInfo("r1", "evening", RunStats(), pending=3)
-    nobody = sentences(FleetStatus(()), (), ())
-    assert nobody[0] == "No worker is there."
+def test_start_of_a_worker_is_suggested_where_none_is_present():
+    nobody = sentences(FleetStatus((), "No worker has joined yet."), (), ())
     assert nobody[1].startswith("Start a worker with `embomatrix worker run`")
-    assert sentences(FleetStatus((worker(),)), (), ())[0] == "The cluster is ready, and no run is open."
-    assert sentences(FleetStatus((worker(),)), (run_info,), ())[0] == "The cluster works."
-    assert sentences(FleetStatus((worker(state="paused"),)), (run_info,), ())[0].startswith(
-        "No worker works, and 3 rollouts wait"
-    )
 
 
 def test_what_the_manager_says_of_itself_is_the_verdict():
@@ -65,19 +56,20 @@ def test_words_tell_what_runs_what_is_warm_and_who_does_not_work():
     )
     assert told[1:] == [
         "Workers: 1 ready, 1 paused; 1 of 2 slots busy; 1 scene is in memory.",
-        "Run evening: 40 rollouts done, 75% of them in warm scenes; 2 lost by the infrastructure, 5 given again; 3 under way.",
+        "Run evening: 40 rollouts done, 75% of them in warm scenes; 2 lost by the infrastructure, 5 re-dispatched; "
+        "3 under way.",
         "Look-ahead: 1 of 2 scenes of the next step warm; 1 without room: give workers memory, or start more.",
         "w2 is paused: somebody uses it.",
     ]
 
 
 def test_who_left_in_order_is_counted_and_no_trouble():
-    told = sentences(FleetStatus((worker(), worker("w2", "left", reason="it left"))), (), ())
+    ready = "Ready: 1 worker waits for a run."
+    told = sentences(FleetStatus((worker(), worker("w2", "left", reason="it left")), ready), (), ())
     assert told == [
-        "The cluster is ready, and no run is open.",
+        ready,
         "Workers: 1 ready, 1 left; 0 of 2 slots busy; 0 scenes are in memory.",
     ]
-    assert sentences(FleetStatus((worker(state="left"),)), (), ())[0] == "No worker is there."
 
 
 def test_words_of_a_thousand_workers_fit_on_a_screen():
@@ -113,13 +105,13 @@ def test_throughput_is_that_of_the_last_seconds_and_never_negative():
 
 async def test_both_commands_show_a_real_manager(tmp_path, capsys):
     async with manager(tmp_path) as endpoints, FakeWorker(endpoints.address, "w1"):
-        await asyncio.to_thread(status, endpoints.address)
+        await asyncio.to_thread(status, manager=endpoints.address)
         words = capsys.readouterr().out
-        await asyncio.to_thread(top, endpoints.address, rounds=1)
+        await asyncio.to_thread(top, manager=endpoints.address, rounds=1)
         live = capsys.readouterr().out
         async with AdminClient(endpoints.address) as client:
             await client.pause_dispatch()
-        await asyncio.to_thread(status, endpoints.address)
+        await asyncio.to_thread(status, manager=endpoints.address)
         paused = capsys.readouterr().out
     assert "Workers: 1 ready" in words
     assert words.startswith("Ready: 1 worker waits for a run.")

@@ -11,7 +11,7 @@ from embomatrix.factory.scenes.view import CapableRobot, SceneView
 from embomatrix.factory.social.requests import RequestedAtom, RequestPredicate, TaskRequest, check_request
 from embomatrix.factory.writer.tasks import DraftOrder, PlainWriter
 from embomatrix.factory.writer.variant import Variant
-from embomatrix.sim.physical.survey import Foresight
+from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import Handling
 from embomatrix.world.scene import Scene
@@ -92,7 +92,7 @@ def test_infeasible_wishes_are_never_written(home: Scene) -> None:
 
 def test_survey_answers_do_not_depend_on_the_order_of_queries(home: Scene) -> None:
     names = ("apple_1", "stove_1")
-    foresight = Foresight()
+    foresight = ReachabilitySurvey()
     with SceneSurvey(home, foresight) as at_once, SceneSurvey(home, foresight) as bit_by_bit:
         assert not bit_by_bit.blocks([(Handling.PRESS, "stove_1")])
         assert not bit_by_bit.blocks([(Handling.TAKE, "apple_1")])

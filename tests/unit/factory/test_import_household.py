@@ -10,7 +10,7 @@ from embomatrix.factory.task_import.batch import Verified, verify
 from embomatrix.factory.task_import.reach import Reachability
 from embomatrix.factory.task_import.task import ImportedTask, import_problem
 from embomatrix.sim.engine import FLOOR
-from embomatrix.sim.physical.survey import Foresight
+from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bddl import parse_formula, parse_problem
@@ -118,7 +118,7 @@ def test_floor_in_the_goal_becomes_an_object_to_wipe_and_stand_on(home: Scene) -
     task = imported.task
     assert "(not (covered floors_1 dust.n.01)) (ontop plate_1 floors_1)" in task.goal_bddl
     assert imported.scene.by_name["floors_1"].fixed
-    outcome = verify(imported, PlacementLibrary(), Foresight())
+    outcome = verify(imported, PlacementLibrary(), ReachabilitySurvey())
     assert isinstance(outcome, Verified), outcome
     assert {"clean_object_with_tool", "slice_object_with_tool"} <= {
         step["action"] for step in outcome.record.oracle

@@ -10,7 +10,7 @@ from embomatrix.factory.task_import.binding import bind
 from embomatrix.factory.task_import.start_state import with_states
 from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
 from embomatrix.factory.task_import.task_fields import category_of, instruction_of
-from embomatrix.sim.physical.survey import Foresight
+from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.world.bddl import BddlError, InitLiteral, parse_formula, parse_problem
 from embomatrix.world.goal import Atom
@@ -207,7 +207,7 @@ def test_imported_task_is_verified_by_execution(home: Scene) -> None:
     text = text.replace("(ontop apple.n.01_2 breakfast_table.n.01_1)\n", "")
     imported = import_problem(source(text), home)
     assert isinstance(imported, ImportedTask)
-    outcome = verify(imported, PlacementLibrary(), Foresight())
+    outcome = verify(imported, PlacementLibrary(), ReachabilitySurvey())
     assert isinstance(outcome, Verified), outcome
     assert [call["action"] for call in outcome.record.oracle][-1] == "close"
 

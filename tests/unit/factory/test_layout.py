@@ -30,8 +30,8 @@ from embomatrix.factory.layout.values import (
 )
 from embomatrix.factory.scenes.check import check_scene
 from embomatrix.factory.scenes.editor import LayoutReason, SceneEditor
+from embomatrix.llm.batch import FailureLimit
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
-from embomatrix.llm.patience import FailureLimit
 from embomatrix.llm.values import EndpointError
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.catalog import Catalog

@@ -1,4 +1,4 @@
-"""Recorded answers stand in for the model, and accounts are kept of what was asked."""
+"""Recorded answers replace the model, and the ledger accounts for questions."""
 
 import json
 from dataclasses import replace
@@ -28,13 +28,13 @@ async def replayed(path, *questions):
     return [(await cassette.complete(question)).text for question in questions]
 
 
-async def test_what_was_recorded_is_answered_again_in_its_order(tmp_path):
+async def test_recorded_answers_are_replayed_in_order(tmp_path):
     path = tmp_path / "tapes" / "cast.jsonl"
     assert await recorded(path, QUESTION, OTHER, QUESTION) == (["Ann.", "Bo.", "Cy."], 3)
     assert await replayed(path, QUESTION, QUESTION, OTHER) == ["Ann.", "Cy.", "Bo."]
 
 
-async def test_auto_asks_only_what_is_not_recorded(tmp_path):
+async def test_auto_mode_asks_only_unrecorded_questions(tmp_path):
     path = tmp_path / "cast.jsonl"
     await recorded(path, QUESTION)
     texts, asked = await recorded(path, QUESTION, OTHER, mode=CassetteMode.AUTO)
@@ -42,7 +42,7 @@ async def test_auto_asks_only_what_is_not_recorded(tmp_path):
     assert len(path.read_text().splitlines()) == 2
 
 
-async def test_a_question_that_changed_is_named(tmp_path):
+async def test_changed_question_is_reported(tmp_path):
     path = tmp_path / "cast.jsonl"
     await recorded(path, QUESTION)
     with pytest.raises(
@@ -52,16 +52,16 @@ async def test_a_question_that_changed_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("line", ["{", "[]", '{"question": 3}'])
-async def test_a_damaged_line_is_named(tmp_path, line):
+async def test_damaged_line_is_reported(tmp_path, line):
     path = tmp_path / "cast.jsonl"
     await recorded(path, QUESTION)
     with path.open("a") as file:
         file.write(f"{line}\n")
-    with pytest.raises(CassetteError, match="line 2, is no recorded answer"):
+    with pytest.raises(CassetteError, match="line 2, is not a recorded answer"):
         Cassette(path, CassetteMode.REPLAY)
 
 
-def test_a_cassette_that_is_not_there_or_has_no_model_to_ask_is_refused(tmp_path):
+def test_missing_cassette_or_missing_model_is_refused(tmp_path):
     with pytest.raises(CassetteError, match="record one first"):
         Cassette(tmp_path / "none.jsonl", CassetteMode.REPLAY)
     with pytest.raises(CassetteError, match="there is no model to ask"):
@@ -76,12 +76,12 @@ def test_a_cassette_that_is_not_there_or_has_no_model_to_ask_is_refused(tmp_path
         replace(QUESTION, messages=(Message(Speaker.USER, "Who?", (b"gif",)),)),
     ],
 )
-def test_all_that_is_asked_counts_and_who_asks_does_not(changed):
+def test_digest_covers_the_question_but_not_its_purpose(changed):
     assert digest(changed) != digest(QUESTION)
     assert digest(replace(QUESTION, purpose="someone else")) == digest(QUESTION)
 
 
-async def test_accounts_say_who_spent_what(tmp_path):
+async def test_ledger_sums_cost_by_purpose(tmp_path):
     server = ChatServer("Ann is here.", "Bo.", (400, {}, "no", 0.0))
     path = tmp_path / "ledger.jsonl"
     with server.serving() as url:

@@ -1,4 +1,4 @@
-"""An endpoint is asked with patience that ends, and what is wrong with it is said."""
+"""The endpoint client retries within bounds and reports failures with their remedy."""
 
 import asyncio
 import base64
@@ -21,7 +21,7 @@ async def asked(server, question=QUESTION, limits=QUICK, **options):
             return await endpoint.complete(question)
 
 
-async def test_a_question_goes_out_whole_and_its_answer_comes_back_counted():
+async def test_question_is_sent_completely_and_usage_is_returned():
     server = ChatServer("Ann and Bo.")
     reply = await asked(server, api_key="key-1")
     sent = server.requests[0]
@@ -33,7 +33,7 @@ async def test_a_question_goes_out_whole_and_its_answer_comes_back_counted():
     assert reply.usage == Usage(11, 3)
 
 
-async def test_pictures_travel_as_data_and_a_schema_where_it_is_wanted():
+async def test_images_are_sent_as_data_urls_and_schema_on_request():
     server = ChatServer("{}")
     question = ChatRequest(
         "view", (Message(Speaker.USER, "Look.", (b"png",)),), json_schema={"type": "object"}
@@ -54,7 +54,7 @@ async def test_pictures_travel_as_data_and_a_schema_where_it_is_wanted():
         (200, {}, '{"choices": []}', 0.0),
     ],
 )
-async def test_what_may_pass_is_tried_again(trouble):
+async def test_transient_failures_are_retried(trouble):
     server = ChatServer(trouble, trouble, "Ann.")
     reply = await asked(server)
     assert (reply.text, reply.retries, len(server.requests)) == ("Ann.", 2, 3)
@@ -67,10 +67,10 @@ async def test_what_may_pass_is_tried_again(trouble):
             (500, {}, "out of memory", 0.0),
             r"cast: the endpoint http.*answered 500 \(out of memory\), 3 times",
         ),
-        ((200, {}, "[]", 0.0), r"what is no chat completion \(\[\]\), 3 times"),
+        ((200, {}, "[]", 0.0), r"its answer is not a chat completion \(\[\]\), 3 times"),
     ],
 )
-async def test_patience_ends(trouble, sentence):
+async def test_retries_are_bounded(trouble, sentence):
     server = ChatServer(trouble)
     with pytest.raises(EndpointError, match=sentence):
         await asked(server)
@@ -78,14 +78,14 @@ async def test_patience_ends(trouble, sentence):
 
 
 @pytest.mark.parametrize("status", [400, 401, 404])
-async def test_what_no_attempt_mends_is_said_at_once(status):
+async def test_permanent_failures_are_not_retried(status):
     server = ChatServer((status, {}, '{"error": {"message": "no model small-1"}}', 0.0))
     with pytest.raises(EndpointError, match=rf"answered {status} .*no model small-1.*check its address"):
         await asked(server)
     assert len(server.requests) == 1
 
 
-async def test_a_dead_endpoint_is_named():
+async def test_unreachable_endpoint_is_named():
     async with Endpoint("http://127.0.0.1:9/v1", "small-1", limits=QUICK) as endpoint:
         with pytest.raises(
             EndpointError, match=r"http://127.0.0.1:9/v1/chat/completions: it can't be reached"
@@ -93,19 +93,19 @@ async def test_a_dead_endpoint_is_named():
             await endpoint.complete(QUESTION)
 
 
-async def test_an_answer_that_does_not_come_is_given_up():
+async def test_missing_answer_times_out():
     slow = (200, {}, "{}", 1.0)
     limits = EndpointLimits(attempts=2, timeout_s=0.1, first_wait_s=0.01)
     with pytest.raises(EndpointError, match=r"gave no answer within 0.1 s, 2 times"):
         await asked(ChatServer(slow), limits=limits)
 
 
-async def test_an_answer_without_end_is_cut_off():
+async def test_oversized_answer_is_refused():
     with pytest.raises(EndpointError, match="more than 8388608 bytes"):
         await asked(ChatServer((200, {}, b"x" * (MAX_REPLY_BYTES + 1), 0.0)))
 
 
-async def test_no_more_questions_are_under_way_than_allowed():
+async def test_concurrency_is_bounded():
     server = ChatServer((200, {}, '{"choices": [{"message": {"content": "a"}}]}', 0.03))
     with server.serving() as url:
         async with Endpoint(url, "small-1", limits=EndpointLimits(concurrent=3)) as endpoint:

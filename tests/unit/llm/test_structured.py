@@ -1,4 +1,4 @@
-"""Typed answers are found in any text, and what is wrong is told to the model."""
+"""Typed answers are found in any text, and problems are reported to the model."""
 
 import json
 
@@ -42,7 +42,7 @@ async def asked(*script, **options):
         f'```\n{ANN}\n```\nnot {{"name": "Bo", "age": 3}}',
     ],
 )
-def test_the_value_is_found_wherever_it_stands(text):
+def test_value_is_found_anywhere_in_the_text(text):
     assert read_json(text, Person) == Person(name="Ann", age=41)
 
 
@@ -59,13 +59,13 @@ def test_the_value_is_found_wherever_it_stands(text):
         ("[" * 100_000, "it holds no complete JSON value"),
     ],
 )
-def test_what_is_wrong_is_said_field_by_field(text, sentence):
+def test_problems_are_reported_by_field(text, sentence):
     with pytest.raises(ValueError, match=sentence):
         read_json(text, Person)
 
 
 @given(st.text())
-def test_text_that_holds_no_person_gives_a_sentence(text):
+def test_text_without_a_value_raises_a_sentence(text):
     with pytest.raises(ValueError, match=r"\w"):
         read_json(text, Person)
 
@@ -78,7 +78,7 @@ def test_prose_before_and_after_changes_nothing(prose, person):
     assert read_json(prose + person.model_dump_json() + prose, Person) == person
 
 
-async def test_the_error_is_quoted_and_the_corrected_answer_taken():
+async def test_error_is_quoted_and_corrected_answer_accepted():
     answer, server = await asked("Ann!", '{"name": "Ann"}', ANN)
     assert answer.value == Person(name="Ann", age=41)
     assert len(answer.replies) == 3
@@ -87,7 +87,7 @@ async def test_the_error_is_quoted_and_the_corrected_answer_taken():
     assert "age: field required" in last[-1]["content"]
 
 
-async def test_what_a_check_objects_to_is_quoted_too():
+async def test_error_of_a_check_is_quoted_too():
     def grown_up(person):
         if person.age < 18:
             raise ValueError(f"{person.name} is {person.age}: expected a grown-up")
@@ -97,14 +97,14 @@ async def test_what_a_check_objects_to_is_quoted_too():
     assert "Bo is 3: expected a grown-up" in server.requests[-1]["messages"][-1]["content"]
 
 
-async def test_a_model_that_never_answers_so_is_given_up_with_its_words():
+async def test_unusable_model_is_reported_with_its_answers():
     error, server = await asked("no", "nein", "non")
     assert "cast: 3 answers of scripted-1, none usable" in str(error)
     assert error.replies == ("no", "nein", "non")
     assert len(server.requests) == 3
 
 
-async def test_an_answer_that_was_cut_off_is_said_to_be():
+async def test_cut_off_answer_is_reported_as_such():
     cut = (
         200,
         {},

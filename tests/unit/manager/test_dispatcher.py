@@ -360,3 +360,33 @@ def test_warm_and_cold_starts_are_told_apart(table):
     assert table.results["b2-0"].outcome.warm
     counters = table.dispatcher.counters("r1")
     assert (counters.cold_starts, counters.warm_starts) == (1, 1)
+
+
+def test_history_of_a_redispatched_rollout_names_workers_reasons_and_causes(table):
+    table.worker("w1")
+    table.submit(2)
+    table.worker("w2")
+    state = table.dispatcher.state
+    assert state.where("b1-0").startswith("leased: boot-1 on w1")
+    (again, _) = leases(table.tell(WorkerLost("w1", "killed"), after_s=1.0))
+    table.finish(again)
+    steps = state.explain("b1-0")
+    assert [(step.kind, step.worker_id, step.cause) for step in steps] == [
+        ("submitted", "", "BatchSubmitted"),
+        ("leased", "w1", "BatchSubmitted"),
+        ("returned", "w1", "WorkerLost"),
+        ("queued", "", "WorkerLost"),
+        ("leased", "w2", "WorkerLost"),
+        ("delivered", "", "LeaseFinished"),
+    ]
+    assert steps[2].reason == "worker lost: killed"
+    assert (state.where("b1-0"), state.explain("b1-9")) == ("", [])
+
+
+def test_every_command_carries_the_event_that_caused_it(table):
+    table.worker("w1")
+    commands = table.submit(2)
+    assert [type(command.caused_by) for command in commands] == [BatchSubmitted, BatchSubmitted]
+    lost = WorkerLost("w1", "killed")
+    table.worker("w2")
+    assert all(command.caused_by is lost for command in table.tell(lost))

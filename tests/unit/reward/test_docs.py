@@ -1,4 +1,4 @@
-"""docs/rewards.md says what the code does: its constants are the defaults, its example is computed anew."""
+"""docs/rewards.md agrees with the code: constants are the defaults, and the example is recomputed."""
 
 import dataclasses
 import re
@@ -17,14 +17,14 @@ PAGE = (Path(__file__).parents[3] / "docs" / "rewards.md").read_text(encoding="u
 
 
 def rows(first_heading: str) -> list[list[str]]:
-    """Cells of the table whose first column has this heading."""
+    """Return the cells of the table whose first column has this heading."""
     found = re.search(rf"^\| {first_heading} \|.*\n\| ---.*\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
     assert found, f"docs/rewards.md has no table of {first_heading}"
     return [line.strip("|").split(" | ") for line in found[1].splitlines()]
 
 
 def example() -> Task:
-    """The problem of the page as a task whose table holds all of its objects."""
+    """Return the page's problem as a task whose table contains all of its objects."""
     text = re.search(r"```lisp\n(.*?)```", PAGE, re.DOTALL)
     assert text
     problem = parse_problem(text[1])
@@ -33,7 +33,7 @@ def example() -> Task:
 
 
 class Holding:
-    """Facts: these atoms hold, written as on the page, and no others."""
+    """Facts that hold exactly the given atoms, written as on the page."""
 
     def __init__(self, atoms: list[str]) -> None:
         self.atoms = atoms
@@ -42,13 +42,13 @@ class Holding:
         return " ".join((predicate, *args)) in self.atoms
 
 
-def test_every_constant_stands_there_with_its_value():
+def test_page_lists_every_constant_with_its_value():
     written = {name.strip(" `"): float(value) for name, value, _ in rows("constant")}
     assert written == dataclasses.asdict(PAPER)
 
 
 @pytest.mark.parametrize("row", rows("what the plan does"), ids=lambda row: row[0].strip())
-def test_example_earns_what_the_page_says(row: list[str]):
+def test_example_earns_the_reward_on_the_page(row: list[str]):
     story, touched, true, *numbers = row
     facts = Holding(re.findall(r"`(.+?)`", true))
     task = example()
@@ -58,14 +58,14 @@ def test_example_earns_what_the_page_says(row: list[str]):
     assert breakdown.success is ("success" in story)
 
 
-def test_task_of_the_example_could_be_admitted():
+def test_example_task_is_admissible():
     task = example()
     assert not evaluate(task.goal, Holding([]), task.types)
     atoms = score(task, frozenset(), Holding([])).atoms
     assert 2 * sum(atom.holds for atom in atoms) <= len(atoms)
 
 
-def test_the_example_of_a_settings_file_is_a_reward():
+def test_example_settings_file_is_valid():
     table = re.search(r"```toml\n(.*?)```", PAGE, re.DOTALL)
     assert table
     assert RewardSettings(**tomllib.loads(table[1])["reward"]).goal == 10.0

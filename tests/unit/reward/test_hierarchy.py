@@ -1,4 +1,4 @@
-"""The three tiers, against the paper's constants."""
+"""The three reward tiers with the paper's constants."""
 
 from collections.abc import Mapping
 
@@ -16,7 +16,7 @@ TYPES: Mapping[str, tuple[str, ...]] = {"apple": NAMES, "box": ("box_1",)}
 
 
 class Inside:
-    """Facts in which these apples are inside the box."""
+    """Facts in which the given apples are inside the box."""
 
     def __init__(self, *names: str) -> None:
         self.names = names
@@ -39,7 +39,7 @@ def test_unparsable_text_earns_minus_one() -> None:
     assert not unparsable().success
 
 
-def test_plan_that_does_nothing_earns_the_format_alone() -> None:
+def test_plan_without_effect_earns_only_the_format_reward() -> None:
     breakdown = score(TWO, frozenset(), Inside())
     assert (breakdown.format, breakdown.relevance, breakdown.goal) == (0.5, 0.0, 0.0)
     assert breakdown.total == 0.5
@@ -61,23 +61,23 @@ def test_each_atom_earns_its_equal_share() -> None:
     assert not breakdown.success
 
 
-def test_only_objects_of_the_goal_are_relevant() -> None:
+def test_relevance_counts_only_goal_objects() -> None:
     assert score(TWO, frozenset({"apple_5", "apple_0"}), Inside()).relevance == pytest.approx(0.2)
 
 
-def test_relevance_ends_at_one() -> None:
+def test_relevance_is_capped_at_one() -> None:
     every = task("(forall (?x - apple) (inside ?x box_1))")
     assert score(every, frozenset({*NAMES, "box_1"}), Inside()).relevance == 1.0
 
 
-def test_members_of_a_quantified_type_are_objects_of_the_goal() -> None:
+def test_members_of_a_quantified_type_are_goal_objects() -> None:
     some = task("(exists (?x - apple) (inside ?x box_1))")
     breakdown = score(some, frozenset({"apple_3"}), Inside("apple_3"))
     assert breakdown.total == pytest.approx(0.5 + 0.2 + 30.0)
     assert len(breakdown.atoms) == 1
 
 
-def test_constants_are_settings() -> None:
+def test_settings_override_every_constant() -> None:
     settings = RewardSettings(unparsable=-2.0, format=1.0, relevance_per_object=0.5, goal=10.0)
     assert unparsable(settings).total == -2.0
     assert score(TWO, frozenset({"box_1"}), Inside("apple_0"), settings).total == pytest.approx(
@@ -94,13 +94,13 @@ def test_constants_are_settings() -> None:
         ({"unparsable": 1.0}, r"unparsable is 1 and format 0\.5: .* lower it"),
     ],
 )
-def test_coefficients_that_make_no_reward_are_named(coefficients: dict[str, float], sentence: str) -> None:
+def test_invalid_coefficients_are_named(coefficients: dict[str, float], sentence: str) -> None:
     with pytest.raises(RewardSettingsError, match=sentence):
         RewardSettings(**coefficients)
 
 
 @given(st.frozensets(st.sampled_from([*NAMES, "box_1"])), st.frozensets(st.sampled_from(NAMES)))
-def test_executed_plan_earns_between_the_format_and_the_paper_s_maximum(
+def test_executed_plan_earns_between_format_reward_and_maximum(
     touched: frozenset[str], inside: frozenset[str]
 ) -> None:
     every = task("(forall (?x - apple) (inside ?x box_1))")

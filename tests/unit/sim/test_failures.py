@@ -1,4 +1,4 @@
-"""Every reason of failure, each met by the shortest plan that leads to it."""
+"""Every failure reason, reached by the shortest plan that leads to it."""
 
 from dataclasses import replace
 
@@ -87,7 +87,7 @@ AT_HOME = {
     FailureReason.GIVES_NO_LIQUID: "soak_object_in_source rag_1 plate_1",
     FailureReason.NOT_SOAKABLE: "soak_object_in_source plate_1 sink_1",
 }
-"""Those of cutting, cleaning and soaking."""
+"""Plans that fail with the reasons of cutting, cleaning and soaking."""
 ELSEWHERE = {
     FailureReason.NO_PATH,
     FailureReason.NO_STANDING_POSE,
@@ -96,18 +96,18 @@ ELSEWHERE = {
     FailureReason.DOOR_BLOCKED,
     FailureReason.NO_FREE_POSE,
 }
-"""Reasons that the tests below this table meet in scenes of their own."""
+"""Reasons that the tests below reach in dedicated scenes."""
 
 
 @pytest.mark.parametrize("reason", list(REACHED))
-def test_a_plan_meets_the_reason(awkward, reason):
+def test_plan_fails_with_the_expected_reason(awkward, reason):
     trace = executed(awkward, REACHED[reason])
     assert trace.failure is reason, trace.steps[-1].message
     assert trace.steps[-1].failure in reasons_of(trace.steps[-1].call.skill)
 
 
 @pytest.mark.parametrize("reason", list(AT_HOME))
-def test_a_household_plan_meets_the_reason(home, reason):
+def test_household_plan_fails_with_the_expected_reason(home, reason):
     trace = executed(home, AT_HOME[reason])
     assert trace.failure is reason, trace.steps[-1].message
     assert trace.steps[-1].failure in reasons_of(trace.steps[-1].call.skill)
@@ -129,12 +129,12 @@ def test_a_household_plan_meets_the_reason(home, reason):
         ),
     ],
 )
-def test_a_tool_or_a_tap_that_is_not_ready_is_told(home, text, reason):
+def test_unready_tool_or_tap_is_reported(home, text, reason):
     trace = executed(home, text)
     assert trace.failure is reason, trace.steps[-1].message
 
 
-def test_every_reason_is_met_by_some_test():
+def test_tests_cover_every_failure_reason():
     mishaps = frozenset().union(*MISHAPS.values())
     assert {*REACHED, *AT_HOME} | ELSEWHERE | mishaps == set(FailureReason)
     assert not mishaps & {*REACHED, *AT_HOME, *ELSEWHERE}
@@ -152,7 +152,7 @@ def test_a_room_without_a_door_can_not_be_entered():
     assert trace.failure is FailureReason.NO_PATH
 
 
-def test_what_lies_in_the_middle_of_a_huge_table_can_not_be_reached():
+def test_middle_of_a_huge_table_is_out_of_reach():
     island, apple = make.block("island", "island.n.01", (2.6, 2.6, 0.5), {}), make.apple()
     scene = scene_of(
         "island",
@@ -167,7 +167,7 @@ def test_what_lies_in_the_middle_of_a_huge_table_can_not_be_reached():
 
 
 @pytest.mark.parametrize("text", ["move apple_2", "go_to_room living_room_0"])
-def test_who_stands_in_the_doorway_is_told(text):
+def test_blocker_in_the_doorway_is_named(text):
     chest = make.block("chest", "chest.n.02", (0.5, 0.9, 0.6), {})
     scene = with_objects(
         kitchen_scene(),
@@ -224,13 +224,13 @@ def in_front_of_the_microwave():
     )
 
 
-def test_a_mug_in_front_of_the_microwave_keeps_its_door_shut():
+def test_mug_in_front_of_the_microwave_blocks_its_door():
     trace = executed_alone(in_front_of_the_microwave(), "move microwave_1; open microwave_1")
     assert trace.failure is FailureReason.DOOR_BLOCKED
     assert trace.steps[-1].message == "mug_1 is in the way of the door of microwave_1"
 
 
-def test_a_door_that_is_blocked_stays_as_it_was():
+def test_blocked_door_stays_in_place():
     simulator = load_simulator(Bundle(in_front_of_the_microwave(), {}))
     executed(simulator, "move microwave_1; open microwave_1")
     assert not simulator.facts.holds("open", ("microwave_1",))

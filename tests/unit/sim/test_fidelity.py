@@ -1,4 +1,4 @@
-"""The fidelity of two modes: known disagreements are found, counted and told; plans are reproducible and reach their quotas."""
+"""Fidelity suite: known disagreements are found and counted; plans are reproducible and reach their quotas."""
 
 from collections import Counter
 
@@ -14,17 +14,15 @@ from embomatrix.sim.fidelity.compare import (
     PlanKind,
     StepRun,
     compare,
-    objects_in,
-    run_trial,
-)
-from embomatrix.sim.fidelity.plans import Example, Request, write_trials
-from embomatrix.sim.fidelity.records import (
     comparison_from_json,
     comparison_to_json,
     disagreement_to_json,
+    objects_in,
+    run_trial,
     trial_from_json,
     trial_to_json,
 )
+from embomatrix.sim.fidelity.plans import SolvedTask, TrialRequest, write_trials
 from embomatrix.sim.fidelity.report import report_on
 from embomatrix.sim.fidelity.sampler import ROUTINES, SKILLS
 from embomatrix.sim.planner.oracle import find_plan
@@ -54,7 +52,7 @@ def cached(bundle):
 
 @pytest.fixture(scope="module")
 def examples(bundle, cached):
-    return [Example(task, find_plan(cached, task)) for task in bundle.tasks.values()]
+    return [SolvedTask(task, find_plan(cached, task)) for task in bundle.tasks.values()]
 
 
 def trial_of(task, words):
@@ -66,7 +64,7 @@ def compared(cached, other, words):
     return compare(cached, other, task, trial_of(task, words))
 
 
-def test_a_mode_agrees_with_itself_in_every_step_and_atom(cached, bundle):
+def test_mode_agrees_with_itself_in_every_step_and_atom(cached, bundle):
     other = load_simulator(bundle)
     comparison = compared(cached, other, CARRY)
     other.close()
@@ -76,7 +74,7 @@ def test_a_mode_agrees_with_itself_in_every_step_and_atom(cached, bundle):
     assert "(ontop apple_1 countertop_1)" in comparison.equal_atoms
 
 
-def test_the_first_step_that_differs_is_named_with_both_sentences(cached, bundle):
+def test_first_different_step_is_reported_with_both_messages(cached, bundle):
     other = clumsy(bundle)
     comparison = compared(cached, other, LAMP)
     other.close()
@@ -88,7 +86,7 @@ def test_the_first_step_that_differs_is_named_with_both_sentences(cached, bundle
     assert "blocks it" in told["physical"]
 
 
-def test_atoms_that_hold_in_one_mode_alone_are_told(cached, bundle):
+def test_atoms_of_one_mode_only_are_reported(cached, bundle):
     other = sloppy(bundle)
     comparison = compared(cached, other, CARRY)
     other.close()
@@ -99,7 +97,7 @@ def test_atoms_that_hold_in_one_mode_alone_are_told(cached, bundle):
     assert "step" not in told
 
 
-def test_objects_of_the_goal_and_of_the_calls_are_compared(bundle):
+def test_comparison_covers_objects_of_goal_and_calls(bundle):
     task = bundle.tasks[sorted(bundle.tasks)[0]]
     named = objects_in(task, plan_of(task, "move shelf_1"))
     assert "shelf_1" in named
@@ -115,7 +113,7 @@ def run_of(*steps, cpu_s=1.0):
     )
 
 
-def test_figures_are_those_that_one_reckons_by_hand():
+def test_figures_agree_with_hand_computed_values():
     good, bad = None, FailureReason.FELL
     trial = FidelityTrial("t", DIGEST, "flat", "task", PlanKind.ORACLE, 0, ())
     one = Comparison(
@@ -144,18 +142,18 @@ def test_figures_are_those_that_one_reckons_by_hand():
     assert (by_skill[Skill.CLOSE].unequal, by_skill[Skill.PLACE].other_reason) == (1, 1)
 
 
-def test_a_suite_without_plans_has_figures_all_the_same():
+def test_empty_suite_has_default_figures():
     report = report_on([])
     assert (report.plans, report.atoms_equal, report.steps_equal, report.speedup_min) == (0, 1.0, 1.0, 0.0)
 
 
-def test_every_skill_of_the_paper_has_a_way_to_be_sampled():
+def test_every_paper_skill_has_a_sampling_routine():
     assert set(ROUTINES) == set(SKILLS)
 
 
-def test_equal_seeds_write_equal_trials_and_other_seeds_others(cached, examples):
+def test_equal_seeds_give_equal_trials_and_different_seeds_differ(cached, examples):
     first, again, other = (
-        write_trials(cached, DIGEST, examples, Request(KINDS, {}, seed)) for seed in (0, 0, 1)
+        write_trials(cached, DIGEST, examples, TrialRequest(KINDS, {}, seed)) for seed in (0, 0, 1)
     )
     assert first == again
     assert [trial.plan for trial in first] != [trial.plan for trial in other]
@@ -163,9 +161,11 @@ def test_equal_seeds_write_equal_trials_and_other_seeds_others(cached, examples)
     assert len({trial.trial_id for trial in first}) == len(first)
 
 
-def test_trials_reach_the_quota_of_every_skill_and_behave_as_their_kind_says(cached, examples, bundle):
+def test_trials_reach_every_quota_and_match_their_kind(cached, examples, bundle):
     quota = 6
-    trials = write_trials(cached, DIGEST, examples, Request(KINDS, dict.fromkeys(SKILLS, quota), 5, extra=60))
+    trials = write_trials(
+        cached, DIGEST, examples, TrialRequest(KINDS, dict.fromkeys(SKILLS, quota), 5, extra=60)
+    )
     calls = Counter()
     for trial in trials:
         run = run_trial(cached, bundle.tasks[trial.task_id], trial)
@@ -178,8 +178,8 @@ def test_trials_reach_the_quota_of_every_skill_and_behave_as_their_kind_says(cac
     assert all(calls[skill] >= quota for skill in SKILLS), calls
 
 
-def test_trials_and_comparisons_survive_their_files(cached, examples, bundle):
-    for trial in write_trials(cached, DIGEST, examples, Request(KINDS, {}, 2)):
+def test_trials_and_comparisons_round_trip_through_json(cached, examples, bundle):
+    for trial in write_trials(cached, DIGEST, examples, TrialRequest(KINDS, {}, 2)):
         assert trial_from_json(trial_to_json(trial)) == trial
         found = compare(cached, cached, bundle.tasks[trial.task_id], trial)
         back = comparison_from_json(comparison_to_json(found))

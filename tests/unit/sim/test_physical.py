@@ -1,4 +1,4 @@
-"""The physical mode, each skill carried out once by the robot in the flat, and what must fail there."""
+"""Physical mode: the robot carries out every skill once in the flat, and fails where it must."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def executed_physically(scene, text):
         simulator.close()
 
 
-def test_every_skill_has_a_motion_and_says_what_may_go_wrong():
+def test_every_skill_has_a_motion_and_listed_mishaps():
     assert set(MOTIONS) == set(MISHAPS) == set(Skill)
 
 
@@ -45,12 +45,12 @@ def test_every_skill_has_a_motion_and_says_what_may_go_wrong():
         "go_to_room living_room_0; turn 1; move_forward 0.5 0",
     ],
 )
-def test_the_robot_does_what_cached_mode_says_it_does(flat, text):
+def test_physical_mode_succeeds_where_cached_mode_does(flat, text):
     trace = executed(flat, text)
     assert trace.failure is None, trace.steps[-1].message
 
 
-def test_food_comes_out_of_the_fridge_and_its_door_is_shut_again(flat):
+def test_food_is_taken_out_of_the_opened_fridge(flat):
     text = "move fridge_1; open fridge_1; move chicken_leg_1; pick_up chicken_leg_1; move fridge_1"
     trace = executed(flat, text)
     assert trace.failure is None, trace.steps[-1].message
@@ -58,13 +58,13 @@ def test_food_comes_out_of_the_fridge_and_its_door_is_shut_again(flat):
     assert flat.world.carried == ("chicken_leg_1",)
 
 
-def test_a_door_is_led_open_and_shut_by_the_hand(flat):
+def test_hand_opens_and_shuts_a_door(flat):
     trace = executed(flat, "move fridge_1; open fridge_1; close fridge_1")
     assert trace.failure is None, trace.steps[-1].message
     assert flat.world.engine.joints("fridge_1")[0] < 0.05
 
 
-def test_a_bowl_carries_what_lies_in_it_to_the_stove_where_both_get_hot(flat):
+def test_bowl_carries_its_contents_to_the_stove_and_both_get_hot(flat):
     text = (
         "move apple_1; pick_up apple_1; move bowl_1; place bowl_1 inside; pick_up bowl_1; move stove_1; "
         "place stove_1 ontop; toggle_on stove_1"
@@ -75,14 +75,14 @@ def test_a_bowl_carries_what_lies_in_it_to_the_stove_where_both_get_hot(flat):
     assert flat.facts.holds("cooked", ("apple_1",))
 
 
-def test_what_is_held_is_lifted_and_what_is_placed_rests_where_physics_left_it(flat):
+def test_held_object_is_lifted_and_placed_object_rests(flat):
     executed(flat, "move apple_1; pick_up apple_1; move countertop_1; place countertop_1 ontop")
     pose = flat.world.engine.pose("apple_1")
     assert abs(pose.position_m[2] - 0.94) < 0.005
     assert flat.world.carried == ()
 
 
-def test_equal_plans_end_bit_equal_whatever_was_executed_before():
+def test_equal_plans_give_bit_equal_traces_after_any_history():
     text = "move apple_1; pick_up apple_1; move countertop_1; place countertop_1 ontop"
     bundle = Bundle(kitchen_scene(), {})
     first, second = physical_simulator(bundle), physical_simulator(bundle)
@@ -100,7 +100,7 @@ def test_a_refused_call_moves_nothing(flat):
     assert flat.world.engine.pose("apple_1") == flat.world.scene.by_name["apple_1"].pose_world_asset
 
 
-def test_a_heavy_thing_before_a_door_bars_it_really():
+def test_heavy_object_in_front_of_a_door_blocks_it():
     anvil = replace(make.block("anvil", "anvil.n.01", (0.12, 0.3, 0.28), {}), mass_kg=60.0)
     anvil_pose = upright(2.6, 3.47, 0.9, anvil, 1.5707963)
     scene = with_objects(
@@ -114,14 +114,14 @@ def test_a_heavy_thing_before_a_door_bars_it_really():
     }
 
 
-def test_the_lid_of_what_can_be_carried_is_no_door_to_the_robot():
+def test_lid_of_a_portable_object_is_no_door():
     scene = kitchen_scene()
     objects = tuple(replace(item, fixed=item.fixed and item.name != "microwave_1") for item in scene.objects)
     trace = executed_physically(replace(scene, objects=objects), "move microwave_1; open microwave_1")
     assert trace.failure is FailureReason.ARM_BLOCKED
 
 
-def test_what_stands_walled_in_by_heavy_things_can_not_be_taken():
+def test_object_walled_in_by_heavy_objects_is_unreachable():
     wall = replace(make.block("slab", "slab.n.01", (0.04, 0.6, 0.5), {}), mass_kg=50.0)
     lid = replace(make.block("lid", "lid.n.01", (0.6, 0.6, 0.04), {}), mass_kg=50.0)
     x, y, top = 1.9, 1.6, 0.75
@@ -142,7 +142,7 @@ def test_what_stands_walled_in_by_heavy_things_can_not_be_taken():
         simulator.close()
 
 
-def test_watching_sees_time_pass():
+def test_watch_function_is_called_as_time_passes():
     scene = kitchen_scene()
     actor = PhysicalActor(Bundle(scene, {}))
     simulator = load_simulator(Bundle(scene, {}), actor=actor)

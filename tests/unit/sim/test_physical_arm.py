@@ -1,4 +1,4 @@
-"""The arm's kinematics: what is solved in closed form is where the chain of joints leads."""
+"""Closed-form inverse kinematics of the arm agree with forward kinematics."""
 
 from dataclasses import replace
 
@@ -15,11 +15,11 @@ from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.robot import tucked
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.physical import arm, body
-from embomatrix.sim.physical.doors import Leaf
+from embomatrix.sim.physical.doors import DoorPanel
 from embomatrix.sim.physical.floor import Floor
 from embomatrix.sim.physical.grasp import cross
 from embomatrix.sim.physical.motion import Mover
-from embomatrix.sim.physical.space import boxes_of, strikes, struck
+from embomatrix.sim.physical.space import boxes_of, collides, deepest_box
 from embomatrix.sim.state.relations import Relations
 from embomatrix.world.asset import Joint, JointKind, Link
 from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
@@ -29,7 +29,7 @@ SHARES = arrays.arrays(np.float64, (5, arm.JOINTS), elements=st.floats(0.02, 0.9
 
 
 @given(SHARES)
-def test_every_solution_brings_the_tool_where_it_was_asked_to_be(shares):
+def test_every_solution_reaches_the_requested_tool_pose(shares):
     joints = arm.LOW_RAD + shares * (arm.HIGH_RAD - arm.LOW_RAD)
     rotation, position = arm.frames(joints)
     found = arm.solve(rotation[:, 7], position[:, 7], joints[:, 6])
@@ -40,7 +40,7 @@ def test_every_solution_brings_the_tool_where_it_was_asked_to_be(shares):
         np.testing.assert_allclose(again[:, 7], rotation[solved, 7], atol=1e-6)
 
 
-def test_nearly_all_postures_are_found_again():
+def test_nearly_all_postures_are_recovered_by_inverse_kinematics():
     rng = np.random.default_rng(0)
     joints = rng.uniform(arm.LOW_RAD, arm.HIGH_RAD, (500, arm.JOINTS))
     rotation, position = arm.frames(joints)
@@ -48,12 +48,12 @@ def test_nearly_all_postures_are_found_again():
     assert (~np.isnan(found[:, :, 0])).any(axis=1).mean() > 0.97
 
 
-def test_what_is_out_of_the_arms_reach_has_no_solution():
+def test_pose_out_of_reach_has_no_solution():
     found = arm.solve(np.eye(3)[None], np.array([[1.5, 0.0, 0.5]]), np.array([0.785]))
     assert np.isnan(found).all()
 
 
-def test_the_base_the_lift_and_the_heading_carry_the_tool_along():
+def test_tool_moves_with_base_lift_and_heading():
     rest = np.array([[0.0, 0.0, 0.0, 0.2, 0.0, -0.6, 0.0, -2.2, 0.0, 1.7, 0.785]])
     moved = rest.copy()
     moved[0, :4] = (1.0, 2.0, np.pi / 2, 0.5)
@@ -70,19 +70,19 @@ def test_the_folded_arm_keeps_within_the_robots_disc_and_off_its_own_trunk():
     posture = np.concatenate([[0.0, 0.0, 0.0, 0.0], np.array(TUCKED_ARM)])[None]
     wide = np.linalg.norm(body.balls(posture)[0, :, :2], axis=1) + body.RADII
     assert wide.max() <= ROBOT.radius_m + 0.005
-    assert not body.strikes_itself(posture, body.balls(posture), body.RADII)[0]
+    assert not body.self_collides(posture, body.balls(posture), body.RADII)[0]
 
 
-def test_balls_strike_a_turned_box_where_they_are_in_it():
+def test_balls_collide_with_a_rotated_box_only_inside_it():
     quarter = Pose.from_xyz_yaw(1.0, 0.0, 0.0, np.pi / 4)
     boxes = boxes_of([(quarter, (0.2, 2.0, 0.2), "beam")])
     balls = np.array([[[0.5, 0.5, 0.0]], [[1.5, 0.5, 0.0]]])  # the beam runs along (-1, 1)
-    assert strikes(boxes, balls, np.array([0.05]), 0.0).tolist() == [0, -1]
+    assert [deepest_box(boxes, row, np.array([0.05]), 0.0) for row in balls] == [0, -1]
     np.testing.assert_allclose(boxes.gaps(balls[:, 0])[:, 0], (-0.1, 0.6071), atol=1e-3)
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_who_strikes_nothing_is_told_sooner_and_is_the_same(seed):
+def test_fast_collision_check_agrees_with_the_exact_one(seed):
     rng = np.random.default_rng(seed)
     postures = np.zeros((int(rng.integers(1, 60)), body.NUMBERS))
     postures[:, body.ARM] = rng.uniform(arm.LOW_RAD, arm.HIGH_RAD, (len(postures), arm.JOINTS))
@@ -94,51 +94,51 @@ def test_who_strikes_nothing_is_told_sooner_and_is_the_same(seed):
     )
     balls = body.balls(postures)
     for margin_m in (-0.003, 0.0, 0.012):
-        expected = strikes(boxes, balls, body.RADII, margin_m) >= 0
-        np.testing.assert_array_equal(struck(boxes, balls, body.RADII, margin_m), expected)
+        expected = np.array([deepest_box(boxes, row, body.RADII, margin_m) >= 0 for row in balls])
+        np.testing.assert_array_equal(collides(boxes, balls, body.RADII, margin_m), expected)
 
 
-def test_a_door_is_at_its_front_when_it_is_shut_and_before_it_when_it_is_open():
+def test_door_panel_box_moves_from_the_front_to_before_it():
     front = ConvexPart(Shape.BOX, Pose((0.31, 0.0, 0.0)), (0.02, 0.6, 1.0))
     hinge = Joint(JointKind.REVOLUTE, (0.31, -0.3, 0.0), (0.0, 0.0, 1.0), -np.pi / 2)
     link = Link("door", (front,), hinge)
     fridge = make.asset("fridge", "electric_refrigerator.n.01", (0.6, 0.6, 1.0), [], links=[link])
     around = Aabb.around([front.aabb(Pose((0.0, 0.0, 0.0)))])
-    leaf = Leaf("fridge_1", 0, link, hinge, fridge, Pose((1.0, 2.0, 0.5)), around)
-    shut, opened = leaf.at(0.0), leaf.at(1.0)
+    panel = DoorPanel("fridge_1", 0, link, hinge, fridge, Pose((1.0, 2.0, 0.5)), around)
+    shut, opened = panel.at(0.0), panel.at(1.0)
     np.testing.assert_allclose((shut.low_m[0], shut.high_m[0]), (1.3, 1.32), atol=1e-9)
     np.testing.assert_allclose((opened.low_m[0], opened.high_m[0]), (1.31, 1.91), atol=0.02)
 
 
-def test_what_the_arm_touches_is_drawn_in_until_it_does_not_and_the_rest_stays():
+def test_touched_boxes_shrink_until_clear_and_others_stay():
     near, far = Pose((1.0, 0.0, 0.0)), Pose((0.0, 2.0, 0.0))
     boxes = boxes_of([(near, (0.2, 2.0, 0.2), "door"), (far, (0.2, 0.2, 0.2), "wall")])
     ball, radius = np.array([[0.88, 0.0, 0.0]]), np.array([0.05])  # 3 cm deep in the door
-    assert strikes(boxes, ball[None], radius, 0.0).tolist() == [0]
-    freed = boxes.drawn_in(ball, radius, 0.012)
+    assert deepest_box(boxes, ball, radius, 0.0) == 0
+    freed = boxes.shrunk_clear_of(ball, radius, 0.012)
     np.testing.assert_allclose(freed.gaps(ball).min(axis=1) - radius, [0.012], atol=1e-9)
     np.testing.assert_array_equal(freed.half[1], boxes.half[1])
 
 
-@pytest.mark.parametrize(("leaf_m", "order"), [(2.4, [3.3, 4.5]), (3.6, [4.5, 3.3])])
-def test_places_that_a_leaf_cuts_off_come_last(leaf_m, order):
+@pytest.mark.parametrize(("panel_m", "order"), [(2.4, [3.3, 4.5]), (3.6, [4.5, 3.3])])
+def test_places_that_an_open_panel_cuts_off_come_last(panel_m, order):
     engine = BulletEngine(kitchen_scene())
     try:
         # From the south wall on: the long one reaches the furniture in the north, and more floor lies east of it.
-        leaf = boxes_of([(Pose((4.0, leaf_m / 2, 0.5)), (0.04, leaf_m, 1.0), "door")])
+        panel = boxes_of([(Pose((4.0, panel_m / 2, 0.5)), (0.04, panel_m, 1.0), "door")])
         east, west = np.array([[4.5, 0.5, 0.0]]), np.array([[3.3, 2.6, 0.0]])
-        found = Floor(Navigator(engine, Relations(engine))).cut_off_last([west, east], leaf)
+        found = Floor(Navigator(engine, Relations(engine))).with_cut_off_last([west, east], panel)
     finally:
         engine.close()
     assert [float(group[0, 0]) for group in found] == order
 
 
 @given(arrays.arrays(np.float64, (2, 3), elements=st.floats(-10, 10)))
-def test_a_cross_product_in_numbers_is_that_of_numpy(vectors):
+def test_cross_product_equals_that_of_numpy(vectors):
     np.testing.assert_allclose(cross(*vectors), np.cross(*vectors), atol=1e-9)
 
 
-def test_what_is_swept_in_coarse_steps_ends_where_it_is_followed_in_fine_ones():
+def test_coarse_and_fine_motions_end_at_the_same_posture():
     scene = kitchen_scene()
     poses = {item.name: item.pose_world_asset for item in scene.objects}
     joints = {
@@ -157,7 +157,7 @@ def test_what_is_swept_in_coarse_steps_ends_where_it_is_followed_in_fine_ones():
     np.testing.assert_allclose(ends[1], ends[0], atol=0.01)
 
 
-def test_the_arm_bears_its_own_weight_stretched_out_in_coarse_steps_too():
+def test_stretched_arm_bears_its_weight_in_coarse_steps():
     scene = kitchen_scene()
     joints = {
         item.name: item.joints or (0.0,) * len(scene.asset_of(item.name).joints) for item in scene.objects
@@ -172,8 +172,8 @@ def test_the_arm_bears_its_own_weight_stretched_out_in_coarse_steps_too():
     world.close()
 
 
-def test_the_lift_bears_its_load_beside_a_leaf_that_fits_closely_between_its_neighbours():
-    """A contact that can move nothing is one by whose effect Bullet divides: it once ended the solving for the robot too."""
+def test_lift_bears_its_load_beside_a_closely_fitting_panel():
+    """Bullet divides by the effect of a contact. A contact that can move nothing once stopped the solver for the robot too."""
     front, tall = ConvexPart(Shape.BOX, Pose((0.31, 0.0, 0.0)), (0.02, 0.6, 1.0)), (0.6, 0.6, 1.0)
     door = Link("door", (front,), Joint(JointKind.REVOLUTE, (0.31, 0.0, -0.5), (0.0, 1.0, 0.0), 1.5))
     oven = make.asset("oven", "oven.n.01", tall, [make.box((0.0, 0.0, 0.0), tall)], links=[door])

@@ -1,4 +1,4 @@
-"""Films of the physical mode: the arm moves, and things move only while something moves them."""
+"""Films of physical mode: the arm moves, and objects move only while something moves them."""
 
 import itertools
 import math
@@ -31,7 +31,7 @@ def test_the_arm_reaches_and_the_object_is_lifted(film) -> None:
     assert len({frame.posture.arm for frame in film.frames if frame.step == 2}) > 5
 
 
-def test_nothing_leaps_between_two_frames(film) -> None:
+def test_objects_move_continuously_between_frames(film) -> None:
     heights = [
         frame.poses.get("apple_1", film.scene.by_name["apple_1"].pose_world_asset).position_m
         for frame in film.frames
@@ -39,6 +39,6 @@ def test_nothing_leaps_between_two_frames(film) -> None:
     assert max(math.dist(a, b) for a, b in itertools.pairwise(heights)) < 0.5
 
 
-def test_what_nobody_touches_stays_where_it_is(film) -> None:
+def test_untouched_objects_stay_in_place(film) -> None:
     moved = {name for frame in film.frames for name in frame.poses}
     assert moved == {"apple_1"}

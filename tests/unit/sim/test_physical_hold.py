@@ -1,4 +1,4 @@
-"""How the hand takes hold of things: flat ones, and those that it must take otherwise before they go where they should."""
+"""Grasps of flat objects, and regrasps before an object is placed."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from tests.fakes.plans import executed, with_objects
 from tests.fakes.scenes import kitchen_scene, placed, upright
 
 from embomatrix.sim.physical.actor import physical_simulator
-from embomatrix.sim.physical.grasp import SHEET_M, grasp_tracks, surface_point
+from embomatrix.sim.physical.grasp import SHEET_M, grasp_tool_paths, surface_point
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.geometry import Pose
 
@@ -35,7 +35,7 @@ def play():
 
 
 @given(angles, angles, angles)
-def test_a_pose_is_found_again_from_its_rotation(roll, pitch, yaw):
+def test_pose_is_recovered_from_its_rotation_matrix(roll, pitch, yaw):
     half = Pose.from_xyz_yaw(0.0, 0.0, 0.0, yaw)
     tilt = Pose((0.0, 0.0, 0.0), (np.sin(roll / 2), 0.0, 0.0, np.cos(roll / 2)))
     nod = Pose((0.0, 0.0, 0.0), (0.0, np.sin(pitch / 2), 0.0, np.cos(pitch / 2)))
@@ -45,7 +45,7 @@ def test_a_pose_is_found_again_from_its_rotation(roll, pitch, yaw):
     assert again.rotation == pytest.approx(pose.rotation, abs=1e-9)
 
 
-def test_a_ray_tells_where_it_enters_a_thing_and_how_thick_that_is():
+def test_ray_returns_entry_point_and_thickness():
     boxes = [(Pose((0.0, 0.0, 1.0)), (0.2, 0.2, 0.04)), (Pose((0.0, 0.0, 0.5)), (0.2, 0.2, 0.1))]
     point, thick_m, number = surface_point(boxes, np.zeros(3), np.array([0.0, 0.0, -1.0]))
     assert point == pytest.approx([0.0, 0.0, 1.02])
@@ -54,13 +54,13 @@ def test_a_ray_tells_where_it_enters_a_thing_and_how_thick_that_is():
     assert surface_point(boxes, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])) is None
 
 
-def test_the_hand_does_not_reach_through_a_sheet_into_what_it_lies_on():
+def test_grasp_of_a_sheet_does_not_enter_its_support():
     sheet = make.block("sheet", "sheet.n.01", (0.2, 0.15, 0.003), {})
-    tracks = grasp_tracks(sheet, Pose((0.0, 0.0, 0.7515)), (), 0.0, None)
+    tracks = grasp_tool_paths(sheet, Pose((0.0, 0.0, 0.7515)), (), 0.0, None)
     assert min(float(track.position[:, 2].min()) for track in tracks) >= 0.753 - SHEET_M - 1e-9
 
 
-def test_a_sheet_is_taken_off_a_table(play):
+def test_sheet_is_picked_up_from_a_table(play):
     sheet = replace(make.block("sheet", "sheet.n.01", (0.2, 0.15, 0.003), {}), mass_kg=0.05)
     pose = upright(2.0, 1.3, TABLE_TOP_M, sheet)
     trace, simulator = play(
@@ -81,20 +81,18 @@ def goes_to_the_bottom(play, crate):
     assert simulator.world.relations.inside("die_1", "crate_1")
 
 
-def test_what_was_taken_from_aside_is_taken_from_above_to_go_to_the_bottom_of_a_crate(play):
+def test_side_grasp_is_replaced_by_top_grasp_for_a_crate(play):
     crate = make.tub("crate", "crate.n.01", (0.24, 0.24, 0.2), 0.01, 0.01, mass_kg=1.0, abilities={})
     goes_to_the_bottom(play, crate)
 
 
-def test_what_goes_into_a_crate_too_narrow_for_the_hand_is_dropped_in(play):
+def test_object_is_dropped_into_a_crate_too_narrow_for_the_hand(play):
     crate = make.tub("crate", "crate.n.01", (0.16, 0.16, 0.3), 0.01, 0.01, mass_kg=1.0, abilities={})
     goes_to_the_bottom(play, crate)
 
 
 @pytest.mark.parametrize(("x", "yaw", "gap"), [(2.35, 0.0, 0.1), (1.7, 0.45, 0.0), (2.35, 0.45, 0.1)])
-def test_what_goes_on_a_narrow_top_is_taken_otherwise_with_the_hand_on_the_side_from_which_it_comes(
-    play, x, yaw, gap
-):
+def test_regrasp_for_a_narrow_top_puts_the_hand_on_the_near_side(play, x, yaw, gap):
     # The roll can't lie across the heater, nor the hand come along it, past the lockers.
     roll = replace(make.block("roll", "roll.n.01", (0.2, 0.063, 0.032), {}), mass_kg=0.15)
     heater = make.block("heater", "heater.n.01", (0.084, 0.48, 1.84), {})
@@ -118,7 +116,7 @@ def test_what_goes_on_a_narrow_top_is_taken_otherwise_with_the_hand_on_the_side_
 
 
 @pytest.mark.parametrize(("wide_m", "yaw"), [(0.4, 0.0), (0.36, np.pi / 2)])
-def test_what_fits_a_board_one_way_only_is_taken_at_the_side_that_will_be_outside(play, wide_m, yaw):
+def test_object_that_fits_a_board_one_way_is_gripped_at_its_outer_side(play, wide_m, yaw):
     # The book lies across the board, as long as that is wide, and is put down for the while with an end to the robot.
     book = replace(make.block("book", "book.n.01", (0.32, 0.22, 0.02), {}), mass_kg=0.4)
     size = (0.26 + make.PANEL_M, wide_m + 2 * make.PANEL_M, 0.32)
@@ -134,7 +132,7 @@ def test_what_fits_a_board_one_way_only_is_taken_at_the_side_that_will_be_outsid
     assert simulator.world.relations.inside("book_1", "rack_1")
 
 
-def test_a_cup_taken_at_its_thin_wall_stays_where_it_is_put(play):
+def test_cup_gripped_at_its_wall_stays_where_it_is_put(play):
     cup = make.tub("cup", "cup.n.01", (0.08, 0.08, 0.08), 0.003, 0.005, mass_kg=0.1, abilities={})
     pose = upright(2.0, 1.3, TABLE_TOP_M, cup)
     text = "move cup_1; pick_up cup_1; move countertop_1; place countertop_1 ontop"

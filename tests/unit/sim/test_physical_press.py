@@ -1,4 +1,4 @@
-"""How the hand presses: nothing else of the arm may meet what it presses, or it would keep the hand off."""
+"""Pressing: only the hand touches the pressed object."""
 
 import contextlib
 import itertools
@@ -11,9 +11,9 @@ from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical import body
-from embomatrix.sim.physical.fold import WAYS
-from embomatrix.sim.physical.press import press, pressing
-from embomatrix.sim.physical.space import struck
+from embomatrix.sim.physical.fold import PATHS_TRIED
+from embomatrix.sim.physical.press import press, press_paths
+from embomatrix.sim.physical.space import collides
 from embomatrix.sim.physical.stage import PhysicalStage
 from embomatrix.sim.placing.pose_cache import standing_poses
 from embomatrix.world.bundle import Bundle
@@ -35,19 +35,19 @@ def stage():
 
 
 @pytest.mark.parametrize("name", PRESSED)
-def test_no_way_to_press_a_thing_leads_the_arm_through_it(stage, name):
+def test_press_paths_keep_the_arm_out_of_the_pressed_object(stage, name):
     boxes = stage.boxes_within(np.full(3, -9.0), np.full(3, 20.0))
     own = boxes.only(name)
     for stand in stage.world.navigator.stands(name, stage.world.navigator.start)[:4]:
         stage.stand_at(stand)
-        ways = list(itertools.islice(pressing(stage, name)[1], WAYS))
+        ways = list(itertools.islice(press_paths(stage, name)[1], PATHS_TRIED))
         assert ways
         arms = body.balls(np.concatenate([way.postures for way in ways]))[:, ~body.HAND_BALLS]
-        assert not struck(own, arms, body.RADII[~body.HAND_BALLS], 0.0).any()
+        assert not collides(own, arms, body.RADII[~body.HAND_BALLS], 0.0).any()
 
 
 @pytest.mark.parametrize("name", PRESSED)
-def test_the_hand_gets_at_a_switch_from_the_first_place_to_stand(stage, name):
+def test_switch_is_pressed_from_the_first_standing_pose(stage, name):
     stage.world.robot = stage.world.navigator.stands(name, stage.world.navigator.start)[0]
     stage.begin()
     assert press(stage, name) is None

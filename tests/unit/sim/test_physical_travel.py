@@ -1,4 +1,4 @@
-"""Driving with an arm that stays out: it sweeps over more than the places where it stops."""
+"""Driving with a stretched arm, which sweeps over more than its stops."""
 
 import contextlib
 import math
@@ -24,7 +24,7 @@ STEP = math.tau / HEADINGS
 
 @contextlib.contextmanager
 def stretched_beside_a_post(turn):
-    """A stage on which the robot stretches its arm, and a thin post where the hand is after a turn."""
+    """Return a stage with a stretched arm, and a thin post at the hand position after a turn."""
     start = np.array([3.5, 1.5, turn, *STRETCHED])
     x, y, _ = body.tools(start[None])[1][0].tolist()
     post = make.block("post", "post.n.01", (0.01, 0.01, 1.6), {})
@@ -41,7 +41,7 @@ def stretched_beside_a_post(turn):
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_an_arm_that_stays_out_turns_the_other_way_round_from_a_post_between_two_headings(side):
+def test_stretched_arm_turns_away_from_a_post_between_two_headings(side):
     aim = side * 10 * STEP
     with stretched_beside_a_post(side * 2.5 * STEP) as stage:
         here = stage.mover.posture[None, :2]

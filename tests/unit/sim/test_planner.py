@@ -1,13 +1,13 @@
-"""The oracle: for every kind of goal a plan that works, without a call too many, or the reason why there is none."""
+"""Oracle planner: for every kind of goal a minimal working plan, or the reason why there is none."""
 
 from dataclasses import replace
 
 import pytest
 from tests.fakes import furniture as make
 from tests.fakes.plans import awkward_scene, task_over, with_objects, words_of
+from tests.fakes.pose_caches import build_pose_cache
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks, placed, upright
 
-from embomatrix.sim.placing.pose_cache import build_pose_cache
 from embomatrix.sim.planner.oracle import PROOF_SEEDS, PlanNotFound, find_plan
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.syntax import MAX_STEPS, Skill
@@ -37,7 +37,7 @@ def flat():
 
 
 def oracle(simulator, goal):
-    """The plan in words, checked with seeds that the oracle has not seen; or the reason."""
+    """Return the plan in words, verified with unseen seeds, or the reason."""
     task = task_over(simulator.world.scene, goal)
     found = find_plan(simulator, task)
     if isinstance(found, PlanNotFound):
@@ -108,11 +108,11 @@ def oracle(simulator, goal):
         ),
     ],
 )
-def test_the_plan_for_the_goal_is_the_shortest_that_a_person_would_write(flat, goal, plan):
+def test_plan_equals_the_shortest_sensible_plan(flat, goal, plan):
     assert oracle(flat, goal) == plan
 
 
-def test_the_open_door_of_what_is_fetched_ends_closed_when_the_goal_says_so(flat):
+def test_opened_container_is_closed_if_the_goal_requires_it(flat):
     goal = And((atom("ontop", "chicken_leg_1", "coffee_table_1"), Not(atom("open", "fridge_1"))))
     assert oracle(flat, goal) == (
         "move fridge_1; open fridge_1; pick_up chicken_leg_1; move coffee_table_1; place coffee_table_1 ontop; "
@@ -120,7 +120,7 @@ def test_the_open_door_of_what_is_fetched_ends_closed_when_the_goal_says_so(flat
     )
 
 
-def test_what_is_cooked_is_served_elsewhere(flat):
+def test_cooked_food_is_served_elsewhere(flat):
     goal = And(
         (
             atom("cooked", "chicken_leg_1"),
@@ -165,7 +165,7 @@ def test_a_plan_is_found_for_the_goal(flat, goal):
     assert oracle(flat, goal).startswith("move")
 
 
-def test_the_tasks_of_the_flat_can_be_done_with_several_seeds(flat):
+def test_plans_for_the_flat_succeed_with_several_seeds(flat):
     for task in kitchen_tasks(flat.world.scene):
         plan = find_plan(flat, task)
         assert not isinstance(plan, PlanNotFound), plan
@@ -175,7 +175,7 @@ def test_the_tasks_of_the_flat_can_be_done_with_several_seeds(flat):
             assert evaluate(task.goal, flat.facts, task.types)
 
 
-def test_the_source_that_the_instruction_names_is_used_though_another_would_do(flat):
+def test_source_named_in_the_instruction_is_preferred(flat):
     task = task_over(flat.world.scene, atom("cooked", "apple_1"))
     by_stove = words_of(find_plan(flat, replace(task, instruction="Cook the apple.")), task)
     told = replace(task, instruction="Cook the apple in the microwave, please.")
@@ -183,14 +183,14 @@ def test_the_source_that_the_instruction_names_is_used_though_another_would_do(f
     assert words_of(find_plan(flat, told), task).endswith("close microwave_1; toggle_on microwave_1")
 
 
-def test_of_two_apples_the_one_in_the_room_that_the_instruction_names_is_taken(flat):
+def test_object_in_the_named_room_is_preferred(flat):
     task = task_over(flat.world.scene, Exists("?a", "apple.n.01", atom("inside", "?a", "bowl_1")))
     told = replace(task, instruction="Put the apple in the living room into the bowl.")
     assert words_of(find_plan(flat, task), task).startswith("move apple_1")
     assert words_of(find_plan(flat, told), task).startswith("move apple_2")
 
 
-def test_no_call_of_a_plan_can_be_left_out(flat):
+def test_every_call_of_a_plan_is_necessary(flat):
     for task in kitchen_tasks(flat.world.scene):
         plan = find_plan(flat, task)
         for number, call in enumerate(plan):
@@ -218,7 +218,7 @@ def test_no_call_of_a_plan_can_be_left_out(flat):
         ),
     ],
 )
-def test_a_goal_without_a_plan_is_refused_with_the_reason(flat, goal, reason):
+def test_goal_without_a_plan_is_refused_with_a_reason(flat, goal, reason):
     assert oracle(flat, goal) == reason
 
 
@@ -228,7 +228,7 @@ def test_a_goal_that_needs_an_object_outside_the_table_has_no_plan(flat):
     assert find_plan(flat, task) == PlanNotFound("apple_1 is not in the object table: no plan can name it")
 
 
-def test_what_may_be_left_nowhere_ends_in_the_hand_once_all_else_is_done(flat):
+def test_object_without_an_allowed_place_stays_in_the_hand(flat):
     goal = And((Not(atom("inroom", "apple_1", "kitchen_0")), atom("open", "fridge_1")))
     task = replace(
         task_over(flat.world.scene, goal), table=("apple_1", "breakfast_table_1", "countertop_1", "fridge_1")
@@ -238,7 +238,7 @@ def test_what_may_be_left_nowhere_ends_in_the_hand_once_all_else_is_done(flat):
     assert words_of(plan, task) == "move fridge_1; open fridge_1; move apple_1; pick_up apple_1"
 
 
-def test_two_things_that_may_be_left_nowhere_are_too_many_for_one_hand(flat):
+def test_two_objects_without_an_allowed_place_exceed_one_hand(flat):
     goal = And(tuple(Not(atom("inroom", name, "kitchen_0")) for name in ("apple_1", "bowl_1")))
     task = replace(task_over(flat.world.scene, goal), table=("apple_1", "bowl_1", "breakfast_table_1"))
     found = find_plan(flat, task)
@@ -246,12 +246,12 @@ def test_two_things_that_may_be_left_nowhere_are_too_many_for_one_hand(flat):
     assert "there is no free surface in the object table to put bowl_1 on" in found.reason
 
 
-def test_a_running_microwave_can_not_end_open_and_on(flat):
+def test_microwave_cannot_end_open_and_on(flat):
     goal = And((atom("open", "microwave_1"), atom("toggled_on", "microwave_1")))
     assert "goal does not hold" in oracle(flat, goal)
 
 
-def test_what_is_stacked_is_taken_off_first():
+def test_stacked_objects_are_removed_first():
     simulator = load_simulator(Bundle(awkward_scene(), {}))
     plan = oracle(simulator, atom("ontop", "tray_1", "coffee_table_1"))
     simulator.close()
@@ -287,24 +287,24 @@ def test_what_is_stacked_is_taken_off_first():
         ),
     ],
 )
-def test_what_can_not_be_asked_for_as_it_stands_is_brought_about_otherwise(flat, goal, plan):
+def test_relation_without_a_skill_is_reached_by_an_equivalent_one(flat, goal, plan):
     assert oracle(flat, goal) == plan
 
 
-def test_two_small_things_come_next_to_each_other_on_a_surface_that_they_fill(flat):
+def test_two_small_objects_get_next_to_each_other_on_a_small_surface(flat):
     task = task_over(flat.world.scene, atom("nextto", "apple_1", "apple_2"))
     plan = words_of(find_plan(flat, task), task)
     assert plan.count("place bowl_1") == 2
 
 
-def test_a_plan_that_would_be_too_long_goes_nowhere_for_what_is_in_reach(flat, monkeypatch):
+def test_too_long_plan_is_rewritten_without_moves_to_objects_in_reach(flat, monkeypatch):
     goal = atom("inside", "apple_1", "bowl_1")
     assert oracle(flat, goal) == "move apple_1; pick_up apple_1; move bowl_1; place bowl_1 inside"
     monkeypatch.setattr("embomatrix.sim.planner.calls.MAX_STEPS", 3)
     assert oracle(flat, goal) == "move apple_1; pick_up apple_1; place bowl_1 inside"
 
 
-def test_what_has_no_floor_left_in_a_box_is_put_on_what_lies_there():
+def test_object_is_placed_on_contents_of_a_full_box():
     brick = replace(make.block("brick", "brick.n.01", (0.12, 0.12, 0.05), {}), mass_kg=0.5)
     crate = make.tub("crate", "crate.n.01", (0.18, 0.18, 0.3), 0.01, 0.01, mass_kg=1.0, abilities={})
     table_m = 0.75
@@ -325,7 +325,7 @@ def test_what_has_no_floor_left_in_a_box_is_put_on_what_lies_there():
     assert "place crate_1 inside" in plan
 
 
-def test_what_would_lie_above_a_box_is_taken_back_until_there_is_room_in_it():
+def test_object_above_a_box_is_removed_until_there_is_room_inside():
     column = replace(make.block("column", "column.n.01", (0.12, 0.12, 0.27), {}), mass_kg=0.5)
     brick = replace(make.block("brick", "brick.n.01", (0.12, 0.12, 0.2), {}), mass_kg=0.5)
     crate = make.tub("crate", "crate.n.01", (0.18, 0.18, 0.3), 0.01, 0.01, mass_kg=1.0, abilities={})
@@ -348,7 +348,7 @@ def test_what_would_lie_above_a_box_is_taken_back_until_there_is_room_in_it():
     assert plan.endswith("pick_up brick_1; move crate_1; place crate_1 inside"), plan
 
 
-def test_what_does_not_open_where_it_stands_is_carried_to_where_it_does():
+def test_portable_container_is_carried_to_a_place_where_it_opens():
     post = make.block("post", "post.n.01", (0.05, 0.3, 0.3), {})
     casket = replace(
         make.cupboard("casket", "casket.n.01", (0.2, 0.25, 0.2), boards=0, abilities={}), mass_kg=2.0
@@ -368,7 +368,7 @@ def test_what_does_not_open_where_it_stands_is_carried_to_where_it_does():
     assert plan.endswith("open casket_1"), plan
 
 
-def test_food_that_must_end_cooked_and_not_hot_is_cooled_down_after_it_is_cooked(flat):
+def test_food_is_cooled_after_cooking_if_it_must_not_be_hot(flat):
     plan = oracle(flat, And((atom("cooked", "apple_1"), Not(atom("hot", "apple_1")))))
     assert (
         plan.index("toggle_on stove_1") < plan.index("place fridge_1 inside") < plan.index("close fridge_1")
@@ -389,5 +389,5 @@ def test_food_that_must_end_cooked_and_not_hot_is_cooled_down_after_it_is_cooked
         ),
     ],
 )
-def test_the_reason_names_what_speaks_against_the_goal(flat, goal, reason):
+def test_reason_names_the_obstacle_to_the_goal(flat, goal, reason):
     assert oracle(flat, goal) == reason

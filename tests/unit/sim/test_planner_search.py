@@ -1,4 +1,4 @@
-"""The oracle against exhaustive search: where breadth-first search over executed calls finds a plan, so does the oracle."""
+"""The oracle planner finds a plan wherever breadth-first search over executed calls finds one."""
 
 import pytest
 from tests.fakes.search import compare
@@ -7,7 +7,7 @@ GOALS = 10
 SCENES = 10
 
 
-def test_the_oracle_solves_what_search_solves_in_a_small_scene():
+def test_oracle_solves_tasks_that_search_solves_in_a_small_scene():
     comparison = compare(0, GOALS, limit=120)
     assert comparison.found >= GOALS // 2
     assert not comparison.missed
@@ -15,7 +15,7 @@ def test_the_oracle_solves_what_search_solves_in_a_small_scene():
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_the_oracle_solves_98_of_100_small_tasks_that_search_solves(capsys):
+def test_oracle_solves_98_percent_of_small_tasks_that_search_solves(capsys):
     found, missed = 0, []
     for number in range(SCENES):
         comparison = compare(number, GOALS, limit=700)

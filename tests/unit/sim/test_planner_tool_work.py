@@ -1,4 +1,4 @@
-"""The oracle cuts, cleans and wets: its plans reach goals about substances and pieces, and it says what is lacking."""
+"""The oracle planner reaches goals about substances and pieces, and names missing tools."""
 
 import contextlib
 from dataclasses import replace
@@ -54,14 +54,14 @@ def test_a_household_goal_is_reached(home, goal):
     assert GOALS[goal] in words_of(plan, task)
 
 
-def test_one_cloth_is_soaked_once_and_wipes_all_that_it_can(home):
+def test_one_cloth_is_soaked_once_for_several_objects(home):
     task = task_of(home, "(and (not (stained plate_2)) (not (stained plate_1)) (not (dusty plate_1)))")
     plan = find_plan(home, task)
     assert not isinstance(plan, PlanNotFound), plan.reason
     assert sum(call.skill is Skill.CLEAN for call in plan) == 2
 
 
-def test_a_cup_is_taken_from_source_to_source_without_being_put_down(home):
+def test_cup_is_filled_at_several_sources_without_being_put_down(home):
     task = task_of(home, "(and (filled cup_1 liquid_soap.n.01) (filled cup_1 water.n.06))")
     plan = find_plan(home, task)
     assert not isinstance(plan, PlanNotFound), plan.reason
@@ -99,7 +99,7 @@ def test_a_cup_is_taken_from_source_to_source_without_being_put_down(home):
         ),
     ],
 )
-def test_a_chore_without_means_is_refused_with_the_reason(home, goal, profile, reason):
+def test_subgoal_without_a_method_is_refused_with_the_reason(home, goal, profile, reason):
     found = find_plan(home, task_of(home, goal, profile))
     assert isinstance(found, PlanNotFound)
     assert found.reason == reason

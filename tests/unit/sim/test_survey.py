@@ -1,4 +1,4 @@
-"""What is found out offline about the arm: in the flat, and in the flat with something in the way."""
+"""Reachability survey of the flat, and of the flat with obstacles."""
 
 import contextlib
 from dataclasses import replace
@@ -10,7 +10,7 @@ from tests.fakes.scenes import kitchen_scene, placed, upright
 
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.live_world import LiveWorld
-from embomatrix.sim.physical.survey import Foresight
+from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.sim.placing.pose_cache import standing_poses
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
@@ -19,9 +19,9 @@ from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import Handling, PoseCache
 
 BOX_M = 0.14
-"""Inner width of what the apple is walled in by."""
+"""Inner width of the box around the apple."""
 TALL_M = 0.12
-"""Not much taller than the apple: the line of approach is clear."""
+"""Height of the box: little more than the apple, so that the line of approach is clear."""
 NAMES = ("apple_1", "chicken_leg_1", "microwave_1", "table_lamp_1")
 
 
@@ -43,12 +43,12 @@ def walled_in():
 
 
 def surveyed(scene, names, foresight=None):
-    """The cache of a scene with standing poses for these objects, after a look ahead; the world's state before and after."""
+    """Return the cache of a scene after a survey. The world is unchanged afterwards."""
     with contextlib.closing(BulletEngine(scene)) as engine:
         poses = PoseCache({}, standing_poses(engine, names))
         world = LiveWorld(Bundle(scene, {}, poses), engine)
         before = world.state_bytes()
-        found = (foresight or Foresight()).survey(world, poses, names)
+        found = (foresight or ReachabilitySurvey()).survey(world, poses, names)
         assert world.state_bytes() == before
         assert {name: set(stands) for name, stands in found.stands.items()} == {
             name: set(stands) for name, stands in poses.stands.items()
@@ -69,11 +69,11 @@ def flat():
     return surveyed(kitchen_scene(), NAMES)
 
 
-def test_nothing_is_barred_where_the_arm_gets_at_everything(flat):
+def test_open_flat_has_no_blockers(flat):
     assert flat.barred == {}
 
 
-def test_what_is_walled_in_is_barred_and_cached_mode_says_who_bars_it():
+def test_walled_in_object_is_refused_in_cached_mode_with_its_blocker():
     scene = walled_in()
     poses = surveyed(scene, ("apple_1",))
     other = poses.barred[Handling.TAKE]["apple_1"]
@@ -83,7 +83,7 @@ def test_what_is_walled_in_is_barred_and_cached_mode_says_who_bars_it():
     assert trace.steps[-1].message == f"the arm finds no free path to apple_1: {other} blocks it"
 
 
-def test_a_thing_is_free_again_when_what_barred_it_is_taken_away():
+def test_object_is_reachable_after_its_blocker_is_removed():
     poses = PoseCache(barred={Handling.TAKE: {"apple_1": "bowl_1"}})
     scene = kitchen_scene()
     barred = executed_with(scene, poses, "move apple_1; pick_up apple_1")
@@ -92,7 +92,7 @@ def test_a_thing_is_free_again_when_what_barred_it_is_taken_away():
     assert executed_with(scene, poses, taken).failure is None
 
 
-def test_a_thing_that_was_put_elsewhere_is_not_barred_there():
+def test_moved_object_is_not_blocked_at_its_new_place():
     poses = PoseCache(barred={Handling.PRESS: {"table_lamp_1": "wall"}})
     barred = executed_with(kitchen_scene(), poses, "move table_lamp_1; toggle_on table_lamp_1")
     assert barred.failure is FailureReason.ARM_BLOCKED
@@ -100,7 +100,7 @@ def test_a_thing_that_was_put_elsewhere_is_not_barred_there():
     assert executed_with(kitchen_scene(), poses, moved).failure is None
 
 
-def test_a_thing_stays_barred_in_the_drawer_that_was_led_out_with_it():
+def test_object_in_an_opened_drawer_stays_blocked():
     cabinet, apple = make.drawer_cabinet(), make.apple()
     at = upright(3.0, 2.4, 0.0, cabinet, -1.5707963267948966)
     drawers = replace(placed("bottom_cabinet_1", cabinet, "kitchen_0", at, fixed=True), joints=(0.0, 0.0))
@@ -114,20 +114,20 @@ def test_a_thing_stays_barred_in_the_drawer_that_was_led_out_with_it():
     assert executed_with(scene, barred, text).failure is FailureReason.ARM_BLOCKED
 
 
-def test_the_lid_of_what_can_be_carried_is_barred():
+def test_lid_of_a_portable_object_is_blocked():
     scene = kitchen_scene()
     objects = tuple(replace(item, fixed=item.fixed and item.name != "microwave_1") for item in scene.objects)
     found = surveyed(replace(scene, objects=objects), ("microwave_1",))
     assert found.barred[Handling.OPEN] == {"microwave_1": "microwave_1"}
 
 
-def test_what_a_look_ahead_knows_of_other_scenes_changes_no_answer(flat):
-    foresight = Foresight()
+def test_results_of_other_scenes_do_not_change_answers(flat):
+    foresight = ReachabilitySurvey()
     surveyed(walled_in(), ("microwave_1",), foresight)
     assert surveyed(kitchen_scene(), NAMES, foresight) == flat
 
 
-def test_what_is_barred_travels_in_the_bundle():
+def test_blockers_are_stored_in_the_bundle():
     poses = PoseCache(barred={Handling.OPEN: {"fridge_1": "wall"}, Handling.TAKE: {"apple_1": "bowl_1"}})
     bundle = Bundle(kitchen_scene(), {}, poses)
     assert decode_bundle(encode_bundle(bundle)).poses.barred == poses.barred

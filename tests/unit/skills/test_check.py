@@ -1,4 +1,4 @@
-"""Preconditions on a world of words: no engine, no geometry, one rule at a time."""
+"""Preconditions in a symbolic world without engine and geometry, one rule at a time."""
 
 from dataclasses import dataclass, field, replace
 
@@ -31,7 +31,7 @@ AT_HAND = ObjectReach(0.5, 0.8)
 
 @dataclass
 class WordWorld:
-    """Everything is at hand, closed, off and empty, unless it is said otherwise."""
+    """World in which every object is in reach, closed, off and empty by default."""
 
     table: tuple[str, ...] = TABLE
     rooms: tuple[str, ...] = ("kitchen_0", "bedroom_0")
@@ -106,24 +106,24 @@ def reason(world, skill, *args, **kwargs):
     return refusal.reason if refusal else None
 
 
-def test_a_call_whose_preconditions_hold_is_not_refused():
+def test_call_with_valid_preconditions_is_accepted():
     assert reason(WordWorld(), Skill.PICK_UP, "apple") is None
 
 
 @pytest.mark.parametrize("index", [-1, len(TABLE), 10**15])
-def test_an_index_outside_the_table_is_refused_and_its_range_told(index):
+def test_index_outside_the_table_is_refused_with_the_valid_range(index):
     refusal = check(WordWorld(), SkillCall(Skill.MOVE, object_index=index))
     assert refusal.reason is FailureReason.UNKNOWN_INDEX
     assert refusal.sentence == f"there is no object with index {index}: the table has indices 0 to 5"
 
 
-def test_an_unknown_room_is_answered_with_the_rooms_there_are():
+def test_unknown_room_is_refused_with_the_list_of_rooms():
     refusal = check(WordWorld(), SkillCall(Skill.GO_TO_ROOM, room_name="attic"))
     assert refusal.sentence == "there is no room attic: the rooms are kitchen_0, bedroom_0"
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False))
-def test_steps_up_to_five_metres_either_way_are_allowed(distance):
+def test_drives_up_to_five_metres_in_both_directions_are_allowed(distance):
     refused = check(WordWorld(), SkillCall(Skill.MOVE_FORWARD, distance=distance, yaw=0.0)) is not None
     assert refused == (abs(distance) > ROBOT.max_step_m)
 
@@ -137,16 +137,16 @@ def test_reach_is_checked_to_the_centimetre():
     )
 
 
-def test_what_is_too_high_is_not_called_too_far():
+def test_object_above_reach_is_too_high_not_too_far():
     world = WordWorld(reaches={"apple": ObjectReach(3.0, 2.3)})
     assert reason(world, Skill.PICK_UP, "apple") is FailureReason.TOO_HIGH
 
 
-def test_reach_without_a_line_of_approach_is_not_enough():
+def test_reach_needs_a_clear_line_of_approach():
     assert reason(WordWorld(hidden={"apple"}), Skill.PICK_UP, "apple") is FailureReason.NO_LINE_OF_APPROACH
 
 
-def test_the_load_in_a_bowl_counts_when_the_bowl_is_lifted():
+def test_contents_of_a_bowl_count_towards_its_mass():
     heavy = {**ASSETS, "apple": replace(ASSETS["apple"], mass_kg=7.7)}
     assert reason(WordWorld(assets=heavy), Skill.PICK_UP, "bowl") is None
     loaded = WordWorld(assets=heavy, inside={"apple": "bowl"})
@@ -161,17 +161,17 @@ def test_the_load_in_a_bowl_counts_when_the_bowl_is_lifted():
         ((0.1, 0.1, 0.91), FailureReason.TOO_LARGE),
     ],
 )
-def test_the_gripper_takes_a_thing_by_its_smallest_side(size, expected):
+def test_gripper_limit_applies_to_the_smallest_extent(size, expected):
     world = WordWorld(assets={**ASSETS, "apple": replace(ASSETS["apple"], size_m=size)})
     assert reason(world, Skill.PICK_UP, "apple") is expected
 
 
-def test_what_others_rest_on_is_not_lifted():
+def test_object_that_supports_others_is_not_lifted():
     world = WordWorld(burdens={"bowl": "apple"})
     assert check(world, call(Skill.PICK_UP, "bowl")).sentence == "apple rests on bowl: take it off first"
 
 
-def test_nothing_passes_through_a_closed_door_either_way():
+def test_closed_door_blocks_picking_and_placing():
     shut_in = WordWorld(inside={"apple": "fridge"})
     assert reason(shut_in, Skill.PICK_UP, "apple") is FailureReason.CONTAINER_CLOSED
     holding = WordWorld(carried=("apple",))
@@ -181,17 +181,17 @@ def test_nothing_passes_through_a_closed_door_either_way():
     )
 
 
-def test_an_open_door_lets_things_through():
+def test_open_door_allows_picking_and_placing():
     world = WordWorld(inside={"apple": "fridge"}, open={"fridge"})
     assert reason(world, Skill.PICK_UP, "apple") is None
 
 
-def test_the_top_of_a_closed_fridge_is_a_place():
+def test_top_of_a_closed_fridge_accepts_objects():
     world = WordWorld(carried=("apple",))
     assert reason(world, Skill.PLACE, "fridge", relation=PlaceRelation.ONTOP) is None
 
 
-def test_a_running_microwave_is_not_opened_but_a_running_stove_is_no_matter():
+def test_running_microwave_is_not_opened_but_running_stove_is_no_obstacle():
     assert reason(WordWorld(on={"microwave"}), Skill.OPEN, "microwave") is FailureReason.OPENED_WHILE_ON
     assert reason(WordWorld(on={"microwave"}), Skill.TOGGLE_OFF, "microwave") is None
 
@@ -201,7 +201,7 @@ def test_a_microwave_starts_only_when_closed():
     assert reason(WordWorld(), Skill.TOGGLE_ON, "microwave") is None
 
 
-def test_an_oven_whose_switch_does_not_mind_may_be_opened_while_it_runs():
+def test_oven_that_runs_open_may_be_opened_while_it_runs():
     oven = make.microwave()
     assets = {
         **ASSETS,
@@ -212,7 +212,7 @@ def test_an_oven_whose_switch_does_not_mind_may_be_opened_while_it_runs():
     assert reason(opened, Skill.HEAT, "apple", "microwave") is FailureReason.SOURCE_OPEN
 
 
-def test_the_heat_skills_ask_for_the_food_the_switch_and_the_door_in_turn():
+def test_heat_skills_check_food_then_switch_then_door():
     world = WordWorld()
     assert reason(world, Skill.COOK, "apple", "microwave") is FailureReason.NOT_AT_SOURCE
     world.at.add(("apple", "microwave"))
@@ -221,14 +221,14 @@ def test_the_heat_skills_ask_for_the_food_the_switch_and_the_door_in_turn():
     assert reason(world, Skill.COOK, "apple", "microwave") is None
 
 
-def test_where_food_must_lie_is_told_by_the_source():
+def test_heat_source_defines_whether_food_lies_inside_or_on_top():
     inside = check(WordWorld(), call(Skill.HEAT, "apple", "microwave")).sentence
     ontop = check(WordWorld(), call(Skill.HEAT, "apple", "stove")).sentence
     assert inside == "apple is not inside microwave"
     assert ontop == "apple is not on top of stove"
 
 
-def test_food_tells_at_which_temperature_it_cooks():
+def test_cooking_temperature_depends_on_the_food():
     apple = ASSETS["apple"]
     tough = replace(apple, abilities={**apple.abilities, "cookable": {"cook_temperature": 120.0}})
     world = WordWorld(assets={**ASSETS, "apple": tough}, on={"microwave"}, at={("apple", "microwave")})
@@ -237,7 +237,7 @@ def test_food_tells_at_which_temperature_it_cooks():
     )
 
 
-def test_an_ability_without_a_temperature_makes_no_source():
+def test_ability_without_temperature_is_no_heat_source():
     stove = replace(ASSETS["stove"], abilities={"heatSource": {}})
     world = WordWorld(assets={**ASSETS, "stove": stove})
     assert reason(world, Skill.HEAT, "apple", "stove") is FailureReason.NOT_A_HEAT_SOURCE
@@ -252,7 +252,7 @@ def test_an_ability_without_a_temperature_makes_no_source():
     opened=st.sets(st.sampled_from(["fridge", "microwave"])),
     running=st.sets(st.sampled_from(["microwave", "stove"])),
 )
-def test_every_refusal_is_one_that_the_library_lists_and_a_whole_sentence(
+def test_refusals_use_listed_reasons_and_complete_sentences(
     skill, target, source, relation, carried, opened, running
 ):
     world = WordWorld(carried=carried, open=opened, on=running, inside={"bowl": "microwave"})
@@ -314,13 +314,13 @@ def soaked(substance):
         ("red_wine.n.01", "", None),
     ],
 )
-def test_what_a_rag_takes_off_depends_on_what_it_is_soaked_with(substance, soak, expected):
+def test_substances_that_a_rag_removes_depend_on_its_liquid(substance, soak, expected):
     facts = {**covered(substance), **(soaked(soak) if soak else {})}
     world = at_home(carried=("rag",), facts=facts)
     assert home_reason(world, Skill.CLEAN, "plate", "rag") is expected
 
 
-def test_a_rag_that_takes_one_of_two_substances_off_is_of_use():
+def test_rag_that_removes_one_of_two_substances_is_accepted():
     facts = {"plate": frozenset(SubstanceFact(COVERED, name) for name in ("dust.n.01", "rust.n.01"))}
     assert home_reason(at_home(carried=("rag",), facts=facts), Skill.CLEAN, "plate", "rag") is None
 
@@ -329,14 +329,14 @@ def test_a_clean_plate_may_be_wiped():
     assert home_reason(at_home(carried=("rag",)), Skill.CLEAN, "plate", "rag") is None
 
 
-def test_a_vacuum_sucks_when_it_is_on():
+def test_vacuum_cleaner_works_only_when_on():
     world = at_home(carried=("vacuum",), facts=covered("dust.n.01"))
     assert home_reason(world, Skill.CLEAN, "plate", "vacuum") is FailureReason.SOURCE_OFF
     world.on.add("vacuum")
     assert home_reason(world, Skill.CLEAN, "plate", "vacuum") is None
 
 
-def test_a_dishwasher_needs_the_plate_the_door_and_the_switch():
+def test_dishwasher_needs_plate_inside_closed_door_and_switch():
     world = at_home(facts=covered("ink.n.01"))
     assert home_reason(world, Skill.CLEAN, "plate", "dishwasher") is FailureReason.NOT_AT_SOURCE
     world.inside["plate"] = "dishwasher"
@@ -347,21 +347,21 @@ def test_a_dishwasher_needs_the_plate_the_door_and_the_switch():
     assert home_reason(world, Skill.CLEAN, "plate", "dishwasher") is FailureReason.SOURCE_OPEN
 
 
-def test_running_water_alone_does_not_take_ink_off():
+def test_running_water_alone_does_not_remove_ink():
     world = at_home(facts=covered("ink.n.01"), inside={"plate": "sink"}, on={"sink"})
     assert home_reason(world, Skill.CLEAN, "plate", "sink") is FailureReason.STAYS_ON
     world.facts = covered("stain.n.01")
     assert home_reason(world, Skill.CLEAN, "plate", "sink") is None
 
 
-def test_a_rag_is_soaked_in_the_hand_or_in_the_sink_and_nowhere_else():
+def test_rag_is_soaked_only_in_the_hand_or_in_the_sink():
     world = at_home(on={"sink"})
     assert home_reason(world, Skill.SOAK, "rag", "sink") is FailureReason.NOT_AT_SOURCE
     assert home_reason(at_home(on={"sink"}, carried=("rag",)), Skill.SOAK, "rag", "sink") is None
     assert home_reason(at_home(on={"sink"}, inside={"rag": "sink"}), Skill.SOAK, "rag", "sink") is None
 
 
-def test_a_full_bottle_needs_no_switch_and_an_empty_one_gives_nothing():
+def test_full_bottle_needs_no_switch_and_empty_bottle_gives_nothing():
     full = {"bottle": frozenset({SubstanceFact(SubstanceRelation.FILLED, "liquid_soap.n.01")})}
     assert home_reason(at_home(carried=("rag",), facts=full), Skill.SOAK, "rag", "bottle") is None
     empty = at_home(carried=("rag",))
@@ -378,19 +378,19 @@ def test_a_full_bottle_needs_no_switch_and_an_empty_one_gives_nothing():
         ("", "stain.n.01", FailureReason.NOT_A_CLEANER),
     ],
 )
-def test_soap_in_the_hand_takes_stains_off_without_a_cloth(liquid, substance, expected):
+def test_soap_in_the_hand_removes_stains_without_a_cloth(liquid, substance, expected):
     held = {SubstanceFact(SubstanceRelation.FILLED, liquid)} if liquid else set()
     world = at_home(carried=("bottle",), facts={**covered(substance), "bottle": frozenset(held)})
     assert home_reason(world, Skill.CLEAN, "plate", "bottle") is expected
 
 
-def test_bread_is_cut_once_with_a_knife_that_is_held():
+def test_bread_is_cut_once_with_the_held_knife():
     assert home_reason(at_home(), Skill.SLICE, "loaf", "knife") is FailureReason.TOOL_NOT_HELD
     assert home_reason(at_home(carried=("knife",)), Skill.SLICE, "loaf", "knife") is None
     again = at_home(carried=("knife",), sliced={"loaf"})
     assert home_reason(again, Skill.SLICE, "loaf", "knife") is FailureReason.ALREADY_SLICED
 
 
-def test_what_was_cut_up_is_no_longer_there():
+def test_cut_object_is_no_longer_in_the_world():
     world = at_home(carried=("knife",), absent={"loaf"})
     assert home_reason(world, Skill.SLICE, "loaf", "knife") is FailureReason.NOT_THERE

@@ -13,19 +13,19 @@ from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
 from embomatrix.world.state import Relation
 
 
-def test_an_object_is_told_with_its_host_room_and_states():
+def test_description_contains_host_room_and_states():
     sight = ObjectDescription("apple_1", "kitchen_0", "bowl_1", Relation.INSIDE, states=("cooked", "hot"))
     assert line(sight) == "apple_1: inside bowl_1 in kitchen_0, cooked, hot"
 
 
-def test_what_stands_on_the_floor_is_told_with_its_room():
+def test_object_on_the_floor_is_described_with_its_room():
     assert (
         line(ObjectDescription("fridge_1", "kitchen_0", states=("closed",)))
         == "fridge_1: in kitchen_0, closed"
     )
 
 
-def test_a_place_says_what_went_where():
+def test_place_message_names_object_and_destination():
     call = SkillCall(Skill.PLACE, object_index=3, relation=PlaceRelation.ONTOP)
     assert done(call, target="table_1", held="apple_1") == "put apple_1 on top of table_1"
 
@@ -39,13 +39,13 @@ def test_lists_read_like_sentences():
     ]
 
 
-def test_states_that_temperature_brought_are_told_by_object():
+def test_new_temperature_states_are_listed_by_object():
     assert gained({"apple_1": ["hot", "cooked"], "mug_1": ["hot"]}) == (
         "apple_1 is now hot and cooked; mug_1 is now hot"
     )
 
 
-def test_a_long_final_state_is_cut_and_says_so():
+def test_long_final_description_is_cut_with_a_remark():
     sights = [ObjectDescription(f"apple_{n}", "kitchen_0") for n in range(MAX_FINAL_LINES + 3)]
     lines = final_lines(sights)
     assert len(lines) == MAX_FINAL_LINES + 1

@@ -10,7 +10,7 @@ import pytest
 from embomatrix.sim.geometry import surfaces as spots
 from embomatrix.sim.state import relations, sources
 from embomatrix.skills.check import RULES
-from embomatrix.skills.failure import SENTENCES
+from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.library import LIBRARY, Precondition
 from embomatrix.skills.limits import ROBOT
 from embomatrix.skills.parse import MAX_ROOM_NAME, PlanReason, parse_plan, plan_from_json
@@ -70,7 +70,7 @@ def test_table_lists_every_failure_reason_with_its_sentence():
     table = re.search(r"### Reasons of failure\n\n(.*?)\n\n", PAGE, re.DOTALL)
     assert table
     written = dict(re.findall(r"^\| `(\w+)` \| (.*) \|$", table[1], re.MULTILINE))
-    assert written == {reason.value: sentence for reason, sentence in SENTENCES.items()}
+    assert written == {reason.value: reason.sentence for reason in FailureReason}
 
 
 def test_table_lists_every_plan_error():

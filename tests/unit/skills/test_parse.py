@@ -1,4 +1,4 @@
-"""Text becomes a plan, or one PlanError with a reason of a closed set; nothing else ever happens."""
+"""Text becomes a plan or raises one PlanError with a reason from a closed set."""
 
 import json
 from typing import Any
@@ -65,7 +65,7 @@ NESTED = (
         "Move to the cup and put it away, like this.\nmove 3\nplace 4 inside",
     ],
 )
-def test_both_forms_are_found_in_what_models_write(text: str) -> None:
+def test_both_plan_forms_are_found_in_model_output(text: str) -> None:
     assert parse_plan(text) == TWO
 
 
@@ -117,29 +117,29 @@ ERRORS: dict[str, PlanReason] = {
 
 
 @pytest.mark.parametrize("text", ERRORS, ids=lambda text: text[:40])
-def test_text_that_is_no_plan_has_one_reason_and_a_sentence(text: str) -> None:
+def test_text_without_a_plan_has_one_reason_and_a_sentence(text: str) -> None:
     with pytest.raises(PlanError) as caught:
         parse_plan(text)
     assert caught.value.reason is ERRORS[text]
     assert 10 < len(str(caught.value)) < 400
 
 
-def test_every_reason_is_reached() -> None:
+def test_examples_cover_every_plan_error() -> None:
     assert set(ERRORS.values()) == set(PlanReason)
 
 
-def test_index_that_no_table_has_is_parsed_and_left_to_fail() -> None:
+def test_impossible_index_parses_and_fails_at_execution() -> None:
     assert parse_plan("move -1") == (SkillCall(Skill.MOVE, object_index=-1),)
     assert parse_plan("move 1000000")[0].object_index == 1_000_000
 
 
-def test_whole_numbers_are_angles_too() -> None:
+def test_integers_are_accepted_as_angles() -> None:
     assert parse_plan('[{"action": "move_forward", "distance": 1, "yaw": -2}]') == (
         SkillCall(Skill.MOVE_FORWARD, distance=1.0, yaw=-2.0),
     )
 
 
-def test_message_names_the_step_and_what_was_found() -> None:
+def test_message_names_the_step_and_the_value_found() -> None:
     with pytest.raises(PlanError, match=r"step 2: object_index must be a whole number.*found 'cup'"):
         parse_plan('[{"action": "move", "object_index": 3}, {"action": "open", "object_index": "cup"}]')
 
@@ -154,13 +154,13 @@ def test_message_names_the_step_and_what_was_found() -> None:
         ("[" * 30_000, "its JSON can't be read"),
     ],
 )
-def test_message_tells_what_stood_in_place_of_a_plan(text: str, found: str) -> None:
+def test_message_describes_the_text_found_instead_of_a_plan(text: str, found: str) -> None:
     with pytest.raises(PlanError) as refusal:
         parse_plan(text)
     assert str(refusal.value).startswith(f"no plan was found ({found}")
 
 
-def test_index_beyond_the_wire_is_told_as_what_it_is() -> None:
+def test_index_beyond_64_bits_is_named_as_such() -> None:
     with pytest.raises(PlanError, match="found a number beyond 64 bits"):
         parse_plan(f"move {10**30}")
 
@@ -186,14 +186,14 @@ plans = st.lists(calls(), min_size=1, max_size=12).map(tuple)
 
 
 @given(plans)
-def test_plan_survives_both_forms(plan: tuple[SkillCall, ...]) -> None:
+def test_plan_is_equal_after_a_round_trip_in_both_forms(plan: tuple[SkillCall, ...]) -> None:
     assert parse_plan(plan_to_lines(plan), HOUSEHOLD) == plan
     assert parse_plan(json.dumps(plan_to_json(plan), indent=1), HOUSEHOLD) == plan
     assert plan_from_json(plan_to_json(plan), HOUSEHOLD) == plan
 
 
 @given(plans)
-def test_the_paper_s_profile_reads_a_plan_exactly_when_all_its_skills_are_the_paper_s(
+def test_paper_profile_accepts_only_skills_of_the_paper(
     plan: tuple[SkillCall, ...],
 ) -> None:
     if {call.skill for call in plan} <= set(PROFILES[Profile.PAPER]):
@@ -205,14 +205,14 @@ def test_the_paper_s_profile_reads_a_plan_exactly_when_all_its_skills_are_the_pa
         assert caught.value.reason is PlanReason.UNKNOWN_SKILL
 
 
-def test_the_paper_has_thirteen_skills_and_the_household_three_more() -> None:
+def test_paper_profile_has_13_skills_and_household_3_more() -> None:
     assert set(PROFILES) == set(Profile)
     assert len(PROFILES[Profile.PAPER]) == 13
     assert PROFILES[Profile.HOUSEHOLD] == tuple(Skill)
     assert PROFILES[Profile.HOUSEHOLD][:13] == PROFILES[Profile.PAPER]
 
 
-def test_a_tool_may_be_called_by_its_own_index() -> None:
+def test_tool_index_is_an_alias_of_source_index() -> None:
     text = '[{"action": "slice_object_with_tool", "object_index": 3, "tool_index": 5}]'
     assert parse_plan(text, HOUSEHOLD) == (SkillCall(Skill.SLICE, object_index=3, source_index=5),)
     assert set(ALIASES.values()) <= set(Arg)
@@ -221,19 +221,17 @@ def test_a_tool_may_be_called_by_its_own_index() -> None:
 @given(
     plans, st.text(max_size=60).filter(lambda text: "<" not in text and "[" not in text and "{" not in text)
 )
-def test_plan_is_found_whatever_prose_precedes_it(plan: tuple[SkillCall, ...], prose: str) -> None:
+def test_plan_is_found_after_any_prose(plan: tuple[SkillCall, ...], prose: str) -> None:
     assert parse_plan(f"{prose}\n```json\n{json.dumps(plan_to_json(plan))}\n```", HOUSEHOLD) == plan
 
 
 @given(st.text(max_size=300))
-def test_garbage_raises_nothing_but_a_plan_error(text: str) -> None:
+def test_random_text_raises_only_plan_errors(text: str) -> None:
     refuse_or_read(text)
 
 
 @given(plans, st.data())
-def test_damaged_plan_raises_nothing_but_a_plan_error(
-    plan: tuple[SkillCall, ...], data: st.DataObject
-) -> None:
+def test_damaged_plan_raises_only_plan_errors(plan: tuple[SkillCall, ...], data: st.DataObject) -> None:
     for text in (json.dumps(plan_to_json(plan)), plan_to_lines(plan)):
         position = data.draw(st.integers(0, len(text)))
         end = data.draw(st.integers(position, len(text)))
@@ -253,7 +251,7 @@ json_values = st.recursive(
 
 
 @given(json_values)
-def test_any_json_value_is_read_or_refused_by_the_one_error(value: Any) -> None:
+def test_any_json_value_is_read_or_raises_a_plan_error(value: Any) -> None:
     try:
         plan = plan_from_json(value)
     except PlanError:

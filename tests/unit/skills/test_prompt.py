@@ -1,4 +1,4 @@
-"""Prompts: the scene as a tree, names that are unique, and examples that parse."""
+"""Prompts: scene tree, unique names, and examples that parse."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ SITUATION = Situation(
 )
 
 
-def test_names_prompt_tells_rooms_furniture_contents_and_states():
+def test_names_prompt_lists_rooms_furniture_contents_and_states():
     assert prompt_for(SITUATION, Codec.NAMES).user.splitlines() == [
         "room kitchen_0",
         "countertop on bowl_1 apple",
@@ -61,7 +61,7 @@ def test_indexed_prompt_puts_the_name_before_the_index():
 
 
 @pytest.mark.parametrize("codec", [Codec.LINES, Codec.JSON])
-def test_system_text_lists_every_skill_and_its_own_example(codec):
+def test_system_text_lists_every_skill_and_the_example_of_its_codec(codec):
     for profile in Profile:
         system = prompt_for(replace(SITUATION, profile=profile), codec).system
         assert [skill for skill in Skill if skill.value in system] == [*PROFILES[profile]]
@@ -76,7 +76,7 @@ def test_the_example_of_every_codec_parses_to_the_same_plan(codec):
     assert [call.skill for call in plan][:3] == [Skill.MOVE, Skill.OPEN, Skill.MOVE]
 
 
-def test_a_name_is_short_only_where_it_is_unique():
+def test_name_is_shortened_only_if_unique():
     assert labels(SITUATION) == {
         0: "countertop",
         1: "chicken_leg",
@@ -88,7 +88,7 @@ def test_a_name_is_short_only_where_it_is_unique():
     }
 
 
-def test_every_kind_of_call_survives_the_names_codec():
+def test_every_kind_of_call_round_trips_through_the_names_codec():
     plan = (
         SkillCall(Skill.GO_TO_ROOM, room_name="kitchen_0"),
         SkillCall(Skill.MOVE, object_index=3),
@@ -102,26 +102,26 @@ def test_every_kind_of_call_survives_the_names_codec():
     assert parse_plan(with_indices(text, SITUATION)) == plan
 
 
-def test_full_names_are_understood_beside_short_ones():
+def test_full_names_are_accepted_beside_short_ones():
     assert with_indices("move apple_1", SITUATION) == with_indices("move apple", SITUATION) == "move 4"
 
 
-def test_an_unknown_name_parses_to_an_index_that_no_row_has():
+def test_unknown_name_parses_to_an_index_outside_the_table():
     assert parse_plan(with_indices("move unicorn", SITUATION)) == (SkillCall(Skill.MOVE, object_index=7),)
 
 
 @pytest.mark.parametrize("text", ["", "hello there", "fly apple"])
-def test_text_that_is_no_plan_stays_as_it_is(text):
+def test_text_without_a_plan_is_unchanged(text):
     assert with_indices(text, SITUATION) == text
 
 
-def test_limit_keeps_what_the_instruction_names_and_what_it_rests_on():
+def test_limit_keeps_named_rows_and_their_hosts():
     told = limited(SITUATION, 3)
     assert {row.name for row in told.rows} == {"apple_1", "fridge_1", "countertop_1"}
     assert limited(SITUATION, 7) is SITUATION
 
 
-def test_limit_does_not_take_a_part_of_a_word_for_a_name():
+def test_limit_ignores_names_inside_other_words():
     told = limited(
         Situation(
             (),
@@ -135,18 +135,18 @@ def test_limit_does_not_take_a_part_of_a_word_for_a_name():
     assert [row.name for row in told.rows] == ["apple_1"]
 
 
-def test_contents_of_a_row_that_is_not_told_stand_in_the_room():
+def test_contents_of_an_omitted_row_are_listed_in_the_room():
     told = subset(SITUATION, {4, 2})
     assert prompt_for(told, Codec.NAMES).user.splitlines()[:3] == ["room kitchen_0", "fridge closed", "apple"]
 
 
-def test_a_prompt_never_holds_the_goal():
+def test_prompt_never_contains_the_goal():
     for codec in Codec:
         prompt = prompt_for(SITUATION, codec)
         assert "inside(" not in prompt.system + prompt.user
 
 
-def test_what_can_be_seen_of_substances_and_of_what_is_to_come_is_told():
+def test_prompt_shows_substances_and_absent_objects():
     scene = household_scene()
     situation = situation_of(scene, replace(task_over(scene), profile=Profile.HOUSEHOLD))
     states = {row.name: row.states for row in situation.rows}

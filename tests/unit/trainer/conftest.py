@@ -1,4 +1,4 @@
-"""What tests of the trainer share."""
+"""Shared fixtures of the trainer's tests."""
 
 import resource
 import signal

@@ -1,4 +1,4 @@
-"""Adapters to other trainers, on a cluster of symbolic rules: what they score, what they never do, what they announce."""
+"""Adapters to other trainers on a symbolic cluster: scores, retries, announcements."""
 
 import asyncio
 import pickle
@@ -42,7 +42,7 @@ def on_cluster(cluster):
         yield opened
 
 
-async def test_texts_of_several_tasks_are_scored_in_their_order_a_batch_for_each_task(cluster, on_cluster):
+async def test_texts_of_several_tasks_are_scored_in_order_with_one_batch_per_task(cluster, on_cluster):
     texts = [oracle(FIRST), "no plan", oracle(SECOND), "toggle_on 0"]
     ids = [FIRST.task.task_id, SECOND.task.task_id, SECOND.task.task_id, FIRST.task.task_id]
     outcomes = await on_cluster.score(ids, texts)
@@ -60,7 +60,7 @@ async def test_a_scorer_serves_several_event_loops(on_cluster):
     assert all(outcome.success for (outcome,) in found)
 
 
-async def test_texts_scored_one_by_one_are_gathered_by_task(cluster, on_cluster):
+async def test_single_texts_are_grouped_by_task(cluster, on_cluster):
     ids = [FIRST.task.task_id] * 5 + [SECOND.task.task_id] * 3
     outcomes = await asyncio.gather(
         *(on_cluster.score_one(task_id, f"toggle_on {index}") for index, task_id in enumerate(ids))
@@ -69,7 +69,7 @@ async def test_texts_scored_one_by_one_are_gathered_by_task(cluster, on_cluster)
     assert len(cluster.batches) == 2
 
 
-async def test_a_task_that_the_dataset_lacks_is_one_sentence(on_cluster):
+async def test_unknown_task_gives_a_one_sentence_error(on_cluster):
     with pytest.raises(TrainerError, match=r"no task 'elsewhere' among its 7"):
         await on_cluster.score(["elsewhere"], ["move 1"])
 
@@ -82,7 +82,7 @@ def new_cluster():
     return SymbolicCluster(TASKS)
 
 
-def test_a_scorer_that_is_open_can_be_pickled_and_the_copy_opens_a_run_of_its_own():
+def test_pickled_copy_of_an_open_scorer_opens_its_own_run():
     with PlanScorer(given_tasks, new_cluster) as original:
         copy = pickle.loads(pickle.dumps(original))
         outcomes = asyncio.run(copy.score([FIRST.task.task_id], [oracle(FIRST)]))
@@ -96,12 +96,12 @@ def test_closing_ends_the_run_and_the_next_score_opens_another(cluster, on_clust
     assert asyncio.run(on_cluster.score([FIRST.task.task_id], [oracle(FIRST)]))[0].success
 
 
-def test_a_token_file_that_is_missing_is_one_sentence(tmp_path):
+def test_missing_token_file_gives_a_one_sentence_error(tmp_path):
     with pytest.raises(TrainerError, match="can't be read"):
         scorer_for(tmp_path, token=f"@{tmp_path / 'token'}")
 
 
-async def test_trl_gets_a_number_for_each_completion_and_none_for_a_lost_one():
+async def test_trl_gets_a_reward_per_completion_and_none_for_a_lost_one():
     lossy = SymbolicCluster(TASKS, lost=frozenset({"score-0/1"}))
     metrics, columns = {}, {}
     with scorer(lossy) as opened:
@@ -123,11 +123,11 @@ async def test_trl_gets_a_number_for_each_completion_and_none_for_a_lost_one():
 
 
 @pytest.mark.parametrize("completion", [None, [], [{"role": "assistant"}], [{"content": None}], 3])
-def test_a_completion_without_text_is_an_empty_one(completion):
+def test_completion_without_text_counts_as_empty(completion):
     assert text_of(completion) == ""
 
 
-def test_the_sampler_tells_of_each_portion_before_its_first_index():
+def test_sampler_announces_each_portion_before_its_first_index():
     told = []
     sampler = AnnouncedSampler([4, 4, 1, 1, 0, 0, 2, 2, 3, 3], 4, 1, told.append)
     drawn = []
@@ -177,7 +177,7 @@ def test_the_mixin_announces_each_generation_and_the_next_to_the_cluster(cluster
     assert len([0, *drawn]) == len(sampler) == 16
 
 
-def test_the_mixin_leaves_a_trainer_without_our_reward_alone():
+def test_mixin_ignores_a_trainer_without_our_reward():
     assert isinstance(LookingAhead(len)._get_train_sampler(), list)
 
 
@@ -188,14 +188,14 @@ def until(condition, seconds=20.0):
         time.sleep(0.005)
 
 
-async def test_verl_gets_the_same_keys_for_a_plan_and_for_none(on_cluster):
+async def test_verl_gets_the_same_keys_for_valid_and_invalid_plans(on_cluster):
     good = await verl.scored(on_cluster, FIRST.task.task_id, oracle(FIRST))
     none = await verl.scored(on_cluster, FIRST.task.task_id, "hm")
     assert good.keys() == none.keys()
     assert (good["score"] > 30, good["success"], none["score"]) == (True, 1.0, -1.0)
 
 
-async def test_verl_never_sees_a_lost_plan_it_is_tried_again_and_then_given_up():
+async def test_lost_plan_is_retried_for_verl_and_then_raises():
     with scorer(SymbolicCluster(TASKS, lost=frozenset({"score-0/"}))) as opened:
         assert (await verl.scored(opened, FIRST.task.task_id, oracle(FIRST)))["success"] == 1.0
     with (
@@ -205,7 +205,7 @@ async def test_verl_never_sees_a_lost_plan_it_is_tried_again_and_then_given_up()
         await verl.scored(opened, FIRST.task.task_id, oracle(FIRST))
 
 
-async def test_openrlhf_gets_tensors_and_what_was_lost_is_executed_again():
+async def test_openrlhf_gets_tensors_and_lost_plans_are_retried():
     ids = [FIRST.task.task_id, SECOND.task.task_id, FIRST.task.task_id]
     with scorer(SymbolicCluster(TASKS, lost=frozenset({"score-0/"}))) as opened:
         rewards = await openrlhf.rewards_of(opened, ids, [oracle(FIRST), oracle(SECOND), "hm"])
@@ -220,7 +220,7 @@ async def test_openrlhf_gets_tensors_and_what_was_lost_is_executed_again():
         await openrlhf.rewards_of(opened, ids[:1], [oracle(FIRST)])
 
 
-def test_openrlhf_is_told_which_query_is_not_its_prompt_s_and_which_setting_is_missing():
+def test_openrlhf_errors_name_the_mismatched_query_and_the_missing_setting():
     label = RewardLabel("t", FIRST.bundle_digest, Profile.PAPER, 0).text()
     with pytest.raises(TrainerError, match="does not hold its prompt 'the prompt'"):
         openrlhf.reward_func(["move 1"], ["the prompt"], [label])
@@ -228,7 +228,7 @@ def test_openrlhf_is_told_which_query_is_not_its_prompt_s_and_which_setting_is_m
         openrlhf.reward_func(["the prompt move 1"], ["the prompt"], [label])
 
 
-async def test_rows_carry_what_each_trainer_finds_the_task_by(tmp_path, cluster):
+async def test_rows_contain_the_key_of_the_task_for_each_trainer(tmp_path, cluster):
     folder = write_kitchen_dataset(tmp_path)
     ids = [task.task.task_id for task in load_tasks(folder).train]
     assert [row["task_id"] for row in rows.prompt_rows(folder)] == ids

@@ -1,4 +1,4 @@
-"""What the dashboard is told of training: every step's figures, the ends of a group, and nothing that waits for a manager."""
+"""Training reports to the manager: figures of every step, plans of a group, and no waiting."""
 
 import math
 
@@ -26,7 +26,7 @@ class AwayCluster(SymbolicCluster):
         await super().report_training(run_id, report)
 
 
-def test_a_run_reports_both_its_phases_where_its_time_went_and_plans(tmp_path):
+def test_run_reports_both_phases_time_by_activity_and_plans(tmp_path):
     cluster = SymbolicCluster(TASKS)
     short = {"imitation__steps": 2, "grpo__steps": 2, "grpo__tasks_per_step": 2, "grpo__max_new": 8}
     run(tmp_path, cluster, **short, evaluation__samples=1)
@@ -49,7 +49,7 @@ def test_a_run_reports_both_its_phases_where_its_time_went_and_plans(tmp_path):
     assert {"imitation", "success after GRPO"} <= {report.phase for report in cluster.reports}
 
 
-def test_the_best_and_the_worst_plan_of_a_group_are_shown_and_a_lost_one_last():
+def test_report_shows_best_and_worst_plan_and_a_lost_one_last():
     told = []
     good, bad = outcomes(SymbolicCluster(TASKS), "toggle_on countertop", "what?")
     lost = good.__class__("move table", None)
@@ -62,13 +62,13 @@ def test_the_best_and_the_worst_plan_of_a_group_are_shown_and_a_lost_one_last():
     assert (report.plans[2].reward, report.plans[2].advantage) == (None, 0.0)
 
 
-def test_numbers_that_are_none_are_not_told():
+def test_non_finite_numbers_are_not_reported():
     told = []
     DashboardReporter(told.append).log("grpo", 1, {"reward": 1.0, "kl": math.nan})
     assert told == [TrainingReport("grpo", 1, {"reward": 1.0})]
 
 
-def test_the_latest_reports_wait_for_a_manager_that_is_away():
+def test_latest_reports_are_queued_for_an_unreachable_manager():
     cluster = AwayCluster(TASKS)
     with Gateway(lambda: cluster, TASKS.bundle_bytes, run_name="test", run_seed=0) as gateway:
         for step in range(MAX_QUEUED_REPORTS + 10):
@@ -78,7 +78,7 @@ def test_the_latest_reports_wait_for_a_manager_that_is_away():
     assert [report.step for report in cluster.reports] == list(range(10, MAX_QUEUED_REPORTS + 10))
 
 
-def test_a_manager_that_is_too_old_to_listen_is_told_nothing_more():
+def test_manager_that_rejects_reports_gets_no_more():
     cluster = AwayCluster(TASKS)
     cluster.error = PreconditionError("no such call")
     with Gateway(lambda: cluster, TASKS.bundle_bytes, run_name="test", run_seed=0) as gateway:

@@ -1,4 +1,4 @@
-"""Several processes learn what one learns, to the bit; one that dies ends the run, and the checkpoints stay."""
+"""Data-parallel workers: several processes learn bit-identically to one, and a dead one ends the run with a checkpoint."""
 
 import asyncio
 import os
@@ -43,7 +43,7 @@ def learnt(folder, **changes):
 @pytest.mark.parametrize(
     "changes", [{}, {"grpo__reserve": 4, "grpo__overlap": "ahead"}], ids=["plain", "all"]
 )
-def test_two_processes_learn_what_one_learns_to_the_bit(tmp_path, remotes, changes):
+def test_two_processes_are_bit_identical_to_one(tmp_path, remotes, changes):
     one = learnt(tmp_path / "one", **changes)
     two = learnt(tmp_path / "two", processes=2, **changes)
     assert len(remotes) == 1
@@ -55,13 +55,13 @@ def test_two_processes_learn_what_one_learns_to_the_bit(tmp_path, remotes, chang
     assert told[0] == told[1]
 
 
-def test_more_processes_than_a_step_has_chunks_change_nothing(tmp_path, remotes):
+def test_more_processes_than_microbatches_are_bit_identical(tmp_path, remotes):
     assert torch.equal(learnt(tmp_path / "one"), learnt(tmp_path / "three", processes=3))
     assert len(remotes) == 2
     assert not any(process.is_alive() for process in remotes)
 
 
-def test_a_process_that_is_killed_ends_the_run_and_one_alone_goes_on_to_the_same_end(tmp_path, remotes):
+def test_killed_process_ends_the_run_and_a_resume_gives_the_same_result(tmp_path, remotes):
     whole, _ = run(tmp_path / "whole", **FAST)
 
     class Killer(LineDisplay):
@@ -85,7 +85,7 @@ def interruptible():
     signal.signal(signal.SIGINT, before)
 
 
-def test_an_interrupt_waits_neither_for_rewards_nor_for_processes(tmp_path, remotes, interruptible):
+def test_ctrl_c_waits_for_neither_rewards_nor_processes(tmp_path, remotes, interruptible):
     class Silent(SymbolicCluster):
         """Gives no reward in the third step of GRPO, and has the trainer interrupted."""
 
@@ -103,7 +103,7 @@ def test_an_interrupt_waits_neither_for_rewards_nor_for_processes(tmp_path, remo
     assert CheckpointStore(tmp_path / CHECKPOINTS, keep=9).latest().name == "step-000002"
 
 
-def test_a_gradient_that_no_process_can_make_is_told(tmp_path, monkeypatch):
+def test_error_in_a_remote_process_is_reported(tmp_path, monkeypatch):
     settings = read_settings(None, {"processes": 2})
     policy = new_policy(settings, TASKS)
     policy.save(tmp_path)
@@ -115,7 +115,7 @@ def test_a_gradient_that_no_process_can_make_is_told(tmp_path, monkeypatch):
             asked.result(timeout=60)
 
 
-def test_a_policy_on_another_device_has_no_remotes(tmp_path):
+def test_several_processes_need_a_policy_on_the_cpu(tmp_path):
     settings = read_settings(None, {"processes": 2})
     policy = new_policy(settings, TASKS)
     elsewhere = settings.model_copy(update={"device": "cuda"})
@@ -123,7 +123,7 @@ def test_a_policy_on_another_device_has_no_remotes(tmp_path):
         DataParallelWorkers.start(Learner(policy, policy, settings.grpo), policy, elsewhere, tmp_path)
 
 
-def test_what_one_side_writes_the_other_reads():
+def test_shared_tensors_are_visible_on_both_sides():
     like = [torch.zeros(3, 5), torch.zeros((), dtype=torch.float64), torch.zeros(7, dtype=torch.bfloat16)]
     ours = SharedTensors(like)
     theirs = SharedTensors(like, os.dup(ours.fd))

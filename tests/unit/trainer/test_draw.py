@@ -1,4 +1,4 @@
-"""Tokens are drawn as likely as their scores say, and never one that is barred."""
+"""Drawing of tokens: frequencies follow the scores, and masked tokens are never drawn."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ BARRED = -1e9
 
 
 @pytest.mark.parametrize("temperature", [0.5, 1.0, 1.7])
-def test_tokens_come_as_often_as_the_softmax_says(temperature):
+def test_token_frequencies_follow_the_softmax(temperature):
     scores = torch.tensor([2.0, BARRED, 0.0, 1.0, -1.0, BARRED])
     count = 40_000
     choice, logprob = draw(scores.repeat(count, 1), temperature, torch.Generator().manual_seed(0))
@@ -24,7 +24,7 @@ def test_tokens_come_as_often_as_the_softmax_says(temperature):
     barred=st.lists(st.booleans(), min_size=2, max_size=40).filter(lambda marks: not all(marks)),
     seed=st.integers(0, 2**32),
 )
-def test_a_barred_token_is_never_drawn(barred, seed):
+def test_masked_token_is_never_drawn(barred, seed):
     generator = torch.Generator().manual_seed(seed)
     marks = torch.tensor(barred)
     scores = torch.randn(len(barred), generator=generator).masked_fill(marks, BARRED)
@@ -32,7 +32,7 @@ def test_a_barred_token_is_never_drawn(barred, seed):
     assert not marks[choice].any()
 
 
-def test_temperature_zero_takes_the_likeliest_token():
+def test_temperature_zero_is_greedy():
     scores = torch.tensor([[0.1, 0.3, 0.2], [5.0, BARRED, 1.0]])
     choice, _ = draw(scores, 0.0, torch.Generator())
     assert choice.tolist() == [1, 0]

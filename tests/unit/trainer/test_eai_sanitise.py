@@ -1,4 +1,4 @@
-"""What EAI's judge is given is pure JSON of plain names, whatever a model wrote: its parser calls eval."""
+"""Sanitising for EAI's judge: pure JSON of plain names for any model text, because the judge's parser calls eval."""
 
 import ast
 import json
@@ -23,7 +23,7 @@ STEP = {"action": "OPEN", "object": "fridge_97"}
         json.dumps([{**STEP, "why": "__import__('os').system('true')"}]),
     ],
 )
-def test_steps_are_found_in_what_models_write(text):
+def test_steps_are_extracted_from_model_output(text):
     assert json.loads(sanitise_answer(text)) == [STEP]
 
 
@@ -34,13 +34,13 @@ def test_text_without_steps_is_empty(text):
     assert sanitise_answer(text) == ""
 
 
-def test_names_lose_what_could_end_a_string_or_a_list():
+def test_characters_that_could_break_out_are_removed_from_names():
     text = json.dumps([{"action": "OPEN", "object": 'a"]) or __import__("os")#'}])
     assert json.loads(sanitise_answer(text)) == [{"action": "OPEN", "object": "a??? or __import__??os???"}]
 
 
 @given(st.text(), st.text())
-def test_whatever_is_handed_over_is_a_literal_up_to_the_first_closing_bracket(action, thing):
+def test_sanitised_text_is_a_literal_up_to_the_first_closing_bracket(action, thing):
     """The published parser evaluates the text from the first "[" to the first "]"."""
     text = sanitise_answer(json.dumps([{"action": action, "object": thing}]))
     value = ast.literal_eval(text[text.find("[") : text.find("]") + 1])

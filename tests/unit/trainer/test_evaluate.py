@@ -1,4 +1,4 @@
-"""Held-out success: intervals over tasks, paired differences, lost rollouts counted nowhere."""
+"""Held-out evaluation: intervals over tasks, paired differences, lost rollouts left out."""
 
 import math
 
@@ -18,13 +18,13 @@ def scored(successes, samples=10, prefix="t", category="pick_and_place"):
     )
 
 
-def test_interval_holds_the_mean_and_narrows_with_more_tasks():
+def test_interval_contains_the_mean_and_narrows_with_more_tasks():
     few, many = scored([0, 10] * 5).success(), scored([0, 10] * 50).success()
     assert few.low < few.value == many.value == 0.5 < few.high
     assert many.high - many.low < few.high - few.low
 
 
-def test_interval_covers_the_truth_about_as_often_as_it_says():
+def test_interval_has_its_nominal_coverage():
     rng = np.random.default_rng(0)
     hits = 0
     for _ in range(200):
@@ -33,7 +33,7 @@ def test_interval_covers_the_truth_about_as_often_as_it_says():
     assert 0.88 <= hits / 200 <= 0.99
 
 
-def test_pairing_sees_a_difference_that_lies_within_both_intervals():
+def test_paired_difference_is_significant_within_both_intervals():
     before, after = scored([0, 2, 8, 9] * 10), scored([1, 3, 9, 10] * 10)
     assert before.success().high > after.success().low
     change = improvement(before, after)
@@ -41,24 +41,24 @@ def test_pairing_sees_a_difference_that_lies_within_both_intervals():
     assert change.low > 0
 
 
-def test_only_tasks_of_both_evaluations_are_paired():
+def test_only_common_tasks_are_paired():
     assert improvement(scored([0, 0]), scored([10, 10, 10])).value == 1.0
     assert math.isnan(improvement(scored([5]), scored([5], prefix="other")).value)
 
 
-def test_a_task_whose_rollouts_were_all_lost_is_left_out():
+def test_task_with_only_lost_rollouts_is_left_out():
     known = scored([5, 5])
     lost = scored([0], samples=0, prefix="lost")
     assert HeldOutEvaluation((*known.scores, *lost.scores)).success().value == 0.5
 
 
-def test_categories_are_reported_apart():
+def test_categories_are_reported_separately():
     both = HeldOutEvaluation((*scored([10]).scores, *scored([0], prefix="c", category="compound").scores))
     assert both.categories == ("compound", "pick_and_place")
     assert both.success("compound").value == 0
     assert both.success("pick_and_place").value == 1
 
 
-def test_scores_survive_their_file():
+def test_scores_survive_a_json_round_trip():
     result = scored([1, 2, 3])
     assert HeldOutEvaluation.from_json(result.as_json()) == result

@@ -1,4 +1,4 @@
-"""From answers to a table: kept, resumed, judged by the engine, and the same again from what was kept."""
+"""Evaluation from answers to tables: stored, resumed, judged by the engine, and reproduced from the stored answers."""
 
 import json
 from dataclasses import replace
@@ -18,7 +18,7 @@ from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, Evaluatio
 from embomatrix.trainer.evaluation.baselines import BaselineName, baseline_for
 from embomatrix.trainer.evaluation.benchmark import find_benchmark
 from embomatrix.trainer.evaluation.exam import WorldExam
-from embomatrix.trainer.evaluation.judging import AnswerJudge
+from embomatrix.trainer.evaluation.judging import judge_answers
 from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
 from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
@@ -43,13 +43,13 @@ def setup_of(bench, samples=2, codec="lines", **changes):
 
 def judged(bench, answers, setup=None):
     executor = HereExecutor(bench.folder)
-    found = AnswerJudge(bench, setup or setup_of(bench), executor).next_pause_state(answers)
+    found = judge_answers(bench, setup or setup_of(bench), executor, answers)
     return found, executor
 
 
 def report(bench, answers, setup=None):
     setup = setup or setup_of(bench)
-    marked = WorldExam(bench, HereExecutor(bench.folder)).next_pause_state(setup, answers, lambda *_: None)
+    marked = WorldExam(bench, HereExecutor(bench.folder)).judge(setup, answers, lambda *_: None)
     value = report_of(setup, marked)
     return value, evaluation_page(value, marked.pictures)
 
@@ -87,7 +87,7 @@ def test_oracle_succeeds_everywhere_and_random_plans_parse(bench):
     assert not all(verdict.success for verdict in drawn.verdicts)
 
 
-def test_greedy_script_solves_what_takes_no_foresight(bench):
+def test_greedy_baseline_solves_tasks_without_dependencies(bench):
     found, _ = judged(bench, asked(bench, BaselineName.GREEDY))
     assert {verdict.task_id: verdict.success for verdict in found.verdicts}[APPLE]
 
@@ -118,13 +118,13 @@ def test_equal_plans_of_a_task_are_executed_once(bench):
     assert len(found.verdicts) == 4
 
 
-def test_processes_of_this_machine_give_what_this_process_gives(bench):
+def test_process_pool_gives_the_same_outcomes_as_one_process(bench):
     answers = asked(bench, BaselineName.RANDOM, 2)
     here, _ = judged(bench, answers)
-    assert AnswerJudge(bench, setup_of(bench), RolloutPool(bench.folder, 2)).next_pause_state(answers) == here
+    assert judge_answers(bench, setup_of(bench), RolloutPool(bench.folder, 2), answers) == here
 
 
-def test_report_is_made_again_from_the_kept_answers_bit_for_bit(bench, tmp_path):
+def test_report_from_stored_answers_is_bit_identical(bench, tmp_path):
     setup = setup_of(bench, codec="json")
     with AnswerSheet(tmp_path / "answers.jsonl", setup) as sheet:
         written(bench, BaselineName.RANDOM).ask(questions(bench), sheet, lambda *_: None)
@@ -140,12 +140,12 @@ def test_report_is_made_again_from_the_kept_answers_bit_for_bit(bench, tmp_path)
     assert text_report(again[0]) == text_report(first[0])
 
 
-def test_order_in_which_answers_came_leaves_no_trace(bench):
+def test_report_does_not_depend_on_the_order_of_answers(bench):
     answers = asked(bench, BaselineName.RANDOM, 2)
     assert report(bench, answers[::-1]) == report(bench, answers)
 
 
-def test_report_of_other_tasks_does_not_stand_in_the_same_table(bench, tmp_path):
+def test_report_on_other_tasks_is_rejected_as_a_row(bench, tmp_path):
     value, _ = report(bench, asked(bench, BaselineName.ORACLE))
     path = tmp_path / "report.json"
     path.write_text(json.dumps(value))
@@ -163,14 +163,14 @@ def test_lost_plans_count_in_no_figure(bench):
     assert board.success().interval.value == 1.0
 
 
-def test_tasks_that_can_not_be_expressed_count_as_failed_in_the_success_over_all(bench):
+def test_inexpressible_tasks_count_as_failed_in_the_success_over_all(bench):
     found, _ = judged(bench, asked(bench, BaselineName.ORACLE))
     board = Scoreboard.of(categories(bench), found.verdicts, by_rule=4)
     assert board.success().interval.value == 1.0
     assert board.success_over_all().interval.value == 0.5
 
 
-def test_page_escapes_what_models_and_tasks_say(bench):
+def test_page_escapes_texts_of_models_and_tasks(bench):
     setup = setup_of(bench, model="<script>alert(1)</script>")
     _, page = report(bench, asked(bench, BaselineName.ORACLE), setup)
     assert "<script" not in page
@@ -198,7 +198,7 @@ def test_page_escapes_what_models_and_tasks_say(bench):
         (lambda text: text + "nonsense\n", "is damaged"),
     ],
 )
-def test_answers_that_can_not_be_used_are_named(bench, tmp_path, damage, words):
+def test_damaged_answer_files_are_rejected(bench, tmp_path, damage, words):
     path = tmp_path / "answers.jsonl"
     with AnswerSheet(path, setup_of(bench)) as sheet:
         sheet.add([Answer(APPLE, 0, "move 1")])
@@ -207,7 +207,7 @@ def test_answers_that_can_not_be_used_are_named(bench, tmp_path, damage, words):
         read_answers(path)
 
 
-def test_answers_to_other_questions_are_not_added_to(bench, tmp_path):
+def test_answer_file_of_other_questions_is_rejected(bench, tmp_path):
     path = tmp_path / "answers.jsonl"
     with AnswerSheet(path, setup_of(bench)) as sheet:
         sheet.add([Answer(APPLE, 0, "move 1")])
@@ -218,7 +218,7 @@ def test_answers_to_other_questions_are_not_added_to(bench, tmp_path):
         pass
 
 
-def test_line_cut_short_by_a_kill_is_asked_again(bench, tmp_path):
+def test_truncated_line_is_asked_again(bench, tmp_path):
     path = tmp_path / "answers.jsonl"
     with AnswerSheet(path, setup_of(bench)) as sheet:
         sheet.add([Answer(APPLE, 0, "move 1"), Answer(APPLE, 1, "móve \ud800 2")])
@@ -236,7 +236,7 @@ def endpoint_asker(url, tmp_path, attempts=1):
     return EndpointSource(lambda: Endpoint(url, "scripted", limits=limits), tmp_path / "ledger.jsonl")
 
 
-def test_endpoint_is_asked_once_for_each_sample_and_what_it_cost_is_written(bench, tmp_path):
+def test_endpoint_is_asked_once_per_sample_and_usage_is_recorded(bench, tmp_path):
     server = ChatServer("move 10")
     with server.serving() as url, AnswerSheet(tmp_path / "answers.jsonl", setup_of(bench)) as sheet:
         endpoint_asker(url, tmp_path).ask(questions(bench), sheet, lambda *_: None)
@@ -247,7 +247,7 @@ def test_endpoint_is_asked_once_for_each_sample_and_what_it_cost_is_written(benc
     assert len((tmp_path / "ledger.jsonl").read_text().splitlines()) == len(server.requests)
 
 
-def test_endpoint_that_breaks_off_costs_no_answer_that_came(bench, tmp_path):
+def test_failing_endpoint_loses_no_earlier_answer(bench, tmp_path):
     good = (200, {}, json.dumps(completion("move 10")), 0.0)
     server = ChatServer(good, good, good, (500, {}, "out of order", 0.0))
     path = tmp_path / "answers.jsonl"
@@ -262,12 +262,12 @@ def test_endpoint_that_breaks_off_costs_no_answer_that_came(bench, tmp_path):
     assert len(again.requests) == 8 - kept
 
 
-def test_other_prompts_are_other_questions(bench):
+def test_questions_digest_depends_on_the_prompts(bench):
     digests = {questions_digest(questions(bench, codec, rows)) for codec in Codec for rows in (5, 60)}
     assert len(digests) == 6
 
 
-def test_task_in_a_scene_without_a_bundle_is_named(bench, tmp_path):
+def test_task_without_a_bundle_is_rejected(bench, tmp_path):
     path = tmp_path / "tasks.json"
     path.write_bytes((bench.folder / "tasks.jsonl").read_bytes())
     with pytest.raises(TrainerError, match="is in the unknown scene 'flat_kitchen'"):
@@ -281,17 +281,17 @@ def test_task_in_a_scene_without_a_bundle_is_named(bench, tmp_path):
         ("KITCHEN", "test", "no tasks in the split 'test': it has heldout, train"),
     ],
 )
-def test_benchmark_that_is_not_there_is_named(bench, named, split, words):
+def test_missing_benchmark_is_reported(bench, named, split, words):
     with pytest.raises(TrainerError, match=words):
         find_benchmark(named.replace("KITCHEN", str(bench.folder)), split)
 
 
-def test_held_out_tasks_are_measured_unless_told_otherwise(bench):
+def test_held_out_tasks_are_the_default_split(bench):
     assert find_benchmark(str(bench.folder)).split == "heldout"
     assert find_benchmark(str(bench.folder), "all", 2).digest != bench.digest
 
 
-def test_refused_problems_of_an_import_and_goals_beyond_the_profile_are_failed_by_rule(bench, tmp_path):
+def test_rejected_imports_and_goals_beyond_the_profile_fail_by_rule(bench, tmp_path):
     folder = write_kitchen_dataset(tmp_path)
     lines = [json.loads(line) for line in (folder / "tasks.jsonl").read_text().splitlines()]
     lines[0]["task"]["profile"] = "household"

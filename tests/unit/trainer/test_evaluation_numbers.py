@@ -29,26 +29,26 @@ def failed(plan, at, reason, **words):
     return (*steps, Step(plan[at - 1], reason, refusal.sentence, refusal.blocker))
 
 
-def test_wilson_gives_the_textbook_interval():
+def test_wilson_interval_equals_the_textbook_value():
     interval = wilson(0.1, 20)  # Newcombe 1998, table I: 2 of 20
     assert (interval.low, interval.high) == pytest.approx((0.0279, 0.3010), abs=1e-3)
 
 
-def test_tasks_that_are_all_alike_leave_no_false_certainty():
+def test_equal_tasks_give_a_wilson_interval():
     nothing = mean_over_tasks([0.0] * 20)
     assert nothing.method is IntervalMethod.WILSON
     assert nothing.interval.low == pytest.approx(0.0)
     assert 0.1 < nothing.interval.high < 0.2
 
 
-def test_tasks_are_resampled_with_all_their_samples():
+def test_bootstrap_resamples_tasks_not_samples():
     """Ten samples of each of ten tasks that either always or never succeed are ten observations, not a hundred."""
     estimate = mean_over_tasks([0.0, 1.0] * 5)
     assert estimate.method is IntervalMethod.BOOTSTRAP
     assert estimate.interval.high - estimate.interval.low > 0.5
 
 
-def test_a_task_of_which_nothing_is_known_is_left_out():
+def test_unknown_task_is_left_out():
     estimate = mean_over_tasks([1.0, math.nan, 0.5])
     assert (estimate.tasks, estimate.interval.value) == (2, 0.75)
     assert mean_over_tasks([math.nan]).method is IntervalMethod.NONE
@@ -63,12 +63,12 @@ def test_pass_at_k_is_the_share_of_draws_with_a_success():
     assert math.isnan(pass_at(11, 10, 2))
 
 
-def test_every_reason_of_a_step_has_one_cause():
+def test_every_failure_reason_has_one_cause():
     assert set(STEP_CAUSES) | set(REMEDIES) == set(FailureReason)
     assert not set(STEP_CAUSES) & set(REMEDIES)
 
 
-def test_every_reason_of_a_text_has_a_cause_and_every_cause_a_meaning():
+def test_every_plan_reason_has_a_cause_and_every_cause_a_meaning():
     assert {cause_of_text(reason) for reason in PlanReason} <= set(Cause)
     assert set(MEANINGS) == set(Cause)
 
@@ -126,11 +126,11 @@ def test_every_reason_of_a_text_has_a_cause_and_every_cause_a_meaning():
         ("move 1", 1, "no_path", {"target": "apple_1", "other": "table_1"}, "unreachable"),
     ],
 )
-def test_first_failed_step_gives_the_cause(plan, at, reason, words, cause):
+def test_first_failed_step_decides_the_cause(plan, at, reason, words, cause):
     calls = parse_plan(plan)
     assert cause_of_trace(calls, failed(calls, at, FailureReason(reason), **words), TABLE) == cause
 
 
-def test_a_plan_that_ran_to_its_end_missed_its_goal():
+def test_complete_plan_without_success_has_the_cause_goal_not_met():
     plan = parse_plan("move 1")
     assert cause_of_trace(plan, [Step(plan[0], None, "")], TABLE) is Cause.GOAL_NOT_MET

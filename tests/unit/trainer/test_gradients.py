@@ -1,4 +1,4 @@
-"""Gradients of parts add up in one order, to the bit, whatever order the parts come in."""
+"""Gradients of microbatches: bit-identical sums in any order of arrival."""
 
 import torch
 from hypothesis import given
@@ -23,12 +23,12 @@ def summed(order, tensors=PARTS):
 
 
 @given(st.permutations(range(len(PARTS))))
-def test_any_order_gives_the_sum_of_the_order_of_parts(order):
+def test_sum_is_bit_identical_for_any_order(order):
     assert torch.equal(summed(order)[0], summed(range(len(PARTS)))[0])
 
 
 @given(st.permutations(range(len(PARTS))), st.sets(st.sampled_from(range(len(PARTS)))))
-def test_parts_that_were_made_elsewhere_add_up_to_the_same(order, elsewhere):
+def test_remote_gradients_give_the_same_sum(order, elsewhere):
     weights, idle = nn.Parameter(torch.zeros(3)), nn.Parameter(torch.zeros(2))
     gradients = GradientSum([weights, idle])
     for part in order:
@@ -40,12 +40,12 @@ def test_parts_that_were_made_elsewhere_add_up_to_the_same(order, elsewhere):
     assert idle.grad is None
 
 
-def test_a_part_before_its_turn_waits_beside_the_sum():
+def test_early_gradients_are_stored():
     assert summed([0, 1, 2, 3, 4])[1] == 0
     assert summed([4, 3, 2, 1, 0])[1] == 4
 
 
-def test_a_part_without_a_gradient_takes_its_turn():
+def test_microbatch_without_a_gradient_is_counted():
     weights = nn.Parameter(torch.zeros(3))
     gradients = GradientSum([weights])
     gradients.add(1, lambda: weights.sum().backward())

@@ -1,4 +1,4 @@
-"""Group relative policy optimisation against the formulas written out in plain Python."""
+"""Group relative policy optimisation against the formulas in plain Python."""
 
 import itertools
 import math
@@ -49,7 +49,7 @@ SCALE = LossTotals(4, 7, LONGEST)
 
 
 def by_hand(kind, ratio, low, high, kl_coef):
-    """The objective as a person would compute it, plan by plan and token by token."""
+    """Objective in plain Python, plan by plan and token by token."""
     plans = []
     for new, old, reference, mask, advantage in zip(NEW, OLD, REFERENCE, MASK, ADVANTAGES, strict=True):
         own = [at for at, present in enumerate(mask) if present]
@@ -78,13 +78,13 @@ def by_hand(kind, ratio, low, high, kl_coef):
 
 
 @pytest.mark.parametrize(("kind", "ratio"), list(itertools.product(LossKind, RatioLevel)))
-def test_loss_is_the_formula_written_out(kind, ratio):
+def test_loss_equals_the_formula(kind, ratio):
     settings = objective(loss=kind, ratio=ratio, kl_coef=0.1)
     loss, _ = surrogate_loss(terms(), settings, SCALE)
     assert loss.item() == pytest.approx(by_hand(kind, ratio, 0.2, 0.28, 0.1), abs=1e-12)
 
 
-def test_paper_objective_keeps_its_golden_value():
+def test_paper_objective_equals_its_golden_value():
     settings = objective(loss=LossKind.PAPER, ratio=RatioLevel.SEQUENCE, clip_high=0.2, kl_coef=0.1)
     # ratios exp(0.5), exp(-0.5), exp(-0.5), exp(0.5); clipped at 1.2 and 0.8 where that lowers the gain
     gain = (1.2 - 0.8 + 0.5 * math.exp(-0.5) - 0.5 * math.exp(0.5)) / 4
@@ -93,7 +93,7 @@ def test_paper_objective_keeps_its_golden_value():
 
 
 @pytest.mark.parametrize(("kind", "ratio"), list(itertools.product(LossKind, RatioLevel)))
-def test_parts_of_a_step_add_up_to_the_whole(kind, ratio):
+def test_microbatches_add_up_to_the_step(kind, ratio):
     settings = objective(loss=kind, ratio=ratio, kl_coef=0.05, entropy_coef=0.01)
     entropy = torch.full((4, 2), 0.3, dtype=torch.float64)
     whole = terms(entropy=entropy)
@@ -126,7 +126,7 @@ def test_gradient_raises_good_plans_and_lowers_bad_ones(kind, ratio):
     assert metrics.kl_to_old == pytest.approx(0)
 
 
-def test_ratio_beyond_the_clip_gives_no_more_gradient():
+def test_clipped_ratio_has_no_gradient():
     far = terms(new=[[0.9, 0.9]] * 4, reference=None, advantages=torch.ones(4, dtype=torch.float64))
     loss, metrics = surrogate_loss(far, objective(), SCALE)
     loss.backward()
@@ -134,7 +134,7 @@ def test_ratio_beyond_the_clip_gives_no_more_gradient():
     assert metrics.clip_fraction == 1
 
 
-def test_lost_rows_move_nothing():
+def test_lost_rows_have_no_influence():
     mask = torch.tensor(MASK)
     mask[2] = False
     part = terms(mask=mask)
@@ -145,7 +145,7 @@ def test_lost_rows_move_nothing():
     assert part.logprobs.grad[2].abs().max() == 0
 
 
-def test_kl_pulls_towards_the_reference():
+def test_kl_term_pulls_towards_the_reference():
     part = terms(new=OLD, advantages=torch.zeros(4, dtype=torch.float64))
     loss, metrics = surrogate_loss(part, objective(kl_coef=1.0), SCALE)
     loss.backward()
@@ -162,7 +162,7 @@ def test_advantages_are_centred_and_scaled_by_the_group():
 
 
 @given(GROUPS)
-def test_advantages_of_a_group_sum_to_zero_and_lost_rollouts_get_none(rows):
+def test_advantages_sum_to_zero_and_lost_rollouts_get_none(rows):
     rewards = torch.tensor(rows, dtype=torch.float64)
     result = group_advantages(rewards)
     assert torch.isfinite(result.values).all()
@@ -171,7 +171,7 @@ def test_advantages_of_a_group_sum_to_zero_and_lost_rollouts_get_none(rows):
 
 
 @given(st.lists(st.floats(-1, 32), min_size=2, max_size=7), st.integers(0, 6))
-def test_a_lost_rollout_changes_nothing_for_the_others(rewards, place):
+def test_lost_rollout_does_not_change_the_other_advantages(rewards, place):
     place = min(place, len(rewards))
     alone = group_advantages(torch.tensor([rewards], dtype=torch.float64)).values[0].tolist()
     padded = [*rewards[:place], LOST, *rewards[place:]]
@@ -180,7 +180,7 @@ def test_a_lost_rollout_changes_nothing_for_the_others(rewards, place):
 
 
 @pytest.mark.parametrize("rewards", [[31.5] * 4, [LOST] * 4, [LOST, LOST, 0.5, LOST]])
-def test_groups_without_signal_are_dead(rewards):
+def test_groups_with_equal_or_too_few_rewards_are_zero_variance(rewards):
     result = group_advantages(torch.tensor([rewards]))
     assert result.zero_variance.tolist() == [True]
     assert result.values.abs().max() == 0

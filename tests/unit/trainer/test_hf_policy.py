@@ -1,4 +1,4 @@
-"""Hugging Face policies: a tiny random Llama by default, SmolLM2 from its package where it can be had."""
+"""Hugging Face policies: a tiny random Llama by default, and the packaged SmolLM2 if available."""
 
 import copy
 import math
@@ -48,7 +48,7 @@ def prompts(policy, count=3):
     return [policy.encode(prompt_for(task.situation, Codec.LINES)) for task in TASKS.train[:count]]
 
 
-def test_log_probabilities_with_a_shared_prompt_are_those_of_the_plain_forward(policy):
+def test_shared_prompt_gives_the_log_probabilities_of_a_plain_forward_pass(policy):
     told = [prompts(policy)[0][30:], *prompts(policy)[1:]]
     samples = policy.sample(told, 3, 1.2, 10, torch.Generator().manual_seed(0))
     shared = policy.logprobs(told, samples.tokens, samples.mask, 3, 1.2)
@@ -60,7 +60,7 @@ def test_log_probabilities_with_a_shared_prompt_are_those_of_the_plain_forward(p
         assert torch.allclose(shared.logprobs[row], plain * samples.mask[row], atol=1e-4)
 
 
-def test_sharing_the_prompt_keeps_the_gradient(policy):
+def test_shared_prompt_gives_the_same_gradient(policy):
     told = prompts(policy, 1)
     samples = policy.sample(told, 2, 1.0, 8, torch.Generator().manual_seed(0))
 
@@ -85,7 +85,7 @@ def half(policy, tokenizer):
     return HfPolicy(model, tokenizer, Codec.LINES, "random llama")
 
 
-def test_products_of_half_the_bits_are_close_and_leave_weights_and_gradients_whole(policy, half):
+def test_bfloat16_products_are_close_and_keep_float32_weights_and_gradients(policy, half):
     told = prompts(policy)
     samples = half.sample(told, 3, 1.2, 10, torch.Generator().manual_seed(0))
     scored = half.logprobs(told, samples.tokens, samples.mask, 3, 1.2)
@@ -97,7 +97,7 @@ def test_products_of_half_the_bits_are_close_and_leave_weights_and_gradients_who
     assert {parameter.grad.dtype for parameter in half.parameters()} == {torch.float32}
 
 
-def test_a_model_that_multiplies_in_half_the_bits_shows_what_it_learnt_and_is_saved_whole(half, tmp_path):
+def test_model_with_bfloat16_products_learns_and_is_saved_in_float32(half, tmp_path):
     told = prompts(half)
     before = half.sample(told, 2, 0.0, 6, torch.Generator()).texts
     with torch.no_grad():
@@ -113,7 +113,7 @@ def test_a_model_that_multiplies_in_half_the_bits_shows_what_it_learnt_and_is_sa
 
 
 @pytest.mark.parametrize(("able", "compute_dtype"), [(True, torch.bfloat16), (False, None)])
-def test_layers_but_not_the_head_multiply_in_half_the_bits_where_the_processor_can(
+def test_layers_but_not_the_head_use_bfloat16_on_capable_cpus(
     policy, tmp_path, monkeypatch, able, compute_dtype
 ):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": able})
@@ -123,7 +123,7 @@ def test_layers_but_not_the_head_multiply_in_half_the_bits_where_the_processor_c
     assert not hasattr(model.get_output_embeddings(), "compute_dtype")
 
 
-def test_adapters_learn_beside_products_of_half_the_bits(half, tmp_path):
+def test_adapters_learn_with_bfloat16_products(half, tmp_path):
     half.adapt(LoraSettings(rank=2, alpha=4.0), seed=0)
     told = prompts(half)
     samples = half.sample(told, 2, 1.0, 6, torch.Generator().manual_seed(0))
@@ -134,7 +134,7 @@ def test_adapters_learn_beside_products_of_half_the_bits(half, tmp_path):
     assert back.module.model.layers[0].mlp.down_proj.weight.dtype is torch.float32
 
 
-def test_saved_model_comes_back_through_its_folder(policy, tmp_path):
+def test_saved_model_can_be_loaded(policy, tmp_path):
     policy.save(tmp_path)
     back = saved_policy(tmp_path, read_settings(None, {}))
     told = prompts(policy)
@@ -142,7 +142,7 @@ def test_saved_model_comes_back_through_its_folder(policy, tmp_path):
     assert first == again
 
 
-def test_a_model_whose_weights_are_damaged_is_one_sentence(policy, tmp_path):
+def test_damaged_weights_give_a_one_sentence_error(policy, tmp_path):
     policy.save(tmp_path)
     weights_file = tmp_path / "model.safetensors"
     weights_file.write_bytes(weights_file.read_bytes()[:-40])
@@ -150,7 +150,7 @@ def test_a_model_whose_weights_are_damaged_is_one_sentence(policy, tmp_path):
         HfPolicy.load(tmp_path, Codec.LINES)
 
 
-def test_a_model_that_finds_no_room_leaves_the_checkpoint_before_it_whole(policy, tmp_path, small_files):
+def test_full_disk_leaves_the_previous_checkpoint_intact(policy, tmp_path, small_files):
     settings = read_settings(None, {})
     store = CheckpointStore(tmp_path, keep=3)
     before = store.save(policy, {}, TrainingProgress(step=1, grpo_ready=True), settings)
@@ -163,13 +163,13 @@ def test_a_model_that_finds_no_room_leaves_the_checkpoint_before_it_whole(policy
     assert torch.equal(weights(saved_policy(before / "policy", settings)), weights(policy))
 
 
-def test_a_model_that_is_nowhere_is_one_sentence(tmp_path):
+def test_missing_model_gives_a_one_sentence_error(tmp_path):
     with pytest.raises(TrainerError, match=r"is not a folder.*pass `tiny`"):
         HfPolicy.load(tmp_path / "nothing", Codec.LINES)
 
 
 @pytest.mark.parametrize(("name", "content"), [("a.txt", b"x"), ("a.gguf", b"no gguf at all")])
-def test_a_file_that_is_no_gguf_is_one_sentence(tmp_path, name, content):
+def test_invalid_gguf_gives_a_one_sentence_error(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(TrainerError):
         import_gguf(tmp_path / name, tmp_path / "out")
@@ -191,7 +191,7 @@ def weights(policy):
     return torch.cat([parameter.detach().flatten() for parameter in policy.parameters()]).clone()
 
 
-def test_a_random_llama_goes_through_the_whole_loop(policy, tmp_path):
+def test_random_llama_completes_a_run(policy, tmp_path):
     before = weights(policy)
     summary = train(
         policy,
@@ -256,13 +256,13 @@ def test_smollm2_takes_real_grpo_steps(smollm2, tmp_path):
     assert not torch.equal(before, weights(policy))
 
 
-def test_model_folder_without_a_tokenizer_is_told_what_it_lacks(tmp_path):
+def test_model_folder_without_a_tokenizer_is_rejected(tmp_path):
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(TrainerError, match=r"has no tokenizer: copy the model's tokenizer\.json"):
         HfPolicy.load(tmp_path, Codec.LINES)
 
 
-def test_without_transformers_a_folder_that_is_not_there_is_told_first(tmp_path, monkeypatch):
+def test_missing_folder_is_reported_before_missing_transformers(tmp_path, monkeypatch):
     for library in ("transformers", "huggingface_hub"):
         monkeypatch.setitem(sys.modules, library, None)
     (tmp_path / "tokenizer.json").write_text("{}")
@@ -272,9 +272,7 @@ def test_without_transformers_a_folder_that_is_not_there_is_told_first(tmp_path,
         HfPolicy.load("runs/nowhere", Codec.LINES)
 
 
-def test_a_saved_policy_is_measured_in_the_codec_that_it_was_taught_and_another_model_in_json(
-    policy, tokenizer, tmp_path
-):
+def test_trained_policy_keeps_its_codec_and_other_models_use_json(policy, tokenizer, tmp_path):
     policy.save(tmp_path / "taught")
     model = copy.deepcopy(policy.module)
     del model.config.embomatrix_codec

@@ -1,4 +1,4 @@
-"""Plans of two hands are told for one arm: things are fetched when they are needed, doors shut when nothing is behind them."""
+"""Conversion of two-handed human plans to one arm: objects are fetched when needed, and doors closed at the end."""
 
 import json
 
@@ -22,7 +22,7 @@ def told(*steps):
     return words
 
 
-def test_two_things_are_carried_one_after_the_other_before_the_door_is_shut():
+def test_two_objects_are_carried_in_turn_before_the_door_is_closed():
     steps = (
         *(("OPEN", "fridge"), ("LEFT_GRASP", "apple"), ("RIGHT_GRASP", "milk"), ("CLOSE", "fridge")),
         *(("LEFT_PLACE_ONTOP", "table"), ("RIGHT_PLACE_ONTOP", "table")),
@@ -37,7 +37,7 @@ def test_two_things_are_carried_one_after_the_other_before_the_door_is_shut():
     ]
 
 
-def test_a_tool_is_laid_down_where_it_was_before_the_hand_is_needed():
+def test_tool_is_put_back_before_the_hand_is_needed():
     steps = (("RIGHT_GRASP", "rag"), ("LEFT_GRASP", "chair"), ("CLEAN", "chair"), ("OPEN", "fridge"))
     assert told(*steps) == [
         "pick_up rag_1",
@@ -47,12 +47,12 @@ def test_a_tool_is_laid_down_where_it_was_before_the_hand_is_needed():
     ]
 
 
-def test_what_is_soaked_is_held_under_the_sink_that_it_was_put_into():
+def test_soaked_object_is_held_under_its_sink():
     steps = (("RIGHT_GRASP", "rag"), ("RIGHT_PLACE_INSIDE", "sink"), ("TOGGLE_ON", "sink"), ("SOAK", "rag"))
     assert told(*steps)[2:] == ["toggle_on sink_1", "pick_up rag_1", "soak_object_in_source rag_1 sink_1"]
 
 
-def test_what_is_left_on_a_floor_that_nobody_asks_for_goes_back():
+def test_object_left_on_the_floor_is_put_back():
     steps = (("RIGHT_GRASP", "rag"), ("CLEAN", "chair"), ("RIGHT_PLACE_ONTOP", "room_floor_kitchen_0"))
     assert told(*steps)[2:] == ["place table_1 ontop"]
 
@@ -67,6 +67,6 @@ def test_what_is_left_on_a_floor_that_nobody_asks_for_goes_back():
         (("RIGHT_PLACE_ONTOP", "table"), "an empty hand"),
     ],
 )
-def test_a_step_that_our_skills_have_no_word_for_is_told(step, words):
+def test_step_without_a_matching_skill_is_reported(step, words):
     with pytest.raises(UntoldError, match=words):
         told(step)

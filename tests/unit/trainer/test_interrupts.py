@@ -1,4 +1,4 @@
-"""An interrupt waits for the end of what is put off, a second one does not."""
+"""Deferred interrupts: the first Ctrl-C waits for the end of the block, a second one does not."""
 
 import signal
 
@@ -12,7 +12,7 @@ def interrupt():
 
 
 @pytest.mark.parametrize(("times", "is_whole"), [(1, True), (2, False)])
-def test_one_interrupt_comes_at_the_end_and_a_second_one_at_once(times, is_whole):
+def test_first_ctrl_c_is_deferred_and_the_second_is_immediate(times, is_whole):
     done = []
 
     def whole():
@@ -27,7 +27,7 @@ def test_one_interrupt_comes_at_the_end_and_a_second_one_at_once(times, is_whole
     assert bool(done) is is_whole
 
 
-def test_nothing_is_put_off_before_it_is_said_nor_afterwards():
+def test_interrupts_are_deferred_only_inside_the_block():
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt), DeferredInterrupts():
         interrupt()
@@ -36,7 +36,7 @@ def test_nothing_is_put_off_before_it_is_said_nor_afterwards():
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_an_error_that_ends_the_whole_is_not_hidden_by_an_interrupt():
+def test_deferred_interrupt_does_not_hide_an_error():
     def spoilt():
         with DeferredInterrupts() as interrupts:
             interrupts.defer()

@@ -1,4 +1,4 @@
-"""A data loader that is looked ahead in gives the same batches in the same order, and tells the ones to come."""
+"""Look-ahead: the same batches in the same order, and the coming ones known."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from embomatrix.trainer.data.lookahead import Lookahead
 
 
 @given(st.lists(st.integers(), max_size=20), st.integers(0, 25))
-def test_batches_come_in_order_and_the_window_is_what_comes_next(batches, steps):
+def test_batches_keep_their_order_and_the_window_shows_the_next_ones(batches, steps):
     ahead = Lookahead(batches, steps=steps)
     seen = []
     for batch in ahead:
@@ -21,7 +21,7 @@ def test_batches_come_in_order_and_the_window_is_what_comes_next(batches, steps)
     assert ahead.window() == ()
 
 
-def test_a_shuffling_loader_is_drawn_from_once_for_each_epoch():
+def test_shuffling_loader_is_iterated_once_per_epoch():
     def epochs(wrap):
         generator = torch.Generator().manual_seed(4)
         data = TensorDataset(torch.arange(20))
@@ -31,7 +31,7 @@ def test_a_shuffling_loader_is_drawn_from_once_for_each_epoch():
     assert epochs(lambda loader: Lookahead(loader, steps=3)) == epochs(lambda loader: loader)
 
 
-def test_a_sampler_is_looked_ahead_in_before_its_data_are_read():
+def test_sampler_look_ahead_reads_no_data():
     read = []
 
     class Data(TensorDataset):
@@ -52,12 +52,12 @@ def test_a_sampler_is_looked_ahead_in_before_its_data_are_read():
     assert len(sampler) == 4
 
 
-def test_leaving_an_epoch_early_begins_the_next_one_whole():
+def test_next_epoch_is_complete_after_an_early_exit():
     ahead = Lookahead([1, 2, 3], steps=1)
     assert next(iter(ahead)) == 1
     assert list(ahead) == [1, 2, 3]
 
 
-def test_a_window_can_not_be_negative():
+def test_negative_window_is_rejected():
     with pytest.raises(ValueError, match="look-ahead of -1 steps"):
         Lookahead([1], steps=-1)

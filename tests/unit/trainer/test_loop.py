@@ -1,4 +1,4 @@
-"""The loop learns, can be stopped and resumed exactly, and says where its time went."""
+"""Training run: it learns, resumes exactly, and reports its time by activity."""
 
 import json
 import signal
@@ -73,7 +73,7 @@ def without_time(metrics):
     ]
 
 
-def test_six_steps_are_three_and_three_after_a_resume(tmp_path):
+def test_resumed_run_is_bit_identical_to_an_uninterrupted_one(tmp_path):
     _, whole = run(tmp_path / "whole")
     run(tmp_path / "halves")
     newest = CheckpointStore(tmp_path / "halves" / CHECKPOINTS, keep=9).latest()
@@ -85,13 +85,13 @@ def test_six_steps_are_three_and_three_after_a_resume(tmp_path):
     assert without_time(read_metrics(tmp_path / "whole")) == without_time(read_metrics(tmp_path / "halves"))
 
 
-def test_a_slow_cluster_changes_when_results_come_and_not_what_is_learnt(tmp_path):
+def test_slow_cluster_does_not_change_the_learned_weights(tmp_path):
     _, fast = run(tmp_path / "fast")
     _, slow = run(tmp_path / "slow", SymbolicCluster(TASKS, delay_s=0.02))
     assert torch.equal(weights(fast), weights(slow))
 
 
-def test_a_run_leaves_report_metrics_samples_and_the_newest_checkpoints(tmp_path):
+def test_run_writes_report_metrics_samples_and_the_newest_checkpoints(tmp_path):
     summary, _ = run(tmp_path, keep_checkpoints=1)
     page = summary.report.read_text()
     assert page.count("<svg") == 5
@@ -109,9 +109,7 @@ def test_a_run_leaves_report_metrics_samples_and_the_newest_checkpoints(tmp_path
     assert told.peak_mb > 50, "torch alone takes more"
 
 
-def test_a_disk_that_is_full_at_a_checkpoint_ends_the_run_and_leaves_the_one_before_whole(
-    tmp_path, small_files
-):
+def test_full_disk_ends_the_run_and_keeps_the_previous_checkpoint(tmp_path, small_files):
     whole, _ = run(tmp_path / "whole")
 
     class Filled(LineDisplay):
@@ -126,7 +124,7 @@ def test_a_disk_that_is_full_at_a_checkpoint_ends_the_run_and_leaves_the_one_bef
     assert gone_on.after == whole.after
 
 
-def test_a_step_that_ends_after_the_minutes_do_leaves_no_more_than_all_of_them_spent(tmp_path):
+def test_used_share_of_the_budget_is_at_most_one(tmp_path):
     told = []
 
     class Listener(LineDisplay):
@@ -137,7 +135,7 @@ def test_a_step_that_ends_after_the_minutes_do_leaves_no_more_than_all_of_them_s
     assert told == [1.0]
 
 
-def test_the_window_of_every_step_is_announced_with_the_steps_ahead(tmp_path):
+def test_every_step_announces_its_window(tmp_path):
     cluster = SymbolicCluster(TASKS)
     run(tmp_path, cluster, grpo__lookahead=2)
     windows = [sorted(set(steps)) for _, steps in cluster.announced]
@@ -147,7 +145,7 @@ def test_the_window_of_every_step_is_announced_with_the_steps_ahead(tmp_path):
     )
 
 
-def test_a_group_with_a_lost_rollout_is_left_out_of_the_update(tmp_path):
+def test_group_with_a_lost_rollout_is_left_out_of_the_update(tmp_path):
     summary, policy = run(tmp_path / "a", SymbolicCluster(TASKS, lose_first=True))
     reference = saved_policy(tmp_path / "a" / REFERENCE, read_settings(None, {}))
     assert summary.lost > 0
@@ -156,7 +154,7 @@ def test_a_group_with_a_lost_rollout_is_left_out_of_the_update(tmp_path):
     assert not torch.equal(weights(moved), weights(reference))
 
 
-def test_a_step_that_is_broken_off_leaves_nothing_behind_and_is_taken_again_after_a_resume(tmp_path):
+def test_interrupted_step_is_rolled_back_and_repeated_after_a_resume(tmp_path):
     class Failing(SymbolicCluster):
         async def execute(self, batch):
             if batch.batch_id.startswith("step-4"):
@@ -178,7 +176,7 @@ def test_a_step_that_is_broken_off_leaves_nothing_behind_and_is_taken_again_afte
     assert without_time(read_metrics(tmp_path / "whole")) == without_time(read_metrics(tmp_path / "broken"))
 
 
-def test_an_interrupt_while_the_policy_moves_waits_until_the_step_is_whole(tmp_path, monkeypatch):
+def test_ctrl_c_during_an_update_waits_for_the_end_of_the_step(tmp_path, monkeypatch):
     apply = Updater._apply
 
     def interrupted(updater, work):
@@ -198,7 +196,7 @@ def test_an_interrupt_while_the_policy_moves_waits_until_the_step_is_whole(tmp_p
     assert without_time(read_metrics(tmp_path / "whole")) == without_time(read_metrics(tmp_path / "halves"))
 
 
-def test_a_live_display_draws_every_phase(tmp_path):
+def test_live_display_shows_every_phase(tmp_path):
     console = Console(force_terminal=True, width=120, record=True)
     run(tmp_path, display=LiveDisplay(console))
     text = console.export_text()
@@ -206,7 +204,7 @@ def test_a_live_display_draws_every_phase(tmp_path):
     assert "held-out success after GRPO" in text
 
 
-def test_damaged_checkpoints_are_named(tmp_path):
+def test_damaged_checkpoints_are_rejected(tmp_path):
     run(tmp_path)
     newest = CheckpointStore(tmp_path / CHECKPOINTS, keep=9).latest()
     (newest / "state.json").write_text("{}")
@@ -217,7 +215,7 @@ def test_damaged_checkpoints_are_named(tmp_path):
         saved_policy(newest / "policy", read_settings(None, {}))
 
 
-def test_imitation_alone_teaches_a_small_world(tmp_path):
+def test_imitation_alone_learns_a_small_world(tmp_path):
     tasks = make_tasks(40, 20, objects=7)
     summary, _ = run(
         tmp_path,

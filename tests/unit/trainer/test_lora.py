@@ -1,4 +1,4 @@
-"""Adapters learn in a model's place, are merged when it is saved, and go on exactly; layers may be computed twice."""
+"""Low-rank adapters and gradient checkpointing: learning, merging, resuming, memory."""
 
 import shutil
 
@@ -75,7 +75,7 @@ def adapters(module):
 
 
 def moved(policy):
-    """Give the adapters something to say."""
+    """Give the adapters random weights."""
     with torch.no_grad():
         for at, layer in enumerate(adapters(policy.module).values()):
             up = layer.lora_B["default"].weight
@@ -115,7 +115,7 @@ def learnt(policy):
     return torch.cat([parameter.detach().flatten() for parameter in policy.parameters()])
 
 
-def test_a_model_with_new_adapters_is_the_model(tokenizer):
+def test_new_adapters_do_not_change_the_output(tokenizer):
     plain, adapted = policy_of(tokenizer), policy_of(tokenizer)
     adapted.adapt(SHAPE, seed=0)
     # Weights that want a gradient may be multiplied by another kernel than frozen ones: the last bits would differ.
@@ -123,7 +123,7 @@ def test_a_model_with_new_adapters_is_the_model(tokenizer):
     assert torch.equal(scored(plain).logprobs, scored(adapted).logprobs)
 
 
-def test_adapters_alone_learn_and_the_output_layer_has_none(tokenizer):
+def test_only_adapters_learn_and_the_output_layer_has_none(tokenizer):
     policy = policy_of(tokenizer)
     policy.adapt(SHAPE, seed=0)
     scored(policy).logprobs.sum().backward()
@@ -134,7 +134,7 @@ def test_adapters_alone_learn_and_the_output_layer_has_none(tokenizer):
     assert not any("lm_head" in name for name in adapters(policy.module))
 
 
-def test_the_merged_model_says_what_the_adapted_one_says(tokenizer, tmp_path):
+def test_merged_model_equals_the_adapted_one(tokenizer, tmp_path):
     policy = policy_of(tokenizer)
     policy.adapt(SHAPE, seed=0)
     before = scored(policy).logprobs
@@ -149,7 +149,7 @@ def test_the_merged_model_says_what_the_adapted_one_says(tokenizer, tmp_path):
     )
 
 
-def test_a_frozen_copy_shares_the_model_and_not_the_adapters(tokenizer):
+def test_frozen_copy_shares_the_model_but_not_the_adapters(tokenizer):
     policy = policy_of(tokenizer)
     policy.adapt(SHAPE, seed=0)
     twin = policy.frozen_copy()
@@ -161,7 +161,7 @@ def test_a_frozen_copy_shares_the_model_and_not_the_adapters(tokenizer):
     assert not any(parameter.requires_grad for parameter in twin.module.parameters())
 
 
-def test_four_steps_with_adapters_are_two_and_two_after_a_resume(model_folder, tmp_path):
+def test_resumed_run_with_adapters_is_bit_identical(model_folder, tmp_path):
     whole, summary = train(tmp_path / "whole", {"model": str(model_folder)})
     train(tmp_path / "halves", {"model": str(model_folder)})
     shutil.rmtree(tmp_path / "halves" / CHECKPOINTS / "step-000004")  # as if killed after its second step
@@ -176,7 +176,7 @@ def test_four_steps_with_adapters_are_two_and_two_after_a_resume(model_folder, t
     assert torch.allclose(scored(loaded).logprobs, scored(whole).logprobs, atol=1e-4)
 
 
-def test_adapters_learn_the_same_in_two_processes(model_folder, tmp_path):
+def test_two_processes_with_adapters_are_bit_identical_to_one(model_folder, tmp_path):
     one, _ = train(tmp_path / "one", {"model": str(model_folder)})
     two, _ = train(tmp_path / "two", {"model": str(model_folder), "processes": 2, "grpo.chunk": 1})
     assert torch.equal(learnt(one), learnt(two))
@@ -187,7 +187,7 @@ def settings_of(folder, **changes):
     return read_settings(None, {"model": str(folder), "lora.rank": 4, "lora.alpha": 8.0, **changes})
 
 
-def test_adapters_of_another_model_or_shape_are_refused(tokenizer, tmp_path):
+def test_adapters_of_another_model_or_shape_are_rejected(tokenizer, tmp_path):
     policy = policy_of(tokenizer)
     policy.adapt(SHAPE, seed=0)
     policy.save(tmp_path)
@@ -201,19 +201,19 @@ def test_adapters_of_another_model_or_shape_are_refused(tokenizer, tmp_path):
         policy_of(tokenizer).adapt(SHAPE, seed=0, saved=tmp_path)
 
 
-def test_layers_that_a_model_has_not_are_named(tokenizer):
+def test_unknown_target_layers_are_rejected(tokenizer):
     with pytest.raises(TrainerError, match=r"no linear layer named query.*such as q_proj"):
         policy_of(tokenizer).adapt(LoraSettings(rank=4, alpha=8.0, targets=("query",)), seed=0)
 
 
 @pytest.mark.parametrize("changes", [{"lora.rank": 4}, {"gradient_checkpointing": True}])
-def test_the_word_level_policy_takes_neither(changes):
+def test_word_level_policy_rejects_adapters_and_checkpointing(changes):
     with pytest.raises(TrainerError, match="are for Hugging Face models"):
         new_policy(read_settings(None, changes), TASKS)
 
 
 @pytest.mark.parametrize("adapted", [False, True])
-def test_layers_computed_twice_give_the_same_gradient_from_less_memory(tokenizer, adapted):
+def test_gradient_checkpointing_gives_the_same_gradient_in_less_memory(tokenizer, adapted):
     gradients, kept = [], []
     for recompute in (False, True):
         policy = policy_of(tokenizer, recompute=recompute)
@@ -233,7 +233,7 @@ def test_layers_computed_twice_give_the_same_gradient_from_less_memory(tokenizer
     assert kept[1] < 0.7 * kept[0]
 
 
-def test_layers_are_left_as_they_were(tokenizer):
+def test_gradient_checkpointing_restores_the_layers(tokenizer):
     policy = policy_of(tokenizer, recompute=True)
     scored(policy)
     assert all("forward" not in vars(module) for module in policy.module.modules())

@@ -55,7 +55,7 @@ def next_words(situation, written):
 
 
 @pytest.mark.parametrize("task", TASKS.train, ids=lambda task: task.task.task_id)
-def test_a_policy_that_knows_nothing_still_writes_plans_that_call_what_is_told(task):
+def test_untrained_policy_writes_valid_plans(task):
     samples = POLICY.sample(
         [prompt_of(task.situation)], 40, 2.0, 60, torch.Generator().manual_seed(len(task.oracle))
     )
@@ -68,7 +68,7 @@ def test_a_policy_that_knows_nothing_still_writes_plans_that_call_what_is_told(t
             assert call.room_name is None or call.room_name in task.situation.rooms
 
 
-def test_a_room_that_instructions_call_by_its_number_can_still_be_gone_to():
+def test_room_with_a_number_in_instructions_can_be_reached():
     situation = TASKS.train[0].situation
     room = situation.rooms[0]
     words = build_vocabulary([situation], [f"Put the apple away in {room}."] * 3)
@@ -82,7 +82,7 @@ def test_a_room_that_instructions_call_by_its_number_can_still_be_gone_to():
 
 
 @pytest.mark.parametrize("task", TASKS.train, ids=lambda task: task.task.task_id)
-def test_no_word_of_an_oracle_s_plan_is_barred(task):
+def test_oracle_plans_are_never_masked(task):
     text = plan_in_names(task.oracle, task.situation)
     tokens = torch.tensor([POLICY.encode_plan(text)])
     names = GRAMMAR.prompt_names(torch.tensor([prompt_of(task.situation)]))
@@ -92,24 +92,24 @@ def test_no_word_of_an_oracle_s_plan_is_barred(task):
         state = GRAMMAR.advance(state, token[None])
 
 
-def test_every_skill_may_begin_a_call_and_nothing_else():
+def test_only_skills_can_start_a_call():
     skills = {skill.value for skill in PROFILES[Profile.HOUSEHOLD]}
     assert next_words(TASKS.train[0].situation, "") == skills
 
 
-def test_a_name_of_two_things_needs_the_number_of_one_of_them():
+def test_ambiguous_name_needs_a_number():
     situation = TWINS
     category = situation.rows[-1].category
     assert next_words(situation, f"open {category}") == {"_3", "_7"}
     assert next_words(situation, f"open {category}_3") == {"\n", "<end>"}
 
 
-def test_a_name_that_stands_alone_gets_no_number():
+def test_unique_name_without_a_number_gets_none():
     situation = TASKS.train[0].situation
     assert next_words(situation, f"open {situation.rows[0].category}") == {"\n", "<end>"}
 
 
-def test_what_only_the_instruction_names_can_not_be_called():
+def test_objects_only_in_the_instruction_are_masked():
     situation = TASKS.train[0].situation
     gone = situation.rows[0].category
     without = replace(situation, rows=situation.rows[1:], instruction=f"bring the {gone.replace('_', ' ')}")
@@ -117,7 +117,7 @@ def test_what_only_the_instruction_names_can_not_be_called():
     assert gone not in next_words(without, "move")
 
 
-def test_calls_take_a_relation_a_second_thing_a_room_or_an_angle_where_their_skill_does():
+def test_arguments_follow_the_signature_of_the_skill():
     situation = TASKS.train[0].situation
     thing = situation.rows[0].category
     assert next_words(situation, f"place {thing}") == {"ontop", "inside", "under"}
@@ -129,7 +129,7 @@ def test_calls_take_a_relation_a_second_thing_a_room_or_an_angle_where_their_ski
 
 
 @given(st.lists(st.integers(0, len(WORDS) - 1), min_size=1, max_size=12))
-def test_a_plan_that_breaks_the_grammar_has_a_likelihood_all_the_same(written):
+def test_invalid_plan_still_has_a_likelihood(written):
     tokens = torch.tensor([written])
     scored = POLICY.logprobs(
         [prompt_of(TASKS.train[0].situation)], tokens, torch.ones_like(tokens) > 0, 1, 1.0
@@ -138,6 +138,6 @@ def test_a_plan_that_breaks_the_grammar_has_a_likelihood_all_the_same(written):
     assert (scored.logprobs > -1e6).all()
 
 
-def test_a_prompt_that_tells_nothing_leaves_the_end():
+def test_empty_prompt_allows_only_the_end_token():
     situation = replace(TASKS.train[0].situation, rows=(), rooms=())
     assert next_words(situation, "move") == {"<end>"}

@@ -1,4 +1,4 @@
-"""What a run has written stays whole: steps that are taken again are dropped, what a crash cut short too."""
+"""Files of a run stay consistent: repeated steps and truncated lines are dropped."""
 
 import json
 
@@ -9,7 +9,7 @@ from embomatrix.trainer.lifecycle.checkpoint import atomic_folder
 from embomatrix.trainer.logging.recorder import METRICS, SAMPLES, Recorder, read_metrics
 
 
-def test_steps_after_the_checkpoint_and_half_lines_are_forgotten(tmp_path):
+def test_steps_after_the_checkpoint_and_truncated_lines_are_dropped(tmp_path):
     lines = [json.dumps({"step": step}) for step in (1, 2, 3)]
     for name in (METRICS, SAMPLES):
         (tmp_path / name).write_text("\n".join([*lines, '{"step": 1, "rew']))
@@ -18,14 +18,14 @@ def test_steps_after_the_checkpoint_and_half_lines_are_forgotten(tmp_path):
     assert (tmp_path / SAMPLES).read_text() == (tmp_path / METRICS).read_text()
 
 
-def test_folder_appears_when_it_is_filled(tmp_path):
+def test_atomic_folder_appears_when_complete(tmp_path):
     with atomic_folder(tmp_path / "final") as partial:
         (partial / "a").write_text("1")
         assert not (tmp_path / "final").exists()
     assert [path.name for path in tmp_path.iterdir()] == ["final"]
 
 
-def test_folder_that_could_not_be_filled_leaves_what_was_there(tmp_path):
+def test_failed_atomic_folder_keeps_the_old_one(tmp_path):
     with atomic_folder(tmp_path / "final") as partial:
         (partial / "a").write_text("1")
     told = pytest.raises(TrainerError, match=r"final can't be written \(no room\)")

@@ -1,4 +1,4 @@
-"""The gateway: what is executed, what is not, and what a lost rollout is worth."""
+"""Gateway: executed and unparsable plans, lost rollouts, uploads, shutdown."""
 
 import math
 import time
@@ -35,7 +35,7 @@ def until(condition, seconds=10.0):
         time.sleep(0.005)
 
 
-def test_outcomes_come_in_the_order_of_the_texts():
+def test_outcomes_keep_the_order_of_the_texts():
     wrong, right = outcomes(SymbolicCluster(TASKS), "toggle_on countertop", ORACLE)
     assert right.success
     assert right.value > 30
@@ -43,7 +43,7 @@ def test_outcomes_come_in_the_order_of_the_texts():
     assert wrong.value == 0.5
 
 
-def test_text_that_is_no_plan_is_scored_here_and_never_executed():
+def test_unparsable_text_is_scored_locally_and_never_executed():
     cluster = SymbolicCluster(TASKS)
     (verdict,) = outcomes(cluster, "no idea")
     assert verdict.value == -1
@@ -52,7 +52,7 @@ def test_text_that_is_no_plan_is_scored_here_and_never_executed():
     assert cluster.batches == []
 
 
-def test_a_run_s_coefficients_score_what_is_executed_and_what_never_is():
+def test_reward_coefficients_apply_to_executed_and_unparsable_plans():
     terms = RunTerms(reward=RewardSettings(unparsable=-7.0, format=2.0))
     cluster = SymbolicCluster(TASKS)
     none, failed = outcomes(cluster, "no idea", "toggle_on countertop", terms=terms)
@@ -60,14 +60,14 @@ def test_a_run_s_coefficients_score_what_is_executed_and_what_never_is():
     assert (none.value, failed.value) == (-7.0, 2.0)
 
 
-def test_a_lost_rollout_has_no_reward_rather_than_a_zero():
+def test_lost_rollout_has_no_reward():
     lost, kept = outcomes(SymbolicCluster(TASKS, lost=frozenset({"b/0"})), ORACLE, ORACLE)
     assert lost.reward is None
     assert math.isnan(lost.value)
     assert kept.success
 
 
-def test_a_bundle_is_sent_once_and_before_its_first_rollout():
+def test_bundle_is_uploaded_once_before_its_first_rollout():
     cluster = SymbolicCluster(TASKS)
     with gateway(cluster) as gate:
         gate.announce({1: TASKS.train[:2], 2: TASKS.train[2:4]}, 8)
@@ -90,14 +90,14 @@ class Away(SymbolicCluster):
         return await super().put_bundles(bundles)
 
 
-def test_a_scene_waits_for_a_manager_that_is_away_and_nothing_is_lost():
+def test_bundle_upload_retries_until_the_manager_is_back():
     cluster = Away(TASKS)
     (found,) = outcomes(cluster, ORACLE)
     assert found.success
     assert (cluster.refused, cluster.sent) == (3, {TASK.bundle_digest})
 
 
-def test_leaving_does_not_wait_for_a_manager_that_is_away():
+def test_exit_does_not_wait_for_an_unreachable_manager():
     cluster = Away(TASKS)
     cluster.refused = -1_000_000
     with gateway(cluster) as gate:
@@ -107,7 +107,7 @@ def test_leaving_does_not_wait_for_a_manager_that_is_away():
     assert cluster.sent == set()
 
 
-def test_leaving_closes_the_run_with_work_under_way():
+def test_exit_closes_the_run_with_pending_work():
     cluster = SymbolicCluster(TASKS, delay_s=60)
     with gateway(cluster) as gate:
         gate.submit("b", 1, TASK, TASK.situation, [ORACLE], Codec.NAMES)
@@ -119,32 +119,32 @@ class Unreachable(SymbolicCluster):
         raise ManagerUnreachableError("no manager answers at nowhere:1: start one, or pass --manager")
 
 
-def test_an_unreachable_manager_is_one_sentence():
+def test_unreachable_manager_gives_a_one_sentence_error():
     with pytest.raises(TrainerError, match=r"no manager answers at nowhere:1"), gateway(Unreachable(TASKS)):
         pass
 
 
-def test_all_rollouts_of_a_task_share_a_seed_that_other_tasks_and_runs_do_not():
+def test_rollouts_share_a_seed_per_task_and_run():
     assert group_seed(0, "a") == group_seed(0, "a")
     assert len({group_seed(0, "a"), group_seed(0, "b"), group_seed(1, "a")}) == 3
     assert 0 <= group_seed(0, "a") < 2**31
 
 
-def test_peek_tells_exactly_what_take_will_give():
+def test_peek_equals_the_next_take():
     schedule = Schedule(TASKS.train, seed=3)
     schedule.take(4)
     ahead = schedule.peek(5, skip=2)
     assert schedule.take(7)[2:] == ahead
 
 
-def test_every_epoch_has_every_task_once_in_another_order():
+def test_every_epoch_is_a_new_permutation():
     schedule = Schedule(TASKS.train, seed=3)
     first, second = schedule.take(6), schedule.take(6)
     assert {task.task.task_id for task in first} == {task.task.task_id for task in second}
     assert first != second
 
 
-def test_a_schedule_goes_on_from_its_cursor():
+def test_schedule_continues_from_its_cursor():
     whole = Schedule(TASKS.train, seed=3)
     whole.take(4)
     assert Schedule(TASKS.train, seed=3, cursor=4).take(9) == whole.take(9)

@@ -1,4 +1,4 @@
-"""The order of tasks is known arbitrarily far ahead, with and without a curriculum."""
+"""Task schedule: known arbitrarily far ahead, with and without a curriculum."""
 
 from collections import Counter
 
@@ -16,7 +16,7 @@ def ids(tasks):
 
 
 @given(st.integers(0, 60), st.integers(0, 20), st.integers(0, 30))
-def test_what_is_peeked_is_what_is_taken(cursor, count, curriculum_tasks):
+def test_peek_equals_take_with_a_curriculum(cursor, count, curriculum_tasks):
     curriculum = Curriculum(curriculum_tasks, 0.25)
     schedule = Schedule(TASKS, seed=3, cursor=cursor, curriculum=curriculum)
     ahead = ids(schedule.peek(count, skip=5))
@@ -26,7 +26,7 @@ def test_what_is_peeked_is_what_is_taken(cursor, count, curriculum_tasks):
     assert ids(again.peek(7)) == ids(schedule.peek(7))
 
 
-def test_an_epoch_holds_every_task_once():
+def test_epoch_contains_every_task_once():
     assert Counter(ids(Schedule(TASKS, seed=1).take(len(TASKS)))) == Counter(ids(TASKS))
 
 
@@ -34,7 +34,7 @@ def test_streams_of_one_seed_differ():
     assert ids(Schedule(TASKS, seed=1).peek(12)) != ids(Schedule(TASKS, seed=1, stream=1).peek(12))
 
 
-def test_a_curriculum_begins_with_the_shortest_plans_and_ends_with_all():
+def test_curriculum_starts_with_the_shortest_plans_and_ends_with_all():
     schedule = Schedule(TASKS, seed=1, curriculum=Curriculum(400, 0.25))
     by_length = sorted(TASKS, key=lambda task: (len(task.oracle), task.task.task_id))
     first, last = set(ids(schedule.peek(40))), set(ids(schedule.peek(200, skip=300)))

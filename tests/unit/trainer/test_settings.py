@@ -1,4 +1,4 @@
-"""Settings are read once, and what is wrong with them is named."""
+"""Settings: precedence, and errors that name the setting."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import read_settings
 
 
-def test_file_stands_above_defaults_and_below_options(tmp_path):
+def test_file_overrides_defaults_and_options_override_the_file(tmp_path):
     path = tmp_path / "settings.toml"
     path.write_text("seed = 3\n[grpo]\ngroup = 4\nchunk = 2\n")
     settings = read_settings(
@@ -31,13 +31,13 @@ def test_file_stands_above_defaults_and_below_options(tmp_path):
         ("[grpo", r"settings\.toml is not valid TOML"),
     ],
 )
-def test_wrong_settings_are_named(tmp_path, content, sentence):
+def test_invalid_settings_are_rejected(tmp_path, content, sentence):
     (tmp_path / "settings.toml").write_text(content)
     with pytest.raises(TrainerError, match=sentence):
         read_settings(tmp_path / "settings.toml", {"grpo.minutes": 1})
 
 
-def test_settings_file_that_is_not_there_is_named(tmp_path):
+def test_missing_settings_file_is_reported(tmp_path):
     with pytest.raises(
         TrainerError, match=r"can't be read \(No such file or directory\): expected a TOML file"
     ):

@@ -1,4 +1,4 @@
-"""A run goes on as it began, or says what is otherwise."""
+"""Start and resume of a run: kept settings, and rejected changes."""
 
 import json
 
@@ -38,7 +38,7 @@ def begun(kitchen, tmp_path):
 
 
 @pytest.mark.parametrize("changes", [{"grpo.steps": 9, "threads": 1}, {"seed": 0}, {"seed": None}])
-def test_a_run_goes_on_for_longer_and_with_what_it_began_with(kitchen, tmp_path, begun, changes):
+def test_resumed_run_can_be_longer_and_keeps_its_settings(kitchen, tmp_path, begun, changes):
     begun(grpo_ready=True)
     start = resume_run(kitchen, tmp_path, changes)
     assert start.progress.step == 1
@@ -65,7 +65,7 @@ def test_a_run_goes_on_for_longer_and_with_what_it_began_with(kitchen, tmp_path,
         ({}, "tiny", "[grpo]\ngruop = 4\n", r"unknown setting 'grpo\.gruop'"),
     ],
 )
-def test_a_run_does_not_go_on_with_other_settings(kitchen, tmp_path, begun, changes, model, written, told):
+def test_resume_rejects_changed_settings(kitchen, tmp_path, begun, changes, model, written, told):
     begun(grpo_ready=True)
     file = tmp_path / "settings.toml"
     file.write_text(written)
@@ -73,14 +73,14 @@ def test_a_run_does_not_go_on_with_other_settings(kitchen, tmp_path, begun, chan
         resume_run(kitchen, tmp_path, changes, model=model, settings_file=file)
 
 
-def test_until_imitation_ends_what_comes_after_it_may_change(kitchen, tmp_path, begun):
+def test_later_settings_can_change_until_imitation_ends(kitchen, tmp_path, begun):
     begun()
     assert resume_run(kitchen, tmp_path, {"reward.goal": "10"}).settings.reward.goal == 10.0
     with pytest.raises(TrainerError, match=r"started with imitation\.patience = 0"):
         resume_run(kitchen, tmp_path, {"imitation.patience": 3})
 
 
-def test_a_run_does_not_go_on_with_other_tasks(kitchen, tmp_path, begun):
+def test_resume_rejects_other_tasks(kitchen, tmp_path, begun):
     begun()
     other = write_kitchen_dataset(tmp_path / "other")
     tasks = (other / "tasks.jsonl").read_text().splitlines(keepends=True)
@@ -91,14 +91,14 @@ def test_a_run_does_not_go_on_with_other_tasks(kitchen, tmp_path, begun):
         resume_run(other, tmp_path, {})
 
 
-def test_a_checkpoint_of_another_version_is_told(kitchen, tmp_path, begun):
+def test_checkpoint_of_another_version_is_rejected(kitchen, tmp_path, begun):
     state = begun() / "state.json"
     state.write_text(json.dumps({**json.loads(state.read_text()), "schema": 2}))
     with pytest.raises(TrainerError, match="has schema 2, this version reads 3: start a new run"):
         resume_run(kitchen, tmp_path, {})
 
 
-def test_threads_and_processes_suit_the_model_unless_they_are_told(kitchen, tmp_path, monkeypatch):
+def test_default_threads_and_processes_depend_on_the_model(kitchen, tmp_path, monkeypatch):
     monkeypatch.setattr(starting, "usable_cores", lambda: 8)
     shape = {name: value for name, value in SMALL.items() if name != "threads"}
     by_itself = start_run(kitchen, tmp_path / "itself", "tiny", None, shape).settings
@@ -109,12 +109,12 @@ def test_threads_and_processes_suit_the_model_unless_they_are_told(kitchen, tmp_
     assert (told.threads, told.processes) == (1, 3)
 
 
-def test_a_policy_on_another_device_has_one_process_unless_more_are_told(kitchen, tmp_path, monkeypatch):
+def test_policy_on_another_device_has_one_process_by_default(kitchen, tmp_path, monkeypatch):
     monkeypatch.setattr(starting, "usable_cores", lambda: 8)
     assert start_run(kitchen, tmp_path, "tiny", None, {**SMALL, "device": "meta"}).settings.processes == 1
 
 
-def test_a_run_from_a_saved_policy_goes_on_with_that_policy_named_again(kitchen, tmp_path, begun):
+def test_resume_accepts_the_same_saved_policy(kitchen, tmp_path, begun):
     policy, arm = str(begun() / "policy"), tmp_path / "arm"
     start = start_run(kitchen, arm, policy, None, SMALL)
     start.progress.grpo_ready = True
@@ -123,9 +123,7 @@ def test_a_run_from_a_saved_policy_goes_on_with_that_policy_named_again(kitchen,
 
 
 @pytest.mark.parametrize(("able", "compute_dtype"), [(True, torch.bfloat16), (False, torch.float32)])
-def test_the_small_policy_multiplies_in_half_the_bits_where_the_processor_has_instructions_for_it(
-    kitchen, tmp_path, monkeypatch, able, compute_dtype
-):
+def test_word_level_policy_uses_bfloat16_on_capable_cpus(kitchen, tmp_path, monkeypatch, able, compute_dtype):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": able})
     assert (
         start_run(kitchen, tmp_path / "auto", "tiny", None, SMALL).policy.module.blocks[0].qkv.compute_dtype
@@ -136,9 +134,7 @@ def test_the_small_policy_multiplies_in_half_the_bits_where_the_processor_has_in
 
 
 @pytest.mark.parametrize(("told", "codec"), [({}, Codec.JSON), ({"codec": "lines"}, Codec.LINES)])
-def test_a_language_model_that_was_taught_here_goes_on_in_its_codec_unless_another_is_told(
-    kitchen, tmp_path, told, codec
-):
+def test_trained_language_model_keeps_its_codec_by_default(kitchen, tmp_path, told, codec):
     pytest.importorskip("tokenizers")
     tokenizer = word_tokenizer(load_tasks(kitchen).train)
     HfPolicy(random_llama(tokenizer), tokenizer, Codec.JSON, "random llama").save(tmp_path / "taught")

@@ -1,4 +1,4 @@
-"""Imitation stops when it no longer helps, goes on where it was cut short, and leaves a policy to train."""
+"""Imitation: early stopping, exact resume, and the resulting policy."""
 
 import itertools
 import json
@@ -60,7 +60,7 @@ def weights(policy):
 
 
 @pytest.mark.parametrize("stopping", [{}, STOPPING])
-def test_twelve_steps_are_seven_and_five_after_a_resume(tmp_path, stopping):
+def test_resumed_imitation_is_bit_identical(tmp_path, stopping):
     settings = settings_of(**{key.replace(".", "__"): value for key, value in stopping.items()})
     whole, state, _ = imitate(tmp_path / "whole", settings)
     with pytest.raises(CutError):
@@ -71,7 +71,7 @@ def test_twelve_steps_are_seven_and_five_after_a_resume(tmp_path, stopping):
     assert (tmp_path / "whole" / IMITATION).read_text() == (tmp_path / "halves" / IMITATION).read_text()
 
 
-def test_an_interrupt_while_the_policy_moves_waits_until_it_has(tmp_path, monkeypatch):
+def test_ctrl_c_during_an_imitation_update_is_deferred(tmp_path, monkeypatch):
     whole, _, _ = imitate(tmp_path / "whole", settings_of())
     step, calls = ImitationOptimiser.step, itertools.count(1)
 
@@ -90,7 +90,7 @@ def test_an_interrupt_while_the_policy_moves_waits_until_it_has(tmp_path, monkey
 
 
 @pytest.mark.parametrize(("chunk", "at_once"), [(None, [4]), (1, [1, 1, 1, 1]), (3, [3, 1])])
-def test_a_step_in_chunks_has_the_gradient_of_the_whole_and_the_memory_of_a_chunk(
+def test_chunked_step_has_the_full_gradient_and_the_memory_of_one_chunk(
     tmp_path, monkeypatch, chunk, at_once
 ):
     def gradient(name, **changes):
@@ -112,7 +112,7 @@ def test_a_step_in_chunks_has_the_gradient_of_the_whole_and_the_memory_of_a_chun
     assert loss_of_parts == pytest.approx(loss, rel=1e-5)
 
 
-def test_policy_is_put_back_to_where_it_was_best_on_tasks_set_aside(tmp_path):
+def test_early_stopping_restores_the_best_weights(tmp_path):
     ruin = settings_of(
         imitation__steps=400,
         imitation__learning_rate=2.0,  # after the first measurement nothing gets better
@@ -146,7 +146,7 @@ def test_policy_is_put_back_to_where_it_was_best_on_tasks_set_aside(tmp_path):
         ([0.5, 0.6, 0.7, 0.8, 0.9], 4),
     ],
 )
-def test_one_lucky_measurement_does_not_stop_what_goes_on_falling(tmp_path, monkeypatch, losses, taken):
+def test_low_outlier_does_not_stop_a_falling_loss(tmp_path, monkeypatch, losses, taken):
     told = iter(losses)
     monkeypatch.setattr(Imitation, "_validation_loss", lambda _: next(told))
     settings = settings_of(imitation__steps=len(losses), imitation__patience=3, imitation__validate_every=1)
@@ -162,18 +162,18 @@ def test_finished_imitation_is_not_repeated(tmp_path):
     assert torch.equal(weights(first), weights(again))
 
 
-def test_checkpoints_come_by_the_clock(tmp_path):
+def test_checkpoints_are_written_by_time(tmp_path):
     imitate(tmp_path, settings_of(imitation__checkpoint_seconds=1e-9, keep_checkpoints=3))
     names = sorted(path.name for path in (tmp_path / CHECKPOINTS).iterdir())
     assert names == ["imitation-000010", "imitation-000011", "imitation-000012"]
 
 
-def test_too_few_tasks_to_set_aside_are_told(tmp_path):
+def test_too_few_tasks_for_validation_are_rejected(tmp_path):
     with pytest.raises(TrainerError, match="which leaves none to train on"):
         imitate(tmp_path, settings_of(imitation__patience=1), tasks=make_tasks(1, 0, objects=7))
 
 
-def test_policy_in_a_folder_is_a_model_to_start_from(tmp_path):
+def test_saved_policy_can_start_a_run(tmp_path):
     policy, _, _ = imitate(tmp_path, settings_of())
     policy.save(tmp_path / "reference")
     begun = new_policy(settings_of(model=str(tmp_path / "reference")), TASKS)
@@ -181,7 +181,7 @@ def test_policy_in_a_folder_is_a_model_to_start_from(tmp_path):
 
 
 @pytest.mark.parametrize("live", [False, True])
-def test_displays_tell_the_loss_on_tasks_set_aside(tmp_path, live):
+def test_displays_show_the_validation_loss(tmp_path, live):
     console = Console(force_terminal=live, width=120, record=True)
     display = LiveDisplay(console) if live else LineDisplay(console)
     with display:

@@ -1,4 +1,4 @@
-"""The word-level policy: shared prompts change nothing, names survive the round trip, files bring it back."""
+"""Word-level policy: shared prompts, vocabulary, saving and loading."""
 
 from dataclasses import replace
 
@@ -50,7 +50,7 @@ def test_sampler_and_update_agree_on_log_probabilities():
     assert (scored.entropy[samples.mask] > 0).any()
 
 
-def test_padding_and_sharing_the_prompt_change_neither_value_nor_gradient():
+def test_padding_and_prompt_sharing_do_not_change_values_or_gradients():
     made = policy()
     told = [prompts(made)[0][:9], *prompts(made)[1:]]
     samples = draw(made, told)
@@ -74,7 +74,7 @@ def test_padding_and_sharing_the_prompt_change_neither_value_nor_gradient():
     assert torch.allclose(shared, gradient(alone), atol=1e-3, rtol=1e-3)
 
 
-def test_products_of_half_the_bits_are_close_and_leave_weights_and_gradients_whole():
+def test_bfloat16_products_are_close_and_keep_float32_weights_and_gradients():
     whole, half = policy(), policy(compute_dtype=torch.bfloat16)
     told = prompts(whole)
     samples = draw(half, told)
@@ -88,7 +88,7 @@ def test_products_of_half_the_bits_are_close_and_leave_weights_and_gradients_who
 
 
 @pytest.mark.parametrize("compute_dtype", [torch.float32, torch.bfloat16])
-def test_what_was_learnt_between_two_samplings_shows_in_the_second(compute_dtype):
+def test_sampling_uses_weights_learned_since_the_last_sampling(compute_dtype):
     made = policy(compute_dtype=compute_dtype)
     before = draw(made, prompts(made))
     with torch.no_grad():
@@ -100,14 +100,14 @@ def test_what_was_learnt_between_two_samplings_shows_in_the_second(compute_dtype
     assert torch.allclose(scored.logprobs, after.logprobs * after.mask, atol=0.1)
 
 
-def test_samples_depend_on_the_generator_alone():
+def test_samples_depend_only_on_the_generator():
     made = policy()
     first, again, other = (draw(made, prompts(made), seed=seed).texts for seed in (1, 1, 2))
     assert first == again
     assert first != other
 
 
-def test_temperature_zero_takes_the_likeliest_plan():
+def test_temperature_zero_gives_the_greedy_plan():
     made = policy()
     texts = draw(made, prompts(made, 1), group=3, temperature=0.0).texts
     assert len(set(texts)) == 1
@@ -123,12 +123,12 @@ def test_mask_ends_with_the_end_token():
 
 
 @pytest.mark.parametrize("task", TASKS.train, ids=lambda task: task.task.task_id)
-def test_oracle_plans_survive_the_vocabulary(task):
+def test_oracle_plans_survive_encoding_and_decoding(task):
     text = plan_in_names(task.oracle, task.situation)
     assert parse_policy_text(WORDS.decode(WORDS.encode(text)), task.situation, Codec.NAMES) == task.oracle
 
 
-def test_phrases_of_an_instruction_meet_the_names_of_the_table():
+def test_instruction_phrases_get_the_tokens_of_table_names():
     assert WORDS.encode("the chicken leg") == WORDS.encode("the chicken_leg")
     assert WORDS.decode(WORDS.encode("move apple_1\npick_up apple_1")) == "move apple_1\npick_up apple_1"
     assert WORDS.encode("apples") == WORDS.encode("apple")
@@ -145,7 +145,7 @@ def test_any_tokens_can_be_decoded(tokens):
     assert isinstance(WORDS.decode(tokens), str)
 
 
-def test_saved_policy_comes_back_equal(tmp_path):
+def test_saved_policy_can_be_loaded(tmp_path):
     made = policy(seed=3)
     made.save(tmp_path)
     assert TinyPolicy.is_saved_in(tmp_path)
@@ -153,7 +153,7 @@ def test_saved_policy_comes_back_equal(tmp_path):
     assert draw(back, prompts(back)).texts == draw(made, prompts(made)).texts
 
 
-def test_reference_stays_when_the_policy_moves():
+def test_frozen_copy_does_not_change_with_the_policy():
     made = policy()
     reference = made.frozen_copy()
     before = draw(reference, prompts(made)).texts
@@ -164,7 +164,7 @@ def test_reference_stays_when_the_policy_moves():
     assert not any(parameter.requires_grad for parameter in reference.parameters())
 
 
-def test_a_prompt_too_long_keeps_its_end():
+def test_too_long_prompt_keeps_its_end():
     made = policy()
     told = made.encode(prompt_for(TASKS.train[0].situation, Codec.NAMES))
     situation = TASKS.train[0].situation
@@ -174,7 +174,7 @@ def test_a_prompt_too_long_keeps_its_end():
     assert long[-4:] == told[-4:]
 
 
-def test_household_tasks_add_their_words_and_the_paper_s_none():
+def test_household_tasks_add_words_to_the_vocabulary():
     situations = [task.situation for task in TASKS.train]
     added = {skill.value for skill in PROFILES[Profile.HOUSEHOLD]} - {
         skill.value for skill in PROFILES[Profile.PAPER]

@@ -1,4 +1,4 @@
-"""Metrics reach the programs that draw them, under one name a phase."""
+"""Experiment trackers receive the metrics, named by phase."""
 
 import importlib.util
 
@@ -11,7 +11,7 @@ from embomatrix.trainer.logging.recorder import Recorder, numbers_of
 from embomatrix.trainer.logging.trackers import trackers_of
 
 
-def test_tensorboard_draws_what_a_run_records(tmp_path):
+def test_tensorboard_receives_the_recorded_metrics(tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     settings = read_settings(None, {"track": ["tensorboard"]})
@@ -24,18 +24,18 @@ def test_tensorboard_draws_what_a_run_records(tmp_path):
     assert [(event.step, event.value) for event in drawn.Scalars("imitation/validation")] == [(2, 2.75)]
 
 
-def test_tables_in_a_row_are_named_by_their_path():
+def test_nested_values_are_named_by_their_path():
     row = {"step": 1, "reward": 2.5, "success_by_category": {"compound": 0.5}, "validation": None}
     assert dict(numbers_of(row)) == {"step": 1, "reward": 2.5, "success_by_category/compound": 0.5}
 
 
 @pytest.mark.skipif(importlib.util.find_spec("trackio") is not None, reason="trackio is installed")
-def test_tracker_that_is_not_installed_is_named(tmp_path):
+def test_missing_tracker_package_is_reported(tmp_path):
     told = pytest.raises(TrainerError, match="pip install trackio")
     with told, trackers_of(read_settings(None, {"track": ["trackio"]}), tmp_path):
         pass
 
 
-def test_unknown_tracker_is_a_setting_that_is_refused():
+def test_unknown_tracker_is_rejected():
     with pytest.raises(TrainerError, match="track"):
         read_settings(None, {"track": ["paper"]})

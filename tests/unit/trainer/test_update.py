@@ -1,4 +1,4 @@
-"""Steps of GRPO: what is overlapped, replaced and weighted changes nothing that it should not."""
+"""GRPO steps: overlap, replacement of zero-variance groups, weights of reward tiers."""
 
 import math
 
@@ -19,13 +19,13 @@ def trained(out, **changes):
     return run(out, changes.pop("cluster", SymbolicCluster(TASKS)), TASKS, **{"grpo__steps": 4, **changes})
 
 
-def test_streaming_learns_the_same_to_the_bit_as_waiting_for_everything(tmp_path):
+def test_streaming_is_bit_identical_to_waiting(tmp_path):
     _, waited = trained(tmp_path / "none", grpo__overlap=Overlap.NONE, grpo__chunk=1)
     _, streamed = trained(tmp_path / "stream", grpo__chunk=1, cluster=SymbolicCluster(TASKS, delay_s=0.01))
     assert torch.equal(weights(waited), weights(streamed))
 
 
-def test_a_step_ahead_is_sampled_by_weights_one_step_old(tmp_path):
+def test_step_ahead_is_sampled_from_weights_one_step_old(tmp_path):
     summary, policy = trained(tmp_path / "ahead", grpo__overlap=Overlap.AHEAD, grpo__learning_rate=1e-2)
     _, streamed = trained(tmp_path / "stream", grpo__learning_rate=1e-2)
     rows = read_metrics(tmp_path / "ahead")
@@ -35,7 +35,7 @@ def test_a_step_ahead_is_sampled_by_weights_one_step_old(tmp_path):
     assert max(row["kl_to_old"] for row in rows[1:]) > 1e-6
 
 
-def test_groups_without_signal_are_replaced_from_the_reserve(tmp_path):
+def test_zero_variance_groups_are_replaced_from_the_reserve(tmp_path):
     cluster = SymbolicCluster(TASKS)
     trained(tmp_path / "a", cluster=cluster, grpo__reserve=6, imitation__steps=0)
     without = trained(tmp_path / "b", imitation__steps=0)[0]
@@ -45,7 +45,7 @@ def test_groups_without_signal_are_replaced_from_the_reserve(tmp_path):
     assert sum(row["rollouts"] for row in rows) > without.rollouts
 
 
-def test_a_step_in_which_no_group_has_a_signal_tells_no_mean_over_its_tokens(tmp_path):
+def test_step_without_a_signal_has_no_token_means(tmp_path):
     before = trained(tmp_path / "none", grpo__steps=0)[1]
     _, policy = trained(tmp_path / "all", grpo__temperature=1e-4)  # all plans of a group are equal
     rows = read_metrics(tmp_path / "all")
@@ -55,7 +55,7 @@ def test_a_step_in_which_no_group_has_a_signal_tells_no_mean_over_its_tokens(tmp
 
 
 @pytest.mark.parametrize("kind", [LossKind.DAPO, LossKind.BNPO, LossKind.GRPO])
-def test_a_reserve_that_is_not_needed_changes_nothing(tmp_path, kind):
+def test_unused_reserve_changes_nothing(tmp_path, kind):
     changes = {
         "grpo__loss": kind,
         "grpo__tasks_per_step": 2,
@@ -71,7 +71,7 @@ def test_a_reserve_that_is_not_needed_changes_nothing(tmp_path, kind):
     assert torch.equal(weights(plain), weights(reserved))
 
 
-def test_without_the_relevance_tier_the_update_differs_and_the_log_keeps_it(tmp_path):
+def test_update_without_the_relevance_tier_differs_but_the_log_keeps_it(tmp_path):
     _, whole = trained(tmp_path / "whole")
     _, without = trained(tmp_path / "without", grpo__relevance=0.0)
     assert not torch.equal(weights(whole), weights(without))
@@ -81,6 +81,6 @@ def test_without_the_relevance_tier_the_update_differs_and_the_log_keeps_it(tmp_
     assert row["reward_relevance"] > 0
 
 
-def test_a_gradient_that_is_never_finite_ends_the_run_with_the_policy_as_it_was(tmp_path):
+def test_repeated_non_finite_gradients_end_the_run_without_an_update(tmp_path):
     with pytest.raises(TrainerError, match=r"not finite .* lower grpo.learning_rate"):
         trained(tmp_path, grpo__kl_coef=math.inf, grpo__steps=30)

@@ -1,4 +1,4 @@
-"""Tellings vary in what must not matter and agree in what must."""
+"""Prompt variation: irrelevant properties change, and the oracle plan stays valid."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def rng(seed=0):
 
 
 @pytest.mark.parametrize("task", TASKS.train, ids=lambda task: task.task.task_id)
-def test_the_oracle_succeeds_in_every_telling(task):
+def test_oracle_succeeds_in_every_variation(task):
     for seed in range(5):
         situation = drop_bystanders(task.situation, used_rows(task.oracle), 0.5, rng(seed))
         told = vary(situation, VARIATION, rng(seed))
@@ -31,7 +31,7 @@ def test_the_oracle_succeeds_in_every_telling(task):
 
 
 @pytest.mark.parametrize("task", TASKS.train, ids=lambda task: task.task.task_id)
-def test_what_the_instruction_does_not_name_is_renamed_to_its_kind_only(task):
+def test_unnamed_categories_are_renamed_within_their_kind(task):
     told = vary(task.situation, VARIATION, rng())
     before = {row.index: row for row in task.situation.rows}
     names = {row.name for row in told.rows}
@@ -45,7 +45,7 @@ def test_what_the_instruction_does_not_name_is_renamed_to_its_kind_only(task):
         assert names_it(told.instruction, row) == named
 
 
-def test_what_the_instruction_names_may_be_called_anything():
+def test_named_categories_can_get_any_name():
     kinds = {
         (old.category, row.category)
         for task in TASKS.train
@@ -59,20 +59,20 @@ def told_in_order(task):
     return sorted(vary(task.situation, VARIATION, rng()).rows, key=lambda row: row.index)
 
 
-def test_tellings_differ_and_repeat_with_the_seed():
+def test_variations_differ_and_repeat_with_the_seed():
     situation = TASKS.train[0].situation
     texts = [prompt_for(vary(situation, VARIATION, rng(seed)), Codec.NAMES).user for seed in (1, 1, 2)]
     assert texts[0] == texts[1] != texts[2]
 
 
-def test_without_renaming_only_order_changes_where_names_are_unique():
+def test_without_renaming_unique_names_only_change_order():
     situation = TASKS.train[0].situation
     told = vary(situation, Variation(TASKS.kinds, rename=0.0), rng(3))
     assert sorted(told.rows, key=lambda row: row.index) == list(situation.rows)
     assert told.instruction == situation.instruction
 
 
-def test_needed_rows_and_their_hosts_are_never_left_out():
+def test_needed_rows_and_their_hosts_are_kept():
     task = TASKS.train[0]
     needed = used_rows(task.oracle)
     for seed in range(20):

@@ -33,7 +33,7 @@ from embomatrix.bench.experiments.section import add_section, learning_section
 from embomatrix.bench.report.figures import BenchResult, commit_here, describe_machine, result_to_json
 from embomatrix.bench.report.output import write
 from embomatrix.cli.failure import fail
-from embomatrix.cli.foreground import no_problem, run_command
+from embomatrix.cli.local_cluster import no_problem, run_command
 from embomatrix.host.cores import usable_cores
 from embomatrix.pages.figures import shown
 from embomatrix.trainer.config.errors import TrainerError

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from embomatrix.bench.experiments.design import toml_of
-from embomatrix.cli.foreground import cluster_problem, no_problem, run_command
-from embomatrix.cli.local_cluster import local_cluster
+from embomatrix.cli.local_cluster import cluster_problem, local_cluster, no_problem, run_command
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.logging.outcome import OUTCOME
 from embomatrix.world.whole_file import write_whole

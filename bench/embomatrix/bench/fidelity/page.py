@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.pages.figures import Better, Figure
-from embomatrix.sim.fidelity.compare import objects_in, true_atoms
-from embomatrix.sim.fidelity.records import trial_from_json
+from embomatrix.sim.fidelity.compare import objects_in, trial_from_json, true_atoms
 from embomatrix.sim.fidelity.report import MANIPULATION, calls_of, report_on
 from embomatrix.sim.fidelity.sampler import SKILLS
 

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.bench.fidelity.pool import LOST, FidelityPool, Modes, TrialJob
 from embomatrix.bench.report.figures import BenchError
-from embomatrix.sim.fidelity.compare import PlanKind
-from embomatrix.sim.fidelity.plans import Example, Request, write_trials
-from embomatrix.sim.fidelity.records import (
+from embomatrix.sim.fidelity.compare import (
+    PlanKind,
     comparison_from_json,
     disagreement_to_json,
     trial_from_json,
     trial_to_json,
 )
+from embomatrix.sim.fidelity.plans import SolvedTask, TrialRequest, write_trials
 from embomatrix.sim.fidelity.sampler import SKILLS
 from embomatrix.skills.parse import PlanError, plan_from_json
 from embomatrix.world.dataset import DatasetError
@@ -112,9 +112,9 @@ def run_fidelity(
         return _outcome(trials, done, folder)
 
 
-def examples_of(dataset: Dataset) -> dict[str, list[Example]]:
+def examples_of(dataset: Dataset) -> dict[str, list[SolvedTask]]:
     """Tasks with their oracle plans, by bundle. Raise BenchError for an invalid plan."""
-    found: dict[str, list[Example]] = {}
+    found: dict[str, list[SolvedTask]] = {}
     for record in dataset.records:
         found.setdefault(record.bundle_digest, []).append(_example(record))
     if not found:
@@ -135,7 +135,7 @@ def write_all_trials(
     wanted = dict.fromkeys(SKILLS, math.ceil(settings.calls / len(examples)))
     for turn in range(ROUNDS):
         for number, (digest, items) in enumerate(examples.items(), start=1):
-            request = Request(plans, wanted, settings.seed + turn, extra, first=len(trials))
+            request = TrialRequest(plans, wanted, settings.seed + turn, extra, first=len(trials))
             with contextlib.closing(modes.cached(dataset.read_bundle(digest))) as simulator:
                 trials += write_trials(simulator, digest, items, request)
             progress.written(number, len(examples))
@@ -155,9 +155,9 @@ def _calls(trials: Iterable[FidelityTrial]) -> dict[Skill, int]:
     return {skill: counts[skill] for skill in SKILLS}
 
 
-def _example(record: TaskRecord) -> Example:
+def _example(record: TaskRecord) -> SolvedTask:
     try:
-        return Example(record.task, plan_from_json([*record.oracle], record.task.profile))
+        return SolvedTask(record.task, plan_from_json([*record.oracle], record.task.profile))
     except PlanError as error:
         raise BenchError(
             f"the oracle plan of task {record.task.task_id!r} is no plan: {error}; build the dataset anew"

@@ -1,12 +1,11 @@
-"""`embomatrix cluster`: the operator's command line. Reads and steers a manager, wherever it runs."""
+"""`embomatrix cluster`: the operator's command line for a manager."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, TypeVar
+from typing import Annotated, Final
 
 import typer
 from rich.console import Console
@@ -18,45 +17,34 @@ from embomatrix.cli.cluster.tables import (
     run_table,
     show,
     show_json,
+    step_line,
     worker_table,
 )
 from embomatrix.cli.cluster.trace import chrome_trace
-from embomatrix.cli.connection import Ca, Manager, Token  # noqa: TC001  typer reads the annotations when a command runs
+from embomatrix.cli.connection import AsJson, manager_command
 from embomatrix.cli.failure import fail
-from embomatrix.rpc.admin_client import AdminClient
-from embomatrix.rpc.channel import DEFAULT_ADDRESS
-from embomatrix.rpc.status import ClusterError
-from embomatrix.rpc.trust import read_ca, read_token
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine
-
-    from embomatrix.rpc.wire.run_log import RunEvent, RunSummary
-
-T = TypeVar("T")
+from embomatrix.rpc.admin_client import AdminClient  # noqa: TC001  typer reads the annotations when a command runs
 
 FOLLOW_S: Final = 0.5
-"""`events --follow` asks again after this long."""
+"""Pause between two requests of `events --follow`."""
 
 app = typer.Typer(
-    help="Look at a cluster and steer it: workers, runs, plan, reports and traces.",
+    help="Inspect and control a cluster: workers, runs, look-ahead, reports, traces, and the history of a rollout.",
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-Worker = Annotated[str, typer.Argument(help="Id of the worker, as `embomatrix cluster workers` shows it.")]
-Run = Annotated[str, typer.Argument(help="Id of the run, as `embomatrix cluster runs` shows it.")]
+Worker = Annotated[str, typer.Argument(help="Id of a worker, as `embomatrix cluster workers` shows it.")]
+Run = Annotated[str, typer.Argument(help="Id of a run, as `embomatrix cluster runs` shows it.")]
+Out = Annotated[Path | None, typer.Option(help="File to write.", show_default=False)]
 
 
 @app.command()
-def workers(
-    manager: Manager = DEFAULT_ADDRESS, token: Token = "", ca: Ca = None, as_json: AsJson = False
-) -> None:
-    """List the workers: state, slots, scenes, and why one does not work."""
-
-    found = _asked(manager, token, ca, lambda client: client.list_workers())
+@manager_command("cluster")
+async def workers(client: AdminClient, as_json: AsJson = False) -> None:
+    """List workers: state, slots, scenes, and why one does not work."""
+    found = await client.list_workers()
     if as_json:
         show_json(found)
     elif found:
@@ -66,16 +54,14 @@ def workers(
 
 
 @app.command()
-def runs(
-    closed: Annotated[bool, typer.Option("--closed", help="Those that are over and still kept.")] = False,
-    manager: Manager = DEFAULT_ADDRESS,
-    token: Token = "",
-    ca: Ca = None,
+@manager_command("cluster")
+async def runs(
+    client: AdminClient,
+    closed: Annotated[bool, typer.Option("--closed", help="List closed runs that are still kept.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """List the runs that are open, or those that were closed."""
-
-    found = _asked(manager, token, ca, lambda client: client.list_runs(closed=closed))
+    """List open runs, or closed ones."""
+    found = await client.list_runs(closed=closed)
     if as_json:
         show_json(found)
     elif found:
@@ -85,189 +71,138 @@ def runs(
 
 
 @app.command()
-def plan(
-    run: Annotated[str, typer.Argument(help="Of this run only.")] = "",
-    manager: Manager = DEFAULT_ADDRESS,
-    token: Token = "",
-    ca: Ca = None,
+@manager_command("cluster")
+async def plan(
+    client: AdminClient,
+    run: Annotated[str, typer.Argument(help="Show this run only.")] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Show the look-ahead grid: which scenes each coming step needs, how warm each is, and where."""
-
-    cells = _asked(manager, token, ca, lambda client: client.plan(run))
+    """Show the look-ahead: scenes of each coming step, how warm they are, and on which workers."""
+    cells = await client.plan(run)
     if as_json:
         show_json(cells)
     elif cells:
         show(plan_table(cells))
     else:
-        print("nothing is announced: trainers tell the scenes of coming steps with AnnounceLookahead")
+        print("no look-ahead: no trainer has announced coming steps with AnnounceLookahead")
 
 
 @app.command()
-def drain(
-    name: Worker,
-    manager: Manager = DEFAULT_ADDRESS,
-    token: Token = "",
-    ca: Ca = None,
+@manager_command("cluster", until_interrupted=True)
+async def events(
+    client: AdminClient,
+    run: Annotated[str, typer.Argument(help="Log of this run; else of workers and scenes.")] = "",
+    follow: Annotated[
+        bool, typer.Option("--follow", help="Wait for further events until interrupted.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Take a worker out: it finishes what it holds and gets nothing new."""
-
-    _asked(manager, token, ca, lambda client: client.drain_worker(name))
-    _done(as_json, worker=name, state="draining")
+    """Print the log of a run, or of the workers, one event per line."""
+    console, after = Console(soft_wrap=True, highlight=False), 0
+    while True:
+        page = await client.read_events(run, after=after)
+        for event in page.events:
+            if as_json:
+                show_json(event_plain(event))
+            else:
+                console.print(event_line(event))
+        if page.events:
+            after = page.events[-1].sequence
+        elif follow:
+            await asyncio.sleep(FOLLOW_S)
+        else:
+            return
 
 
 @app.command()
-def resume(
-    name: Worker,
-    manager: Manager = DEFAULT_ADDRESS,
-    token: Token = "",
-    ca: Ca = None,
+@manager_command("cluster")
+async def explain(
+    client: AdminClient,
+    rollout: Annotated[str, typer.Argument(help="Id of a rollout, as events and log lines name it.")],
     as_json: AsJson = False,
 ) -> None:
-    """Take a drain back, as long as the worker has not left."""
-
-    _asked(manager, token, ca, lambda client: client.resume(name))
-    _done(as_json, worker=name, state="ready")
-
-
-@app.command()
-def revoke(
-    name: Worker,
-    reason: Annotated[str, typer.Option(help="Why: its owner reads it.")],
-    manager: Manager = DEFAULT_ADDRESS,
-    token: Token = "",
-    ca: Ca = None,
-    as_json: AsJson = False,
-) -> None:
-    """Send a worker away for good: its credential is void, and what it held goes to others."""
-
-    async def ask() -> None:
-        async with AdminClient(manager, read_token(token), ca=read_ca(ca)) as client:
-            await client.revoke_worker(name, reason)
-        _done(as_json, worker=name, state="revoked")
-
-    _ask(ask())
+    """Explain a rollout: when it was queued and leased, where and why, and what became of it."""
+    found = await client.explain(rollout)
+    if as_json:
+        show_json({"steps": [step._asdict() for step in found.steps], "place": found.place})
+        return
+    console = Console(soft_wrap=True, highlight=False)
+    begin_s = found.steps[0].at_s if found.steps else 0.0
+    for step in found.steps:
+        console.print(step_line(step, begin_s))
+    console.print(f"now: {found.place or 'it has its outcome'}", markup=False)
 
 
 @app.command()
-def pause(
-    manager: Manager = DEFAULT_ADDRESS, token: Token = "", ca: Ca = None, as_json: AsJson = False
-) -> None:
-    """Give no new leases, to any worker; what runs goes on."""
-
-    _asked(manager, token, ca, lambda client: client.pause_dispatch())
-    _done(as_json, dispatch="paused")
-
-
-@app.command("resume-dispatch")
-def resume_dispatch(
-    manager: Manager = DEFAULT_ADDRESS, token: Token = "", ca: Ca = None, as_json: AsJson = False
-) -> None:
-    """Give leases again."""
-
-    _asked(manager, token, ca, lambda client: client.resume_dispatch())
-    _done(as_json, dispatch="running")
-
-
-@app.command()
-def report(
+@manager_command("cluster")
+async def report(
+    client: AdminClient,
     run: Run,
-    out: Annotated[
-        Path | None, typer.Option(help="File to write; else RUN.html.", show_default=False)
-    ] = None,
-    manager: Manager = DEFAULT_ADDRESS,
-    token: Token = "",
-    ca: Ca = None,
+    out: Out = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures instead.")] = False,
 ) -> None:
-    """Write what a run came to as one HTML file that needs nothing else; also after it was closed."""
-    summary, events, _ = _ask(_read(manager, token, ca, run))
+    """Write the report of an open or closed run as one self-contained HTML file, RUN.html by default."""
+    summary = await client.run(run)
     if as_json:
         show_json(summary)
         return
     from embomatrix.cli.cluster.report import report_page
 
-    _write(out or Path(f"{run}.html"), report_page(summary, events))
+    _write(out or Path(f"{run}.html"), report_page(summary, await client.all_events(run)))
 
 
 @app.command()
-def trace(
-    run: Run,
-    out: Annotated[
-        Path | None, typer.Option(help="File to write; else RUN.trace.json.", show_default=False)
-    ] = None,
-    manager: Manager = DEFAULT_ADDRESS,
-    token: Token = "",
-    ca: Ca = None,
-) -> None:
-    """Write a run as a Chrome trace: open it in https://ui.perfetto.dev."""
-    summary, events, fleet = _ask(_read(manager, token, ca, run))
-    text = json.dumps(chrome_trace(events, fleet, summary.run.name or run), separators=(",", ":"))
-    _write(out or Path(f"{run}.trace.json"), text)
+@manager_command("cluster")
+async def trace(client: AdminClient, run: Run, out: Out = None) -> None:
+    """Write a run as a Chrome trace for https://ui.perfetto.dev, RUN.trace.json by default."""
+    summary = await client.run(run)
+    page = chrome_trace(await client.all_events(run), await client.all_events(), summary.run.name or run)
+    _write(out or Path(f"{run}.trace.json"), json.dumps(page, separators=(",", ":")))
 
 
 @app.command()
-def events(
-    run: Annotated[str, typer.Argument(help="Of this run; without it, of workers and scenes.")] = "",
-    follow: Annotated[bool, typer.Option("--follow", help="Go on until interrupted.")] = False,
-    manager: Manager = DEFAULT_ADDRESS,
-    token: Token = "",
-    ca: Ca = None,
+@manager_command("cluster")
+async def drain(client: AdminClient, name: Worker, as_json: AsJson = False) -> None:
+    """Drain a worker: it finishes its leases and gets nothing new."""
+    await client.drain_worker(name)
+    _done(as_json, worker=name, state="draining")
+
+
+@app.command()
+@manager_command("cluster")
+async def resume(
+    client: AdminClient,
+    name: Annotated[str, typer.Argument(help="Id of a worker; without it, dispatch is resumed.")] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Print the log of a run, or of the fleet, one event a line."""
-
-    async def ask() -> None:
-        console, after = Console(soft_wrap=True, highlight=False), 0
-        async with _client(manager, token, ca) as client:
-            while True:
-                page = await client.read_events(run, after=after)
-                for event in page.events:
-                    if as_json:
-                        show_json(event_plain(event))
-                    else:
-                        console.print(event_line(event))
-                if page.events:
-                    after = page.events[-1].sequence
-                elif follow:
-                    await asyncio.sleep(FOLLOW_S)
-                else:
-                    return
-
-    with contextlib.suppress(KeyboardInterrupt, BrokenPipeError):
-        _ask(ask())
+    """End the drain or quarantine of a worker, or resume paused dispatch."""
+    if name:
+        await client.resume(name)
+        _done(as_json, worker=name, state="ready")
+    else:
+        await client.resume_dispatch()
+        _done(as_json, dispatch="running")
 
 
-async def _read(
-    manager: str, token: str, ca: Path | None, run: str
-) -> tuple[RunSummary, tuple[RunEvent, ...], tuple[RunEvent, ...]]:
-    async with _client(manager, token, ca) as client:
-        return await client.run(run), await client.all_events(run), await client.all_events()
+@app.command()
+@manager_command("cluster")
+async def pause(client: AdminClient, as_json: AsJson = False) -> None:
+    """Pause dispatch: no worker gets new leases, running rollouts continue."""
+    await client.pause_dispatch()
+    _done(as_json, dispatch="paused")
 
 
-def _client(manager: str, token: str, ca: Path | None) -> AdminClient:
-    return AdminClient(manager, read_token(token), ca=read_ca(ca))
-
-
-def _asked(
-    manager: str, token: str, ca: Path | None, question: Callable[[AdminClient], Coroutine[None, None, T]]
-) -> T:
-    """The answer to one question to the manager."""
-
-    async def ask() -> T:
-        async with _client(manager, token, ca) as client:
-            return await question(client)
-
-    return _ask(ask())
-
-
-def _ask(question: Coroutine[None, None, T]) -> T:
-    """Put a question to the manager; what goes wrong is told in a sentence."""
-    try:
-        return asyncio.run(question)
-    except ClusterError as error:
-        fail("cluster", str(error))
+@app.command()
+@manager_command("cluster")
+async def revoke(
+    client: AdminClient,
+    name: Worker,
+    reason: Annotated[str, typer.Option(help="Reason shown to the worker's owner.")],
+    as_json: AsJson = False,
+) -> None:
+    """Expel a worker: its credential becomes void, and its leases are re-dispatched."""
+    await client.revoke_worker(name, reason)
+    _done(as_json, worker=name, state="revoked")
 
 
 def _write(path: Path, text: str) -> None:
@@ -278,8 +213,8 @@ def _write(path: Path, text: str) -> None:
     print(f"{path}: {len(text) / 1e6:.1f} MB")
 
 
-def _done(as_json: bool, **told: str) -> None:
+def _done(as_json: bool, **changed: str) -> None:
     if as_json:
-        show_json(told)
+        show_json(changed)
     else:
-        print(", ".join(f"{name} {value}" for name, value in told.items()))
+        print(", ".join(f"{name} {value}" for name, value in changed.items()))

@@ -1,4 +1,4 @@
-"""Charts of a run's report: drawn by matplotlib as SVG, coloured by the page, so that they follow its light or dark theme."""
+"""Charts of a run's report as SVG. The page sets their colours, for light and dark themes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 SIZE_IN: Final = (6.2, 2.5)
 MOST_POINTS: Final = 300
-"""Points of a line; more can't be told apart at this size."""
+"""Most points of a line at this size."""
 INK, GRID, GOOD, BAD, SECOND = "#010101", "#020202", "#030303", "#040404", "#050505"
 VARIABLES: Final[Mapping[str, str]] = {
     INK: "var(--soft)",
@@ -30,7 +30,7 @@ VARIABLES: Final[Mapping[str, str]] = {
     BAD: "var(--bad)",
     SECOND: "var(--second)",
 }
-"""Colours that the charts are drawn in, and what the page puts in their place."""
+"""CSS variable that replaces each drawing colour."""
 STYLE: Final[dict[Any, Any]] = {
     "svg.fonttype": "none",
     "font.size": 10.0,
@@ -46,7 +46,7 @@ STYLE: Final[dict[Any, Any]] = {
 
 
 def throughput_chart(series: RunSeries) -> str:
-    """Completed and failed rollouts a second, over the minutes of the run."""
+    """Draw completed and failed rollouts per second over the run."""
     per_step = max(1, -(-len(series.completed) // MOST_POINTS))
     step_s = series.step_s * per_step
 
@@ -67,7 +67,7 @@ def throughput_chart(series: RunSeries) -> str:
 
 
 def busy_chart(shares: Sequence[float], step_s: float) -> str:
-    """The share of slots that were at work."""
+    """Draw the share of busy slots over the run."""
     with mpl.rc_context(STYLE):
         figure, axes = _chart("slots at work")
         times_s = _times(axes, len(shares), step_s)
@@ -79,12 +79,12 @@ def busy_chart(shares: Sequence[float], step_s: float) -> str:
 
 
 def phase_chart(phases: Mapping[RolloutPhase, PhaseSummary]) -> str:
-    """Median, 95th and 99th percentile of each phase, on a logarithmic axis."""
+    """Draw median, 95th and 99th percentile of each phase on a logarithmic axis."""
     with mpl.rc_context(STYLE):
         figure, axes = _chart("")
         for row, phase in enumerate(reversed(RolloutPhase)):
             found = phases[phase]
-            # A logarithmic axis has no zero: what took no time worth telling stands at its left end.
+            # A logarithmic axis has no zero: shorter times are drawn at 0.01 ms.
             points_ms = [max(value * 1e3, 0.01) for value in (found.p50_s, found.p95_s, found.p99_s)]
             axes.plot([points_ms[0], points_ms[2]], [row, row], color=SECOND, linewidth=5, alpha=0.3)
             for value, marker, shown in zip(points_ms, "oD|", ("p50", "p95", "p99"), strict=True):
@@ -119,7 +119,7 @@ def _legend(axes: Axes) -> None:
 
 
 def _times(axes: Axes, steps: int, step_s: float) -> list[float]:
-    """Where each step begins, in seconds, with a fitting axis."""
+    """Return the start of each step in seconds, and label the axis in a fitting unit."""
     whole_s = max(steps, 1) * step_s
     unit, name = (3600.0, "h") if whole_s > 3 * 3600 else (60.0, "min") if whole_s > 180 else (1.0, "s")
     axes.xaxis.set_major_formatter(FuncFormatter(lambda at_s, _: f"{at_s / unit:g}"))
@@ -129,7 +129,7 @@ def _times(axes: Axes, steps: int, step_s: float) -> list[float]:
 
 
 def _svg(figure: Figure, name: str, description: str) -> str:
-    """The figure as an element of an HTML page: no header, no size, no ids that two charts would share."""
+    """Return the figure as an SVG element without header, size, or ids that two charts would share."""
     buffer = io.StringIO()
     with mpl.rc_context({"svg.hashsalt": name}):
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})

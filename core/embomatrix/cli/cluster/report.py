@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from embomatrix.rpc.wire.run_log import PhaseSummary, RunEvent, RunSummary
 
 STEPS: Final = 240
-"""Points in time at which the share of slots at work is told."""
+"""Points of the chart of busy slots."""
 NONE: Final = "–"
 PHASES: Final[Mapping[RolloutPhase, str]] = {
     RolloutPhase.QUEUE: "waited for a lease",
@@ -35,7 +35,7 @@ PHASES: Final[Mapping[RolloutPhase, str]] = {
 
 
 def report_page(summary: RunSummary, events: Sequence[RunEvent]) -> str:
-    """The page. ``events`` is the run's log as far as it was kept; counts and quantiles are of the whole run."""
+    """Return the page. ``events`` is the kept part of the run's log; counts and quantiles cover the whole run."""
     template = files("embomatrix.cli.cluster").joinpath("report.html").read_text(encoding="utf-8")
     run = summary.run
     return string.Template(template).substitute(
@@ -55,7 +55,7 @@ def report_page(summary: RunSummary, events: Sequence[RunEvent]) -> str:
 
 
 def seconds_text(seconds: float) -> str:
-    """A duration in the unit that suits it, to three digits."""
+    """Format a duration with three digits and a fitting unit."""
     if seconds >= 120:
         return f"{seconds / 60:.3g} min"
     if seconds >= 1:
@@ -77,7 +77,7 @@ def _about(summary: RunSummary) -> str:
 
 
 def _reward_text(reward: RewardSettings) -> str:
-    """The coefficients that are not the paper's."""
+    """Name the coefficients that differ from the paper's."""
     told = dataclasses.asdict(reward)
     own = [
         f"{name} {told[name]:g}" for name, usual in dataclasses.asdict(PAPER).items() if told[name] != usual
@@ -86,7 +86,7 @@ def _reward_text(reward: RewardSettings) -> str:
 
 
 def _length_s(summary: RunSummary) -> float:
-    """Of the run; of one that is open, up to its last outcome."""
+    """Return the length of the run; of an open run, up to its last outcome."""
     if summary.run.closed_s:
         return summary.run.closed_s - summary.run.opened_s
     return len(summary.series.completed) * summary.series.step_s
@@ -103,7 +103,7 @@ def _tiles(summary: RunSummary) -> str:
         (
             "Completed",
             f"{completed:,}",
-            f"{stats.infra_failures:,} failed, {stats.redispatched:,} leases given again",
+            f"{stats.infra_failures:,} failed, {stats.redispatched:,} rollouts re-dispatched",
         ),
         ("Throughput", f"{completed / active_s:,.0f}/s" if active_s else NONE, "while there was work"),
         (
@@ -117,7 +117,11 @@ def _tiles(summary: RunSummary) -> str:
             _share(stats.prewarm_wasted, asked + stats.prewarm_wasted),
             f"{stats.prewarm_wasted:,} loads unused",
         ),
-        ("Manager overhead", _share(summary.manager_cpu_s, cpu_s), "its CPU time, of its own and the slots'"),
+        (
+            "Manager overhead",
+            _share(summary.manager_cpu_s, cpu_s),
+            "share of all CPU time, manager and slots",
+        ),
     )
     return "".join(
         f'<section class="tile"><h2>{_text(name)}</h2><b>{_text(value)}</b><span>{_text(note)}</span></section>'
@@ -132,7 +136,7 @@ def _share(part: float, whole: float) -> str:
 def _busy(summary: RunSummary, events: Sequence[RunEvent]) -> str:
     spans = slot_spans(events)
     if not spans:
-        return '<p class="none">No slot was told of: no rollout has run, or the workers are older than this manager.</p>'
+        return '<p class="none">No rollout has run.</p>'
     length_s = max(_length_s(summary), 1e-3)
     step_s = length_s / STEPS
     return busy_chart(busy_share(spans, summary.run.opened_s, step_s, STEPS), step_s)
@@ -184,7 +188,7 @@ def _worker_rows(summary: RunSummary) -> str:
 
 def _failures(summary: RunSummary) -> str:
     if not summary.failures:
-        return '<p class="none">None. Every lease that was given came back with a result.</p>'
+        return '<p class="none">None: every lease brought a result.</p>'
     codes = Counter(event.code for event in summary.failures)
     told = ", ".join(f"{count} {code}" for code, count in codes.most_common())
     rows = "".join(map(_failure_row, reversed(summary.failures)))
@@ -195,7 +199,7 @@ def _failures(summary: RunSummary) -> str:
 
 
 def _failure_row(event: RunEvent) -> str:
-    """Two rows: what and where, and below it the words of whoever saw it."""
+    """Return two rows: the failure, and its message."""
     what = "lease failed" if event.kind is EventKind.FAILED else "rollout given up"
     at = time.strftime("%H:%M:%S", time.gmtime(event.at_s))
     scene = event.bundle_digest.removeprefix("sha256:")[:8] or NONE
@@ -206,7 +210,7 @@ def _failure_row(event: RunEvent) -> str:
 
 
 def _row(cells: Iterable[str], *, figures: int) -> str:
-    """Cells of markup; those after the first are numbers, as many as ``figures``."""
+    """Return a table row of markup; the ``figures`` cells after the first are numbers."""
     return (
         "<tr>"
         + "".join(
@@ -225,8 +229,8 @@ def _kept(summary: RunSummary, events: Sequence[RunEvent]) -> str:
     if not summary.events_dropped:
         return f"All {len(events):,} events of the run are kept."
     return (
-        f"The latest {len(events):,} events are kept, {summary.events_dropped:,} earlier ones made room: slots at work are "
-        f"known for the end of the run only; everything else is of the whole run."
+        f"The latest {len(events):,} events are kept, {summary.events_dropped:,} earlier ones were dropped: busy slots are "
+        f"known for the end of the run only; all other figures cover the whole run."
     )
 
 

@@ -1,4 +1,4 @@
-"""What `embomatrix cluster` prints: tables for people, JSON for programs."""
+"""Output of `embomatrix cluster`: tables, lines and JSON."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from embomatrix.rpc.wire.run_log import EventKind, RunEvent
+from embomatrix.rpc.wire.run_log import EventKind, RolloutStep, RunEvent
 from embomatrix.rpc.wire.values import ResidentState, Warmth
 
 if TYPE_CHECKING:
@@ -35,14 +35,14 @@ WARMTH_STYLES: Final[Mapping[Warmth, str]] = {
 WIDEST: Final = 1000
 SENTENCE: Final = 60
 GRID: Final = 100
-"""Letters of a line that may be as wide as it needs, of a column of sentences, and of the scenes of a step."""
+"""Most characters of a table line, of a column of sentences, and of the scenes of a step."""
 NAMED: Final = 3
-"""Workers that a cell of the grid names."""
+"""Most workers named in a look-ahead cell."""
 _BAD: Final = frozenset((EventKind.FAILED, EventKind.WORKER_LOST, EventKind.SCENE_FAILED))
 
 
 def show(table: Table) -> None:
-    """Print a table whole: where the terminal is too narrow for its figures, lines wrap rather than lose them."""
+    """Print a table without cutting it: lines wrap in a narrow terminal."""
     console = Console()
     whole = Measurement.get(console, console.options.update(max_width=WIDEST), table).maximum
     Console(width=max(whole, console.width)).print(table)
@@ -54,18 +54,18 @@ def show_json(value: object) -> None:
 
 
 def plain(value: object) -> Any:
-    """What JSON can hold of a value of ours."""
+    """Return a JSON-serialisable form of a value, for ``json.dumps``."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     if isinstance(value, frozenset | set):
         return sorted(value)
     if hasattr(value, "items"):
         return dict(value.items())
-    raise TypeError(f"{type(value).__name__} can't be told as JSON")
+    raise TypeError(f"{type(value).__name__} has no JSON form")
 
 
 def event_plain(event: RunEvent) -> dict[str, Any]:
-    """An event without what does not apply to it."""
+    """Return the fields of an event that are set."""
     return {name: value for name, value in event._asdict().items() if value or name == "sequence"}
 
 
@@ -112,7 +112,7 @@ def run_table(runs: Sequence[RunInfo]) -> Table:
 
 
 def plan_table(cells: Sequence[PlanCell]) -> Table:
-    """Steps down; beside each the scenes that it needs, coloured by how far they are: ``scene·rollouts·warmth@workers``."""
+    """Draw one row per step with its scenes as ``scene·rollouts·warmth@workers``, coloured by warmth."""
     table = _table("run", "step")
     table.add_column("scenes", overflow="fold", max_width=GRID)
     rows: dict[tuple[str, int], list[Text]] = {}
@@ -128,7 +128,7 @@ def plan_table(cells: Sequence[PlanCell]) -> Table:
 
 
 def event_line(event: RunEvent) -> Text:
-    """One event in one line: when, what, and what it is about, as ``name=value``."""
+    """Format an event as one line: time, kind, and fields as ``name=value``."""
     at = time.strftime("%H:%M:%S", time.localtime(event.at_s)) + f".{int(event.at_s % 1 * 1000):03d}"
     named = (
         ("batch", event.batch_id),
@@ -148,8 +148,18 @@ def event_line(event: RunEvent) -> Text:
     return line.append(f" {event.message}" if event.message else "", style="default")
 
 
+def step_line(step: RolloutStep, begin_s: float) -> Text:
+    """Format a step of a rollout's history as one line, with seconds since the first step."""
+    at = time.strftime("%H:%M:%S", time.localtime(step.at_s))
+    line = Text(f"{at} +{step.at_s - begin_s:.3f} s ", style="dim", no_wrap=True)
+    line.append(f"{step.kind:<10}", style="default")
+    line.append(f" {step.worker_id}:" if step.worker_id else "", style="default")
+    line.append(f" {step.reason}" if step.reason else "", style="default")
+    return line.append(f"  ({step.cause})", style="dim")
+
+
 def _table(*names: str, **figures: int) -> Table:
-    """``names`` are words, ``figures`` the further columns: 1 for a number, 0 for sentences, which alone may fold."""
+    """Make a table with text columns ``names`` and further columns: 1 for numbers, 0 for sentences that may wrap."""
     table = Table(box=None, padding=(0, 2, 0, 0))
     for name in names:
         table.add_column(name, no_wrap=True)

@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from embomatrix.rpc.wire.run_log import RunEvent
 
 MANAGER: Final = 1
-"""Process id of the manager's track; workers come after it."""
+"""Process id of the manager's track; workers follow."""
 SUBMISSION_US: Final = 1000.0
-"""A submission is a moment; it is drawn this long, so that there is something to click on."""
+"""Drawn length of a submission, which takes no time."""
 
 TraceEvent = dict[str, Any]
 
 
 def chrome_trace(run: Sequence[RunEvent], fleet: Sequence[RunEvent], name: str) -> Mapping[str, Any]:
-    """The trace as a JSON value: one track for each slot, one for submissions, loading scenes beside the slots.
+    """Return the trace: a track for each slot, one for submissions, and scene loads beside the slots.
 
     ``run`` are the events of a run, ``fleet`` those of workers and scenes; both in order.
     """
@@ -74,7 +74,7 @@ def _meta(kind: str, process: int, thread: int, name: str) -> TraceEvent:
 
 
 def _flow_ids(run: Sequence[RunEvent]) -> dict[tuple[str, str], int]:
-    """A number for each rollout that completed, by batch and rollout, where its submission is still in the log."""
+    """Number the completed rollouts, by (batch, rollout), whose submission is still in the log."""
     submitted = {event.batch_id for event in run if event.kind is EventKind.SUBMITTED}
     done = [
         event
@@ -95,8 +95,15 @@ def _submissions(
     for event, after in itertools.zip_longest(submitted, submitted[1:]):
         begin = clock.us(event.at_s)
         length = min(SUBMISSION_US, clock.us(after.at_s) - begin) if after is not None else SUBMISSION_US
-        told = {"batch": event.batch_id, "rollouts": event.size}
-        yield {"ph": "X", "name": f"submit {event.size}", "ts": begin, "dur": length, "args": told, **track}
+        arguments = {"batch": event.batch_id, "rollouts": event.size}
+        yield {
+            "ph": "X",
+            "name": f"submit {event.size}",
+            "ts": begin,
+            "dur": length,
+            "args": arguments,
+            **track,
+        }
         for flow in of_batch.get(event.batch_id, ()):
             yield {"ph": "s", "name": "rollout", "cat": "rollout", "id": flow, "ts": begin, **track}
 
@@ -104,13 +111,20 @@ def _submissions(
 def _track(
     process: int, slot: int, spans: Sequence[Span], clock: _Clock, flows: Mapping[tuple[str, str], int]
 ) -> Iterator[TraceEvent]:
-    """What one slot did, gaps told apart: the result was on its way, nothing was to be done, the scene was loading."""
+    """Yield the slices of one slot. Gaps are split into result delivery, idle time and scene load."""
     track = {"pid": process, "tid": slot}
 
-    def part(name: str, begin_s: float, end_s: float, told: TraceEvent) -> Iterator[TraceEvent]:
+    def part(name: str, begin_s: float, end_s: float, arguments: TraceEvent) -> Iterator[TraceEvent]:
         begin, end = clock.us(begin_s), clock.us(end_s)
         if end > begin:
-            yield {"ph": "X", "name": name, "ts": begin, "dur": round(end - begin, 3), "args": told, **track}
+            yield {
+                "ph": "X",
+                "name": name,
+                "ts": begin,
+                "dur": round(end - begin, 3),
+                "args": arguments,
+                **track,
+            }
 
     free_s: float | None = None
     arrived_s = 0.0
@@ -123,7 +137,7 @@ def _track(
             yield from part("idle", on_its_way_s, loading_s, {})
         yield from part("load", loading_s, begin_s, {"scene": span.event.bundle_digest})
         failed = span.event.kind is EventKind.FAILED
-        yield from part("failed" if failed else "execute", begin_s, span.end_s, _told(span.event))
+        yield from part("failed" if failed else "execute", begin_s, span.end_s, _arguments(span.event))
         flow = None if failed else flows.get((span.event.batch_id, span.event.rollout_id))
         if flow is not None:
             at = {"ts": clock.us(begin_s), **track}
@@ -133,22 +147,22 @@ def _track(
         yield from part("deliver", free_s, max(free_s, arrived_s), {})
 
 
-def _told(event: RunEvent) -> TraceEvent:
-    told: TraceEvent = {
+def _arguments(event: RunEvent) -> TraceEvent:
+    arguments: TraceEvent = {
         "rollout": event.rollout_id,
         "batch": event.batch_id,
         "attempt": event.attempt,
         "scene": event.bundle_digest,
     }
     if event.timings is not None:
-        told["queue_ms"] = round(event.timings.queued_s * 1e3, 3)
-        told["lease_ms"] = round(event.timings.lease_s * 1e3, 3)
-        told["execute_ms"] = round(event.timings.execute_s * 1e3, 3)
-    return told | ({"code": event.code, "message": event.message} if event.code else {})
+        arguments["queue_ms"] = round(event.timings.queued_s * 1e3, 3)
+        arguments["lease_ms"] = round(event.timings.lease_s * 1e3, 3)
+        arguments["execute_ms"] = round(event.timings.execute_s * 1e3, 3)
+    return arguments | ({"code": event.code, "message": event.message} if event.code else {})
 
 
 def _fleet(fleet: Iterable[RunEvent], processes: Mapping[str, int], clock: _Clock) -> Iterator[TraceEvent]:
-    """Scenes that were loaded, and workers that came and went, since the run was opened."""
+    """Yield scene loads and worker changes since the run was opened."""
     for event in fleet:
         process = processes.get(event.worker_id)
         if process is None or clock.us(event.at_s - event.held_s) < 0:
@@ -159,12 +173,12 @@ def _fleet(fleet: Iterable[RunEvent], processes: Mapping[str, int], clock: _Cloc
             yield {"ph": "b", "ts": clock.us(event.at_s - event.held_s), **scene}
             yield {"ph": "e", "ts": clock.us(event.at_s), **scene}
         else:
-            told = {"message": event.message, "scene": event.bundle_digest}
+            arguments = {"message": event.message, "scene": event.bundle_digest}
             yield {
                 "ph": "i",
                 "s": "p",
                 "name": event.kind.value,
                 "ts": clock.us(event.at_s),
-                "args": told,
+                "args": arguments,
                 **at,
             }

@@ -1,4 +1,4 @@
-"""`embomatrix doctor`: is this machine fit for its part in a cluster, and can it reach the manager?"""
+"""`embomatrix doctor`: checks of this machine and of the connection to a manager."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from rich.table import Table
 from rich.text import Text
 
 from embomatrix.cli.cluster.tables import show_json
-from embomatrix.cli.connection import Ca, Token  # noqa: TC001  typer reads the annotations when a command runs
-from embomatrix.cli.doctor.findings import Level, verdict
-from embomatrix.cli.doctor.machine import machine
+from embomatrix.cli.connection import AsJson, Ca, Token  # noqa: TC001  typer reads the annotations when a command runs
+from embomatrix.cli.doctor.machine import Level, machine, verdict
 from embomatrix.cli.doctor.manager import Visit, manager, ports_held
 from embomatrix.cli.failure import MENDABLE, fail
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
@@ -25,7 +24,7 @@ from embomatrix.rpc.trust import read_ca, read_token
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from embomatrix.cli.doctor.findings import Finding
+    from embomatrix.cli.doctor.machine import Finding
 
 STYLES: Final[Mapping[Level, str]] = {Level.FINE: "green", Level.NOTE: "yellow", Level.WRONG: "red"}
 
@@ -33,14 +32,12 @@ Manager = Annotated[
     str,
     typer.Option(
         "--manager",
-        help="HOST:PORT of the manager to visit.",
+        help="HOST:PORT of the manager to check.",
         envvar="EMBOMATRIX_MANAGER",
         show_default=False,
     ),
 ]
-PagePort = Annotated[
-    int, typer.Option(help="Port of its status page, which tells the time.", min=1, max=65535)
-]
+PagePort = Annotated[int, typer.Option(help="Port of its status page, to compare clocks.", min=1, max=65535)]
 
 
 def doctor(
@@ -48,9 +45,9 @@ def doctor(
     token: Token = "",
     ca: Ca = None,
     page_port: PagePort = 8070,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Check Python, packages, ports, memory, disk and the way to the manager, and say what to do. Status 2: all is not well."""
+    """Check Python, packages, ports, memory, disk and the connection to a manager. Exits with 2 if something is wrong."""
     try:
         addresses = Managers(manager or DEFAULT_ADDRESS).addresses
         secret, trusted = read_token(token), read_ca(ca)
@@ -69,7 +66,7 @@ def doctor(
 
 
 async def _visit(visits: Sequence[Visit]) -> list[list[Finding]]:
-    """What each manager is found to be; all are visited at the same time."""
+    """Check all managers at the same time."""
     return await asyncio.gather(*(manager(visit) for visit in visits))
 
 

@@ -1,4 +1,4 @@
-"""What a machine brings: Python, packages, ports, memory, disk. Each is judged by a function of what was measured."""
+"""Findings about a machine: Python, packages, ports, memory and disk."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import platform
 import shutil
 import socket
 import sys
+from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.cli.doctor.findings import Finding, Level
-
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
+    from collections.abc import Collection, Mapping, Sequence
 
 NEEDED: Final[Mapping[str, tuple[str, ...]]] = {
     "worker": ("pybullet", "scipy", "psutil"),
@@ -23,19 +23,55 @@ NEEDED: Final[Mapping[str, tuple[str, ...]]] = {
     "factory": ("pybullet", "scipy", "trimesh", "PIL", "httpx"),
     "trainer": ("torch", "httpx"),
 }
-"""Packages that a part imports beyond those of the command itself, by the extra that brings them."""
+"""Packages of each part, by the extra that installs them."""
 PORTS: Final[Mapping[str, int]] = {"port of workers and trainers": 50070, "port of the status page": 8070}
 MEMORY_LEAST_MB: Final = 512
-"""A simulator with its engine takes 100 MB, a scene 20 to 80, an empty manager 90."""
+"""A simulator takes 100 MB, a scene 20 to 80 MB, an empty manager 90 MB."""
 MEMORY_GOOD_MB: Final = 2048
 DISK_LEAST_MB: Final = 200
 DISK_GOOD_MB: Final = 2048
-"""A worker's cache of bundles may take 1 GiB, a manager's bundles more."""
+"""A worker's bundle cache may take 1 GiB; a manager's bundles may take more."""
 MEGABYTE: Final = 1_000_000
 
 
+class Level(StrEnum):
+    """Severity of a finding."""
+
+    FINE = "fine"
+    NOTE = "note"
+    """Some part cannot be used here, or may run short of a resource."""
+    WRONG = "wrong"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Result of one check; ``remedy`` is empty if nothing needs to be done."""
+
+    thing: str
+    level: Level
+    found: str
+    remedy: str = ""
+
+
+def verdict(findings: Sequence[Finding]) -> str:
+    """Summarise the findings in one sentence."""
+    wrong = [finding.thing for finding in findings if finding.level is Level.WRONG]
+    if wrong:
+        return f"{len(wrong)} of {len(findings)} things {_are(len(wrong))} wrong: {', '.join(wrong)}"
+    notes = sum(finding.level is Level.NOTE for finding in findings)
+    return (
+        "all is well"
+        if not notes
+        else f"nothing is wrong; {notes} of {len(findings)} things {_are(notes)} worth a look"
+    )
+
+
+def _are(number: int) -> str:
+    return "is" if number == 1 else "are"
+
+
 def machine(managers: Collection[int] = ()) -> list[Finding]:
-    """Look at this machine. ``managers`` are ports of its own at which a manager was found."""
+    """Check this machine. ``managers`` are its ports at which a manager answered."""
     installed = {name for names in NEEDED.values() for name in names if importlib.util.find_spec(name)}
     free_ports = {name: _is_free(port) for name, port in PORTS.items()}
     return [
@@ -51,7 +87,7 @@ def machine(managers: Collection[int] = ()) -> list[Finding]:
 
 
 def python(version: tuple[int, int], system: str, processor: str) -> Finding:
-    """The interpreter, on which everything depends."""
+    """Judge the Python version and platform."""
     found = f"{version[0]}.{version[1]} on {system}, {processor}"
     if version < (3, 11):
         return Finding("Python", Level.WRONG, found, "install Python 3.11")
@@ -62,7 +98,7 @@ def python(version: tuple[int, int], system: str, processor: str) -> Finding:
 
 
 def parts(installed: Collection[str]) -> list[Finding]:
-    """Which parts of the project can run, by the packages that are there."""
+    """Judge for each part whether its packages are installed."""
     findings: list[Finding] = []
     for extra, names in NEEDED.items():
         missing = [name for name in names if name not in installed]
@@ -75,24 +111,24 @@ def parts(installed: Collection[str]) -> list[Finding]:
 
 
 def port(name: str, number: int, *, free: bool, ours: bool = False) -> Finding:
-    """A port of loopback that a manager takes by default; ``ours`` if one answers there."""
+    """Judge a default port of the manager; ``ours`` if a manager answers there."""
     if free:
         return Finding(name, Level.FINE, f"{number} is free")
     if ours:
-        return Finding(name, Level.FINE, f"{number} is this machine's manager's")
-    remedy = "no manager answers there that doctor could speak to: a manager takes others by --port and --http-port"
+        return Finding(name, Level.FINE, f"{number} is used by this machine's manager")
+    remedy = "another program uses it: start a manager with --port and --http-port"
     return Finding(name, Level.NOTE, f"{number} is taken", remedy)
 
 
 def memory(free_mb: float) -> Finding:
-    """What new processes may take."""
+    """Judge the free memory."""
     return _amount(
         "memory", free_mb, MEMORY_LEAST_MB, MEMORY_GOOD_MB, "close programs, or give it fewer --slots"
     )
 
 
 def disk(folder: Path, free_mb: float) -> Finding:
-    """Where caches and state lie by default."""
+    """Judge the free disk space of the default folder for caches and state."""
     remedy = "make room, or pass --cache-dir and --data-dir of another disk"
     return _amount(f"disk of {folder}", free_mb, DISK_LEAST_MB, DISK_GOOD_MB, remedy)
 
@@ -116,7 +152,7 @@ def _is_free(number: int) -> bool:
 
 
 def _free_memory_mb() -> float:
-    """What the kernel would give without swapping; where it doesn't tell, what nobody uses at all."""
+    """Return the memory available without swapping; where the kernel does not say, the total memory."""
     table = Path("/proc/meminfo")
     if table.exists():
         for line in table.read_text(encoding="ascii").splitlines():

@@ -1,4 +1,4 @@
-"""Whether a manager can be reached from here: by the network, by TLS, in a version that both speak, with the token in hand."""
+"""Findings about the connection to a manager: network, TLS, versions, token and clock."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from email.utils import parsedate_to_datetime
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.cli.doctor.findings import Finding, Level
+from embomatrix.cli.doctor.machine import Finding, Level
 from embomatrix.proto.v1 import rollout_service_pb2_grpc
 from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.channel import open_channel
@@ -24,29 +24,29 @@ if TYPE_CHECKING:
 
     from embomatrix.rpc.wire.values import FleetStatus
 
-KNOCK_S: Final = 1.0
-"""Limit for each of the questions, of which there are four: a doctor is quick."""
+TIMEOUT_S: Final = 1.0
+"""Timeout of each of the four requests."""
 CERTIFICATE_DAYS: Final = 30
-"""`manager init` renews a certificate with less than this left."""
+"""`manager init` renews certificates with less than this left."""
 CLOCK_S: Final = 60.0
 OUT_OF_TIME: Final = frozenset({9, 10})
 """X509_V_ERR_CERT_NOT_YET_VALID and X509_V_ERR_CERT_HAS_EXPIRED."""
 DAY_S: Final = 86400.0
 CALM: Final = frozenset({"good", "idle"})
-"""Moods of a cluster that nobody needs to care about."""
+"""Moods of a cluster that call for no action."""
 LOOPBACK: Final = ("127.0.0.1", "localhost", "::1")
 
 
 @dataclass(frozen=True, slots=True)
 class Visit:
-    """Whom to visit, and what to show there. ``ca`` is PEM; ``page_port`` is that of the status page."""
+    """A manager to check, with credentials. ``ca`` is PEM."""
 
     address: str
     token: str = field(default="", repr=False)
     ca: bytes = b""
     page_port: int = 8070
     expected: bool = True
-    """Whether somebody named this manager, or it is only where one would be by default."""
+    """True if the user named this manager; False for the default address."""
 
     @property
     def host(self) -> str:
@@ -58,12 +58,12 @@ class Visit:
 
     @property
     def is_here(self) -> bool:
-        """On this machine's loopback interface."""
+        """True if the address is on the loopback interface."""
         return self.host in LOOPBACK
 
 
 async def manager(visit: Visit) -> list[Finding]:
-    """Knock, and go on for as long as there is an answer."""
+    """Run the checks in order until one fails."""
     reached = await asyncio.to_thread(_reach, visit)
     findings = [reached]
     if reached.level is not Level.FINE:
@@ -84,15 +84,15 @@ async def manager(visit: Visit) -> list[Finding]:
 
 
 def ports_held(visit: Visit, findings: Sequence[Finding]) -> frozenset[int]:
-    """Ports of this machine that the manager was found to serve at."""
+    """Return the ports of this machine that the manager serves."""
     well = {finding.thing for finding in findings if finding.level is not Level.WRONG}
     served = {"versions": visit.port, "clock": visit.page_port}
     return frozenset(port for thing, port in served.items() if visit.is_here and thing in well)
 
 
 def certificate(days_left: float) -> Finding:
-    """How long the manager's certificate still holds."""
-    found = f"by TLS, its certificate holds {days_left:.0f} days more"
+    """Judge the remaining validity of the manager's certificate."""
+    found = f"TLS; its certificate is valid for {days_left:.0f} more days"
     if days_left < CERTIFICATE_DAYS:
         return Finding(
             "TLS", Level.NOTE, found, "run `embomatrix manager init` there again: it makes a new one"
@@ -101,7 +101,7 @@ def certificate(days_left: float) -> Finding:
 
 
 def mistrust(code: int, message: str) -> Finding:
-    """Why the manager's certificate was refused, by OpenSSL's code."""
+    """Explain a refused certificate, by OpenSSL's error code."""
     remedy = "pass the ca.pem of this manager with --ca; a name that it lacks is added by `manager init --san NAME`"
     if code in OUT_OF_TIME:
         remedy = "is this machine's clock right? If so, run `embomatrix manager init` there again: it makes a new certificate"
@@ -109,7 +109,7 @@ def mistrust(code: int, message: str) -> Finding:
 
 
 def versions(found: Capabilities) -> Finding:
-    """Whether both sides speak one protocol; other releases than our own are told."""
+    """Judge the protocol versions of both sides; note a different release."""
     try:
         spoken = agree(
             SPOKEN, found.protocol, us="this trainer", them="that manager", their_release=found.release
@@ -125,19 +125,17 @@ def versions(found: Capabilities) -> Finding:
 
 
 def clock(offset_s: float) -> Finding:
-    """This machine's clock less the manager's."""
+    """Judge the offset of this machine's clock from the manager's, in seconds."""
     found = f"{abs(offset_s):.0f} s {'ahead of' if offset_s > 0 else 'behind'} the manager's"
     if abs(offset_s) < CLOCK_S:
         return Finding("clock", Level.FINE, found)
-    remedy = (
-        "let NTP set it: leases don't mind, but certificates may seem expired and logs don't fit together"
-    )
+    remedy = "set it by NTP: leases are not affected, but certificates may seem expired and log times differ"
     return Finding("clock", Level.NOTE, found, remedy)
 
 
 def _reach(visit: Visit) -> Finding:
     try:
-        socket.create_connection((visit.host, visit.port), KNOCK_S).close()
+        socket.create_connection((visit.host, visit.port), TIMEOUT_S).close()
     except OSError as error:
         if not visit.expected:
             return Finding(
@@ -153,7 +151,7 @@ def _tls(visit: Visit) -> Finding:
     context.set_alpn_protocols(["h2"])
     try:
         with (
-            socket.create_connection((visit.host, visit.port), KNOCK_S) as plain,
+            socket.create_connection((visit.host, visit.port), TIMEOUT_S) as plain,
             context.wrap_socket(plain, server_hostname=visit.host) as tls,
         ):
             shown = tls.getpeercert()
@@ -171,7 +169,7 @@ def _tls(visit: Visit) -> Finding:
 
 
 def _trusting() -> ssl.SSLContext:
-    """Only asks whether there is TLS at all."""
+    """Return a context that accepts any certificate, to find out whether there is TLS."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
     context.verify_mode = ssl.CERT_NONE
@@ -183,16 +181,16 @@ async def _versions(visit: Visit) -> Finding:
         async with open_channel(visit.address, ca=visit.ca) as channel:
             stub = rollout_service_pb2_grpc.RolloutServiceStub(channel)
             with cluster_errors(visit.address):
-                return versions(await capabilities_of(stub, timeout_s=KNOCK_S))
+                return versions(await capabilities_of(stub, timeout_s=TIMEOUT_S))
     except ClusterError as error:
         return Finding("versions", Level.WRONG, str(error), "is this the port of a manager's gRPC services?")
 
 
 async def _token(visit: Visit) -> list[Finding]:
-    """What becomes of who shows it, and what the manager says of the cluster then."""
+    """Judge the token, and the state of the cluster if the token may read it."""
     try:
         async with AdminClient(
-            visit.address, visit.token, ca=visit.ca, call_s=KNOCK_S, failover_s=0
+            visit.address, visit.token, ca=visit.ca, call_s=TIMEOUT_S, failover_s=0
         ) as client:
             fleet = await client.fleet()
     except NotAllowedError as error:
@@ -205,9 +203,7 @@ async def _token(visit: Visit) -> list[Finding]:
 
 
 def cluster(fleet: FleetStatus) -> list[Finding]:
-    """How the cluster does, if its manager says so. It is no fault of this machine: never worse than a note."""
-    if not fleet.health:
-        return []
+    """Report the state of the cluster. It is no fault of this machine: at most a note."""
     ready = sum(worker.state == "ready" for worker in fleet.workers)
     found = f"{fleet.health} Workers that are ready: {ready}"
     if fleet.mood in CALM:
@@ -216,14 +212,14 @@ def cluster(fleet: FleetStatus) -> list[Finding]:
 
 
 def _clock_offset_s(visit: Visit) -> float | None:
-    """By the date in the status page's answer; None where no page answers. Right to a second."""
+    """Return the clock offset by the status page's Date header, to one second; None without an answer."""
     if visit.ca:
         context = ssl.create_default_context(cadata=visit.ca.decode("ascii"))
         page: http.client.HTTPConnection = http.client.HTTPSConnection(
-            visit.host, visit.page_port, timeout=KNOCK_S, context=context
+            visit.host, visit.page_port, timeout=TIMEOUT_S, context=context
         )
     else:
-        page = http.client.HTTPConnection(visit.host, visit.page_port, timeout=KNOCK_S)
+        page = http.client.HTTPConnection(visit.host, visit.page_port, timeout=TIMEOUT_S)
     with contextlib.closing(page), contextlib.suppress(OSError, http.client.HTTPException, ValueError):
         page.request("GET", "/healthz")
         return time.time() - parsedate_to_datetime(page.getresponse().headers["date"] or "").timestamp()

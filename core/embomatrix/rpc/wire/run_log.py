@@ -115,6 +115,41 @@ class RunSummary:
     version: str
 
 
+class RolloutStepKind(StrEnum):
+    """Kinds of steps in the history of a rollout."""
+
+    SUBMITTED = "submitted"
+    QUEUED = "queued"
+    LEASED = "leased"
+    HEDGED = "hedged"
+    REVOKED = "revoked"
+    EXPIRED = "expired"
+    RETURNED = "returned"
+    HELD = "held"
+    DELIVERED = "delivered"
+
+
+class RolloutStep(NamedTuple):
+    """One step in the history of a rollout. ``cause`` names the event that led to it."""
+
+    at_s: float
+    kind: str
+    """A ``RolloutStepKind``, or a kind of a newer manager."""
+    run_id: str
+    batch_id: str
+    worker_id: str
+    reason: str
+    cause: str
+
+
+@dataclass(frozen=True, slots=True)
+class RolloutExplanation:
+    """Recent history of a rollout. ``place`` is empty once it has its outcome."""
+
+    steps: tuple[RolloutStep, ...]
+    place: str
+
+
 @dataclass(frozen=True, slots=True)
 class EventPage:
     """Events in order. ``dropped`` counts the log's events that were discarded for later ones."""
@@ -132,6 +167,10 @@ run_event_to_proto, run_event_from_proto = converters(
 )
 event_page_to_proto, event_page_from_proto = converters(
     EventPage, pb.ReadEventsResponse, parts={"events": (run_event_to_proto, run_event_from_proto)}
+)
+_step_to_proto, _step_from_proto = converters(RolloutStep, pb.RolloutStep)
+explanation_to_proto, explanation_from_proto = converters(
+    RolloutExplanation, pb.ExplainRolloutResponse, parts={"steps": (_step_to_proto, _step_from_proto)}
 )
 _phase_to_proto, _phase_from_proto = converters(PhaseSummary, pb.PhaseSummary)
 _worker_to_proto, _worker_from_proto = converters(RunWorker, pb.RunWorker)

@@ -1,7 +1,8 @@
-"""How far two execution modes agree: the same plan in both, compared step by step and atom by atom.
+"""Comparison of the two execution modes: the same plan in both, step by step and atom by atom.
 
-A *trial* is one plan in one scene with one seed. Its atoms are those over the objects of the goal and of the plan's calls, and
-whatever is near these at the end: relations both ways, rooms, states and substances. No atom that holds nowhere is counted.
+A *trial* is one plan in one scene with one seed. Its atoms range over the objects of the goal and of the calls, and over
+their neighbours at the end: relations in both directions, rooms, states and substances. Atoms that hold in neither mode don't
+count.
 """
 
 from __future__ import annotations
@@ -10,26 +11,30 @@ import itertools
 import time
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
+
+from embomatrix.skills.failure import FailureReason  # noqa: TC001 -- msgspec reads the annotations
+from embomatrix.skills.parse import plan_from_json, plan_to_json
+from embomatrix.skills.syntax import Skill  # noqa: TC001 -- msgspec reads the annotations
 from embomatrix.world.evaluate import objects_of
-from embomatrix.world.geometry import Aabb
 from embomatrix.world.state import Relation, State
+from embomatrix.world.task import Profile
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Mapping
 
     from embomatrix.sim.executor import Simulator
-    from embomatrix.skills.failure import FailureReason
-    from embomatrix.skills.syntax import Plan, Skill
+    from embomatrix.skills.syntax import Plan
     from embomatrix.world.task import Task
 
 NEAR_M: Final = 0.5
-"""Objects whose boxes come this near may stand in a relation: ``nextto`` reaches no farther."""
+"""Largest distance of boxes whose objects may be in a relation; ``nextto`` reaches no farther."""
 
 
 class PlanKind(StrEnum):
-    """Where a plan comes from."""
+    """Origin of a plan."""
 
     ORACLE = "oracle"
     VALID = "valid"
@@ -39,7 +44,7 @@ class PlanKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class FidelityTrial:
-    """One plan to be executed in both modes. ``base`` is the base scene that the bundle's scene was made from."""
+    """One plan to execute in both modes. ``base``: base scene of the bundle's scene."""
 
     trial_id: str
     bundle_digest: str
@@ -52,7 +57,7 @@ class FidelityTrial:
 
 @dataclass(frozen=True, slots=True)
 class StepRun:
-    """One executed call; ``failure`` is None for a success. ``cpu_s`` is processor time of the thread."""
+    """One executed call; ``failure`` is None for a success. ``cpu_s``: processor time of the thread, in seconds."""
 
     skill: Skill
     failure: FailureReason | None
@@ -66,9 +71,9 @@ class StepRun:
 
 @dataclass(frozen=True, slots=True)
 class ModeRun:
-    """What one mode made of a trial: its steps up to the first failure, and the atoms that hold in the end, as BDDL text.
+    """Result of a trial in one mode: steps up to the first failure, and final atoms as BDDL text.
 
-    ``cpu_s`` is processor time of the whole execution, its reset included.
+    ``cpu_s``: processor time of the execution with its reset, in seconds.
     """
 
     steps: tuple[StepRun, ...]
@@ -82,7 +87,7 @@ class ModeRun:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """A trial in both modes. ``bodies`` counts the objects of the scene."""
+    """A trial in both modes. ``bodies``: number of objects in the scene."""
 
     trial: FidelityTrial
     bodies: int
@@ -91,22 +96,22 @@ class Comparison:
 
     @property
     def pairs(self) -> tuple[tuple[StepRun, StepRun], ...]:
-        """Steps that both modes came to. Up to the last of these all outcomes are equal."""
+        """Steps that both modes reached. All outcomes before the last of these are equal."""
         return tuple(zip(self.cached.steps, self.physical.steps, strict=False))
 
     @property
     def steps_of_either(self) -> int:
-        """Steps that at least one mode came to."""
+        """Number of steps that at least one mode reached."""
         return max(len(self.cached.steps), len(self.physical.steps))
 
     @property
     def equal_steps(self) -> int:
-        """Steps that both modes came to and that succeed in both, or fail in both."""
+        """Number of steps that both modes reached with equal success."""
         return sum(one.ok is other.ok for one, other in self.pairs)
 
     @property
     def first_difference(self) -> int | None:
-        """Index of the first step whose outcomes differ, None when all are equal."""
+        """Index of the first step with different outcomes, None if all are equal."""
         differing = (number for number, (one, other) in enumerate(self.pairs) if one.ok is not other.ok)
         return next(differing, None)
 
@@ -145,24 +150,24 @@ def compare(cached: Simulator, physical: Simulator, task: Task, trial: FidelityT
 
 
 def objects_in(task: Task, plan: Plan) -> tuple[str, ...]:
-    """Objects of the goal and those that calls name, in the order of the table; indices outside it name none."""
+    """Return the objects of the goal and of the calls, in table order. Indices outside the table are ignored."""
     rows = {row for call in plan for row in (call.object_index, call.source_index) if row is not None}
     named = objects_of(task.goal, task.types) | {task.table[row] for row in rows if row < len(task.table)}
     return tuple(name for name in task.table if name in named)
 
 
 def true_atoms(simulator: Simulator, names: Iterable[str]) -> frozenset[str]:
-    """Atoms over the objects and their neighbourhood that hold in the state reached, as BDDL text."""
+    """Return the true atoms over the objects and their neighbours, as BDDL text."""
     facts = simulator.facts
     return frozenset(
         f"({' '.join((predicate, *args))})"
-        for predicate, args in _asked(simulator, tuple(names))
+        for predicate, args in _candidates(simulator, tuple(names))
         if facts.holds(predicate, args)
     )
 
 
-def _asked(simulator: Simulator, names: tuple[str, ...]) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Atoms that may hold: what is farther apart than ``NEAR_M`` is in no relation."""
+def _candidates(simulator: Simulator, names: tuple[str, ...]) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Yield atoms that may hold: objects farther apart than ``NEAR_M`` are in no relation."""
     world = simulator.world
     for name in names:
         for state in State:
@@ -175,7 +180,7 @@ def _asked(simulator: Simulator, names: tuple[str, ...]) -> Iterator[tuple[str, 
         pair
         for name in names
         if not world.engine.is_parked(name)
-        for other in world.engine.near(_grown(world.engine.aabb(name)), frozenset((name,)))
+        for other in world.engine.near(world.engine.aabb(name).grown(NEAR_M), frozenset((name,)))
         for pair in ((name, other), (other, name))
     }
     for (one, other), relation in itertools.product(sorted(pairs), Relation):
@@ -183,6 +188,63 @@ def _asked(simulator: Simulator, names: tuple[str, ...]) -> Iterator[tuple[str, 
             yield relation.value, (one, other)
 
 
-def _grown(box: Aabb) -> Aabb:
-    (a, b, c), (d, e, f) = box.low_m, box.high_m
-    return Aabb((a - NEAR_M, b - NEAR_M, c - NEAR_M), (d + NEAR_M, e + NEAR_M, f + NEAR_M))
+def trial_to_json(trial: FidelityTrial) -> dict[str, Any]:
+    return {
+        "trial": trial.trial_id,
+        "bundle": trial.bundle_digest,
+        "base": trial.base,
+        "task": trial.task_id,
+        "kind": trial.kind.value,
+        "seed": trial.seed,
+        "plan": plan_to_json(trial.plan),
+    }
+
+
+def trial_from_json(value: Mapping[str, Any]) -> FidelityTrial:
+    """Read a trial. Raises KeyError, TypeError or ValueError (PlanError among them) for invalid values."""
+    return FidelityTrial(
+        value["trial"],
+        value["bundle"],
+        value["base"],
+        value["task"],
+        PlanKind(value["kind"]),
+        int(value["seed"]),
+        plan_from_json(value["plan"], Profile.HOUSEHOLD),
+    )
+
+
+def comparison_to_json(comparison: Comparison) -> dict[str, Any]:
+    return {
+        **trial_to_json(comparison.trial),
+        "bodies": comparison.bodies,
+        "cached": msgspec.to_builtins(comparison.cached, order="deterministic"),
+        "physical": msgspec.to_builtins(comparison.physical, order="deterministic"),
+    }
+
+
+def comparison_from_json(value: Mapping[str, Any]) -> Comparison:
+    """Read a comparison. Raises what ``trial_from_json`` raises."""
+    return Comparison(
+        trial_from_json(value),
+        int(value["bodies"]),
+        msgspec.convert(value["cached"], ModeRun),
+        msgspec.convert(value["physical"], ModeRun),
+    )
+
+
+def disagreement_to_json(comparison: Comparison) -> dict[str, Any]:
+    """Return the trial, its first different step with both messages, and the atoms of one mode only."""
+    found = trial_to_json(comparison.trial)
+    index = comparison.first_difference
+    if index is not None:
+        one, other = comparison.pairs[index]
+        found |= {
+            "step": index + 1,
+            "skill": one.skill.value,
+            "cached": one.message,
+            "physical": other.message,
+        }
+    return found | {
+        "only_cached": sorted(comparison.cached.atoms - comparison.physical.atoms),
+        "only_physical": sorted(comparison.physical.atoms - comparison.cached.atoms),
+    }

@@ -1,4 +1,4 @@
-"""The plans of the fidelity suite for one scene: oracle plans, random valid ones, perturbed and failing ones."""
+"""Plans of the fidelity suite for one scene: oracle plans, and random valid, perturbed and failing plans."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ if TYPE_CHECKING:
 
 LENGTHS: Final = (4, 9)
 MOST: Final = 12
-"""Calls of a random plan: at least, less than, and at most with what they need before them."""
+"""Length of a random plan in calls: least, upper bound, and most with the calls that these need."""
 PREFIXES: Final = (0, 5)
-"""Calls before the one that fails, likewise."""
+"""Calls before the failing one: least, and upper bound."""
 WAITS: Final = 3
-"""Times in a plan that the robot waits at a source for the same effect."""
+"""Largest number of waits at a source for the same effect in one plan."""
 IDLE: Final = 6
-"""Plans in a row without a call that was lacking, after which a scene is taken to allow no more."""
+"""Consecutive plans without progress on missing calls after which a scene counts as exhausted."""
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
-    """What is asked of one scene: plans of each kind, and successful calls of each skill.
+class TrialRequest:
+    """Wanted numbers of plans of each kind, and of successful calls of each skill, for one scene.
 
-    ``extra`` valid plans more are written at most, while they bring calls that are lacking. Trials are numbered from ``first``.
+    Up to ``extra`` more valid plans are written while they provide missing calls. Trials are numbered from ``first``.
     """
 
     plans: Mapping[PlanKind, int]
@@ -46,25 +46,25 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True)
-class Example:
-    """A task of the scene and a plan that reaches its goal."""
+class SolvedTask:
+    """A task of the scene with a plan that reaches its goal."""
 
     task: Task
     plan: Plan
 
 
 def write_trials(
-    simulator: Simulator, digest: str, examples: Sequence[Example], request: Request
+    simulator: Simulator, digest: str, examples: Sequence[SolvedTask], request: TrialRequest
 ) -> tuple[FidelityTrial, ...]:
-    """Trials for a scene that is loaded in cached mode; equal arguments give equal trials.
+    """Write trials for a scene loaded in cached mode. Equal arguments give equal trials.
 
-    Skills that lack calls come more often in valid plans.
+    Skills with missing calls are more frequent in valid plans.
     """
     return tuple(_Writer(simulator, digest, examples, request).write())
 
 
 def can_use(world: LiveWorld, task: Task, skill: Skill) -> bool:
-    """Whether the task's table holds what the skill is for."""
+    """True if the object table offers an object for the skill."""
     assets = [(name, world.asset(name)) for name in task.table]
     match skill:
         case Skill.PICK_UP | Skill.PLACE:
@@ -79,7 +79,7 @@ def can_use(world: LiveWorld, task: Task, skill: Skill) -> bool:
 
 class _Writer:
     def __init__(
-        self, simulator: Simulator, digest: str, examples: Sequence[Example], request: Request
+        self, simulator: Simulator, digest: str, examples: Sequence[SolvedTask], request: TrialRequest
     ) -> None:
         self._simulator = simulator
         self._digest = digest
@@ -102,7 +102,7 @@ class _Writer:
                 yield self._trial(kind, *change())
 
     def _valid_trials(self, count: int) -> Iterator[FidelityTrial]:
-        """As many as asked for, and more while they bring calls of skills that lack some."""
+        """Yield the requested number of trials, and more while they provide missing calls."""
         made = idle = 0
         most = count + self._request.extra
         while made < count or (made < most and idle < IDLE and self._lacking()):
@@ -129,7 +129,7 @@ class _Writer:
         return FidelityTrial(trial_id, self._digest, scene.base, task.task_id, kind, seed, plan)
 
     def _lacking(self) -> list[Skill]:
-        """Skills that some task of the scene allows and that have too few calls, those that lack most first."""
+        """Return usable skills with missing calls, those that lack most first."""
         world = self._simulator.world
         able = [
             skill
@@ -139,14 +139,14 @@ class _Writer:
         return sorted(able, key=lambda skill: -self._missing[skill])
 
     def _task(self) -> Task:
-        """A task that allows the skill which lacks most calls, if any does."""
+        """Draw a task that allows the skill with the most missing calls, if any does."""
         lacking, world = self._lacking(), self._simulator.world
         tasks = [item.task for item in self._examples]
         able = [task for task in tasks if not lacking or can_use(world, task, lacking[0])]
         return able[self._draw(len(able))]
 
     def _valid(self, task: Task, seed: int) -> Plan:
-        """A random plan, all of whose calls succeed: skills that lack calls come more often."""
+        """Draw a plan whose calls all succeed."""
         sampler = PlanSampler(self._simulator, task, seed, self._rng)
         able = [skill for skill in SKILLS if can_use(self._simulator.world, task, skill)]
         weights = np.array([0.3 + max(0, self._missing[skill]) for skill in able])
@@ -155,19 +155,19 @@ class _Writer:
             if len(sampler.plan) >= length:
                 break
             skill = able[int(self._rng.choice(len(able), p=weights / weights.sum()))]
-            # What lies at a working source is dear to bring about: there the robot waits more than once.
+            # An object at a working source takes many calls to arrange, so the robot waits there more than once.
             while sampler.add(skill) and skill in ABILITY and sampler.count(skill) < WAITS:
                 pass
         return sampler.plan[:MOST]
 
     def _perturbed(self) -> tuple[Task, Plan, int]:
-        """A plan that was written before, with a step dropped, two swapped or an index changed."""
+        """Return an earlier plan with a step dropped, two steps swapped or an index changed."""
         task, plan = self._base[self._draw(len(self._base))]
         change = CHANGES[self._draw(len(CHANGES))]
         return task, change(plan, task, self._rng), self._seed()
 
     def _failing(self) -> tuple[Task, Plan, int]:
-        """A valid beginning and a call that fails."""
+        """Return a valid prefix with a failing call."""
         task, seed = self._task(), self._seed()
         sampler = PlanSampler(self._simulator, task, seed, self._rng)
         for _ in range(int(self._rng.integers(*PREFIXES))):
@@ -195,7 +195,7 @@ def _swapped(plan: Plan, task: Task, rng: np.random.Generator) -> Plan:
 
 
 def _reindexed(plan: Plan, task: Task, rng: np.random.Generator) -> Plan:
-    """Another object in one of the calls that have one."""
+    """Change the object of one call."""
     named = [number for number, call in enumerate(plan) if call.object_index is not None]
     if not named:
         return plan
@@ -209,4 +209,4 @@ CHANGES: Final[tuple[Callable[[Plan, Task, np.random.Generator], Plan], ...]] = 
     _swapped,
     _reindexed,
 )
-"""How a plan is perturbed."""
+"""Perturbations of a plan."""

@@ -1,4 +1,4 @@
-"""Figures of the fidelity suite, from its comparisons alone."""
+"""Figures of the fidelity suite, computed from its comparisons."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ MANIPULATION: Final = (
     Skill.TOGGLE_ON,
     Skill.TOGGLE_OFF,
 )
-"""Skills in which the arm works: those whose speed-up is bounded."""
+"""Skills that use the arm, whose speed-up has a bound."""
 FULL_SCENE: Final = (250, 350)
-"""Objects of a scene, at least and at most, that counts as one of about 300 bodies."""
+"""Range of object counts of a scene that counts as one of about 300 bodies."""
 
 
 @dataclass(frozen=True, slots=True)
 class SkillReport:
-    """One skill over all trials. ``calls`` and ``succeeded`` are those of cached mode.
+    """Figures of one skill over all trials. ``calls`` and ``succeeded`` refer to cached mode.
 
-    ``compared`` calls were reached by both modes; ``unequal`` of them had other outcomes, ``other_reason`` failed in both for
-    different reasons. Times are means in seconds of processor time over calls that succeeded in both modes.
+    Both modes reached ``compared`` calls; ``unequal`` of them had different outcomes, and ``other_reason`` failed in both for
+    different reasons. Times are mean processor seconds of calls that succeeded in both modes.
     """
 
     skill: Skill
@@ -47,16 +47,16 @@ class SkillReport:
 
     @property
     def speedup(self) -> float:
-        """How many times faster cached mode is; 0 where nothing was measured."""
+        """Ratio of physical to cached time; 0 without measurements."""
         return self.physical_s / self.cached_s if self.cached_s > 0.0 else 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class FidelityReport:
-    """The suite's figures. Shares are of the totals beside them; a share of nothing is 1.
+    """Figures of the suite. Shares refer to the totals beside them; a share of nothing is 1.
 
-    ``steps_equal`` is over steps that both modes came to, ``steps_equal_of_either`` over all that at least one came to: after a
-    difference one mode stops, so that its later steps are equal to none.
+    ``steps_equal`` counts steps that both modes reached, ``steps_equal_of_either`` all steps that one mode reached: after a
+    difference one mode stops, so its later steps have no counterpart.
     """
 
     plans: int
@@ -77,13 +77,13 @@ class FidelityReport:
 
     @property
     def speedup_min(self) -> float:
-        """The least speed-up of a manipulation skill that was measured."""
+        """Least measured speed-up of a manipulation skill."""
         found = [item.speedup for item in self.skills if item.skill in MANIPULATION and item.speedup > 0.0]
         return min(found, default=0.0)
 
 
 def report_on(comparisons: Sequence[Comparison]) -> FidelityReport:
-    """Sum up. An empty suite has zero plans and shares of 1."""
+    """Compute the figures. An empty suite has zero plans and shares of 1."""
     pairs = [pair for item in comparisons for pair in item.pairs]
     equal_steps = sum(item.equal_steps for item in comparisons)
     steps_of_either = sum(item.steps_of_either for item in comparisons)
@@ -109,7 +109,7 @@ def report_on(comparisons: Sequence[Comparison]) -> FidelityReport:
 
 
 def calls_of(comparisons: Iterable[Comparison]) -> Counter[Skill]:
-    """Calls of each skill that cached mode came to."""
+    """Count the calls of each skill that cached mode reached."""
     return Counter(step.skill for item in comparisons for step in item.cached.steps)
 
 

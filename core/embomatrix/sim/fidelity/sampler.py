@@ -1,7 +1,7 @@
-"""Random plans, written by executing them in cached mode: what ``check`` allows, skill by skill.
+"""Random plans, written by executing them in cached mode: `check` decides which calls are possible.
 
-A call that fails is not part of a plan that is to be valid: the sampler goes back to before it, so that the plan meets the
-same random numbers whenever it is executed with its seed.
+A failed call is not part of a valid plan. The sampler then restores the state before it, so that the plan meets the same random
+numbers whenever it is executed with its seed.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 SKILLS: Final = PROFILES[Profile.PAPER]
 TRIES: Final = 4
-"""Objects that are tried for a skill before another skill is."""
+"""Objects to try for a skill before another skill is drawn."""
 REVISIT: Final = 0.8
-"""How often the robot is sent to a thing that it reaches already."""
+"""Probability of a move to an object that is in reach already."""
 ABILITY: Final[Mapping[Skill, str]] = {
     Skill.HEAT: "heatable",
     Skill.COOK: "cookable",
@@ -37,11 +37,11 @@ ABILITY: Final[Mapping[Skill, str]] = {
 RELATIONS: Final = (PlaceRelation.ONTOP, PlaceRelation.INSIDE, PlaceRelation.UNDER)
 RELATION_SHARES: Final = (0.5, 0.35, 0.15)
 STEP_M: Final = (0.1, 1.5)
-"""Lengths between which a drive straight on is drawn."""
+"""Range of the length of a straight drive."""
 
 
 class PlanSampler:
-    """Writes one plan at a time in a simulator. The randomness is the caller's."""
+    """Sampler of one plan in a simulator. The caller provides the random generator."""
 
     def __init__(self, simulator: Simulator, task: Task, seed: int, rng: np.random.Generator) -> None:
         self._simulator = simulator
@@ -55,19 +55,19 @@ class PlanSampler:
 
     @property
     def plan(self) -> Plan:
-        """The calls so far: all of them succeed."""
+        """Calls so far, all of which succeed."""
         return tuple(self._calls)
 
     def count(self, skill: Skill) -> int:
-        """Calls of the skill so far."""
+        """Count the calls of a skill so far."""
         return sum(call.skill is skill for call in self._calls)
 
     def add(self, skill: Skill) -> bool:
-        """Add a call of the skill with what it needs before; False when none was found. What was needed may be added still."""
+        """Add a call of the skill with the calls that it needs. False if none was found; needed calls may then remain."""
         return ROUTINES[skill](self, skill)
 
     def fail(self) -> SkillCall | None:
-        """A call that fails in the state reached, None when no random one does."""
+        """Draw a call that fails in the present state, None if none was drawn."""
         for _ in range(8 * TRIES):
             call = self._any_call()
             if check(self._world, call) is not None:
@@ -102,7 +102,7 @@ class PlanSampler:
         return False
 
     def _use(self, call: SkillCall) -> bool:
-        """The call, with a drive to its source or its object before it where that is out of reach, and often elsewhere."""
+        """Run the call, with a move to its source or object before it if that is out of reach, and often otherwise."""
         row = call.source_index if call.source_index is not None else call.object_index
         assert row is not None
         away = within_reach(self._world, self._task.table[row]) is not None
@@ -123,7 +123,7 @@ class PlanSampler:
                 return any(self._drive_on() for _ in range(TRIES))
 
     def _drive_on(self) -> bool:
-        """Straight on, half of the time backwards, where the floor is free."""
+        """Drive straight, backwards with probability 0.5, where the floor is free."""
         distance, yaw = self._between(*STEP_M), self._yaw()
         back = self._rng.random() < 0.5
         robot = self._world.robot
@@ -137,7 +137,7 @@ class PlanSampler:
         return self._free_hand() and any(self._fetch(row) for row in self._some(movable))
 
     def _fetch(self, row: int) -> bool:
-        """Take the object, out of a closed container if need be."""
+        """Pick up the object, out of closed containers if necessary."""
         while container := self._world.closed_around(self._task.table[row]):
             around = self._task.index_of.get(container)
             if around is None or not self._open_row(around):
@@ -158,7 +158,7 @@ class PlanSampler:
         return bool(asset.interiors if relation is PlaceRelation.INSIDE else asset.supports)
 
     def _free_hand(self) -> bool:
-        """Put down what the hand holds, on any surface."""
+        """Put the held object on any surface."""
         if not self._world.carried:
             return True
         hosts = [row for row in self._rows if self._may_hold(row, PlaceRelation.ONTOP)]
@@ -188,7 +188,7 @@ class PlanSampler:
         )
 
     def _switch(self, skill: Skill) -> bool:
-        """Switch something that is not so yet; for the switching off, after switching it on when nothing is on."""
+        """Switch an object. Before switching off, switch one on if none is on."""
         able = [row for row in self._rows if self._world.asset(self._task.table[row]).can("toggleable")]
         wanted = skill is Skill.TOGGLE_ON
         ready = [row for row in able if self._world.is_on(self._task.table[row]) is not wanted]
@@ -199,14 +199,14 @@ class PlanSampler:
         )
 
     def _work(self, skill: Skill) -> bool:
-        """Heat, cook or freeze: what lies at a source already, or a thing that is taken there."""
+        """Heat, cook or freeze an object that is at a source already, or bring one there."""
         pairs = work_pairs(self._world, self._task, skill)
         order = self._rng.permutation(len(pairs)).tolist()[:TRIES]
         chosen = sorted((pairs[number] for number in order), key=lambda pair: not self._is_at(*pair))
         return any(self._work_at(skill, food, source) for food, source in chosen)
 
     def _work_at(self, skill: Skill, food: int, source: int) -> bool:
-        """Whatever this skill still needs: a way in, the food in it, the door shut, the switch on."""
+        """Provide missing conditions: access, the food at the source, a closed door, the switch on. Then wait."""
         name = self._task.table[source]
         asset = self._world.asset(name)
         found = cold_source(asset) if skill is Skill.FREEZE else heat_source(asset)
@@ -237,7 +237,7 @@ class PlanSampler:
         return self._world.is_open(self._task.table[row])
 
     def _some(self, rows: Sequence[int]) -> list[int]:
-        """A few of them in random order."""
+        """Draw a few rows in random order."""
         return [rows[number] for number in self._rng.permutation(len(rows)).tolist()[:TRIES]]
 
     def _draw(self, count: int) -> int:
@@ -251,15 +251,15 @@ class PlanSampler:
 
 
 def work_pairs(world: LiveWorld, task: Task, skill: Skill) -> list[tuple[int, int]]:
-    """Rows of things that can be heated, cooked or frozen, each with every source of the table."""
+    """Return the rows of objects that can be heated, cooked or frozen, each with every source of the table."""
     source_of = cold_source if skill is Skill.FREEZE else heat_source
     sources = [row for row, name in enumerate(task.table) if source_of(world.asset(name)) is not None]
-    things = [
+    foods = [
         row
         for row, name in enumerate(task.table)
         if world.asset(name).can(ABILITY[skill]) and not world.is_fixed(name)
     ]
-    return [(thing, source) for thing in things for source in sources if thing != source]
+    return [(food, source) for food in foods for source in sources if food != source]
 
 
 ROUTINES: Final[Mapping[Skill, Callable[[PlanSampler, Skill], bool]]] = {
@@ -277,4 +277,4 @@ ROUTINES: Final[Mapping[Skill, Callable[[PlanSampler, Skill], bool]]] = {
     Skill.FREEZE: PlanSampler._work,
     Skill.GO_TO_ROOM: PlanSampler._drive,
 }
-"""How a call of each skill of the paper is found."""
+"""Routine that draws a call of each skill of the paper."""

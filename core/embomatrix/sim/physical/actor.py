@@ -1,8 +1,7 @@
-"""The physical mode: every skill is carried out by a robot in a world where time passes.
+"""Physical execution mode: a robot carries out every skill in a world where time passes.
 
-Preconditions, relations and effects are those of cached mode, read in the same planning scene. What differs is how an
-outcome comes about: the robot drives, reaches, touches, lifts and lets go, and physics says what became of it. A skill that
-fails leaves what it did.
+Preconditions, relations and effects are those of cached mode, read in the same planning scene. The robot drives, reaches,
+touches, lifts and lets go, and physics decides the outcome. A failed skill leaves the changes that it made.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from embomatrix.sim.actions import ACTIONS
 from embomatrix.sim.blockers import path_refusal, room_refusal
 from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.physical.doors import close_all, open_all
-from embomatrix.sim.physical.hands import pick_up
+from embomatrix.sim.physical.pick import pick_up
 from embomatrix.sim.physical.place import place
 from embomatrix.sim.physical.press import press
 from embomatrix.sim.physical.stage import PhysicalStage
@@ -40,37 +39,37 @@ if TYPE_CHECKING:
 
 
 def physical_simulator(bundle: Bundle) -> Simulator:
-    """A simulator that executes plans physically. Raises EngineError when the scene can't be loaded."""
+    """Return a simulator that executes plans physically. Raises EngineError when the scene can't be loaded."""
     return load_simulator(bundle, actor=PhysicalActor(bundle))
 
 
 class PhysicalActor:
-    """Carries out calls with the robot in a dynamic world of its own."""
+    """Actor that carries out calls with the robot in a dedicated dynamic world."""
 
     drawing = frozenset(Skill)
 
     def __init__(self, bundle: Bundle, dynamic: DynamicWorld | None = None) -> None:
-        """Take a physics client, or the world that is given; it is built when a rollout begins, and closed with the actor."""
+        """Use the given dynamic world, or create one. It is built at the first reset and closed with the actor."""
         self._dynamic = dynamic if dynamic is not None else DynamicWorld(bundle.scene)
         self._stage: PhysicalStage | None = None
         self._watch: Callable[[], None] | None = None
 
     @property
     def dynamic(self) -> DynamicWorld:
-        """The world in which time passes, for reading."""
+        """The dynamic world, for reading."""
         return self._dynamic
 
     def watch(self, watch: Callable[[], None] | None) -> None:
-        """Call something after every few steps of simulated time, or nothing any more."""
+        """Register a function to call after every few steps of simulated time; None removes it."""
         self._watch = watch
 
     def reset(self, world: LiveWorld) -> None:
-        """Build the dynamic world as the scene is at its start."""
+        """Build the dynamic world in the initial state of the scene."""
         self._stage = PhysicalStage(world, self._dynamic, self._tick)
         self._stage.begin()
 
     def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-        """Carry out a call whose preconditions hold, let the world settle, and copy what moved."""
+        """Carry out a call whose preconditions hold, let the world settle, and copy moved objects to the planning scene."""
         assert self._stage is not None
         refusal = MOTIONS[call.skill](self._stage, call, rng)
         self._stage.settle()
@@ -95,26 +94,26 @@ def _move(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> Sk
 
 
 def _turn(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-    heading, told = _heading(stage, call), stage.told
+    heading, here = _heading(stage, call), stage.commanded
     refusal = drive(stage, stage.mover.posture[None, :2], heading)
-    stage.told = StandPose(told.x_m, told.y_m, heading)
+    stage.commanded = StandPose(here.x_m, here.y_m, heading)
     return refusal
 
 
 def _move_forward(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     heading, distance_m = _heading(stage, call), call.distance or 0.0
     course = heading if distance_m >= 0 else heading + math.pi
-    told = stage.told
-    free_m = stage.world.navigator.forward(told, course, abs(distance_m))
+    start = stage.commanded
+    free_m = stage.world.navigator.forward(start, course, abs(distance_m))
     if free_m < abs(distance_m):
         return refuse(FailureReason.BLOCKED, distance=metres(free_m))
     here = stage.mover.posture[:2]
-    x, y = told.x_m + abs(distance_m) * math.cos(course), told.y_m + abs(distance_m) * math.sin(course)
+    x, y = start.x_m + abs(distance_m) * math.cos(course), start.y_m + abs(distance_m) * math.sin(course)
     return drive(stage, here[None], heading) or drive(stage, np.array([here, (x, y)]), heading)
 
 
 def _heading(stage: PhysicalStage, call: SkillCall) -> float:
-    return math.remainder(stage.told.yaw + math.remainder(call.yaw or 0.0, math.tau), math.tau)
+    return math.remainder(stage.commanded.yaw + math.remainder(call.yaw or 0.0, math.tau), math.tau)
 
 
 def _go_to_room(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
@@ -125,30 +124,13 @@ def _go_to_room(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator)
     return travel(stage, entry)
 
 
-def _pick_up(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-    return pick_up(stage, target_of(stage.world, call))
-
-
-def _place(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-    assert call.relation is not None
-    return place(stage, target_of(stage.world, call), call.relation, rng)
-
-
-def _open(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-    return open_all(stage, target_of(stage.world, call))
-
-
-def _close(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-    return close_all(stage, target_of(stage.world, call))
-
-
 def _toggle(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-    """Press the switch; what that means is the same as in cached mode."""
+    """Press the switch. The effect is that of cached mode."""
     return press(stage, target_of(stage.world, call)) or ACTIONS[call.skill](stage.world, call, rng)
 
 
 def _work(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-    """Touch what is cut, wiped or wetted; what that does to it is the same as in cached mode."""
+    """Touch the object that is cut, wiped or wetted. The effect is that of cached mode."""
     world = stage.world
     target = target_of(world, call)
     touched = source_of(world, call) if target in world.carried else target
@@ -161,7 +143,7 @@ def _work(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> Sk
 
 
 def _wait(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-    """The source acts by itself; the world only settles."""
+    """Let the world settle. The source acts by itself."""
     stage.mover.wait(60)
     return None
 
@@ -169,11 +151,11 @@ def _wait(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> Sk
 MOTIONS: Final[Mapping[Skill, Motion]] = {
     Skill.MOVE: _move,
     Skill.TURN: _turn,
-    Skill.PICK_UP: _pick_up,
-    Skill.PLACE: _place,
+    Skill.PICK_UP: lambda stage, call, rng: pick_up(stage, target_of(stage.world, call)),
+    Skill.PLACE: lambda stage, call, rng: place(stage, call, rng),
     Skill.MOVE_FORWARD: _move_forward,
-    Skill.OPEN: _open,
-    Skill.CLOSE: _close,
+    Skill.OPEN: lambda stage, call, rng: open_all(stage, target_of(stage.world, call)),
+    Skill.CLOSE: lambda stage, call, rng: close_all(stage, target_of(stage.world, call)),
     Skill.TOGGLE_ON: _toggle,
     Skill.TOGGLE_OFF: _toggle,
     Skill.HEAT: _wait,
@@ -184,4 +166,4 @@ MOTIONS: Final[Mapping[Skill, Motion]] = {
     Skill.CLEAN: _work,
     Skill.SOAK: _work,
 }
-"""One motion for each skill."""
+"""Motion of each skill."""

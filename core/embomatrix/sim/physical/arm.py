@@ -1,8 +1,8 @@
-"""Kinematics of the robot's arm in closed form, for many poses at once: no physics engine, no iteration.
+"""Closed-form kinematics of the robot's arm for many poses at once, without a physics engine and without iteration.
 
-The arm is a Franka Panda: a spherical shoulder, an elbow with two equal offsets, and a wrist whose last axis is offset. With
-the angle of the last joint given, the six others follow geometrically; He and Liu, "Analytical inverse kinematics for
-Franka Emika Panda", 2021, solve it in the same way. Lengths are those of the installed ``pybullet_data`` package's URDF.
+The arm is a Franka Panda: a spherical shoulder, an elbow with two equal offsets, and a wrist with an offset last axis. With
+the angle of the last joint given, the six others follow geometrically, as in He and Liu, "Analytical inverse kinematics for
+Franka Emika Panda", 2021. Lengths are those of the URDF in the installed ``pybullet_data`` package.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 JOINTS: Final = 7
 LOW_RAD: Final = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
 HIGH_RAD: Final = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
-"""The arm's soft limits: its controller stops before the hard ones."""
+"""Soft joint limits: the controller stops before the hard ones."""
 SHOULDER_M: Final = 0.333
 UPPER_M: Final = 0.316
 FOREARM_M: Final = 0.384
@@ -26,9 +26,9 @@ ELBOW_M: Final = 0.0825
 WRIST_M: Final = 0.088
 FLANGE_M: Final = 0.107
 TOOL_M: Final = 0.1122
-"""From the flange to the fingertips' ends: the point by which the hand touches things."""
+"""Distance from the flange to the ends of the fingertips, the contact point of the hand."""
 HAND_TURN: Final = -math.pi / 4
-"""The hand is mounted askew on the flange."""
+"""Angle by which the hand is mounted on the flange."""
 BRANCHES: Final = 4
 """Solutions for one pose and one angle of the last joint: two of the wrist times two of the shoulder."""
 _UPPER = np.array([ELBOW_M, UPPER_M])
@@ -40,10 +40,10 @@ _ALONG, _SWAY = math.hypot(_P, _Q), math.atan2(_Q, _P)
 
 
 def frames(joints: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Frames of the seven links and of the tool, in the frame of the arm's mount.
+    """Return the frames of the seven links and of the tool, in the frame of the arm's mount.
 
-    joints: (n, 7). Returns rotations (n, 8, 3, 3) and positions (n, 8, 3); index 7 is the tool, at the fingertips' end with
-    z out of the hand and y along the fingers' travel.
+    joints: (n, 7). Returns rotations (n, 8, 3, 3) and positions (n, 8, 3). Index 7 is the tool at the fingertips, with z out of
+    the hand and y along the travel of the fingers.
     """
     rotation, position = np.empty((len(joints), 8, 3, 3)), np.empty((len(joints), 8, 3))
     sines, cosines = np.sin(joints.T), np.cos(joints.T)
@@ -70,7 +70,7 @@ def frames(joints: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def solve(rotation: FloatArray, position: FloatArray, last: FloatArray) -> FloatArray:
-    """Joint angles that bring the tool to poses in the mount's frame, shape (n, 4, 7); NaN where a branch has none.
+    """Return joint angles that bring the tool to poses in the mount's frame, shape (n, 4, 7); NaN for branches without one.
 
     rotation: (n, 3, 3), position: (n, 3), last: (n,) angles of the last joint. Angles keep the soft limits.
     """
@@ -85,10 +85,10 @@ def solve(rotation: FloatArray, position: FloatArray, last: FloatArray) -> Float
 
 
 def _branches(six: FloatArray, back: FloatArray, last: FloatArray) -> FloatArray:
-    """All seven angles of every branch, shape (n, 4, 7), whatever the joints' limits.
+    """Return all seven angles of every branch, shape (n, 4, 7), without regard to joint limits.
 
-    six: axes of the frame after joint 6, (3 axes, 3, n); back: from the wrist to the shoulder, (3, n). Vectors lie along the
-    first axis here and branches of the wrist along the second: (3, 2, n).
+    six: axes of the frame after joint 6, (3 axes, 3, n); back: vector from wrist to shoulder, (3, n). Vectors lie along
+    the first axis and wrist branches along the second: (3, 2, n).
     """
     length = np.sqrt(_dot(back, back))
     bend = _SWAY - np.arccos((length**2 - _UPPER @ _UPPER - _FORE @ _FORE) / (2 * _ALONG))  # joint 4
@@ -97,7 +97,7 @@ def _branches(six: FloatArray, back: FloatArray, last: FloatArray) -> FloatArray
     out_z = UPPER_M - ELBOW_M * s + FOREARM_M * c
     cosine = (
         s * out_x - c * out_z
-    )  # between the forearm's axis and the way back to the shoulder, times the length
+    )  # between the forearm's axis and the vector back to the shoulder, times its length
     ahead, aside = _dot(six[0], back), _dot(six[1], back)
     q6 = np.arctan2(ahead, aside) + _WRIST_SIGNS * np.arccos(cosine / np.hypot(ahead, aside))
     q6 = np.remainder(q6 + math.pi / 2, math.tau) - math.pi / 2  # the joint's travel starts at about zero
@@ -114,7 +114,7 @@ def _branches(six: FloatArray, back: FloatArray, last: FloatArray) -> FloatArray
     angles = np.empty((len(last), BRANCHES, JOINTS))
     for number, sign in enumerate((1.0, -1.0)):
         q1, q2 = np.arctan2(sign * z3[1], sign * z3[0]), sign * tilt
-        # The third angle is what the first two leave: exact with the upper arm upright too, where they are arbitrary.
+        # The third angle follows from the first two. This is exact for an upright upper arm too, where those are arbitrary.
         s1, c1 = np.sin(q1), np.cos(q1)
         q3 = np.arctan2(c1 * x3[1] - s1 * x3[0], np.cos(q2) * (c1 * x3[0] + s1 * x3[1]) - np.sin(q2) * x3[2])
         for joint, column in enumerate((q1, q2, q3, bend, q5, q6, last)):
@@ -123,12 +123,12 @@ def _branches(six: FloatArray, back: FloatArray, last: FloatArray) -> FloatArray
 
 
 def _dot(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Inner products of vectors that lie along the first axis: written out, as these arrays are small."""
+    """Inner products of vectors along the first axis, written out because these arrays are small."""
     return np.asarray(one[0] * other[0] + one[1] * other[1] + one[2] * other[2])
 
 
 def _cross(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Cross products of vectors that lie along the first axis."""
+    """Cross products of vectors along the first axis."""
     return np.stack(
         (
             one[1] * other[2] - one[2] * other[1],
@@ -149,7 +149,7 @@ def _about_z_then_tilted(angles: FloatArray) -> FloatArray:
 
 
 def strain(angles: FloatArray) -> FloatArray:
-    """How far joints, (n, 7), are from the middle of their travel, (n,)."""
+    """Distance of joints, (n, 7), from the middle of their travel, (n,), in units without dimension."""
     middle, half = (HIGH_RAD + LOW_RAD) / 2, (HIGH_RAD - LOW_RAD) / 2
     return np.asarray((((angles - middle) / half) ** 4).sum(axis=1))
 
@@ -173,4 +173,4 @@ _CHAIN: Final = (
     (0.0, 0.0, 0.0, 1),
     (WRIST_M, 0.0, 0.0, 1),
 )
-"""Where each joint sits on the link before it, x, y, z, and by how many right angles about x its axis is tilted against it."""
+"""Offset x, y, z of each joint on the link before it, and the tilt of its axis about x in right angles."""

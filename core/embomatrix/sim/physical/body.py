@@ -1,6 +1,6 @@
-"""The robot's body as balls: where its links are for many postures at once, to see what is free without asking physics.
+"""Ball model of the robot: positions of its links for many postures at once, for collision checks without physics.
 
-A posture is a row of eleven numbers: the base's x, y and heading, the lift's height, and the arm's seven angles.
+A posture is a row of eleven numbers: x, y and heading of the base, height of the lift, and the arm's seven angles.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     BoolArray = NDArray[np.bool_]
 
-AIR_M: Final = 0.01
+CLEARANCE_M: Final = 0.01
 """Distance that the arm keeps from the robot's own trunk."""
 NUMBERS: Final = 4 + arm.JOINTS
 X, Y, YAW, LIFT, ARM = 0, 1, 2, 3, slice(4, None)
@@ -63,34 +63,34 @@ _BALLS: Final = (
         ),
     ),
 )
-"""Balls (x, y, z, radius) in the frames of the arm's links: a cover of the collision meshes."""
+"""Balls (x, y, z, radius) in the frames of the arm's links, which cover the collision meshes."""
 _LINK: Final = np.array([link for link, balls in _BALLS for _ in balls])
 _CENTRE: Final = np.array([ball[:3] for _, balls in _BALLS for ball in balls])
 RADII: Final = np.array([ball[3] for _, balls in _BALLS for ball in balls])
 """Radius of each ball of the arm."""
 HAND_BALLS: Final = _LINK == 7
-"""Which of them are the hand's."""
+"""Mask of the balls of the hand."""
 _SWINGING: Final = _LINK >= 1
-"""Balls that can come to base and mast."""
+"""Mask of the balls that can touch the base or the mast."""
 _MOVING: Final = _LINK[_SWINGING] >= 3
-"""Which of these can come to the arm's own foot and shoulder too."""
+"""Mask, within the swinging balls, of those that can touch the arm's own foot and shoulder too."""
 _MOUNT: Final = np.array(MOUNT_AXES)
 _FOOT_LOW: Final = np.array([-0.154, -0.095, MAST_X_M - MOUNT_X_M])
 _FOOT_HIGH: Final = np.array([0.072, 0.095, 0.14])
-"""The arm's foot with the carriage behind it, in the mount's frame."""
+"""Corners of the box around the arm's foot and the carriage, in the mount's frame."""
 _MAST_LOW: Final = np.array([MAST_X_M - MAST_SIZE_M[0] / 2, -MAST_SIZE_M[1] / 2, 0.0])
 _MAST_HIGH: Final = np.array([MAST_X_M + MAST_SIZE_M[0] / 2, MAST_SIZE_M[1] / 2, MAST_TOP_M])
 _STUB_M: Final = 0.055
 """Radius of the arm between its foot and its shoulder."""
 
 _STAGE_BALLS: Final = 4
-"""Pairs of balls at the top of the mast's inner stage, as far as it rises."""
+"""Pairs of balls at the top of the mast's inner stage."""
 
 
 def _trunk() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Balls of base, mast, carriage and foot, the lift down: centres (k, 3) and radii (k,).
+    """Return the balls of base, mast, carriage and foot with the lift down: centres (k, 3) and radii (k,).
 
-    With them the share of the lift's height by which each rises, (k,).
+    The third array, (k,), is the share of the lift's height by which each ball rises.
     """
     thick = (BASE_TOP_M - GROUND_M) / 2
     ring = np.arange(10) * math.tau / 10
@@ -111,7 +111,7 @@ _TRUNK, _TRUNK_RADII, _RISES = _trunk()
 
 
 def mounts(postures: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Frames of the arm's mount in the world: rotations (n, 3, 3) and positions (n, 3)."""
+    """Return the frames of the arm's mount in the world: rotations (n, 3, 3) and positions (n, 3)."""
     turn = arm.about_z(postures[:, YAW] + ASKEW_RAD)
     place = turn[:, :, 0] * MOUNT_X_M
     place = place + np.stack([postures[:, X], postures[:, Y], postures[:, LIFT] + SHOULDER_LOW_M], axis=1)
@@ -119,14 +119,14 @@ def mounts(postures: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def tools(postures: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Frames of the tool in the world: rotations (n, 3, 3) and positions (n, 3)."""
+    """Return the frames of the tool in the world: rotations (n, 3, 3) and positions (n, 3)."""
     turn, place = mounts(postures)
     rotation, position = arm.frames(postures[:, ARM])
     return turn @ rotation[:, 7], place + np.einsum("nij,nj->ni", turn, position[:, 7])
 
 
 def balls(postures: FloatArray) -> FloatArray:
-    """Centres of the arm's balls in the world, (n, balls, 3); radii are ``RADII``."""
+    """Return the centres of the arm's balls in the world, (n, balls, 3). Their radii are ``RADII``."""
     turn, place = mounts(postures)
     rotation, position = arm.frames(postures[:, ARM])
     axes = rotation[:, _LINK]  # (n, balls, 3, 3)
@@ -137,26 +137,26 @@ def balls(postures: FloatArray) -> FloatArray:
 
 
 def forearm_balls(postures: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Centres (n, balls, 3) and radii (balls,) of the arm without its hand: what must not meet what the hand works at."""
+    """Return centres (n, balls, 3) and radii (balls,) of the arm without its hand."""
     return balls(postures)[:, ~HAND_BALLS], RADII[~HAND_BALLS]
 
 
 def trunk_balls(postures: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Centres (n, balls, 3) and radii (balls,) of the base, the mast, the carriage and the arm's foot."""
+    """Return centres (n, balls, 3) and radii (balls,) of the base, the mast, the carriage and the arm's foot."""
     centres = np.einsum("nij,bj->nbi", arm.about_z(postures[:, YAW] + ASKEW_RAD), _TRUNK)
     centres[:, :, :2] += postures[:, None, :2]
     centres[:, :, 2] += postures[:, LIFT, None] * _RISES
     return centres, _TRUNK_RADII
 
 
-def strikes_itself(postures: FloatArray, points: FloatArray, radii: FloatArray) -> BoolArray:
-    """Whether arm, hand or what it holds touch the robot's own base, mast or carriage, or the arm's foot, shape (n,).
+def self_collides(postures: FloatArray, points: FloatArray, radii: FloatArray) -> BoolArray:
+    """Return a mask, (n,), of postures in which arm, hand or load touch the robot's own trunk or the arm's foot.
 
-    points: (n, balls + k, 3), the arm's ``balls`` and then those of what the hand holds; radii: (balls + k,).
+    points: (n, balls + k, 3), the arm's ``balls`` and then those of the load; radii: (balls + k,).
     """
     loads = np.ones(len(radii) - len(RADII), dtype=np.bool_)
     swinging = np.concatenate([_SWINGING, loads])
-    points, sizes = points[:, swinging], radii[swinging] + AIR_M
+    points, sizes = points[:, swinging], radii[swinging] + CLEARANCE_M
     moving = np.concatenate([_MOVING, loads])
     turn, place = mounts(postures)
     seen = (points - place[:, None]) @ turn  # in the mount's frame
@@ -184,7 +184,7 @@ def _outside(points: FloatArray, low: FloatArray, high: FloatArray) -> FloatArra
 def solve(
     rotation: FloatArray, position: FloatArray, bases: FloatArray, lifts: FloatArray, last: FloatArray
 ) -> FloatArray:
-    """Postures that bring the tool to poses in the world, (n, 4, 11), NaN where there is none.
+    """Return postures that bring the tool to poses in the world, (n, 4, 11), NaN for branches without one.
 
     rotation: (n, 3, 3), position: (n, 3), bases: (n, 3) x, y, heading; lifts: (n,); last: (n,) angles of the last joint.
     """

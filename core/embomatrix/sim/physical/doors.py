@@ -1,4 +1,4 @@
-"""Doors, drawers and lids: the hand takes the free edge and leads it along its arc, or pushes it from within."""
+"""Doors, drawers and lids: the hand takes the free edge of a panel and pulls it along its arc, or pushes it from within."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ import numpy as np
 from embomatrix.sim.actions import other_stands
 from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion
 from embomatrix.sim.physical import body
-from embomatrix.sim.physical.fold import WAYS, approach, fold, unfold
+from embomatrix.sim.physical.fold import PATHS_TRIED, approach, fold, unfold
 from embomatrix.sim.physical.grasp import cross, facing
-from embomatrix.sim.physical.hands import GENTLE, TOUCH_M
-from embomatrix.sim.physical.reach import JUMP_RAD, ArmReach, Track
+from embomatrix.sim.physical.pick import GENTLE_PACE, TOUCH_M
+from embomatrix.sim.physical.reach import JUMP_RAD, ArmReach, ToolPath
 from embomatrix.sim.physical.reach import TOUCH_M as PRESS_M
-from embomatrix.sim.physical.space import Boxes, boxes_of, part_boxes, struck
+from embomatrix.sim.physical.space import Boxes, boxes_of, collides, part_boxes
 from embomatrix.sim.physical.stage import compact
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.skills.failure import FailureReason
@@ -32,43 +32,43 @@ from embomatrix.world.state import OPEN_FRACTION
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from embomatrix.sim.physical.reach import Way
+    from embomatrix.sim.physical.reach import ArmPath
     from embomatrix.sim.physical.stage import PhysicalStage
     from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.asset import Asset, Joint, Link
     from embomatrix.world.geometry import FloatArray
 
 EDGE: Final = 0.88
-"""The hand takes a leaf at this share of the way from its hinge to its free edge."""
+"""Grip point on a hinged panel, as a share of the distance from its hinge to its free edge."""
 ALONG: Final = (0.0, 0.5, -0.5, 0.85)
-"""Where along the edge, as shares of its half length."""
+"""Grip points along the edge, as shares of its half length."""
 FOLLOWED: Final = (1.0, 0.5, 0.0)
-"""Shares of the leaf's turn that the hand turns along."""
+"""Shares of the panel's rotation that the hand follows."""
 TILTS: Final = (0.0, 40.0, -40.0)
-"""Degrees by which the hand comes from above, or from below."""
+"""Angles, in degrees, from which the hand comes: level, from above, from below."""
 OFF_M: Final = 0.08
 LEAST_OFF: Final = 0.3
-"""Where the ways back and off a leaf are nearly opposite, so that their sum is shorter, the hand goes back."""
-PULL: Final = 0.4
-"""Share of full speed at which a leaf is led."""
+"""If the directions back and off a panel are nearly opposite, so that their sum is shorter than this, the hand goes back."""
+PULL_PACE: Final = 0.4
+"""Share of full speed at which the hand moves a panel."""
 WAYPOINTS: Final = 7
 OVER: Final = 0.5
-"""The hand goes on for this share of a waypoint's step, as leaf and arm give way a little."""
+"""Share of a waypoint step by which the hand overshoots, because panel and arm yield a little."""
 AJAR: Final = 0.2
-"""A leaf that is open by more can be taken from within."""
+"""A panel that is open by more than this share can be gripped from within."""
 ENOUGH: Final = 0.5
-"""A door that something stops before this share of its travel is not open: the same as in cached mode."""
+"""A door that stops before this share of its travel is not open, as in cached mode."""
 SHUT: Final = OPEN_FRACTION
 STRETCHES: Final = (1, 2, 4)
-"""Into how many pulls the way is divided, with steps between them."""
+"""Numbers of pulls into which a motion is divided. The robot repositions itself between pulls."""
 ELSEWHERE: Final = 1
-"""Other standing poses that the robot tries a leaf from: there it finds other places to work."""
+"""Other standing poses from which the robot tries to move a panel."""
 FAR_M: Final = 1.7
-"""So far the base may go to lead a leaf."""
+"""Longest distance that the base may drive to move a panel."""
 
 
 class GraspSpot(Enum):
-    """Where the hand takes a hinged leaf: on the face that looks out when it is shut, on the other, or at its free edge."""
+    """Grip spot on a hinged panel: the face that looks out when it is shut, the inner face, or the free edge."""
 
     OUTSIDE = "outside"
     WITHIN = "within"
@@ -76,8 +76,8 @@ class GraspSpot(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Leaf:
-    """One door, drawer or lid of an object: which joint moves it, and where the hand takes it."""
+class DoorPanel:
+    """One door, drawer or lid of an object, with its joint. A part of the object `name`."""
 
     name: str
     number: int
@@ -86,23 +86,23 @@ class Leaf:
     asset: Asset
     pose: Pose
     box: Aabb
-    """Around its parts, in the asset's frame with the joint at zero."""
+    """Box around the panel's parts, in the asset's frame with the joint at zero."""
 
     @property
     def height_m(self) -> float:
-        """Height of its middle above the floor with the joint at zero, to the centimetre: leaves of one row are equal."""
+        """Height of the panel's centre above the floor with the joint at zero. Centimetres make panels of one row equal."""
         box = Aabb.around(part.aabb(self.pose) for part in self.link.parts)
         return round(box.center_m[2], 2)
 
     def at(self, fraction: float) -> Aabb:
-        """Around its parts in the world, at a share of its travel."""
+        """Box around the panel in the world at a share of its travel."""
         frame = self.pose @ joint_motion(self.joint, fraction)
         return Aabb.around(part.aabb(frame) for part in self.link.parts)
 
     def grips(
         self, fraction: float, along: float, spot: GraspSpot
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Point on the leaf in the world at a share of its travel, the way out of its surface there, and the edge's line."""
+        """Return grip point, outward surface normal and edge direction in the world at a share of the travel."""
         centre, half = np.array(self.box.center_m), np.array(self.box.size_m) / 2
         axis = np.array(self.joint.axis)
         if self.joint.kind is JointKind.PRISMATIC:
@@ -127,12 +127,12 @@ class Leaf:
         return np.array(frame.apply((point[0], point[1], point[2]))), turn @ out, turn @ edge
 
 
-def leaves_of(stage: PhysicalStage, name: str) -> list[Leaf]:
-    """The moving leaves of an object, in the order of its joints."""
+def panels_of(stage: PhysicalStage, name: str) -> list[DoorPanel]:
+    """Return the moving panels of an object, in the order of its joints."""
     asset, pose = stage.world.asset(name), stage.world.engine.pose(name)
     moving = [link for link in asset.links if link.joint is not None]
     return [
-        Leaf(
+        DoorPanel(
             name,
             number,
             link,
@@ -147,153 +147,155 @@ def leaves_of(stage: PhysicalStage, name: str) -> list[Leaf]:
 
 
 def open_all(stage: PhysicalStage, name: str) -> SkillRefusal | None:
-    """Open every leaf, the low ones first. It fails, and leaves what it did, when one does not get half open."""
-    return _lead_all(stage, name, 1.0)
+    """Open every panel, the low ones first. Fails, and leaves its changes, if one does not get half open."""
+    return _move_all(stage, name, 1.0)
 
 
 def close_all(stage: PhysicalStage, name: str) -> SkillRefusal | None:
-    """Shut every leaf, the high ones first."""
-    return _lead_all(stage, name, 0.0)
+    """Shut every panel, the high ones first."""
+    return _move_all(stage, name, 0.0)
 
 
-def _lead_all(stage: PhysicalStage, name: str, goal: float) -> SkillRefusal | None:
+def _move_all(stage: PhysicalStage, name: str, goal: float) -> SkillRefusal | None:
     if not stage.dynamic.bodies.has_leaves(name):
         return refuse(FailureReason.ARM_BLOCKED, target=name, other=name)
-    home = stage.told
+    home = stage.commanded
     refusal = None
-    row = in_turn(stage, name, goal)
-    # Who leads a leaf may push one that is done: those have a second turn.
-    for leaf in (*row, *row):
-        if _is_done(stage.dynamic.bodies.joints(name)[leaf.number], goal):
+    row = panels_in_order(stage, name, goal)
+    # Moving one panel may push another that is done: such panels get a second turn.
+    for panel in (*row, *row):
+        if _is_done(stage.dynamic.bodies.joints(name)[panel.number], goal):
             continue
-        refusal = _lead_from_anywhere(stage, leaf, goal)
-        if _is_done(stage.dynamic.bodies.joints(name)[leaf.number], goal):
+        refusal = _move_from_anywhere(stage, panel, goal)
+        if _is_done(stage.dynamic.bodies.joints(name)[panel.number], goal):
             refusal = None
         elif refusal is None:
             refusal = refuse(FailureReason.DOOR_BLOCKED, target=name, other=SOMETHING)
         if refusal is not None:
             break
-    # Where the robot ends up does not undo what became of the door.
+    # The refusal of this drive does not matter: the door's result stands.
     fold(stage, stage.world.navigator.step_aside(name, home), name)
     return refusal
 
 
-def in_turn(stage: PhysicalStage, name: str, goal: float) -> list[Leaf]:
-    """The leaves of an object in the order in which they are led: to open it the low ones first, to shut it the high ones."""
-    return sorted(leaves_of(stage, name), key=lambda leaf: leaf.height_m, reverse=not goal)
+def panels_in_order(stage: PhysicalStage, name: str, goal: float) -> list[DoorPanel]:
+    """Return the panels of an object in the order of motion: low ones first to open, high ones first to shut."""
+    return sorted(panels_of(stage, name), key=lambda panel: panel.height_m, reverse=not goal)
 
 
 def _is_done(reached: float, goal: float) -> bool:
-    """Whether a leaf is open, or shut, as far as cached mode asks."""
+    """True if a panel is open, or shut, by the standard of cached mode."""
     return reached >= ENOUGH if goal else reached <= SHUT
 
 
-def _lead_from_anywhere(stage: PhysicalStage, leaf: Leaf, goal: float) -> SkillRefusal | None:
-    """Move one leaf to a share of its travel from here, else from where else its object is served."""
-    refusal = _lead(stage, leaf, goal)
+def _move_from_anywhere(stage: PhysicalStage, panel: DoorPanel, goal: float) -> SkillRefusal | None:
+    """Move one panel to a share of its travel from here, else from other standing poses."""
+    refusal = _move_panel(stage, panel, goal)
     if refusal is not None:
-        for stand in itertools.islice(other_stands(stage.world, leaf.name), ELSEWHERE):
-            refusal = fold(stage, stand, leaf.name) or _lead(stage, leaf, goal)
+        for stand in itertools.islice(other_stands(stage.world, panel.name), ELSEWHERE):
+            refusal = fold(stage, stand, panel.name) or _move_panel(stage, panel, goal)
             if refusal is None:
                 break
     return refusal
 
 
-def _lead(stage: PhysicalStage, leaf: Leaf, goal: float) -> SkillRefusal | None:
-    """Move one leaf to a share of its travel: in one stretch, else in ever more of them with steps between.
+def _move_panel(stage: PhysicalStage, panel: DoorPanel, goal: float) -> SkillRefusal | None:
+    """Move one panel to a share of its travel in one pull, else in more and more pulls with steps between them.
 
-    Where it is open, or shut, far enough by then it stays: who tries for the rest may push it back.
+    A panel that is open, or shut, far enough stays there: another attempt may push it back.
     """
     refusal: SkillRefusal | None = None
     for stretches in STRETCHES:
-        start = stage.dynamic.bodies.joints(leaf.name)[leaf.number]
+        start = stage.dynamic.bodies.joints(panel.name)[panel.number]
         for number in range(stretches):
-            now = stage.dynamic.bodies.joints(leaf.name)[leaf.number]
+            now = stage.dynamic.bodies.joints(panel.name)[panel.number]
             aim = start + (number + 1) / stretches * (goal - start)
-            refusal = _stretch(stage, leaf, now, aim) if abs(aim - now) > SHUT else None
+            refusal = _stretch(stage, panel, now, aim) if abs(aim - now) > SHUT else None
             if refusal is not None:
                 break
-        if refusal is None or _is_done(stage.dynamic.bodies.joints(leaf.name)[leaf.number], goal):
+        if refusal is None or _is_done(stage.dynamic.bodies.joints(panel.name)[panel.number], goal):
             return None
     return refusal
 
 
-def _stretch(stage: PhysicalStage, leaf: Leaf, start: float, goal: float) -> SkillRefusal | None:
-    """Take the leaf where it is and lead it to a share of its travel."""
-    reach, ways = leading(stage, leaf, start, goal)
-    for way in itertools.islice(ways, WAYS):
-        _draw_in(stage, way)
-        swing = approach(stage, way, reach, loaded=False)
+def _stretch(stage: PhysicalStage, panel: DoorPanel, start: float, goal: float) -> SkillRefusal | None:
+    """Grip the panel at its present position and move it to a share of its travel."""
+    reach, paths = panel_paths(stage, panel, start, goal)
+    for path in itertools.islice(paths, PATHS_TRIED):
+        _draw_in(stage, path)
+        swing = approach(stage, path, reach, loaded=False)
         if swing is not None and unfold(stage, swing) is None:
-            return _pull(stage, way, leaf, goal)
-    return refuse(FailureReason.ARM_BLOCKED, target=leaf.name, other=reach.hindrance or SOMETHING)
+            return _pull(stage, path, panel, goal)
+    return refuse(FailureReason.ARM_BLOCKED, target=panel.name, other=reach.blocker or SOMETHING)
 
 
-def leading(stage: PhysicalStage, leaf: Leaf, start: float, goal: float) -> tuple[ArmReach, Iterator[Way]]:
-    """Free ways to lead a leaf from one share of its travel to another, and what judges them."""
+def panel_paths(
+    stage: PhysicalStage, panel: DoorPanel, start: float, goal: float
+) -> tuple[ArmReach, Iterator[ArmPath]]:
+    """Return free paths that move a panel from one share of its travel to another, and the reach that judges them."""
     boxes = stage.boxes()
     fractions = np.linspace(start, goal, WAYPOINTS)
-    moving = [_leaf_boxes(leaf, float(fraction)) for fraction in fractions]
-    fixed = boxes.without((leaf.name,)).joined(_body_boxes(stage, leaf))
+    moving = [_panel_boxes(panel, float(fraction)) for fraction in fractions]
+    fixed = boxes.without((panel.name,)).joined(_body_boxes(stage, panel))
     course = np.concatenate([[0, 0], np.arange(WAYPOINTS), [WAYPOINTS - 1]]).astype(int)
 
     def clear(postures: FloatArray) -> bool:
-        """Whether arm and trunk, but not the hand, keep clear of the leaf as it moves."""
+        """True if arm and trunk, without the hand, keep clear of the moving panel."""
         parts = (body.forearm_balls(postures), body.trunk_balls(postures))
         points = np.concatenate([centres for centres, _ in parts], axis=1)
         radii = np.concatenate([sizes for _, sizes in parts])
         return not any(
-            struck(moving[number], points[row : row + 1], radii, PRESS_M)[0]
+            collides(moving[number], points[row : row + 1], radii, PRESS_M)[0]
             for row, number in enumerate(course.tolist())
         )
 
     reach = ArmReach(boxes, fixed, None, clear)
-    tracks = _tracks(leaf, fractions)
-    first = next(tracks)
+    tool_paths = _tool_paths(panel, fractions)
+    first = next(tool_paths)
     bases = stage.bases(first.position[2], 0.75, walk_m=FAR_M)
     if goal > start:
-        # The others of the object will stand open too.
-        ends = [_leaf_boxes(other, goal) for other in leaves_of(stage, leaf.name)]
-        bases = stage.floor.cut_off_last(bases, functools.reduce(Boxes.joined, ends))
-    return reach, reach.ways(itertools.chain([first], tracks), bases)
+        # The other panels of the object will be open too.
+        ends = [_panel_boxes(other, goal) for other in panels_of(stage, panel.name)]
+        bases = stage.floor.with_cut_off_last(bases, functools.reduce(Boxes.joined, ends))
+    return reach, reach.paths(itertools.chain([first], tool_paths), bases)
 
 
-def _draw_in(stage: PhysicalStage, way: Way) -> None:
-    """Fold the arm where the last pull left it, before the base goes elsewhere: out it sweeps all that stands around."""
+def _draw_in(stage: PhysicalStage, path: ArmPath) -> None:
+    """Fold the arm before the base drives elsewhere: an arm left out after a pull sweeps over everything around."""
     now = stage.mover.posture
-    if math.dist(now[:2], way.postures[0, :2]) > 0.01 and not compact(stage, now):
+    if math.dist(now[:2], path.postures[0, :2]) > 0.01 and not compact(stage, now):
         fold(stage, StandPose(*now[:3].tolist()))
 
 
-def _pull(stage: PhysicalStage, way: Way, leaf: Leaf, goal: float) -> SkillRefusal | None:
-    """Touch the leaf, lead it along the way, let go and step back."""
-    # Not what stands in the furniture: bottles in a fridge rest until something comes to them, and awake they are dear.
-    stage.wake_around(leaf.at(stage.dynamic.bodies.joints(leaf.name)[leaf.number]))
-    touch = way.postures[1:3]
-    stage.mover.follow(touch, GENTLE, lambda: stage.dynamic.gap(leaf.name) < TOUCH_M)
-    if stage.dynamic.gap(leaf.name) > 3 * TOUCH_M:
-        return refuse(FailureReason.ARM_BLOCKED, target=leaf.name, other=SOMETHING)
-    stage.dynamic.hook(leaf.name, leaf.number)
-    hit = stage.mover.follow(way.postures[3:-1], PULL)
+def _pull(stage: PhysicalStage, path: ArmPath, panel: DoorPanel, goal: float) -> SkillRefusal | None:
+    """Touch the panel, move it along the path, let go and step back."""
+    # Contents stay asleep until something touches them: awake bottles in a fridge cost much time.
+    stage.wake_around(panel.at(stage.dynamic.bodies.joints(panel.name)[panel.number]))
+    touch = path.postures[1:3]
+    stage.mover.follow(touch, GENTLE_PACE, lambda: stage.dynamic.gap(panel.name) < TOUCH_M)
+    if stage.dynamic.gap(panel.name) > 3 * TOUCH_M:
+        return refuse(FailureReason.ARM_BLOCKED, target=panel.name, other=SOMETHING)
+    stage.dynamic.hook(panel.name, panel.number)
+    hit = stage.mover.follow(path.postures[3:-1], PULL_PACE)
     if hit is None and goal in (0.0, 1.0):
-        last = way.postures[-2]
-        stage.mover.follow((last + OVER * (last - way.postures[-3]))[None], PULL)
+        last = path.postures[-2]
+        stage.mover.follow((last + OVER * (last - path.postures[-3]))[None], PULL_PACE)
     stage.mover.wait(24)
     stage.dynamic.unhook()
-    stage.mover.follow(way.postures[-1:] if hit is None else _off(stage.mover.posture), 0.6)
+    stage.mover.follow(path.postures[-1:] if hit is None else _off(stage.mover.posture), 0.6)
     stage.dynamic.part()
     stage.mover.wait(4)
-    if stage.dynamic.hindrance() == leaf.name and not _pushes(way.postures[-2], way.postures[-3]):
-        _lean_off(stage, way, leaf)
-    reached = stage.dynamic.bodies.joints(leaf.name)[leaf.number]
+    if stage.dynamic.hindrance() == panel.name and not _pushes(path.postures[-2], path.postures[-3]):
+        _lean_off(stage, path, panel)
+    reached = stage.dynamic.bodies.joints(panel.name)[panel.number]
     stage.settle()
     if abs(reached - goal) > 0.12 and hit is not None:
-        return refuse(FailureReason.DOOR_BLOCKED, target=leaf.name, other=hit or SOMETHING)
+        return refuse(FailureReason.DOOR_BLOCKED, target=panel.name, other=hit or SOMETHING)
     return None
 
 
 def _off(posture: FloatArray) -> FloatArray:
-    """Where the hand goes off a leaf that is not led to its end: straight back, shape (1, 11); nowhere when the arm can't."""
+    """Return the posture, (1, 11), with the hand drawn straight back; the present posture if the arm can't."""
     now = posture[None]
     rotation, position = body.tools(now)
     back = position - OFF_M * rotation[:, :, 2]
@@ -303,25 +305,25 @@ def _off(posture: FloatArray) -> FloatArray:
 
 
 def _pushes(start: FloatArray, end: FloatArray) -> bool:
-    """Whether the hand goes where it points between two postures, each of shape (11,): back along a pull it shuts the leaf."""
+    """True if the hand moves in its pointing direction between two postures, each of shape (11,)."""
     rotation, position = body.tools(np.stack([start, end]))
     return bool((position[1] - position[0]) @ rotation[0, :, 2] > 0.0)
 
 
-def _lean_off(stage: PhysicalStage, way: Way, leaf: Leaf) -> None:
-    """Draw the arm back as it came, as far as it leans on the leaf and does not take the leaf along."""
-    let_go = stage.dynamic.bodies.joints(leaf.name)[leaf.number]
+def _lean_off(stage: PhysicalStage, path: ArmPath, panel: DoorPanel) -> None:
+    """Draw the arm back along its path until it no longer leans on the panel, unless it takes the panel along."""
+    let_go = stage.dynamic.bodies.joints(panel.name)[panel.number]
 
     def is_off() -> bool:
-        moved = abs(stage.dynamic.bodies.joints(leaf.name)[leaf.number] - let_go)
-        return moved > SHUT or stage.dynamic.hindrance() != leaf.name
+        moved = abs(stage.dynamic.bodies.joints(panel.name)[panel.number] - let_go)
+        return moved > SHUT or stage.dynamic.hindrance() != panel.name
 
-    stage.mover.follow(way.postures[-3:0:-1], 0.6, is_off)
+    stage.mover.follow(path.postures[-3:0:-1], 0.6, is_off)
 
 
-def _tracks(leaf: Leaf, fractions: FloatArray) -> Iterator[Track]:
-    """Ways of the tool: to the leaf, along its arc, and off it."""
-    if leaf.joint.kind is JointKind.PRISMATIC:
+def _tool_paths(panel: DoorPanel, fractions: FloatArray) -> Iterator[ToolPath]:
+    """Yield tool paths to the panel, along its arc, and off it."""
+    if panel.joint.kind is JointKind.PRISMATIC:
         spots: tuple[GraspSpot, ...] = (GraspSpot.OUTSIDE,)
     elif fractions[0] > AJAR:
         spots = (
@@ -331,20 +333,20 @@ def _tracks(leaf: Leaf, fractions: FloatArray) -> Iterator[Track]:
         )
     else:
         spots = (GraspSpot.OUTSIDE, GraspSpot.EDGE)
-    turns = FOLLOWED if leaf.joint.kind is JointKind.REVOLUTE else FOLLOWED[:1]
-    grips = functools.cache(leaf.grips)  # many ways go by the same points
+    turns = FOLLOWED if panel.joint.kind is JointKind.REVOLUTE else FOLLOWED[:1]
+    grips = functools.cache(panel.grips)  # many paths share points
     for spot, tilt, along, followed in itertools.product(spots, TILTS, ALONG, turns):
-        yield _track(grips, fractions, along, followed, spot, tilt)
+        yield _tool_path(grips, fractions, along, followed, spot, tilt)
 
 
-def _track(
+def _tool_path(
     grips: Callable[[float, float, GraspSpot], tuple[FloatArray, FloatArray, FloatArray]],
     fractions: FloatArray,
     along: float,
     followed: float,
     spot: GraspSpot,
     tilt: float,
-) -> Track:
+) -> ToolPath:
     down = np.array([0.0, 0.0, -math.sin(math.radians(tilt))])
     start = float(fractions[0])
     rotations, positions = [], []
@@ -356,7 +358,7 @@ def _track(
         rotations.append(facing(course, 0.0 if abs(edge[2]) < 0.5 else math.pi / 2, edge))
         positions.append(point)
     first, back = grips(start, along, spot)[1], -rotations[-1][:, 2]
-    # A hand that did not turn with a door lies along it in the end, and straight back it stays there; but never under a flap.
+    # A hand that did not turn with a door lies along it at the end, so it must leave sideways too, but never under a flap.
     last = back + grips(float(fractions[-1]), along, spot)[1] * (1.0, 1.0, 0.0)
     far = float(np.linalg.norm(last))
     last = last / far if far > LEAST_OFF else back
@@ -369,32 +371,32 @@ def _track(
     ]
     rotations = [rotations[0], rotations[0], *rotations, rotations[-1]]
     count = len(positions)
-    return Track(
+    return ToolPath(
         np.array(rotations), np.array(positions), np.zeros(count, dtype=bool), 2 + len(fractions) // 2
     )
 
 
-def _leaf_boxes(leaf: Leaf, fraction: float) -> Boxes:
-    frame = leaf.pose @ joint_motion(leaf.joint, fraction)
-    return boxes_of([(frame @ part.pose, part.size_m, leaf.name) for part in leaf.link.parts])
+def _panel_boxes(panel: DoorPanel, fraction: float) -> Boxes:
+    frame = panel.pose @ joint_motion(panel.joint, fraction)
+    return boxes_of([(frame @ part.pose, part.size_m, panel.name) for part in panel.link.parts])
 
 
-def _body_boxes(stage: PhysicalStage, leaf: Leaf) -> Boxes:
-    """The object's parts but those of the leaf."""
-    fractions = stage.world.engine.joints(leaf.name)
-    parts = part_boxes(leaf.asset, leaf.pose, fractions)
-    owners = [link for link in leaf.asset.links for _ in link.parts]
+def _body_boxes(stage: PhysicalStage, panel: DoorPanel) -> Boxes:
+    """Boxes of the object's parts without the panel."""
+    fractions = stage.world.engine.joints(panel.name)
+    parts = part_boxes(panel.asset, panel.pose, fractions)
+    owners = [link for link in panel.asset.links for _ in link.parts]
     return boxes_of(
         [
-            (pose, size, leaf.name)
+            (pose, size, panel.name)
             for (pose, size), link in zip(parts, owners, strict=True)
-            if link.name != leaf.link.name
+            if link.name != panel.link.name
         ]
     )
 
 
 def _main_axis(vector: FloatArray) -> FloatArray:
-    """The coordinate axis that a vector points along most."""
+    """Unit vector of the coordinate axis along which a vector is longest."""
     found = np.zeros(3)
     number = int(np.abs(vector).argmax())
     found[number] = math.copysign(1.0, vector[number])

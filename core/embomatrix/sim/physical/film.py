@@ -1,4 +1,4 @@
-"""Films of the physical mode: the robot and everything it moves, as the dynamic world had them."""
+"""Films of the physical mode: the robot and all moved objects, as recorded in the dynamic world."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from embomatrix.world.task import Task
 
 PACE: Final = 2
-"""A film runs this many times as fast as the world."""
+"""Playback speed relative to simulated time."""
 STEPS_PER_FRAME: Final = PACE * 240 // FRAMES_PER_S
 """Steps of 1/240 s between two frames."""
-STIRRED: Final = 3e-3
-"""What moved less than this, in metres or of a quaternion, stands still in a film."""
+MOTION_THRESHOLD: Final = 3e-3
+"""Motion below this, in metres or in a quaternion component, is not shown."""
 
 
 def film_physical(simulator: Simulator, actor: PhysicalActor, task: Task, plan: Plan, seed: int) -> Film:
-    """Execute a plan physically up to its end or its first failed step, and show it. ``actor`` is the simulator's."""
+    """Execute a plan physically up to its end or its first failed step, and record it. ``actor`` is the simulator's."""
     simulator.reset(task, seed)
     camera = _Camera(simulator.world.scene, actor)
     camera.shoot()
@@ -43,7 +43,7 @@ def film_physical(simulator: Simulator, actor: PhysicalActor, task: Task, plan: 
 
 
 class _Camera:
-    """Takes a frame whenever enough time has passed in the dynamic world."""
+    """Recorder that takes a frame whenever enough simulated time has passed."""
 
     def __init__(self, scene: Scene, actor: PhysicalActor) -> None:
         self._scene = scene
@@ -53,7 +53,7 @@ class _Camera:
         self.step = 0
 
     def tick(self) -> None:
-        """Some time has passed."""
+        """Take a frame if it is due."""
         if self._dynamic.steps >= self._next:
             self.shoot()
 
@@ -82,4 +82,4 @@ class _Camera:
 
 def _moved(now: Pose, before: Pose) -> bool:
     changes = zip((*now.position_m, *now.quat_xyzw), (*before.position_m, *before.quat_xyzw), strict=True)
-    return any(abs(a - b) > STIRRED for a, b in changes)
+    return any(abs(a - b) > MOTION_THRESHOLD for a, b in changes)

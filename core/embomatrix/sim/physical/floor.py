@@ -1,4 +1,4 @@
-"""Ways of the base over the floor, out of the places where a leaf left it, and beside places that are taken."""
+"""Routes of the base over the free floor: out of the reach of open panels, and to poses beside occupied ones."""
 
 from __future__ import annotations
 
@@ -22,27 +22,28 @@ if TYPE_CHECKING:
 OUT_M: Final = 0.45
 OUT_TRIED: Final = 60
 ASIDE_M: Final = 0.9
-"""When a place to stand is taken, one this near does."""
+"""Radius around an occupied standing place in which a free one replaces it."""
 
 
 class Floor:
-    """The free floor in the planning scene's present state."""
+    """Free floor in the present state of the planning scene."""
 
     def __init__(self, navigator: Navigator) -> None:
         self._navigator = navigator
 
     @property
     def grid(self) -> FloorGrid:
-        """Where the base fits now."""
+        """Grid of the places that the base fits."""
         return self._navigator.ground.grid
 
-    def cut_off_last(self, bases: Sequence[FloatArray], leaf: Boxes) -> list[FloatArray]:
-        """Places to stand, groups of shape (b, 3), those last that a leaf cuts off when it gets to where some boxes are.
+    def with_cut_off_last(self, bases: Sequence[FloatArray], panel: Boxes) -> list[FloatArray]:
+        """Order groups of standing places, (b, 3) each, so that those come last which the open panel cuts off.
 
-        What is cut off is all but the largest part of the free floor that the place belongs to now.
+        ``panel``: boxes of the panels in their final position. A place is cut off if it leaves the largest part of the
+        free floor that it belongs to now.
         """
         grid = self.grid
-        after = grid.narrowed(_barring(leaf))
+        after = grid.narrowed(_blocking_rows(panel))
         first, last = [], []
         for group in bases:
             good = np.array([self._stays_joined(grid, after, x, y) for x, y in group[:, :2].tolist()])
@@ -53,15 +54,15 @@ class Floor:
     def _stays_joined(self, grid: FloorGrid, after: FloorGrid, x_m: float, y_m: float) -> bool:
         return after is grid or after.label_at(x_m, y_m) == after.main_part_of(grid, x_m, y_m)
 
-    def way(
+    def route(
         self, start: Vec2, goal: StandPose, serves: Callable[[StandPose], bool]
     ) -> tuple[FloatArray, StandPose] | None:
-        """Points, (n, 2), from here to a pose, and that pose; None when there are none.
+        """Return points, (n, 2), from here to a pose, and that pose; None if there is no route.
 
-        Where the pose is taken, the nearest free one that ``serves`` as well is meant, or else the nearest.
+        If the pose is occupied, the nearest free pose that ``serves`` replaces it, else the nearest free pose.
         """
         grid = self.grid
-        first = self._way_out(start)
+        first = self._exit_cell(start)
         if first is None:
             return None
         end = self._free_near(goal, grid.label(first), serves)
@@ -72,8 +73,8 @@ class Floor:
         out = () if grid.is_free(*start) else (grid.center(first),)
         return np.array([start, *out, *corners[1:-1], (end.x_m, end.y_m)]), end
 
-    def _way_out(self, start: Vec2) -> Cell | None:
-        """The free cell to begin at: from beside a door the robot first goes where it fits, not through the door."""
+    def _exit_cell(self, start: Vec2) -> Cell | None:
+        """Return the free cell at which a route starts. A robot beside a door first drives to a cell that it fits."""
         grid = self.grid
         if grid.is_free(*start):
             return grid.cell(*start)
@@ -88,7 +89,7 @@ class Floor:
         return grid.cell(*start)
 
     def _air(self, points: FloatArray) -> FloatArray:
-        """Distance from points, (n, 2), to the nearest obstacle, (n,)."""
+        """Distances from points, (n, 2), to the nearest obstacle, (n,)."""
         ground = self._navigator.ground
         rows = np.concatenate([ground.obstacles.blocking, ground.open_panels.blocking])
         nearest = np.clip(points[:, None], rows[:, :2], rows[:, 2:4])
@@ -108,8 +109,8 @@ class Floor:
         return next((spot for spot in near[::4] if serves(spot)), near[0] if near else None)
 
 
-def _barring(boxes: Boxes) -> FloatArray:
-    """What of some boxes bars the robot's way: their bounds, rows of low x, low y, high x, high y, low z, high z."""
+def _blocking_rows(boxes: Boxes) -> FloatArray:
+    """Bounds of the boxes that block the robot: rows of low x, low y, high x, high y, low z, high z."""
     half = np.einsum("mij,mj->mi", np.abs(boxes.rotation), boxes.half)
     low, high = boxes.centre - half, boxes.centre + half
     rows = np.column_stack([low[:, :2], high[:, :2], low[:, 2], high[:, 2]])

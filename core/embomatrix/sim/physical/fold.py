@@ -1,4 +1,4 @@
-"""Folding and unfolding: the arm gets to its work and back over the base without touching anything on the way."""
+"""Folding and unfolding of the arm: paths between the carrying posture over the base and the start of the work."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from embomatrix.sim.bullet.robot import TUCKED_ARM, TUCKED_LIFT_M
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.motion import standing, with_arm
-from embomatrix.sim.physical.reach import AIR_M
-from embomatrix.sim.physical.space import struck
+from embomatrix.sim.physical.reach import CLEARANCE_M
+from embomatrix.sim.physical.space import collides
 from embomatrix.sim.physical.stage import compact
 from embomatrix.sim.physical.travel import SOMETHING, travel
 from embomatrix.sim.robot_dimensions import SHOULDER_LOW_M
@@ -24,38 +24,38 @@ from embomatrix.world.poses import StandPose
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from embomatrix.sim.physical.reach import ArmReach, HeldGeometry, Way
+    from embomatrix.sim.physical.reach import ArmPath, ArmReach, HeldGeometry
     from embomatrix.sim.physical.space import Boxes
     from embomatrix.sim.physical.stage import PhysicalStage
     from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.geometry import FloatArray
 
-WAYS: Final = 16
+PATHS_TRIED: Final = 16
 ATTEMPTS: Final = 3
-"""Ways that are looked at, and how many of them the arm sets out for."""
+"""Paths to examine, and how many of them the arm attempts."""
 BACK_OFF_M: Final = (0.0, 0.3, 0.55)
-"""How far before the place of work the arm is unfolded."""
+"""Distances before the place of work at which the arm unfolds."""
 RETREATS_M: Final = (0.2, 0.4, 0.6)
 ASIDES: Final = (0.0, 45.0, -45.0, 90.0, -90.0, 135.0, -135.0)
-"""How far, and in which directions in degrees from straight back, the base draws the arm to where there is room to fold."""
+"""Distances, and directions in degrees from straight back, in which the base retreats to get room to fold."""
 DRAWS: Final = 100
-"""Random postures by which the arm may find its way to be folded: one that stays out bars every way that comes."""
+"""Random postures for folding. A high number pays off: an arm that stays out blocks all later paths."""
 TURN_RAD: Final = 0.01
 FOLDS: Final = 3
-"""Ways that the arm tries to get folded: what stops it on one shows where the next begins."""
+"""Attempts to fold. An obstacle met on one path tells where the next begins."""
 CARRY_LIFT_M: Final = 0.6
 """Height of the lift while the robot drives with a load."""
 SURROUNDINGS_M: Final = np.array([0.8, 0.8, 9.0])
 OVER_M: Final = 1.0
-"""Loads are carried higher than this where that is possible: over counters."""
+"""Preferred minimum height of loads while driving, above counters."""
 
 
-def approach(stage: PhysicalStage, way: Way, reach: ArmReach, *, loaded: bool) -> FloatArray | None:
-    """Postures that lead to the start of a way, (w, 11), None when none are found.
+def approach(stage: PhysicalStage, path: ArmPath, reach: ArmReach, *, loaded: bool) -> FloatArray | None:
+    """Return postures, (w, 11), that lead to the start of a path, None if none are found.
 
-    The arm unfolds where it will work, or some way back from there, whence the base then drives on with the arm ready.
+    The arm unfolds at the place of work, or some distance before it, from where the base drives on with the arm ready.
     """
-    start = way.postures[0]
+    start = path.postures[0]
     now = stage.mover.posture
     back = -np.array([math.cos(start[body.YAW]), math.sin(start[body.YAW]), 0.0])
     for away in BACK_OFF_M:
@@ -69,25 +69,25 @@ def approach(stage: PhysicalStage, way: Way, reach: ArmReach, *, loaded: bool) -
 
 
 def arrivals(
-    stage: PhysicalStage, ways: Iterable[Way], reach: ArmReach, *, loaded: bool
-) -> Iterator[tuple[Way, SkillRefusal | None]]:
-    """Bring the arm to the start of one way after another, each with why it did not get there; it tries a few, no more."""
+    stage: PhysicalStage, paths: Iterable[ArmPath], reach: ArmReach, *, loaded: bool
+) -> Iterator[tuple[ArmPath, SkillRefusal | None]]:
+    """Bring the arm to the start of one path after another. Yield each path with the refusal that stopped the arm, if any."""
     attempts = 0
-    for way in itertools.islice(ways, WAYS):
-        swing = approach(stage, way, reach, loaded=loaded)
+    for path in itertools.islice(paths, PATHS_TRIED):
+        swing = approach(stage, path, reach, loaded=loaded)
         if swing is None:
             continue
         attempts += 1
-        yield way, unfold(stage, swing)
+        yield path, unfold(stage, swing)
         if attempts == ATTEMPTS:
             return
 
 
 def unfold(stage: PhysicalStage, swing: FloatArray) -> SkillRefusal | None:
-    """Drive to where a swing begins, and make it."""
+    """Drive to the start of a swing, and make it."""
     now = stage.mover.posture
     turns = abs(math.remainder(now[body.YAW] - swing[0, body.YAW], math.tau)) > TURN_RAD
-    # An arm that stays out sweeps over what is around while the base turns.
+    # An arm left out sweeps over its surroundings while the base turns.
     if math.dist(now[:2], swing[0, :2]) > 0.01 or (turns and not compact(stage, now)):
         refusal = travel(stage, StandPose(*swing[0, :3].tolist()))
         if refusal is not None:
@@ -103,12 +103,12 @@ def _pair(point: FloatArray) -> tuple[float, float]:
 
 
 def fold(stage: PhysicalStage, home: StandPose, target: str = "") -> SkillRefusal | None:
-    """Bring the arm, with what it holds, over the base, and the base back to where it stood to serve a target.
+    """Bring the arm with its load over the base, and the base back to ``home``.
 
-    Where the arm has no room to fold, the base first draws it back. What the hand still touches does not keep it there.
+    If there is no room to fold, the base first retreats. Contact of the hand at the start is allowed.
     """
     for _ in range(FOLDS):
-        if _drawn_over_base(stage):
+        if _folded_over_base(stage):
             break
     now = stage.mover.posture
     if (
@@ -116,14 +116,15 @@ def fold(stage: PhysicalStage, home: StandPose, target: str = "") -> SkillRefusa
         or abs(math.remainder(now[2] - home.yaw, math.tau)) > 0.01
     ):
         return travel(stage, home, target)
-    stage.told = home
+    stage.commanded = home
     return None
 
 
-def _drawn_over_base(stage: PhysicalStage) -> bool:
-    """Whether the arm is over the base, or finds no way there; not where something stopped it on the way it took."""
+def _folded_over_base(stage: PhysicalStage) -> bool:
+    """True if the arm is over the base, or finds no path there; False if an obstacle stopped it."""
     now = stage.mover.posture
-    reach = stage.reach(stage.boxes().drawn_in(*_limbs(stage, now), AIR_M))
+    balls, radii = stage.limbs(now[None])
+    reach = stage.reach(stage.boxes().shrunk_clear_of(balls[0], radii, CLEARANCE_M))
     loaded = stage.grip is not None
     folded = carrying(stage, now)
     for spot in _retreats(reach, now, loaded):
@@ -134,17 +135,8 @@ def _drawn_over_base(stage: PhysicalStage) -> bool:
     return True
 
 
-def _limbs(stage: PhysicalStage, now: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Balls of the arm and of what it holds: centres (k, 3) and radii (k,)."""
-    points, radii = body.balls(now[None])[0], body.RADII
-    if stage.grip is not None:
-        points = np.concatenate([points, stage.grip.held.placed(now[None])[0]])
-        radii = np.concatenate([radii, stage.grip.held.radii])
-    return points, radii
-
-
 def _retreats(reach: ArmReach, now: FloatArray, loaded: bool) -> Iterator[FloatArray]:
-    """Bases, (3,), at which the arm may fold: here, then where the base gets to straight on, back before aside."""
+    """Yield bases, (3,), at which the arm may fold: here, then places that the base reaches in a straight line."""
     yield now[:3]
     for away, aside in itertools.product(RETREATS_M, ASIDES):
         course = now[body.YAW] + math.pi + math.radians(aside)
@@ -154,7 +146,7 @@ def _retreats(reach: ArmReach, now: FloatArray, loaded: bool) -> Iterator[FloatA
 
 
 def carrying(stage: PhysicalStage, now: FloatArray) -> FloatArray:
-    """The posture in which the robot drives: folded when the hand is empty, else with the load upright and near."""
+    """Return the driving posture: folded with an empty hand, else with the load upright and near."""
     if stage.grip is None:
         folded = with_arm(now, np.array(TUCKED_ARM))
         folded[body.LIFT] = TUCKED_LIFT_M
@@ -176,7 +168,7 @@ def carrying(stage: PhysicalStage, now: FloatArray) -> FloatArray:
 
 
 def _carried_to(now: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Poses of the tool over the base, as it is but turned about the vertical: rotations (n, 3, 3) and positions (n, 3)."""
+    """Return tool poses over the base that keep the load upright: rotations (n, 3, 3) and positions (n, 3)."""
     rotation, _ = body.tools(now[None])
     turns, xs, ys, heights = (
         grid.ravel()
@@ -196,7 +188,7 @@ def _carried_to(now: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _carrying_cost(rows: FloatArray, now: FloatArray, held: HeldGeometry, boxes: Boxes) -> FloatArray:
-    """How ill postures, (n, 11), suit a drive: wide, high, low over counters, far from now, in things; shape (n,)."""
+    """Cost, (n,), of driving with postures, (n, 11): wide, high, low over counters, far from now, or in collision."""
     load, arms = held.placed(rows), body.balls(rows)
     wide = np.linalg.norm(load[:, :, :2] - now[:2], axis=2) + held.radii
     limbs = np.linalg.norm(arms[:, :, :2] - now[:2], axis=2) + body.RADII
@@ -207,5 +199,5 @@ def _carrying_cost(rows: FloatArray, now: FloatArray, held: HeldGeometry, boxes:
     cost += np.maximum(wide.max(axis=1), limbs.max(axis=1))
     radii = np.concatenate([body.RADII, held.radii])
     points = np.concatenate([arms, load], axis=1)
-    cost += np.where(struck(boxes, points, radii, AIR_M), 2.0, 0.0)
-    return np.where(body.strikes_itself(rows, points, radii), math.inf, cost)
+    cost += np.where(collides(boxes, points, radii, CLEARANCE_M), 2.0, 0.0)
+    return np.where(body.self_collides(rows, points, radii), math.inf, cost)

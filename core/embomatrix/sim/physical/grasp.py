@@ -1,4 +1,4 @@
-"""Where the hand may touch a thing to take it, and on which way it comes there."""
+"""Grasp candidates: contact points of the hand on an object, and the tool paths to them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.physical.reach import Track
+from embomatrix.sim.physical.reach import ToolPath
 from embomatrix.sim.physical.space import part_boxes
 from embomatrix.world.geometry import Shape
 
@@ -20,35 +20,35 @@ if TYPE_CHECKING:
 
 OPEN_ELEVATIONS: Final = (30.0, 50.0, 10.0, 70.0, 90.0)
 ROOFED_ELEVATIONS: Final = (15.0, 30.0, 0.0, 45.0, 60.0)
-"""Degrees by which the hand comes from above, in the order of preference."""
+"""Angles, in degrees, by which the hand comes from above, in the order of preference."""
 OPEN_AZIMUTHS: Final = (0.0, 40.0, -40.0, 80.0, -80.0)
 ROOFED_AZIMUTHS: Final = (0.0, 25.0, -25.0)
-"""Degrees by which it comes from aside."""
+"""Angles, in degrees, by which the hand comes from the side."""
 ROLLS: Final = (0.0, 90.0)
 STEEP: Final = 70.0
 STEEP_ROLLS: Final = (0.0, 90.0, 45.0, -45.0)
-"""From so steeply above the hand has no way of its own to lie: it comes between things as there is room."""
+"""Rolls of a steep hand: it has no preferred roll and fits between objects where there is room."""
 FORWARD: Final = 0.35
-"""The front of a thing is this share of its depth before its middle."""
+"""Distance of the front grasp point from the middle, as a share of the object's depth."""
 OPEN_BACK_M: Final = 0.10
 PIT_BACK_M: Final = 0.28
-"""Between tall things the hand comes straight down, from higher than they are."""
+"""Height from which the hand comes straight down between tall objects."""
 BEYOND_M: Final = 0.015
-"""The way ends this far behind the surface: the hand stops when it touches."""
+"""Distance behind the surface at which the tool path ends. The hand stops when it touches."""
 SHEET_M: Final = 0.004
-"""It ends no farther behind than the thing is thick there, but at least this far: a sheet of paper lies on something."""
+"""Least distance behind the surface. The path ends no deeper than the object is thick, because a sheet lies on something."""
 HOLLOW_M: Final = 0.12
-"""Round things and hulls do not fill their boxes: to those it leads on to half their thickness, up to this far."""
+"""Largest distance behind the surface for round parts and hulls, which do not fill their boxes."""
 
 
 def cross(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Cross product of two vectors, (3,): in numbers, as numpy's own spends its time on shapes."""
+    """Cross product of two vectors, (3,), in plain numbers: faster than numpy for single vectors."""
     (a, b, c), (d, e, f) = one.tolist(), other.tolist()
     return np.array([b * f - c * e, c * d - a * f, a * e - b * d])
 
 
 def facing(direction: FloatArray, roll: float, aside: FloatArray) -> FloatArray:
-    """Rotation, (3, 3), of a tool whose z axis points along a direction and whose y axis is level, turned by ``roll``."""
+    """Return the rotation, (3, 3), of a tool with z along a direction and a level y axis, turned by ``roll``."""
     level = np.array([-direction[1], direction[0], 0.0])
     if np.linalg.norm(level) < 0.05:
         level = aside
@@ -61,9 +61,9 @@ def facing(direction: FloatArray, roll: float, aside: FloatArray) -> FloatArray:
 def surface_point(
     boxes: Sequence[tuple[Pose, tuple[float, float, float]]], aim: FloatArray, direction: FloatArray
 ) -> tuple[FloatArray, float, int] | None:
-    """Where a ray through a point first meets any of the boxes, how thick that box is there, and its number: slab test.
+    """Return the first intersection of a ray with boxes, the thickness of that box along the ray, and its index; None for none.
 
-    None when it misses them all.
+    Slab test. ``aim``: point on the ray; ``direction``: unit vector.
     """
     start = aim - 3.0 * direction
     nearest, thick_m, met = math.inf, 0.0, 0
@@ -79,39 +79,38 @@ def surface_point(
     return (start + nearest * direction, thick_m, met) if math.isfinite(nearest) else None
 
 
-def grasp_tracks(
-    asset: Asset, pose: Pose, fractions: Sequence[float], course: float, out_m: float | None
-) -> list[Track]:
-    """Ways of the tool to the thing's surface, the preferred ones first: far, half way, at it, a little beyond.
+def grasp_tool_paths(
+    asset: Asset, pose: Pose, fractions: Sequence[float], course: float, depth_m: float | None
+) -> list[ToolPath]:
+    """Return tool paths to the surface of an object, preferred ones first: far, half-way, at the surface, a little beyond.
 
-    ``course`` is the heading, in the world, in which the hand goes; ``out_m`` the length of the way in when the thing stands
-    under a roof, None in the open.
+    ``course``: heading of the hand in the world. ``depth_m``: length of the entry under a roof, None in the open.
     """
     body = _Body(
         part_boxes(asset, pose, fractions), [part.shape for link in asset.links for part in link.parts]
     )
-    inward = None if out_m is None else _direction(course, 0.0)
+    inward = None if depth_m is None else _direction(course, 0.0)
     aims = list(_aims(asset, pose, body.boxes, inward))
-    tracks: list[Track] = []
-    for azimuth in OPEN_AZIMUTHS if out_m is None else ROOFED_AZIMUTHS:
-        for elevation in OPEN_ELEVATIONS if out_m is None else ROOFED_ELEVATIONS:
+    tool_paths: list[ToolPath] = []
+    for azimuth in OPEN_AZIMUTHS if depth_m is None else ROOFED_AZIMUTHS:
+        for elevation in OPEN_ELEVATIONS if depth_m is None else ROOFED_ELEVATIONS:
             if elevation == 90.0 and azimuth != 0.0:
                 continue
             direction = _direction(course + math.radians(azimuth), math.radians(elevation))
-            back = direction * OPEN_BACK_M if inward is None or out_m is None else inward * out_m
+            back = direction * OPEN_BACK_M if inward is None or depth_m is None else inward * depth_m
             rolls = ROLLS if elevation < STEEP else STEEP_ROLLS
-            tracks += body.approaches(aims, direction, back, rolls, course)
-    if out_m is None:
+            tool_paths += body.approaches(aims, direction, back, rolls, course)
+    if depth_m is None:
         for elevation in (90.0, STEEP):
             direction = _direction(course, math.radians(elevation))
             back = np.array([0.0, 0.0, -PIT_BACK_M])
-            tracks += body.approaches(aims[:1], direction, back, STEEP_ROLLS, course)
-    return tracks
+            tool_paths += body.approaches(aims[:1], direction, back, STEEP_ROLLS, course)
+    return tool_paths
 
 
 @dataclass(frozen=True, slots=True)
 class _Body:
-    """Boxes around the parts of a thing in the world, and the parts' shapes."""
+    """Boxes around the parts of an object in the world, and the shapes of the parts."""
 
     boxes: Sequence[tuple[Pose, tuple[float, float, float]]]
     shapes: Sequence[Shape]
@@ -123,8 +122,8 @@ class _Body:
         back: FloatArray,
         rolls: Sequence[float],
         course: float,
-    ) -> Iterator[Track]:
-        """Ways on which the hand goes for each of the aims: ``back``, (3,), is how it comes near."""
+    ) -> Iterator[ToolPath]:
+        """Yield tool paths to each aim. ``back``, (3,), is the displacement of the approach."""
         aside = np.array([-math.sin(course), math.cos(course), 0.0])
         for aim in aims:
             met = surface_point(self.boxes, aim, direction)
@@ -139,13 +138,13 @@ class _Body:
                 yield _approach(rotation, point, point + beyond_m * direction, back)
 
 
-def _approach(rotation: FloatArray, point: FloatArray, end: FloatArray, back: FloatArray) -> Track:
+def _approach(rotation: FloatArray, point: FloatArray, end: FloatArray, back: FloatArray) -> ToolPath:
     near = point - 0.03 * rotation[:, 2]
     count = max(2, math.ceil(float(np.linalg.norm(back)) / 0.12) + 1)
     steps = np.linspace(1.0, 0.0, count)[:, None]
     positions = np.concatenate([near - steps * back, [point, end]])
     total = len(positions)
-    return Track(np.tile(rotation, (total, 1, 1)), positions, np.zeros(total, dtype=bool), total - 2)
+    return ToolPath(np.tile(rotation, (total, 1, 1)), positions, np.zeros(total, dtype=bool), total - 2)
 
 
 def _aims(
@@ -154,9 +153,9 @@ def _aims(
     boxes: Sequence[tuple[Pose, tuple[float, float, float]]],
     inward: FloatArray | None,
 ) -> Iterator[FloatArray]:
-    """Points of the thing that the hand goes for: its middle, then the middles of its largest parts.
+    """Yield grasp points: the middle of the object, then the middles of its largest parts.
 
-    Where the hand goes inward under a roof, what is nearer to the front comes next after the middle.
+    Under a roof, a point nearer to the front comes second.
     """
     middle = np.array(pose.position_m)
     yield middle

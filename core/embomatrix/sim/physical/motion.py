@@ -1,4 +1,4 @@
-"""Motions in the dynamic world: the motors follow postures at bounded speeds, and stop when something holds them up."""
+"""Motions in the dynamic world: the motors follow postures at bounded speeds and stop at resistance."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
     IntArray = NDArray[np.int_]
 
 SPEED: Final = np.array([1.0, 1.0, 2.5, 0.5, 2.1, 2.1, 2.1, 2.1, 2.6, 2.6, 2.6])
-"""Metres, and radians, a second: the arm's are the Panda's own limits."""
+"""Largest speeds in metres, and radians, a second. The arm's are the Panda's limits."""
 STEERED: Final = 4
 """Steps of 1/240 s between two commands to the motors."""
 STEPS_A_SECOND: Final = 240
 LAG: Final = np.array([0.08, 0.08, 0.15, 0.06, 0.3, 0.3, 0.3, 0.3, 0.4, 0.4, 0.4])
-"""A joint that falls this far behind is held up by something."""
+"""Lag of a joint behind its command that counts as resistance, in metres and radians."""
 _LAGS: Final = tuple(LAG.tolist())
 ARRIVAL_STEPS: Final = 12
 APART_M: Final = 0.035
 LOAD_APART_M: Final = 0.02
-"""So far no point of the arm goes between two postures at which a passage is looked at, with an empty hand and with a load.
+"""Largest motion of any point of the arm between two checked postures, with an empty hand and with a load.
 
-Fingers are 28 mm thick and may come no nearer than 5 mm to anything: nothing is so thin that it is passed unseen.
+Fingers are 28 mm thick and keep 5 mm from everything, so no obstacle is thin enough to be missed.
 """
 LEAST_COMMANDS: Final = 3
 SHARP_RAD: Final = 1.2
@@ -44,16 +44,16 @@ RAMP_S: Final = 0.3
 
 
 class Mover:
-    """Moves the robot of one dynamic world."""
+    """Controller that moves the robot of one dynamic world."""
 
     def __init__(self, world: DynamicWorld, watch: Callable[[], None]) -> None:
-        """``watch`` is called after every few steps: for whoever makes a film."""
+        """``watch`` is called after every few steps, for films."""
         self._world = world
         self._watch = watch
 
     @property
     def posture(self) -> FloatArray:
-        """The present posture, shape (11,)."""
+        """Present posture, shape (11,)."""
         return np.array(self._world.robot.posture.numbers)
 
     def follow(
@@ -61,26 +61,26 @@ class Mover:
     ) -> str | None:
         """Move through postures, (w, 11), from the present one. ``pace`` is a share of full speed.
 
-        None when the end is reached or ``until`` says so, else the name of what holds the robot up, "" when unknown.
+        Return None if the end is reached or ``until`` holds, else the name of the obstacle, "" for an unknown one.
         """
         commands = _commands(np.concatenate([self.posture[None], postures]), pace)
         return self._pursue(commands, self._world.go, until)
 
     def sweep(self, postures: FloatArray) -> str | None:
-        """Move through postures, as ``follow`` does, where nothing is to be touched.
+        """Move through postures without touching anything, as ``follow`` does.
 
-        Where nothing is near the motion is made at once; else time passes in coarser steps.
+        The motion is made at once if nothing is near, else in coarser time steps.
         """
         commands = _commands(np.concatenate([self.posture[None], postures]), 1.0)
         return None if self._passes(commands) else self._pursue(commands, self._world.glide, None)
 
     def advance(self, postures: FloatArray, pace: float = 1.0) -> str | None:
-        """Move through postures, as ``follow`` does, beside things that may be touched: at once where nothing is near."""
+        """Move through postures beside objects that may be touched, as ``follow`` does: at once if nothing is near."""
         commands = _commands(np.concatenate([self.posture[None], postures]), pace)
         return None if self._passes(commands) else self._pursue(commands, self._world.go, None)
 
     def _passes(self, commands: FloatArray) -> bool:
-        """Whether the robot went through commands, (n, 11), without coming near anything: then it is where they end."""
+        """Try to make a motion, (n, 11), at once. True if nothing was near; the robot is then at its end."""
         passage = self._world.passage()
         if passage is None:
             return False
@@ -108,15 +108,15 @@ class Mover:
                 self._world.robot.steer(self._world.robot.posture)
                 return None
             if self._lags(command):
-                hindrance = self._world.hindrance()
+                blocker = self._world.hindrance()
                 self._world.robot.steer(self._world.robot.posture)
-                return hindrance
+                return blocker
         self._world.robot.steer(Posture.of(commands[-1].tolist()))
         self.wait(ARRIVAL_STEPS)
         return None
 
     def _lags(self, command: Sequence[float]) -> bool:
-        """Whether a joint is far behind a command: asked so often that eleven numbers are compared one by one."""
+        """True if a joint is far behind a command. A loop over eleven numbers is faster than numpy here."""
         now = self._world.robot.posture.numbers
         return any(abs(is_at - wanted) > lag for is_at, wanted, lag in zip(now, command, _LAGS, strict=True))
 
@@ -128,7 +128,7 @@ class Mover:
 
 
 def _commands(postures: FloatArray, pace: float) -> FloatArray:
-    """Targets for every few steps along postures: full speed in the middle, gentle at both ends."""
+    """Return targets for every few steps along postures: full speed in the middle, ramps at both ends."""
     postures = postures.copy()
     postures[:, YAW] = np.unwrap(postures[:, YAW])
     seconds = (np.abs(np.diff(postures, axis=0)) / (SPEED * pace)).max(axis=1)  # (w - 1,)
@@ -136,7 +136,7 @@ def _commands(postures: FloatArray, pace: float) -> FloatArray:
     total = float(marks[-1])
     if total <= 0.0:
         return postures[-1:]
-    # Speed grows evenly, stays, and shrinks evenly: the ramps cost as much time as one of them lasts.
+    # Speed grows linearly, stays, and shrinks linearly. Both ramps together cost the time of one ramp.
     ramp = min(RAMP_S, total)
     count = max(LEAST_COMMANDS, int(np.ceil((total + ramp) * STEPS_A_SECOND / STEERED)))
     clock = np.linspace(0.0, total + ramp, count + 1)[1:]
@@ -151,21 +151,21 @@ def _commands(postures: FloatArray, pace: float) -> FloatArray:
 
 
 def _spaced(start: FloatArray, commands: FloatArray, apart_m: float) -> IntArray:
-    """Numbers of so many commands, (n, 11), that no point of the arm goes farther from one to the next, the last among them."""
+    """Return indices of commands, (n, 11), between which no point of the arm moves farther than ``apart_m``, with the last."""
     places = body.balls(np.concatenate([start[None], commands]))
-    ways = np.linalg.norm(np.diff(places, axis=0), axis=2).max(axis=1)  # (n,)
-    # Each command is at most as far from the one chosen before it as the ways in between sum up to.
+    paths = np.linalg.norm(np.diff(places, axis=0), axis=2).max(axis=1)  # (n,)
+    # The distance to the last chosen command is at most the sum of the motions in between.
     chosen, gone = [], 0.0
-    for number, way in enumerate(ways.tolist()):
-        if number and gone + way > apart_m:
+    for number, path in enumerate(paths.tolist()):
+        if number and gone + path > apart_m:
             chosen.append(number - 1)
             gone = 0.0
-        gone += way
+        gone += path
     return np.array([*chosen, len(commands) - 1])
 
 
 def _smoothed(commands: FloatArray, start: FloatArray) -> FloatArray:
-    """Running means over a short window: no joint changes its speed at once. The end stays where it is."""
+    """Running means over a short window, so that no joint changes its speed at once. The end stays in place."""
     window = min(WINDOW, len(commands))
     padded = np.concatenate([np.tile(start, (window // 2, 1)), commands, np.tile(commands[-1], (window, 1))])
     sums = np.cumsum(np.concatenate([np.zeros((1, padded.shape[1])), padded]), axis=0)
@@ -173,7 +173,7 @@ def _smoothed(commands: FloatArray, start: FloatArray) -> FloatArray:
 
 
 def _caution(postures: FloatArray) -> FloatArray:
-    """How many times longer than at full speed each piece takes, (w - 1,): the base slows down before and after corners."""
+    """Factor, (w - 1,), by which each piece takes longer than at full speed: the base slows down at corners."""
     steps = np.diff(postures[:, :2], axis=0)
     length = np.linalg.norm(steps, axis=1)
     course = np.arctan2(steps[:, 1], steps[:, 0])
@@ -187,21 +187,21 @@ def _caution(postures: FloatArray) -> FloatArray:
 
 
 def raised(posture: FloatArray, by_m: float) -> FloatArray:
-    """The posture with the lift higher by some metres."""
+    """Return the posture with the lift higher by some metres."""
     higher = posture.copy()
     higher[..., LIFT] += by_m
     return higher
 
 
 def standing(posture: FloatArray, base: FloatArray) -> FloatArray:
-    """The posture with the base elsewhere: x, y and heading, shape (3,)."""
+    """Return the posture with the base at x, y and heading, shape (3,)."""
     moved = posture.copy()
     moved[..., :3] = base
     return moved
 
 
 def with_arm(posture: FloatArray, arm: FloatArray) -> FloatArray:
-    """The posture with the arm's joints elsewhere."""
+    """Return the posture with other arm angles."""
     changed = posture.copy()
     changed[..., ARM] = arm
     return changed

@@ -1,4 +1,4 @@
-"""Touching: switches are pressed and things are worked on where the hand, or what it holds, gets at them."""
+"""Touching: the hand presses switches and works on objects."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.fold import arrivals, fold
 from embomatrix.sim.physical.grasp import facing, surface_point
-from embomatrix.sim.physical.hands import GENTLE, TOUCH_M
-from embomatrix.sim.physical.reach import Track
-from embomatrix.sim.physical.space import part_boxes, struck
+from embomatrix.sim.physical.pick import GENTLE_PACE, TOUCH_M
+from embomatrix.sim.physical.reach import ToolPath
+from embomatrix.sim.physical.space import collides, part_boxes
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.view import refuse
@@ -20,13 +20,13 @@ from embomatrix.skills.view import refuse
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from embomatrix.sim.physical.reach import ArmReach, Way
+    from embomatrix.sim.physical.reach import ArmPath, ArmReach
     from embomatrix.sim.physical.stage import PhysicalStage
     from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.geometry import FloatArray
 
 HEIGHTS: Final = (0.85, 0.97, 0.65, 0.45, 0.25)
-"""Shares of the thing's height at which it is pressed, the first that the arm reaches."""
+"""Shares of the object's height at which the hand presses, in order of preference."""
 DOWNS: Final = (0.0, 35.0, 70.0, 90.0)
 ASIDES: Final = (0.0, 30.0, -30.0)
 OFF_M: Final = 0.08
@@ -34,48 +34,48 @@ BEYOND_M: Final = 0.02
 
 
 def press(stage: PhysicalStage, target: str) -> SkillRefusal | None:
-    """Touch a thing with the empty hand."""
-    home = stage.told
+    """Touch an object with the empty hand."""
+    home = stage.commanded
     refusal = _press(stage, target)
     fold(stage, home, target)
     return refusal
 
 
 def _press(stage: PhysicalStage, target: str) -> SkillRefusal | None:
-    reach, ways = pressing(stage, target)
+    reach, paths = press_paths(stage, target)
     refusal = None
-    for way, refusal in arrivals(stage, ways, reach, loaded=False):
+    for path, refusal in arrivals(stage, paths, reach, loaded=False):
         if refusal is not None:
             continue
         if not stage.world.is_fixed(target):
             stage.wake_around(stage.world.engine.aabb(target))
-        hit = stage.mover.follow(way.postures[1:3], GENTLE, lambda: stage.dynamic.gap(target) < TOUCH_M)
+        hit = stage.mover.follow(path.postures[1:3], GENTLE_PACE, lambda: stage.dynamic.gap(target) < TOUCH_M)
         touched = stage.dynamic.gap(target) < 2 * TOUCH_M
-        stage.mover.follow(way.postures[:1])
+        stage.mover.follow(path.postures[:1])
         if touched:
             return None
         refusal = refuse(FailureReason.ARM_BLOCKED, target=target, other=hit or SOMETHING)
-    return refusal or refuse(FailureReason.ARM_BLOCKED, target=target, other=reach.hindrance or SOMETHING)
+    return refusal or refuse(FailureReason.ARM_BLOCKED, target=target, other=reach.blocker or SOMETHING)
 
 
-def pressing(stage: PhysicalStage, target: str) -> tuple[ArmReach, Iterator[Way]]:
-    """Free ways to touch a thing, and what judges them.
+def press_paths(stage: PhysicalStage, target: str) -> tuple[ArmReach, Iterator[ArmPath]]:
+    """Return free paths that touch an object, and the reach that judges them.
 
-    Nothing but the hand may meet it: an arm that leant on it would keep the hand off.
+    Only the hand may touch it: an arm that leans on the object would keep the hand off.
     """
     boxes = stage.boxes()
     own = boxes.only(target)
 
     def leans_not(postures: FloatArray) -> bool:
-        return not struck(own, *body.forearm_balls(postures), 0.0).any()
+        return not collides(own, *body.forearm_balls(postures), 0.0).any()
 
     reach = stage.reach(boxes, target, leans_not)
     point = np.array(stage.world.relations.body(target).center_m)
-    return reach, reach.ways(_tracks(stage, target), stage.bases(point))
+    return reach, reach.paths(_tool_paths(stage, target), stage.bases(point))
 
 
-def _tracks(stage: PhysicalStage, target: str) -> Iterator[Track]:
-    """Ways to the side that faces the robot, from the switch's usual height on downwards."""
+def _tool_paths(stage: PhysicalStage, target: str) -> Iterator[ToolPath]:
+    """Yield tool paths to the side that faces the robot, from the usual height of a switch downwards."""
     world = stage.world
     robot = world.robot
     boxes = part_boxes(world.asset(target), world.engine.pose(target), world.engine.joints(target))
@@ -100,4 +100,4 @@ def _tracks(stage: PhysicalStage, target: str) -> Iterator[Track]:
                     point = met[0]
                     rotation = facing(into, 0.0, arm.about_z(np.array([course]))[0][:, 1])
                     positions = np.array([point - OFF_M * into, point - 0.01 * into, point + BEYOND_M * into])
-                    yield Track(np.tile(rotation, (3, 1, 1)), positions, np.zeros(3, dtype=bool), 1)
+                    yield ToolPath(np.tile(rotation, (3, 1, 1)), positions, np.zeros(3, dtype=bool), 1)

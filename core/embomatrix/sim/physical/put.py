@@ -1,4 +1,4 @@
-"""Putting: the hand brings what it holds in on a free way, sets it down, lets go and leaves."""
+"""Putting down: the hand brings the held object in on a free path, sets it down, lets go and leaves."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim.physical.fold import arrivals
-from embomatrix.sim.physical.hands import GENTLE, ROOFED_RAISE_M, bases_at, way_in
 from embomatrix.sim.physical.motion import raised
-from embomatrix.sim.physical.reach import ArmReach, Track
+from embomatrix.sim.physical.pick import GENTLE_PACE, ROOFED_RAISE_M, bases_at, entry
+from embomatrix.sim.physical.reach import ArmReach, ToolPath
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.view import refuse
@@ -21,83 +21,85 @@ from embomatrix.world.geometry import Pose
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from embomatrix.sim.physical.reach import Way
+    from embomatrix.sim.physical.reach import ArmPath
     from embomatrix.sim.physical.stage import Grip, PhysicalStage
     from embomatrix.skills.view import SkillRefusal
 
 CHUNKS: Final = (0, 1, 4, 9, 16, 24)
-"""Poses are looked at a few at a time: the robot stands elsewhere for each lot."""
-FITS: Final = 48
-"""Turned poses of one lot that are looked at: those in the open first, then the less deep ones."""
+"""Poses are examined in these lots. The robot stands elsewhere for each lot."""
+MOST_OPTIONS: Final = 48
+"""Rotated poses of one lot to examine: first those in the open, then the less deep ones."""
 DROPS_M: Final = (0.03, 0.06, 0.12, 0.24, 0.4)
-"""Heights from which things are dropped where the hand can't follow."""
+"""Heights from which the object is dropped if the hand can't reach its pose."""
 RISE_M: Final = 0.01
 DROP_M: Final = 0.004
-"""The hand lets go when what it holds touches, or this far below where it should."""
+"""The hand lets go at contact, or this far below the pose."""
 LEVEL: Final = 0.3
 """A hand that points down more steeply than this has no heading."""
 ASIDES: Final = (0.0, 35.0, -35.0)
-"""Degrees by which the hand may come from aside when it puts something."""
+"""Angles, in degrees, by which the hand may come from the side."""
 ROOFED_ASIDE: Final = math.radians(35.0)
 OPEN_ASIDE: Final = math.radians(80.0)
-"""What is put as it was found good, or the other way round, may make the hand come this far from aside."""
+"""Largest angle from the side for an object in its verified orientation, or half turned."""
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
-    """Where what is held may stand, the heading of the way in, and how long that is under a roof; None in the open."""
+class PutPose:
+    """Pose for the held object, heading of the entry, and length of the way under a roof; None in the open."""
 
     pose: Pose
     course: float
-    out_m: float | None
+    depth_m: float | None
 
 
 class PutRequest:
-    """What is held, how, and where it is to go: poses of which the first is preferred, at which ``counts`` must hold.
+    """Poses for a held object, the preferred one first, at which ``is_valid`` must hold.
 
-    ``counts`` is asked with the thing standing at a pose in the planning scene.
+    ``is_valid`` is asked while the object stands at a pose in the planning scene.
     """
 
     def __init__(
-        self, stage: PhysicalStage, grip: Grip, poses: Sequence[Pose], counts: Callable[[], bool]
+        self, stage: PhysicalStage, grip: Grip, poses: Sequence[Pose], is_valid: Callable[[], bool]
     ) -> None:
         self._stage = stage
         self._grip = grip
         self._poses = poses
-        self._counts = counts
+        self._is_valid = is_valid
         self._boxes = stage.boxes()
         self.reach = ArmReach(self._boxes, self._boxes, grip.held)
 
-    def ways(self) -> Iterator[Way]:
-        """Ways to put it down, to the first pose while there are any."""
-        for fits in self._lots():
-            if fits:
-                tracks = list(_put_tracks(self._grip, fits))
-                yield from self.reach.ways(tracks, bases_at(self._stage, *_at(fits[0])))
+    def paths(self) -> Iterator[ArmPath]:
+        """Yield paths that put the object down, to the first pose as long as there are any."""
+        for options in self._option_lots():
+            if options:
+                tool_paths = list(_put_tool_paths(self._grip, options))
+                yield from self.reach.paths(tool_paths, bases_at(self._stage, *_at(options[0])))
 
-    def drops(self) -> Iterator[Way]:
-        """Ways to let it fall from no higher than must be, as into a crate that is too narrow for the hand."""
-        fits = [fit for pose in self._poses[: CHUNKS[2]] for some in self._fits(pose) for fit in some]
-        clear_m = [self._clear_above(fit.pose) for fit in fits]
+    def drops(self) -> Iterator[ArmPath]:
+        """Yield paths that drop the object from the least height, as into a crate too narrow for the hand."""
+        options = [
+            option for pose in self._poses[: CHUNKS[2]] for some in self._put_poses(pose) for option in some
+        ]
+        clear_m = [self._clear_above(option.pose) for option in options]
         for drop_m in DROPS_M:
             higher = [
-                Fit(Pose((0.0, 0.0, drop_m)) @ fit.pose, fit.course, fit.out_m)
-                for fit, most_m in zip(fits, clear_m, strict=True)
+                PutPose(Pose((0.0, 0.0, drop_m)) @ option.pose, option.course, option.depth_m)
+                for option, most_m in zip(options, clear_m, strict=True)
                 if drop_m <= most_m
             ]
             if not higher:
                 return
-            tracks = list(_put_tracks(self._grip, higher))
-            yield from self.reach.ways(tracks, bases_at(self._stage, *_at(higher[0])))
+            tool_paths = list(_put_tool_paths(self._grip, higher))
+            yield from self.reach.paths(tool_paths, bases_at(self._stage, *_at(higher[0])))
 
     def may_turn(self) -> bool:
-        """Whether the thing may stand a quarter turned at one of the first poses, so that the hand may come from anywhere."""
+        """True if the object may stand a quarter turned at one of the first poses, so that the hand may come from anywhere."""
         found = any(True for pose in self._poses[: CHUNKS[2]] for _ in self._turned(pose, math.pi / 2))
         self._stage.world.engine.park(self._grip.name)
         return found
 
     def _clear_above(self, pose: Pose) -> float:
-        """How far straight up from a pose the thing could come from, as far as drops go."""
+        """Free height straight above a pose, up to the largest drop."""
         engine, name = self._stage.world.engine, self._grip.name
         risen = 0
         while risen * RISE_M < DROPS_M[-1]:
@@ -108,40 +110,44 @@ class PutRequest:
         engine.park(name)
         return risen * RISE_M
 
-    def _lots(self) -> Iterator[list[Fit]]:
-        """The first pose with the thing as it was found good; then turned, as the hand comes best; then the other poses."""
+    def _option_lots(self) -> Iterator[list[PutPose]]:
+        """Yield the first pose in its verified orientation, then rotated to suit the hand, then the other poses."""
         for first, last in itertools.pairwise(CHUNKS):
-            some = [self._fits(pose) for pose in self._poses[first:last]]
-            as_found = [fit for fits, _ in some for fit in fits]
-            turned = [fit for _, fits in some for fit in fits]
+            some = [self._put_poses(pose) for pose in self._poses[first:last]]
+            as_found = [option for options, _ in some for option in options]
+            turned = [option for _, options in some for option in options]
             lots = (as_found, turned) if first == 0 else (as_found + turned,)
-            for fits in lots:
-                fits.sort(key=lambda fit: fit.out_m or 0.0)
-                roofed = [Fit(fit.pose, fit.course, None) for fit in fits if fit.out_m is not None]
-                yield [*fits[:FITS], *roofed[:FITS]]
+            for options in lots:
+                options.sort(key=lambda option: option.depth_m or 0.0)
+                roofed = [
+                    PutPose(option.pose, option.course, None)
+                    for option in options
+                    if option.depth_m is not None
+                ]
+                yield [*options[:MOST_OPTIONS], *roofed[:MOST_OPTIONS]]
 
-    def _fits(self, pose: Pose) -> tuple[list[Fit], list[Fit]]:
-        """A pose as it is and the other way round, as far as the hand can come so; then turned to where the hand comes from."""
+    def _put_poses(self, pose: Pose) -> tuple[list[PutPose], list[PutPose]]:
+        """Return a pose as it is and half turned, if the hand can come so; and the pose rotated to suit the hand."""
         engine, name = self._stage.world.engine, self._grip.name
         engine.set_pose(name, pose)
-        course, out_m = way_in(self._stage, name, engine.aabb(name), self._boxes)
+        course, depth_m = entry(self._stage, name, engine.aabb(name), self._boxes)
         pointing = (pose @ self._grip.pose_tool_object.inverse()).rotation[:, 2]
         if math.hypot(pointing[0], pointing[1]) > LEVEL:
             off = math.remainder(course - math.atan2(pointing[1], pointing[0]), math.tau)
-            aside = OPEN_ASIDE if out_m is None else ROOFED_ASIDE
+            aside = OPEN_ASIDE if depth_m is None else ROOFED_ASIDE
             same = [turn for turn in (0.0, math.pi) if abs(math.remainder(off - turn, math.tau)) <= aside]
             other = [math.remainder(off + math.radians(by), math.tau) for by in ASIDES]
         else:
             same, other = [0.0, math.pi], [math.pi / 2, -math.pi / 2]
         found = [
-            [Fit(turned, course, out_m) for turn in turns for turned in self._turned(pose, turn)]
+            [PutPose(turned, course, depth_m) for turn in turns for turned in self._turned(pose, turn)]
             for turns in (same, other)
         ]
         engine.park(name)
         return found[0], found[1]
 
     def _turned(self, pose: Pose, turn: float) -> Iterator[Pose]:
-        """The pose turned about the vertical, if the thing can stand there so."""
+        """Yield the pose rotated about the vertical, if the object can stand there so."""
         if not turn:
             yield pose
             return
@@ -149,99 +155,101 @@ class PutRequest:
         turned = Pose(pose.position_m, about.quat_xyzw)
         engine, name = self._stage.world.engine, self._grip.name
         engine.set_pose(name, turned)
-        if not engine.penetrates(name) and self._counts():
+        if not engine.penetrates(name) and self._is_valid():
             yield turned
 
 
-def _at(fit: Fit) -> tuple[Pose, float, float | None]:
-    return fit.pose, fit.course, fit.out_m
+def _at(option: PutPose) -> tuple[Pose, float, float | None]:
+    return option.pose, option.course, option.depth_m
 
 
 def put(
-    stage: PhysicalStage, poses: Sequence[Pose], counts: Callable[[], bool], target: str
+    stage: PhysicalStage, poses: Sequence[Pose], is_valid: Callable[[], bool], target: str
 ) -> SkillRefusal | None:
-    """Bring what is held to the first of several poses that the arm gets at, let go, and draw the hand back.
+    """Bring the held object to the first reachable pose, let go, and draw the hand back.
 
-    ``counts`` tells whether what is held may stay where it stands in the planning scene. A refusal names the target where
-    nothing else is known to bar the way; what is held may be in the hand still.
+    ``is_valid`` tells if the object may stay at its present pose in the planning scene. A refusal names the target if no other
+    blocker is known. The object may then still be in the hand.
     """
     assert stage.grip is not None
-    delivery = PutRequest(stage, stage.grip, poses, counts)
-    return _bring(stage, delivery, delivery.ways(), target)
+    request = PutRequest(stage, stage.grip, poses, is_valid)
+    return _bring(stage, request, request.paths(), target)
 
 
 def drop(
-    stage: PhysicalStage, poses: Sequence[Pose], counts: Callable[[], bool], target: str
+    stage: PhysicalStage, poses: Sequence[Pose], is_valid: Callable[[], bool], target: str
 ) -> SkillRefusal | None:
-    """As ``put``, but let it fall from as little above one of the poses as the hand can come."""
+    """Drop the held object from the least height above one of the poses. Arguments and result are those of ``put``."""
     assert stage.grip is not None
-    delivery = PutRequest(stage, stage.grip, poses, counts)
-    return _bring(stage, delivery, delivery.drops(), target)
+    request = PutRequest(stage, stage.grip, poses, is_valid)
+    return _bring(stage, request, request.drops(), target)
 
 
 def _bring(
     stage: PhysicalStage,
-    delivery: PutRequest,
-    ways: Iterator[Way],
+    request: PutRequest,
+    paths: Iterator[ArmPath],
     target: str,
 ) -> SkillRefusal | None:
     grip = stage.grip
     assert grip is not None
     refusal = None
-    for way, refusal in arrivals(stage, ways, delivery.reach, loaded=True):
+    for path, refusal in arrivals(stage, paths, request.reach, loaded=True):
         if refusal is None:
-            return _set_down(stage, way)
-    other = delivery.reach.hindrance or target
+            return _set_down(stage, path)
+    other = request.reach.blocker or target
     return refusal or refuse(FailureReason.ARM_BLOCKED, target=f"a place for {grip.name}", other=other)
 
 
-def _put_tracks(grip: Grip, fits: Sequence[Fit]) -> Iterator[Track]:
-    """Ways that bring what is held to a pose and the empty hand back from there: in, down, and out."""
+def _put_tool_paths(grip: Grip, options: Sequence[PutPose]) -> Iterator[ToolPath]:
+    """Yield tool paths that bring the object in, down to a pose, and the empty hand out."""
     back = grip.pose_tool_object.inverse()
-    for fit in fits:
-        tool = fit.pose @ back
+    for option in options:
+        tool = option.pose @ back
         rotation, point = tool.rotation, np.array(tool.position_m)
-        inward = np.array([math.cos(fit.course), math.sin(fit.course), 0.0])
+        inward = np.array([math.cos(option.course), math.sin(option.course), 0.0])
         up = np.array([0.0, 0.0, 1.0])
-        if fit.out_m is None:
+        if option.depth_m is None:
             before = [point + 0.12 * up, point + 0.05 * up]
             after = [point - 0.05 * rotation[:, 2] + 0.01 * up, point - 0.1 * rotation[:, 2] + 0.03 * up]
         else:
-            count = max(2, math.ceil(fit.out_m / 0.12) + 1)
-            steps = np.linspace(fit.out_m, 0.0, count)[:, None]
+            count = max(2, math.ceil(option.depth_m / 0.12) + 1)
+            steps = np.linspace(option.depth_m, 0.0, count)[:, None]
             before = list(point + ROOFED_RAISE_M * up - steps * inward)
             off = point - 0.04 * rotation[:, 2] + 0.012 * up
             after = [off, *(off - steps[::-1][1:] * inward)]
         positions = np.array([*before, point, *after])
         loaded = np.arange(len(positions)) < len(before)
-        yield Track(np.tile(rotation, (len(positions), 1, 1)), positions, loaded, len(before))
+        yield ToolPath(np.tile(rotation, (len(positions), 1, 1)), positions, loaded, len(before))
 
 
-def _set_down(stage: PhysicalStage, way: Way) -> SkillRefusal | None:
-    """Follow a way down to where the thing touches, let go, and follow it out."""
+def _set_down(stage: PhysicalStage, path: ArmPath) -> SkillRefusal | None:
+    """Follow a path down until the object touches, let go, and follow it out."""
     grip, world = stage.grip, stage.world
     assert grip is not None
     name = grip.name
-    key = way.track.key
-    hit = stage.mover.advance(way.postures[1:key])
+    key = path.tool_path.key
+    hit = stage.mover.advance(path.postures[1:key])
     if hit is not None or stage.has_slipped():
         reason = FailureReason.SLIPPED if stage.has_slipped() else FailureReason.ARM_BLOCKED
         return refuse(reason, target=name, other=hit or SOMETHING)
-    lower = raised(way.postures[key], -DROP_M)
+    lower = raised(path.postures[key], -DROP_M)
     ignore = frozenset(world.carried)
     stage.mover.follow(
-        np.stack([way.postures[key], lower]), GENTLE, lambda: bool(stage.dynamic.touched_by(name, ignore))
+        np.stack([path.postures[key], lower]),
+        GENTLE_PACE,
+        lambda: bool(stage.dynamic.touched_by(name, ignore)),
     )
     stage.loosen()
     stage.mover.wait(16)
     _let_go(stage)
-    stage.mover.advance(way.postures[key + 1 :], 0.5)
+    stage.mover.advance(path.postures[key + 1 :], 0.5)
     stage.dynamic.part_from(name)
     return None
 
 
 def _let_go(stage: PhysicalStage) -> None:
-    """Put what the hand held, and what lay in it, into the planning scene where it now is."""
+    """Add the object and its contents to the planning scene at their present poses."""
     world = stage.world
     group = world.carried
     world.hand.forget()

@@ -1,6 +1,6 @@
-"""Free space around the robot: the scene's parts as boxes, and how near balls are to them.
+"""Free space around the robot: parts of the scene as oriented boxes, and collision checks of balls against them.
 
-Read from the planning scene, so that a motion can be judged before it is made. What really happens, physics decides.
+The boxes come from the planning scene, to judge a motion before it is made.
 """
 
 from __future__ import annotations
@@ -24,17 +24,16 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import FloatArray
 
     BoolArray = NDArray[np.bool_]
-    IntArray = NDArray[np.int_]
 
 TOGETHER: Final = 6
-"""Balls, neighbours of one limb, that are looked at as one before each of them is."""
+"""Neighbouring balls that are first checked as one enclosing ball."""
 CHUNK: Final = 40_000
-"""Pairs of balls and boxes that are compared at once: what fits into a processor's cache."""
+"""Pairs of balls and boxes to compare at once, sized for a processor cache."""
 
 
 @dataclass(frozen=True, slots=True)
 class Boxes:
-    """Oriented boxes: rotations (m, 3, 3), centres (m, 3), half extents (m, 3), and the object that each belongs to."""
+    """Oriented boxes: rotations (m, 3, 3), centres (m, 3), half extents (m, 3), and the name of each owner."""
 
     rotation: FloatArray
     centre: FloatArray
@@ -42,22 +41,22 @@ class Boxes:
     owners: tuple[str, ...]
 
     def without(self, names: Iterable[str]) -> Boxes:
-        """All but those of some objects."""
+        """Return the boxes without those of some owners."""
         left_out = frozenset(names)
         keep = np.array([owner not in left_out for owner in self.owners], dtype=np.bool_)
         return self.where(keep)
 
     def only(self, name: str) -> Boxes:
-        """Those of one object."""
+        """Return the boxes of one owner."""
         return self.where(np.array([owner == name for owner in self.owners], dtype=np.bool_))
 
     def where(self, keep: BoolArray) -> Boxes:
-        """Those that a mask, shape (m,), keeps."""
+        """Return the boxes that a mask, (m,), keeps."""
         owners = tuple(owner for owner, kept in zip(self.owners, keep, strict=True) if kept)
         return Boxes(self.rotation[keep], self.centre[keep], self.half[keep], owners)
 
     def joined(self, other: Boxes) -> Boxes:
-        """These and others."""
+        """Return these boxes and others."""
         return Boxes(
             np.concatenate([self.rotation, other.rotation]),
             np.concatenate([self.centre, other.centre]),
@@ -65,19 +64,19 @@ class Boxes:
             (*self.owners, *other.owners),
         )
 
-    def drawn_in(self, points: FloatArray, radii: FloatArray, margin_m: float) -> Boxes:
-        """The same, those smaller that balls, (k, 3) and (k,), come nearer to than a margin: by as much as lacks."""
+    def shrunk_clear_of(self, points: FloatArray, radii: FloatArray, margin_m: float) -> Boxes:
+        """Shrink boxes that balls, (k, 3) and (k,), come nearer to than a margin, by the missing distance."""
         lack = np.maximum(margin_m - (self.gaps(points) - radii[:, None]).min(axis=0), 0.0)  # (m,)
         return Boxes(self.rotation, self.centre, self.half - lack[:, None], self.owners)
 
     def near(self, low: FloatArray, high: FloatArray) -> Boxes:
-        """Those whose enclosing boxes overlap a box between two corners."""
+        """Return the boxes whose bounds overlap a box between two corners."""
         reach = np.einsum("mij,mj->mi", np.abs(self.rotation), self.half)
         keep = ((self.centre - reach <= high) & (self.centre + reach >= low)).all(axis=1)
         return self.where(keep)
 
     def within(self, points: FloatArray, reach_m: FloatArray) -> BoolArray:
-        """Whether points, (k, 3), are nearer than a distance of their own, (k,) and positive, to each of the boxes, (k, m)."""
+        """Mask, (k, m), of points, (k, 3), that are nearer to a box than their positive distance, (k,)."""
         offset = np.einsum("mj,mji->im", self.centre, self.rotation)
         squares = np.zeros((len(points), len(self.owners)))
         for axis in range(3):
@@ -91,8 +90,8 @@ class Boxes:
         return np.asarray(squares < (reach_m * reach_m)[:, None])
 
     def gaps(self, points: FloatArray) -> FloatArray:
-        """Signed distances of points, (k, 3), to every box, (k, m): negative inside."""
-        # One matrix for each of the boxes' axes: sums over an axis of three are what small arrays spend their time on.
+        """Signed distances of points, (k, 3), to every box, (k, m), negative inside."""
+        # One matrix per box axis: numpy is slow at sums over an axis of length three.
         offset = np.einsum("mj,mji->im", self.centre, self.rotation)
         deepest = np.full((len(points), len(self.owners)), -np.inf)
         outside = np.zeros((len(points), len(self.owners)))
@@ -111,8 +110,8 @@ class Boxes:
 
 
 @dataclass(frozen=True, slots=True)
-class Struck:
-    """Sets of balls, centres (n, b, 3) and radii (b,), among boxes. ``rows``, (n,): those that come nearer than a margin."""
+class BallCollision:
+    """Sets of balls, centres (n, b, 3) and radii (b,), among boxes. ``rows``, (n,), marks sets nearer than a margin."""
 
     boxes: Boxes
     balls: FloatArray
@@ -120,20 +119,20 @@ class Struck:
     margin_m: float
     rows: BoolArray
 
-    def only(self, row: int) -> Struck:
-        """One of the sets."""
+    def only(self, row: int) -> BallCollision:
+        """Return one of the sets."""
         one = slice(row, row + 1)
-        return Struck(self.boxes, self.balls[one], self.radii, self.margin_m, self.rows[one])
+        return BallCollision(self.boxes, self.balls[one], self.radii, self.margin_m, self.rows[one])
 
     @property
     def owner(self) -> str:
-        """Whose box the first set is deepest in; "" for none."""
-        number = int(strikes(self.boxes, self.balls, self.radii, self.margin_m)[0])
+        """Owner of the box that the first set is deepest in; "" for none."""
+        number = deepest_box(self.boxes, self.balls[0], self.radii, self.margin_m)
         return self.boxes.owners[number] if number >= 0 else ""
 
 
 def boxes_around(engine: PhysicsEngine, low: tuple[float, float], high: tuple[float, float]) -> Boxes:
-    """Parts of all objects, and the walls, over a rectangle of the floor, with doors and drawers as they are."""
+    """Return the parts of all objects and walls over a rectangle of the floor, with doors in their present position."""
     scene = engine.scene
     window = Aabb((low[0], low[1], -1.0), (high[0], high[1], 3.0))
     rows: list[tuple[Pose, tuple[float, float, float], str]] = []
@@ -152,7 +151,7 @@ def boxes_around(engine: PhysicsEngine, low: tuple[float, float], high: tuple[fl
 def part_boxes(
     asset: Asset, pose: Pose, fractions: Sequence[float]
 ) -> list[tuple[Pose, tuple[float, float, float]]]:
-    """World pose and size of the box around each part of an asset, its joints at shares of their travel."""
+    """Return world pose and size of the box around each part of an asset, with joints at shares of their travel."""
     shares = iter(fractions)
     found = []
     for link in asset.links:
@@ -165,7 +164,7 @@ def part_boxes(
 def object_balls(
     asset: Asset, fractions: Sequence[float], *, least_m: float = 0.012
 ) -> tuple[FloatArray, FloatArray]:
-    """Balls that fill an asset's parts, in its frame: centres (k, 3) and radii (k,). Large flat parts get many."""
+    """Return balls that fill the parts of an asset, in its frame: centres (k, 3) and radii (k,). Large flat parts get many."""
     centres, radii = [], []
     for pose, size in part_boxes(asset, IDENTITY, fractions):
         half = np.array(size) / 2
@@ -177,31 +176,20 @@ def object_balls(
     return np.concatenate(centres), np.concatenate(radii)
 
 
-def strikes(boxes: Boxes, balls: FloatArray, radii: FloatArray, margin_m: float) -> IntArray:
-    """For each of n sets of balls, (n, b, 3), the number of the box that it comes nearer than a margin to, -1 for none.
-
-    radii: (b,). Shape of the answer: (n,).
-    """
-    count, each, _ = balls.shape
-    found = np.full(count, -1)
-    if not boxes.owners or not count:
-        return found
-    rows = max(1, CHUNK // (each * len(boxes.owners)))
-    for start in range(0, count, rows):
-        part = balls[start : start + rows]
-        gaps = boxes.gaps(part.reshape(-1, 3)).reshape(len(part), each, -1) - radii[None, :, None]
-        nearest = gaps.min(axis=1)  # (rows, m)
-        deepest = nearest.argmin(axis=1)
-        hit = nearest[np.arange(len(part)), deepest] < margin_m
-        found[start : start + rows][hit] = deepest[hit]
-    return found
+def deepest_box(boxes: Boxes, balls: FloatArray, radii: FloatArray, margin_m: float) -> int:
+    """Return the index of the box that balls, (b, 3) and (b,), are deepest in within a margin; -1 for none."""
+    if not boxes.owners:
+        return -1
+    nearest = (boxes.gaps(balls) - radii[:, None]).min(axis=0)  # (m,)
+    deepest = int(nearest.argmin())
+    return deepest if nearest[deepest] < margin_m else -1
 
 
-def struck(boxes: Boxes, balls: FloatArray, radii: FloatArray, margin_m: float) -> BoolArray:
-    """Whether each of n sets of balls, (n, b, 3), comes nearer than a margin to any of the boxes, shape (n,).
+def collides(boxes: Boxes, balls: FloatArray, radii: FloatArray, margin_m: float) -> BoolArray:
+    """Mask, (n,), of sets of balls, (n, b, 3), that come nearer than a margin to any box.
 
-    radii: (b,), each larger than what a margin below zero lets them sink in. The answer of ``strikes`` without who is struck:
-    neighbours among the balls are first looked at as one, and only what is near then ball by ball.
+    radii: (b,), each larger than a negative margin. Neighbouring balls are first checked as one; only near groups are then
+    checked ball by ball.
     """
     count, each, _ = balls.shape
     found = np.zeros(count, dtype=np.bool_)
@@ -230,7 +218,7 @@ def _count(half_m: float, radius: float) -> int:
 
 
 def _size(shape: Shape, size: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Boxes of round things are drawn in: a box around a ball is twice as large as the ball."""
+    """Shrink the boxes of round parts: the box around a ball has twice its volume."""
     if shape is Shape.CYLINDER:
         return (size[0] * 0.9, size[1] * 0.9, size[2])
     if shape is Shape.SPHERE:
@@ -239,7 +227,7 @@ def _size(shape: Shape, size: tuple[float, float, float]) -> tuple[float, float,
 
 
 def boxes_of(rows: Sequence[tuple[Pose, tuple[float, float, float], str]]) -> Boxes:
-    """Boxes from (pose, size, owner)."""
+    """Return boxes from rows of (pose, size, owner)."""
     return Boxes(
         np.array([pose.rotation for pose, _, _ in rows]).reshape(-1, 3, 3),
         np.array([pose.position_m for pose, _, _ in rows]).reshape(-1, 3),

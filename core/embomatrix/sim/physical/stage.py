@@ -1,6 +1,6 @@
-"""Where a physical rollout takes place: the planning scene, in which meaning is read, and the dynamic world, which decides.
+"""Stage of a physical rollout: the planning scene, in which relations are read, and the dynamic world, which decides.
 
-Motions are planned in the one and made in the other; after every skill what moved there is copied back.
+Motions are planned in the first and made in the second. Objects that moved are copied back after every skill.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import numpy as np
 from embomatrix.sim.bullet.robot import tucked
 from embomatrix.sim.joints.panels import swing_panels
 from embomatrix.sim.joints.swings import SWING
-from embomatrix.sim.physical import arm, body
+from embomatrix.sim.physical import arm
 from embomatrix.sim.physical.floor import Floor
 from embomatrix.sim.physical.motion import Mover
-from embomatrix.sim.physical.reach import ArmReach, HeldGeometry
+from embomatrix.sim.physical.reach import ArmReach, HeldGeometry, limb_balls
 from embomatrix.sim.physical.space import boxes_around, object_balls
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Aabb, Pose
@@ -32,29 +32,29 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import FloatArray
 
 SETTLE_STEPS: Final = 240
-"""After a second the world is taken as it is, at rest or not."""
+"""Longest settling time, in steps of 1/240 s. The world is then taken as it is."""
 AROUND_M: Final = 1.9
-"""Things farther than this from the base are out of the arm's way."""
+"""Objects farther than this from the base are out of the arm's reach."""
 SLIP_M: Final = 0.04
 WAKE_M: Final = 0.03
 TOOL: Final = Pose((0.0, 0.0, arm.TOOL_M))
-"""The tool's frame in the hand's."""
+"""Frame of the tool in the frame of the hand."""
 NEARER: Final = 24
 SPAN_M: Final = 0.5
 APART: Final = 0.13
-"""Places that are tried when the arm does not reach from where the robot stands."""
+"""Standing places to try if the arm does not reach from the present one: number, distance range, spacing."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grip:
-    """What the hand holds and how: the object's pose in the tool's frame, and its balls there."""
+    """Held object, its pose in the tool's frame, and its balls there."""
 
     name: str
     pose_tool_object: Pose
     held: HeldGeometry
 
-    def otherwise(self, pose_tool_object: Pose) -> Grip:
-        """What it would be to hold the same in another way."""
+    def held_as(self, pose_tool_object: Pose) -> Grip:
+        """Return the grip on the same object at another pose in the tool's frame."""
         change = pose_tool_object @ self.pose_tool_object.inverse()
         up = None if self.held.up is None else change.rotation @ self.held.up
         held = HeldGeometry(change.apply_all(self.held.centres), self.held.radii, up)
@@ -62,7 +62,7 @@ class Grip:
 
 
 class PhysicalStage:
-    """One rollout's two worlds and the robot. ``begin`` starts the next."""
+    """Planning scene, dynamic world and robot of one rollout. ``begin`` starts the next rollout."""
 
     def __init__(self, world: LiveWorld, dynamic: DynamicWorld, watch: Callable[[], None]) -> None:
         self.world = world
@@ -70,44 +70,44 @@ class PhysicalStage:
         self.mover = Mover(dynamic, watch)
         self.floor = Floor(world.navigator)
         self.grip: Grip | None = None
-        self.told = world.robot
-        """Where the robot was told to stand, which it leaves to work and comes back to: with a load it may face elsewhere."""
+        self.commanded = world.robot
+        """Commanded standing pose. The robot leaves it to work and returns; with a load it may face elsewhere."""
 
     def begin(self) -> None:
-        """Build the dynamic world as the planning scene is."""
+        """Build the dynamic world in the state of the planning scene."""
         engine, robot = self.world.engine, self.world.robot
         names = [item.name for item in self.world.scene.objects]
         poses = {name: engine.pose(name) for name in names if not engine.is_parked(name)}
         joints = {name: engine.joints(name) for name in names}
         self.dynamic.build(poses, joints, tucked(robot))
-        self.grip, self.told = None, robot
+        self.grip, self.commanded = None, robot
 
     def stand_at(self, stand: StandPose) -> None:
-        """Put the robot somewhere with its arm tucked, in both worlds. Nothing is asked about the way there."""
-        self.world.robot = self.told = stand
+        """Put the robot at a pose with its arm tucked, in both worlds, without a route."""
+        self.world.robot = self.commanded = stand
         self.dynamic.robot.appear(tucked(stand))
 
     def open_around(self, name: str) -> None:
-        """Open in the planning scene whatever is shut around an object, as far as there is room."""
+        """Open the closed containers around an object in the planning scene, as far as there is room."""
         world = self.world
         for enclosure in world.relations.enclosing(name):
             if enclosure.closed:
                 swing_panels(world.engine, world.relations, enclosure.name, SWING)
 
     def boxes(self) -> Boxes:
-        """Parts of things around the robot, without what it holds."""
+        """Return the parts of objects around the robot, without the load."""
         x, y, _ = self.mover.posture[:3]
         return boxes_around(self.world.engine, (x - AROUND_M, y - AROUND_M), (x + AROUND_M, y + AROUND_M))
 
     def boxes_within(self, low: FloatArray, high: FloatArray) -> Boxes:
-        """Parts of things between two corners, each of shape (3,), without what the hand holds."""
+        """Return the parts of objects between two corners, each of shape (3,), without the load."""
         window = ((float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
         return boxes_around(self.world.engine, *window).near(low, high)
 
     def reach(
         self, boxes: Boxes, target: str = "", also: Callable[[FloatArray], bool] | None = None
     ) -> ArmReach:
-        """Ways of the hand as it is, among boxes; it may touch the target. ``also`` has a say in which of them are free."""
+        """Return the reach of the hand among boxes. It may touch the target. ``also``: additional test of paths."""
         held = self.grip.held if self.grip is not None else None
         return ArmReach(boxes, boxes.without((target,)) if target else boxes, held, also)
 
@@ -118,10 +118,10 @@ class PhysicalStage:
         course: float | None = None,
         walk_m: float = ROBOT.reach_m,
     ) -> list[FloatArray]:
-        """Where the base may stand to work at a point: here, shape (1, 3); then other places, (b, 3), the likeliest first.
+        """Return standing places for work at a point: here, shape (1, 3), then others, (b, 3), the likeliest first.
 
-        ``away_m`` is the distance that suits the work, ``course`` the heading in which the hand must go, ``walk_m`` how far the
-        base may go. Places are the farther apart the farther it may.
+        ``away_m``: suitable distance; ``course``: required heading of the hand; ``walk_m``: longest drive. The spacing of the
+        places grows with ``walk_m``.
         """
         here = self.mover.posture[:3]
         yaw = math.atan2(point[1] - here[1], point[0] - here[0])
@@ -151,22 +151,26 @@ class PhysicalStage:
             options += [np.array(part) for part in (chosen[:half], chosen[half:]) if part]
         return options
 
+    def limbs(self, postures: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the balls of the arm and of its load: centres (n, k, 3) and radii (k,)."""
+        return limb_balls(postures, self.grip.held if self.grip is not None else None)
+
     def take(self, name: str) -> None:
-        """The hand holds what it touches."""
+        """Grip the touched object."""
         self.grip = self.grip_with(
             self.dynamic.robot.hand_pose() @ TOOL, self.dynamic.bodies.pose(name), name
         )
         self.dynamic.grasp(name)
 
     def grip_with(self, pose_tool: Pose, pose_object: Pose, name: str) -> Grip:
-        """What it is to hold an object with the tool and the object at these poses in the world."""
+        """Return the grip on an object with tool and object at these poses in the world."""
         local = pose_tool.inverse() @ pose_object
         centres, radii = self._balls(name, local)
         up = local.rotation @ pose_object.rotation[2] if len(self.world.cargo(name)) > 1 else None
         return Grip(name, local, HeldGeometry(centres, radii, up))
 
     def _balls(self, name: str, pose_tool_object: Pose) -> tuple[FloatArray, FloatArray]:
-        """Balls of an object and of all that lies in it, in the tool's frame."""
+        """Return the balls of an object and of its contents in the tool's frame."""
         engine = self.world.engine
         centres, radii = [], []
         base = engine.pose(name)
@@ -178,19 +182,19 @@ class PhysicalStage:
         return np.concatenate(centres), np.concatenate(radii)
 
     def release(self) -> None:
-        """The hand lets go."""
+        """Let go of the held object."""
         held = self.grip.name if self.grip is not None else ""
         self.loosen()
         if held:
             self.dynamic.part_from(held)
 
     def loosen(self) -> None:
-        """The hand lets go, and leaves what it held without dragging it along until they part in the dynamic world."""
+        """Let go without dragging the object along until hand and object part in the dynamic world."""
         self.dynamic.loosen()
         self.grip = None
 
     def has_slipped(self) -> bool:
-        """Whether what the hand should hold is not where the hand holds it."""
+        """True if the held object has moved in the hand."""
         if self.grip is None:
             return False
         tool = self.dynamic.robot.hand_pose() @ TOOL
@@ -198,7 +202,7 @@ class PhysicalStage:
         return math.dist(wanted.position_m, self.dynamic.bodies.pose(self.grip.name).position_m) > SLIP_M
 
     def wake_around(self, box: Aabb) -> None:
-        """Wake what lies at or on something between two corners that is about to move."""
+        """Wake objects at or on a box that is about to move."""
         self.wake(self.world.engine.near(box.grown(WAKE_M)))
 
     def wake(self, names: Iterable[str]) -> None:
@@ -206,7 +210,7 @@ class PhysicalStage:
         self.dynamic.bodies.wake(name for name in names if not self.world.is_fixed(name))
 
     def bring_in_step(self) -> None:
-        """Take out of the dynamic world what left the planning scene, and bring in what came: things that were cut."""
+        """Remove objects from the dynamic world that left the planning scene, and add new ones: effects of cutting."""
         engine = self.world.engine
         for item in self.world.scene.objects:
             if item.fixed or item.name in self.world.carried:
@@ -217,12 +221,12 @@ class PhysicalStage:
                 self.dynamic.bodies.put(item.name, engine.pose(item.name))
 
     def settle(self) -> None:
-        """Let the world come to rest and copy what moved into the planning scene."""
+        """Let the world come to rest and copy moved objects into the planning scene."""
         self.dynamic.settle(SETTLE_STEPS)
         self.copy()
 
     def copy(self) -> None:
-        """Take over where the robot is and what moved, but what the hand holds."""
+        """Copy the robot's pose and moved objects, except the held one, into the planning scene."""
         world, engine = self.world, self.world.engine
         x, y, yaw = self.mover.posture[:3].tolist()
         world.robot = StandPose(x, y, math.remainder(yaw, math.tau))
@@ -240,10 +244,6 @@ class PhysicalStage:
 
 
 def compact(stage: PhysicalStage, posture: FloatArray) -> bool:
-    """Whether arm and load stay over the base's disc."""
-    row = posture[None]
-    points, radii = body.balls(row)[0], body.RADII
-    if stage.grip is not None:
-        points = np.concatenate([points, stage.grip.held.placed(row)[0]])
-        radii = np.concatenate([radii, stage.grip.held.radii])
-    return bool((np.linalg.norm(points[:, :2] - posture[:2], axis=1) + radii).max() <= ROBOT.radius_m)
+    """True if arm and load stay over the base's disc."""
+    points, radii = stage.limbs(posture[None])
+    return bool((np.linalg.norm(points[0, :, :2] - posture[:2], axis=1) + radii).max() <= ROBOT.radius_m)

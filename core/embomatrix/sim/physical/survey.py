@@ -1,7 +1,7 @@
-"""Looking ahead, offline: from which standing poses the arm gets at what is in a scene, and at what from none.
+"""Reachability survey, offline: standing poses from which the arm reaches the objects of a scene, and the blockers elsewhere.
 
-Cached mode does not look at the arm. So that it promises nothing which the physical robot can't do, ways of the arm are
-looked for once, in the scene as it was loaded, by the same search by which physical mode finds them. Nothing is stepped.
+Cached mode does not model the arm. The survey keeps it from promising actions that the physical robot can't do: it searches
+for arm paths once, in the initial scene, with the search of physical mode. Nothing is stepped, except for doors in doubt.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.geometry.bounds import IDENTITY
 from embomatrix.sim.joints.panels import DoorPanels, swing_panels
 from embomatrix.sim.joints.swings import SWING
-from embomatrix.sim.physical.doors import STRETCHES, close_all, in_turn, leading, open_all
-from embomatrix.sim.physical.fold import WAYS, approach
-from embomatrix.sim.physical.hands import ways_to
-from embomatrix.sim.physical.press import pressing
-from embomatrix.sim.physical.prospects import Prospects
+from embomatrix.sim.physical.doors import STRETCHES, close_all, open_all, panel_paths, panels_in_order
+from embomatrix.sim.physical.fold import PATHS_TRIED, approach
+from embomatrix.sim.physical.pick import pick_paths
+from embomatrix.sim.physical.placement_reachability import PlacementReachability
+from embomatrix.sim.physical.press import press_paths
 from embomatrix.sim.physical.stage import AROUND_M, PhysicalStage
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.sim.placing.pose_cache import Contents
@@ -33,60 +33,62 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from embomatrix.sim.live_world import LiveWorld
-    from embomatrix.sim.physical.doors import Leaf
-    from embomatrix.sim.physical.prospects import Placing
-    from embomatrix.sim.physical.reach import ArmReach, Way
+    from embomatrix.sim.physical.doors import DoorPanel
+    from embomatrix.sim.physical.placement_reachability import PlacementQuery
+    from embomatrix.sim.physical.reach import ArmPath, ArmReach
     from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import FloatArray
     from embomatrix.world.poses import StandPose
 
     Look = tuple[int | None, str]
-    """Number of the first standing pose that will do, and what bars the way where none does."""
+    """Number of the first suitable standing pose, and the blocker if there is none."""
 
 STANDS: Final = 2
-"""Standing poses that are looked at: the robot steps aside to work, so that the others add little."""
+"""Standing poses to examine. More add little, because the robot steps aside to work."""
 TRIALS: Final[Mapping[Handling, Callable[[PhysicalStage, str], SkillRefusal | None]]] = {
     Handling.OPEN: open_all,
     Handling.CLOSE: close_all,
 }
-"""Handlings of doors."""
+"""Door handlings, which the survey tries in simulated time if no path is found."""
 SEEN_M: Final = ROBOT.reach_m + AROUND_M
-"""What is farther from a door has no part in whether the robot, within reach of it, can lead it."""
+"""Objects farther than this from a door have no influence on its reachability."""
 
 
-class Foresight:
-    """Looks ahead in scenes. Doors among furniture that was seen before are not looked at again."""
+class ReachabilitySurvey:
+    """Survey of scenes. Results for doors are shared between scenes with equal surroundings."""
 
     def __init__(self) -> None:
         self._known: dict[bytes, Look] = {}
         self._contents = Contents()
 
     def survey(self, world: LiveWorld, poses: PoseCache, names: Iterable[str]) -> PoseCache:
-        """The cache with what the arm can do to these objects: stands from where it can first, and what bars all the others.
+        """Return the cache with suitable standing poses first, and with the blockers of unreachable objects.
 
-        ``world`` is at the start of its scene, and is left there. The answer follows from the arguments alone.
+        ``world`` is at the start of its scene, and is left there. The result depends on the arguments only.
         """
         with _staged(world) as stage:
             surveyor = _Surveyor(stage, self._known, self._contents)
             return surveyor.surveyed(poses, tuple(dict.fromkeys(names)))
 
 
-def prospects(world: LiveWorld, poses: PoseCache, placings: Iterable[Placing]) -> PoseCache:
-    """The cache with at which poses the arm gets with what is placed, the first of these placings as far as looks last.
+def placement_reachability(
+    world: LiveWorld, poses: PoseCache, queries: Iterable[PlacementQuery]
+) -> PoseCache:
+    """Return the cache with the answers to placement queries, the first ones as far as the budget lasts.
 
     ``poses`` hold placements and standing poses. ``world`` is at the start of its scene, and is left there.
     """
     with _staged(world) as stage:
-        return Prospects(stage, poses).seen(placings)
+        return PlacementReachability(stage, poses).seen(queries)
 
 
 @contextlib.contextmanager
 def _staged(world: LiveWorld) -> Iterator[PhysicalStage]:
-    """A robot in a world at the start of its scene, which is there again in the end."""
+    """Yield a stage with the robot at the start of the scene, and restore the world at the end."""
     dynamic = DynamicWorld(world.scene)
     try:
-        stage = PhysicalStage(world, dynamic, _idle)
+        stage = PhysicalStage(world, dynamic, watch=lambda: None)
         stage.begin()
         yield stage
     finally:
@@ -97,12 +99,8 @@ def _staged(world: LiveWorld) -> Iterator[PhysicalStage]:
         world.robot = world.navigator.start
 
 
-def _idle() -> None:
-    """Nobody watches."""
-
-
 def handlings_of(asset: Asset, *, fixed: bool) -> tuple[Handling, ...]:
-    """What the hand may be asked to do to an object."""
+    """Return the actions of the hand that an object offers."""
     taken = () if fixed else (Handling.TAKE,)
     led = (Handling.OPEN, Handling.CLOSE) if asset.joints else ()
     pressed = (Handling.PRESS,) if asset.can("toggleable") else ()
@@ -110,12 +108,12 @@ def handlings_of(asset: Asset, *, fixed: bool) -> tuple[Handling, ...]:
 
 
 def _preferring(first: StandPose, stands: Sequence[StandPose]) -> tuple[StandPose, ...]:
-    """Standing poses with one of them before the others."""
+    """Return standing poses with one of them first."""
     return tuple(sorted(stands, key=lambda stand: stand != first))
 
 
 class _Surveyor:
-    """Puts the robot where it may stand, and looks for ways of the arm."""
+    """Search for arm paths from standing poses in one scene."""
 
     def __init__(self, stage: PhysicalStage, known: dict[bytes, Look], contents: Contents) -> None:
         self._stage = stage
@@ -124,23 +122,23 @@ class _Surveyor:
         self._contents = contents
 
     def surveyed(self, poses: PoseCache, names: tuple[str, ...]) -> PoseCache:
-        """The cache with what was found out about these objects."""
+        """Return the cache with the results for these objects."""
         stands = dict(poses.stands)
-        barred: dict[Handling, dict[str, str]] = {}
+        blockers: dict[Handling, dict[str, str]] = {}
         for name in names:
             handlings = handlings_of(self._world.asset(name), fixed=self._world.is_fixed(name))
             for handling in handlings:
-                reached, other = self._look(name, handling)
+                reached, other = self._answer(name, handling)
                 if reached is None and other:
-                    barred.setdefault(handling, {})[name] = other
+                    blockers.setdefault(handling, {})[name] = other
                 elif reached is not None and handling is handlings[0]:
                     stands[name] = _preferring(reached, stands.get(name, ()))
-        return replace(poses, stands=stands, barred=barred)
+        return replace(poses, stands=stands, barred=blockers)
 
-    def _look(self, name: str, handling: Handling) -> tuple[StandPose | None, str]:
-        """The first standing pose from which it can be done; None, and what bars the way, when there is none such."""
+    def _answer(self, name: str, handling: Handling) -> tuple[StandPose | None, str]:
+        """Return the first suitable standing pose; else None and the blocker."""
         self._make_ready(name, handling)
-        # From where else a door goes the robot finds out itself, when it tries.
+        # Motions of doors try other standing poses themselves.
         looks = 1 if handling in TRIALS else STANDS
         stands = self._world.navigator.stands(name, self._world.navigator.start)[:looks]
         if handling not in TRIALS:
@@ -158,16 +156,16 @@ class _Surveyor:
             if number:
                 self._make_ready(name, handling)
             self._stage.stand_at(stand)
-            other = self._bars(name, handling)
+            other = self._blocker(name, handling)
             if not other:
                 return number, ""
-        # Leaves give way to one another as they are led: of doors it is tried what seems not to go.
+        # Panels make room for each other as they move, so doors that seem blocked are tried in simulated time.
         if stands and handling in TRIALS and self._does(stands[0], name, handling):
             return 0, ""
         return None, other
 
     def _does(self, stand: StandPose, name: str, handling: Handling) -> bool:
-        """Whether the robot can do it all the same: it tries, in a world where time passes."""
+        """True if the robot succeeds when it tries in simulated time."""
         self._make_ready(name, handling)
         self._world.robot = stand
         self._stage.begin()
@@ -177,7 +175,7 @@ class _Surveyor:
         return refusal is None
 
     def _make_ready(self, name: str, handling: Handling) -> None:
-        """The scene as it was loaded, but for what must be open or shut. Doors are looked at without the small things about."""
+        """Restore the initial scene, with doors as the handling needs them. Small objects are removed for doors."""
         world = self._world
         world.engine.reset()
         match handling:
@@ -192,7 +190,7 @@ class _Surveyor:
         world.navigator.refresh()
 
     def _surroundings(self, name: str, handling: Handling, stands: Sequence[StandPose]) -> bytes:
-        """Digest of all that a look at a door depends on."""
+        """Return a digest of everything that the result for a door depends on."""
         engine, scene = self._world.engine, self._world.scene
         window = engine.aabb(name).grown(SEEN_M)
         rows = [
@@ -202,54 +200,54 @@ class _Surveyor:
         walls = [(wall.pose, wall.size_m) for wall in scene.walls if wall.aabb(IDENTITY).overlaps(window)]
         return hashlib.sha256(repr((handling, rows, walls, stands)).encode()).digest()
 
-    def _bars(self, name: str, handling: Handling) -> str:
-        """What bars the way of the arm from where the robot stands; "" when nothing does."""
+    def _blocker(self, name: str, handling: Handling) -> str:
+        """Return the blocker of a handling from the present standing pose; "" for none."""
         match handling:
             case Handling.TAKE:
-                tracks, _, bases = ways_to(self._stage, name)
+                tool_paths, _, bases = pick_paths(self._stage, name)
                 reach = self._stage.reach(self._stage.boxes(), name)
-                return self._bars_all(reach, reach.ways(tracks, bases))
+                return self._paths_blocker(reach, reach.paths(tool_paths, bases))
             case Handling.PRESS:
-                return self._bars_all(*pressing(self._stage, name))
+                return self._paths_blocker(*press_paths(self._stage, name))
             case Handling.OPEN:
-                return self._bars_leaves(name, 1.0)
+                return self._panels_blocker(name, 1.0)
             case Handling.CLOSE:
-                return self._bars_leaves(name, 0.0)
+                return self._panels_blocker(name, 0.0)
 
-    def _bars_all(self, reach: ArmReach, ways: Iterator[Way]) -> str:
-        """What bars all of some ways; "" when the arm gets to the start of one of them, which it then may go."""
-        for way in itertools.islice(ways, WAYS):
-            if approach(self._stage, way, reach, loaded=False) is not None:
+    def _paths_blocker(self, reach: ArmReach, paths: Iterator[ArmPath]) -> str:
+        """Return the blocker of all paths; "" if the arm reaches the start of one of them."""
+        for path in itertools.islice(paths, PATHS_TRIED):
+            if approach(self._stage, path, reach, loaded=False) is not None:
                 return ""
-        return reach.hindrance or SOMETHING
+        return reach.blocker or SOMETHING
 
-    def _bars_leaves(self, name: str, goal: float) -> str:
-        """What bars the way to lead every leaf of an object to a share of its travel, one after the other."""
+    def _panels_blocker(self, name: str, goal: float) -> str:
+        """Return the blocker of moving every panel of an object in turn; "" for none."""
         if not self._stage.dynamic.bodies.has_leaves(name):
             return name
-        for leaf in in_turn(self._stage, name, goal):
-            start = self._world.engine.joints(name)[leaf.number]
+        for panel in panels_in_order(self._stage, name, goal):
+            start = self._world.engine.joints(name)[panel.number]
             other = SOMETHING
             for pulls in STRETCHES:
-                other = self._bars_leaf(leaf, np.linspace(start, goal, pulls + 1))
+                other = self._panel_blocker(panel, np.linspace(start, goal, pulls + 1))
                 if not other:
                     break
             if other:
                 return other
         return ""
 
-    def _bars_leaf(self, leaf: Leaf, course: FloatArray) -> str:
-        """What bars the way to lead a leaf from share to share of its travel, (n,); if nothing does it is left at the last."""
+    def _panel_blocker(self, panel: DoorPanel, course: FloatArray) -> str:
+        """Return the blocker of moving a panel along shares of its travel, (n,). Without one the panel stays at the last."""
         for start, goal in itertools.pairwise(course.tolist()):
-            other = self._bars_all(*leading(self._stage, leaf, start, goal))
+            other = self._paths_blocker(*panel_paths(self._stage, panel, start, goal))
             if other:
-                self._lead(leaf, float(course[0]))
+                self._move_panel(panel, float(course[0]))
                 return other
-            self._lead(leaf, goal)
+            self._move_panel(panel, goal)
         return ""
 
-    def _lead(self, leaf: Leaf, share: float) -> None:
-        fractions = list(self._world.engine.joints(leaf.name))
-        fractions[leaf.number] = share
-        DoorPanels(self._world.engine, self._world.relations, leaf.name).swing([fractions])
+    def _move_panel(self, panel: DoorPanel, share: float) -> None:
+        fractions = list(self._world.engine.joints(panel.name))
+        fractions[panel.number] = share
+        DoorPanels(self._world.engine, self._world.relations, panel.name).swing([fractions])
         self._world.navigator.refresh()

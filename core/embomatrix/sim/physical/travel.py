@@ -1,4 +1,4 @@
-"""Driving: along the navigation grid's corners, turned so that arm and load pass, and stopped by what is hit."""
+"""Driving: along the corners of a route, with headings at which arm and load pass, stopped by collisions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim.physical import body
-from embomatrix.sim.physical.space import struck
+from embomatrix.sim.physical.space import collides
 from embomatrix.sim.physical.stage import compact
 from embomatrix.sim.placing.trial import in_reach
 from embomatrix.skills.failure import FailureReason
@@ -27,17 +27,17 @@ if TYPE_CHECKING:
 
 HEADINGS: Final = 24
 SPACING_M: Final = 0.12
-"""Along the way the load's room is looked at this often."""
+"""Spacing of the collision checks of arm and load along the route."""
 TURNS: Final = 12
 """Marks at either end at which the robot may turn on the spot."""
 MOST_STEPS: Final = 1
-"""Headings that it may turn by from one mark to the next."""
+"""Headings by which the robot may turn between two marks."""
 CHAINS: Final = 4
-"""Ways to turn on the way that are looked at: what one strikes between two headings, the next avoids."""
+"""Attempts to find headings. Turns that collide in one attempt are avoided in the next."""
 BETWEEN: Final = 3
-"""Headings between two that are looked at where the robot turns."""
+"""Intermediate headings to check during a turn."""
 BACK_OUT_M: Final = (0.2, 0.4, 0.6)
-"""So far the robot draws a load straight back where it can't turn with it."""
+"""Distances by which the robot draws a load straight back if it can't turn with it."""
 BLOCKED_COST: Final = 100.0
 BESIDE_COST: Final = 1.0
 STRUCK_M: Final = 0.005
@@ -46,18 +46,20 @@ SOMETHING: Final = "something"
 
 
 def travel(stage: PhysicalStage, goal: StandPose, target: str = "") -> SkillRefusal | None:
-    """Drive to a pose on the floor, or where an open door takes that place beside it, where the target is in reach too."""
+    """Drive to a pose on the floor. If it is occupied, drive to a pose beside it from which the target is in reach."""
     here = stage.mover.posture[:3]
-    way = stage.floor.way((float(here[0]), float(here[1])), goal, lambda spot: _serves(stage, spot, target))
-    if way is not None:
-        return drive(stage, way[0], way[1].yaw)
-    # Only a door stands in the way, as the planner knows of a path: drive against it, and physics says what gives.
+    path = stage.floor.route(
+        (float(here[0]), float(here[1])), goal, lambda spot: _serves(stage, spot, target)
+    )
+    if path is not None:
+        return drive(stage, path[0], path[1].yaw)
+    # Only a door is in the way, because the planner knows a path: drive against it and let physics decide.
     corners = stage.world.navigator.path(StandPose(*here.tolist()), goal)
     return drive(stage, np.array([here[:2], *corners, (goal.x_m, goal.y_m)]), goal.yaw)
 
 
 def _serves(stage: PhysicalStage, spot: StandPose, target: str) -> bool:
-    """Whether a target is in reach from a spot, with nothing between; without a target any spot will do."""
+    """True if the target is in reach from a pose with nothing between. Any pose serves without a target."""
     if not target or target in stage.world.carried:
         return True
     box = stage.world.relations.body(target)
@@ -65,11 +67,11 @@ def _serves(stage: PhysicalStage, spot: StandPose, target: str) -> bool:
 
 
 def drive(stage: PhysicalStage, points: FloatArray, yaw: float) -> SkillRefusal | None:
-    """Drive along straight lines between points, (n, 2), the first of which is here, and end with a heading.
+    """Drive along straight lines between points, (n, 2), starting here, and end with a heading.
 
-    What the robot was told is the end, and the heading even where its load keeps it from facing there.
+    The commanded pose is the end with that heading, even if the load keeps the robot from facing there.
     """
-    stage.told = StandPose(float(points[-1, 0]), float(points[-1, 1]), yaw)
+    stage.commanded = StandPose(float(points[-1, 0]), float(points[-1, 1]), yaw)
     start = stage.mover.posture
     marks, headings = _course(stage, start, points, yaw)
     postures = np.tile(start, (len(marks), 1))
@@ -85,22 +87,22 @@ def drive(stage: PhysicalStage, points: FloatArray, yaw: float) -> SkillRefusal 
 def _course(
     stage: PhysicalStage, start: FloatArray, points: FloatArray, yaw: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Marks, (n, 2), and headings, (n,), along lines between points: where a load finds no room to turn, back out first."""
-    marks, headings, struck = _headings(stage, start, _resampled(points), yaw)
+    """Return marks, (n, 2), and headings, (n,), along lines between points. Back out first if a load has no room to turn."""
+    marks, headings, collisions = _headings(stage, start, _resampled(points), yaw)
     grid, here = stage.floor.grid, (float(points[0, 0]), float(points[0, 1]))
-    for away in BACK_OUT_M if struck and len(points) > 1 else ():
+    for away in BACK_OUT_M if collisions and len(points) > 1 else ():
         spot = (here[0] - away * math.cos(start[body.YAW]), here[1] - away * math.sin(start[body.YAW]))
         onward = (float(points[1, 0]), float(points[1, 1]))
         if grid.drives_straight(here, spot) and grid.drives_straight(spot, onward):
             longer = _resampled(np.array([here, spot, *points[1:]]))
-            other, turned, less = _headings(stage, start, longer, yaw)
-            if less < struck:
-                marks, headings, struck = other, turned, less
+            other, turned, fewer = _headings(stage, start, longer, yaw)
+            if fewer < collisions:
+                marks, headings, collisions = other, turned, fewer
     return marks, headings
 
 
 def _resampled(points: FloatArray) -> FloatArray:
-    """Points along the lines, none farther than the spacing from the next, corners kept."""
+    """Return points along the lines, spaced at most ``SPACING_M`` apart, with the corners."""
     rows = [points[:1]]
     for first, second in itertools.pairwise(points):
         count = max(1, math.ceil(float(np.linalg.norm(second - first)) / SPACING_M))
@@ -111,15 +113,14 @@ def _resampled(points: FloatArray) -> FloatArray:
 def _headings(
     stage: PhysicalStage, start: FloatArray, marks: FloatArray, yaw: float
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Marks, (n, 2), a heading at each, (n,), and at how many something is struck all the same.
+    """Return marks, (n, 2), a heading at each, (n,), and the number of marks with a collision.
 
-    Any heading will do where the arm is folded, else one that lets arm and load pass. With a load there is time to turn at both
-    ends.
+    Any heading is good with a folded arm. With a load the robot may turn on the spot at both ends.
     """
     begin = start[body.YAW]
     end = begin + math.remainder(yaw - begin, math.tau)
     if compact(stage, start):
-        # Who turns on the spot has one mark: it is the end.
+        # A turn on the spot has one mark, the end.
         shares = np.linspace(0.0, 1.0, len(marks)) if len(marks) > 1 else np.ones(1)
         return marks, begin + (end - begin) * shares, 0
     marks = np.concatenate([np.tile(marks[0], (TURNS, 1)), marks, np.tile(marks[-1], (TURNS, 1))])
@@ -132,25 +133,28 @@ def _headings(
     for _ in range(CHAINS):
         chosen = np.array(_cheapest_chain(danger, swept, off))
         found = np.unwrap(options[chosen])
-        strikes = _turns_striking(stage, start, marks, found)
+        strikes = _colliding_turns(stage, start, marks, found)
         if not (strikes & (swept[number, chosen[:-1], chosen[1:]] == 0.0)).any():
             break
         swept[number[strikes], chosen[:-1][strikes], chosen[1:][strikes]] = BLOCKED_COST
-    # The first mark is where the robot is: what it touches there it touches already.
-    struck = int((strikes | (danger[number, chosen[1:]] >= BLOCKED_COST)).sum())
+    # Contacts at the first mark exist already and don't count.
+    collisions = int((strikes | (danger[number, chosen[1:]] >= BLOCKED_COST)).sum())
     nearest = found[-1] + math.remainder(end - found[-1], math.tau)
     last, turned = np.tile(marks[-1], (2, 1)), np.array([found[-1], nearest])
-    if abs(nearest - found[-1]) <= math.tau / HEADINGS and not _turns_striking(stage, start, last, turned)[0]:
+    if (
+        abs(nearest - found[-1]) <= math.tau / HEADINGS
+        and not _colliding_turns(stage, start, last, turned)[0]
+    ):
         found[-1] = nearest
-    return marks, found, struck
+    return marks, found, collisions
 
 
-def _turns_striking(
+def _colliding_turns(
     stage: PhysicalStage, start: FloatArray, marks: FloatArray, headings: FloatArray
 ) -> BoolArray:
-    """Where arm or load strike something on the turn from one mark to the next, (marks - 1,).
+    """Mask, (marks - 1,), of turns between marks in which arm or load collide.
 
-    An outstretched arm goes far between two headings, past what is at neither.
+    An outstretched arm sweeps far between two headings.
     """
     turning = np.flatnonzero(np.abs(np.diff(headings)) > 0.0)
     found = np.zeros(len(marks) - 1, dtype=np.bool_)
@@ -164,10 +168,10 @@ def _turns_striking(
 
 
 def _cheapest_chain(danger: FloatArray, swept: FloatArray, off: FloatArray) -> list[int]:
-    """Numbers of headings, one a mark, the first of them 0: little turning, nothing struck, and the wanted heading in the end.
+    """Return indices of headings, one for each mark and 0 first: little turning, no collision, the wanted heading last.
 
-    danger: (marks, headings); swept: (marks, headings, headings) what it costs to turn so before a mark; off: (headings,) how
-    far each is from the one that is wanted.
+    danger: (marks, headings); swept: (marks, headings, headings) cost of a turn before a mark; off: (headings,) distance to the
+    wanted heading.
     """
     step = np.abs(np.arange(HEADINGS)[:, None] - np.arange(HEADINGS)[None])
     step = np.minimum(step, HEADINGS - step)
@@ -185,29 +189,26 @@ def _cheapest_chain(danger: FloatArray, swept: FloatArray, off: FloatArray) -> l
 
 
 def _danger(stage: PhysicalStage, start: FloatArray, marks: FloatArray, options: FloatArray) -> FloatArray:
-    """What it costs to have arm and load at marks with headings, (marks, headings): much in things, little beside them."""
+    """Cost, (marks, headings), of arm and load at marks with headings: high in collision, low beside objects."""
     bases = np.column_stack([np.repeat(marks, len(options), axis=0), np.tile(options, len(marks))])
     return _cost_at(stage, start, bases).reshape(len(marks), len(options))
 
 
 def _cost_at(stage: PhysicalStage, start: FloatArray, bases: FloatArray) -> FloatArray:
-    """The same for bases, (n, 3): shape (n,)."""
+    """Cost, (n,), of arm and load at bases, (n, 3)."""
     rows = np.tile(start, (len(bases), 1))
     rows[:, : body.LIFT] = bases
-    centres, radii = body.balls(rows), body.RADII
-    if stage.grip is not None:
-        centres = np.concatenate([centres, stage.grip.held.placed(rows)], axis=1)
-        radii = np.concatenate([radii, stage.grip.held.radii])
+    centres, radii = stage.limbs(rows)
     far = np.linalg.norm(centres[0, :, :2] - rows[0, :2], axis=1) + radii > 0.2
     centres, radii = centres[:, far], radii[far]
     wide = float(radii.max()) + BESIDE_M
     boxes = stage.boxes_within(centres.min(axis=(0, 1)) - wide, centres.max(axis=(0, 1)) + wide)
     cost = np.zeros(len(bases))
-    # A few at a time: of what is along the whole way, little is near any place of it.
+    # Check a few marks at a time: few boxes are near any one of them.
     for first in range(0, len(bases), HEADINGS):
         some = centres[first : first + HEADINGS]
         close = boxes.near(some.min(axis=(0, 1)) - wide, some.max(axis=(0, 1)) + wide)
-        beside = first + np.flatnonzero(struck(close, some, radii, BESIDE_M))
+        beside = first + np.flatnonzero(collides(close, some, radii, BESIDE_M))
         cost[beside] = BESIDE_COST
-        cost[beside[struck(close, centres[beside], radii, STRUCK_M)]] = BLOCKED_COST
+        cost[beside[collides(close, centres[beside], radii, STRUCK_M)]] = BLOCKED_COST
     return cost

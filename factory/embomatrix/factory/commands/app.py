@@ -34,8 +34,8 @@ from embomatrix.factory.pipeline.build import BuildSummary, VariantCheck, build_
 from embomatrix.factory.pipeline.cluster import cluster_check
 from embomatrix.factory.pipeline.export import dataset_card, encode_rows, export_rows
 from embomatrix.factory.pipeline.settings import SCENE_EXTRACTOR, BuildSettings, WriterKind, scene_ids
+from embomatrix.llm.batch import FailureLimit
 from embomatrix.llm.ledger import Price
-from embomatrix.llm.patience import FailureLimit
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.task import TaskCategory
 from embomatrix.world.whole_file import write_whole

@@ -22,7 +22,7 @@ from embomatrix.llm.values import EndpointError
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
-    from embomatrix.llm.patience import FailureLimit
+    from embomatrix.llm.batch import FailureLimit
     from embomatrix.llm.values import ChatModel
 
 Forms = Annotated[

@@ -25,8 +25,7 @@ from embomatrix.factory.layout.values import (
     PlacementConstraint,
     PlacementConstraints,
 )
-from embomatrix.llm.loop import OnOneLoop
-from embomatrix.llm.patience import FailureLimit
+from embomatrix.llm.batch import FailureLimit, OnOneLoop
 from embomatrix.llm.structured import ask
 from embomatrix.llm.values import ChatRequest, EndpointError, Message, Speaker, UnusableReplyError
 

@@ -17,8 +17,8 @@ from embomatrix.factory.assets.solids import Solids, placed_parts
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.live_world import LiveWorld
-from embomatrix.sim.physical.prospects import Placing
-from embomatrix.sim.physical.survey import prospects
+from embomatrix.sim.physical.placement_reachability import PlacementQuery
+from embomatrix.sim.physical.survey import placement_reachability
 from embomatrix.sim.placing.pose_cache import PLACE_RELATIONS, footprint_placements, standing_poses
 from embomatrix.skills.appliances import cold_source, heat_source
 from embomatrix.world.bundle import Bundle
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     Poses = dict[PlacementKey, tuple[Pose, ...]]
     from collections.abc import Sequence
 
-    from embomatrix.sim.physical.survey import Foresight
+    from embomatrix.sim.physical.survey import ReachabilitySurvey
     from embomatrix.world.geometry import Pose
     from embomatrix.world.scene import Scene
 
@@ -162,7 +162,7 @@ class SceneSurvey:
     Context manager of an engine. The answers don't depend on the order of the queries.
     """
 
-    def __init__(self, scene: Scene, foresight: Foresight | None) -> None:
+    def __init__(self, scene: Scene, foresight: ReachabilitySurvey | None) -> None:
         """Load the scene. Without ``foresight``, the arm is not analysed. Raise EngineError if the scene can't be loaded."""
         self._foresight = foresight
         self._engine = BulletEngine(scene)
@@ -192,9 +192,9 @@ class SceneSurvey:
         }
         return PoseCache({}, {name: self._stands[name] for name in wanted}, barred)
 
-    def prospects(self, poses: PoseCache, placings: Iterable[Placing]) -> PoseCache:
+    def placement_reachability(self, poses: PoseCache, placings: Iterable[PlacementQuery]) -> PoseCache:
         """Return the cache with the reachable poses of each placed object."""
-        return poses if self._foresight is None else prospects(self._world, poses, placings)
+        return poses if self._foresight is None else placement_reachability(self._world, poses, placings)
 
     def _compute(self, names: Iterable[str]) -> None:
         fresh = [name for name in dict.fromkeys(names) if name not in self._stands]
@@ -231,13 +231,13 @@ def cache_poses(
                 placements[key] = library.poses(view.asset(thing), view.asset(host), relation, seed)
         placements.update(footprint_placements(scene, *_portable_and_holders(view, task), library, seed))
     kept = {key: poses for key, poses in placements.items() if poses}
-    return survey.prospects(replace(survey.poses(rows), placements=kept), _placings(view, tasks))
+    return survey.placement_reachability(replace(survey.poses(rows), placements=kept), _placings(view, tasks))
 
 
-def _placings(view: SceneView, tasks: Sequence[PoseNeeds]) -> Iterator[Placing]:
+def _placings(view: SceneView, tasks: Sequence[PoseNeeds]) -> Iterator[PlacementQuery]:
     """Yield possible placements: those of the goals first, then those at heat and cold sources, then the rest."""
     for task in tasks:
-        yield from itertools.starmap(Placing, _pairs(view, task.about))
+        yield from itertools.starmap(PlacementQuery, _pairs(view, task.about))
     pairs = [
         (thing, host)
         for task in tasks
@@ -245,7 +245,7 @@ def _placings(view: SceneView, tasks: Sequence[PoseNeeds]) -> Iterator[Placing]:
     ]
     pairs.sort(key=lambda pair: not _is_source(view.asset(pair[1])))
     for (thing, host), relation in itertools.product(pairs, PLACE_RELATIONS):
-        yield Placing(thing, host, relation)
+        yield PlacementQuery(thing, host, relation)
 
 
 def _is_source(asset: Asset) -> bool:

@@ -23,7 +23,7 @@ from embomatrix.factory.writer.tasks import BatchTaskWriter, DraftOrder, PlainWr
 from embomatrix.factory.writer.variant import Variant, build_variant
 from embomatrix.sim.live_world import prepare
 from embomatrix.sim.physical.actor import physical_simulator
-from embomatrix.sim.physical.survey import Foresight
+from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.sim.simulation import load_simulator
@@ -94,7 +94,7 @@ class VariantMaker:
     ) -> None:
         if writer is None:
             writer = SocialWriter(settings.seed) if settings.writer is WriterKind.SOCIAL else PlainWriter()
-        foresight = Foresight() if settings.look_ahead else None
+        foresight = ReachabilitySurvey() if settings.look_ahead else None
         self._tools = _SharedTools(settings, writer, PlacementLibrary(), foresight)
         self._layout = layout
         self._bases: dict[str, Scene] = {}
@@ -132,7 +132,7 @@ class _SharedTools:
     settings: BuildSettings
     writer: TaskWriter
     library: PlacementLibrary
-    foresight: Foresight | None
+    foresight: ReachabilitySurvey | None
 
 
 def _focus(

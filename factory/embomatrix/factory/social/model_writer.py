@@ -13,8 +13,7 @@ from embomatrix.factory.social.requests import conjunct_of
 from embomatrix.factory.social.summary import transcript_of
 from embomatrix.factory.writer.goals import GoalContext
 from embomatrix.factory.writer.tasks import Draft, DraftOrder, draft_of
-from embomatrix.llm.loop import OnOneLoop
-from embomatrix.llm.patience import FailureLimit
+from embomatrix.llm.batch import FailureLimit, OnOneLoop
 from embomatrix.llm.values import EndpointError, LlmError, UnusableReplyError
 
 if TYPE_CHECKING:

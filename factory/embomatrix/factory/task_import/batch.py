@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from embomatrix.factory.task_import.sources import SourceText
-    from embomatrix.sim.physical.survey import Foresight
+    from embomatrix.sim.physical.survey import ReachabilitySurvey
     from embomatrix.sim.placing.pose_cache import PlacementLibrary
     from embomatrix.world.poses import PoseCache
     from embomatrix.world.scene import Scene
@@ -119,7 +119,7 @@ def verify_first(
     source: SourceText,
     bases: Sequence[Scene],
     library: PlacementLibrary,
-    foresight: Foresight | None,
+    foresight: ReachabilitySurvey | None,
     *,
     seed: int = 0,
     options: ImportOptions | None = None,
@@ -173,7 +173,7 @@ def _first(outcomes: Iterable[T | TaskRefusal]) -> T | TaskRefusal:
 
 
 def verify(
-    imported: ImportedTask, library: PlacementLibrary, foresight: Foresight | None, *, seed: int = 0
+    imported: ImportedTask, library: PlacementLibrary, foresight: ReachabilitySurvey | None, *, seed: int = 0
 ) -> Verified | TaskRefusal:
     """Verify an imported task by execution, and pack its bundle. Without ``foresight``, the arm is not analysed."""
     poses = poses_for(imported, SceneView(imported.scene), library, foresight, seed)
@@ -197,7 +197,11 @@ def verify(
 
 
 def poses_for(
-    imported: ImportedTask, view: SceneView, library: PlacementLibrary, foresight: Foresight | None, seed: int
+    imported: ImportedTask,
+    view: SceneView,
+    library: PlacementLibrary,
+    foresight: ReachabilitySurvey | None,
+    seed: int,
 ) -> PoseCache:
     """Return the pose cache of an imported task's scene."""
     task = imported.task

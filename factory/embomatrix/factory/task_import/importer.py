@@ -12,7 +12,7 @@ from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.batch import Verified, bind_first, verify_first
 from embomatrix.factory.task_import.report import ProblemOutcome, outcome_of
 from embomatrix.factory.task_import.task import ImportedTask, ImportOptions
-from embomatrix.sim.physical.survey import Foresight
+from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.process_pool import shared_work
 
@@ -58,7 +58,7 @@ class ProblemImporter:
     def __init__(self, settings: ImportSettings) -> None:
         self._settings = settings
         self._bases = [build_base_scene(scene_id) for scene_id in settings.scenes]
-        self._foresight = Foresight() if settings.look_ahead else None
+        self._foresight = ReachabilitySurvey() if settings.look_ahead else None
         self._library = PlacementLibrary()
 
     def run(self, source: SourceText) -> ImportOutcome:

@@ -45,6 +45,7 @@ _TABLE: Final[Mapping[str, Mapping[str, frozenset[AccessRole]]]] = {
         "GetPlan": _VIEWER,
         "GetRun": _VIEWER,
         "ReadEvents": _VIEWER,
+        "ExplainRollout": _VIEWER,
         "DrainWorker": _ADMIN,
         "ResumeWorker": _ADMIN,
         "RevokeWorker": _ADMIN,

@@ -1,4 +1,4 @@
-"""`embomatrix manager`: serve a manager, show its state, prepare its access folder, and manage tokens."""
+"""`embomatrix manager`: serve a manager, prepare its access folder, and manage tokens."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from embomatrix.rpc.wire.tokens import AccessRole, TokenInfo
 
 app = typer.Typer(
-    help="Serve a manager, or show the state of one.",
+    help="Serve a manager, create its certificates, and manage its tokens.",
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -108,7 +108,10 @@ def serve(
     tls_ca: TlsCa = None,
     insecure_bind: InsecureBind = False,
     audit: Audit = None,
-    log_level: Annotated[str, typer.Option(help="debug, info, warning or error.")] = "info",
+    log_level: Annotated[
+        str,
+        typer.Option(help="debug, info, warning or error; debug also checks invariants."),
+    ] = "info",
     log_format: LogLines = LogFormat.HUMAN,
 ) -> None:
     """Serve until interrupted."""
@@ -132,21 +135,6 @@ def serve(
     settings = _settings(options)
     hide(settings.token)
     _serve(settings)
-
-
-@app.command()
-def status(manager: Manager = "127.0.0.1:50070", token: Token = "", ca: Ca = None) -> None:
-    """Show the workers and runs of a manager."""
-    import asyncio
-
-    from embomatrix.manager.commands.status_table import show_status
-    from embomatrix.rpc.status import ClusterError
-    from embomatrix.rpc.trust import read_ca
-
-    try:
-        asyncio.run(show_status(manager, _token(token), read_ca(ca)))
-    except ClusterError as error:
-        _refuse(str(error))
 
 
 @app.command()

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from embomatrix.manager.control.commands import Command
-    from embomatrix.manager.control.dispatch.state import HistoryEntry
     from embomatrix.manager.control.events import Event
+    from embomatrix.rpc.wire.run_log import RolloutStep
 
 UNIT_COST_S: Final = 1e-5
 """Assumed CPU time of a placement for each need and worker that it examines."""
@@ -111,7 +111,7 @@ class ClusterState:
         open_runs = [self.stats(run_id) for run_id in self.dispatcher.runs]
         return _sum([self._closed, *open_runs])
 
-    def explain(self, rollout_id: str) -> tuple[list[HistoryEntry], str]:
+    def explain(self, rollout_id: str) -> tuple[list[RolloutStep], str]:
         """Return the history of a rollout and its present place in words, which is empty for a delivered one."""
         return self.dispatcher.state.explain(rollout_id), self.dispatcher.state.where(rollout_id)
 

@@ -23,6 +23,7 @@ from embomatrix.rpc.wire.codec import ConvertError, each
 from embomatrix.rpc.wire.run_log import (
     EventPage,
     PhaseSummary,
+    RolloutExplanation,
     RunEvent,
     RunSummary,
     run_event_from_proto,
@@ -106,6 +107,17 @@ class RunHistory:
         summary, events = kept
         beyond = [event for event in events if event.sequence > after]
         return EventPage(tuple(beyond[:limit]), summary.events_dropped)
+
+    def explain(self, rollout_id: str) -> RolloutExplanation:
+        """Return the recent decisions about a rollout. Raises ``NotFoundError``."""
+        steps, place = self._cluster.explain(rollout_id)
+        if not steps and not place:
+            raise NotFoundError(
+                f"there is no trace of rollout {rollout_id!r}: this manager never had it, or its history made room for "
+                "later ones; `embomatrix cluster events RUN` may still have its events"
+            )
+        epoch_s = self._event_log.epoch_s
+        return RolloutExplanation(tuple(s._replace(at_s=epoch_s + s.at_s) for s in steps), place)
 
     async def latest(self, run_id: str, seconds: float) -> EventPage:
         """Return the events of the last seconds before the run's last event. Raises NotFoundError."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import gc
 import logging
 import time
 from typing import TYPE_CHECKING, Final
@@ -27,7 +26,6 @@ from embomatrix.manager.observe.event_log import RunEventLog
 from embomatrix.manager.observe.metrics import ManagerLoad, Meter
 from embomatrix.manager.observe.run_archive import RunHistory
 from embomatrix.manager.observe.training_reports import TrainingBook
-from embomatrix.manager.runtime.garbage import Collector
 from embomatrix.manager.runtime.intake import TICK_S, Heartbeat, Intake
 from embomatrix.manager.runtime.registry import WorkerStanding
 from embomatrix.manager.runtime.results import ResultDelivery, ResultLogs
@@ -96,7 +94,6 @@ class ManagerRuntime:
         self.load = ManagerLoad()
         store = timed_store(store, self.load.operated)
         self.started_s = time.monotonic()
-        self._collector = Collector(self.started_s)
         self.event_log = RunEventLog(epoch_s=time.time() - self.started_s)
         self.history = RunHistory(self.event_log, archive, cluster)
         self.runs = Runs(cluster, store, bundles, logs, self._carry_out, limits or RunLimits(), self.history)
@@ -327,6 +324,3 @@ class ManagerRuntime:
             await asyncio.sleep(CLEANUP_S)
             await self._delivery.give_up_outdated(time.monotonic())
             await self.runs.close_idle(time.monotonic())
-            dispatcher = self.cluster.dispatcher
-            if self._collector.note(dispatcher.queued + len(dispatcher.live_leases), time.monotonic()):
-                gc.collect()

@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 PER_MESSAGE: Final = 256
-LINGER_S: Final = 0.1
-"""A full message, or the end of the batch, is sent at once; other results at most one message in this interval."""
+"""Results of one message at most."""
 
 
 class BatchLog:
@@ -56,7 +55,6 @@ class BatchLog:
         self.dropped = False
         """The run was closed, or the log was discarded: no more results follow."""
         self._changed = asyncio.Event()
-        self._over = asyncio.Event()
 
     def append(self, rows: Sequence[ResultRow]) -> None:
         self.rows.extend(rows)
@@ -64,12 +62,10 @@ class BatchLog:
 
     def finish(self, now_s: float) -> None:
         self.finished_s = now_s
-        self._over.set()
         self._wake()
 
     def drop(self) -> None:
         self.dropped = True
-        self._over.set()
         self._wake()
 
     @property
@@ -77,38 +73,25 @@ class BatchLog:
         return self.dropped or self.finished_s is not None
 
     async def messages(self, cursor: int) -> AsyncIterator[list[ResultRow]]:
-        """Yield all results after the cursor until the batch ends: the first at once, later ones as ``LINGER_S``
-        allows.
-        """
-        due_s = 0.0
-        while rows := await self.after(cursor, due_s):
+        """Yield all results after the cursor, as they arrive, until the batch ends."""
+        while rows := await self.after(cursor):
             cursor = rows[-1].cursor
-            due_s = time.monotonic() + LINGER_S
             yield rows
 
-    async def after(self, cursor: int, due_s: float | None = None) -> list[ResultRow]:
+    async def after(self, cursor: int) -> list[ResultRow]:
         """Wait for results after the cursor and return some of them; nothing once the batch has ended.
 
-        Further results are awaited until ``due_s`` on the monotonic clock, by default for ``LINGER_S``. The wait ends
-        with the batch, whose rollouts have deadlines, or with the caller's deadline.
+        The wait ends with the batch, whose rollouts have deadlines, or with the caller's deadline.
         """
         while self.last_cursor <= cursor and not self.ended:
             await self._changed.wait()
-        left_s = LINGER_S if due_s is None else due_s - time.monotonic()
-        if left_s > 0 and self.last_cursor - cursor < PER_MESSAGE and not self.ended:
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(left_s):
-                    await self._over.wait()
-        start = self._position(cursor)
+        start = bisect.bisect_right(self.rows, cursor, key=lambda row: row.cursor)
         return self.rows[start : start + PER_MESSAGE]
 
     @property
     def last_cursor(self) -> int:
         """Cursor of the newest result; 0 before the first."""
         return self.rows[-1].cursor if self.rows else 0
-
-    def _position(self, cursor: int) -> int:
-        return bisect.bisect_right(self.rows, cursor, key=lambda row: row.cursor)
 
     def _wake(self) -> None:
         self._changed.set()

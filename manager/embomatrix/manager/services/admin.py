@@ -9,7 +9,7 @@ from embomatrix.manager.web.cluster_view import health, overview, plan, run_info
 from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.proto.v1 import admin_service_pb2_grpc
 from embomatrix.rpc.status import translate
-from embomatrix.rpc.wire.run_log import event_page_to_proto, run_summary_to_proto
+from embomatrix.rpc.wire.run_log import event_page_to_proto, explanation_to_proto, run_summary_to_proto
 from embomatrix.rpc.wire.session import plan_cell_to_proto, run_info_to_proto, worker_info_to_proto
 from embomatrix.rpc.wire.tokens import role_from_proto, token_info_to_proto
 
@@ -54,6 +54,13 @@ class AdminServicer(admin_service_pb2_grpc.AdminServiceServicer):
         async with translate(context):
             page = await self._runtime.history.events(request.run_id, request.after, request.limit)
         return event_page_to_proto(page)
+
+    async def ExplainRollout(
+        self, request: pb.ExplainRolloutRequest, context: grpc.aio.ServicerContext
+    ) -> pb.ExplainRolloutResponse:
+        async with translate(context):
+            found = self._runtime.history.explain(request.rollout_id)
+        return explanation_to_proto(found)
 
     async def DrainWorker(
         self, request: pb.DrainWorkerRequest, context: grpc.aio.ServicerContext

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import logging
 import secrets
 import signal
@@ -22,7 +23,6 @@ from embomatrix.manager.control.schedule.scheduler import ScheduleLimits
 from embomatrix.manager.observe.run_archive import RunArchive
 from embomatrix.manager.runtime.bundles import BundleStore
 from embomatrix.manager.runtime.event_loop import ManagerRuntime
-from embomatrix.manager.runtime.garbage import only_young
 from embomatrix.manager.runtime.leadership import Leadership, note_folder, warn_of_another_folder
 from embomatrix.manager.runtime.registry import LivenessLimits, Registry
 from embomatrix.manager.runtime.revocation import Revocation
@@ -55,6 +55,8 @@ logger = logging.getLogger(__name__)
 STOP_GRACE_S: Final = 0.5
 """Calls may finish during this time; workers and trainers then attach to the next manager."""
 MEGABYTE: Final = 1_000_000
+YOUNG_OBJECTS: Final = 5_000
+"""Objects allocated between two collections of the youngest generation, which take 2 ms."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +87,7 @@ async def serve(
     async def lead() -> None:
         async with running(settings, on_standby) as endpoints:
             leads.set()
-            only_young()
+            _collect_rarely()
             on_ready(endpoints)
             await stop.wait()
 
@@ -138,6 +140,17 @@ async def running(
         stack.push_async_callback(server.stop, STOP_GRACE_S)
         page_url = _page_url(settings.http_host, http_socket.getsockname()[1], protection.tls)
         yield Endpoints(f"{settings.host}:{port}", page_url)
+
+
+def _collect_rarely() -> None:
+    """Exempt all present objects from garbage collection, and collect less often.
+
+    Rollouts in flight are many objects and no garbage: with the default thresholds the manager needs 22 % more CPU time
+    per rollout.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(YOUNG_OBJECTS)
 
 
 def _page_url(host: str, port: int, tls: Tls | None) -> str:
@@ -225,6 +238,7 @@ async def _start_runtime(
         boot_id=secrets.token_hex(4),
         first_epoch=first_epoch,
         audit_key=secrets.token_bytes(32),
+        debug=logging.getLogger("embomatrix").isEnabledFor(logging.DEBUG),
     )
     archive = RunArchive(settings.data_dir / "runs")
     runtime = ManagerRuntime(

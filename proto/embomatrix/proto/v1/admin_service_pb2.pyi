@@ -30,7 +30,7 @@ class _RoleEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._EnumTypeW
     DESCRIPTOR: google.protobuf.descriptor.EnumDescriptor
     ROLE_UNSPECIFIED: _Role.ValueType  # 0
     ROLE_JOIN: _Role.ValueType  # 1
-    """Registers once; changed for a credential of the worker then."""
+    """Registers one worker once, and is exchanged for that worker's credential."""
     ROLE_WORKER: _Role.ValueType  # 2
     ROLE_TRAINER: _Role.ValueType  # 3
     ROLE_VIEWER: _Role.ValueType  # 4
@@ -40,7 +40,7 @@ class Role(_Role, metaclass=_RoleEnumTypeWrapper): ...
 
 ROLE_UNSPECIFIED: Role.ValueType  # 0
 ROLE_JOIN: Role.ValueType  # 1
-"""Registers once; changed for a credential of the worker then."""
+"""Registers one worker once, and is exchanged for that worker's credential."""
 ROLE_WORKER: Role.ValueType  # 2
 ROLE_TRAINER: Role.ValueType  # 3
 ROLE_VIEWER: Role.ValueType  # 4
@@ -57,14 +57,14 @@ class _EventKindEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._Enum
     EVENT_KIND_RUN_OPENED: _EventKind.ValueType  # 1
     EVENT_KIND_RUN_CLOSED: _EventKind.ValueType  # 2
     EVENT_KIND_SUBMITTED: _EventKind.ValueType  # 3
-    """A batch of so many rollouts came."""
+    """A batch of this size was submitted."""
     EVENT_KIND_LEASED: _EventKind.ValueType  # 4
     EVENT_KIND_COMPLETED: _EventKind.ValueType  # 5
-    """A lease ended with a result. When it began follows from its timings."""
+    """A lease ended with a result. Its begin follows from its timings."""
     EVENT_KIND_FAILED: _EventKind.ValueType  # 6
-    """A lease ended without one, in the worker's own words."""
+    """A lease ended without a result; the message is the worker's."""
     EVENT_KIND_ENDED: _EventKind.ValueType  # 7
-    """A rollout reached its outcome, and it is no result."""
+    """A rollout ended without a result."""
     EVENT_KIND_WORKER_JOINED: _EventKind.ValueType  # 8
     EVENT_KIND_WORKER_LOST: _EventKind.ValueType  # 9
     EVENT_KIND_SCENE_WARM: _EventKind.ValueType  # 10
@@ -77,14 +77,14 @@ EVENT_KIND_UNSPECIFIED: EventKind.ValueType  # 0
 EVENT_KIND_RUN_OPENED: EventKind.ValueType  # 1
 EVENT_KIND_RUN_CLOSED: EventKind.ValueType  # 2
 EVENT_KIND_SUBMITTED: EventKind.ValueType  # 3
-"""A batch of so many rollouts came."""
+"""A batch of this size was submitted."""
 EVENT_KIND_LEASED: EventKind.ValueType  # 4
 EVENT_KIND_COMPLETED: EventKind.ValueType  # 5
-"""A lease ended with a result. When it began follows from its timings."""
+"""A lease ended with a result. Its begin follows from its timings."""
 EVENT_KIND_FAILED: EventKind.ValueType  # 6
-"""A lease ended without one, in the worker's own words."""
+"""A lease ended without a result; the message is the worker's."""
 EVENT_KIND_ENDED: EventKind.ValueType  # 7
-"""A rollout reached its outcome, and it is no result."""
+"""A rollout ended without a result."""
 EVENT_KIND_WORKER_JOINED: EventKind.ValueType  # 8
 EVENT_KIND_WORKER_LOST: EventKind.ValueType  # 9
 EVENT_KIND_SCENE_WARM: EventKind.ValueType  # 10
@@ -151,7 +151,7 @@ class GetPlanRequest(google.protobuf.message.Message):
 
     RUN_ID_FIELD_NUMBER: builtins.int
     run_id: builtins.str
-    """Empty: of all runs."""
+    """Empty: all runs."""
     def __init__(
         self,
         *,
@@ -178,7 +178,7 @@ class PlanCell(google.protobuf.message.Message):
     warmth: embomatrix.proto.v1.types_pb2.Warmth.ValueType
     @property
     def worker_ids(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.str]:
-        """Workers that hold the scene or load it."""
+        """Workers that hold or load the scene."""
 
     def __init__(
         self,
@@ -259,9 +259,9 @@ class IssueTokenRequest(google.protobuf.message.Message):
     LABEL_FIELD_NUMBER: builtins.int
     role: Global___Role.ValueType
     valid_s: builtins.float
-    """Seconds of validity; 0: until revoked. A token to join is valid for a day at most."""
+    """Seconds of validity; 0: until revoked. A join token is valid for one day at most."""
     label: builtins.str
-    """For people: whom it was given to."""
+    """Label for lists, such as the owner's name."""
     def __init__(
         self,
         *,
@@ -314,9 +314,9 @@ class TokenInfo(google.protobuf.message.Message):
     role: Global___Role.ValueType
     label: builtins.str
     left_s: builtins.float
-    """Seconds left; 0: until revoked."""
+    """Remaining validity in seconds; 0: until revoked."""
     worker_id: builtins.str
-    """The worker that the credential belongs to."""
+    """Worker that the credential belongs to."""
     def __init__(
         self,
         *,
@@ -397,12 +397,12 @@ class WorkerInfo(google.protobuf.message.Message):
     AUDIT_MISMATCHES_FIELD_NUMBER: builtins.int
     worker_id: builtins.str
     state: builtins.str
-    """"ready", "paused", "suspect", "lost", "draining" or "quarantined"."""
+    """"ready", "paused", "suspect", "lost", "draining", "quarantined" or "left"."""
     running: builtins.int
     completed: builtins.int
     last_seen_s: builtins.float
     reason: builtins.str
-    """Why it is paused, draining or in quarantine."""
+    """Reason why it is paused, draining, lost or in quarantine."""
     audited: builtins.int
     audit_mismatches: builtins.int
     @property
@@ -436,9 +436,9 @@ class ListWorkersResponse(google.protobuf.message.Message):
     HEALTH_FIELD_NUMBER: builtins.int
     MOOD_FIELD_NUMBER: builtins.int
     health: builtins.str
-    """How the cluster does, in one sentence: the first thing that is wrong, or that all is well."""
+    """Health of the cluster in one sentence."""
     mood: builtins.str
-    """"good", "idle", "warning" or "bad": how much somebody should care."""
+    """Severity of the sentence: "good", "idle", "warning" or "bad"."""
     @property
     def workers(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___WorkerInfo]: ...
     def __init__(
@@ -458,7 +458,7 @@ class ListRunsRequest(google.protobuf.message.Message):
 
     CLOSED_FIELD_NUMBER: builtins.int
     closed: builtins.bool
-    """Those that were closed and are still kept, instead of those that are open."""
+    """List the archived runs instead of the open ones."""
     def __init__(
         self,
         *,
@@ -487,12 +487,12 @@ class RunInfo(google.protobuf.message.Message):
     """Seconds since the epoch on the manager's clock; closed_s is 0 while it is open."""
     closed_s: builtins.float
     waits_for: builtins.str
-    """Why rollouts of it can't be executed by any worker that is there; empty while they can."""
+    """Reason why no connected worker can execute its rollouts; empty while one can."""
     @property
     def stats(self) -> embomatrix.proto.v1.rollout_service_pb2.RunStats: ...
     @property
     def reward(self) -> embomatrix.proto.v1.types_pb2.RewardSettings:
-        """Its coefficients; absent for the workers' defaults."""
+        """Reward coefficients; absent for the defaults."""
 
     def __init__(
         self,
@@ -554,7 +554,7 @@ Global___DrainWorkerResponse: typing_extensions.TypeAlias = DrainWorkerResponse
 
 @typing.final
 class RunEvent(google.protobuf.message.Message):
-    """One fact of the log. What does not apply is empty."""
+    """One event of the log. Fields that do not apply are empty."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -574,7 +574,7 @@ class RunEvent(google.protobuf.message.Message):
     HELD_S_FIELD_NUMBER: builtins.int
     SIZE_FIELD_NUMBER: builtins.int
     sequence: builtins.int
-    """Rises by one from event to event of this manager."""
+    """Rises by one with each event of this manager."""
     at_s: builtins.float
     """Seconds since the epoch, on the manager's clock."""
     kind: Global___EventKind.ValueType
@@ -586,15 +586,15 @@ class RunEvent(google.protobuf.message.Message):
     slot: builtins.int
     attempt: builtins.int
     code: builtins.str
-    """Of a failure."""
+    """Message of a failure."""
     message: builtins.str
     held_s: builtins.float
-    """Seconds that the slot was taken, on the worker's clock."""
+    """Seconds that the lease held its slot, on the worker's clock."""
     size: builtins.int
     """Rollouts of a batch, or slots of a worker."""
     @property
     def timings(self) -> embomatrix.proto.v1.types_pb2.Timings:
-        """Of a lease that ended: deliver_s is not known by then."""
+        """Timings of an ended lease, without deliver_s."""
 
     def __init__(
         self,
@@ -628,11 +628,11 @@ class ReadEventsRequest(google.protobuf.message.Message):
     AFTER_FIELD_NUMBER: builtins.int
     LIMIT_FIELD_NUMBER: builtins.int
     run_id: builtins.str
-    """Empty: what concerns no run, of workers and scenes."""
+    """Empty: events of workers and scenes."""
     after: builtins.int
-    """Events after this one."""
+    """Only events with a higher sequence number."""
     limit: builtins.int
-    """At most; 0 stands for as many as a message takes."""
+    """Events at most; 0: as many as fit one message."""
     def __init__(
         self,
         *,
@@ -651,7 +651,7 @@ class ReadEventsResponse(google.protobuf.message.Message):
     EVENTS_FIELD_NUMBER: builtins.int
     DROPPED_FIELD_NUMBER: builtins.int
     dropped: builtins.int
-    """Of the log so far: the oldest make room."""
+    """Events of the log that were discarded for later ones."""
     @property
     def events(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___RunEvent]: ...
     def __init__(
@@ -663,6 +663,80 @@ class ReadEventsResponse(google.protobuf.message.Message):
     def ClearField(self, field_name: typing.Literal["dropped", b"dropped", "events", b"events"]) -> None: ...
 
 Global___ReadEventsResponse: typing_extensions.TypeAlias = ReadEventsResponse
+
+@typing.final
+class ExplainRolloutRequest(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    ROLLOUT_ID_FIELD_NUMBER: builtins.int
+    rollout_id: builtins.str
+    def __init__(
+        self,
+        *,
+        rollout_id: builtins.str = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["rollout_id", b"rollout_id"]) -> None: ...
+
+Global___ExplainRolloutRequest: typing_extensions.TypeAlias = ExplainRolloutRequest
+
+@typing.final
+class RolloutStep(google.protobuf.message.Message):
+    """One step in the history of a rollout."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    AT_S_FIELD_NUMBER: builtins.int
+    KIND_FIELD_NUMBER: builtins.int
+    RUN_ID_FIELD_NUMBER: builtins.int
+    BATCH_ID_FIELD_NUMBER: builtins.int
+    WORKER_ID_FIELD_NUMBER: builtins.int
+    REASON_FIELD_NUMBER: builtins.int
+    CAUSE_FIELD_NUMBER: builtins.int
+    at_s: builtins.float
+    """Seconds since the epoch, on the manager's clock."""
+    kind: builtins.str
+    """submitted, queued, leased, hedged, revoked, expired, returned, held or delivered."""
+    run_id: builtins.str
+    batch_id: builtins.str
+    worker_id: builtins.str
+    reason: builtins.str
+    """Reason, in words."""
+    cause: builtins.str
+    """Event of the manager that led to the step."""
+    def __init__(
+        self,
+        *,
+        at_s: builtins.float = ...,
+        kind: builtins.str = ...,
+        run_id: builtins.str = ...,
+        batch_id: builtins.str = ...,
+        worker_id: builtins.str = ...,
+        reason: builtins.str = ...,
+        cause: builtins.str = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["at_s", b"at_s", "batch_id", b"batch_id", "cause", b"cause", "kind", b"kind", "reason", b"reason", "run_id", b"run_id", "worker_id", b"worker_id"]) -> None: ...
+
+Global___RolloutStep: typing_extensions.TypeAlias = RolloutStep
+
+@typing.final
+class ExplainRolloutResponse(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    STEPS_FIELD_NUMBER: builtins.int
+    PLACE_FIELD_NUMBER: builtins.int
+    place: builtins.str
+    """Present place of a rollout without an outcome, in words; empty otherwise."""
+    @property
+    def steps(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___RolloutStep]: ...
+    def __init__(
+        self,
+        *,
+        steps: collections.abc.Iterable[Global___RolloutStep] | None = ...,
+        place: builtins.str = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["place", b"place", "steps", b"steps"]) -> None: ...
+
+Global___ExplainRolloutResponse: typing_extensions.TypeAlias = ExplainRolloutResponse
 
 @typing.final
 class GetRunRequest(google.protobuf.message.Message):
@@ -681,7 +755,7 @@ Global___GetRunRequest: typing_extensions.TypeAlias = GetRunRequest
 
 @typing.final
 class PhaseSummary(google.protobuf.message.Message):
-    """Completed rollouts by the time that a phase took. Quantiles are right to 4 %."""
+    """Durations of one phase of completed rollouts. Quantiles have an error of at most 4 %."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -713,7 +787,7 @@ Global___PhaseSummary: typing_extensions.TypeAlias = PhaseSummary
 
 @typing.final
 class RunWorker(google.protobuf.message.Message):
-    """What a worker did for a run."""
+    """Work of one worker for a run."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -742,7 +816,7 @@ Global___RunWorker: typing_extensions.TypeAlias = RunWorker
 
 @typing.final
 class RunSeries(google.protobuf.message.Message):
-    """Outcomes by time: one number for each step since the run was opened."""
+    """Outcomes by time: one number per interval since the run was opened."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -780,10 +854,10 @@ class GetRunResponse(google.protobuf.message.Message):
     EVENTS_DROPPED_FIELD_NUMBER: builtins.int
     VERSION_FIELD_NUMBER: builtins.int
     manager_cpu_s: builtins.float
-    """CPU seconds of the manager while the run was open, for all runs."""
+    """CPU seconds of the manager while the run was open, spent on all runs."""
     events_dropped: builtins.int
     version: builtins.str
-    """Of the manager's software."""
+    """Version of the manager's software."""
     @property
     def run(self) -> Global___RunInfo: ...
     @property
@@ -794,11 +868,11 @@ class GetRunResponse(google.protobuf.message.Message):
     def series(self) -> Global___RunSeries: ...
     @property
     def failures(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___RunEvent]:
-        """The latest leases and rollouts that failed, in the words of whoever saw it."""
+        """Latest failed leases and rollouts."""
 
     @property
     def prewarm_lead(self) -> Global___PhaseSummary:
-        """Between a scene being warm and its first demand."""
+        """Time between a scene being warm and its first demand."""
 
     @property
     def scene_load(self) -> Global___PhaseSummary: ...
@@ -823,7 +897,7 @@ Global___GetRunResponse: typing_extensions.TypeAlias = GetRunResponse
 
 @typing.final
 class KeptRun(google.protobuf.message.Message):
-    """A closed run, as the manager keeps it on disk."""
+    """Archived run on the manager's disk."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 

@@ -26,7 +26,7 @@ if _version_not_supported:
 
 
 class AdminServiceStub(object):
-    """Operators: what the cluster is doing, and a way to take a worker out.
+    """State of the cluster, logs, operator commands, and tokens.
     """
 
     def __init__(self, channel):
@@ -100,10 +100,15 @@ class AdminServiceStub(object):
                 request_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ReadEventsRequest.SerializeToString,
                 response_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ReadEventsResponse.FromString,
                 _registered_method=True)
+        self.ExplainRollout = channel.unary_unary(
+                '/embomatrix.proto.v1.AdminService/ExplainRollout',
+                request_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ExplainRolloutRequest.SerializeToString,
+                response_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ExplainRolloutResponse.FromString,
+                _registered_method=True)
 
 
 class AdminServiceServicer(object):
-    """Operators: what the cluster is doing, and a way to take a worker out.
+    """State of the cluster, logs, operator commands, and tokens.
     """
 
     def ListWorkers(self, request, context):
@@ -125,28 +130,28 @@ class AdminServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def ResumeWorker(self, request, context):
-        """Takes a drain back.
+        """Cancels a drain.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def RevokeWorker(self, request, context):
-        """The worker's credential is void, its session ends, and what it held goes to others.
+        """Revokes the worker's credential and ends its session. Its leases go to other workers.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def GetPlan(self, request, context):
-        """The look-ahead grid: steps by scenes, and who holds them.
+        """Look-ahead grid: steps by scenes, with the workers that hold them.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def PauseDispatch(self, request, context):
-        """No new leases are given until ResumeDispatch; what runs goes on.
+        """No new leases are given until ResumeDispatch. Live leases continue.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -159,7 +164,7 @@ class AdminServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def IssueToken(self, request, context):
-        """A token of a role, told once and kept as a hash.
+        """Returns a new token, which is shown once and stored as a hash.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -178,14 +183,21 @@ class AdminServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def GetRun(self, request, context):
-        """What a run came to so far, or in the end: closed ones are kept for a while.
+        """Totals of an open run, or of a closed run that is still archived.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def ReadEvents(self, request, context):
-        """A page of the event log of a run, or of the cluster.
+        """Page of the event log of a run, or of workers and scenes.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def ExplainRollout(self, request, context):
+        """Recent decisions about one rollout, of whichever run.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -259,6 +271,11 @@ def add_AdminServiceServicer_to_server(servicer, server):
                     request_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ReadEventsRequest.FromString,
                     response_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ReadEventsResponse.SerializeToString,
             ),
+            'ExplainRollout': grpc.unary_unary_rpc_method_handler(
+                    servicer.ExplainRollout,
+                    request_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ExplainRolloutRequest.FromString,
+                    response_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ExplainRolloutResponse.SerializeToString,
+            ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
             'embomatrix.proto.v1.AdminService', rpc_method_handlers)
@@ -268,7 +285,7 @@ def add_AdminServiceServicer_to_server(servicer, server):
 
  # This class is part of an EXPERIMENTAL API.
 class AdminService(object):
-    """Operators: what the cluster is doing, and a way to take a worker out.
+    """State of the cluster, logs, operator commands, and tokens.
     """
 
     @staticmethod
@@ -612,6 +629,33 @@ class AdminService(object):
             '/embomatrix.proto.v1.AdminService/ReadEvents',
             embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ReadEventsRequest.SerializeToString,
             embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ReadEventsResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ExplainRollout(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/embomatrix.proto.v1.AdminService/ExplainRollout',
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ExplainRolloutRequest.SerializeToString,
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ExplainRolloutResponse.FromString,
             options,
             channel_credentials,
             insecure,

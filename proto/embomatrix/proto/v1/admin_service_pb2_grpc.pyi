@@ -233,8 +233,24 @@ _AdminServiceReadEventsType = typing_extensions.TypeVar(
     ],
 )
 
-class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServiceListRunsType, _AdminServiceDrainWorkerType, _AdminServiceResumeWorkerType, _AdminServiceRevokeWorkerType, _AdminServiceGetPlanType, _AdminServicePauseDispatchType, _AdminServiceResumeDispatchType, _AdminServiceIssueTokenType, _AdminServiceListTokensType, _AdminServiceRevokeTokenType, _AdminServiceGetRunType, _AdminServiceReadEventsType]):
-    """Operators: what the cluster is doing, and a way to take a worker out."""
+_AdminServiceExplainRolloutType = typing_extensions.TypeVar(
+    '_AdminServiceExplainRolloutType',
+    grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ExplainRolloutRequest,
+        embomatrix.proto.v1.admin_service_pb2.ExplainRolloutResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ExplainRolloutRequest,
+        embomatrix.proto.v1.admin_service_pb2.ExplainRolloutResponse,
+    ],
+    default=grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ExplainRolloutRequest,
+        embomatrix.proto.v1.admin_service_pb2.ExplainRolloutResponse,
+    ],
+)
+
+class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServiceListRunsType, _AdminServiceDrainWorkerType, _AdminServiceResumeWorkerType, _AdminServiceRevokeWorkerType, _AdminServiceGetPlanType, _AdminServicePauseDispatchType, _AdminServiceResumeDispatchType, _AdminServiceIssueTokenType, _AdminServiceListTokensType, _AdminServiceRevokeTokenType, _AdminServiceGetRunType, _AdminServiceReadEventsType, _AdminServiceExplainRolloutType]):
+    """State of the cluster, logs, operator commands, and tokens."""
 
     @typing.overload
     def __init__(self: AdminServiceStub[
@@ -289,6 +305,10 @@ class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServic
         grpc.UnaryUnaryMultiCallable[
             embomatrix.proto.v1.admin_service_pb2.ReadEventsRequest,
             embomatrix.proto.v1.admin_service_pb2.ReadEventsResponse,
+        ],
+        grpc.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.ExplainRolloutRequest,
+            embomatrix.proto.v1.admin_service_pb2.ExplainRolloutResponse,
         ],
     ], channel: grpc.Channel) -> None: ...
 
@@ -346,6 +366,10 @@ class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServic
             embomatrix.proto.v1.admin_service_pb2.ReadEventsRequest,
             embomatrix.proto.v1.admin_service_pb2.ReadEventsResponse,
         ],
+        grpc.aio.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.ExplainRolloutRequest,
+            embomatrix.proto.v1.admin_service_pb2.ExplainRolloutResponse,
+        ],
     ], channel: grpc.aio.Channel) -> None: ...
 
     ListWorkers: _AdminServiceListWorkersType
@@ -355,31 +379,34 @@ class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServic
     DrainWorker: _AdminServiceDrainWorkerType
 
     ResumeWorker: _AdminServiceResumeWorkerType
-    """Takes a drain back."""
+    """Cancels a drain."""
 
     RevokeWorker: _AdminServiceRevokeWorkerType
-    """The worker's credential is void, its session ends, and what it held goes to others."""
+    """Revokes the worker's credential and ends its session. Its leases go to other workers."""
 
     GetPlan: _AdminServiceGetPlanType
-    """The look-ahead grid: steps by scenes, and who holds them."""
+    """Look-ahead grid: steps by scenes, with the workers that hold them."""
 
     PauseDispatch: _AdminServicePauseDispatchType
-    """No new leases are given until ResumeDispatch; what runs goes on."""
+    """No new leases are given until ResumeDispatch. Live leases continue."""
 
     ResumeDispatch: _AdminServiceResumeDispatchType
 
     IssueToken: _AdminServiceIssueTokenType
-    """A token of a role, told once and kept as a hash."""
+    """Returns a new token, which is shown once and stored as a hash."""
 
     ListTokens: _AdminServiceListTokensType
 
     RevokeToken: _AdminServiceRevokeTokenType
 
     GetRun: _AdminServiceGetRunType
-    """What a run came to so far, or in the end: closed ones are kept for a while."""
+    """Totals of an open run, or of a closed run that is still archived."""
 
     ReadEvents: _AdminServiceReadEventsType
-    """A page of the event log of a run, or of the cluster."""
+    """Page of the event log of a run, or of workers and scenes."""
+
+    ExplainRollout: _AdminServiceExplainRolloutType
+    """Recent decisions about one rollout, of whichever run."""
 
 AdminServiceAsyncStub: typing_extensions.TypeAlias = AdminServiceStub[
     grpc.aio.UnaryUnaryMultiCallable[
@@ -434,10 +461,14 @@ AdminServiceAsyncStub: typing_extensions.TypeAlias = AdminServiceStub[
         embomatrix.proto.v1.admin_service_pb2.ReadEventsRequest,
         embomatrix.proto.v1.admin_service_pb2.ReadEventsResponse,
     ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ExplainRolloutRequest,
+        embomatrix.proto.v1.admin_service_pb2.ExplainRolloutResponse,
+    ],
 ]
 
 class AdminServiceServicer(metaclass=abc.ABCMeta):
-    """Operators: what the cluster is doing, and a way to take a worker out."""
+    """State of the cluster, logs, operator commands, and tokens."""
 
     @abc.abstractmethod
     def ListWorkers(
@@ -466,7 +497,7 @@ class AdminServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.admin_service_pb2.ResumeWorkerRequest,
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.ResumeWorkerResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.ResumeWorkerResponse]]:
-        """Takes a drain back."""
+        """Cancels a drain."""
 
     @abc.abstractmethod
     def RevokeWorker(
@@ -474,7 +505,7 @@ class AdminServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.admin_service_pb2.RevokeWorkerRequest,
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.RevokeWorkerResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.RevokeWorkerResponse]]:
-        """The worker's credential is void, its session ends, and what it held goes to others."""
+        """Revokes the worker's credential and ends its session. Its leases go to other workers."""
 
     @abc.abstractmethod
     def GetPlan(
@@ -482,7 +513,7 @@ class AdminServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.admin_service_pb2.GetPlanRequest,
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.GetPlanResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.GetPlanResponse]]:
-        """The look-ahead grid: steps by scenes, and who holds them."""
+        """Look-ahead grid: steps by scenes, with the workers that hold them."""
 
     @abc.abstractmethod
     def PauseDispatch(
@@ -490,7 +521,7 @@ class AdminServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.admin_service_pb2.PauseDispatchRequest,
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.PauseDispatchResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.PauseDispatchResponse]]:
-        """No new leases are given until ResumeDispatch; what runs goes on."""
+        """No new leases are given until ResumeDispatch. Live leases continue."""
 
     @abc.abstractmethod
     def ResumeDispatch(
@@ -505,7 +536,7 @@ class AdminServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.admin_service_pb2.IssueTokenRequest,
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.IssueTokenResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.IssueTokenResponse]]:
-        """A token of a role, told once and kept as a hash."""
+        """Returns a new token, which is shown once and stored as a hash."""
 
     @abc.abstractmethod
     def ListTokens(
@@ -527,7 +558,7 @@ class AdminServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.admin_service_pb2.GetRunRequest,
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.GetRunResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.GetRunResponse]]:
-        """What a run came to so far, or in the end: closed ones are kept for a while."""
+        """Totals of an open run, or of a closed run that is still archived."""
 
     @abc.abstractmethod
     def ReadEvents(
@@ -535,6 +566,14 @@ class AdminServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.admin_service_pb2.ReadEventsRequest,
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.ReadEventsResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.ReadEventsResponse]]:
-        """A page of the event log of a run, or of the cluster."""
+        """Page of the event log of a run, or of workers and scenes."""
+
+    @abc.abstractmethod
+    def ExplainRollout(
+        self,
+        request: embomatrix.proto.v1.admin_service_pb2.ExplainRolloutRequest,
+        context: _ServicerContext,
+    ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.ExplainRolloutResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.ExplainRolloutResponse]]:
+        """Recent decisions about one rollout, of whichever run."""
 
 def add_AdminServiceServicer_to_server(servicer: AdminServiceServicer, server: typing.Union[grpc.Server, grpc.aio.Server]) -> None: ...

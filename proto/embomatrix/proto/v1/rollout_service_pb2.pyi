@@ -29,23 +29,23 @@ class _GroupPolicyEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._En
     GROUP_POLICY_UNSPECIFIED: _GroupPolicy.ValueType  # 0
     """The manager's default: retry, then fail the group."""
     GROUP_POLICY_RETRY_THEN_FAIL_GROUP: _GroupPolicy.ValueType  # 1
-    """Members without an outcome are cancelled: the group is left out of the update as a whole."""
+    """Members without an outcome are cancelled, and the group is left out of the update."""
     GROUP_POLICY_PARTIAL: _GroupPolicy.ValueType  # 2
-    """The others go on; the trainer masks the member."""
+    """The other members continue, and the trainer masks the failed one."""
     GROUP_POLICY_FAIL_FAST: _GroupPolicy.ValueType  # 3
-    """The first failure, without a retry, cancels the whole batch."""
+    """The first failure cancels the whole batch, without a retry."""
 
 class GroupPolicy(_GroupPolicy, metaclass=_GroupPolicyEnumTypeWrapper):
-    """What becomes of a group when a member of it ends as an infrastructure failure, after its retries."""
+    """Treatment of a group after one of its members ends in an infrastructure failure."""
 
 GROUP_POLICY_UNSPECIFIED: GroupPolicy.ValueType  # 0
 """The manager's default: retry, then fail the group."""
 GROUP_POLICY_RETRY_THEN_FAIL_GROUP: GroupPolicy.ValueType  # 1
-"""Members without an outcome are cancelled: the group is left out of the update as a whole."""
+"""Members without an outcome are cancelled, and the group is left out of the update."""
 GROUP_POLICY_PARTIAL: GroupPolicy.ValueType  # 2
-"""The others go on; the trainer masks the member."""
+"""The other members continue, and the trainer masks the failed one."""
 GROUP_POLICY_FAIL_FAST: GroupPolicy.ValueType  # 3
-"""The first failure, without a retry, cancels the whole batch."""
+"""The first failure cancels the whole batch, without a retry."""
 Global___GroupPolicy: typing_extensions.TypeAlias = GroupPolicy
 
 @typing.final
@@ -69,14 +69,14 @@ class GetCapabilitiesResponse(google.protobuf.message.Message):
     BUNDLE_BYTES_FIELD_NUMBER: builtins.int
     CA_CERTIFICATE_FIELD_NUMBER: builtins.int
     protocol_low: builtins.int
-    """The versions of the protocol that the manager speaks, both ends included."""
+    """Protocol versions that the manager speaks, both ends included."""
     protocol_high: builtins.int
     version: builtins.str
-    """Of the software."""
+    """Version of the manager's software."""
     batch_rollouts: builtins.int
     bundle_bytes: builtins.int
     ca_certificate: builtins.str
-    """PEM of the authority that signed the manager's certificate; empty without TLS. Who joins compares its fingerprint."""
+    """PEM certificate of the authority that signed the manager's certificate; empty without TLS. Joining workers compare its fingerprint."""
     def __init__(
         self,
         *,
@@ -106,16 +106,16 @@ class OpenRunRequest(google.protobuf.message.Message):
     PROTOCOL_VERSION_FIELD_NUMBER: builtins.int
     name: builtins.str
     run_id: builtins.str
-    """Empty: the manager makes one."""
+    """Empty: the manager chooses an id."""
     group_policy: Global___GroupPolicy.ValueType
     weight: builtins.float
-    """Share of the cluster among runs of one priority; 0 stands for 1."""
+    """Weight among runs of equal priority; 0 stands for 1."""
     priority: builtins.int
-    """A run of a higher priority is served first."""
+    """Runs of higher priority are served first."""
     rollout_deadline_s: builtins.float
-    """From submission to outcome; 0: the manager's default."""
+    """Seconds from submission to outcome; 0: the manager's default."""
     verified: builtins.bool
-    """Results of workers on probation are delivered only when a second worker agreed."""
+    """Results of workers on probation are delivered only after a second worker has reproduced them."""
     protocol_version: builtins.int
     @property
     def reward(self) -> embomatrix.proto.v1.types_pb2.RewardSettings: ...
@@ -211,9 +211,9 @@ class LookaheadAnswer(google.protobuf.message.Message):
     bundle_digest: builtins.str
     warmth: embomatrix.proto.v1.types_pb2.Warmth.ValueType
     eta_s: builtins.float
-    """Seconds until it is warm, as far as load times are known; 0 when warm or unknown."""
+    """Forecast seconds until it is warm; 0 if warm or unknown."""
     reason: builtins.str
-    """Why it can't be placed."""
+    """Reason why it fits on no worker."""
     def __init__(
         self,
         *,
@@ -255,7 +255,7 @@ class ExecuteRequest(google.protobuf.message.Message):
     batch_id: builtins.str
     step: builtins.int
     policy_version: builtins.int
-    """Of the weights that wrote the plans; for people and logs."""
+    """Version of the weights that wrote the plans, for logs."""
     @property
     def rollouts(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[embomatrix.proto.v1.types_pb2.Rollout]: ...
     def __init__(
@@ -273,7 +273,7 @@ Global___ExecuteRequest: typing_extensions.TypeAlias = ExecuteRequest
 
 @typing.final
 class GroupDone(google.protobuf.message.Message):
-    """All members of a group have their outcome."""
+    """Number of outcomes of each kind in a finished group."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -396,7 +396,7 @@ class SampledStep(google.protobuf.message.Message):
     skill: builtins.str
     ok: builtins.bool
     message: builtins.str
-    """What happened, in words."""
+    """Outcome of the call in words."""
     def __init__(
         self,
         *,
@@ -422,13 +422,13 @@ class SampledPlan(google.protobuf.message.Message):
     task_id: builtins.str
     instruction: builtins.str
     text: builtins.str
-    """As the policy wrote it, cut to the manager's limit."""
+    """Text of the policy, cut to the manager's limit."""
     advantage: builtins.float
     problem: builtins.str
-    """Why there was nothing to execute, or nothing came back."""
+    """Reason why there was nothing to execute, or no result."""
     @property
     def reward(self) -> Global___RewardTiers:
-        """Absent where the infrastructure lost the rollout."""
+        """Absent after an infrastructure failure."""
 
     @property
     def steps(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___SampledStep]: ...
@@ -499,11 +499,11 @@ class ReportTrainingRequest(google.protobuf.message.Message):
     PLANS_FIELD_NUMBER: builtins.int
     run_id: builtins.str
     phase: builtins.str
-    """Each phase counts its own steps: `grpo`, `imitation`."""
+    """Each phase, `grpo` or `imitation`, counts its own steps."""
     step: builtins.int
     @property
     def figures(self) -> google.protobuf.internal.containers.ScalarMap[builtins.str, builtins.float]:
-        """By name; those of a table as `table/name`."""
+        """Figures by name; those of a table as `table/name`."""
 
     @property
     def plans(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___SampledPlan]:

@@ -26,7 +26,7 @@ if _version_not_supported:
 
 
 class RolloutServiceStub(object):
-    """Trainer to manager.
+    """Calls of the trainer.
     """
 
     def __init__(self, channel):
@@ -78,11 +78,11 @@ class RolloutServiceStub(object):
 
 
 class RolloutServiceServicer(object):
-    """Trainer to manager.
+    """Calls of the trainer.
     """
 
     def GetCapabilities(self, request, context):
-        """Which protocol versions and limits this manager has. Answered to anyone, before a token is shown.
+        """Protocol versions and limits of the manager. Needs no token.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -95,21 +95,21 @@ class RolloutServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def AnnounceLookahead(self, request, context):
-        """Replaces the whole window of the run; idempotent.
+        """Replaces the whole look-ahead window of the run; idempotent.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Execute(self, request, context):
-        """A batch in, each rollout's one outcome out as it comes. The same batch again attaches to it.
+        """Submits a batch and streams the one outcome of each rollout. Submitting the same batch again attaches to it.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def WaitExecution(self, request, context):
-        """Attaches to a batch after a broken stream: results after the cursor.
+        """Attaches to a batch after a broken stream, and streams the results after the cursor.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -122,7 +122,7 @@ class RolloutServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def ReportTraining(self, request, context):
-        """How training goes, for people who watch: nothing is decided by it. The same phase and step again adds to what is known.
+        """Training report for the dashboard. A repeated phase and step adds figures.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -186,7 +186,7 @@ def add_RolloutServiceServicer_to_server(servicer, server):
 
  # This class is part of an EXPERIMENTAL API.
 class RolloutService(object):
-    """Trainer to manager.
+    """Calls of the trainer.
     """
 
     @staticmethod

@@ -154,7 +154,7 @@ _RolloutServiceCloseRunType = typing_extensions.TypeVar(
 )
 
 class RolloutServiceStub(typing.Generic[_RolloutServiceGetCapabilitiesType, _RolloutServiceOpenRunType, _RolloutServiceAnnounceLookaheadType, _RolloutServiceExecuteType, _RolloutServiceWaitExecutionType, _RolloutServiceCancelBatchType, _RolloutServiceReportTrainingType, _RolloutServiceCloseRunType]):
-    """Trainer to manager."""
+    """Calls of the trainer."""
 
     @typing.overload
     def __init__(self: RolloutServiceStub[
@@ -229,23 +229,23 @@ class RolloutServiceStub(typing.Generic[_RolloutServiceGetCapabilitiesType, _Rol
     ], channel: grpc.aio.Channel) -> None: ...
 
     GetCapabilities: _RolloutServiceGetCapabilitiesType
-    """Which protocol versions and limits this manager has. Answered to anyone, before a token is shown."""
+    """Protocol versions and limits of the manager. Needs no token."""
 
     OpenRun: _RolloutServiceOpenRunType
 
     AnnounceLookahead: _RolloutServiceAnnounceLookaheadType
-    """Replaces the whole window of the run; idempotent."""
+    """Replaces the whole look-ahead window of the run; idempotent."""
 
     Execute: _RolloutServiceExecuteType
-    """A batch in, each rollout's one outcome out as it comes. The same batch again attaches to it."""
+    """Submits a batch and streams the one outcome of each rollout. Submitting the same batch again attaches to it."""
 
     WaitExecution: _RolloutServiceWaitExecutionType
-    """Attaches to a batch after a broken stream: results after the cursor."""
+    """Attaches to a batch after a broken stream, and streams the results after the cursor."""
 
     CancelBatch: _RolloutServiceCancelBatchType
 
     ReportTraining: _RolloutServiceReportTrainingType
-    """How training goes, for people who watch: nothing is decided by it. The same phase and step again adds to what is known."""
+    """Training report for the dashboard. A repeated phase and step adds figures."""
 
     CloseRun: _RolloutServiceCloseRunType
 
@@ -285,7 +285,7 @@ RolloutServiceAsyncStub: typing_extensions.TypeAlias = RolloutServiceStub[
 ]
 
 class RolloutServiceServicer(metaclass=abc.ABCMeta):
-    """Trainer to manager."""
+    """Calls of the trainer."""
 
     @abc.abstractmethod
     def GetCapabilities(
@@ -293,7 +293,7 @@ class RolloutServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesRequest,
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesResponse, collections.abc.Awaitable[embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesResponse]]:
-        """Which protocol versions and limits this manager has. Answered to anyone, before a token is shown."""
+        """Protocol versions and limits of the manager. Needs no token."""
 
     @abc.abstractmethod
     def OpenRun(
@@ -308,7 +308,7 @@ class RolloutServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.rollout_service_pb2.AnnounceLookaheadRequest,
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.rollout_service_pb2.AnnounceLookaheadResponse, collections.abc.Awaitable[embomatrix.proto.v1.rollout_service_pb2.AnnounceLookaheadResponse]]:
-        """Replaces the whole window of the run; idempotent."""
+        """Replaces the whole look-ahead window of the run; idempotent."""
 
     @abc.abstractmethod
     def Execute(
@@ -316,7 +316,7 @@ class RolloutServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.rollout_service_pb2.ExecuteRequest,
         context: _ServicerContext,
     ) -> typing.Union[collections.abc.Iterator[embomatrix.proto.v1.rollout_service_pb2.ExecuteResponse], collections.abc.AsyncIterator[embomatrix.proto.v1.rollout_service_pb2.ExecuteResponse]]:
-        """A batch in, each rollout's one outcome out as it comes. The same batch again attaches to it."""
+        """Submits a batch and streams the one outcome of each rollout. Submitting the same batch again attaches to it."""
 
     @abc.abstractmethod
     def WaitExecution(
@@ -324,7 +324,7 @@ class RolloutServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.rollout_service_pb2.WaitExecutionRequest,
         context: _ServicerContext,
     ) -> typing.Union[collections.abc.Iterator[embomatrix.proto.v1.rollout_service_pb2.WaitExecutionResponse], collections.abc.AsyncIterator[embomatrix.proto.v1.rollout_service_pb2.WaitExecutionResponse]]:
-        """Attaches to a batch after a broken stream: results after the cursor."""
+        """Attaches to a batch after a broken stream, and streams the results after the cursor."""
 
     @abc.abstractmethod
     def CancelBatch(
@@ -339,7 +339,7 @@ class RolloutServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.rollout_service_pb2.ReportTrainingRequest,
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.rollout_service_pb2.ReportTrainingResponse, collections.abc.Awaitable[embomatrix.proto.v1.rollout_service_pb2.ReportTrainingResponse]]:
-        """How training goes, for people who watch: nothing is decided by it. The same phase and step again adds to what is known."""
+        """Training report for the dashboard. A repeated phase and step adds figures."""
 
     @abc.abstractmethod
     def CloseRun(

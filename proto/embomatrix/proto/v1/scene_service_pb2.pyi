@@ -57,7 +57,7 @@ class PutBundleRequest(google.protobuf.message.Message):
     BUNDLE_DIGEST_FIELD_NUMBER: builtins.int
     CHUNK_FIELD_NUMBER: builtins.int
     bundle_digest: builtins.str
-    """In the first message; checked against the content at the end."""
+    """Set in the first message; checked against the content at the end."""
     chunk: builtins.bytes
     def __init__(
         self,

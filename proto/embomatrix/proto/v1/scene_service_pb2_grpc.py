@@ -57,7 +57,7 @@ class SceneServiceServicer(object):
     """
 
     def MissingBundles(self, request, context):
-        """Answers which of the digests the manager lacks.
+        """Returns the digests that the manager lacks.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

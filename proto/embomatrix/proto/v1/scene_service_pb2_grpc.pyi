@@ -109,7 +109,7 @@ class SceneServiceStub(typing.Generic[_SceneServiceMissingBundlesType, _SceneSer
     ], channel: grpc.aio.Channel) -> None: ...
 
     MissingBundles: _SceneServiceMissingBundlesType
-    """Answers which of the digests the manager lacks."""
+    """Returns the digests that the manager lacks."""
 
     PutBundle: _SceneServicePutBundleType
 
@@ -139,7 +139,7 @@ class SceneServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.scene_service_pb2.MissingBundlesRequest,
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.scene_service_pb2.MissingBundlesResponse, collections.abc.Awaitable[embomatrix.proto.v1.scene_service_pb2.MissingBundlesResponse]]:
-        """Answers which of the digests the manager lacks."""
+        """Returns the digests that the manager lacks."""
 
     @abc.abstractmethod
     def PutBundle(

@@ -81,11 +81,11 @@ class _InfraCodeEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._Enum
     INFRA_CODE_DEADLINE: _InfraCode.ValueType  # 8
     INFRA_CODE_MANAGER_RESTARTED: _InfraCode.ValueType  # 9
     INFRA_CODE_STALLED: _InfraCode.ValueType  # 10
-    """The slot lived and did no step for too long."""
+    """The slot was alive but executed no step for too long."""
     INFRA_CODE_SLOT_OOM: _InfraCode.ValueType  # 11
     INFRA_CODE_VERSION_SKEW: _InfraCode.ValueType  # 12
     INFRA_CODE_RESULT_MISMATCH: _InfraCode.ValueType  # 13
-    """Two workers answered differently, and no third one could tell which is right."""
+    """Two workers gave different results, and no third worker could decide."""
 
 class InfraCode(_InfraCode, metaclass=_InfraCodeEnumTypeWrapper): ...
 
@@ -100,11 +100,11 @@ INFRA_CODE_NO_CAPACITY: InfraCode.ValueType  # 7
 INFRA_CODE_DEADLINE: InfraCode.ValueType  # 8
 INFRA_CODE_MANAGER_RESTARTED: InfraCode.ValueType  # 9
 INFRA_CODE_STALLED: InfraCode.ValueType  # 10
-"""The slot lived and did no step for too long."""
+"""The slot was alive but executed no step for too long."""
 INFRA_CODE_SLOT_OOM: InfraCode.ValueType  # 11
 INFRA_CODE_VERSION_SKEW: InfraCode.ValueType  # 12
 INFRA_CODE_RESULT_MISMATCH: InfraCode.ValueType  # 13
-"""Two workers answered differently, and no third one could tell which is right."""
+"""Two workers gave different results, and no third worker could decide."""
 Global___InfraCode: typing_extensions.TypeAlias = InfraCode
 
 class _Warmth:
@@ -130,8 +130,8 @@ Global___Warmth: typing_extensions.TypeAlias = Warmth
 
 @typing.final
 class SkillCall(google.protobuf.message.Message):
-    """One step of a plan. Only the arguments of the skill's signature are set. An index is signed: -1 is a step that fails, not a
-    message that breaks.
+    """One step of a plan. Only the arguments of the skill's signature are set. Indices are signed: -1 makes a failed
+    step, not a malformed message.
     """
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
@@ -233,7 +233,7 @@ Global___AtomResult: typing_extensions.TypeAlias = AtomResult
 
 @typing.final
 class Reward(google.protobuf.message.Message):
-    """The three tiers; the total is their sum."""
+    """Reward by tier; the total is the sum of the three."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -291,7 +291,7 @@ Global___StepResult: typing_extensions.TypeAlias = StepResult
 
 @typing.final
 class Timings(google.protobuf.message.Message):
-    """Where the time of a rollout went, in seconds. Durations only: clocks of two machines are never compared."""
+    """Durations of a rollout in seconds. Clocks of two machines are never compared."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -303,11 +303,11 @@ class Timings(google.protobuf.message.Message):
     queued_s: builtins.float
     """From submission to the lease that delivered, on the manager's clock."""
     load_s: builtins.float
-    """Waiting for the scene, on the worker's clock."""
+    """Wait for the scene, on the worker's clock."""
     execute_s: builtins.float
-    """In the slot, on the worker's clock."""
+    """Time in the slot, on the worker's clock."""
     lease_s: builtins.float
-    """From the lease to its result, less load_s and execute_s: the network, and the wait for a slot. On the manager's clock."""
+    """From lease to result, minus load_s and execute_s: network and wait for a slot, on the manager's clock."""
     deliver_s: builtins.float
     """From the result's arrival to its row in the result log, on the manager's clock."""
     def __init__(
@@ -363,7 +363,7 @@ Global___Completed: typing_extensions.TypeAlias = Completed
 
 @typing.final
 class RolloutCalls(google.protobuf.message.Message):
-    """The bytes of a Rollout, read for its calls alone: each as it stands there."""
+    """The bytes of a Rollout, parsed for its serialized calls only."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -381,7 +381,7 @@ Global___RolloutCalls: typing_extensions.TypeAlias = RolloutCalls
 
 @typing.final
 class CompletedSteps(google.protobuf.message.Message):
-    """The bytes of a Completed, read for its steps alone: each as it stands there."""
+    """The bytes of a Completed, parsed for its serialized steps only."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -399,7 +399,7 @@ Global___CompletedSteps: typing_extensions.TypeAlias = CompletedSteps
 
 @typing.final
 class InfraFailure(google.protobuf.message.Message):
-    """The infrastructure failed: there is no result, and no field for a reward."""
+    """Infrastructure failure: no result and no reward."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -422,7 +422,7 @@ Global___InfraFailure: typing_extensions.TypeAlias = InfraFailure
 
 @typing.final
 class Cancelled(google.protobuf.message.Message):
-    """Called off: by its trainer, or because its group or batch can't be completed any more."""
+    """Cancelled by its trainer, or because its group or batch cannot be completed."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -530,12 +530,12 @@ class Resources(google.protobuf.message.Message):
     disk_mb: builtins.int
     """Free space for bundles."""
     render_slots: builtins.int
-    """Slots of them that render on the GPU; gated by vram_mb."""
+    """Slots that render on the GPU; gated by vram_mb."""
     @property
     def versions(self) -> google.protobuf.internal.containers.ScalarMap[builtins.str, builtins.str]: ...
     @property
     def labels(self) -> google.protobuf.internal.containers.ScalarMap[builtins.str, builtins.str]:
-        """What the operator calls this machine by: room=lab, owner=ann."""
+        """Labels of the operator, such as room=lab."""
 
     def __init__(
         self,
@@ -557,7 +557,7 @@ Global___Resources: typing_extensions.TypeAlias = Resources
 
 @typing.final
 class RewardSettings(google.protobuf.message.Message):
-    """Coefficients of the three tiers; all of them, or none for the worker's defaults."""
+    """Reward coefficients of the three tiers; all of them, or none for the worker's defaults."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 

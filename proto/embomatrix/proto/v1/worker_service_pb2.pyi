@@ -51,13 +51,13 @@ class RegisterRequest(google.protobuf.message.Message):
     PROTOCOL_LOW_FIELD_NUMBER: builtins.int
     worker_id: builtins.str
     boot_id: builtins.str
-    """New for every process."""
+    """Unique for every process."""
     protocol_version: builtins.int
-    """The newest version of the protocol that the worker speaks."""
+    """Newest protocol version that the worker speaks."""
     join_token: builtins.str
-    """One-time, for the first registration; after it the worker shows its credential."""
+    """Join token of the first registration; later the worker uses its credential."""
     protocol_low: builtins.int
-    """The oldest version that the worker speaks; 0 stands for protocol_version."""
+    """Oldest protocol version that the worker speaks; 0 stands for protocol_version."""
     @property
     def resources(self) -> embomatrix.proto.v1.types_pb2.Resources: ...
     def __init__(
@@ -90,9 +90,9 @@ class RegisterResponse(google.protobuf.message.Message):
     heartbeat_interval_s: builtins.float
     lease_ttl_s: builtins.float
     protocol_version: builtins.int
-    """The version both sides speak from here on; 0 stands for 1."""
+    """Protocol version that both sides speak from now on."""
     credential: builtins.str
-    """What the worker authenticates with from here on; empty when it had one already, or none is needed."""
+    """Credential that the worker uses from now on; empty if it does not change."""
     def __init__(
         self,
         *,
@@ -149,7 +149,7 @@ class Resident(google.protobuf.message.Message):
     load_s: builtins.float
     memory_mb: builtins.float
     error: builtins.str
-    """Why loading failed."""
+    """Reason why loading failed."""
     def __init__(
         self,
         *,
@@ -183,8 +183,8 @@ Global___LeaseRef: typing_extensions.TypeAlias = LeaseRef
 
 @typing.final
 class LeaseOrigin(google.protobuf.message.Message):
-    """Which rollout a lease is for, and which attempt at it this is: enough for a manager to take up a lease that a
-    former one gave.
+    """Rollout and attempt of a lease. A later manager needs them to adopt a lease that an
+    earlier manager gave.
     """
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
@@ -232,7 +232,7 @@ Global___LeaseClaim: typing_extensions.TypeAlias = LeaseClaim
 
 @typing.final
 class WorkerState(google.protobuf.message.Message):
-    """Everything the worker holds at this moment."""
+    """Full state of the worker."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -244,18 +244,18 @@ class WorkerState(google.protobuf.message.Message):
     CLAIMS_FIELD_NUMBER: builtins.int
     draining: builtins.bool
     paused: builtins.str
-    """Why the worker takes nothing new for now, though it stays; empty while it works."""
+    """Reason why the worker accepts no new leases; empty while it accepts them."""
     @property
     def residents(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___Resident]: ...
     @property
     def running(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LeaseRef]:
-        """Every lease that has no result yet, whether it runs or waits for a slot."""
+        """Every lease without a result, running or waiting for a slot."""
 
     @property
     def finished(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LeaseResult]: ...
     @property
     def claims(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LeaseClaim]:
-        """In the first state of a stream: what every lease in `running` and `finished` is for."""
+        """Origins of all leases in `running` and `finished`; only in the first state of a stream."""
 
     def __init__(
         self,
@@ -281,9 +281,9 @@ class LeaseResult(google.protobuf.message.Message):
     SLOT_FIELD_NUMBER: builtins.int
     HELD_S_FIELD_NUMBER: builtins.int
     slot: builtins.int
-    """The permit under which it ran, from 1; 0: it never ran, or the worker does not tell."""
+    """Slot in which it ran, from 1; 0: never, or unknown."""
     held_s: builtins.float
-    """Seconds that it had the permit, on the worker's clock."""
+    """Seconds that it held the slot, on the worker's clock."""
     @property
     def lease(self) -> Global___LeaseRef: ...
     @property
@@ -321,7 +321,7 @@ class SessionRequest(google.protobuf.message.Message):
 
     @property
     def results(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LeaseResult]:
-        """Results since the last message; kept by the worker until acknowledged."""
+        """Results since the last message; the worker keeps them until they are acknowledged."""
 
     def __init__(
         self,
@@ -352,11 +352,11 @@ class Lease(google.protobuf.message.Message):
     def rollout(self) -> embomatrix.proto.v1.types_pb2.Rollout: ...
     @property
     def reward(self) -> embomatrix.proto.v1.types_pb2.RewardSettings:
-        """The run's coefficients; absent for the worker's defaults."""
+        """Reward coefficients of the run; absent for the worker's defaults."""
 
     @property
     def origin(self) -> Global___LeaseOrigin:
-        """The worker repeats it in its claims."""
+        """Repeated by the worker in its claims."""
 
     def __init__(
         self,
@@ -384,10 +384,10 @@ class SessionResponse(google.protobuf.message.Message):
     RESUME_FIELD_NUMBER: builtins.int
     drain: builtins.bool
     resume: builtins.bool
-    """Takes an earlier drain back: the worker stays, if it has not left yet."""
+    """Cancels a drain, if the worker has not left yet."""
     @property
     def desired(self) -> Global___DesiredResidents:
-        """The full set of scenes that should be resident, most urgent first; others may be evicted."""
+        """Full set of scenes to hold, most urgent first; others may be evicted."""
 
     @property
     def leases(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___Lease]: ...
@@ -428,14 +428,14 @@ Global___DesiredResidents: typing_extensions.TypeAlias = DesiredResidents
 
 @typing.final
 class LeaseProgress(google.protobuf.message.Message):
-    """How far a lease that runs has come."""
+    """Progress of a running lease."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
     REF_FIELD_NUMBER: builtins.int
     STEPS_FIELD_NUMBER: builtins.int
     steps: builtins.int
-    """Steps of the plan that are done; never falls."""
+    """Executed steps of the plan; never falls."""
     @property
     def ref(self) -> Global___LeaseRef: ...
     def __init__(
@@ -465,7 +465,7 @@ class HeartbeatRequest(google.protobuf.message.Message):
     memory_used_mb: builtins.int
     @property
     def running(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LeaseRef]:
-        """Those to renew: every lease that runs or waits for a slot."""
+        """Leases to renew: all that run or wait for a slot."""
 
     @property
     def progress(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LeaseProgress]: ...

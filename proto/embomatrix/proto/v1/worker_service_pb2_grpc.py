@@ -26,7 +26,7 @@ if _version_not_supported:
 
 
 class WorkerServiceStub(object):
-    """Worker to manager; the worker always dials out.
+    """Calls of the worker, which always dials out.
     """
 
     def __init__(self, channel):
@@ -63,25 +63,25 @@ class WorkerServiceStub(object):
 
 
 class WorkerServiceServicer(object):
-    """Worker to manager; the worker always dials out.
+    """Calls of the worker, which always dials out.
     """
 
     def Register(self, request, context):
-        """Announces resources; invalidates an older session of the same worker id.
+        """Registers resources and invalidates an older session of the same worker id.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Session(self, request_iterator, context):
-        """Level-triggered: the worker's first message is its full state, and so is the first after every reconnect.
+        """Level-triggered: the first message after every connect is the worker's full state.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Heartbeat(self, request, context):
-        """On its own channel, so that no bundle transfer delays it. Renews the leases it names.
+        """Renews the leases it names. Uses its own channel, so that no bundle transfer delays it.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -94,7 +94,7 @@ class WorkerServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Deregister(self, request, context):
-        """The worker leaves for good: what it held is given to others at once.
+        """Announces that the worker has left. Its leases are re-dispatched at once.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -137,7 +137,7 @@ def add_WorkerServiceServicer_to_server(servicer, server):
 
  # This class is part of an EXPERIMENTAL API.
 class WorkerService(object):
-    """Worker to manager; the worker always dials out.
+    """Calls of the worker, which always dials out.
     """
 
     @staticmethod

@@ -106,7 +106,7 @@ _WorkerServiceDeregisterType = typing_extensions.TypeVar(
 )
 
 class WorkerServiceStub(typing.Generic[_WorkerServiceRegisterType, _WorkerServiceSessionType, _WorkerServiceHeartbeatType, _WorkerServiceFetchBundleType, _WorkerServiceDeregisterType]):
-    """Worker to manager; the worker always dials out."""
+    """Calls of the worker, which always dials out."""
 
     @typing.overload
     def __init__(self: WorkerServiceStub[
@@ -157,18 +157,18 @@ class WorkerServiceStub(typing.Generic[_WorkerServiceRegisterType, _WorkerServic
     ], channel: grpc.aio.Channel) -> None: ...
 
     Register: _WorkerServiceRegisterType
-    """Announces resources; invalidates an older session of the same worker id."""
+    """Registers resources and invalidates an older session of the same worker id."""
 
     Session: _WorkerServiceSessionType
-    """Level-triggered: the worker's first message is its full state, and so is the first after every reconnect."""
+    """Level-triggered: the first message after every connect is the worker's full state."""
 
     Heartbeat: _WorkerServiceHeartbeatType
-    """On its own channel, so that no bundle transfer delays it. Renews the leases it names."""
+    """Renews the leases it names. Uses its own channel, so that no bundle transfer delays it."""
 
     FetchBundle: _WorkerServiceFetchBundleType
 
     Deregister: _WorkerServiceDeregisterType
-    """The worker leaves for good: what it held is given to others at once."""
+    """Announces that the worker has left. Its leases are re-dispatched at once."""
 
 WorkerServiceAsyncStub: typing_extensions.TypeAlias = WorkerServiceStub[
     grpc.aio.UnaryUnaryMultiCallable[
@@ -194,7 +194,7 @@ WorkerServiceAsyncStub: typing_extensions.TypeAlias = WorkerServiceStub[
 ]
 
 class WorkerServiceServicer(metaclass=abc.ABCMeta):
-    """Worker to manager; the worker always dials out."""
+    """Calls of the worker, which always dials out."""
 
     @abc.abstractmethod
     def Register(
@@ -202,7 +202,7 @@ class WorkerServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.worker_service_pb2.RegisterRequest,
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.worker_service_pb2.RegisterResponse, collections.abc.Awaitable[embomatrix.proto.v1.worker_service_pb2.RegisterResponse]]:
-        """Announces resources; invalidates an older session of the same worker id."""
+        """Registers resources and invalidates an older session of the same worker id."""
 
     @abc.abstractmethod
     def Session(
@@ -210,7 +210,7 @@ class WorkerServiceServicer(metaclass=abc.ABCMeta):
         request_iterator: _MaybeAsyncIterator[embomatrix.proto.v1.worker_service_pb2.SessionRequest],
         context: _ServicerContext,
     ) -> typing.Union[collections.abc.Iterator[embomatrix.proto.v1.worker_service_pb2.SessionResponse], collections.abc.AsyncIterator[embomatrix.proto.v1.worker_service_pb2.SessionResponse]]:
-        """Level-triggered: the worker's first message is its full state, and so is the first after every reconnect."""
+        """Level-triggered: the first message after every connect is the worker's full state."""
 
     @abc.abstractmethod
     def Heartbeat(
@@ -218,7 +218,7 @@ class WorkerServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.worker_service_pb2.HeartbeatRequest,
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.worker_service_pb2.HeartbeatResponse, collections.abc.Awaitable[embomatrix.proto.v1.worker_service_pb2.HeartbeatResponse]]:
-        """On its own channel, so that no bundle transfer delays it. Renews the leases it names."""
+        """Renews the leases it names. Uses its own channel, so that no bundle transfer delays it."""
 
     @abc.abstractmethod
     def FetchBundle(
@@ -233,6 +233,6 @@ class WorkerServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.worker_service_pb2.DeregisterRequest,
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.worker_service_pb2.DeregisterResponse, collections.abc.Awaitable[embomatrix.proto.v1.worker_service_pb2.DeregisterResponse]]:
-        """The worker leaves for good: what it held is given to others at once."""
+        """Announces that the worker has left. Its leases are re-dispatched at once."""
 
 def add_WorkerServiceServicer_to_server(servicer: WorkerServiceServicer, server: typing.Union[grpc.Server, grpc.aio.Server]) -> None: ...

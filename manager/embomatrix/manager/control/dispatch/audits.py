@@ -19,8 +19,9 @@ from embomatrix.manager.control.dispatch.leasing import (
 )
 from embomatrix.manager.control.dispatch.outcomes import close_case, deliver, return_lease
 from embomatrix.manager.control.dispatch.records import RolloutRecord
-from embomatrix.manager.control.dispatch.state import AuditCase, RolloutStep
+from embomatrix.manager.control.dispatch.state import AuditCase
 from embomatrix.manager.control.reputation import Ruling, judge, opinion_of
+from embomatrix.rpc.wire.run_log import RolloutStepKind
 from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ def hold_for_audit(state: DispatchState, lease: LeaseRecord, completed: Complete
     state.cases[case.key] = case
     record.held = verified
     if verified:
-        state.log(RolloutStep.HELD, record.key, worker_id, "another worker checks the result")
+        state.log(RolloutStepKind.HELD, record.key, worker_id, "another worker checks the result")
         for other in list(record.leases):
             revoke(state, other, "another lease brought a result")
         queue_rollouts(state, [check])
@@ -165,7 +166,7 @@ def _convict(state: DispatchState, worker_id: str, case: AuditCase) -> None:
         if held is not None:
             held.held = False
             state.runs.of(other.key.run_id).counters.redispatched += 1
-            state.log(RolloutStep.QUEUED, held.key, text=f"again, because {worker_id} is in quarantine")
+            state.log(RolloutStepKind.QUEUED, held.key, reason=f"again, because {worker_id} is in quarantine")
             queue_rollouts(state, [held])
     worker = state.pool.workers.get(worker_id)
     if worker is not None:

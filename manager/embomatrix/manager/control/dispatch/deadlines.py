@@ -8,7 +8,7 @@ from embomatrix.manager.control.dispatch.audits import finish, tick_audits
 from embomatrix.manager.control.dispatch.lease_ends import judge_scene, take_away
 from embomatrix.manager.control.dispatch.leasing import fill_workers, hedge_late
 from embomatrix.manager.control.dispatch.membership import release_awaited
-from embomatrix.manager.control.dispatch.state import RolloutStep
+from embomatrix.rpc.wire.run_log import RolloutStepKind
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def _expire(state: DispatchState, lease: LeaseRecord, *, started: bool) -> None:
     else:
         message = f"{lease.worker_id} gave no result within {state.limits.lease_limit_s:g} s"
     if lease in lease.record.leases:
-        state.log(RolloutStep.EXPIRED, lease.record.key, lease.worker_id, message)
+        state.log(RolloutStepKind.EXPIRED, lease.record.key, lease.worker_id, message)
     failure = InfraFailure(InfraCode.LEASE_EXPIRED, message, lease.worker_id)
     take_away(state, lease, failure, started=started)
 

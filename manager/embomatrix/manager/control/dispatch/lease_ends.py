@@ -10,7 +10,7 @@ from embomatrix.manager.control.dispatch.audits import finish, hold_for_audit
 from embomatrix.manager.control.dispatch.batches import attempts_allowed
 from embomatrix.manager.control.dispatch.leasing import offer_scene
 from embomatrix.manager.control.dispatch.outcomes import requeue
-from embomatrix.manager.control.dispatch.state import RolloutStep
+from embomatrix.rpc.wire.run_log import RolloutStepKind
 from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def give_back(state: DispatchState, lease: LeaseRecord, failure: InfraFailure, *
     record = lease.record
     if lease not in record.leases:
         return
-    state.log(RolloutStep.RETURNED, record.key, lease.worker_id, failure.message)
+    state.log(RolloutStepKind.RETURNED, record.key, lease.worker_id, failure.message)
     state.end_lease(lease)
     if counted:
         record.attempts += 1

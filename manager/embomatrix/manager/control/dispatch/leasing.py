@@ -6,8 +6,8 @@ from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.control.commands import CancelLease, GiveLease
-from embomatrix.manager.control.dispatch.state import RolloutStep
 from embomatrix.rpc.wire.leases import LeaseOrigin
+from embomatrix.rpc.wire.run_log import RolloutStepKind
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -78,7 +78,7 @@ def grant(
     """Lease a rollout that is in no queue to a worker that takes it."""
     lease = state.leases.grant(record, worker, state.now_s)
     origin = LeaseOrigin(*record.key, attempt=record.attempts + 1)
-    state.log(RolloutStep.HEDGED if hedge else RolloutStep.LEASED, record.key, worker.worker_id, why)
+    state.log(RolloutStepKind.HEDGED if hedge else RolloutStepKind.LEASED, record.key, worker.worker_id, why)
     state.emit(
         GiveLease(
             worker.worker_id,
@@ -95,7 +95,7 @@ def grant(
 
 def revoke(state: DispatchState, lease: LeaseRecord, why: str) -> None:
     """End a lease that its worker may still hold."""
-    state.log(RolloutStep.REVOKED, lease.record.key, lease.worker_id, why)
+    state.log(RolloutStepKind.REVOKED, lease.record.key, lease.worker_id, why)
     state.end_lease(lease)
     state.emit(CancelLease(lease.worker_id, lease.ref))
 

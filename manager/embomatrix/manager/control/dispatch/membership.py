@@ -14,8 +14,8 @@ from embomatrix.manager.control.dispatch.lease_ends import give_back, judge_scen
 from embomatrix.manager.control.dispatch.leasing import fill_workers, offer_scene, queue_rollouts, revoke
 from embomatrix.manager.control.dispatch.outcomes import open_batch
 from embomatrix.manager.control.dispatch.records import DispatchPhase
-from embomatrix.manager.control.dispatch.state import RolloutStep
 from embomatrix.manager.control.events import WorkerJoined, WorkerLost, WorkerReported, WorkerResumed
+from embomatrix.rpc.wire.run_log import RolloutStepKind
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure, ResidentState
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ def _adopt(state: DispatchState, worker: WorkerRecord, ref: LeaseRef, origin: Le
         state.queues.take(record)
     _claimed(state, record)
     record.attempts = max(record.attempts, origin.attempt - 1)
-    state.log(RolloutStep.LEASED, record.key, worker.worker_id, "adopted from a former manager")
+    state.log(RolloutStepKind.LEASED, record.key, worker.worker_id, "adopted from a former manager")
     state.leases.enter(ref, record, worker, state.now_s)
     return True
 

@@ -8,7 +8,7 @@ from embomatrix.manager.control.commands import DeliverResult, FinishBatch
 from embomatrix.manager.control.dispatch.batches import failed_with
 from embomatrix.manager.control.dispatch.leasing import enqueue, queue_rollouts, revoke
 from embomatrix.manager.control.dispatch.records import DispatchPhase, RolloutKey
-from embomatrix.manager.control.dispatch.state import RolloutStep
+from embomatrix.rpc.wire.run_log import RolloutStepKind
 from embomatrix.rpc.wire.values import Cancelled, InfraFailure, RolloutResult
 
 if TYPE_CHECKING:
@@ -39,7 +39,9 @@ def open_batch(state: DispatchState, batch: Batch, delivered: Mapping[str, int])
         batch, delivered, now_s=state.now_s, due_s=due_s, warm=warm, reward=run.terms.reward
     )
     state.log(
-        RolloutStep.SUBMITTED, RolloutKey(*key, ""), text=f"in a batch of {len(batch.rollouts)} rollouts"
+        RolloutStepKind.SUBMITTED,
+        RolloutKey(*key, ""),
+        reason=f"in a batch of {len(batch.rollouts)} rollouts",
     )
     run.submitted += opened.whole.left
     if not opened.whole.left:
@@ -73,7 +75,7 @@ def deliver(state: DispatchState, record: RolloutRecord, outcome: Outcome) -> No
 def return_lease(state: DispatchState, lease: LeaseRecord, why: str) -> None:
     """End a lease without a result; queue the rollout again unless another lease of it goes on."""
     record = lease.record
-    state.log(RolloutStep.RETURNED, record.key, lease.worker_id, why)
+    state.log(RolloutStepKind.RETURNED, record.key, lease.worker_id, why)
     state.end_lease(lease)
     requeue(state, record)
 
@@ -89,7 +91,7 @@ def requeue(state: DispatchState, record: RolloutRecord) -> None:
             queue_rollouts(state, [record])
         return
     state.runs.of(record.key.run_id).counters.redispatched += 1
-    state.log(RolloutStep.QUEUED, record.key, text=f"again, after {record.attempts} failed attempts")
+    state.log(RolloutStepKind.QUEUED, record.key, reason=f"again; failed attempts: {record.attempts}")
     enqueue(state, record)
 
 
@@ -122,7 +124,7 @@ def _conclude(state: DispatchState, record: RolloutRecord, outcome: Outcome) -> 
     counters = state.runs.of(record.key.run_id).counters
     counters.delivered += 1
     counters.infra_failures += isinstance(outcome, InfraFailure)
-    state.log(RolloutStep.DELIVERED, record.key, text=type(outcome).__name__)
+    state.log(RolloutStepKind.DELIVERED, record.key, reason=type(outcome).__name__)
     result = RolloutResult(
         record.key.rollout_id, record.rollout.group_id, cursor, max(record.attempts, 1), outcome
     )

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from dataclasses import dataclass, field
-from enum import StrEnum
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.control.dispatch.batches import OpenBatches
 from embomatrix.manager.control.dispatch.fair_share import RunAccounts
@@ -14,6 +13,7 @@ from embomatrix.manager.control.dispatch.queues import PendingQueues
 from embomatrix.manager.control.dispatch.records import DispatchPhase, LeaseRecord, RolloutKey, RolloutRecord
 from embomatrix.manager.control.reputation import Auditor, AuditRules, Opinion
 from embomatrix.manager.control.workers import WorkerPool
+from embomatrix.rpc.wire.run_log import RolloutStep, RolloutStepKind
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure
 
 if TYPE_CHECKING:
@@ -63,31 +63,6 @@ class DispatchLimits:
     restart_grace_s: float = 5.0
     """A manager that took over waits this long for workers to claim their leases before it re-dispatches them."""
     audit: AuditRules = field(default_factory=AuditRules)
-
-
-class RolloutStep(StrEnum):
-    """Steps in the history of a rollout."""
-
-    SUBMITTED = "submitted"
-    LEASED = "leased"
-    HEDGED = "hedged"
-    REVOKED = "revoked"
-    EXPIRED = "expired"
-    RETURNED = "returned"
-    QUEUED = "queued"
-    HELD = "held"
-    DELIVERED = "delivered"
-
-
-class HistoryEntry(NamedTuple):
-    """One step of a rollout. ``cause`` names the event that led to it."""
-
-    at_s: float
-    step: RolloutStep
-    key: RolloutKey
-    worker_id: str
-    text: str
-    cause: str
 
 
 @dataclass(slots=True, eq=False)
@@ -205,7 +180,7 @@ class DispatchState:
         self.freed: dict[str, Event | None] = {}
         """Workers that lost a lease during this event, with the cause. Their slots are filled last."""
         self._commands: list[Command] = []
-        self._history: deque[tuple[float, RolloutStep, RolloutKey, str, str, type]] = deque(
+        self._history: deque[tuple[float, RolloutStepKind, RolloutKey, str, str, type]] = deque(
             maxlen=HISTORY_KEPT
         )
 
@@ -224,20 +199,19 @@ class DispatchState:
         self.leases.end(lease, self.now_s)
         self.freed[lease.worker_id] = self.cause
 
-    def log(self, step: RolloutStep, key: RolloutKey, worker_id: str = "", text: str = "") -> None:
+    def log(self, kind: RolloutStepKind, key: RolloutKey, worker_id: str = "", reason: str = "") -> None:
         """Add a step to the history of a rollout, or of all rollouts of a batch for an empty rollout id."""
-        self._history.append((self.now_s, step, key, worker_id, text, type(self.cause)))
+        self._history.append((self.now_s, kind, key, worker_id, reason, type(self.cause)))
 
-    def explain(self, rollout_id: str) -> list[HistoryEntry]:
+    def explain(self, rollout_id: str) -> list[RolloutStep]:
         """Return the history of a rollout in order, as far as it is kept. Costs a scan of the whole history."""
-        found = [
-            HistoryEntry(at_s, step, key, worker_id, text, cause.__name__)
-            for at_s, step, key, worker_id, text, cause in self._history
-            if key.rollout_id in (rollout_id, "")
-        ]
-        batches = {entry.key[:2] for entry in found if entry.key.rollout_id}
+        batches = {key[:2] for _, _, key, *_ in self._history if key.rollout_id == rollout_id}
         batches |= {(b.run_id, b.batch_id) for b in self.batches if rollout_id in b.open}
-        return [entry for entry in found if entry.key[:2] in batches]
+        return [
+            RolloutStep(at_s, kind, key.run_id, key.batch_id, worker_id, reason, cause.__name__)
+            for at_s, kind, key, worker_id, reason, cause in self._history
+            if key.rollout_id in (rollout_id, "") and key[:2] in batches
+        ]
 
     def where(self, rollout_id: str) -> str:
         """Return the place of a rollout without an outcome, in words; empty if there is none."""

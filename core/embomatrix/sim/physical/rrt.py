@@ -1,7 +1,7 @@
-"""Ways of the arm through free postures: two trees that grow from both ends until they meet.
+"""RRT-Connect: path search with two trees that grow from both ends until they meet.
 
-Kuffner and LaValle, "RRT-Connect: an efficient approach to single-query path planning", 2000. A branch grows as far as the
-straight way to where it is drawn is free.
+Kuffner and LaValle, "RRT-Connect: an efficient approach to single-query path planning", 2000. A branch grows along the
+straight line to a drawn posture as far as that is free.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import FloatArray
 
     FreeUpTo = Callable[[FloatArray, FloatArray], FloatArray]
-    """The farthest free posture on the straight way from one posture to another, each of shape (k,)."""
+    """Farthest free posture on the straight line from one posture to another, each of shape (k,)."""
 
 SHORTER_TRIES: Final = 12
-"""Pairs of corners of a way that are tried to be joined, to make it shorter."""
+"""Pairs of corners to try to join when a path is shortened."""
 
 
 class _Tree:
-    """Free postures, each with the one that it was reached from."""
+    """Free postures with their predecessors."""
 
     def __init__(self, root: FloatArray, spacing: FloatArray) -> None:
         self._spacing = spacing
@@ -32,7 +32,7 @@ class _Tree:
         self._before = [-1]
 
     def grow(self, towards: FloatArray, free_up_to: FreeUpTo) -> int | None:
-        """Grow from the nearest posture towards another. Returns the new number, None where nothing was gained."""
+        """Grow from the nearest posture towards another. Return the new index, None without progress."""
         nearest = int(np.abs(self._scaled - towards / self._spacing).max(axis=1).argmin())
         reached = free_up_to(self._nodes[nearest], towards)
         if np.array_equal(reached, self._nodes[nearest]):
@@ -46,17 +46,17 @@ class _Tree:
         return self._nodes[number]
 
     def back_to_root(self, number: int) -> list[FloatArray]:
-        way = []
+        path = []
         while number >= 0:
-            way.append(self._nodes[number])
+            path.append(self._nodes[number])
             number = self._before[number]
-        return way
+        return path
 
 
-def way_between(
+def path_between(
     start: FloatArray, goal: FloatArray, draws: FloatArray, spacing: FloatArray, free_up_to: FreeUpTo
 ) -> FloatArray | None:
-    """Postures, (w, k), on a free way between two, None when the trees do not meet.
+    """Return postures, (w, k), on a free path between two, None if the trees do not meet.
 
     draws: (n, k) postures towards which the trees grow, in this order. Distances are in units of ``spacing``, (k,).
     """
@@ -76,14 +76,14 @@ def way_between(
     return None
 
 
-def _shortened(way: FloatArray, free_up_to: FreeUpTo) -> FloatArray:
-    """The way without corners that it does not need."""
+def _shortened(path: FloatArray, free_up_to: FreeUpTo) -> FloatArray:
+    """Return the path without unnecessary corners."""
     first, tries = 0, 0
-    while first < len(way) - 2 and tries < SHORTER_TRIES:
-        for last in range(len(way) - 1, first + 1, -1):
+    while first < len(path) - 2 and tries < SHORTER_TRIES:
+        for last in range(len(path) - 1, first + 1, -1):
             tries += 1
-            if np.array_equal(free_up_to(way[first], way[last]), way[last]):
-                way = np.concatenate([way[: first + 1], way[last:]])
+            if np.array_equal(free_up_to(path[first], path[last]), path[last]):
+                path = np.concatenate([path[: first + 1], path[last:]])
                 break
         first += 1
-    return way
+    return path

@@ -1,4 +1,4 @@
-"""What is found out offline about placing: at which verified poses the arm gets, and that both modes then prefer these."""
+"""Offline placement reachability: reachable poses are found and preferred by both modes."""
 
 import contextlib
 from dataclasses import replace
@@ -7,35 +7,35 @@ import numpy as np
 import pytest
 from tests.fakes import furniture as make
 from tests.fakes.plans import executed, with_objects
+from tests.fakes.pose_caches import build_pose_cache
 from tests.fakes.scenes import kitchen_scene, placed, upright
 
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.live_world import LiveWorld
-from embomatrix.sim.physical.prospects import Placing
-from embomatrix.sim.physical.survey import prospects
-from embomatrix.sim.placing.pose_cache import build_pose_cache
+from embomatrix.sim.physical.placement_reachability import PlacementQuery
+from embomatrix.sim.physical.survey import placement_reachability
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
-from embomatrix.world.codec_task import poses_from_json, poses_to_json
+from embomatrix.world.codec_task import poses_of, poses_to_json
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import PoseCache
-from embomatrix.world.records import SceneInvalidError
+from embomatrix.world.records import PosesJson, SceneInvalidError, convert
 from embomatrix.world.state import Relation
 from embomatrix.world.tables import Tables, TableWriter
 
-ON_COUNTER = Placing("apple_1", "countertop_1", Relation.ONTOP)
-INTO_BOWL = Placing("apple_1", "bowl_1", Relation.INSIDE)
+ON_COUNTER = PlacementQuery("apple_1", "countertop_1", Relation.ONTOP)
+INTO_BOWL = PlacementQuery("apple_1", "bowl_1", Relation.INSIDE)
 
 
 def looked_ahead(scene, placings):
-    """A cache for these placings, with what the arm was asked about them; the world is the same before and after."""
+    """Return a cache with the answers to placement queries. The world is unchanged afterwards."""
     with contextlib.closing(BulletEngine(scene)) as engine:
         held, targets = ([*{getattr(each, key): None for each in placings}] for key in ("held", "target"))
         poses = build_pose_cache(scene, held, targets, seed=0, engine=engine)
         world = LiveWorld(Bundle(scene, {}, poses), engine)
         before = world.state_bytes()
-        found = prospects(world, poses, placings)
+        found = placement_reachability(world, poses, placings)
         assert world.state_bytes() == before
         return found
 
@@ -46,7 +46,7 @@ def known():
 
 
 def chosen(poses, placing, moved=None):
-    """The poses that seeds choose for a thing from the first standing pose, with the target moved or not."""
+    """Return the poses that seeds choose for an object from the first standing pose, with the target moved or not."""
     scene = kitchen_scene()
     with contextlib.closing(BulletEngine(scene)) as engine:
         world = LiveWorld(Bundle(scene, {}, poses), engine)
@@ -62,28 +62,28 @@ def without_prospects(poses):
     return PoseCache(poses.placements, poses.stands)
 
 
-def test_the_arm_is_seen_to_get_at_a_pose_on_an_open_counter(known):
+def test_pose_on_an_open_counter_is_reachable(known):
     assert known.reached[Relation.ONTOP]["apple_1"]["countertop_1"] >= 0
     assert known.barred_places == {}
 
 
-def test_a_pose_that_the_arm_gets_at_comes_first_whatever_the_seed(known):
+def test_reachable_pose_comes_first_for_every_seed(known):
     assert len(set(chosen(known, ON_COUNTER))) == 1
     assert len(set(chosen(without_prospects(known), ON_COUNTER))) > 1
 
 
-def test_a_target_that_was_moved_is_served_as_if_the_arm_had_not_been_asked(known):
+def test_reachability_is_ignored_for_a_moved_target(known):
     aside = Pose((0.05, 0.0, 0.0))
     assert chosen(known, INTO_BOWL, aside) == chosen(without_prospects(known), INTO_BOWL, aside)
 
 
-def test_equal_questions_have_equal_answers(known):
+def test_equal_queries_give_equal_answers(known):
     again = looked_ahead(kitchen_scene(), (ON_COUNTER, INTO_BOWL))
     assert (again.reached, again.barred_places) == (known.reached, known.barred_places)
 
 
 def boxed_in():
-    """The flat with a low stand on its table, in a box that is closed all round and high enough for a slice of bread."""
+    """The flat with a low stand on its table, in a closed box high enough for a slice of bread."""
     x, y, top, high, wide = 1.9, 1.3, 0.75, 0.11, 0.2
     stand = make.block("stand", "board.n.01", (0.06, 0.06, 0.04), {})
     slice_of = replace(make.block("slice", "bread.n.01", (0.05, 0.05, 0.03), {}), mass_kg=0.1)
@@ -103,8 +103,8 @@ def boxed_in():
     return with_objects(kitchen_scene(), [*sides, *boxed, (free, slice_of)])
 
 
-def test_where_nothing_could_be_taken_from_nothing_is_placed():
-    placing = Placing("slice_1", "stand_1", Relation.ONTOP)
+def test_nothing_is_placed_where_nothing_could_be_picked_up():
+    placing = PlacementQuery("slice_1", "stand_1", Relation.ONTOP)
     scene = boxed_in()
     poses = looked_ahead(scene, (placing,))
     other = poses.barred_places[Relation.ONTOP]["slice_1"]["stand_1"]
@@ -114,7 +114,7 @@ def test_where_nothing_could_be_taken_from_nothing_is_placed():
     assert trace.steps[-1].message == f"the arm finds no free path to a place for slice_1: {other} blocks it"
 
 
-def test_a_place_is_free_again_when_what_barred_it_is_taken_away():
+def test_place_is_reachable_after_its_blocker_is_removed():
     poses = PoseCache(barred_places={Relation.ONTOP: {"apple_1": {"coffee_table_1": "mug_1"}}})
     brings = "move apple_1; pick_up apple_1; move coffee_table_1; place coffee_table_1 ontop"
     clears = "move mug_1; pick_up mug_1; move countertop_1; place countertop_1 ontop"
@@ -127,16 +127,16 @@ def execute(scene, poses, text):
         return executed(simulator, text)
 
 
-def test_what_the_arm_gets_at_travels_in_the_bundle(known):
+def test_reachable_poses_are_stored_in_the_bundle(known):
     poses = PoseCache(reached=known.reached, barred_places={Relation.INSIDE: {"mug_1": {"sink_1": "wall"}}})
     found = decode_bundle(encode_bundle(Bundle(kitchen_scene(), {}, poses))).poses
     assert (found.reached, found.barred_places) == (poses.reached, poses.barred_places)
 
 
 @pytest.mark.parametrize("number", ["3", -1, 0.5, True, None])
-def test_a_number_of_a_pose_that_is_none_is_refused_by_name(number):
+def test_invalid_pose_number_is_refused_with_its_name(number):
     writer = TableWriter()
     value = poses_to_json(PoseCache(reached={Relation.ONTOP: {"mug_1": {"sink_1": 1}}}), writer)
     value["reached"]["ontop"]["mug_1"]["sink_1"] = number
     with pytest.raises(SceneInvalidError, match="sink_1"):
-        poses_from_json(value, Tables(writer.arrays()))
+        poses_of(convert(value, PosesJson, "poses"), Tables(writer.arrays()))

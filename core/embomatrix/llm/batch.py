@@ -1,0 +1,52 @@
+"""Support for synchronous code that asks a model many questions: one event loop, and a limit of unanswered questions."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Final, Self
+
+if TYPE_CHECKING:
+    from contextlib import AbstractAsyncContextManager
+
+    from embomatrix.llm.values import EndpointError
+
+MOST_UNANSWERED: Final = 3
+"""Consecutive questions without an answer, each retried, after which an endpoint counts as dead."""
+
+
+class OnOneLoop:
+    """Context manager over one event loop that closes ``endpoint`` at its end: an HTTP client belongs to one loop."""
+
+    def __init__(self, endpoint: AbstractAsyncContextManager[object] | None = None) -> None:
+        self._endpoint = endpoint
+        self._runner = asyncio.Runner()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._endpoint is not None:
+            self._runner.run(_close(self._endpoint))
+        self._runner.close()
+
+
+async def _close(endpoint: AbstractAsyncContextManager[object]) -> None:
+    await endpoint.__aexit__(None, None, None)
+
+
+class FailureLimit:
+    """Counter of consecutive unanswered questions: a batch survives a few, but not a dead endpoint."""
+
+    def __init__(self, most: int = MOST_UNANSWERED) -> None:
+        self._most = most
+        self._unanswered = 0
+
+    def answered(self) -> None:
+        """Reset the counter."""
+        self._unanswered = 0
+
+    def unanswered(self, error: EndpointError) -> None:
+        """Count an unanswered question. Raises the error when the limit is reached."""
+        self._unanswered += 1
+        if self._unanswered >= self._most:
+            raise error
