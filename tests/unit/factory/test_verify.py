@@ -8,6 +8,7 @@ import pytest
 from tests.fakes.datasets import write_kitchen_dataset
 from typer.testing import CliRunner
 
+from embomatrix.factory.admission import PlanFailure
 from embomatrix.factory.commands.app import app
 from embomatrix.factory.evaluate.verification import Judgement, compared, evaluation_of, objections, sampled
 from embomatrix.world.dataset import Dataset, write_dataset
@@ -15,6 +16,7 @@ from embomatrix.world.dataset import Dataset, write_dataset
 if TYPE_CHECKING:
     from pathlib import Path
 
+SLIPPED = PlanFailure("grasp_slipped", "step 2, pick_up: it fell")
 FINE = Judgement("fetch", "", "sha256:1", same_plan=True)
 
 
@@ -33,8 +35,8 @@ def test_equal_judgements_agree_with_the_dataset() -> None:
 
 def test_shares_count_tested_modes_and_objections_name_the_task() -> None:
     verdicts = [
-        compared(FINE, dataclasses.replace(FINE, physical="")),
-        compared(FINE, dataclasses.replace(FINE, physical="grasp_slipped: step 2, pick_up: it fell")),
+        compared(FINE, dataclasses.replace(FINE, in_physics=True)),
+        compared(FINE, dataclasses.replace(FINE, in_physics=True, physical=SLIPPED)),
     ]
     evaluation = evaluation_of(verdicts, {})
     assert evaluation.figure("oracle_cached").value == 100

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from embomatrix.factory.admission import PlanFailure
     from embomatrix.sim.executor import Simulator
     from embomatrix.world.bundle import Bundle
     from embomatrix.world.dataset import TaskRecord
@@ -42,7 +43,7 @@ PHYSICAL_GOAL_PERCENT: Final = 97.0
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """Result of one process. ``cached`` and ``physical`` are objections to the task; ``physical`` is None if not tested.
+    """Result of one process: an objection in cached mode, "" for none, and a failure in physics if ``in_physics``.
 
     ``digest`` covers every pose and state after every step of the plan. ``same_plan`` means that the plan is the dataset's.
     """
@@ -51,7 +52,8 @@ class Judgement:
     cached: str
     digest: str
     same_plan: bool
-    physical: str | None = None
+    in_physics: bool = False
+    physical: PlanFailure | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +63,8 @@ class VerificationOutcome:
     task: str
     cached: str
     equal: bool
-    physical: str | None
+    in_physics: bool
+    physical: PlanFailure | None
 
 
 def sampled(records: Sequence[TaskRecord], most: int | None, seed: int) -> list[TaskRecord]:
@@ -112,7 +115,9 @@ def compared(first: Judgement, second: Judgement) -> VerificationOutcome:
     """Combine two judgements of one task."""
     same = (first.cached, first.digest) == (second.cached, second.digest)
     equal = same and first.same_plan and second.same_plan
-    return VerificationOutcome(first.task, first.cached or second.cached, equal, second.physical)
+    return VerificationOutcome(
+        first.task, first.cached or second.cached, equal, second.in_physics, second.physical
+    )
 
 
 def _judge_bundle(folder: Path, tasks: tuple[str, list[str]], *, physical: bool) -> list[Judgement]:
@@ -125,7 +130,7 @@ def _judge_bundle(folder: Path, tasks: tuple[str, list[str]], *, physical: bool)
     if not physical:
         return judgements
     return [
-        replace(each, physical=_physical(bundle, record))
+        replace(each, in_physics=True, physical=_physical(bundle, record))
         for each, record in zip(judgements, records, strict=True)
     ]
 
@@ -140,8 +145,8 @@ def _cached(stage: Simulator, record: TaskRecord) -> Judgement:
     return Judgement(record.task.task_id, SUCCESS, trace.digest, same)
 
 
-def _physical(bundle: Bundle, record: TaskRecord) -> str:
-    """Execute the dataset's plan with a robot in physics; return the objection, empty if it reaches the goal."""
+def _physical(bundle: Bundle, record: TaskRecord) -> PlanFailure | None:
+    """Execute the dataset's plan with a robot in physics; return the failure, None if it reaches the goal."""
     plan = plan_from_json(list(record.oracle), record.task.profile)
     with contextlib.closing(physical_simulator(bundle)) as stage:
         return plan_failure(stage, record.task, plan)
@@ -151,16 +156,16 @@ def evaluation_of(
     verdicts: Sequence[VerificationOutcome], conditions: Mapping[str, Any]
 ) -> EvaluationFigures:
     """Return shares in percent of the tasks, and the objections to plans in physics, commonest first."""
-    physical = [verdict.physical for verdict in verdicts if verdict.physical is not None]
+    physical = [verdict.physical for verdict in verdicts if verdict.in_physics]
     figures = [
         _figure("oracle_cached", [not verdict.cached for verdict in verdicts], GOAL_PERCENT),
         _figure("reverified_bit_equal", [verdict.equal for verdict in verdicts], GOAL_PERCENT),
     ]
     if physical:
         figures.append(
-            _figure("oracle_physical", [not sentence for sentence in physical], PHYSICAL_GOAL_PERCENT)
+            _figure("oracle_physical", [failure is None for failure in physical], PHYSICAL_GOAL_PERCENT)
         )
-    reasons = Counter(sentence.split(":")[0] for sentence in physical if sentence)
+    reasons = Counter(failure.reason for failure in physical if failure is not None)
     told = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
     notes = (f"Against plans in physics: {told}.",) if told else ()
     return EvaluationFigures("verification", conditions, tuple(figures), notes)
