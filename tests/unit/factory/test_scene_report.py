@@ -162,7 +162,7 @@ def test_check_writes_a_report_and_names_missing_objects(tmp_path: Path) -> None
     (entry,) = json.loads(path.read_text())
     assert entry["scene_id"] == SMALL
     assert entry["problems"] == []
-    assert ("what is listed and not placed" in result.output) == bool(entry["left_out"])
+    assert ("for objects that were left out" in result.output) == bool(entry["left_out"])
 
 
 @pytest.mark.parametrize(
