@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 from tests.fakes import furniture as make
 from tests.fakes.plans import executed, with_objects
+from tests.fakes.pose_caches import build_pose_cache
 from tests.fakes.scenes import kitchen_scene, placed, upright
 
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical.placement_reachability import PlacementQuery
 from embomatrix.sim.physical.survey import placement_reachability
-from embomatrix.sim.placing.pose_cache import build_pose_cache
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
-from embomatrix.world.codec_task import poses_from_json, poses_to_json
+from embomatrix.world.codec_task import poses_of, poses_to_json
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import PoseCache
-from embomatrix.world.records import SceneInvalidError
+from embomatrix.world.records import PosesJson, SceneInvalidError, convert
 from embomatrix.world.state import Relation
 from embomatrix.world.tables import Tables, TableWriter
 
@@ -64,7 +64,7 @@ def without_prospects(poses):
 
 def test_pose_on_an_open_counter_is_reachable(known):
     assert known.reached[Relation.ONTOP]["apple_1"]["countertop_1"] >= 0
-    assert known.barred_places == {}
+    assert known.placing_blockers == {}
 
 
 def test_reachable_pose_comes_first_for_every_seed(known):
@@ -79,7 +79,7 @@ def test_reachability_is_ignored_for_a_moved_target(known):
 
 def test_equal_queries_give_equal_answers(known):
     again = looked_ahead(kitchen_scene(), (ON_COUNTER, INTO_BOWL))
-    assert (again.reached, again.barred_places) == (known.reached, known.barred_places)
+    assert (again.reached, again.placing_blockers) == (known.reached, known.placing_blockers)
 
 
 def boxed_in():
@@ -107,7 +107,7 @@ def test_nothing_is_placed_where_nothing_could_be_picked_up():
     placing = PlacementQuery("slice_1", "stand_1", Relation.ONTOP)
     scene = boxed_in()
     poses = looked_ahead(scene, (placing,))
-    other = poses.barred_places[Relation.ONTOP]["slice_1"]["stand_1"]
+    other = poses.placing_blockers[Relation.ONTOP]["slice_1"]["stand_1"]
     assert other.startswith(("side", "lid", "stand"))
     trace = execute(scene, poses, "move slice_1; pick_up slice_1; move stand_1; place stand_1 ontop")
     assert trace.failure is FailureReason.ARM_BLOCKED
@@ -115,7 +115,7 @@ def test_nothing_is_placed_where_nothing_could_be_picked_up():
 
 
 def test_place_is_reachable_after_its_blocker_is_removed():
-    poses = PoseCache(barred_places={Relation.ONTOP: {"apple_1": {"coffee_table_1": "mug_1"}}})
+    poses = PoseCache(placing_blockers={Relation.ONTOP: {"apple_1": {"coffee_table_1": "mug_1"}}})
     brings = "move apple_1; pick_up apple_1; move coffee_table_1; place coffee_table_1 ontop"
     clears = "move mug_1; pick_up mug_1; move countertop_1; place countertop_1 ontop"
     assert execute(kitchen_scene(), poses, brings).failure is FailureReason.ARM_BLOCKED
@@ -128,9 +128,11 @@ def execute(scene, poses, text):
 
 
 def test_reachable_poses_are_stored_in_the_bundle(known):
-    poses = PoseCache(reached=known.reached, barred_places={Relation.INSIDE: {"mug_1": {"sink_1": "wall"}}})
+    poses = PoseCache(
+        reached=known.reached, placing_blockers={Relation.INSIDE: {"mug_1": {"sink_1": "wall"}}}
+    )
     found = decode_bundle(encode_bundle(Bundle(kitchen_scene(), {}, poses))).poses
-    assert (found.reached, found.barred_places) == (poses.reached, poses.barred_places)
+    assert (found.reached, found.placing_blockers) == (poses.reached, poses.placing_blockers)
 
 
 @pytest.mark.parametrize("number", ["3", -1, 0.5, True, None])
@@ -139,4 +141,4 @@ def test_invalid_pose_number_is_refused_with_its_name(number):
     value = poses_to_json(PoseCache(reached={Relation.ONTOP: {"mug_1": {"sink_1": 1}}}), writer)
     value["reached"]["ontop"]["mug_1"]["sink_1"] = number
     with pytest.raises(SceneInvalidError, match="sink_1"):
-        poses_from_json(value, Tables(writer.arrays()))
+        poses_of(convert(value, PosesJson, "poses"), Tables(writer.arrays()))
