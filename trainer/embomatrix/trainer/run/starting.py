@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import torch
 
-from embomatrix.host.cores import usable_cores
+from embomatrix.host.limits import usable_cores
 from embomatrix.trainer.config.errors import TrainerError, reason_of
 from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, read_settings, with_changes
 from embomatrix.trainer.data.tasks import load_tasks
