@@ -201,7 +201,7 @@ def test_missing_package_is_named_with_what_brings_it(kitchen, tmp_path, package
         ),
         (
             ("status", "--manager=nowhere"),
-            "'nowhere' is no address of a manager: expected HOST:PORT",
+            "'nowhere' is no manager address: expected HOST:PORT",
         ),
         (("worker", "run", "--manager=host:99999"), "--manager 'host:99999': expected HOST:PORT"),
         (("worker", "run", "--nice=50"), "--nice 50: input should be less than or equal to 19"),
@@ -236,7 +236,10 @@ def test_unknown_setting_of_a_training_is_named(kitchen, tmp_path):
             ("train", "--dataset=DATASET", "--out=OUT"),
             "can't be created (Not a directory): pass another --out",
         ),
-        (("demo", "--dataset=DATASET", "--out=OUT"), "can't be made (Not a directory): pass another --out"),
+        (
+            ("demo", "--dataset=DATASET", "--out=OUT"),
+            "can't be created (Not a directory): pass another --out",
+        ),
     ],
 )
 def test_folder_that_can_not_be_written_is_named(kitchen, tmp_path, arguments, words):

@@ -15,6 +15,8 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+import psutil
+
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.host.parent import with_this_process
 
@@ -145,6 +147,15 @@ def running_program(folder: Path, name: str, *command: str) -> Iterator[Process]
         except subprocess.TimeoutExpired:
             child.kill()
             child.wait()
+
+
+def kill_tree(pid: int) -> None:
+    """Kill a process and its descendants."""
+    with contextlib.suppress(psutil.NoSuchProcess):
+        process = psutil.Process(pid)
+        for each in (*process.children(recursive=True), process):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                each.kill()
 
 
 def free_port() -> int:

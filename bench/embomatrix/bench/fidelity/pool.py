@@ -1,33 +1,35 @@
 """Process pool that executes trials in both modes, scene by scene. A process that dies or hangs costs its current trial.
 
-Children are spawned, never forked, because the parent may hold threads and a loaded engine.
+Each thread runs the trials of one bundle in a spawned process, which keeps the loaded scene from trial to trial.
 """
 
 from __future__ import annotations
 
-import multiprocessing
-import multiprocessing.connection
-import time
+import functools
+import os
+import threading
 import traceback
 from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from embomatrix.bench.cluster.processes import kill_tree
 from embomatrix.sim.fidelity.compare import FidelityTrial, compare, comparison_to_json, trial_to_json
+from embomatrix.sim.process_pool import process_pool
 from embomatrix.world.dataset import Dataset
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
-    from multiprocessing.connection import Connection
-    from multiprocessing.process import BaseProcess
     from pathlib import Path
 
     from embomatrix.sim.executor import Simulator
     from embomatrix.world.bundle import Bundle
 
     Load = Callable[[Bundle], Simulator]
+    OnResult = Callable[[Mapping[str, Any]], None]
 
-JOIN_S: Final = 5.0
 LOST: Final = "lost"
 """Key of the reason in the result line of a lost trial."""
 
@@ -49,99 +51,60 @@ class TrialJob:
 
 
 class FidelityPool:
-    """Runs jobs in dedicated processes. ``limit_s`` bounds the time for loading a scene and for each trial."""
+    """Runs jobs in dedicated processes. ``limit_s`` bounds the time for loading a scene and running a trial."""
 
     def __init__(self, folder: Path, modes: Modes, processes: int, limit_s: float) -> None:
         self._folder = folder
         self._modes = modes
         self._processes = processes
         self._limit_s = limit_s
-        self._spawn = multiprocessing.get_context("spawn")
+        self._stopped = False
 
-    def run(self, jobs: Sequence[TrialJob], on_result: Callable[[Mapping[str, Any]], None]) -> None:
+    def run(self, jobs: Sequence[TrialJob], on_result: OnResult) -> None:
         """Execute every trial once. ``on_result`` gets a JSON value for each: a comparison, or a lost trial."""
-        waiting = deque(job for job in jobs if job.trials)
-        busy: list[_Child] = []
-        try:
-            while waiting or busy:
-                while waiting and len(busy) < self._processes:
-                    busy.append(_Child(self._start(), waiting.popleft(), self._limit_s))
-                soonest = min(child.deadline for child in busy)
-                multiprocessing.connection.wait(
-                    [child.connection for child in busy], max(0.0, soonest - time.monotonic())
-                )
-                for child in tuple(busy):
-                    rest = child.receive(on_result)
-                    if rest is not None:
-                        busy.remove(child)
-                        child.stop()
-                        if rest.trials:
-                            waiting.appendleft(rest)
-        finally:
-            for child in busy:
-                child.stop()
+        lock = threading.Lock()
 
-    def _start(self) -> tuple[BaseProcess, Connection]:
-        ours, theirs = self._spawn.Pipe()
-        process = self._spawn.Process(
-            target=_serve, args=(theirs, self._folder, self._modes), daemon=True, name="fidelity"
-        )
-        process.start()
-        theirs.close()
-        return process, ours
-
-
-class _Child:
-    """One process and its remaining trials."""
-
-    def __init__(self, started: tuple[BaseProcess, Connection], job: TrialJob, limit_s: float) -> None:
-        self._process, self.connection = started
-        self._digest = job.bundle_digest
-        self._left = deque(job.trials)
-        self._limit_s = limit_s
-        self.deadline = time.monotonic() + limit_s
-        self.connection.send(job)
-
-    def receive(self, on_result: Callable[[Mapping[str, Any]], None]) -> TrialJob | None:
-        """Read results. Return the rest of the job if the process has to be replaced, None while it works."""
-        try:
-            while self.connection.poll():
-                value = self.connection.recv()
-                self._left.popleft()
-                self.deadline = time.monotonic() + self._limit_s
+        def deliver(value: Mapping[str, Any]) -> None:
+            with lock:
                 on_result(value)
-                if LOST in value:
-                    return TrialJob(self._digest, tuple(self._left))
-        except (EOFError, ConnectionError):
-            return self._lose("the process died", on_result)
-        if not self._left:
-            return TrialJob(self._digest, ())
-        if time.monotonic() >= self.deadline:
-            return self._lose(f"no answer in {self._limit_s:g} s", on_result)
-        return None
 
-    def stop(self) -> None:
-        self.connection.close()
-        self._process.terminate()
-        self._process.join(JOIN_S)
-        if self._process.is_alive():
-            self._process.kill()
+        with ThreadPoolExecutor(self._processes) as threads:
+            try:
+                for _ in threads.map(functools.partial(self._run_job, deliver=deliver), jobs):
+                    pass
+            finally:
+                self._stopped = True
+                threads.shutdown(wait=False, cancel_futures=True)
 
-    def _lose(self, reason: str, on_result: Callable[[Mapping[str, Any]], None]) -> TrialJob:
-        if self._left:
-            on_result({**trial_to_json(self._left.popleft()), LOST: reason})
-        return TrialJob(self._digest, tuple(self._left))
+    def _run_job(self, job: TrialJob, deliver: OnResult) -> None:
+        waiting = deque(job.trials)
+        while waiting and not self._stopped:
+            with process_pool(1) as pool:
+                pid = pool.submit(os.getpid).result()
+                lost = ""
+                while waiting and not lost and not self._stopped:
+                    trial = waiting.popleft()
+                    try:
+                        done = pool.submit(_execute, self._folder, self._modes, trial)
+                        deliver(done.result(self._limit_s))
+                    except BrokenProcessPool:
+                        lost = "the process died"
+                    except TimeoutError:
+                        lost = f"no answer in {self._limit_s:g} s"
+                        kill_tree(pid)
+                    except Exception as error:  # noqa: BLE001 -- any exception of a mode is a finding, reported with its trial
+                        lost = "".join(traceback.format_exception(error, limit=-6))
+                if lost:
+                    deliver({**trial_to_json(trial), LOST: lost})
 
 
-def _serve(connection: Connection, folder: Path, modes: Modes) -> None:
-    """Load the job's scene in both modes and send the result of each trial."""
-    job: TrialJob = connection.recv()
-    trial = job.trials[0]
-    try:
-        bundle = Dataset.load(folder).read_bundle(job.bundle_digest)
-        cached, physical = modes.cached(bundle), modes.physical(bundle)
-        for trial in job.trials:
-            comparison = compare(cached, physical, bundle.tasks[trial.task_id], trial)
-            connection.send(comparison_to_json(comparison))
-    except Exception:  # noqa: BLE001 -- any exception of a mode is a finding, reported with its trial
-        connection.send({**trial_to_json(trial), LOST: traceback.format_exc(limit=-6)})
+def _execute(folder: Path, modes: Modes, trial: FidelityTrial) -> dict[str, Any]:
+    bundle, cached, physical = _load(folder, modes, trial.bundle_digest)
+    return comparison_to_json(compare(cached, physical, bundle.tasks[trial.task_id], trial))
+
+
+@functools.lru_cache(maxsize=1)
+def _load(folder: Path, modes: Modes, digest: str) -> tuple[Bundle, Simulator, Simulator]:
+    """Load the scene in both modes, once in a process."""
+    bundle = Dataset.load(folder).read_bundle(digest)
+    return bundle, modes.cached(bundle), modes.physical(bundle)

@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-import psutil
 
 from embomatrix.bench.cluster.cpu import descendants_cpu_s
+from embomatrix.bench.cluster.processes import kill_tree
 from embomatrix.bench.peers.contenders import (
     ContenderSetup,
     Done,
@@ -173,11 +173,7 @@ def run_apart(measure: Callable[..., Any], arguments: tuple[Any, ...], limit_s: 
         except Exception as error:  # noqa: BLE001  # a library may raise anything: the contest goes without it
             return f"{type(error).__name__}: {error}"[:300]
         finally:
-            with contextlib.suppress(psutil.NoSuchProcess):
-                process = psutil.Process(pid)
-                for each in (*process.children(recursive=True), process):
-                    with contextlib.suppress(psutil.NoSuchProcess):
-                        each.kill()
+            kill_tree(pid)
 
 
 def measure_peer(

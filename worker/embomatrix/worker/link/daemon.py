@@ -140,7 +140,7 @@ class Daemon:
             return
         logger.info("draining held_leases=%d", self.held)
         self._draining.set()
-        self._report.draining()
+        self._report.update(draining=True)
         if self._session is not None:
             self._session.drain()
 
@@ -260,11 +260,11 @@ class Daemon:
             await session.serve()
         finally:
             attached.cancel()
-            self._report.disconnected()
+            self._report.update(connected_since_s=0.0)
 
     async def _note_attached(self, session: ManagerSession) -> None:
         await session.attached.wait()
-        self._report.connected(self._managers.current)
+        self._report.update(manager=self._managers.current, connected_since_s=time.time())
         self._backoff.reset()
 
     async def _fence(self) -> None:
@@ -299,13 +299,13 @@ class Daemon:
 
     def _take_result(self, result: LeaseResult) -> None:
         """Queue a result for the manager, with this worker's name."""
-        self._report.finished(result)
+        self._report.count(result)
         self._outbox.put(signed(result, self._membership.name))
         if self._session is not None:
             self._session.notify()
 
     def _pause(self, reason: str) -> None:
-        self._report.paused(reason)
+        self._report.update(paused=reason)
         if self._session is not None:
             self._session.pause(reason)
 

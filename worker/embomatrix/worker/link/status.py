@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 import os
 import time
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import psutil
 
 from embomatrix.rpc.wire.values import Completed
+from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from embomatrix.rpc.wire.leases import LeaseResult
@@ -67,25 +70,24 @@ class StatusFile:
         self._last: WorkerStatus | None = None
 
     def write(self, status: WorkerStatus) -> None:
-        """Write the status beside and rename it, if it has changed."""
-        if status == self._last:
-            return
-        part = self._path.with_suffix(".part")
-        try:
-            self._path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-            part.write_text(json.dumps(asdict(status)), encoding="utf-8")
-            part.replace(self._path)
-        except OSError as error:
-            logger.debug("status not written: %s", error)
-            return
-        self._last = status
+        """Write the status if it has changed."""
+        if status != self._last:
+            with self._errors_logged():
+                self._path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+                write_whole(self._path, json.dumps(asdict(status)).encode("utf-8"))
+                self._last = status
 
     def remove(self) -> None:
         """Remove the file after the daemon has left."""
-        try:
+        with self._errors_logged():
             self._path.unlink(missing_ok=True)
+
+    @contextlib.contextmanager
+    def _errors_logged(self) -> Iterator[None]:
+        try:
+            yield
         except OSError as error:
-            logger.debug("status not removed: %s", error)
+            logger.debug("status file not updated path=%s: %s", self._path, error)
 
 
 class StatusReport:
@@ -113,8 +115,6 @@ class StatusReport:
         self._pool = pool
         self._cache = cache
         self._outbox = outbox
-        self._completed = 0
-        self._failed = 0
 
     async def run(self) -> None:
         """Write the file until cancelled; then remove it."""
@@ -125,24 +125,14 @@ class StatusReport:
         finally:
             self._file.remove()
 
-    def connected(self, manager: str) -> None:
-        self._status = replace(self._status, manager=manager, connected_since_s=time.time())
+    def update(self, **changes: Any) -> None:
+        """Set fields of the status."""
+        self._status = replace(self._status, **changes)
 
-    def disconnected(self) -> None:
-        self._status = replace(self._status, connected_since_s=0.0)
-
-    def paused(self, reason: str) -> None:
-        """Set the reason of a pause; an empty one ends it."""
-        self._status = replace(self._status, paused=reason)
-
-    def draining(self) -> None:
-        self._status = replace(self._status, draining=True)
-
-    def finished(self, result: LeaseResult) -> None:
-        if isinstance(result.outcome, Completed):
-            self._completed += 1
-        else:
-            self._failed += 1
+    def count(self, result: LeaseResult) -> None:
+        """Count a result as completed or failed."""
+        field = "completed" if isinstance(result.outcome, Completed) else "failed"
+        self.update(**{field: getattr(self._status, field) + 1})
 
     def _current(self, cache_used_mb: float) -> WorkerStatus:
         running = len(self._pool.progress())
@@ -150,8 +140,6 @@ class StatusReport:
             self._status,
             running=running,
             waiting=len(self._pool.held()) - running,
-            completed=self._completed,
-            failed=self._failed,
             unacknowledged=len(self._outbox),
             scenes=len(self._pool.residents()),
             memory_used_mb=round(self._pool.memory_used_mb),
