@@ -195,7 +195,7 @@ def test_training_tells_how_it_was_interrupted_and_what_could_not_be_written(kit
         with background(tmp_path / "late.log", *common, *short, f"--out={tmp_path / 'late'}") as run_:
             run_.wait_for((tmp_path / "late" / "metrics.jsonl").exists)
             assert_told(
-                run_.interrupt(), 130, f"interrupted: go on with `--resume --out={tmp_path / 'late'}`"
+                run_.interrupt(), 130, f"interrupted: continue with `--resume --out={tmp_path / 'late'}`"
             )
         newest = max((tmp_path / "late" / "checkpoints").iterdir())
         assert newest.name.startswith("step-")
@@ -213,7 +213,7 @@ def test_interrupted_demo_ends_what_it_started(kitchen, tmp_path):
         demo.wait_for((out / "metrics.jsonl").exists)
         address = re.search(r"manager at (\S+),", demo.text)[1]
         told = demo.interrupt()
-    assert_told(told, 130, "interrupted: go on with `--resume --out=")
+    assert_told(told, 130, "interrupted: continue with `--resume --out=")
     assert list((out / "checkpoints").glob("step-*"))
     with socket.socket() as probe:
         host, _, port = address.rpartition(":")

@@ -201,7 +201,7 @@ def test_missing_package_is_named_with_what_brings_it(kitchen, tmp_path, package
         ),
         (
             ("status", "--manager=nowhere"),
-            "'nowhere' is no address of a manager: expected HOST:PORT",
+            "'nowhere' is no manager address: expected HOST:PORT",
         ),
         (("worker", "run", "--manager=host:99999"), "--manager 'host:99999': expected HOST:PORT"),
         (("worker", "run", "--nice=50"), "--nice 50: input should be less than or equal to 19"),

@@ -299,7 +299,7 @@ class _AttachedBatch:
         within = "within its deadline" if within_s is None else f"within {within_s:g} s"
         return DeadlineError(
             f"batch {self.batch.batch_id}: {len(self.missing)} of {len(self.batch.rollouts)} rollouts "
-            f"had no outcome {within}: are workers connected? (`embomatrix manager status`)"
+            f"had no outcome {within}: are workers connected? (`embomatrix status`)"
         )
 
 

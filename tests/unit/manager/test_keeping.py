@@ -242,6 +242,6 @@ def test_a_data_folder_that_is_a_file_is_explained(tmp_path):
 
 
 def test_asking_a_manager_that_is_not_there_says_how_to_start_one():
-    result = CliRunner().invoke(app, ["status", "--address", "127.0.0.1:1"])
+    result = CliRunner().invoke(app, ["token", "list", "--address", "127.0.0.1:1"])
     assert result.exit_code == 2
     assert "embomatrix manager serve" in result.output

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from embomatrix.manager.control.commands import AcknowledgeLease, CancelLease, GiveLease, SetDesired
 from embomatrix.rpc.wire.leases import Lease
@@ -13,10 +13,6 @@ if TYPE_CHECKING:
     from embomatrix.manager.runtime.registry import WorkerSession
     from embomatrix.rpc.status import ClusterError
     from embomatrix.rpc.wire.leases import LeaseRef
-
-ACKNOWLEDGE_S: Final = 0.2
-"""An acknowledgement waits this long to travel with other commands. While work goes on, leases leave sooner, and each
-message saved is a wake-up less at both ends."""
 
 WorkerCommand = SetDesired | GiveLease | CancelLease | AcknowledgeLease
 
@@ -40,7 +36,6 @@ class WorkerLink:
         self.session = session
         self._outbox = OutgoingMessage()
         self._ready = asyncio.Event()
-        self._later: asyncio.TimerHandle | None = None
         self._closed: ClusterError | None = None
 
     def put(self, command: WorkerCommand) -> None:
@@ -57,9 +52,6 @@ class WorkerLink:
                 self._outbox.cancelled.append(command.ref)
             case AcknowledgeLease():
                 self._outbox.acknowledged.append(command.ref)
-                if self._later is None:
-                    self._later = asyncio.get_running_loop().call_later(ACKNOWLEDGE_S, self._ready.set)
-                return
         self._ready.set()
 
     def drain(self) -> None:
@@ -82,8 +74,5 @@ class WorkerLink:
         if self._closed is not None:
             raise self._closed
         self._ready.clear()
-        if self._later is not None:
-            self._later.cancel()
-            self._later = None
         outbox, self._outbox = self._outbox, OutgoingMessage()
         return outbox

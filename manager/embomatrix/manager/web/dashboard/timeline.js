@@ -44,7 +44,7 @@ function draw() {
   if (!place || !told) return;
   if (!told.tracks.length) { put(place, none(search ? "No matching worker executed a rollout in this time." : "No rollout was executed in this time.")); at("one").textContent = ""; return; }
   if (!at("one").textContent) at("one").textContent = matchMedia("(pointer: coarse)").matches ? "Tap a span for details; drag to move along the time axis." :
-    "Point at a span for details. Zoom with Ctrl and the wheel, with a double click on a rollout, or with plus and minus. Drag or press the arrow keys to move; Escape follows the latest again.";
+    "Point at a span for details. Zoom: Ctrl and the wheel, double click on a rollout, plus and minus. Move: drag, arrow keys. Escape follows the latest events.";
   let canvas = place.querySelector("canvas");
   if (!canvas) {
     canvas = h("canvas", {class: "gantt", tabindex: "0", role: "img", onwheel: wheel, onpointermove: point, onpointerdown: grab, onpointerup: release, onpointercancel: release, ondblclick: nearer, onkeydown: key});
