@@ -16,7 +16,7 @@ from embomatrix.factory.scenes.batch import SceneBuildJob, run_batch
 from embomatrix.factory.scenes.check import STABLE_SHARE, ProblemKind, check_scene, check_settled
 from embomatrix.factory.scenes.floor import ReachableFloor
 from embomatrix.factory.scenes.report import TABLE_COLUMNS, report_of, report_on, report_table, unaccounted
-from embomatrix.host.cores import usable_cores
+from embomatrix.host.limits import usable_cores
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.codec import scene_from_json
 from embomatrix.world.geometry import ConvexPart, Pose, Shape
