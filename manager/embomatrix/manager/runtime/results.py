@@ -57,6 +57,7 @@ class BatchLog:
         self.dropped = False
         """The run was closed, or the log was discarded: no more results follow."""
         self._changed = asyncio.Event()
+        self._over = asyncio.Event()
 
     def append(self, rows: Sequence[ResultRow]) -> None:
         self.rows.extend(rows)
