@@ -1,4 +1,4 @@
-"""Whoever opens connections and says nothing: the port stays open to others, and lets go of them."""
+"""Connection floods: silent clients are bounded and do not block others."""
 
 import asyncio
 import contextlib
@@ -74,7 +74,7 @@ async def ended(reader):
     return True
 
 
-async def test_connections_beyond_the_bound_end_at_once_and_the_others_go_on():
+async def test_connections_beyond_the_limit_are_closed_at_once():
     async with serving(Patient) as port:
         opened = []
         for _ in range(MOST):
@@ -87,7 +87,7 @@ async def test_connections_beyond_the_bound_end_at_once_and_the_others_go_on():
             writer.close()
 
 
-async def test_connections_that_say_nothing_or_never_end_their_request_make_room():
+async def test_silent_connections_are_closed():
     async with serving(Few) as port:
         silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MOST)]
         for _, writer in silent[::2]:
@@ -99,7 +99,7 @@ async def test_connections_that_say_nothing_or_never_end_their_request_make_room
             writer.close()
 
 
-async def test_connections_that_never_shake_hands_are_few_and_cost_nobody_his_place(tmp_path):
+async def test_pending_handshakes_are_bounded(tmp_path):
     async with serving_by_tls(PatientDoor, tmp_path) as (port, trusting):
         asking = await asyncio.open_connection("127.0.0.1", port, ssl=trusting)
         silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MOST)]
@@ -114,7 +114,7 @@ async def test_connections_that_never_shake_hands_are_few_and_cost_nobody_his_pl
             writer.close()
 
 
-async def test_a_door_lets_go_of_those_that_never_shake_hands(tmp_path):
+async def test_pending_handshakes_time_out(tmp_path):
     async with serving_by_tls(NarrowDoor, tmp_path) as (port, trusting):
         silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MOST)]
         assert await asyncio.gather(*(ended(reader) for reader, _ in silent)) == [True] * MOST

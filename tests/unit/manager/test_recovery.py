@@ -1,4 +1,4 @@
-"""A manager that took over: what workers still hold is taken up, what nobody holds is given out after a while."""
+"""Recovery after a manager change: reported leases are adopted, others re-dispatched after a grace."""
 
 import pytest
 from hypothesis import given
@@ -81,7 +81,7 @@ def given_to(commands):
     return [(command.worker_id, command.rollout.rollout_id) for command in kinds(commands, GiveLease)]
 
 
-def test_a_lease_that_still_runs_is_taken_up_and_its_result_counts():
+def test_running_lease_is_adopted_and_its_result_counts():
     successor = Successor(1)
     assert successor.worker("w1", claim("x0")) == []
     assert successor.wait_out_the_grace() == []
@@ -90,7 +90,7 @@ def test_a_lease_that_still_runs_is_taken_up_and_its_result_counts():
     assert commands[-1] == FinishBatch("r1", "b1")
 
 
-def test_a_result_that_nobody_acknowledged_counts_when_its_worker_comes_back():
+def test_unacknowledged_result_counts_after_reconnect():
     successor = Successor(1)
     successor.worker("w1", claim("x0"))
     commands = successor.tell(LeaseFinished("w1", claim("x0").ref, completed()))
@@ -98,14 +98,14 @@ def test_a_result_that_nobody_acknowledged_counts_when_its_worker_comes_back():
     assert len(kinds(commands, DeliverResult)) == 1
 
 
-def test_what_nobody_holds_is_given_out_only_after_the_grace():
+def test_unclaimed_rollouts_are_dispatched_after_the_grace():
     successor = Successor(2)
     assert given_to(successor.worker("w1", slots=4)) == []
     assert given_to(successor.tell(Tick(), after_s=GRACE_S - 0.1)) == []
     assert given_to(successor.tell(Tick(), after_s=0.2)) == [("w1", "x0"), ("w1", "x1")]
 
 
-def test_once_all_workers_of_before_have_said_what_they_hold_nobody_waits_longer():
+def test_grace_ends_when_all_former_workers_have_reported():
     successor = Successor(2)
     successor.tell(WorkersExpected(frozenset({"w1", "w2"})))
     successor.worker("w1", claim("x0"), slots=4)
@@ -114,14 +114,14 @@ def test_once_all_workers_of_before_have_said_what_they_hold_nobody_waits_longer
     assert [rollout for _, rollout in given_to(successor.tell(Tick(), after_s=0.1))] == ["x1"]
 
 
-def test_where_nobody_was_before_nobody_is_waited_for():
+def test_grace_is_skipped_without_former_workers():
     successor = Successor(1)
     successor.tell(WorkersExpected(frozenset()))
     successor.worker("w1")
     assert given_to(successor.tell(Tick(), after_s=0.1)) == [("w1", "x0")]
 
 
-def test_a_worker_that_does_not_come_back_is_waited_for_no_longer_than_the_grace():
+def test_missing_worker_is_awaited_for_the_grace_only():
     successor = Successor(1)
     successor.tell(WorkersExpected(frozenset({"w1", "gone"})))
     successor.worker("w1")
@@ -130,19 +130,19 @@ def test_a_worker_that_does_not_come_back_is_waited_for_no_longer_than_the_grace
     assert given_to(successor.tell(Tick(), after_s=0.2)) == [("w1", "x0")]
 
 
-def test_a_batch_that_comes_meanwhile_does_not_wait():
+def test_new_batch_does_not_wait_for_the_grace():
     successor = Successor(1)
     successor.worker("w1", slots=4)
     assert given_to(successor.tell(BatchSubmitted(batch(1, "b2")))) == [("w1", "x0")]
 
 
-def test_scenes_of_awaited_rollouts_are_asked_for_already():
+def test_scenes_of_awaited_rollouts_are_preloaded():
     demand = Successor(3).dispatcher.demand()
     assert demand.pending == {"kitchen": 3}
     assert demand.waited_s == {"kitchen": 0.0}
 
 
-def test_of_two_workers_that_hold_one_rollout_the_later_lease_counts():
+def test_later_of_two_leases_of_a_rollout_counts():
     for order in (("w1", "w2"), ("w2", "w1")):
         successor = Successor(1)
         claims = {"w1": claim("x0", epoch=5), "w2": claim("x0", epoch=9)}
@@ -155,14 +155,14 @@ def test_of_two_workers_that_hold_one_rollout_the_later_lease_counts():
         assert len(kinds(good, DeliverResult)) == 1
 
 
-def test_whoever_comes_back_after_the_rollout_was_given_out_again_is_too_late():
+def test_claim_after_redispatch_is_rejected():
     successor = Successor(1)
     successor.worker("w2")
     assert given_to(successor.wait_out_the_grace()) == [("w2", "x0")]
     assert kinds(successor.worker("w1", claim("x0")), CancelLease) == [CancelLease("w1", claim("x0").ref)]
 
 
-def test_whoever_comes_back_late_but_before_anyone_else_could_take_it_keeps_it():
+def test_late_claim_before_redispatch_is_accepted():
     successor = Successor(1)
     successor.wait_out_the_grace()
     assert successor.worker("w1", claim("x0")) == []
@@ -178,12 +178,12 @@ def test_whoever_comes_back_late_but_before_anyone_else_could_take_it_keeps_it()
         claim("x1", epoch=FIRST_EPOCH + 7),  # as if this manager had given it: its book would know
     ],
 )
-def test_what_cannot_be_taken_up_is_cancelled(stray):
+def test_unadoptable_leases_are_cancelled(stray):
     successor = Successor(2, delivered=("x0",))
     assert kinds(successor.worker("w1", stray), CancelLease) == [CancelLease("w1", stray.ref)]
 
 
-def test_a_worker_that_does_not_say_what_its_leases_are_for_executes_nothing_twice_at_once():
+def test_leases_without_origin_are_not_executed_twice_at_once():
     successor = Successor(1)
     old = claim("x0").ref
     successor.tell(WorkerJoined("w1", Resources(1, 1, 1024)))
@@ -192,14 +192,14 @@ def test_a_worker_that_does_not_say_what_its_leases_are_for_executes_nothing_twi
     assert given_to(successor.wait_out_the_grace()) == [("w1", "x0")]
 
 
-def test_attempts_made_under_the_former_manager_still_count():
+def test_attempts_under_the_former_manager_count():
     successor = Successor(1)
     successor.worker("w1", claim("x0", attempt=3))
     (delivered,) = kinds(successor.tell(WorkerLost("w1", "killed")), DeliverResult)
     assert "attempt 3 of 3" in delivered.result.outcome.message
 
 
-def test_a_taken_up_lease_runs_out_like_any_other():
+def test_adopted_lease_expires_like_any_other():
     successor = Successor(1)
     successor.worker("w1", claim("x0"))
     successor.worker("w2")
@@ -208,21 +208,21 @@ def test_a_taken_up_lease_runs_out_like_any_other():
     assert len(given_to(commands)) == 1
 
 
-def test_a_batch_that_was_delivered_wholly_ends_at_once_and_counts():
+def test_fully_delivered_batch_ends_at_once():
     successor = Successor(2, delivered=("x0", "x1"), failures=1)
     assert successor.first == [FinishBatch("r1", "b1")]
     counters = successor.dispatcher.counters("r1")
     assert (counters.delivered, counters.infra_failures) == (2, 1)
 
 
-def test_cursors_go_on_where_the_former_manager_stopped():
+def test_cursors_continue_after_a_manager_change():
     successor = Successor(3, delivered=("x0", "x1"))
     successor.worker("w1", claim("x2"))
     (delivered,) = kinds(successor.tell(LeaseFinished("w1", claim("x2").ref, completed())), DeliverResult)
     assert delivered.result.cursor == 3
 
 
-def test_a_batch_called_off_while_its_workers_are_awaited_is_not_given_out():
+def test_cancelled_batch_is_not_dispatched_after_the_grace():
     successor = Successor(2)
     assert len(kinds(successor.tell(BatchCancelled("r1", "b1")), DeliverResult)) == 2
     successor.worker("w1", slots=4)
@@ -233,7 +233,7 @@ def test_a_batch_called_off_while_its_workers_are_awaited_is_not_given_out():
     held=st.lists(st.tuples(st.sampled_from(["w1", "w2", "w3"]), st.integers(0, 5)), max_size=12),
     back=st.permutations(["w1", "w2", "w3"]),
 )
-def test_every_rollout_gets_one_outcome_whoever_says_to_hold_it(held, back):
+def test_every_rollout_has_one_outcome_under_any_claims(held, back):
     successor = Successor(6)
     claims = {name: [] for name in back}
     for epoch, (name, number) in enumerate(held, 1):
