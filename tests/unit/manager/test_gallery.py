@@ -8,7 +8,7 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
-from embomatrix.manager.web.floor_plan import floor_plan, played, small_things
+from embomatrix.manager.web.floor_plan import floor_plan, moments_of, movable_objects
 from embomatrix.manager.web.gallery import Gallery
 from embomatrix.manager.web.gallery_values import SceneName
 from embomatrix.manager.web.rest_tasks import NO_DATASET, task_routes
@@ -125,13 +125,13 @@ async def test_missing_or_damaged_dataset_is_reported(folder, tmp_path):
 
 
 def test_plan_moves_picked_objects_to_their_targets():
-    things = small_things(SCENE, TASK)
+    things = movable_objects(SCENE, TASK)
     thing = next(iter(things))
     row = TASK.table.index(thing)
     target = next(name for name in TASK.table if SCENE.by_name[name].fixed)
     to = TASK.table.index(target)
     plan = parse_plan(f"move {row}\npick_up {row}\nmove {to}\nopen {to}\nplace {to} inside\nclose {to}")
-    start, at_thing, carried, moved, opened, placed, closed = played(SCENE, TASK, plan)
+    start, at_thing, carried, moved, opened, placed, closed = moments_of(SCENE, TASK, plan)
     assert (start.held, start.things) == ([], {})
     assert at_thing.robot != start.robot
     assert carried.held == [thing]

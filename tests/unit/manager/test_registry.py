@@ -96,11 +96,11 @@ def test_silence_during_a_manager_stall_is_excused(registry):
     registry.attach(left, now_s=0.0)
     registry.detach(left, now_s=1.0)
     registry.heard(session, now_s=1.5)
-    registry.stood_still(30.0, now_s=31.6)
+    registry.excuse_silence(30.0, now_s=31.6)
     assert registry.tick(now_s=31.6) == []
     assert [event.worker_id for event in registry.tick(now_s=32.0)] == ["w2"]
     assert registry.tick(now_s=34.6) == [WorkerSuspected("w1")]
-    registry.stood_still(30.0, now_s=35.0)
+    registry.excuse_silence(30.0, now_s=35.0)
     assert session.last_seen_s == 35.0, "nobody was heard in the future"
 
 

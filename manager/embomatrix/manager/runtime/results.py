@@ -183,7 +183,7 @@ class ResultDelivery:
         """Queue an acknowledgement, which is sent after everything queued before it is stored."""
         self._acknowledgements.append(command)
 
-    def hurry(self) -> None:
+    def flush(self) -> None:
         """Start to write the queue: no related results follow."""
         if self._waiting or self._acknowledgements:
             self._fresh.set()
