@@ -1,7 +1,7 @@
-# Two commands for a person: `make run` and `make test`. Each sets up its own virtual environment first.
+# `make run` and `make test` are all that a user needs. Each sets up a virtual environment first.
 PYTHON ?= python3.11
 VENV ?= .venv
-# A package index with torch wheels without CUDA, for machines where the default index serves gigabytes of it:
+# Package index with CPU builds of torch, where the default index serves gigabytes of CUDA:
 #   make run TORCH_INDEX=https://...    (the "cpu" index of the PyTorch project, or a mirror of it)
 TORCH_INDEX ?=
 PIP_FLAGS := $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX),)
@@ -53,11 +53,11 @@ check: lint types contracts proto-check
 house: $(VENV)/.dev
 	$(BIN)/python bench/house.py $(ARGS)
 
-# The documentation site, in build/site. `make site ARGS=serve` shows it while it is written.
+# Documentation site in build/site. `make site ARGS=serve` shows it live.
 site: $(VENV)/.dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs $(if $(ARGS),$(ARGS),build --strict)
 
-# Needs npm and Chromium; only after a diagram was changed. What it draws is committed.
+# Redraw the committed pictures of changed Mermaid diagrams. Needs npm and Chromium.
 diagrams:
 	mkdir -p build/mermaid && cd build/mermaid && npm pack --silent mermaid@11.17.2 && tar -xf mermaid-*.tgz package/dist/mermaid.min.js
 	$(PYTHON) deploy/site/diagrams.py docs build/mermaid/package/dist/mermaid.min.js

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Holds the protocol to its rules: Buf's lint, and no change that breaks who speaks the version before.
-# The version before is that of the branch's base: where it left main (or origin/main), on main itself the commit before.
+# Check the protocol: Buf's lint rules, and no breaking change against the base version.
+# The base is where the branch left main (or origin/main); on main it is the previous commit.
 #   proto/check.sh [BUF]      BUF: path of the `buf` program, from the wheel buf-bin; else the one on the PATH
 set -euo pipefail
 cd "$(dirname "$0")/.."

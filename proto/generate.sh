@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes the stubs beside the .proto files. They are committed; CI runs this and then `git diff --exit-code -- proto`.
+# Generate the committed stubs beside the .proto files. CI runs this and then `git diff --exit-code -- proto`.
 set -euo pipefail
 root="$(cd "$(dirname "$0")" && pwd)"
 python="${PYTHON:-python3}"

@@ -1,6 +1,6 @@
-"""Prints what an extra of this project needs, one requirement a line, so that an image layer holds dependencies alone.
+"""Print the requirements of extras of this project, one per line, so that an image layer holds dependencies only.
 
-A change of the sources then rebuilds none of them.  Usage: requirements.py PYPROJECT EXTRA [EXTRA ...]
+A source change then rebuilds no dependency.  Usage: requirements.py PYPROJECT EXTRA [EXTRA ...]
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ _OWN = "embomatrix["
 
 
 def requirements(project: dict[str, object], extras: list[str]) -> list[str]:
-    """Requirements of the project and the extras, with extras that name extras of their own resolved."""
+    """Return the requirements of the project and the extras. Extras of this project inside extras are resolved."""
     optional: dict[str, list[str]] = project["optional-dependencies"]  # type: ignore[assignment]
     found = list(project["dependencies"])  # type: ignore[call-overload]
     waiting = list(extras)

@@ -1,8 +1,8 @@
-"""Makes an installed environment small: what a service never reads is removed, and what it imports is compiled ahead.
+"""Shrink an installed environment: remove files that a service never reads, and compile the modules that it imports.
 
-The extension of PyBullet's wheel carries 130 MB of debugging symbols; its package of models one arm that is used here.
+PyBullet's wheel carries 130 MB of debugging symbols and many robot models, of which one arm is used here.
 
-Usage, by the environment's own Python: slim.py MODULE [MODULE ...], the modules being what the service imports.
+Usage, with the environment's Python: slim.py MODULE [MODULE ...], where the modules are those that the service imports.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ NEVER_READ: Final = (
     "**/*.pyc",
 )
 STRIPPED: Final = ("pybullet*.so", "grpc/**/*.so", "cryptography/**/*.so")
-"""Libraries with symbols. Those that a wheel brings in a folder ``*.libs`` were edited after linking and don't survive it."""
+"""Libraries with symbols. Stripping breaks the libraries in ``*.libs`` folders, which were edited after linking."""
 ARM: Final = "franka_panda"
-"""The model of ``pybullet_data`` that the robot is made of, beside the package's own modules."""
+"""Folder of ``pybullet_data`` with the robot's arm; the other models are removed."""
 
 
 def _remove(path: Path) -> None:
@@ -41,7 +41,7 @@ def _remove(path: Path) -> None:
 
 
 def slim(packages: Path) -> None:
-    """Remove what is never read below the folder of installed packages, and strip its libraries."""
+    """Remove unused files below the folder of installed packages, and strip its libraries."""
     for pattern in NEVER_READ:
         for path in sorted(packages.glob(pattern)):
             _remove(path)

@@ -1,9 +1,9 @@
-"""Diagrams of the documentation site: drawn once by Mermaid and shown as pictures, so that no page needs a script for them.
+"""Diagrams of the documentation site, drawn ahead by Mermaid and shown as pictures, so that no page needs a script.
 
-A page's source holds a diagram as a fence of Mermaid's, which code hosts draw themselves. Its pictures, a light and a dark
-one, stand beside the pages under a name made of the fence's text: a diagram that was changed and not drawn anew has none.
+A page holds a diagram as a Mermaid fence, which code hosts draw themselves. A digest of the fence's text names its light
+and dark pictures, so a changed diagram has no picture until it is drawn again.
 
-As a hook of MkDocs it replaces the fences. As a command it draws: diagrams.py DOCS MERMAID_JS  (`make diagrams`).
+The MkDocs hook replaces the fences. The command draws: diagrams.py DOCS MERMAID_JS  (`make diagrams`).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FENCE: Final = re.compile(r"^```mermaid\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 TITLE: Final = re.compile(r"^\s*accTitle: (.+)$", re.MULTILINE)
 FOLDER: Final = Path("pictures", "diagrams")
 THEMES: Final = {"light": "neutral", "dark": "dark"}
-"""The site's themes, and Mermaid's for each."""
+"""Mermaid theme for each theme of the site."""
 BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome")
 LIMIT_S: Final = 60.0
 _DRAWING: Final = """<!doctype html><meta charset="utf-8"><pre id="drawn"></pre><script src="{script}"></script><script>
@@ -44,12 +44,12 @@ mermaid.render("diagram", {source}).then(({{svg}}) => {{
 
 
 def picture(source: str, theme: str) -> Path:
-    """Where the picture of a diagram stands, below the folder of pages."""
+    """Path of a diagram's picture below the folder of pages."""
     return FOLDER / f"{hashlib.sha256(source.encode('utf-8')).hexdigest()[:16]}-{theme}.svg"
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """The page's text with pictures for fences. MkDocs calls it for every page before it becomes HTML.
+    """Return the page's text with pictures instead of fences. MkDocs calls it for every page before it becomes HTML.
 
     Raises FileNotFoundError for a diagram without its pictures, ValueError for one without a title.
     """
@@ -74,7 +74,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def draw(source: str, theme: str, script: Path, browser: str) -> str:
-    """The diagram as SVG, drawn in a browser. Raises ValueError for what Mermaid doesn't understand."""
+    """Return the diagram as SVG, drawn in a browser. Raise ValueError for invalid Mermaid source."""
     with tempfile.TemporaryDirectory() as name:
         sheet = Path(name, "sheet.html")
         filled = _DRAWING.format(script=script.resolve().as_uri(), theme=theme, source=json.dumps(source))
@@ -89,7 +89,7 @@ def draw(source: str, theme: str, script: Path, browser: str) -> str:
 
 
 def draw_all(docs: Path, script: Path, browser: str) -> list[Path]:
-    """Draw what pages have and the folder has not, and remove what no page has any longer. Returns what was drawn."""
+    """Draw missing pictures and remove unused ones. Return the names of the new pictures."""
     found = [
         source for page in sorted(docs.rglob("*.md")) for source in FENCE.findall(page.read_text("utf-8"))
     ]

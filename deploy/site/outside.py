@@ -1,7 +1,7 @@
-"""Hooks of MkDocs that make the site stand alone.
+"""MkDocs hooks that make the site self-contained.
 
-Links from the pages to files of the repository, which are no pages of the site, become the file's path in words. A page that
-would load anything from another site is refused.
+A link to a repository file outside the site becomes the file's path as text. A page that would load anything from another
+site is refused.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ FETCHED: Final = re.compile(
     r"""<(?:script|img|iframe|video|source|link)\b[^>]*?\b(?:src|href)=["']?((?:https?:)?//[^"'\s>]+)""",
     re.IGNORECASE,
 )
-"""What a browser asks for by itself; a link that a person may follow is none of it."""
+"""Elements that a browser loads by itself; ordinary links are excluded."""
 SCRIPTED: Final = 'class="mermaid"'
-"""The theme answers to it with a script from elsewhere."""
+"""Class to which the theme responds with a script from another site."""
 LINK: Final = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)#\s]+)(?:#[^)]*)?\)")
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """The page's text with such links replaced. MkDocs calls it for every page before it becomes HTML."""
+    """Return the page's text with links outside the site replaced. MkDocs calls it for every page before it becomes HTML."""
     docs = Path(config.docs_dir).resolve()
     here = (docs / page.file.src_uri).parent
 
@@ -36,15 +36,15 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         if "://" in target or target.startswith("mailto:") or files.get_file_from_path(_uri(path, docs)):
             return found[0]
         if not path.is_relative_to(docs.parent) or not path.exists():
-            return found[0]  # MkDocs says that it leads nowhere
-        told = str(path.relative_to(docs.parent))
-        return f"`{told}`" if words.strip("`") in (told, path.name) else f"{words} (`{told}`)"
+            return found[0]  # MkDocs reports the broken link
+        relative = str(path.relative_to(docs.parent))
+        return f"`{relative}`" if words.strip("`") in (relative, path.name) else f"{words} (`{relative}`)"
 
     return LINK.sub(replaced, markdown)
 
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
-    """The page as it is. Raises ValueError for one that would make a browser ask another site."""
+    """Return the page unchanged. Raise ValueError if it would load anything from another site."""
     found = FETCHED.findall(output)
     if found or SCRIPTED in output:
         raise ValueError(
@@ -55,5 +55,5 @@ def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
 
 
 def _uri(path: Path, docs: Path) -> str:
-    """As MkDocs names its files; empty for one outside."""
+    """Return the name that MkDocs uses for a file, or an empty string outside the docs folder."""
     return path.relative_to(docs).as_posix() if path.is_relative_to(docs) else ""

@@ -1,4 +1,4 @@
-// A worker in another language: all of WorkerService, and in `execute` the place for a simulator of your own.
+// A worker in JavaScript: all of WorkerService. Put your simulator into `execute`.
 //
 //   npm install @grpc/grpc-js@1 @grpc/proto-loader@0.8
 //   node worker.mjs PROTO_FOLDER HOST:PORT NAME      (EMBOMATRIX_TOKEN, EMBOMATRIX_CA as for other commands)
@@ -18,17 +18,17 @@ const GROWTH = 100;
 const RETRY_MS = [200, 400, 800, 1600, 2000];
 const SLOTS = cpus().length;
 
-// 64-bit numbers stay text: JavaScript's own would lose their last digits, and epochs are compared to the digit.
+// 64-bit numbers stay text: JavaScript numbers would lose digits, and epochs must match exactly.
 const loaded = loadSync("embomatrix/proto/v1/worker_service.proto", { includeDirs: [protoFolder], keepCase: true, longs: String, enums: String, arrays: true });
 const { WorkerService } = grpc.loadPackageDefinition(loaded).embomatrix.proto.v1;
 const authority = process.env.EMBOMATRIX_CA;
 const security = authority ? grpc.credentials.createSsl(readFileSync(authority)) : grpc.credentials.createInsecure();
 const metadata = new grpc.Metadata();
 if (process.env.EMBOMATRIX_TOKEN) metadata.set("authorization", `Bearer ${process.env.EMBOMATRIX_TOKEN}`);
-// The manager takes a ping each 10 s at most. Pools of their own, so that heartbeats have a connection of their own.
+// The manager accepts one ping per 10 s. Separate subchannel pools give heartbeats their own connection.
 const connect = () => new WorkerService(address, security, { "grpc.keepalive_time_ms": 30000, "grpc.use_local_subchannel_pool": 1, "grpc.max_receive_message_length": 32 << 20 });
 
-// What outlives a session: scenes by digest, leases that wait or run, and results that nobody acknowledged.
+// State across sessions: scenes by digest, queued and running leases, unacknowledged results.
 const residents = new Map();
 const leases = new Map();
 const outbox = new Map();
@@ -54,7 +54,7 @@ function state(first = false) {
   return { ...told, finished: [...outbox.values()].map((kept) => kept.result), claims };
 }
 
-// Scenes: `desired` is the whole set. What is no longer in it goes, what is new is fetched, checked and loaded.
+// Scenes: `desired` is the complete set. Drop scenes that are not in it; fetch, check and load new ones.
 function want(digests) {
   desired = digests;
   for (const digest of residents.keys()) if (!desired.includes(digest)) residents.delete(digest);
@@ -98,7 +98,7 @@ function decode(data, digest) {
   return JSON.parse(content.toString("utf8", 12, 12 + content.readUInt32LE(8)));
 }
 
-// Leases: each is executed under a free slot, in its warm scene, and its result kept until it is acknowledged.
+// Leases: execute each in a free slot and a warm scene, and keep its result until it is acknowledged.
 function begin() {
   while (busy < SLOTS) {
     const at = waiting.findIndex((lease) => residents.get(lease.rollout.bundle_digest)?.scene);
@@ -129,7 +129,7 @@ async function run(lease) {
   begin();
 }
 
-// Your simulator. This one knows rooms only. What it can't do is a failure of the infrastructure: nobody gets a reward for it.
+// Replace with your simulator. This one only goes to rooms. Everything else is an infrastructure failure, without a reward.
 async function execute(scene, lease, onStep) {
   const { plan, task_id } = lease.rollout;
   if (!scene.tasks.some((task) => task.task_id === task_id)) throw new Error(`the bundle has no task ${task_id}`);
@@ -149,7 +149,7 @@ async function execute(scene, lease, onStep) {
   return { reward: { format, relevance: 0, goal: 0, atoms: [], success: false }, steps, final_state: [], trace_digest };
 }
 
-// What the manager says. Every part of it may be missing from a message.
+// Handle a message of the manager. Every field may be absent.
 function take(message) {
   if (message.drain) draining = true;
   if (message.resume) draining = false;
@@ -190,13 +190,13 @@ async function beat(client) {
       interval_s = (await unary(client, "Heartbeat", request, 2)).next_interval_s || interval_s;
       renewed = Date.now();
     } catch {
-      // The stream tells what became of the session. Leases that can't be renewed belong to others by now.
+      // The stream reports the end of the session. Leases that can't be renewed belong to other workers by now.
       if (Date.now() - renewed > 1000 * mine.lease_ttl_s) held.forEach(({ ref }) => forget(keyOf(ref)));
     }
   }
 }
 
-// One session, from its registration to the end of its stream. Leases and results that are held live on in the next one.
+// One session, from registration to the end of its stream. Leases and results continue in the next one.
 async function serve() {
   const client = connect();
   const pulse = connect();
@@ -235,7 +235,7 @@ for (let attempt = 0; !left(); attempt += 1) {
     const { UNAVAILABLE, DEADLINE_EXCEEDED, ABORTED, INTERNAL, CANCELLED } = grpc.status;
     if (![UNAVAILABLE, DEADLINE_EXCEEDED, ABORTED, INTERNAL, CANCELLED].includes(error.code)) throw error;
     console.error(`${error.details ?? error.message}: trying again`);
-    // Of a session that another one took over, what is held is void; a manager that took over is told of it.
+    // After another process took over the session, held leases are void; a new manager gets them as claims.
     const kind = error.metadata?.get("embomatrix-error")[0];
     if (error.code === ABORTED && kind !== "unknown-session") [...leases.keys(), ...outbox.keys()].forEach(forget);
     await sleep(RETRY_MS[Math.min(attempt, RETRY_MS.length - 1)] * (0.8 + 0.4 * Math.random()));

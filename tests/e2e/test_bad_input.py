@@ -236,7 +236,10 @@ def test_unknown_setting_of_a_training_is_named(kitchen, tmp_path):
             ("train", "--dataset=DATASET", "--out=OUT"),
             "can't be created (Not a directory): pass another --out",
         ),
-        (("demo", "--dataset=DATASET", "--out=OUT"), "can't be made (Not a directory): pass another --out"),
+        (
+            ("demo", "--dataset=DATASET", "--out=OUT"),
+            "can't be created (Not a directory): pass another --out",
+        ),
     ],
 )
 def test_folder_that_can_not_be_written_is_named(kitchen, tmp_path, arguments, words):

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from tests.fakes import furniture as make
 from tests.fakes.plans import task_over, words_of
+from tests.fakes.pose_caches import build_pose_cache
 from tests.fakes.scenes import NORTH, SOUTH, WEST, placed, scene_of, upright
 
-from embomatrix.sim.placing.pose_cache import build_pose_cache
 from embomatrix.sim.planner.oracle import PROOF_SEEDS, PlanNotFound, find_plan
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.check import check

@@ -12,6 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 from tests.fakes.plans import plan_of
+from tests.fakes.pose_caches import build_pose_cache
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
 from embomatrix.reward.settings import PAPER, RewardSettings
@@ -23,7 +24,6 @@ from embomatrix.rpc.wire.values import (
     Rollout,
 )
 from embomatrix.sim.live_world import prepare
-from embomatrix.sim.placing.pose_cache import build_pose_cache
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.sim.zygote import private_mb
 from embomatrix.skills.syntax import MAX_STEPS

@@ -11,13 +11,13 @@ from collections import Counter
 from pathlib import Path
 
 import psutil
+from tests.fakes.pose_caches import build_pose_cache
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
 from embomatrix.cli.local_cluster import free_port
 from embomatrix.rpc.client import ClientLimits, ClusterClient
 from embomatrix.rpc.status import ClusterError
 from embomatrix.rpc.wire.values import Batch, Completed, LookaheadEntry, Rollout, Warmth
-from embomatrix.sim.placing.pose_cache import build_pose_cache
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
 from embomatrix.world.bundle import Bundle, encode_bundle

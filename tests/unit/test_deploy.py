@@ -111,7 +111,7 @@ def test_systemd_finds_nothing_wrong_with_the_unit_of_the_manager(tmp_path):
 def test_what_the_manager_s_image_imports_needs_no_package_that_it_lacks():
     built = (DEPLOY / "docker" / "Dockerfile").read_text()
     (lacked,) = re.findall(r"pyproject\.toml manager \| grep -v \^(\w+)", built)
-    (modules,) = re.findall(r"slim\.py (.*embomatrix\.manager\.runtime\.app.*)", built)
+    (modules,) = re.findall(r"slim\.py (.*embomatrix\.manager\.services\.app.*)", built)
     asked = f"import importlib, sys\nsys.modules[{lacked!r}] = None\nfor name in sys.argv[1:]: importlib.import_module(name)"
     ran = subprocess.run(
         (sys.executable, "-c", asked, *modules.split()), capture_output=True, text=True, check=False

@@ -1,4 +1,4 @@
-"""`embomatrix demo`: dataset, local cluster and training in one go, each by the same commands that a person would use."""
+"""`embomatrix demo`: dataset, local cluster and training in one command, by the same commands that users run."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from embomatrix.cli.local_cluster import LocalCluster, cluster_problem, local_cl
 
 DEFAULT_OUT: Final = Path("runs/demo")
 TASKS: Final = 960
-"""Tasks to train on. Of half as many a policy learns the plans by heart before it has learnt to read."""
+"""Training tasks. With half as many, the policy memorises the plans before it learns to read prompts."""
 console = Console()
 
 
 _Out = Annotated[
     Path | None,
-    typer.Option(help=f"Folder for everything that the run writes; else {DEFAULT_OUT}, or -2, -3 ..."),
+    typer.Option(help=f"Output folder. Default: {DEFAULT_OUT}, or the first free {DEFAULT_OUT}-2, -3 …"),
 ]
-_Dataset = Annotated[Path, typer.Option(help="Dataset folder; built first when it is missing.")]
-_Workers = Annotated[int, typer.Option(min=1, max=64, help="Worker daemons on this machine.")]
-_Slots = Annotated[int, typer.Option(min=1, max=64, help="Slots of each worker.")]
+_Dataset = Annotated[Path, typer.Option(help="Dataset folder. It is built if missing.")]
+_Workers = Annotated[int, typer.Option(min=1, max=64, help="Workers on this machine.")]
+_Slots = Annotated[int, typer.Option(min=1, max=64, help="Slots per worker.")]
 _Minutes = Annotated[float, typer.Option(min=0.1, help="Minutes of GRPO.")]
-_ImitateSeconds = Annotated[float, typer.Option(min=0.0, help="Seconds of imitation before it.")]
-_Model = Annotated[str, typer.Option(help="`tiny`, or a Hugging Face name or folder.")]
-_Seed = Annotated[int, typer.Option(help="Seed of tasks, policy and sampling.")]
-_Threads = Annotated[int, typer.Option(min=0, help="Threads of torch in each process; 0: half of the cores.")]
+_ImitateSeconds = Annotated[float, typer.Option(min=0.0, help="Seconds of imitation before GRPO.")]
+_Model = Annotated[str, typer.Option(help="`tiny`, or a Hugging Face model by name or folder.")]
+_Seed = Annotated[int, typer.Option(help="Random seed of tasks, policy and sampling.")]
+_Threads = Annotated[int, typer.Option(min=0, help="torch threads per process. 0: half of the cores.")]
 
 
 def demo(
@@ -47,9 +47,9 @@ def demo(
     seed: _Seed = 0,
     threads: _Threads = 0,
 ) -> None:
-    """Bring up a local cluster and train on real tasks, from nothing to a report."""
+    """Start a local cluster and train on real tasks, from nothing to a report."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[RichHandler(show_path=False)])
-    # Threads that spin while they wait would take the cores from the simulators.
+    # Waiting threads must not spin: the simulators need the cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     folder = _folder(out)
     started_s = time.monotonic()
@@ -58,16 +58,16 @@ def demo(
     cluster = local_cluster(folder / "cluster", workers=workers, slots=slots, dataset=dataset)
     with cluster.supervisor:
         _announce(cluster, slots)
-        how = [
+        options = [
             f"--model={model}",
             f"--minutes={minutes}",
             f"--imitate-seconds={imitate_seconds}",
             f"--seed={seed}",
         ]
         if threads:
-            how.append(f"--threads={threads}")
+            options.append(f"--threads={threads}")
         where = [f"--dataset={dataset}", f"--manager={cluster.address}", f"--out={folder}"]
-        run_command("demo", lambda: cluster_problem(cluster), "train", *where, *how)
+        run_command("demo", lambda: cluster_problem(cluster), "train", *where, *options)
         _report_restarts(cluster)
     ended_s = time.monotonic()
     console.print(
@@ -77,11 +77,11 @@ def demo(
 
 
 def _ensure_tasks(dataset: Path, seed: int) -> None:
-    """Build the dataset where there is none."""
+    """Build the dataset if it is missing."""
     if (dataset / "tasks.jsonl").exists():
         return
     console.rule("tasks")
-    # A run to look at: what the arm of physical mode could not do after all is not looked for.
+    # Skip the reachability check for physical mode, which a demo does not need.
     where = [f"--out={dataset}", f"--seed={seed}"]
     run_command("demo", no_problem, "factory", "build", *where, f"--train={TASKS}", "--no-look-ahead")
 
@@ -99,11 +99,11 @@ def _report_restarts(cluster: LocalCluster) -> None:
     for name in ("manager", *cluster.workers):
         count = cluster.supervisor.restarts(name)
         if count:
-            console.print(f"{name} died and was started anew {count} times", highlight=False)
+            console.print(f"{name} was restarted {count} times", highlight=False)
 
 
 def _folder(wanted: Path | None) -> Path:
-    """A folder without a run in it: the one that is wanted, or the first free one of the default's name."""
+    """Folder without a run: the wanted one, or the first free one of the default's name."""
     if wanted is not None:
         if _holds_run(wanted):
             fail("demo", f"{wanted} holds another run: pass another --out, or remove the folder")
@@ -114,7 +114,7 @@ def _folder(wanted: Path | None) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        fail("demo", f"the folder {folder} can't be made ({error.strerror}): pass another --out")
+        fail("demo", f"the folder {folder} can't be created ({error.strerror}): pass another --out")
     return folder
 
 

@@ -3,34 +3,26 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
-
-import numpy as np
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from embomatrix.sim.engine import FLOOR, WALL, EngineError
-from embomatrix.world.geometry import Shape
-from embomatrix.world.records import MAX_VERTICES
-from embomatrix.world.tables import has_volume
+from embomatrix.world.asset import Asset, Link
+from embomatrix.world.codec import asset_from_json, asset_to_json
+from embomatrix.world.records import MAX_COORDINATE_M, UNIT_TOLERANCE, SceneInvalidError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
 
-    from embomatrix.world.asset import Asset, Joint, Link
-    from embomatrix.world.geometry import ConvexPart, Pose
+    from embomatrix.world.geometry import Pose
     from embomatrix.world.scene import Scene, SceneObject
-
-PART_LIMIT: Final = 16
-LINK_LIMIT: Final = 100
-MIN_EXTENT_M: Final = 0.001
-WORLD_LIMIT_M: Final = 1e4
-UNIT_TOLERANCE: Final = 1e-4
 
 
 def check_scene(scene: Scene) -> None:
     """Raise EngineError for the first element of the scene that physics can't take."""
     seen = {WALL, FLOOR}
     for wall in scene.walls:
-        _check_part(wall, f"a wall of scene {scene.scene_id!r}")
+        check_asset(Asset("wall", "wall", "", wall.size_m, 1.0, (Link("base", (wall,)),)))
     for item in scene.objects:
         if item.name in seen:
             raise EngineError(f"two bodies are called {item.name!r}: expected unique names; rename one")
@@ -47,28 +39,20 @@ def check_scene(scene: Scene) -> None:
 
 
 def check_asset(asset: Asset) -> None:
-    """Raise EngineError if physics can't hold the asset."""
-    what = f"asset {asset.asset_id!r}"
-    pieces = sum(1 + sum(part.shape is Shape.HULL for part in link.parts) for link in asset.links)
-    if not asset.links or not asset.links[0].parts or asset.links[0].joint is not None:
-        raise EngineError(f"{what} has no base: expected a first link with parts and without a joint")
-    if pieces > LINK_LIMIT:
-        raise EngineError(
-            f"{what} makes {pieces} bodies: expected at most {LINK_LIMIT}; use fewer hulls or links"
-        )
-    if not (math.isfinite(asset.mass_kg) and asset.mass_kg > 0):
-        raise EngineError(f"{what} weighs {asset.mass_kg} kg: expected a positive, finite mass")
-    for number, link in enumerate(asset.links):
-        _check_link(link, what, moves=number > 0)
+    """Raise EngineError if physics can't hold the asset: its links and its mass must be valid in a bundle too."""
+    try:
+        asset_from_json(asset_to_json(replace(asset, supports=(), interiors=(), abilities={})))
+    except SceneInvalidError as error:
+        raise EngineError(f"physics can't hold asset {asset.asset_id!r}: {error}") from error
 
 
 def check_pose(pose: Pose, what: str) -> None:
     """Raise EngineError unless the position is finite and within the world, and the quaternion has length 1."""
     x, y, z = pose.position_m
-    limit = WORLD_LIMIT_M
+    limit = MAX_COORDINATE_M
     if not (-limit <= x <= limit and -limit <= y <= limit and -limit <= z <= limit):
         raise EngineError(
-            f"{what!r} is at {pose.position_m} m: expected finite coordinates within {WORLD_LIMIT_M:.0f} m"
+            f"{what!r} is at {pose.position_m} m: expected finite coordinates within {MAX_COORDINATE_M:.0f} m"
         )
     length = math.hypot(*pose.quat_xyzw)
     if not abs(length - 1.0) <= UNIT_TOLERANCE:
@@ -89,51 +73,3 @@ def check_fractions(item: SceneObject, asset: Asset, fractions: Sequence[float])
             raise EngineError(
                 f"{item.name!r} has a joint at {value}: expected a share of its travel from 0 to 1"
             )
-
-
-def _check_link(link: Link, what: str, *, moves: bool) -> None:
-    plain = sum(part.shape is not Shape.HULL for part in link.parts)
-    if plain > PART_LIMIT:
-        raise EngineError(
-            f"link {link.name!r} of {what} has {plain} parts: expected at most {PART_LIMIT}; merge some or split the link"
-        )
-    if moves and link.joint is None:
-        raise EngineError(
-            f"link {link.name!r} of {what} has no joint: expected one on each link after the base"
-        )
-    if link.joint is not None:
-        _check_joint(link.joint, f"link {link.name!r} of {what}")
-    for part in link.parts:
-        _check_part(part, f"a part of {what}")
-
-
-def _check_joint(joint: Joint, what: str) -> None:
-    if not _finite((*joint.origin_m, joint.upper)) or joint.upper == 0.0:
-        raise EngineError(
-            f"{what} has a joint with travel {joint.upper}: expected a finite number other than 0"
-        )
-    if not abs(math.hypot(*joint.axis) - 1.0) <= UNIT_TOLERANCE:
-        raise EngineError(f"{what} has the joint axis {joint.axis}: expected a vector of length 1")
-
-
-def _check_part(part: ConvexPart, what: str) -> None:
-    check_pose(part.pose, what)
-    if not all(MIN_EXTENT_M <= extent <= WORLD_LIMIT_M for extent in part.size_m):
-        raise EngineError(
-            f"{what} measures {part.size_m} m: expected extents of {MIN_EXTENT_M} m or more; make it thicker or leave it out"
-        )
-    if part.shape is not Shape.HULL:
-        return
-    if len(part.vertices_m) < 4 or not all(_finite(vertex) for vertex in part.vertices_m):
-        raise EngineError(
-            f"{what} is a hull of {len(part.vertices_m)} vertices: expected 4 or more finite points"
-        )
-    if len(part.vertices_m) > MAX_VERTICES or not has_volume(np.asarray(part.vertices_m)):
-        raise EngineError(
-            f"{what} is a hull of {len(part.vertices_m)} vertices, flat or too many: expected at most {MAX_VERTICES} that "
-            "span a body"
-        )
-
-
-def _finite(values: Iterable[float]) -> bool:
-    return all(map(math.isfinite, values))

@@ -175,21 +175,6 @@ def parse_formula(text: str, objects: Mapping[str, str]) -> Formula:
     return _Reader(objects).formula(_read(text), {})
 
 
-def render_problem(problem: BddlProblem) -> str:
-    """BDDL text that ``parse_problem`` parses to an equal problem."""
-    grouped: dict[str, list[str]] = {}
-    for name, type_name in problem.objects.items():
-        grouped.setdefault(type_name, []).append(name)
-    objects = "\n".join(f"        {' '.join(names)} - {type_name}" for type_name, names in grouped.items())
-    init = "\n".join(
-        f"        {render(item.atom if item.positive else Not(item.atom))}" for item in problem.init
-    )
-    return (
-        f"(define (problem {problem.name})\n    (:domain omnigibson)\n    (:objects\n{objects}\n    )\n"
-        f"    (:init\n{init}\n    )\n    (:goal\n        {render(problem.goal)}\n    )\n)\n"
-    )
-
-
 def is_room_instance(name: str) -> bool:
     """True for the name of one room of a scene, ``kitchen_0``; False for a bare room type."""
     stem, _, number = name.rpartition("_")

@@ -8,12 +8,13 @@ from embomatrix.world.bddl import BddlError, parse_formula
 from embomatrix.world.evaluate import GoalError, objects_of
 from embomatrix.world.placements import flattened
 from embomatrix.world.poses import PoseCache
-from embomatrix.world.records import PosesJson, SceneInvalidError, TaskJson, convert
+from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.task import Profile, Task
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from embomatrix.world.records import PosesJson, TaskJson
     from embomatrix.world.state import Relation
     from embomatrix.world.tables import Tables, TableWriter
 
@@ -35,11 +36,6 @@ def task_to_json(task: Task) -> Json:
     if task.profile is not Profile.PAPER:
         value["profile"] = task.profile.value
     return value
-
-
-def task_from_json(value: object) -> Task:
-    """Task whose goal names only objects of its table. Raises SceneInvalidError."""
-    return task_of(convert(value, TaskJson, "task"), "task")
 
 
 def task_of(record: TaskJson, path: str) -> Task:
@@ -85,11 +81,6 @@ def poses_to_json(poses: PoseCache, tables: TableWriter) -> Json:
         "reached": _by_relation(poses.reached),
     }
     return {"placements": names, "stands": stands, **{key: found for key, found in arm.items() if found}}
-
-
-def poses_from_json(value: object, tables: Tables) -> PoseCache:
-    """Pose cache; ``tables`` hold the rows that it was written with. Raises SceneInvalidError."""
-    return poses_of(convert(value, PosesJson, "poses"), tables)
 
 
 def poses_of(record: PosesJson, tables: Tables) -> PoseCache:

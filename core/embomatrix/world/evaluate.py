@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from embomatrix.world.goal import (
     And,
     Atom,
+    Compound,
     Exists,
     Forall,
     Formula,
@@ -129,46 +130,30 @@ def scored_atoms(formula: Formula, types: Types) -> tuple[Formula, ...]:
 
 def substitute(formula: Formula, names: Mapping[str, str]) -> Formula:
     """Replace free arguments, variables and objects alike. Quantifiers shadow their variables."""
-
-    def inner(body: Formula, *bound: str) -> Formula:
-        return substitute(body, {arg: name for arg, name in names.items() if arg not in bound})
-
-    match formula:
-        case Atom(predicate, args):
-            return Atom(predicate, tuple(names.get(arg, arg) for arg in args))
-        case Not(body):
-            return Not(inner(body))
-        case And(parts):
-            return And(tuple(inner(part) for part in parts))
-        case Or(parts):
-            return Or(tuple(inner(part) for part in parts))
-        case Imply(premise, conclusion):
-            return Imply(inner(premise), inner(conclusion))
-        case Forall(variable, type_name, body):
-            return Forall(variable, type_name, inner(body, variable))
-        case Exists(variable, type_name, body):
-            return Exists(variable, type_name, inner(body, variable))
-        case ForN(count, variable, type_name, body):
-            return ForN(count, variable, type_name, inner(body, variable))
-        case ForPairs(a, type_a, b, type_b, body):
-            return ForPairs(a, type_a, b, type_b, inner(body, a, b))
-        case ForNPairs(count, a, type_a, b, type_b, body):
-            return ForNPairs(count, a, type_a, b, type_b, inner(body, a, b))
+    if isinstance(formula, Atom):
+        return Atom(formula.predicate, tuple(names.get(arg, arg) for arg in formula.args))
+    bound = {getattr(formula, field, "") for field in ("variable", "variable_a", "variable_b")}
+    free = {arg: name for arg, name in names.items() if arg not in bound}
+    return _map_children(formula, lambda child: substitute(child, free))
 
 
 def map_atoms(formula: Formula, change: Callable[[Atom], Formula]) -> Formula:
     """Replace each atom by the result of ``change``."""
+    if isinstance(formula, Atom):
+        return change(formula)
+    return _map_children(formula, lambda child: map_atoms(child, change))
+
+
+def _map_children(formula: Compound, change: Callable[[Formula], Formula]) -> Formula:
     match formula:
-        case Atom():
-            return change(formula)
         case And(parts):
-            return And(tuple(map_atoms(part, change) for part in parts))
+            return And(tuple(map(change, parts)))
         case Or(parts):
-            return Or(tuple(map_atoms(part, change) for part in parts))
+            return Or(tuple(map(change, parts)))
         case Imply(premise, conclusion):
-            return Imply(map_atoms(premise, change), map_atoms(conclusion, change))
+            return Imply(change(premise), change(conclusion))
         case _:
-            return dataclasses.replace(formula, body=map_atoms(formula.body, change))
+            return dataclasses.replace(formula, body=change(formula.body))
 
 
 def subformulas(formula: Formula) -> Iterator[Formula]:

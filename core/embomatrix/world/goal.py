@@ -67,7 +67,7 @@ class ForN:
 
 @dataclass(frozen=True, slots=True)
 class ForPairs:
-    """At least min(|A|, |B|) rows and as many columns of the truth table over A x B hold a true cell."""
+    """Quantifier over pairs: at least min(|A|, |B|) rows and as many columns of the truth table over A x B hold a true cell."""
 
     variable_a: str
     type_a: str
@@ -88,4 +88,5 @@ class ForNPairs:
     body: Formula
 
 
-Formula = Atom | Not | And | Or | Imply | Forall | Exists | ForN | ForPairs | ForNPairs
+Compound = Not | And | Or | Imply | Forall | Exists | ForN | ForPairs | ForNPairs
+Formula = Atom | Compound

@@ -1,4 +1,4 @@
-"""Verified placements and standing poses of a bundle as flat arrays, converted to poses on demand.
+"""Verified placements of a bundle as flat arrays, converted to poses on demand.
 
 An analysis finds thousands of poses and a rollout uses a few: loading a bundle converts none of them.
 """
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.world.geometry import Pose
-from embomatrix.world.poses import PlacementKey, StandPose
+from embomatrix.world.poses import PlacementKey
 from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.state import Relation
 
@@ -87,32 +87,6 @@ class Placements(Mapping[PlacementKey, tuple[Pose, ...]]):
             numbers.get(key.support_asset_id, -1),
             RELATIONS.index(key.relation),
         )
-
-
-class Stands(Mapping[str, tuple[StandPose, ...]]):
-    """Standing poses by object name.
-
-    ``spans`` map a name to its first row in ``rows`` and the number of its rows, which must exist. ``rows``, shape (n, 3), are
-    x, y and yaw.
-    """
-
-    def __init__(self, spans: Mapping[str, tuple[int, int]], rows: FloatArray) -> None:
-        self._spans = spans
-        self._rows = rows
-        self._made: dict[str, tuple[StandPose, ...]] = {}
-
-    def __getitem__(self, name: str) -> tuple[StandPose, ...]:
-        if name not in self._made:
-            first, count = self._spans[name]
-            rows = self._rows[first : first + count].tolist()
-            self._made[name] = tuple(StandPose(x, y, yaw) for x, y, yaw in rows)
-        return self._made[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._spans)
-
-    def __len__(self) -> int:
-        return len(self._spans)
 
 
 def rows_of(placements: Mapping[PlacementKey, tuple[Pose, ...]], key: PlacementKey) -> FloatArray:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Final, TypeVar
 import numpy as np
 
 from embomatrix.world.geometry import ConvexPart, Pose, Shape
-from embomatrix.world.placements import SET_NUMBERS, Placements, Stands
+from embomatrix.world.placements import SET_NUMBERS, Placements
+from embomatrix.world.poses import StandPose
 from embomatrix.world.records import (
     MAX_COORDINATE_M,
     MAX_VERTICES,
@@ -123,15 +124,15 @@ class Tables:
         """Part in a row."""
         return _at(self._parts, row, "")
 
-    def stands(self, spans: Mapping[str, tuple[int, int]]) -> Stands:
+    def stands(self, spans: Mapping[str, tuple[int, int]]) -> dict[str, tuple[StandPose, ...]]:
         """Standing poses of objects by name; each span is the first row and the number of rows."""
+        rows = [StandPose(x, y, yaw) for x, y, yaw in self._stands.tolist()]
         for name, (first, count) in spans.items():
-            if first + count > len(self._stands):
+            if first + count > len(rows):
                 raise SceneInvalidError(
-                    f"poses.stands[{name!r}]",
-                    f"found rows {first} to {first + count}: there are {len(self._stands)}",
+                    f"poses.stands[{name!r}]", f"found rows {first} to {first + count}: there are {len(rows)}"
                 )
-        return Stands(spans, self._stands)
+        return {name: tuple(rows[first : first + count]) for name, (first, count) in spans.items()}
 
 
 def _at(values: Sequence[T], row: object, field: str) -> T:

@@ -221,7 +221,7 @@ def test_outcome_survives_a_round_trip(tmp_path):
     write_outcome(tmp_path, found)
     assert read_outcome(tmp_path) == found
     (tmp_path / "outcome.json").write_text('{"schema": 1}')
-    with pytest.raises(TrainerError, match="no outcome of a finished run"):
+    with pytest.raises(TrainerError, match="not the outcome of a finished run"):
         read_outcome(tmp_path)
 
 
@@ -232,7 +232,7 @@ def test_outcome_survives_a_round_trip(tmp_path):
         (("compare", "--arm=Fast:a=1", "--dataset=DS"), "has the name 'Fast': expected small letters"),
         (("compare", "--arm=a:grpo.speed=1", "--dataset=DS"), "unknown setting 'grpo.speed'"),
         (("learning", "--set=grpo.group=1", "--dataset=DS"), "setting 'grpo.group'"),
-        (("table", "--run=nowhere", "--bench=DS"), "no outcome of a finished run"),
+        (("table", "--run=nowhere", "--bench=DS"), "not the outcome of a finished run"),
     ],
 )
 def test_impossible_experiment_is_refused_at_once(dataset, tmp_path, arguments, words):

@@ -178,4 +178,4 @@ REACHABLE: dict[str, bool] = {
 def test_reachability_is_judged_from_the_problem_alone(goal: str) -> None:
     problem = parse_problem(HOUSEHOLD)
     formula = parse_formula(goal, problem.objects)
-    assert (Reachability(problem).obstacle(formula) is None) is REACHABLE[goal]
+    assert (Reachability(problem).unreachable_part(formula) is None) is REACHABLE[goal]

@@ -18,7 +18,6 @@ from embomatrix.factory.layout.model_agents import ModelLayoutAgents
 from embomatrix.factory.layout.organization import LayoutTree, TreeError, organize
 from embomatrix.factory.layout.request import RequestedObject
 from embomatrix.factory.layout.values import (
-    RELATION_METHODS,
     Branch,
     DistributionBrief,
     HostFacts,
@@ -50,11 +49,6 @@ PLATE = ObjectBrief("plate_1", "plate", (0.24, 0.24, 0.02))
 
 def branch_to(name: str, tree: LayoutTree) -> Branch | None:
     return next((branch for branch in tree.branches() if branch.child == name), None)
-
-
-def test_every_tree_relation_has_a_method():
-    assert set(RELATION_METHODS) == set(LayoutRelation)
-    assert len(LayoutRelation) == 9
 
 
 def test_tree_round_trips_through_its_branches_with_parents_first():

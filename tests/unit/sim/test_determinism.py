@@ -46,7 +46,7 @@ def digests(bundle, order) -> dict[tuple[int, int], str]:
     return found
 
 
-def test_traces_do_not_depend_on_what_was_executed_before(bundle) -> None:
+def test_traces_do_not_depend_on_earlier_executions(bundle) -> None:
     order = [(plan, seed) for plan in range(len(PLANS)) for seed in SEEDS]
     first = digests(bundle, order)
     for number in range(3):
@@ -57,7 +57,7 @@ def test_traces_do_not_depend_on_what_was_executed_before(bundle) -> None:
     assert len(set(first.values())) > len(PLANS)
 
 
-def test_traces_do_not_depend_on_what_a_waiting_process_made(bundle) -> None:
+def test_traces_do_not_depend_on_the_warm_up(bundle) -> None:
     order = [(plan, seed) for plan in range(len(PLANS)) for seed in SEEDS]
     engine = BulletEngine(bundle.scene)
     simulator = Simulator(bundle, engine)

@@ -1,4 +1,4 @@
-"""Tasks call by call, without a cluster: the same reward as the plan as a whole, and observations that tell no goal."""
+"""Episodes without a cluster: rewards equal those of whole plans, and observations reveal no goal."""
 
 from pathlib import Path
 
@@ -34,7 +34,7 @@ def test_gains_of_an_episode_add_up_to_the_reward_of_its_plan(household):
         assert whole.success
 
 
-def test_a_failed_call_changes_nothing_and_the_next_may_be_tried(household):
+def test_failed_call_changes_nothing_and_the_episode_continues(household):
     record = household.records[0]
     episode = household.episode(record.task.task_id)
     before = episode.state()
@@ -45,20 +45,20 @@ def test_a_failed_call_changes_nothing_and_the_next_may_be_tried(household):
     assert turns[-1].reward.success
 
 
-def test_the_state_tells_every_object_of_the_table_in_its_order(household):
+def test_state_lists_every_object_of_the_table_in_order(household):
     episode = household.episode(household.records[0].task.task_id)
     lines = episode.state()
     assert len(lines) == len(episode.task.table)
     assert all(name in line for name, line in zip(episode.task.table, lines, strict=True))
 
 
-def test_an_episode_ends_with_the_longest_plan(household):
+def test_episode_ends_at_the_longest_plan(household):
     episode = household.episode(household.records[0].task.task_id)
     turns = [episode.act(SkillCall(Skill.MOVE, object_index=59)) for _ in range(MAX_STEPS)]
     assert [turn.over for turn in turns] == [False] * (MAX_STEPS - 1) + [True]
 
 
-def test_an_unknown_task_is_one_sentence(household):
+def test_unknown_task_raises_a_dataset_error(household):
     with pytest.raises(DatasetError, match="no task 'elsewhere'"):
         household.episode("elsewhere")
 
@@ -76,7 +76,7 @@ class Closing:
         self.open = False
 
 
-def test_no_more_scenes_than_a_few_are_kept_and_all_are_closed(tmp_path):
+def test_few_scenes_are_kept_and_all_are_closed(tmp_path):
     from tests.fakes.datasets import write_flats_dataset
 
     made = []
@@ -97,7 +97,7 @@ def test_no_more_scenes_than_a_few_are_kept_and_all_are_closed(tmp_path):
     assert not any(one.open for one in made)
 
 
-def test_the_example_of_the_docs_runs(household, capsys):
+def test_docs_example_runs(household, capsys):
     page = (Path(__file__).parents[3] / "docs" / "adapters.md").read_text(encoding="utf-8")
     example = page.split("## Plain Python\n\n```python\n")[1].split("```")[0]
     folder = household._dataset.folder

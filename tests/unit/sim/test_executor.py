@@ -1,4 +1,4 @@
-"""Plans executed in the flat: the rules of the skills, every reason of failure, and traces that repeat to the bit."""
+"""Plans executed in the flat: rules of the skills, failure reasons, and bit-equal traces."""
 
 from dataclasses import replace
 
@@ -61,7 +61,7 @@ def test_embobrain_opens_inserts_closes_switches_on_and_succeeds(flat):
 # The rules of the household, as sentences.
 
 
-def test_a_failed_step_stops_the_plan_and_changes_nothing(flat):
+def test_failed_step_stops_the_plan_and_changes_nothing(flat):
     trace = executed(flat, "move apple_1; pick_up fridge_1; pick_up apple_1")
     assert len(trace.steps) == 2
     assert trace.touched == {"apple_1"}
@@ -79,13 +79,13 @@ def test_doors_and_switches_need_a_free_hand(flat, skill):
     assert trace.failure is FailureReason.HAND_FULL
 
 
-def test_what_is_in_the_hand_stands_in_no_relation(flat):
+def test_held_object_has_no_relations(flat):
     executed(flat, "move apple_1; pick_up apple_1")
     assert not flat.facts.holds("ontop", ("apple_1", "breakfast_table_1"))
     assert not flat.facts.holds("inroom", ("apple_1", "kitchen_0"))
 
 
-def test_what_lies_in_a_bowl_goes_where_the_bowl_goes(flat):
+def test_contents_of_a_bowl_move_with_it(flat):
     trace = executed(
         flat,
         "move apple_1; pick_up apple_1; move bowl_1; place bowl_1 inside; pick_up bowl_1; "
@@ -97,7 +97,7 @@ def test_what_lies_in_a_bowl_goes_where_the_bowl_goes(flat):
     assert flat.facts.holds("inroom", ("apple_1", "living_room_0"))
 
 
-def test_what_lies_in_the_bowl_in_the_hand_is_no_place_for_the_bowl(flat):
+def test_bowl_can_not_be_placed_on_its_own_contents(flat):
     trace = executed(
         flat,
         "move apple_1; pick_up apple_1; move bowl_1; place bowl_1 inside; pick_up bowl_1; place apple_1 ontop",
@@ -105,21 +105,21 @@ def test_what_lies_in_the_bowl_in_the_hand_is_no_place_for_the_bowl(flat):
     assert trace.failure is FailureReason.PLACE_ON_ITSELF
 
 
-def test_the_robot_can_not_drive_to_what_it_holds(flat):
+def test_robot_can_not_drive_to_a_held_object(flat):
     trace = executed(flat, "move apple_1; pick_up apple_1; move apple_1")
     assert trace.failure is FailureReason.HAND_FULL
 
 
-def test_nothing_is_placed_on_what_stands_in_a_closed_container(flat):
+def test_placing_on_an_object_in_a_closed_container_fails(flat):
     trace = executed(flat, "move apple_1; pick_up apple_1; move chicken_leg_1; place chicken_leg_1 ontop")
     assert trace.failure is FailureReason.CONTAINER_CLOSED
 
 
-def test_a_bowl_needs_no_opening(flat):
+def test_bowl_needs_no_opening(flat):
     assert executed(flat, "move apple_1; pick_up apple_1; move bowl_1; place bowl_1 inside").failure is None
 
 
-def test_going_to_the_room_one_is_in_changes_nothing(flat):
+def test_going_to_the_current_room_changes_nothing(flat):
     trace = executed(flat, "go_to_room kitchen_0")
     assert trace.failure is None
     assert flat.world.robot == flat.world.navigator.start
@@ -143,14 +143,14 @@ def test_driving_turns_first_and_goes_straight_on(flat):
     assert flat.world.robot.yaw == pytest.approx(before.yaw + 1.5707963267948966)
 
 
-def test_a_negative_distance_drives_backwards_and_keeps_the_heading(flat):
+def test_negative_distance_drives_backwards_and_keeps_the_heading(flat):
     before = flat.world.navigator.start
     executed(flat, "move_forward -0.3 0")
     assert flat.world.robot.x_m == pytest.approx(before.x_m - 0.3)
     assert flat.world.robot.yaw == before.yaw
 
 
-def test_a_switch_can_be_thrown_back(flat):
+def test_switch_can_be_toggled_back(flat):
     executed(flat, "move table_lamp_1; toggle_on table_lamp_1; toggle_off table_lamp_1")
     assert not flat.facts.holds("toggled_on", ("table_lamp_1",))
 
@@ -185,7 +185,7 @@ def test_equal_plans_and_seeds_give_equal_traces_to_the_bit(flat):
     assert first.digest.startswith("sha256:")
 
 
-def test_a_simulator_of_its_own_gives_the_same_trace(flat):
+def test_dedicated_simulator_gives_the_same_trace(flat):
     assert executed_alone(kitchen_scene(), STOCK) == executed(flat, STOCK)
 
 
@@ -200,30 +200,30 @@ def test_plans_that_differ_have_different_digests(flat):
     assert executed(flat, "turn 1").digest != executed(flat, "turn 2").digest
 
 
-def test_an_empty_plan_is_executed_and_fails_nowhere(flat):
+def test_empty_plan_executes_without_failure(flat):
     task = task_over(flat.world.scene)
     trace = flat.execute(task, (), 0)
     assert trace.failure is None
     assert trace.touched == frozenset()
 
 
-def test_touched_are_the_objects_of_calls_that_succeeded_and_their_sources(flat):
+def test_touched_objects_are_targets_and_sources_of_successful_calls(flat):
     trace = executed(flat, "move fridge_1; froze_object_with_source chicken_leg_1 fridge_1; pick_up stove_1")
     assert trace.touched == {"fridge_1", "chicken_leg_1"}
 
 
-def test_the_final_state_is_told_in_words(flat):
+def test_final_state_is_described_in_words(flat):
     trace = executed(flat, f"{STOCK}; close microwave_1; toggle_on microwave_1", HEATED)
     assert "chicken_leg_1: inside microwave_1 in kitchen_0, cooked, hot" in trace.final
     assert "microwave_1: on countertop_1 in kitchen_0, closed, on" in trace.final
 
 
-def test_the_final_state_tells_what_the_hand_holds(flat):
+def test_final_state_describes_the_held_object(flat):
     trace = executed(flat, "move apple_1; pick_up apple_1", And((Atom("hot", ("apple_1",)),)))
     assert trace.final[-1] == "apple_1: in the robot's hand"
 
 
-def test_a_step_at_a_time_goes_on_after_a_failure(flat):
+def test_single_steps_continue_after_a_failure(flat):
     task = task_over(flat.world.scene)
     flat.reset(task, 0)
     failed, moved = (flat.run_step(call) for call in plan_of(task, "pick_up apple_1; move apple_1"))
@@ -231,12 +231,12 @@ def test_a_step_at_a_time_goes_on_after_a_failure(flat):
     assert moved.ok
 
 
-def test_relations_of_the_goal_are_asked_by_their_own_names(flat):
+def test_goal_relations_are_queried_by_their_own_names(flat):
     executed(flat, "turn 0")
     assert flat.facts.holds(Relation.ONTOP.value, ("bowl_1", "breakfast_table_1"))
 
 
-def test_the_example_of_the_prompt_does_what_it_says(flat):
+def test_prompt_example_executes_as_described(flat):
     names = ["countertop_1", "stove_1", "fridge_1", "sink_1", "apple_1"]
     task = replace(task_over(flat.world.scene), table=tuple(names))
     trace = flat.execute(task, parse_plan(EXAMPLES[Codec.JSON]), 0)

@@ -1,4 +1,4 @@
-"""Facts answer every predicate of the vocabulary, and refuse the others by name."""
+"""Facts answer every predicate of the vocabulary and refuse the others by name."""
 
 from dataclasses import replace
 
@@ -49,7 +49,7 @@ def flat():
         ("dusty", ("apple_1",), False),
     ],
 )
-def test_the_predicate_is_answered(flat, predicate, args, expected):
+def test_predicate_is_evaluated(flat, predicate, args, expected):
     assert flat.facts.holds(predicate, args) is expected
 
 
@@ -72,12 +72,12 @@ def test_every_state_is_known(flat, predicate):
     ("predicate", "args"),
     [("grasped", ("apple_1", "bowl_1")), ("covered", ("apple_1",)), ("ontop", ("apple_1",)), ("hot", ())],
 )
-def test_an_unknown_predicate_is_refused_with_the_known_ones(flat, predicate, args):
+def test_unknown_predicate_error_lists_the_known_ones(flat, predicate, args):
     with pytest.raises(FactError, match="expected one of ontop"):
         flat.facts.holds(predicate, args)
 
 
-def test_an_unknown_object_is_refused_by_name(flat):
+def test_unknown_object_is_named(flat):
     with pytest.raises(FactError, match="no object 'ghost_1'"):
         flat.facts.holds("hot", ("ghost_1",))
 
@@ -87,12 +87,12 @@ def test_every_relation_to_a_substance_is_known(flat, predicate):
     assert flat.facts.holds(predicate.value, ("apple_1", "salt.n.02")) is False
 
 
-def test_dusty_and_stained_are_coverings_whichever_the_scene_speaks_of(flat):
+def test_dusty_and_stained_equal_coverings_in_both_dialects(flat):
     assert flat.facts.holds("covered", ("bowl_1", "dust.n.01"))
     assert flat.facts.holds("covered", ("bowl_1", "stain.n.01"))
     assert not flat.facts.holds("covered", ("bowl_1", "water.n.06"))
 
 
-def test_what_is_in_the_world_is_real_and_no_future(flat):
+def test_object_in_the_world_is_real_and_not_future(flat):
     assert flat.facts.holds("real", ("apple_1",))
     assert not flat.facts.holds("future", ("apple_1",))

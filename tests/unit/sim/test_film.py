@@ -1,4 +1,4 @@
-"""Films: from one state to the next without leaps, and what a stage shows of them."""
+"""Films interpolate between states; stages show them."""
 
 import itertools
 import math
@@ -32,14 +32,14 @@ def film(scene):
     return film
 
 
-def test_the_robot_drives_no_faster_than_it_can(film) -> None:
+def test_robot_respects_its_speed_limit_in_films(film) -> None:
     most = 1.5 * DRIVE_M_S / FRAMES_PER_S
     for before, after in itertools.pairwise(film.frames):
         moved = math.dist((before.robot.x_m, before.robot.y_m), (after.robot.x_m, after.robot.y_m))
         assert moved <= most
 
 
-def test_what_is_carried_stays_before_the_robot(film) -> None:
+def test_carried_object_stays_before_the_robot(film) -> None:
     driven = [frame for frame in film.frames if frame.step == 5]
     assert len({frame.robot for frame in driven}) > 3
     for frame in driven:
@@ -47,7 +47,7 @@ def test_what_is_carried_stays_before_the_robot(film) -> None:
         assert math.hypot(x - frame.robot.x_m, y - frame.robot.y_m) < 0.6
 
 
-def test_a_door_opens_by_and_by(film) -> None:
+def test_door_opens_gradually(film) -> None:
     shares = [frame.joints.get("fridge_1", (0.0,))[0] for frame in film.frames]
     assert shares == sorted(shares)
     assert len(set(shares)) > 3
@@ -62,7 +62,7 @@ def test_the_film_ends_in_the_state_that_the_plan_reached(film, scene) -> None:
     simulator.close()
 
 
-def test_a_plan_that_fails_is_shown_up_to_its_failure(scene) -> None:
+def test_failed_plan_is_filmed_up_to_its_failure(scene) -> None:
     simulator = load_simulator(Bundle(scene, {}))
     task = task_over(scene)
     film = film_cached(simulator, task, plan_of(task, "pick_up apple_2; move apple_2"), 0)
@@ -71,7 +71,7 @@ def test_a_plan_that_fails_is_shown_up_to_its_failure(scene) -> None:
     assert {frame.step for frame in film.frames} == {0, 1}
 
 
-def test_moving_an_object_on_a_stage_changes_the_picture_and_moving_it_back_restores_it(scene) -> None:
+def test_moving_an_object_changes_the_picture_and_moving_it_back_restores_it(scene) -> None:
     with VisualScene(scene) as stage:
         furnish_cutaway(stage)
         before = shoot_oblique(stage, scene.rooms, 160, 120)
@@ -83,7 +83,7 @@ def test_moving_an_object_on_a_stage_changes_the_picture_and_moving_it_back_rest
     np.testing.assert_array_equal(before, again)
 
 
-def test_the_robot_sees_another_picture_when_it_turns(scene) -> None:
+def test_robot_camera_view_changes_with_the_heading(scene) -> None:
     views = render_egocentric(scene, StandPose(3.5, 1.5, 0.0), width_px=80, height_px=60)
     assert views.shape == (4, 60, 80, 3)
     assert all(len(np.unique(view.reshape(-1, 3), axis=0)) > 4 for view in views[:2])

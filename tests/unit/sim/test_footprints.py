@@ -1,4 +1,4 @@
-"""Footprint classes: a pose of the class is one of every object in it, and an analysis covers what a scene can hold."""
+"""Footprint classes: a class pose suits every object in the class, and an analysis covers the scene's objects."""
 
 import pytest
 from hypothesis import given
@@ -57,7 +57,7 @@ def cache(engine, pool):
 
 
 @given(SIZE)
-def test_thing_lies_within_its_class_whichever_way_it_is_turned(size) -> None:
+def test_object_lies_within_its_class_at_every_yaw(size) -> None:
     thing = make.block("block", "block.n.01", size, {})
     standing = Pose.from_xyz_yaw(0.3, -0.2, size[2] / 2, 0.0)
     footprint = footprint_of(thing, standing)
@@ -70,7 +70,7 @@ def test_thing_lies_within_its_class_whichever_way_it_is_turned(size) -> None:
     assert footprint.height_m in HEIGHTS_M
 
 
-def test_thing_that_is_too_large_has_no_class() -> None:
+def test_too_large_object_has_no_class() -> None:
     thing = make.block("block", "block.n.01", (0.9, 0.2, 0.2), {})
     assert footprint_of(thing, IDENTITY) is None
 
@@ -85,7 +85,7 @@ def test_sets_of_flat_supports_hold_eight_poses_or_more(cache) -> None:
     assert min(sizes.values()) >= 8
 
 
-def test_every_small_thing_is_known_to_stand_by_itself(engine, cache) -> None:
+def test_every_small_object_has_a_standing_pose(engine, cache) -> None:
     for item in engine.scene.objects:
         if not item.fixed:
             assert PlacementKey(item.asset_id, LEVEL_FLOOR.asset_id, Relation.ONTOP) in cache.placements
@@ -100,7 +100,7 @@ def class_poses(engine, cache, held, target, relation) -> list[Pose]:
     return [pose @ pose_box_held for pose in cache.placements.get(key, ())]
 
 
-def test_every_object_stays_where_its_class_may_stand(engine, cache) -> None:
+def test_every_object_is_stable_at_the_poses_of_its_class(engine, cache) -> None:
     looked_at = 0
     for held in ("mug_1", "apple_1", "chicken_leg_1", "bowl_1", "table_lamp_1"):
         for target in ("countertop_1", "breakfast_table_1", "shelf_1", "fridge_1"):
@@ -117,7 +117,7 @@ def test_every_object_stays_where_its_class_may_stand(engine, cache) -> None:
     assert looked_at > 60
 
 
-def test_pose_of_the_class_is_taken_without_settling(engine, cache) -> None:
+def test_class_pose_is_used_without_settling(engine, cache) -> None:
     engine.reset()
     placer = Placer(engine, Relations(engine), cache)
     engine.park("mug_1")

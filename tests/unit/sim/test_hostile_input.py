@@ -1,7 +1,7 @@
-"""Every kind of input that crashes, hangs or silently poisons the physics engine is refused before it gets there.
+"""Inputs that crash, hang or silently corrupt physics are refused early.
 
-Each kind is tried at three gates: bundles and scene files, where all data from outside comes in, and the engine itself, for
-scenes that a program makes. A message names what was found.
+Each kind is tried at three gates: bundles and scene files, which carry all outside data, and the engine itself, for scenes that
+a program makes. Messages name what was found.
 """
 
 import dataclasses
@@ -171,7 +171,7 @@ PHYSICAL = {
     "object named like the walls": lambda: named(WALL),
     "object named like the floor": lambda: named(FLOOR),
 }
-"""What physics itself can't take: all three gates refuse it."""
+"""Invalid for physics itself: all three gates refuse it."""
 OUTSIDE = {
     "box with vertices": lambda: with_part(dataclasses.replace(BOX, vertices_m=CUBE)),
     "things that rest on one another in a circle": in_a_circle,
@@ -201,14 +201,14 @@ OUTSIDE = {
         kitchen_scene(), objects=kitchen_scene().objects[-1:] * 40_000
     ),
 }
-"""What the engine is never asked about: bundles and scene files refuse it."""
+"""Invalid only for bundles and scene files: the engine never checks it."""
 EVERYTHING = PHYSICAL | OUTSIDE
 
 
 @pytest.mark.parametrize("kind", EVERYTHING)
-def test_a_bundle_with_it_is_refused_by_the_one_error(kind):
+def test_invalid_bundle_raises_bundle_error(kind):
     started_s = time.monotonic()
-    # What JSON has no number for, no bundle can hold: it is refused when one is written, all else when one is read.
+    # Encoding refuses numbers that JSON lacks; decoding refuses everything else.
     with pytest.raises(ValueError) as caught:
         decode_bundle(encode_bundle(Bundle(EVERYTHING[kind](), {})))
     assert isinstance(caught.value, BundleError) or "not JSON compliant" in str(caught.value)
@@ -216,26 +216,26 @@ def test_a_bundle_with_it_is_refused_by_the_one_error(kind):
 
 
 @pytest.mark.parametrize("kind", EVERYTHING)
-def test_a_scene_with_it_is_refused_by_a_named_field(kind):
+def test_invalid_scene_error_names_the_field(kind):
     with pytest.raises(SceneInvalidError) as caught:
         scene_from_json(scene_to_json(EVERYTHING[kind]()))
     assert caught.value.field.startswith("scene.")
 
 
 @pytest.mark.parametrize("kind", PHYSICAL)
-def test_the_engine_refuses_it_in_a_sentence(kind):
+def test_engine_refuses_invalid_scene(kind):
     with pytest.raises(EngineError, match=r"expected|one on each link|called|rename"):
         BulletEngine(PHYSICAL[kind]())
 
 
-def test_the_flat_that_they_were_made_from_is_sound():
+def test_unmodified_flat_is_valid():
     scene = kitchen_scene()
     assert decode_bundle(encode_bundle(Bundle(scene, {}))).scene == scene
     assert decode_bundle(encode_bundle(Bundle(hull(CUBE), {}))).scene == hull(CUBE)
     assert {WALL, FLOOR} == RESERVED_NAMES
 
 
-def test_four_hundred_thousand_objects_in_a_scene_file_cost_no_time():
+def test_scene_file_with_400_000_objects_is_refused_quickly():
     value = scene_to_json(kitchen_scene())
     value["objects"] *= 400_000 // len(value["objects"]) + 1
     started_s = time.monotonic()
@@ -244,7 +244,7 @@ def test_four_hundred_thousand_objects_in_a_scene_file_cost_no_time():
     assert time.monotonic() - started_s < 1.0
 
 
-def test_a_file_of_a_gigabyte_is_refused_before_it_is_read(tmp_path):
+def test_gigabyte_file_is_refused_before_reading(tmp_path):
     path = tmp_path / "scene.bundle"
     with path.open("wb") as file:
         file.truncate(1 << 30)
@@ -254,7 +254,7 @@ def test_a_file_of_a_gigabyte_is_refused_before_it_is_read(tmp_path):
     assert time.monotonic() - started_s < 1.0
 
 
-def test_a_gigabyte_of_blanks_is_refused_before_it_is_unpacked():
+def test_decompression_bomb_of_a_gigabyte_is_refused():
     packer = zlib.compressobj(9)
     data = b"".join(packer.compress(b" " * (1 << 20)) for _ in range(1024)) + packer.flush()
     with pytest.raises(BundleError, match="grows beyond"):
@@ -262,7 +262,7 @@ def test_a_gigabyte_of_blanks_is_refused_before_it_is_unpacked():
 
 
 def _respun(change):
-    """The flat's bundle with its JSON and its arrays changed by a function, as an attacker would write it."""
+    """Bundle of the flat whose JSON and arrays a function has changed, as an attacker would."""
     content = bytearray(zlib.decompress(encode_bundle(Bundle(kitchen_scene(), {}))))
     length = int.from_bytes(content[8:12], "little")
     value, rest = json.loads(content[12 : 12 + length]), bytes(content[12 + length :])
@@ -306,12 +306,12 @@ def _edit(*path, to):
         (lambda value, rest: ([], rest), "expected `object`, got `array`"),
     ],
 )
-def test_arrays_that_do_not_fit_their_bundle_are_refused(change, found):
+def test_mismatched_arrays_are_refused(change, found):
     with pytest.raises(BundleError, match=found):
         decode_bundle(_respun(change))
 
 
-def test_any_byte_of_the_content_may_be_wrong_and_nothing_but_the_one_error_comes_of_it():
+def test_any_corrupted_byte_raises_only_bundle_error():
     content = zlib.decompress(encode_bundle(Bundle(kitchen_scene(), {})))
     for position in range(0, len(content), max(1, len(content) // 300)):
         broken = bytearray(content)

@@ -1,4 +1,4 @@
-"""Cutting, cleaning and soaking: what changes, what does not, and that a reset undoes it."""
+"""Slicing, cleaning and soaking, their limits, and their reset."""
 
 import pytest
 from hypothesis import given, settings
@@ -36,7 +36,7 @@ RAG = "move rag_1; pick_up rag_1"
 TAP = "move sink_1; toggle_on sink_1"
 
 
-def test_a_knife_in_the_hand_slices_bread(home):
+def test_knife_in_the_hand_slices_bread(home):
     trace = succeeded(home, f"{KNIFE}; move loaf_1; slice_object_with_tool loaf_1 table_knife_1")
     assert home.facts.holds("sliced", ("loaf_1",))
     assert home.facts.holds("real", ("loaf_1",))
@@ -48,7 +48,7 @@ def test_a_knife_in_the_hand_slices_bread(home):
 MELON = f"{KNIFE}; move melon_1; slice_object_with_tool melon_1 table_knife_1"
 
 
-def test_the_halves_of_a_melon_come_in_where_it_lay(home):
+def test_melon_halves_appear_in_its_place(home):
     before = home.world.engine.pose("melon_1").position_m
     succeeded(home, MELON)
     engine = home.world.engine
@@ -62,7 +62,7 @@ def test_the_halves_of_a_melon_come_in_where_it_lay(home):
         assert abs(x - before[0]) + abs(y - before[1]) < 0.2
 
 
-def test_a_thing_that_was_cut_up_is_gone_and_its_halves_are_no_future_any_more(home):
+def test_sliced_object_is_gone_and_its_halves_are_real(home):
     executed(home, "turn 1")
     assert home.facts.holds("future", ("half_melon_1",))
     assert not home.facts.holds("real", ("half_melon_1",))
@@ -75,7 +75,7 @@ def test_a_thing_that_was_cut_up_is_gone_and_its_halves_are_no_future_any_more(h
     assert failed(home, f"{MELON}; move melon_1") is FailureReason.NOT_THERE
 
 
-def test_a_half_can_be_picked_up_and_put_away(home):
+def test_half_can_be_picked_up_and_placed(home):
     succeeded(
         home,
         f"{MELON}; move coffee_table_1; place coffee_table_1 ontop; move half_melon_2; pick_up half_melon_2; "
@@ -84,7 +84,7 @@ def test_a_half_can_be_picked_up_and_put_away(home):
     assert home.facts.holds("ontop", ("half_melon_2", "fridge_1"))
 
 
-def test_what_is_still_to_come_can_not_be_used(home):
+def test_absent_object_can_not_be_used(home):
     trace = executed(home, "pick_up half_melon_1")
     assert trace.failure is FailureReason.NOT_THERE
     assert trace.final == ()
@@ -92,7 +92,7 @@ def test_what_is_still_to_come_can_not_be_used(home):
     assert "melon_1: not there" in final
 
 
-def test_a_dry_cloth_takes_dust_off_and_leaves_stains(home):
+def test_dry_cloth_removes_dust_but_not_stains(home):
     wiped = succeeded(home, f"{RAG}; move plate_1; clean_object_with_tool plate_1 rag_1")
     assert wiped.steps[-1].message == "cleaned plate_1; plate_1 is now free of dust"
     assert not home.facts.holds("dusty", ("plate_1",))
@@ -104,7 +104,7 @@ def test_a_dry_cloth_takes_dust_off_and_leaves_stains(home):
     assert "water" in trace.steps[-1].message
 
 
-def test_a_cloth_that_was_held_under_the_tap_takes_stains_off(home):
+def test_wet_cloth_removes_stains(home):
     soaked = f"{TAP}; {RAG}; move sink_1; soak_object_in_source rag_1 sink_1"
     succeeded(home, f"{soaked}; move plate_2; clean_object_with_tool plate_2 rag_1")
     assert home.facts.holds("soaked", ("rag_1",))
@@ -112,7 +112,7 @@ def test_a_cloth_that_was_held_under_the_tap_takes_stains_off(home):
     assert not home.facts.holds("covered", ("plate_2", "stain.n.01"))
 
 
-def test_soap_from_a_bottle_does_as_well(home):
+def test_soap_from_a_bottle_removes_stains(home):
     text = f"{RAG}; move liquid_soap__bottle_1; soak_object_in_source rag_1 liquid_soap__bottle_1"
     succeeded(home, f"{text}; move plate_2; clean_object_with_tool plate_2 rag_1")
     assert not home.facts.holds("soaked", ("rag_1",))
@@ -120,7 +120,7 @@ def test_soap_from_a_bottle_does_as_well(home):
     assert not home.facts.holds("stained", ("plate_2",))
 
 
-def test_a_cup_is_filled_from_a_bottle_or_a_tap_and_wet_by_water_only(home):
+def test_cup_is_filled_from_a_bottle_or_a_tap_and_wet_only_by_water(home):
     text = "move cup_1; pick_up cup_1; move liquid_soap__bottle_1; soak_object_in_source cup_1 liquid_soap__bottle_1"
     poured = succeeded(home, text)
     assert (
@@ -134,7 +134,7 @@ def test_a_cup_is_filled_from_a_bottle_or_a_tap_and_wet_by_water_only(home):
     assert home.facts.holds("filled", ("cup_1", "water.n.06"))
 
 
-def test_what_is_put_into_a_running_sink_is_soaked_filled_and_washed_at_once(home):
+def test_object_in_a_running_sink_is_soaked_filled_and_washed_at_once(home):
     rag = succeeded(home, f"{TAP}; {RAG}; move sink_1; place sink_1 inside")
     assert rag.steps[-1].message == "put rag_1 inside sink_1; rag_1 is now soaked"
     succeeded(home, "move cup_1; pick_up cup_1; move sink_1; place sink_1 inside; toggle_on sink_1")
@@ -153,7 +153,7 @@ def test_what_is_put_into_a_running_sink_is_soaked_filled_and_washed_at_once(hom
 DISHES = "move dishwasher_1; open dishwasher_1; move plate_2; pick_up plate_2; move dishwasher_1; place dishwasher_1 inside"
 
 
-def test_a_dishwasher_washes_when_it_is_closed_and_on(home):
+def test_dishwasher_washes_when_closed_and_on(home):
     succeeded(home, f"{DISHES}; close dishwasher_1")
     assert home.facts.holds("stained", ("plate_2",))
     succeeded(
@@ -163,7 +163,7 @@ def test_a_dishwasher_washes_when_it_is_closed_and_on(home):
     assert not home.facts.holds("stained", ("plate_2",))
 
 
-def test_equal_plans_cut_equally_and_a_reset_brings_the_melon_back(home):
+def test_slicing_is_deterministic_and_a_reset_restores_the_melon(home):
     first = executed(home, MELON, seed=3)
     again = executed(home, MELON, seed=3)
     assert first == again
@@ -179,7 +179,7 @@ def test_dust_is_part_of_the_digest(home):
     assert executed(home, wiped).digest != executed(home, other).digest
 
 
-def test_every_skill_of_the_household_profile_is_tried_here(home):
+def test_every_household_skill_is_covered(home):
     used = {
         call.skill
         for text in (
@@ -218,7 +218,7 @@ CALLS = st.sampled_from(
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(CALLS, min_size=1, max_size=14))
-def test_whatever_was_cut_and_cleaned_a_reset_undoes_it_to_the_bit(home, calls):
+def test_reset_undoes_slicing_and_cleaning_to_the_bit(home, calls):
     task = task_over(home.world.scene)
     home.reset(task, 0)
     before = home.world.state_bytes()
@@ -230,7 +230,7 @@ def test_whatever_was_cut_and_cleaned_a_reset_undoes_it_to_the_bit(home, calls):
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(CALLS, min_size=1, max_size=14))
-def test_a_call_that_fails_changes_nothing(home, calls):
+def test_failed_call_changes_nothing(home, calls):
     task = task_over(home.world.scene)
     home.reset(task, 0)
     for call in plan_of(task, "; ".join(calls)):

@@ -1,4 +1,4 @@
-"""Navigation: where the robot fits, how far it is, and where it stands to serve a thing."""
+"""Navigation: free space, distances and standing poses."""
 
 import dataclasses
 import itertools
@@ -90,17 +90,17 @@ def test_robot_never_stands_within_its_radius_of_a_part_or_wall(engine, navigato
                     assert np.linalg.norm(at - nearest) > ROBOT.radius_m - 0.051
 
 
-def test_what_has_a_door_is_served_from_its_front(navigator) -> None:
+def test_object_with_a_door_is_served_from_its_front(navigator) -> None:
     for stand in navigator.stands("cabinet_1", navigator.start):
         assert stand.y_m > 0.45
         assert abs(math.atan2(stand.x_m - 6.5, stand.y_m - 0.225)) <= math.radians(65.5)
 
 
-def test_what_stands_on_a_shelf_board_is_served_from_the_front_of_the_shelf(navigator) -> None:
+def test_object_on_a_shelf_is_served_from_the_shelf_front(navigator) -> None:
     assert all(stand.x_m < 8.8 for stand in navigator.stands("mug_1", navigator.start))
 
 
-def test_sides_of_furniture_are_not_reached_through_but_its_door_leaf_is(engine, navigator) -> None:
+def test_arm_passes_an_open_door_panel_but_not_the_sides_of_furniture(engine, navigator) -> None:
     abeam, ahead = StandPose(1.3, 3.6, math.pi), StandPose(0.6, 2.9, math.pi / 2)
     assert not navigator.line_is_clear(abeam, "chicken_leg_1")
     assert navigator.line_is_clear(ahead, "chicken_leg_1")
@@ -109,7 +109,7 @@ def test_sides_of_furniture_are_not_reached_through_but_its_door_leaf_is(engine,
     assert navigator.line_is_clear(behind, "chicken_leg_1")  # under the table: its legs leave room
 
 
-def test_walls_are_not_reached_through(engine, navigator) -> None:
+def test_arm_does_not_pass_through_walls(engine, navigator) -> None:
     engine.set_pose("apple_1", Pose((4.9, 0.8, 0.04)))
     navigator.refresh()
     stands = navigator.stands("apple_1", navigator.start)
@@ -128,7 +128,7 @@ def test_path_leads_around_furniture_and_through_the_doorway(navigator) -> None:
     assert navigator.path_length(target, start) == pytest.approx(length, abs=1e-4)
 
 
-def test_corners_of_a_path_join_by_straight_drives_of_about_its_length(navigator) -> None:
+def test_straight_drives_between_path_corners_have_about_its_length(navigator) -> None:
     start, end = StandPose(4.5, 0.5, 0.0), StandPose(8.0, 0.5, 0.0)
     corners = navigator.path(start, end)
     points = [(start.x_m, start.y_m), *corners, (end.x_m, end.y_m)]
@@ -150,7 +150,7 @@ def test_no_path_leads_through_a_bricked_up_doorway(pool) -> None:
     engine.close()
 
 
-def test_room_is_entered_just_behind_its_door(engine, navigator) -> None:
+def test_room_entry_is_just_behind_its_door(engine, navigator) -> None:
     entry = navigator.room_entry("living_room_0", navigator.start)
     assert entry is not None
     assert engine.scene.room_at((entry.x_m, entry.y_m)) == "living_room_0"
@@ -171,7 +171,7 @@ def test_driving_forward_stops_in_front_of_obstacles(navigator, yaw, distance_m,
     assert low_m <= navigator.forward(navigator.start, yaw, distance_m) <= high_m
 
 
-def test_thing_put_on_the_floor_bars_the_way_until_it_is_taken_up(engine, navigator) -> None:
+def test_object_on_the_floor_blocks_the_path_until_it_is_picked_up(engine, navigator) -> None:
     before = navigator.forward(navigator.start, 0.0, 1.0)
     engine.set_pose("bowl_1", Pose((4.2, 1.5, 0.035)))
     navigator.refresh()
@@ -181,7 +181,7 @@ def test_thing_put_on_the_floor_bars_the_way_until_it_is_taken_up(engine, naviga
     assert navigator.forward(navigator.start, 0.0, 1.0) == before
 
 
-def test_floors_with_one_thing_open_are_the_same_when_they_were_found_ahead(engine, navigator) -> None:
+def test_warmed_up_floors_with_one_open_object_equal_fresh_ones(engine, navigator) -> None:
     jointed = [item for item in engine.scene.objects if item.fixed and item.joints]
     ahead = Navigator(engine, Relations(engine))
     assert len(list(ahead.ground.warm_up())) == len(jointed) > 0
@@ -193,7 +193,7 @@ def test_floors_with_one_thing_open_are_the_same_when_they_were_found_ahead(engi
         engine.reset()
 
 
-def test_robot_drives_to_the_first_of_the_standing_poses_whatever_stands_open(engine, navigator) -> None:
+def test_robot_drives_to_the_first_standing_pose_with_any_open_doors(engine, navigator) -> None:
     openable = [item for item in engine.scene.objects if item.fixed and item.joints]
     for opened in (None, *openable):
         if opened is not None:
@@ -213,7 +213,7 @@ def test_place_off_the_map_is_not_reachable(navigator) -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(RECTANGLE, max_size=6), st.lists(RECTANGLE, max_size=4), st.data())
-def test_changed_grid_is_the_one_that_would_be_made_anew(start, come, data) -> None:
+def test_changed_grid_equals_a_fresh_one(start, come, data) -> None:
     scene = kitchen_scene()
     gone = data.draw(st.lists(st.sampled_from(start), unique=True)) if start else []
     left = [row for row in start if row not in gone]
@@ -231,7 +231,7 @@ def test_changed_grid_is_the_one_that_would_be_made_anew(start, come, data) -> N
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(RECTANGLE, max_size=6), st.lists(RECTANGLE, max_size=3), st.lists(RECTANGLE, max_size=4))
-def test_narrowed_grid_is_the_one_that_would_be_made_anew(start, come, leaves) -> None:
+def test_narrowed_grid_equals_a_fresh_one(start, come, leaves) -> None:
     scene = kitchen_scene()
     grid = FloorGrid(scene, rows_of(start)).changed(rows_of([]), rows_of(come))
     narrowed = grid.narrowed(rows_of(leaves))
@@ -248,7 +248,7 @@ def test_narrowed_grid_is_the_one_that_would_be_made_anew(start, come, leaves) -
     COORDINATE,
     COORDINATE,
 )
-def test_main_part_is_the_largest_that_is_left_of_the_floor_around_a_point(start, come, leaves, x, y) -> None:
+def test_main_part_is_the_largest_remaining_component_around_a_point(start, come, leaves, x, y) -> None:
     wide = FloorGrid(kitchen_scene(), rows_of(start)).changed(rows_of([]), rows_of(come))
     narrowed = wide.narrowed(rows_of(leaves))
     cell = wide.cell(x, y)
@@ -272,7 +272,7 @@ def _parts_are_equal(grid: FloorGrid, other: FloorGrid) -> bool:
 
 @settings(max_examples=60, deadline=None)
 @given(COORDINATE, COORDINATE)
-def test_robot_beside_a_free_cell_counts_as_on_the_nearest_one(x, y) -> None:
+def test_robot_beside_free_cells_snaps_to_the_nearest(x, y) -> None:
     grid = FloorGrid(kitchen_scene(), rows_of([(2.0, 1.0, 3.0, 2.0)]))
     cell = grid.cell(x, y)
     free = np.argwhere(grid.free)
@@ -285,7 +285,7 @@ def test_robot_beside_a_free_cell_counts_as_on_the_nearest_one(x, y) -> None:
         assert float(np.linalg.norm(np.array(grid.center(cell)) - (x, y))) <= nearest + CELL_M
 
 
-def test_only_the_floors_that_were_asked_for_last_keep_their_distances():
+def test_only_recently_used_floors_keep_their_distances():
     free = np.zeros((5, 5), dtype=np.bool_)
     free[1:4, 1:4] = True
     recent = RecentDistances(CELL_M)

@@ -1,4 +1,4 @@
-"""Passages: where nothing is near, the robot is in the end where its motion ends, and no time has to pass for that."""
+"""Passages: free-space motions of the robot without simulation steps."""
 
 import contextlib
 import math
@@ -39,7 +39,7 @@ FAR_OFF = ("box_1", (0.1, 0.1, 0.1), (3.5, 2.5, 0.0), False)
 LOAD = ("load_1", (0.05, 0.05, 0.1), (2.6, 1.5, 0.7), False)
 
 
-def test_a_drive_past_nothing_ends_exactly_where_it_leads_and_lasts_as_long_as_it_would():
+def test_free_drive_ends_exactly_at_its_target_in_the_stepped_time():
     with room_with(FAR_OFF) as world:
         ticks = []
         mover = Mover(world, lambda: ticks.append(world.steps))
@@ -53,7 +53,7 @@ def test_a_drive_past_nothing_ends_exactly_where_it_leads_and_lasts_as_long_as_i
         assert len(ticks) > 10
 
 
-def test_the_robot_stays_where_a_passage_ended_when_time_passes_again():
+def test_robot_stays_at_the_end_of_a_passage_when_stepped():
     with room_with(FAR_OFF) as world:
         mover = Mover(world, lambda: None)
         goal = mover.posture
@@ -67,7 +67,7 @@ def test_the_robot_stays_where_a_passage_ended_when_time_passes_again():
     ("degrees", "back_m", "stops"),
     [(30.0, 0.08, True), (47.0, 0.08, True), (11.0, 0.02, False), (47.0, 0.02, False)],
 )
-def test_nothing_is_so_thin_that_it_is_passed_unseen(degrees, back_m, stops):
+def test_thin_obstacle_is_detected(degrees, back_m, stops):
     """A rod stops the hand. Its fingers give way and pass: but that is for physics to say, and then no end is exact."""
     turn = np.eye(body.NUMBERS)[body.YAW] * math.radians(degrees)
     start = np.array([2.0, 1.5, 0.0, *OUT])
@@ -81,7 +81,7 @@ def test_nothing_is_so_thin_that_it_is_passed_unseen(degrees, back_m, stops):
         assert np.abs(mover.posture - (start + 2 * turn)).max() > 1e-7
 
 
-def test_looking_at_a_passage_leaves_robot_and_load_as_they_were():
+def test_clearance_check_restores_robot_and_load():
     with room_with(LOAD) as world:
         world.grasp("load_1")
         before, load = world.robot.posture, world.bodies.pose("load_1")
@@ -93,7 +93,7 @@ def test_looking_at_a_passage_leaves_robot_and_load_as_they_were():
         np.testing.assert_allclose(world.bodies.pose("load_1").position_m, load.position_m, atol=1e-6)
 
 
-def test_what_the_hand_holds_comes_along_as_it_is_held():
+def test_held_object_keeps_its_pose_in_the_hand():
     with room_with(LOAD) as world:
         world.grasp("load_1")
         held = world.robot.hand_pose().inverse() @ world.bodies.pose("load_1")
@@ -105,7 +105,7 @@ def test_what_the_hand_holds_comes_along_as_it_is_held():
         np.testing.assert_allclose(mover.posture, goal, atol=1e-6)
 
 
-def test_a_load_that_would_strike_something_is_seen_to_where_the_robot_alone_would_pass():
+def test_collision_of_the_held_object_is_detected():
     post = ("post_1", (0.01, 0.01, 1.6), (3.0, 1.5, 0.0), True)
     for things, passes in (((post,), True), ((LOAD, post), False)):
         with room_with(*things) as world:
@@ -117,7 +117,7 @@ def test_a_load_that_would_strike_something_is_seen_to_where_the_robot_alone_wou
             assert passage.is_clear([Posture.of(row) for row in rows.tolist()]) is passes
 
 
-def test_while_something_falls_time_passes():
+def test_no_passage_while_an_object_falls():
     with room_with(("load_1", (0.1, 0.1, 0.1), (3.5, 2.5, 1.5), False)) as world:
         world.bodies.wake(["load_1"])
         world.step(12)

@@ -19,7 +19,7 @@ from embomatrix.sim.physical.doors import DoorPanel
 from embomatrix.sim.physical.floor import Floor
 from embomatrix.sim.physical.grasp import cross
 from embomatrix.sim.physical.motion import Mover
-from embomatrix.sim.physical.space import boxes_of, deepest_box, struck
+from embomatrix.sim.physical.space import boxes_of, collides, deepest_box
 from embomatrix.sim.state.relations import Relations
 from embomatrix.world.asset import Joint, JointKind, Link
 from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
@@ -70,7 +70,7 @@ def test_the_folded_arm_keeps_within_the_robots_disc_and_off_its_own_trunk():
     posture = np.concatenate([[0.0, 0.0, 0.0, 0.0], np.array(TUCKED_ARM)])[None]
     wide = np.linalg.norm(body.balls(posture)[0, :, :2], axis=1) + body.RADII
     assert wide.max() <= ROBOT.radius_m + 0.005
-    assert not body.strikes_itself(posture, body.balls(posture), body.RADII)[0]
+    assert not body.self_collides(posture, body.balls(posture), body.RADII)[0]
 
 
 def test_balls_collide_with_a_rotated_box_only_inside_it():
@@ -95,7 +95,7 @@ def test_fast_collision_check_agrees_with_the_exact_one(seed):
     balls = body.balls(postures)
     for margin_m in (-0.003, 0.0, 0.012):
         expected = np.array([deepest_box(boxes, row, body.RADII, margin_m) >= 0 for row in balls])
-        np.testing.assert_array_equal(struck(boxes, balls, body.RADII, margin_m), expected)
+        np.testing.assert_array_equal(collides(boxes, balls, body.RADII, margin_m), expected)
 
 
 def test_door_panel_box_moves_from_the_front_to_before_it():
@@ -115,7 +115,7 @@ def test_touched_boxes_shrink_until_clear_and_others_stay():
     boxes = boxes_of([(near, (0.2, 2.0, 0.2), "door"), (far, (0.2, 0.2, 0.2), "wall")])
     ball, radius = np.array([[0.88, 0.0, 0.0]]), np.array([0.05])  # 3 cm deep in the door
     assert deepest_box(boxes, ball, radius, 0.0) == 0
-    freed = boxes.drawn_in(ball, radius, 0.012)
+    freed = boxes.shrunk_clear_of(ball, radius, 0.012)
     np.testing.assert_allclose(freed.gaps(ball).min(axis=1) - radius, [0.012], atol=1e-9)
     np.testing.assert_array_equal(freed.half[1], boxes.half[1])
 

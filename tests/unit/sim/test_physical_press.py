@@ -13,7 +13,7 @@ from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical import body
 from embomatrix.sim.physical.fold import PATHS_TRIED
 from embomatrix.sim.physical.press import press, press_paths
-from embomatrix.sim.physical.space import struck
+from embomatrix.sim.physical.space import collides
 from embomatrix.sim.physical.stage import PhysicalStage
 from embomatrix.sim.placing.pose_cache import standing_poses
 from embomatrix.world.bundle import Bundle
@@ -43,7 +43,7 @@ def test_press_paths_keep_the_arm_out_of_the_pressed_object(stage, name):
         ways = list(itertools.islice(press_paths(stage, name)[1], PATHS_TRIED))
         assert ways
         arms = body.balls(np.concatenate([way.postures for way in ways]))[:, ~body.HAND_BALLS]
-        assert not struck(own, arms, body.RADII[~body.HAND_BALLS], 0.0).any()
+        assert not collides(own, arms, body.RADII[~body.HAND_BALLS], 0.0).any()
 
 
 @pytest.mark.parametrize("name", PRESSED)

@@ -63,7 +63,7 @@ def test_arm_on_the_base_is_a_self_collision():
     up = down.copy()
     up[0, 5] = 1.6
     both = np.concatenate([down, up])
-    assert body.strikes_itself(both, body.balls(both), body.RADII).tolist() == [True, False]
+    assert body.self_collides(both, body.balls(both), body.RADII).tolist() == [True, False]
 
 
 @pytest.mark.parametrize("height_m", [0.15, 0.3, 1.0, 1.7])

@@ -1,16 +1,16 @@
-"""Placing: the first verified pose that is free and in reach, or a reason."""
+"""Placement: the first verified pose that is free and in reach, or a reason."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.fakes.pose_caches import build_pose_cache
 from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.placing.placement import Placer
-from embomatrix.sim.placing.pose_cache import build_pose_cache
 from embomatrix.sim.placing.trial import in_reach
 from embomatrix.sim.state.relations import Relations
 from embomatrix.skills.failure import FailureReason
@@ -63,7 +63,7 @@ def navigator(engine, relations):
 
 @pytest.mark.parametrize(("held", "target", "relation"), PAIRS)
 @pytest.mark.parametrize("cached", [True, False])
-def test_found_pose_has_the_relation_in_reach_and_free_and_stable(
+def test_found_pose_has_the_relation_and_is_reachable_free_and_stable(
     engine, relations, navigator, cache, held, target, relation, cached
 ) -> None:
     placer = Placer(engine, relations, cache if cached else PoseCache())
@@ -80,7 +80,7 @@ def test_found_pose_has_the_relation_in_reach_and_free_and_stable(
         engine.park(held)
 
 
-def test_search_leaves_the_world_as_it_was(engine, placer, navigator) -> None:
+def test_search_leaves_the_world_unchanged(engine, placer, navigator) -> None:
     robot = navigator.stands("countertop_1", navigator.start)[0]
     engine.park("apple_1")
     before = engine.state_bytes()
@@ -99,7 +99,7 @@ def test_equal_seeds_choose_equal_poses_and_others_differ(engine, placer, naviga
     assert len({pose(seed) for seed in range(8)}) > 1
 
 
-def test_taken_poses_are_passed_over(engine, placer, relations, navigator) -> None:
+def test_taken_poses_are_skipped(engine, placer, relations, navigator) -> None:
     robot = navigator.stands("coffee_table_1", navigator.start)[0]
     chosen = []
     for name in ("mug_1", "bowl_1", "apple_1", "chicken_leg_1", "table_lamp_1"):
@@ -133,7 +133,7 @@ def test_full_bowl_takes_no_more(engine, placer, navigator) -> None:
         ("mug_1", "mug_1", Relation.ONTOP, FailureReason.PLACE_ON_ITSELF),
     ],
 )
-def test_what_cannot_be_done_has_its_reason(
+def test_impossible_placement_has_its_reason(
     engine, placer, navigator, held, target, relation, reason
 ) -> None:
     robot = navigator.start
@@ -155,7 +155,7 @@ def test_reach_is_measured_to_the_nearest_point_of_the_box() -> None:
 
 
 @pytest.mark.parametrize(("rim_m", "is_found"), [(1.5, True), (1.99, False)])
-def test_what_goes_into_an_open_bowl_must_get_over_its_rim_within_reach(rim_m, is_found) -> None:
+def test_rim_of_an_open_bowl_must_be_within_reach(rim_m, is_found) -> None:
     scene = kitchen_scene()
     bowl = scene.asset_of("bowl_1")
     open_bowl = replace(bowl, supports=tuple(replace(item, clearance_m=2.0) for item in bowl.supports))
@@ -173,7 +173,7 @@ def test_what_goes_into_an_open_bowl_must_get_over_its_rim_within_reach(rim_m, i
 
 
 @pytest.mark.parametrize("relation", [Relation.ONTOP, Relation.INSIDE])
-def test_what_is_put_on_a_shelf_goes_where_it_can_be_taken_back_from_if_there_is_such_a_place(
+def test_object_on_a_shelf_is_placed_where_it_can_be_picked_up_again(
     engine, relations, navigator, relation
 ) -> None:
     held, target = "apple_1", "shelf_1"

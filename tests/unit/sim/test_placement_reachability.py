@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 from tests.fakes import furniture as make
 from tests.fakes.plans import executed, with_objects
+from tests.fakes.pose_caches import build_pose_cache
 from tests.fakes.scenes import kitchen_scene, placed, upright
 
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical.placement_reachability import PlacementQuery
 from embomatrix.sim.physical.survey import placement_reachability
-from embomatrix.sim.placing.pose_cache import build_pose_cache
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
-from embomatrix.world.codec_task import poses_from_json, poses_to_json
+from embomatrix.world.codec_task import poses_of, poses_to_json
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import PoseCache
-from embomatrix.world.records import SceneInvalidError
+from embomatrix.world.records import PosesJson, SceneInvalidError, convert
 from embomatrix.world.state import Relation
 from embomatrix.world.tables import Tables, TableWriter
 
@@ -139,4 +139,4 @@ def test_invalid_pose_number_is_refused_with_its_name(number):
     value = poses_to_json(PoseCache(reached={Relation.ONTOP: {"mug_1": {"sink_1": 1}}}), writer)
     value["reached"]["ontop"]["mug_1"]["sink_1"] = number
     with pytest.raises(SceneInvalidError, match="sink_1"):
-        poses_from_json(value, Tables(writer.arrays()))
+        poses_of(convert(value, PosesJson, "poses"), Tables(writer.arrays()))

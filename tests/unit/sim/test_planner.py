@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 from tests.fakes import furniture as make
 from tests.fakes.plans import awkward_scene, task_over, with_objects, words_of
+from tests.fakes.pose_caches import build_pose_cache
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks, placed, upright
 
-from embomatrix.sim.placing.pose_cache import build_pose_cache
 from embomatrix.sim.planner.oracle import PROOF_SEEDS, PlanNotFound, find_plan
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.syntax import MAX_STEPS, Skill

@@ -5,6 +5,7 @@ import time
 
 import pytest
 from tests.fakes import furniture as make
+from tests.fakes.pose_caches import build_pose_cache
 from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.bullet.client import ClientPool
@@ -12,7 +13,7 @@ from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.mini_world import MiniWorld, StaticObject
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.candidates import beside, candidates, stands_in
-from embomatrix.sim.placing.pose_cache import POSES, PlacementLibrary, build_pose_cache
+from embomatrix.sim.placing.pose_cache import POSES, PlacementLibrary
 from embomatrix.sim.state.relations import Relations
 from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.poses import PlacementKey
@@ -56,7 +57,7 @@ def test_impossible_pairs_have_no_entry(cache) -> None:
     assert (f"shelf-{make.MODEL}", Relation.UNDER) not in keys
 
 
-def test_every_cached_pose_is_in_its_relation_and_stays_put(cache, pool) -> None:
+def test_every_cached_pose_has_its_relation_and_is_stable(cache, pool) -> None:
     assets = kitchen_scene().assets
     mini = MiniWorld(pool)
     for key, poses in cache.placements.items():
@@ -87,7 +88,7 @@ def test_every_named_object_has_standing_poses(cache) -> None:
     assert all(cache.stands.values())
 
 
-def test_equal_seeds_give_equal_caches_whatever_was_built_before(cache, pool) -> None:
+def test_equal_seeds_give_equal_caches(cache, pool) -> None:
     library = PlacementLibrary(pool)
     engine = BulletEngine(kitchen_scene(), pool)
     build_pose_cache(kitchen_scene(), ("table_lamp_1",), ("sink_1",), seed=1, engine=engine, library=library)
@@ -102,7 +103,7 @@ def test_equal_seeds_give_equal_caches_whatever_was_built_before(cache, pool) ->
     library.close()
 
 
-def test_library_knows_equal_assets_again_and_tells_changed_ones_apart(pool) -> None:
+def test_library_identifies_assets_by_content(pool) -> None:
     library = PlacementLibrary(pool)
     first = library.poses(make.apple(), make.kitchen_table(), Relation.ONTOP, 0)
     started = time.perf_counter()
@@ -113,7 +114,7 @@ def test_library_knows_equal_assets_again_and_tells_changed_ones_apart(pool) -> 
     library.close()
 
 
-def test_thing_too_tall_for_a_cavity_is_not_put_inside() -> None:
+def test_too_tall_object_is_not_placed_inside_a_cavity() -> None:
     lamp, microwave = make.table_lamp(), make.microwave()
     assert list(candidates(lamp, microwave, Relation.INSIDE, (0.5, 0.5), 20)) == []
     assert len(list(candidates(make.apple(), microwave, Relation.INSIDE, (0.5, 0.5), 20))) == 20
@@ -129,7 +130,7 @@ def test_unknown_name_is_a_key_error() -> None:
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.4])
-def test_poses_beside_a_neighbour_are_next_to_it_by_the_definition_of_nextto(pool, yaw: float) -> None:
+def test_poses_beside_a_neighbour_satisfy_nextto(pool, yaw: float) -> None:
     scene = kitchen_scene()
     engine = BulletEngine(scene, pool)
     library = PlacementLibrary(pool)
@@ -153,7 +154,7 @@ def test_poses_beside_a_neighbour_are_next_to_it_by_the_definition_of_nextto(poo
     library.close()
 
 
-def test_beside_what_stands_at_an_edge_nothing_hangs_over_it() -> None:
+def test_poses_beside_a_neighbour_stay_on_the_surface() -> None:
     apple, table = make.apple(), make.kitchen_table()
     width, depth, height = table.size_m
     corner = Aabb((width / 2 - 0.3, depth / 2 - 0.3, height / 2), (width / 2, depth / 2, height / 2 + 0.3))

@@ -1,4 +1,4 @@
-"""What a bundle carries ready-made changes how fast a scene loads, and nothing else."""
+"""Prepared arrays of a bundle change loading time only."""
 
 import contextlib
 from dataclasses import replace
@@ -39,7 +39,7 @@ def _loaded(bundle):
     return contextlib.closing(Simulator(bundle, BulletEngine(bundle.scene, None, PreparedScene.of(bundle))))
 
 
-def test_boxes_obstacles_and_floor_are_those_that_loading_would_derive(bundle):
+def test_prepared_arrays_equal_derived_ones(bundle):
     found = PreparedScene.of(bundle)
     bare = replace(bundle, prepared={})
     with _loaded(bare) as derived, _loaded(bundle) as carried:
@@ -55,7 +55,7 @@ def test_boxes_obstacles_and_floor_are_those_that_loading_would_derive(bundle):
 
 
 @pytest.mark.parametrize("plan", PLANS)
-def test_traces_are_equal_to_the_bit_with_and_without(bundle, plan):
+def test_traces_are_equal_with_and_without_prepared_arrays(bundle, plan):
     task = bundle.tasks["test"]
     traces = []
     for variant in (bundle, replace(bundle, prepared={})):
@@ -85,7 +85,7 @@ def _without(arrays, name):
         lambda arrays: arrays | {"1.obstacles": arrays["1.obstacles"].ravel()},
     ],
 )
-def test_what_does_not_fit_the_scene_is_derived_instead(bundle, spoil):
+def test_mismatched_arrays_are_derived_instead(bundle, spoil):
     spoilt = replace(bundle, prepared=spoil(dict(bundle.prepared)))
     assert PreparedScene.of(spoilt) is None
     task = bundle.tasks["test"]

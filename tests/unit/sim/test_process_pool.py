@@ -1,4 +1,4 @@
-"""Processes that share the factory's work, and what becomes of them."""
+"""Pools of processes and their failures."""
 
 import os
 import subprocess
@@ -20,7 +20,7 @@ if __name__ == "__main__":
 """
 
 
-def test_processes_go_with_the_one_that_started_them_when_that_is_killed(tmp_path):
+def test_pool_processes_die_with_their_killed_parent(tmp_path):
     program = tmp_path / "sleeper.py"
     program.write_text(SLEEPER)
     with subprocess.Popen([sys.executable, program], stdout=subprocess.PIPE, text=True) as parent:
@@ -31,7 +31,7 @@ def test_processes_go_with_the_one_that_started_them_when_that_is_killed(tmp_pat
     assert alive == []
 
 
-def test_work_is_done_in_other_processes_that_began_as_they_were_told(tmp_path):
+def test_work_runs_in_initialised_pool_processes(tmp_path):
     with process_pool(1, os.chdir, tmp_path) as pool:
         assert pool.submit(os.getcwd).result() == str(tmp_path)
         assert pool.submit(os.getpid).result() != os.getpid()
@@ -51,7 +51,7 @@ class Adder:
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_shared_work_comes_in_the_order_of_the_items_from_one_process_or_several(jobs):
+def test_shared_work_keeps_the_order_of_items(jobs):
     with shared_work(jobs, Adder, Adder.add, 10, died=RuntimeError()) as add:
         done = list(add(range(8)))
     assert [value for value, _ in done] == list(range(10, 18))
@@ -63,7 +63,7 @@ class Mortal(Adder):
         os._exit(item)
 
 
-def test_the_death_of_one_of_several_processes_is_told_as_the_caller_says():
+def test_death_of_a_pool_process_raises_the_callers_error():
     with (
         shared_work(2, Mortal, Mortal.die, 0, died=RuntimeError("fewer jobs")) as work,
         pytest.raises(RuntimeError, match="fewer jobs"),

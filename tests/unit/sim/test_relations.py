@@ -1,4 +1,4 @@
-"""Relations: each definition at its tolerance, and who moves along with whom."""
+"""Relations at their tolerances, and groups of objects that move together."""
 
 import dataclasses
 import math
@@ -59,7 +59,7 @@ def relations(engine):
         (("ontop", "apple_1", "apple_1"), False),
     ],
 )
-def test_relations_of_the_kitchen_are_what_a_person_sees(relations, atom, holds) -> None:
+def test_relations_of_the_kitchen_match_a_human_reading(relations, atom, holds) -> None:
     relation, a, b = atom
     assert relations.holds(Relation(relation), a, b) is holds
 
@@ -78,7 +78,7 @@ def test_centre_past_the_edge_does_not_rest(engine, relations, past_edge_m, rest
 
 @settings(max_examples=60, deadline=None)
 @given(st.floats(-3.1, 3.1), st.floats(0.0, 4.0), st.floats(0.0, 2.0))
-def test_moving_a_thing_away_ends_ontop_and_moving_it_back_restores_it(engine, yaw, away_m, up_m) -> None:
+def test_moving_an_object_away_ends_ontop_and_moving_it_back_restores_it(engine, yaw, away_m, up_m) -> None:
     relations = Relations(engine)
     table = engine.aabb("breakfast_table_1")
     low, high = table.low_m, table.high_m
@@ -94,14 +94,14 @@ def test_moving_a_thing_away_ends_ontop_and_moving_it_back_restores_it(engine, y
     assert relations.ontop("apple_1", "breakfast_table_1")
 
 
-def test_thing_on_the_floor_below_the_board_is_under_the_table(engine, relations) -> None:
+def test_object_on_the_floor_below_the_board_is_under_the_table(engine, relations) -> None:
     engine.set_pose("bowl_1", Pose((2.0, 1.3, 0.035)))
     assert relations.under("bowl_1", "breakfast_table_1")
     engine.set_pose("bowl_1", Pose((1.0, 1.3, 0.035)))
     assert not relations.under("bowl_1", "breakfast_table_1")
 
 
-def test_opening_a_thing_does_not_move_it_out_from_under_another(engine, relations) -> None:
+def test_opening_an_object_does_not_end_under(engine, relations) -> None:
     table, microwave = (engine.scene.asset_of(name) for name in ("breakfast_table_1", "microwave_1"))
     x, y, _ = engine.pose("breakfast_table_1").position_m
     edge = x + table.size_m[0] / 2
@@ -112,7 +112,7 @@ def test_opening_a_thing_does_not_move_it_out_from_under_another(engine, relatio
     assert relations.under("microwave_1", "breakfast_table_1")
 
 
-def test_what_lies_in_a_cavity_is_under_nothing_beyond_its_roof(engine, relations) -> None:
+def test_cavity_roof_ends_under(engine, relations) -> None:
     x, y, top = 0.6, 3.6, 1.7 + APPLE_M
     assert relations.inside("chicken_leg_1", "fridge_1")
     engine.set_pose("apple_1", Pose((x, y, top)))
@@ -120,7 +120,7 @@ def test_what_lies_in_a_cavity_is_under_nothing_beyond_its_roof(engine, relation
     assert not relations.under("chicken_leg_1", "apple_1")
 
 
-def test_thing_on_a_shelf_board_is_not_under_the_shelf(relations) -> None:
+def test_object_on_a_shelf_board_is_not_under_the_shelf(relations) -> None:
     assert not relations.under("mug_1", "shelf_1")
 
 
@@ -130,7 +130,7 @@ def test_mug_that_sticks_out_of_a_bowl_is_inside_while_its_centre_is_below_the_r
         assert relations.inside("mug_1", "bowl_1") is inside
 
 
-def test_thing_that_sticks_out_of_a_doorway_is_not_inside(engine, relations) -> None:
+def test_object_that_sticks_out_of_a_door_opening_is_not_inside(engine, relations) -> None:
     for y, inside in ((3.36, True), (3.33, False)):  # the cavity begins at y = 3.32, the leg is 0.06 m wide
         engine.set_pose("chicken_leg_1", Pose((0.6, y, 0.875)))
         assert relations.inside("chicken_leg_1", "fridge_1") is inside
@@ -144,7 +144,7 @@ def test_nextto_ends_at_a_sixth_of_the_mean_extent(engine, relations) -> None:
         assert relations.nextto("mug_1", "apple_1") is near
 
 
-def test_things_at_different_heights_are_not_next_to_each_other(engine, relations) -> None:
+def test_objects_at_different_heights_are_not_next_to_each_other(engine, relations) -> None:
     engine.set_pose("mug_1", Pose((1.95, 1.6, TABLE_M + 0.2)))
     assert not relations.nextto("apple_1", "mug_1")
 
@@ -176,7 +176,7 @@ def test_food_in_a_bowl_moves_along_and_a_plate_on_its_rim_blocks(engine, relati
     assert relations.group_of("bowl_1") == ("bowl_1", "apple_1")
 
 
-def test_parked_object_stands_in_no_relation(engine, relations) -> None:
+def test_parked_object_has_no_relations(engine, relations) -> None:
     engine.park("apple_1")
     for relation in Relation:
         room_or_thing = "kitchen_0" if relation is Relation.INROOM else "breakfast_table_1"
@@ -185,7 +185,7 @@ def test_parked_object_stands_in_no_relation(engine, relations) -> None:
     assert relations.resting_on("breakfast_table_1") == ("bowl_1",)
 
 
-def test_one_open_door_of_two_is_a_way_in() -> None:
+def test_one_open_door_of_two_is_an_opening() -> None:
     cabinet = make.cabinet()
     left, right = cabinet.links[1], dataclasses.replace(cabinet.links[1], name="right")
     double = dataclasses.replace(cabinet, links=(cabinet.links[0], left, right))

@@ -1,4 +1,4 @@
-"""After any sequence of skills a reset leaves the state, and all that is derived from it, as it was at first."""
+"""A reset restores the state and everything derived from it."""
 
 import pytest
 from hypothesis import given, settings
@@ -48,7 +48,7 @@ def probed():
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(ERRANDS, min_size=1, max_size=8))
-def test_whatever_was_done_a_reset_undoes_it_to_the_bit(flat, probed, errands) -> None:
+def test_reset_undoes_any_sequence_of_skills_to_the_bit(flat, probed, errands) -> None:
     task = task_over(flat.world.scene)
     flat.reset(task, 0)
     before = flat.world.state_bytes()

@@ -1,9 +1,9 @@
-"""How panels open that nothing was moved near to is found out ahead: the answers are those of looking at it then."""
+"""Predicted swings equal measured ones."""
 
 import pytest
 from tests.fakes.plans import plan_of, task_over
 from tests.fakes.scenes import upright
-from tests.unit.sim.test_leaves import drawer_scene
+from tests.unit.sim.test_panels import drawer_scene
 
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.simulation import load_simulator
@@ -37,7 +37,7 @@ def in_the_way(simulator: Simulator, y_m: float) -> None:
 
 
 @pytest.mark.parametrize("plan", PLANS)
-def test_plans_go_the_same_whether_doors_were_looked_at_ahead_or_not(both, plan) -> None:
+def test_predicted_swings_do_not_change_traces(both, plan) -> None:
     task = task_over(both[0].world.scene)
     first, second = (simulator.execute(task, plan_of(task, plan), 3) for simulator in both)
     assert first.failure is None
@@ -45,7 +45,7 @@ def test_plans_go_the_same_whether_doors_were_looked_at_ahead_or_not(both, plan)
 
 
 @pytest.mark.parametrize("y_m", [0.6, 0.64, 0.75, 0.9, 1.2, 3.0])
-def test_what_came_before_a_drawer_stops_it_as_if_nothing_had_been_predicted(both, y_m) -> None:
+def test_new_obstacle_before_a_drawer_overrides_the_prediction(both, y_m) -> None:
     task = task_over(both[0].world.scene)
     outcomes = []
     for simulator in both:
@@ -55,7 +55,7 @@ def test_what_came_before_a_drawer_stops_it_as_if_nothing_had_been_predicted(bot
     assert outcomes[0] == outcomes[1]
 
 
-def test_looking_ahead_leaves_the_scene_as_it_was(both) -> None:
+def test_prediction_leaves_the_scene_unchanged(both) -> None:
     ahead, then = both
     task = task_over(ahead.world.scene)
     for simulator in both:
@@ -64,7 +64,7 @@ def test_looking_ahead_leaves_the_scene_as_it_was(both) -> None:
         assert ahead.world.engine.state_bytes() == then.world.engine.state_bytes()
 
 
-def test_nothing_is_foreseen_in_a_scene_from_which_something_is_gone(both) -> None:
+def test_changed_scene_gets_no_predictions(both) -> None:
     _, then = both
     simulator = load_simulator(Bundle(drawer_scene(), {}))
     try:
@@ -78,7 +78,7 @@ def test_nothing_is_foreseen_in_a_scene_from_which_something_is_gone(both) -> No
         simulator.close()
 
 
-def test_what_was_foreseen_is_not_measured_again(both) -> None:
+def test_predicted_swing_is_not_measured_again(both) -> None:
     ahead, _ = both
     ahead.reset(task_over(ahead.world.scene), 0)
     assert not ahead.world.swings.open(DRAWERS)

@@ -18,7 +18,7 @@ from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, Evaluatio
 from embomatrix.trainer.evaluation.baselines import BaselineName, baseline_for
 from embomatrix.trainer.evaluation.benchmark import find_benchmark
 from embomatrix.trainer.evaluation.exam import WorldExam
-from embomatrix.trainer.evaluation.judging import AnswerJudge
+from embomatrix.trainer.evaluation.judging import judge_answers
 from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
 from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
@@ -43,13 +43,13 @@ def setup_of(bench, samples=2, codec="lines", **changes):
 
 def judged(bench, answers, setup=None):
     executor = HereExecutor(bench.folder)
-    found = AnswerJudge(bench, setup or setup_of(bench), executor).next_pause_state(answers)
+    found = judge_answers(bench, setup or setup_of(bench), executor, answers)
     return found, executor
 
 
 def report(bench, answers, setup=None):
     setup = setup or setup_of(bench)
-    marked = WorldExam(bench, HereExecutor(bench.folder)).next_pause_state(setup, answers, lambda *_: None)
+    marked = WorldExam(bench, HereExecutor(bench.folder)).judge(setup, answers, lambda *_: None)
     value = report_of(setup, marked)
     return value, evaluation_page(value, marked.pictures)
 
@@ -121,7 +121,7 @@ def test_equal_plans_of_a_task_are_executed_once(bench):
 def test_process_pool_gives_the_same_outcomes_as_one_process(bench):
     answers = asked(bench, BaselineName.RANDOM, 2)
     here, _ = judged(bench, answers)
-    assert AnswerJudge(bench, setup_of(bench), RolloutPool(bench.folder, 2)).next_pause_state(answers) == here
+    assert judge_answers(bench, setup_of(bench), RolloutPool(bench.folder, 2), answers) == here
 
 
 def test_report_from_stored_answers_is_bit_identical(bench, tmp_path):

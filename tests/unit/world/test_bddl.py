@@ -1,4 +1,4 @@
-"""The parser reads both dialects, and an error names the line and the column of what is wrong."""
+"""The parser accepts both dialects; errors name line and column."""
 
 import contextlib
 import json
@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.fakes.bddl_text import render_problem
 
-from embomatrix.world.bddl import BddlError, BddlProblem, parse_formula, parse_problem, render_problem
+from embomatrix.world.bddl import BddlError, BddlProblem, parse_formula, parse_problem
 from embomatrix.world.evaluate import render
 from embomatrix.world.goal import (
     And,
@@ -78,7 +79,7 @@ WILD = TIDY.replace("basket.n.01_1 - basket", "basket.n.01_1 basket.n.01_* - bas
 )
 
 
-def test_wildcard_stands_for_objects_that_are_named_once_the_room_is_known() -> None:
+def test_wildcard_expands_to_objects_of_the_known_room() -> None:
     problem = parse_problem(WILD)
     assert problem.wildcards == {"basket.n.01_*": "living_room"}
     assert problem.types["basket.n.01"] == ("basket.n.01_1",)
@@ -99,12 +100,12 @@ def test_wildcard_stands_for_objects_that_are_named_once_the_room_is_known() -> 
         ("(inroom basket.n.01_*", "(ontop basket.n.01_*"),
     ],
 )
-def test_wildcard_is_only_ever_in_a_room(old: str, new: str) -> None:
+def test_wildcard_outside_inroom_is_refused(old: str, new: str) -> None:
     with pytest.raises(BddlError, match="wildcard"):
         parse_problem(WILD.replace(old, new).replace("_* living_room", "_* floor.n.01_1"))
 
 
-def test_substance_is_called_by_its_synset_where_one_can_stand() -> None:
+def test_substance_is_named_by_its_synset() -> None:
     formula = parse_formula("(not (covered x dust.n.01))", {"x": "plate"})
     assert formula == Not(Atom("covered", ("x", "dust.n.01")))
     for text in ("(covered x dusk.n.01)", "(ontop x dust.n.01)", "(covered dust.n.01 dust.n.01)"):
@@ -172,7 +173,7 @@ ERRORS: dict[str, tuple[str, str, str, int]] = {
 
 
 @pytest.mark.parametrize("name", ERRORS)
-def test_error_names_the_line_of_what_is_wrong(name: str) -> None:
+def test_error_names_the_line(name: str) -> None:
     old, new, message, line = ERRORS[name]
     assert old in TIDY
     with pytest.raises(BddlError) as caught:
@@ -189,19 +190,19 @@ def test_column_points_at_the_word() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "   ; nothing\n", "apple", ")", "()", "(" * 10_000, "(define)"])
-def test_nonsense_is_refused_in_a_sentence(text: str) -> None:
+def test_nonsense_is_refused_with_an_explanation(text: str) -> None:
     with pytest.raises(BddlError):
         parse_problem(text)
 
 
 @given(st.text(alphabet="()?-:;. \nandforallnotdefineobjectsgoalinit_1", max_size=200))
-def test_garbage_raises_nothing_but_the_parser_s_error(text: str) -> None:
+def test_garbage_raises_only_parser_errors(text: str) -> None:
     with pytest.raises(BddlError):
         parse_problem(text)
 
 
 @given(st.integers(0, len(TIDY) - 1), st.sampled_from(["", "(", ")", " ", "?", "x"]))
-def test_one_changed_character_is_read_or_refused(position: int, character: str) -> None:
+def test_text_with_one_changed_character_parses_or_raises_parser_error(position: int, character: str) -> None:
     text = TIDY[:position] + character + TIDY[position + 1 :]
     with contextlib.suppress(BddlError):
         parse_problem(text)
@@ -235,17 +236,17 @@ def formulas() -> st.SearchStrategy[Formula]:
 
 
 @given(formulas())
-def test_rendered_formula_is_read_back_equal(formula: Formula) -> None:
+def test_rendered_formula_parses_to_an_equal_one(formula: Formula) -> None:
     assert parse_formula(render(formula), OBJECTS) == formula
 
 
 @given(formulas())
-def test_rendered_problem_is_read_back_equal(goal: Formula) -> None:
+def test_rendered_problem_parses_to_an_equal_one(goal: Formula) -> None:
     problem = BddlProblem("p", OBJECTS, parse_problem(TIDY).init[:0], goal)
     assert parse_problem(render_problem(problem)) == problem
 
 
-def test_every_activity_of_behavior_1k_is_read() -> None:
+def test_every_activity_of_behavior_1k_parses() -> None:
     problems = [parse_problem(path.read_text()) for path in bddl_activities()]
     assert len(problems) >= 1016
     assert all(parse_problem(render_problem(problem)).goal == problem.goal for problem in problems)
@@ -254,7 +255,7 @@ def test_every_activity_of_behavior_1k_is_read() -> None:
 @pytest.mark.skipif(
     not SAMPLE.exists(), reason="the sample of the paper's tasks is not beside the repository"
 )
-def test_every_task_of_the_paper_s_factory_is_read() -> None:
+def test_every_task_of_the_paper_s_factory_parses() -> None:
     texts = [json.loads(line)["bddl"] for line in SAMPLE.read_text().splitlines()]
     problems = [parse_problem(text) for text in texts]
     assert len(problems) == 400

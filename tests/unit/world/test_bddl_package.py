@@ -1,4 +1,4 @@
-"""Against the bddl package: the same texts are read alike, and the same formulas hold in the same states."""
+"""Parsing and evaluation agree with the bddl package."""
 
 import hashlib
 import re
@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.fakes.bddl_text import render_problem
 
-from embomatrix.world.bddl import WILDCARD, BddlProblem, InitLiteral, parse_problem, render_problem
+from embomatrix.world.bddl import WILDCARD, BddlProblem, InitLiteral, parse_problem
 from embomatrix.world.evaluate import evaluate
 from embomatrix.world.goal import (
     And,
@@ -77,7 +78,7 @@ def unmarked(nested: Any) -> Any:
     return nested.lstrip("?") if isinstance(nested, str) else [unmarked(item) for item in nested]
 
 
-def test_every_activity_is_read_as_by_the_bddl_package() -> None:
+def test_every_activity_parses_as_in_the_bddl_package() -> None:
     from bddl.parsing import parse_problem as parse_by_package
 
     for activity in ACTIVITIES:
@@ -149,7 +150,7 @@ class Package:
         return bool(evaluate_goal_conditions(self.goal)[0])
 
 
-def test_every_activity_is_judged_as_by_the_bddl_package_in_six_states() -> None:
+def test_every_activity_evaluates_as_in_the_bddl_package_in_six_states() -> None:
     verdicts: list[bool] = []
     for number, activity in enumerate(ACTIVITIES):
         formula = parse_problem(text_of(activity)).goal
@@ -228,6 +229,6 @@ def test_formulas_of_all_ten_operators_hold_in_the_same_states(
     assert evaluate(goal, facts, problem.types) is expected
 
 
-def test_the_types_of_a_problem_keep_the_order_of_the_text() -> None:
+def test_types_of_a_problem_keep_the_order_of_the_text() -> None:
     shuffled = re.sub(r"\s+", " ", render_problem(BddlProblem("p-0", OBJECTS, (), And(()))))
     assert list(parse_problem(shuffled).types) == [*KINDS]

@@ -1,4 +1,4 @@
-"""Bundles come back equal, have one digest each, and refuse what is damaged, hostile or foreign."""
+"""Bundles survive encoding, have one digest each, and refuse damaged, hostile or foreign data."""
 
 import dataclasses
 import zlib
@@ -16,7 +16,7 @@ from embomatrix.world.bundle import (
 from embomatrix.world.task import Task
 
 
-def test_bundle_comes_back_equal(bundle: Bundle) -> None:
+def test_bundle_survives_encoding_and_decoding(bundle: Bundle) -> None:
     assert decode_bundle(encode_bundle(bundle)) == bundle
 
 
@@ -41,7 +41,7 @@ def test_wrong_digest_names_what_was_found_and_what_was_expected(bundle: Bundle)
     assert bundle_digest(data) in str(caught.value)
 
 
-def test_damage_is_refused_wherever_it_strikes(bundle: Bundle) -> None:
+def test_damaged_bundle_is_refused(bundle: Bundle) -> None:
     data = encode_bundle(bundle)
     for position in range(0, len(data), 37):
         broken = bytearray(data)
@@ -67,7 +67,7 @@ def test_decompression_bomb_is_refused() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", '{"format": 1}', "[" * 100_000, '{"format": NaN}', "null"])
-def test_compressed_nonsense_is_refused_in_a_sentence(text: str) -> None:
+def test_compressed_nonsense_is_refused(text: str) -> None:
     with pytest.raises(BundleError):
         decode_bundle(zlib.compress(text.encode()))
 
@@ -79,7 +79,7 @@ def test_bundle_of_another_format_names_both(bundle: Bundle) -> None:
         decode_bundle(zlib.compress(content))
 
 
-def test_bundle_of_the_first_format_is_told_to_be_built_anew() -> None:
+def test_bundle_of_the_first_format_names_the_remedy() -> None:
     with pytest.raises(BundleError, match="build the dataset anew"):
         decode_bundle(zlib.compress(b'{"format":1,"scene":{}}'))
 

@@ -1,4 +1,4 @@
-"""The catalog: what the tables hold, what is corrected, how an unknown name is answered."""
+"""Contents of the catalog, its corrections, and errors for unknown names."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_synsets_reach_their_descendants(catalog: Catalog) -> None:
     assert not catalog.is_a("apple.n.01", "table.n.02")
 
 
-def test_substances_are_told_by_their_ability(catalog: Catalog) -> None:
+def test_substances_are_recognised_by_their_ability(catalog: Catalog) -> None:
     assert "substance" in catalog.abilities_of("water.n.06")
     assert "substance" not in catalog.abilities_of("apple.n.01")
 
@@ -123,13 +123,13 @@ def test_every_category_has_a_mass_and_a_model(catalog: Catalog) -> None:
         (lambda c: c.synset_of("qqqqqqq"), "for example"),
     ],
 )
-def test_unknown_name_is_answered_with_close_ones(catalog: Catalog, ask, said: str) -> None:
+def test_unknown_name_error_suggests_close_matches(catalog: Catalog, ask, said: str) -> None:
     with pytest.raises(CatalogError, match="unknown") as caught:
         ask(catalog)
     assert said in str(caught.value)
 
 
-def test_a_model_at_a_share_of_its_size_has_its_shape_and_the_cube_of_its_mass() -> None:
+def test_scaled_model_keeps_its_shape_and_scales_its_mass_with_the_cube() -> None:
     catalog = Catalog.load()
     (whole,) = catalog.models_of("chorizo")
     small = catalog.model("chorizo", f"{whole.model_id}@0.8")
@@ -140,7 +140,7 @@ def test_a_model_at_a_share_of_its_size_has_its_shape_and_the_cube_of_its_mass()
 
 
 @pytest.mark.parametrize("share", ["0.1", "3", "nan", "half", "-1"])
-def test_a_share_beyond_all_sizes_is_refused(share: str) -> None:
+def test_scale_out_of_range_is_refused(share: str) -> None:
     catalog = Catalog.load()
     (whole,) = catalog.models_of("chorizo")
     with pytest.raises(CatalogError, match=r"expected a number from 0\.5 to 2\.0"):

@@ -1,4 +1,4 @@
-"""Decoding trusts nothing: every rule that the engine needs is checked, and the error names the field."""
+"""Decoding checks every rule that the engine needs; errors name the field."""
 
 import contextlib
 import copy
@@ -16,11 +16,20 @@ from hypothesis import strategies as st
 
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.codec import asset_from_json, asset_to_json, scene_from_json, scene_to_json
-from embomatrix.world.codec_task import poses_from_json, poses_to_json, task_from_json, task_to_json
-from embomatrix.world.records import SceneInvalidError
+from embomatrix.world.codec_task import poses_of, poses_to_json, task_of, task_to_json
+from embomatrix.world.poses import PoseCache
+from embomatrix.world.records import PosesJson, SceneInvalidError, TaskJson, convert
 from embomatrix.world.scene import Scene, Window
 from embomatrix.world.tables import Tables, TableWriter
 from embomatrix.world.task import Task
+
+
+def task_from_json(value: object) -> Task:
+    return task_of(convert(value, TaskJson, "task"), "task")
+
+
+def poses_from_json(value: object, tables: Tables) -> PoseCache:
+    return poses_of(convert(value, PosesJson, "poses"), tables)
 
 
 def through_text(value: Any) -> Any:
@@ -53,7 +62,7 @@ def test_windows_survive_json(scene: Scene) -> None:
         (replace(WINDOW, along="z"), "a wall along x or y"),
     ],
 )
-def test_a_window_that_breaks_a_rule_is_named(scene: Scene, window: Window, found: str) -> None:
+def test_error_names_the_invalid_window(scene: Scene, window: Window, found: str) -> None:
     with pytest.raises(SceneInvalidError, match=found) as caught:
         scene_from_json(scene_to_json(replace(scene, windows=(window,))))
     assert caught.value.field.startswith("scene.windows[0]")
@@ -155,14 +164,14 @@ json_values = st.recursive(
 
 
 @given(json_values)
-def test_any_json_value_is_read_or_refused_by_the_one_error(value: Any) -> None:
+def test_any_json_value_decodes_or_raises_scene_invalid_error(value: Any) -> None:
     for read in (scene_from_json, task_from_json, asset_from_json, partial(poses_from_json, tables=NO_ROWS)):
         with pytest.raises(SceneInvalidError):
             read(value)
 
 
 @given(st.data())
-def test_scene_with_one_value_replaced_is_read_or_refused_by_the_one_error(data: st.DataObject) -> None:
+def test_scene_with_one_replaced_value_decodes_or_raises_scene_invalid_error(data: st.DataObject) -> None:
     value = through_text(SCENE_JSON)
     place: Any = value
     while isinstance(place, dict | list) and place:

@@ -1,4 +1,4 @@
-"""A dataset survives the disk, reads bundles when asked, and says what is wrong with a folder."""
+"""Datasets survive the disk, read bundles on demand, and explain damaged folders."""
 
 import json
 from pathlib import Path
@@ -81,7 +81,7 @@ def test_missing_and_damaged_bundles_are_named(tmp_path: Path, bundle: Bundle, t
 
 
 @pytest.mark.parametrize("digest", ["", "sha256:../../etc/passwd", "md5:00", "sha256:" + "g" * 64])
-def test_digest_that_is_no_digest_never_becomes_a_path(
+def test_malformed_digest_never_becomes_a_path(
     tmp_path: Path, bundle: Bundle, task: Task, digest: str
 ) -> None:
     write(tmp_path, bundle, task)
@@ -90,7 +90,7 @@ def test_digest_that_is_no_digest_never_becomes_a_path(
 
 
 @pytest.mark.parametrize("digest", ["Atlantis", "sha256:" + "g" * 64])
-def test_record_without_a_digest_is_named_by_its_line(
+def test_record_with_a_malformed_digest_is_named_by_its_line(
     tmp_path: Path, bundle: Bundle, task: Task, digest: str
 ) -> None:
     record = write(tmp_path, bundle, task)

@@ -1,4 +1,4 @@
-"""Formulas mean what they say, and the reward's atoms are the conjuncts of the goal."""
+"""Semantics of formulas, and the reward's atoms as conjuncts of the goal."""
 
 from dataclasses import dataclass, field
 
@@ -73,7 +73,7 @@ def test_formula_holds_or_not(text: str, true: list[str], expected: bool) -> Non
     assert evaluate(goal(text), facts(*true), TYPES) is expected
 
 
-def test_only_the_facts_that_decide_are_asked_for() -> None:
+def test_only_deciding_facts_are_queried() -> None:
     table = facts("open box_1")
     assert evaluate(goal("(or (open box_1) (open box_2) (hot lamp_1))"), table, TYPES)
     assert table.asked == 1
@@ -108,14 +108,14 @@ def test_unknown_type_and_free_variable_are_named() -> None:
         evaluate(Atom("hot", ("?x",)), facts(), TYPES)
 
 
-def test_objects_of_a_goal_are_those_it_names_and_those_it_ranges_over() -> None:
+def test_objects_of_a_goal_include_named_and_quantified_ones() -> None:
     formula = goal(f"(and {EVERY} (inroom lamp_1 kitchen_0))")
     assert objects_of(formula, TYPES) == {"apple_1", "apple_2", "box_1", "lamp_1"}
     assert types_of(formula) == {"apple"}
     assert [atom.predicate for atom in atoms_of(formula)] == ["inside", "inroom"]
 
 
-def test_substitution_reaches_objects_and_spares_bound_variables() -> None:
+def test_substitution_replaces_objects_but_not_bound_variables() -> None:
     renamed = substitute(goal(EVERY), {"box_1": "crate_7", "?x": "wrong"})
     assert render(renamed) == "(forall (?x - apple) (inside ?x crate_7))"
 

@@ -1,4 +1,4 @@
-"""The algebra of poses, and what boxes say of the points and boxes within them."""
+"""Algebra of poses and boxes."""
 
 import dataclasses
 import math
@@ -35,12 +35,12 @@ def same_frame(a: Pose, b: Pose) -> bool:
 
 
 @given(POSES, POSES, POSES)
-def test_products_chain_however_they_are_bracketed(a, b, c) -> None:
+def test_pose_product_is_associative(a, b, c) -> None:
     assert same_frame((a @ b) @ c, a @ (b @ c))
 
 
 @given(POSES)
-def test_a_pose_and_its_inverse_cancel_out_on_either_side(pose) -> None:
+def test_pose_and_its_inverse_cancel_on_either_side(pose) -> None:
     identity = Pose((0.0, 0.0, 0.0))
     assert same_frame(pose @ pose.inverse(), identity)
     assert same_frame(pose.inverse() @ pose, identity)
@@ -48,12 +48,12 @@ def test_a_pose_and_its_inverse_cancel_out_on_either_side(pose) -> None:
 
 
 @given(POSES, POSES, POINTS)
-def test_a_product_maps_a_point_as_its_factors_do_one_after_the_other(a, b, point) -> None:
+def test_product_maps_a_point_like_its_factors_in_sequence(a, b, point) -> None:
     assert near((a @ b).apply(point), a.apply(b.apply(point)))
 
 
 @given(POSES, st.lists(POINTS, min_size=1, max_size=5))
-def test_many_points_are_mapped_as_each_of_them(pose, points) -> None:
+def test_batch_mapping_equals_mapping_each_point(pose, points) -> None:
     assert near(pose.apply_all(np.array(points)), [pose.apply(point) for point in points])
 
 
@@ -63,25 +63,25 @@ def test_poses_keep_distances(pose, one, other) -> None:
 
 
 @given(POSES)
-def test_a_rotation_is_one(pose) -> None:
+def test_rotation_matrix_is_orthonormal(pose) -> None:
     assert near(pose.rotation @ pose.rotation.T, np.eye(3))
     assert near(np.linalg.det(pose.rotation), 1.0)
 
 
 @given(METRES, METRES, METRES, st.floats(-math.pi + 1e-6, math.pi))
-def test_an_upright_pose_tells_the_yaw_that_it_was_made_of(x, y, z, yaw) -> None:
+def test_upright_pose_returns_its_yaw(x, y, z, yaw) -> None:
     pose = Pose.from_xyz_yaw(x, y, z, yaw)
     assert near(pose.yaw, yaw)
     assert near(pose.apply((1.0, 0.0, 0.0)), (x + math.cos(yaw), y + math.sin(yaw), z))
 
 
 @given(BOXES, BOXES, st.floats(0.0, 1.0))
-def test_boxes_overlap_both_ways_and_exactly_when_the_grown_one_does(a, b, margin_m) -> None:
+def test_overlap_is_symmetric_and_equals_overlap_of_the_grown_box(a, b, margin_m) -> None:
     assert a.overlaps(b, margin_m) == b.overlaps(a, margin_m) == a.grown(margin_m).overlaps(b)
 
 
 @given(st.lists(BOXES, min_size=1, max_size=4))
-def test_the_box_around_boxes_holds_their_corners_and_touches_them(boxes) -> None:
+def test_box_around_boxes_is_tight(boxes) -> None:
     whole = Aabb.around(boxes)
     assert all(whole.contains(corner) for box in boxes for corner in (box.low_m, box.high_m))
     assert whole.low_m == tuple(np.min([box.low_m for box in boxes], axis=0))
@@ -89,7 +89,7 @@ def test_the_box_around_boxes_holds_their_corners_and_touches_them(boxes) -> Non
 
 
 @given(POSES, SIZES, st.tuples(*[st.floats(-0.5, 0.5)] * 3))
-def test_every_point_of_a_part_lies_in_its_bounding_box(pose, size, share) -> None:
+def test_bounding_box_contains_every_point_of_a_part(pose, size, share) -> None:
     part = ConvexPart(Shape.BOX, Pose((0.0, 0.0, 0.0)), size)
     point = pose.apply(tuple(np.multiply(size, share).tolist()))
     assert part.aabb(pose).contains(point, margin_m=1e-9)
@@ -102,7 +102,7 @@ def test_every_point_of_a_part_lies_in_its_bounding_box(pose, size, share) -> No
         (Aabb((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), {"high_m": (2.0, 2.0, 2.0)}),
     ],
 )
-def test_poses_and_boxes_are_values_that_nobody_changes(value, change) -> None:
+def test_poses_and_boxes_are_immutable(value, change) -> None:
     assert pickle.loads(pickle.dumps(value)) == value == dataclasses.replace(value)
     assert hash(value) == hash(dataclasses.replace(value))
     assert dataclasses.replace(value, **change) != value

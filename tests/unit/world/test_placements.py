@@ -1,4 +1,4 @@
-"""Placements in flat arrays: what was written is read, pose by pose, and arrays that lie are refused."""
+"""Placements in flat arrays restore every pose and refuse invalid indices."""
 
 import numpy as np
 import pytest
@@ -6,10 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from embomatrix.world.geometry import Pose
-from embomatrix.world.placements import Placements, Stands, flattened
+from embomatrix.world.placements import Placements, flattened
 from embomatrix.world.poses import PlacementKey, StandPose
 from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.state import Relation
+from embomatrix.world.tables import Tables, TableWriter
 
 NAME = st.sampled_from(("apple-aa", "table-bb", "footprint-9x9x12cm", "level-floor"))
 KEY = st.builds(PlacementKey, NAME, NAME, st.sampled_from(Relation))
@@ -18,7 +19,7 @@ SETS = st.dictionaries(KEY, st.lists(POSE, min_size=1, max_size=3).map(tuple), m
 
 
 @given(SETS)
-def test_what_was_flattened_is_the_same_mapping(known) -> None:
+def test_flattened_placements_restore_the_same_mapping(known) -> None:
     placements = Placements(*flattened(known))
     assert dict(placements) == known
     assert placements == known
@@ -46,14 +47,14 @@ GOOD = [0, 1, 0, 0, 2]
         [0, 1, 0, 0, 9999],
     ],
 )
-def test_sets_that_point_nowhere_are_refused(row) -> None:
+def test_set_with_an_index_out_of_range_is_refused(row) -> None:
     spots = np.array([[0, 0, 0, 0, 0, 0, 1.0]] * 3)
     Placements(["a", "b"], np.array([GOOD], dtype=np.int32), spots)
     with pytest.raises(SceneInvalidError, match="sets"):
         Placements(["a", "b"], np.array([row], dtype=np.int32), spots)
 
 
-def test_what_stands_there_twice_is_refused() -> None:
+def test_duplicate_set_or_asset_is_refused() -> None:
     spots = np.array([[0, 0, 0, 0, 0, 0, 1.0]] * 3)
     with pytest.raises(SceneInvalidError, match="twice"):
         Placements(["a", "b"], np.array([GOOD, GOOD], dtype=np.int32), spots)
@@ -61,9 +62,10 @@ def test_what_stands_there_twice_is_refused() -> None:
         Placements(["a", "a"], np.array([GOOD], dtype=np.int32), spots)
 
 
-def test_standing_poses_are_made_of_the_rows_that_belong_to_a_name() -> None:
-    rows = np.array([[1.0, 2.0, 0.5], [3.0, 4.0, -0.5], [5.0, 6.0, 0.0]])
-    stands = Stands({"apple_1": (0, 2), "table_1": (2, 1), "sky_1": (3, 0)}, rows)
+def test_standing_poses_come_from_the_rows_of_their_name() -> None:
+    writer = TableWriter()
+    writer.stands([(1.0, 2.0, 0.5), (3.0, 4.0, -0.5), (5.0, 6.0, 0.0)])
+    stands = Tables(writer.arrays()).stands({"apple_1": (0, 2), "table_1": (2, 1), "sky_1": (3, 0)})
     assert stands == {
         "apple_1": (StandPose(1.0, 2.0, 0.5), StandPose(3.0, 4.0, -0.5)),
         "table_1": (StandPose(5.0, 6.0, 0.0),),

@@ -1,4 +1,4 @@
-"""A file is there whole, or as it was."""
+"""Writes are atomic and reads are bounded."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ def test_file_is_written_and_nothing_else_remains(tmp_path: Path) -> None:
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a.json", b"new")]
 
 
-def test_failure_leaves_what_was_there(tmp_path: Path) -> None:
+def test_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
     target = tmp_path / "taken"
     (target / "inner").mkdir(parents=True)
     with pytest.raises(OSError):
@@ -20,7 +20,7 @@ def test_failure_leaves_what_was_there(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
 
 
-def test_asking_first_changes_nothing_and_tells_what_would_fail(tmp_path: Path) -> None:
+def test_writability_check_leaves_no_file_and_reports_failures(tmp_path: Path) -> None:
     target = tmp_path / "a.json"
     target.write_bytes(b"old")
     check_writable(target)
@@ -30,7 +30,7 @@ def test_asking_first_changes_nothing_and_tells_what_would_fail(tmp_path: Path) 
             check_writable(impossible)
 
 
-def test_file_is_read_up_to_its_limit_and_not_beyond(tmp_path: Path) -> None:
+def test_file_beyond_the_size_limit_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     path.write_bytes(b"four")
     assert read_whole(path, at_most=4) == b"four"

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     BoolArray = NDArray[np.bool_]
 
-AIR_M: Final = 0.01
+CLEARANCE_M: Final = 0.01
 """Distance that the arm keeps from the robot's own trunk."""
 NUMBERS: Final = 4 + arm.JOINTS
 X, Y, YAW, LIFT, ARM = 0, 1, 2, 3, slice(4, None)
@@ -149,14 +149,14 @@ def trunk_balls(postures: FloatArray) -> tuple[FloatArray, FloatArray]:
     return centres, _TRUNK_RADII
 
 
-def strikes_itself(postures: FloatArray, points: FloatArray, radii: FloatArray) -> BoolArray:
+def self_collides(postures: FloatArray, points: FloatArray, radii: FloatArray) -> BoolArray:
     """Return a mask, (n,), of postures in which arm, hand or load touch the robot's own trunk or the arm's foot.
 
     points: (n, balls + k, 3), the arm's ``balls`` and then those of the load; radii: (balls + k,).
     """
     loads = np.ones(len(radii) - len(RADII), dtype=np.bool_)
     swinging = np.concatenate([_SWINGING, loads])
-    points, sizes = points[:, swinging], radii[swinging] + AIR_M
+    points, sizes = points[:, swinging], radii[swinging] + CLEARANCE_M
     moving = np.concatenate([_MOVING, loads])
     turn, place = mounts(postures)
     seen = (points - place[:, None]) @ turn  # in the mount's frame

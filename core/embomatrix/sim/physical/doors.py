@@ -16,10 +16,10 @@ from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion
 from embomatrix.sim.physical import body
 from embomatrix.sim.physical.fold import PATHS_TRIED, approach, fold, unfold
 from embomatrix.sim.physical.grasp import cross, facing
-from embomatrix.sim.physical.pick import GENTLE, TOUCH_M
+from embomatrix.sim.physical.pick import GENTLE_PACE, TOUCH_M
 from embomatrix.sim.physical.reach import JUMP_RAD, ArmReach, ToolPath
 from embomatrix.sim.physical.reach import TOUCH_M as PRESS_M
-from embomatrix.sim.physical.space import Boxes, boxes_of, part_boxes, struck
+from embomatrix.sim.physical.space import Boxes, boxes_of, collides, part_boxes
 from embomatrix.sim.physical.stage import compact
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.skills.failure import FailureReason
@@ -49,7 +49,7 @@ TILTS: Final = (0.0, 40.0, -40.0)
 OFF_M: Final = 0.08
 LEAST_OFF: Final = 0.3
 """If the directions back and off a panel are nearly opposite, so that their sum is shorter than this, the hand goes back."""
-PULL: Final = 0.4
+PULL_PACE: Final = 0.4
 """Share of full speed at which the hand moves a panel."""
 WAYPOINTS: Final = 7
 OVER: Final = 0.5
@@ -245,7 +245,7 @@ def panel_paths(
         points = np.concatenate([centres for centres, _ in parts], axis=1)
         radii = np.concatenate([sizes for _, sizes in parts])
         return not any(
-            struck(moving[number], points[row : row + 1], radii, PRESS_M)[0]
+            collides(moving[number], points[row : row + 1], radii, PRESS_M)[0]
             for row, number in enumerate(course.tolist())
         )
 
@@ -272,14 +272,14 @@ def _pull(stage: PhysicalStage, path: ArmPath, panel: DoorPanel, goal: float) ->
     # Contents stay asleep until something touches them: awake bottles in a fridge cost much time.
     stage.wake_around(panel.at(stage.dynamic.bodies.joints(panel.name)[panel.number]))
     touch = path.postures[1:3]
-    stage.mover.follow(touch, GENTLE, lambda: stage.dynamic.gap(panel.name) < TOUCH_M)
+    stage.mover.follow(touch, GENTLE_PACE, lambda: stage.dynamic.gap(panel.name) < TOUCH_M)
     if stage.dynamic.gap(panel.name) > 3 * TOUCH_M:
         return refuse(FailureReason.ARM_BLOCKED, target=panel.name, other=SOMETHING)
     stage.dynamic.hook(panel.name, panel.number)
-    hit = stage.mover.follow(path.postures[3:-1], PULL)
+    hit = stage.mover.follow(path.postures[3:-1], PULL_PACE)
     if hit is None and goal in (0.0, 1.0):
         last = path.postures[-2]
-        stage.mover.follow((last + OVER * (last - path.postures[-3]))[None], PULL)
+        stage.mover.follow((last + OVER * (last - path.postures[-3]))[None], PULL_PACE)
     stage.mover.wait(24)
     stage.dynamic.unhook()
     stage.mover.follow(path.postures[-1:] if hit is None else _off(stage.mover.posture), 0.6)

@@ -19,7 +19,7 @@ PACE: Final = 2
 """Playback speed relative to simulated time."""
 STEPS_PER_FRAME: Final = PACE * 240 // FRAMES_PER_S
 """Steps of 1/240 s between two frames."""
-STIRRED: Final = 3e-3
+MOTION_THRESHOLD: Final = 3e-3
 """Motion below this, in metres or in a quaternion component, is not shown."""
 
 
@@ -82,4 +82,4 @@ class _Camera:
 
 def _moved(now: Pose, before: Pose) -> bool:
     changes = zip((*now.position_m, *now.quat_xyzw), (*before.position_m, *before.quat_xyzw), strict=True)
-    return any(abs(a - b) > STIRRED for a, b in changes)
+    return any(abs(a - b) > MOTION_THRESHOLD for a, b in changes)

@@ -11,8 +11,8 @@ import numpy as np
 from embomatrix.sim.bullet.robot import TUCKED_ARM, TUCKED_LIFT_M
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.motion import standing, with_arm
-from embomatrix.sim.physical.reach import AIR_M
-from embomatrix.sim.physical.space import struck
+from embomatrix.sim.physical.reach import CLEARANCE_M
+from embomatrix.sim.physical.space import collides
 from embomatrix.sim.physical.stage import compact
 from embomatrix.sim.physical.travel import SOMETHING, travel
 from embomatrix.sim.robot_dimensions import SHOULDER_LOW_M
@@ -124,7 +124,7 @@ def _folded_over_base(stage: PhysicalStage) -> bool:
     """True if the arm is over the base, or finds no path there; False if an obstacle stopped it."""
     now = stage.mover.posture
     balls, radii = stage.limbs(now[None])
-    reach = stage.reach(stage.boxes().drawn_in(balls[0], radii, AIR_M))
+    reach = stage.reach(stage.boxes().shrunk_clear_of(balls[0], radii, CLEARANCE_M))
     loaded = stage.grip is not None
     folded = carrying(stage, now)
     for spot in _retreats(reach, now, loaded):
@@ -199,5 +199,5 @@ def _carrying_cost(rows: FloatArray, now: FloatArray, held: HeldGeometry, boxes:
     cost += np.maximum(wide.max(axis=1), limbs.max(axis=1))
     radii = np.concatenate([body.RADII, held.radii])
     points = np.concatenate([arms, load], axis=1)
-    cost += np.where(struck(boxes, points, radii, AIR_M), 2.0, 0.0)
-    return np.where(body.strikes_itself(rows, points, radii), math.inf, cost)
+    cost += np.where(collides(boxes, points, radii, CLEARANCE_M), 2.0, 0.0)
+    return np.where(body.self_collides(rows, points, radii), math.inf, cost)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.geometry import Aabb, FloatArray, Pose
 
-GENTLE: Final = 0.25
+GENTLE_PACE: Final = 0.25
 """Share of full speed on the last centimetres."""
 TOUCH_M: Final = 0.004
 PUSHED_M: Final = 0.01
@@ -109,7 +109,7 @@ def _touch(stage: PhysicalStage, path: ArmPath, target: str) -> SkillRefusal | N
     stage.wake_around(stage.world.engine.aabb(target))
     hit = stage.mover.advance(path.postures[1:-2]) if len(path.postures) > 3 else None
     if hit is None:
-        hit = stage.mover.follow(path.postures[-2:], GENTLE, lambda: stage.dynamic.gap(target) < TOUCH_M)
+        hit = stage.mover.follow(path.postures[-2:], GENTLE_PACE, lambda: stage.dynamic.gap(target) < TOUCH_M)
     if stage.dynamic.gap(target) > TOUCH_M * 2:
         return refuse(FailureReason.ARM_BLOCKED, target=target, other=hit or SOMETHING)
     stage.take(target)

@@ -40,7 +40,7 @@ ON_EACH: Final = 4
 RING_M: Final = (0.6, 0.75)
 RING_DEGREES: Final = (0.0, 40.0, -40.0, 80.0, -80.0, 130.0, -130.0, 180.0)
 """Places on the floor around the robot: distances and directions."""
-LOOKED_AT: Final = 10
+EXAMINED: Final = 10
 """Kinds of grasps to examine at one side of the object, before all kinds at every side."""
 FORESEEN: Final = 4
 """Goal poses for which a grasp is examined."""
@@ -196,7 +196,7 @@ def _foresee(
 ) -> tuple[dict[tuple[float, float], list[FloatArray]], Turns]:
     """Return grasps that lead to a goal, as `_grasps_leading_to` gives them, and the rotations by which others may differ."""
     goals = poses[:FORESEEN]
-    found = _grasps_leading_to(stage, grip, _kinds(offered)[:LOOKED_AT], rest, goals, is_valid)
+    found = _grasps_leading_to(stage, grip, _kinds(offered)[:EXAMINED], rest, goals, is_valid)
     if found:
         return found, Turns.ANY if PutRequest(stage, grip, poses, is_valid).may_turn() else Turns.HALF
     # Where the object barely fits, the hand may have to be at one particular side of it.

@@ -26,11 +26,11 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import Pose
     from embomatrix.world.poses import PoseCache, StandPose
 
-LOOKS: Final = 9
+POSES_EXAMINED: Final = 9
 """Poses of one object at one target to examine."""
-MOST_LOOKS: Final = 500
+POSE_BUDGET: Final = 500
 """Poses to examine in one scene. The first queries use up the budget."""
-FEW: Final = 6
+FEW_PLACES: Final = 6
 """Targets with at most this many free places are examined completely before they count as unreachable."""
 APART_M: Final = 0.02
 """Poses nearer to each other than this count as one place."""
@@ -55,23 +55,23 @@ class PlacementReachability:
         self._poses = poses
         self._placer = Placer(stage.world.engine, stage.world.relations, poses, stage.world.navigator)
         self._grips: dict[str, Grip | None] = {}
-        self._looks = 0
+        self._examined = 0
 
     def seen(self, queries: Iterable[PlacementQuery]) -> PoseCache:
         """Return the poses with the answers to these queries, the first ones as far as the budget lasts."""
         reached: dict[Relation, dict[str, dict[str, int]]] = {}
         blockers: dict[Relation, dict[str, dict[str, str]]] = {}
         for query in dict.fromkeys(queries):
-            if self._looks >= MOST_LOOKS:
+            if self._examined >= POSE_BUDGET:
                 break
-            number, other = self._look(query)
+            number, other = self._answer(query)
             if number is not None:
                 reached.setdefault(query.relation, {}).setdefault(query.held, {})[query.target] = number
             if other:
                 blockers.setdefault(query.relation, {}).setdefault(query.held, {})[query.target] = other
         return replace(self._poses, reached=reached, barred_places=blockers)
 
-    def _look(self, query: PlacementQuery) -> tuple[int | None, str]:
+    def _answer(self, query: PlacementQuery) -> tuple[int | None, str]:
         """Return the number of the first reachable pose, and the blocker if all poses are certainly unreachable."""
         stands = self._poses.stands.get(query.target, ())
         if not stands or not self._placer.has_verified(query.held, query.target, query.relation):
@@ -82,7 +82,7 @@ class PlacementReachability:
         self._make_ready(query)
         # The robot has stepped aside from the open panels.
         stand = self._world.navigator.step_aside(query.target, stands[0])
-        poses = self._placer.verified(query.held, query.target, query.relation, stand, LOOKS)
+        poses = self._placer.verified(query.held, query.target, query.relation, stand, POSES_EXAMINED)
         if not poses:
             return None, ""
         self._stage.stand_at(stand)
@@ -96,7 +96,7 @@ class PlacementReachability:
         index = len(poses) - 1
         if path is not None:
             index = _nearest([pose for _, pose in poses], path.tool_path.key_pose @ grip.pose_tool_object)
-        self._looks += index + 1
+        self._examined += index + 1
         other = "" if path is not None else self._blocker(query, grip, stand, is_valid)
         self._stage.grip = None
         return None if path is None else poses[index][0], other
@@ -113,7 +113,7 @@ class PlacementReachability:
         if isinstance(poses, FailureReason):
             return ""
         places = _apart(poses)
-        if len(places) > FEW:
+        if len(places) > FEW_PLACES:
             return ""
         request = PutRequest(self._stage, grip, poses, is_valid)
         if any(self._could_take(held, pose) for pose in places):

@@ -10,9 +10,9 @@ import numpy as np
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.fold import arrivals, fold
 from embomatrix.sim.physical.grasp import facing, surface_point
-from embomatrix.sim.physical.pick import GENTLE, TOUCH_M
+from embomatrix.sim.physical.pick import GENTLE_PACE, TOUCH_M
 from embomatrix.sim.physical.reach import ToolPath
-from embomatrix.sim.physical.space import part_boxes, struck
+from embomatrix.sim.physical.space import collides, part_boxes
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.view import refuse
@@ -49,7 +49,7 @@ def _press(stage: PhysicalStage, target: str) -> SkillRefusal | None:
             continue
         if not stage.world.is_fixed(target):
             stage.wake_around(stage.world.engine.aabb(target))
-        hit = stage.mover.follow(path.postures[1:3], GENTLE, lambda: stage.dynamic.gap(target) < TOUCH_M)
+        hit = stage.mover.follow(path.postures[1:3], GENTLE_PACE, lambda: stage.dynamic.gap(target) < TOUCH_M)
         touched = stage.dynamic.gap(target) < 2 * TOUCH_M
         stage.mover.follow(path.postures[:1])
         if touched:
@@ -67,7 +67,7 @@ def press_paths(stage: PhysicalStage, target: str) -> tuple[ArmReach, Iterator[A
     own = boxes.only(target)
 
     def leans_not(postures: FloatArray) -> bool:
-        return not struck(own, *body.forearm_balls(postures), 0.0).any()
+        return not collides(own, *body.forearm_balls(postures), 0.0).any()
 
     reach = stage.reach(boxes, target, leans_not)
     point = np.array(stage.world.relations.body(target).center_m)

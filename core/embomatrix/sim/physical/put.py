@@ -11,7 +11,7 @@ import numpy as np
 
 from embomatrix.sim.physical.fold import arrivals
 from embomatrix.sim.physical.motion import raised
-from embomatrix.sim.physical.pick import GENTLE, ROOFED_RAISE_M, bases_at, entry
+from embomatrix.sim.physical.pick import GENTLE_PACE, ROOFED_RAISE_M, bases_at, entry
 from embomatrix.sim.physical.reach import ArmReach, ToolPath
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.skills.failure import FailureReason
@@ -70,7 +70,7 @@ class PutRequest:
 
     def paths(self) -> Iterator[ArmPath]:
         """Yield paths that put the object down, to the first pose as long as there are any."""
-        for options in self._lots():
+        for options in self._option_lots():
             if options:
                 tool_paths = list(_put_tool_paths(self._grip, options))
                 yield from self.reach.paths(tool_paths, bases_at(self._stage, *_at(options[0])))
@@ -110,7 +110,7 @@ class PutRequest:
         engine.park(name)
         return risen * RISE_M
 
-    def _lots(self) -> Iterator[list[PutPose]]:
+    def _option_lots(self) -> Iterator[list[PutPose]]:
         """Yield the first pose in its verified orientation, then rotated to suit the hand, then the other poses."""
         for first, last in itertools.pairwise(CHUNKS):
             some = [self._put_poses(pose) for pose in self._poses[first:last]]
@@ -236,7 +236,9 @@ def _set_down(stage: PhysicalStage, path: ArmPath) -> SkillRefusal | None:
     lower = raised(path.postures[key], -DROP_M)
     ignore = frozenset(world.carried)
     stage.mover.follow(
-        np.stack([path.postures[key], lower]), GENTLE, lambda: bool(stage.dynamic.touched_by(name, ignore))
+        np.stack([path.postures[key], lower]),
+        GENTLE_PACE,
+        lambda: bool(stage.dynamic.touched_by(name, ignore)),
     )
     stage.loosen()
     stage.mover.wait(16)

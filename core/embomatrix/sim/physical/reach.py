@@ -13,7 +13,7 @@ import numpy as np
 
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.rrt import path_between
-from embomatrix.sim.physical.space import Boxes, Struck, struck
+from embomatrix.sim.physical.space import BallCollision, Boxes, collides
 from embomatrix.sim.robot_dimensions import LIFT_M, SHOULDER_LOW_M
 from embomatrix.world.geometry import Pose
 
@@ -34,19 +34,19 @@ LAST_RAD: Final = np.array([0.785, -0.785, 2.3, -2.3, 0.0, 1.57, -1.57])
 ALIKE_RAD: Final = 0.5
 JUMP_RAD: Final = 1.3
 """Largest rotation of a joint between two waypoints."""
-LOOKED_AT: Final = (0, 160, 640)
+EXAMINED: Final = (0, 160, 640)
 """Numbers of the most comfortable solutions to check against obstacles; more if none is free."""
 RANK: Final = 0.2
 """Weight of the rank of a tool path against joint strain."""
 FOLLOWED: Final = 40
 """Solutions whose paths are computed at once: one path costs nearly as much as many."""
-LOTS: Final = (0, 4, FOLLOWED)
+CHECK_LOTS: Final = (0, 4, FOLLOWED)
 """Of those, the first few are checked before the others, because they are often free."""
-OFFERED: Final = 3
+PATHS_RETURNED: Final = 3
 """Paths of one batch to return."""
 BATCH: Final = 12
 """Tool paths to examine together."""
-AIR_M: Final = 0.012
+CLEARANCE_M: Final = 0.012
 """Distance that the arm keeps from objects."""
 TOUCH_M: Final = -0.003
 """Allowed overlap of hand or load with objects: their balls are a little larger than the truth."""
@@ -142,12 +142,12 @@ class ArmReach:
         self._standing = boxes.without(("floor",))
         self._at_work = at_work
         self._held = held
-        self._struck: Struck | None = None
+        self._collision: BallCollision | None = None
 
     @property
     def blocker(self) -> str:
         """Owner of the box that blocked the last path; "" for none."""
-        return self._struck.owner if self._struck is not None else ""
+        return self._collision.owner if self._collision is not None else ""
 
     def paths(self, tool_paths: Iterable[ToolPath], places: Sequence[FloatArray]) -> Iterator[ArmPath]:
         """Yield free arm paths along the tool paths, preferred ones first, from bases in groups of shape (b, 3).
@@ -158,7 +158,7 @@ class ArmReach:
         start = 0
         while batch := list(itertools.islice(rest, BATCH)):
             for bases in places:
-                yield from self._some(batch, start, bases)
+                yield from self._batch_paths(batch, start, bases)
             start += len(batch)
 
     def transit(
@@ -181,15 +181,15 @@ class ArmReach:
 
         def free_up_to(one: FloatArray, other: FloatArray) -> FloatArray:
             between = _between(one, other)[1:]
-            free = self._free(between[:-1], self._boxes, held, AIR_M)
+            free = self._free(between[:-1], self._boxes, held, CLEARANCE_M)
             # Start and end are given, so they are not checked.
             last = bool(np.array_equal(other, ready) or np.array_equal(other, start))
-            if free.all() and (last or self._free(other[None], self._boxes, held, AIR_M)[0]):
+            if free.all() and (last or self._free(other[None], self._boxes, held, CLEARANCE_M)[0]):
                 return other
             reached = int(free.argmin()) if not free.all() else len(free)
             return between[reached - 1] if reached else one
 
-        drawn = _drawn(start, draws, level=held is not None and held.up is not None)
+        drawn = _scattered(start, draws, level=held is not None and held.up is not None)
         drawn[:1] = (start + ready) / 2
         path = path_between(start, ready, drawn, SAMPLED, free_up_to)
         return None if path is None else np.concatenate([path, end[None]])
@@ -198,14 +198,14 @@ class ArmReach:
         """True if the base can drive straight between two postures with the arm unchanged."""
         line = _between(start, end)
         trunk, radii = body.trunk_balls(line)
-        hit = struck(self._standing, trunk, radii, 0.0)
+        hit = collides(self._standing, trunk, radii, 0.0)
         return not hit.any() and self._is_free(line, self._held if loaded else None)
 
     def _is_free(self, postures: FloatArray, held: HeldGeometry | None) -> bool:
         """True if all postures but the first and the last keep clear."""
-        return bool(self._free(postures[1:-1], self._boxes, held, AIR_M).all())
+        return bool(self._free(postures[1:-1], self._boxes, held, CLEARANCE_M).all())
 
-    def _some(self, tool_paths: Sequence[ToolPath], first: int, bases: FloatArray) -> list[ArmPath]:
+    def _batch_paths(self, tool_paths: Sequence[ToolPath], first: int, bases: FloatArray) -> list[ArmPath]:
         """Return free paths along a batch of tool paths, best first. ``first`` is the number of its first tool path."""
         tool_path, base, lift, last = _combinations(tool_paths, bases)
         key_rotation = np.stack([one.rotation[one.key] for one in tool_paths])
@@ -215,7 +215,7 @@ class ArmReach:
         if not len(rows):
             return []
         comfort = arm.strain(found[rows, branches][:, body.ARM]) + RANK * tool_path[rows]
-        for fore, end in itertools.pairwise(LOOKED_AT):
+        for fore, end in itertools.pairwise(EXAMINED):
             best = _best_of_each(base[rows], comfort, _share(fore, bases), _share(end, bases))
             some = best[self._free(found[rows[best], branches[best]], self._at_work, None, TOUCH_M)]
             row = rows[some]
@@ -244,39 +244,39 @@ class ArmReach:
                 for number, tool_path, postures in zip(numbers[some], tool_paths[some], followed, strict=True)
                 if postures is not None
             ]
-            for first, last in itertools.pairwise(LOTS):
-                self._choose(found[first:last], paths)
-                if len(paths) == OFFERED:
+            for first, last in itertools.pairwise(CHECK_LOTS):
+                self._add_free(found[first:last], paths)
+                if len(paths) == PATHS_RETURNED:
                     return paths
         return paths
 
-    def _choose(self, offered: Sequence[ArmPath], paths: list[ArmPath]) -> None:
+    def _add_free(self, offered: Sequence[ArmPath], paths: list[ArmPath]) -> None:
         """Add free paths that differ from the chosen ones, up to the largest number."""
-        unlike = [path for path in offered if not _is_known(path, paths)]
+        unlike = [path for path in offered if not _resembles_any(path, paths)]
         if not unlike:
             return
-        for path, (free, hit) in zip(unlike, self._looked_at(unlike), strict=True):
-            if _is_known(path, paths):
+        for path, (free, hit) in zip(unlike, self._collisions_of(unlike), strict=True):
+            if _resembles_any(path, paths):
                 continue
             if free and (self._also is None or self._also(path.postures)):
                 paths.append(path)
-                if len(paths) == OFFERED:
+                if len(paths) == PATHS_RETURNED:
                     return
-            self._struck = hit or self._struck
+            self._collision = hit or self._collision
 
-    def _looked_at(self, paths: Sequence[ArmPath]) -> list[tuple[bool, Struck | None]]:
+    def _collisions_of(self, paths: Sequence[ArmPath]) -> list[tuple[bool, BallCollision | None]]:
         """Return for each path if it is free, and the collision with a box if there is one."""
         postures = np.concatenate([path.postures for path in paths])
         loaded = np.concatenate([path.tool_path.loaded for path in paths])
         number = np.repeat(np.arange(len(paths)), [len(path.postures) for path in paths])
         trunk, trunk_radii = body.trunk_balls(np.stack([path.postures[0] for path in paths]))
-        free = ~struck(self._standing, trunk, trunk_radii, TOUCH_M)
-        hits: list[Struck | None] = [None] * len(paths)
+        free = ~collides(self._standing, trunk, trunk_radii, TOUCH_M)
+        hits: list[BallCollision | None] = [None] * len(paths)
         for mask, held in ((~loaded, None), (loaded, self._held)):
             rows = np.flatnonzero(mask & free[number])
             if not len(rows):
                 continue
-            clear, seen = self._compared(postures[rows], self._at_work, held, TOUCH_M)
+            clear, seen = self._check(postures[rows], self._at_work, held, TOUCH_M)
             if seen is not None:
                 hit = np.flatnonzero(seen.rows)
                 for path, row in zip(*np.unique(number[rows[hit]], return_index=True), strict=True):
@@ -290,24 +290,24 @@ class ArmReach:
         """Mask, (n,), of postures in which arm and load keep a margin from the boxes and from the robot's trunk."""
         if not len(postures):
             return np.zeros(0, dtype=np.bool_)
-        free, seen = self._compared(postures, boxes, held, margin_m)
+        free, seen = self._check(postures, boxes, held, margin_m)
         if seen is not None:
-            self._struck = seen.only(int(seen.rows.argmax()))
+            self._collision = seen.only(int(seen.rows.argmax()))
         return free
 
-    def _compared(
+    def _check(
         self, postures: FloatArray, boxes: Boxes, held: HeldGeometry | None, margin_m: float
-    ) -> tuple[BoolArray, Struck | None]:
+    ) -> tuple[BoolArray, BallCollision | None]:
         """Return the mask of free postures and the collisions with boxes, for at least one posture."""
         centres, radii = limb_balls(postures, held)
         widest = float(radii.max()) + 0.05
         close = boxes.near(centres.min(axis=(0, 1)) - widest, centres.max(axis=(0, 1)) + widest)
-        hit = struck(close, centres, radii, margin_m)
+        hit = collides(close, centres, radii, margin_m)
         free = ~hit
-        free[free] = ~body.strikes_itself(postures[free], centres[free], radii)
+        free[free] = ~body.self_collides(postures[free], centres[free], radii)
         if held is not None and held.up is not None:
             free[free] = held.is_level(postures[free])
-        return np.asarray(free), Struck(close, centres, radii, margin_m, hit) if hit.any() else None
+        return np.asarray(free), BallCollision(close, centres, radii, margin_m, hit) if hit.any() else None
 
 
 def _share(most: int, bases: FloatArray) -> int:
@@ -323,7 +323,7 @@ def _best_of_each(base: FloatArray, cost: FloatArray, first: int, end: int) -> F
     return np.asarray(chosen[np.argsort(cost[chosen], kind="stable")])
 
 
-def _is_known(path: ArmPath, paths: Iterable[ArmPath]) -> bool:
+def _resembles_any(path: ArmPath, paths: Iterable[ArmPath]) -> bool:
     """True if a path begins like one of others."""
     return any(_alike(path.postures[0], other.postures[0]) for other in paths)
 
@@ -382,7 +382,7 @@ def _followed(
     ]
 
 
-def _drawn(start: FloatArray, count: int, *, level: bool) -> FloatArray:
+def _scattered(start: FloatArray, count: int, *, level: bool) -> FloatArray:
     """Return scattered postures, (n, 11), at the base of the start; ``level``: the load only turns about z.
 
     They are always the same, so that a path found once in a scene is found again.

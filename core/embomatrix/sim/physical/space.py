@@ -64,7 +64,7 @@ class Boxes:
             (*self.owners, *other.owners),
         )
 
-    def drawn_in(self, points: FloatArray, radii: FloatArray, margin_m: float) -> Boxes:
+    def shrunk_clear_of(self, points: FloatArray, radii: FloatArray, margin_m: float) -> Boxes:
         """Shrink boxes that balls, (k, 3) and (k,), come nearer to than a margin, by the missing distance."""
         lack = np.maximum(margin_m - (self.gaps(points) - radii[:, None]).min(axis=0), 0.0)  # (m,)
         return Boxes(self.rotation, self.centre, self.half - lack[:, None], self.owners)
@@ -110,7 +110,7 @@ class Boxes:
 
 
 @dataclass(frozen=True, slots=True)
-class Struck:
+class BallCollision:
     """Sets of balls, centres (n, b, 3) and radii (b,), among boxes. ``rows``, (n,), marks sets nearer than a margin."""
 
     boxes: Boxes
@@ -119,10 +119,10 @@ class Struck:
     margin_m: float
     rows: BoolArray
 
-    def only(self, row: int) -> Struck:
+    def only(self, row: int) -> BallCollision:
         """Return one of the sets."""
         one = slice(row, row + 1)
-        return Struck(self.boxes, self.balls[one], self.radii, self.margin_m, self.rows[one])
+        return BallCollision(self.boxes, self.balls[one], self.radii, self.margin_m, self.rows[one])
 
     @property
     def owner(self) -> str:
@@ -185,7 +185,7 @@ def deepest_box(boxes: Boxes, balls: FloatArray, radii: FloatArray, margin_m: fl
     return deepest if nearest[deepest] < margin_m else -1
 
 
-def struck(boxes: Boxes, balls: FloatArray, radii: FloatArray, margin_m: float) -> BoolArray:
+def collides(boxes: Boxes, balls: FloatArray, radii: FloatArray, margin_m: float) -> BoolArray:
     """Mask, (n,), of sets of balls, (n, b, 3), that come nearer than a margin to any box.
 
     radii: (b,), each larger than a negative margin. Neighbouring balls are first checked as one; only near groups are then

@@ -128,14 +128,14 @@ class _Surveyor:
         for name in names:
             handlings = handlings_of(self._world.asset(name), fixed=self._world.is_fixed(name))
             for handling in handlings:
-                reached, other = self._look(name, handling)
+                reached, other = self._answer(name, handling)
                 if reached is None and other:
                     blockers.setdefault(handling, {})[name] = other
                 elif reached is not None and handling is handlings[0]:
                     stands[name] = _preferring(reached, stands.get(name, ()))
         return replace(poses, stands=stands, barred=blockers)
 
-    def _look(self, name: str, handling: Handling) -> tuple[StandPose | None, str]:
+    def _answer(self, name: str, handling: Handling) -> tuple[StandPose | None, str]:
         """Return the first suitable standing pose; else None and the blocker."""
         self._make_ready(name, handling)
         # Motions of doors try other standing poses themselves.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim.physical import body
-from embomatrix.sim.physical.space import struck
+from embomatrix.sim.physical.space import collides
 from embomatrix.sim.physical.stage import compact
 from embomatrix.sim.placing.trial import in_reach
 from embomatrix.skills.failure import FailureReason
@@ -88,16 +88,16 @@ def _course(
     stage: PhysicalStage, start: FloatArray, points: FloatArray, yaw: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return marks, (n, 2), and headings, (n,), along lines between points. Back out first if a load has no room to turn."""
-    marks, headings, struck = _headings(stage, start, _resampled(points), yaw)
+    marks, headings, collisions = _headings(stage, start, _resampled(points), yaw)
     grid, here = stage.floor.grid, (float(points[0, 0]), float(points[0, 1]))
-    for away in BACK_OUT_M if struck and len(points) > 1 else ():
+    for away in BACK_OUT_M if collisions and len(points) > 1 else ():
         spot = (here[0] - away * math.cos(start[body.YAW]), here[1] - away * math.sin(start[body.YAW]))
         onward = (float(points[1, 0]), float(points[1, 1]))
         if grid.drives_straight(here, spot) and grid.drives_straight(spot, onward):
             longer = _resampled(np.array([here, spot, *points[1:]]))
-            other, turned, less = _headings(stage, start, longer, yaw)
-            if less < struck:
-                marks, headings, struck = other, turned, less
+            other, turned, fewer = _headings(stage, start, longer, yaw)
+            if fewer < collisions:
+                marks, headings, collisions = other, turned, fewer
     return marks, headings
 
 
@@ -133,20 +133,23 @@ def _headings(
     for _ in range(CHAINS):
         chosen = np.array(_cheapest_chain(danger, swept, off))
         found = np.unwrap(options[chosen])
-        strikes = _turns_striking(stage, start, marks, found)
+        strikes = _colliding_turns(stage, start, marks, found)
         if not (strikes & (swept[number, chosen[:-1], chosen[1:]] == 0.0)).any():
             break
         swept[number[strikes], chosen[:-1][strikes], chosen[1:][strikes]] = BLOCKED_COST
     # Contacts at the first mark exist already and don't count.
-    struck = int((strikes | (danger[number, chosen[1:]] >= BLOCKED_COST)).sum())
+    collisions = int((strikes | (danger[number, chosen[1:]] >= BLOCKED_COST)).sum())
     nearest = found[-1] + math.remainder(end - found[-1], math.tau)
     last, turned = np.tile(marks[-1], (2, 1)), np.array([found[-1], nearest])
-    if abs(nearest - found[-1]) <= math.tau / HEADINGS and not _turns_striking(stage, start, last, turned)[0]:
+    if (
+        abs(nearest - found[-1]) <= math.tau / HEADINGS
+        and not _colliding_turns(stage, start, last, turned)[0]
+    ):
         found[-1] = nearest
-    return marks, found, struck
+    return marks, found, collisions
 
 
-def _turns_striking(
+def _colliding_turns(
     stage: PhysicalStage, start: FloatArray, marks: FloatArray, headings: FloatArray
 ) -> BoolArray:
     """Mask, (marks - 1,), of turns between marks in which arm or load collide.
@@ -205,7 +208,7 @@ def _cost_at(stage: PhysicalStage, start: FloatArray, bases: FloatArray) -> Floa
     for first in range(0, len(bases), HEADINGS):
         some = centres[first : first + HEADINGS]
         close = boxes.near(some.min(axis=(0, 1)) - wide, some.max(axis=(0, 1)) + wide)
-        beside = first + np.flatnonzero(struck(close, some, radii, BESIDE_M))
+        beside = first + np.flatnonzero(collides(close, some, radii, BESIDE_M))
         cost[beside] = BESIDE_COST
-        cost[beside[struck(close, centres[beside], radii, STRUCK_M)]] = BLOCKED_COST
+        cost[beside[collides(close, centres[beside], radii, STRUCK_M)]] = BLOCKED_COST
     return cost

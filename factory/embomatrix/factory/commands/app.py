@@ -31,7 +31,7 @@ from embomatrix.factory.commands.task_import import app as import_app
 from embomatrix.factory.commands.terminal import fail, progress, user_errors
 from embomatrix.factory.commands.verification import app as verify_app
 from embomatrix.factory.pipeline.build import BuildSummary, VariantCheck, build_dataset
-from embomatrix.factory.pipeline.cluster import ClusterCheck
+from embomatrix.factory.pipeline.cluster import cluster_check
 from embomatrix.factory.pipeline.export import dataset_card, encode_rows, export_rows
 from embomatrix.factory.pipeline.settings import SCENE_EXTRACTOR, BuildSettings, WriterKind, scene_ids
 from embomatrix.llm.batch import FailureLimit
@@ -47,7 +47,10 @@ if TYPE_CHECKING:
     from embomatrix.llm.ledger import Ledger
 
 app = typer.Typer(
-    help="Make verified tasks.", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False
+    help="Build and inspect datasets of verified tasks.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
 )
 app.add_typer(assets_app, name="assets")
 app.add_typer(evaluate_app, name="evaluate")
@@ -159,7 +162,7 @@ def generate(
         check: VariantCheck | None = None
         if manager:
             trusted = ca.read_bytes() if ca is not None else b""
-            check = stack.enter_context(ClusterCheck(manager, token, trusted)).check
+            check = stack.enter_context(cluster_check(manager, token, trusted))
         layout = _layout(stack, model_backed, llm, model, key, cassette)
         if kind is WriterKind.SOCIAL:
             _make(out, settings, jobs=jobs, check=check, layout=layout)

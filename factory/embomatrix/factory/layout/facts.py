@@ -38,8 +38,8 @@ def rooms_of(editor: SceneEditor) -> tuple[LayoutRoomFacts, ...]:
     )
 
 
-def hosts_in(editor: SceneEditor, room: str, named: Container[str] = ()) -> tuple[HostFacts, ...]:
-    """Return the possible hosts in a room: furniture that people put objects on or in, and objects that the task names.
+def hosts_in(editor: SceneEditor, room: str, named: Container[str] = ()) -> Iterator[HostFacts]:
+    """Yield the possible hosts in a room: furniture that people put objects on or in, and objects that the task names.
 
     Furniture that the robot can't reach is left out.
     """
@@ -47,12 +47,6 @@ def hosts_in(editor: SceneEditor, room: str, named: Container[str] = ()) -> tupl
     for item in editor.objects.values():
         if item.host:
             contents.setdefault(item.host, []).append(editor.asset_of(item.name).category)
-    return tuple(_hosts(editor, room, named, contents))
-
-
-def _hosts(
-    editor: SceneEditor, room: str, named: Container[str], contents: dict[str, list[str]]
-) -> Iterator[HostFacts]:
     for item in editor.objects.values():
         asset = editor.asset_of(item.name)
         if item.name not in named:

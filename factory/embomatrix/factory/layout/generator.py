@@ -91,7 +91,7 @@ def lay(
     unreachable: list[LayoutFailure] = []
     for number, room in enumerate(dict.fromkeys(rooms.values())):
         room_items = [item for item in items if rooms[item.name] == room]
-        job = _RoomJob(editor, agents, editor.rooms[room], room_items, seed * 1009 + number, record)
+        job = _RoomLayout(editor, agents, editor.rooms[room], room_items, seed * 1009 + number, record)
         left += job.run()
         names |= job.names
         unreachable += job.unreachable
@@ -125,7 +125,7 @@ def _at_neighbours_host(editor: SceneEditor, thing: ObjectBrief) -> ObjectBrief:
     return replace(thing, relation=LayoutRelation.INSIDE if inside else LayoutRelation.ONTOP, host=other.host)
 
 
-class _RoomJob:
+class _RoomLayout:
     """Layout of one room. It requests tree after tree until each object has a place or no option is left."""
 
     def __init__(
@@ -193,7 +193,7 @@ class _RoomJob:
             _at_neighbours_host(self._editor, self._brief_of(name)) for name in self._pending.waiting
         )
         named = {thing.host for thing in objects if thing.host in self._editor.objects}
-        hosts = hosts_in(self._editor, self._room.name, named)
+        hosts = tuple(hosts_in(self._editor, self._room.name, named))
         room = next(room for room in rooms_of(self._editor) if room.name == self._room.name)
         return RoomBrief(room, hosts, objects, tuple(self._pending.failures), self._seed * 31 + self._round)
 

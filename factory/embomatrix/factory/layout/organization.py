@@ -15,11 +15,10 @@ import numpy as np
 from embomatrix.factory.furnish.hosts import NO_HOSTS, kept_behind_doors
 from embomatrix.factory.furnish.small_objects import is_appliance_top, preferred_hosts, suits
 from embomatrix.factory.layout.values import (
-    RELATION_METHODS,
+    CLOTH_RELATIONS,
     Branch,
     LayoutRelation,
     PlacementClass,
-    RelationMethod,
 )
 from embomatrix.factory.scenes.editor import LayoutReason
 
@@ -251,7 +250,7 @@ def _max_attempts(branch: Branch, brief: RoomBrief) -> int:
 def _open_choices(brief: RoomBrief, thing: ObjectBrief, hung: Mapping[str, Branch]) -> Iterator[Branch]:
     floor = Branch(brief.room.name, LayoutRelation.ONTOP, thing.name)
     if thing.relation is not None:
-        if RELATION_METHODS[thing.relation] is not RelationMethod.NONE:
+        if thing.relation not in CLOTH_RELATIONS:
             yield Branch(thing.host or brief.room.name, thing.relation, thing.name)
         return
     beside = next((hung[other] for other in thing.beside if other in hung), None)

@@ -40,25 +40,8 @@ class LayoutRelation(StrEnum):
     SATURATED = "saturated"
 
 
-class RelationMethod(StrEnum):
-    """Mechanism that makes a relation of the tree hold in a scene."""
-
-    POSE = "pose"  # the child is placed
-    FACT = "fact"  # the child is a substance that the parent holds
-    NONE = "none"  # impossible for rigid bodies: needs cloth
-
-
-RELATION_METHODS: Final = {
-    LayoutRelation.ONTOP: RelationMethod.POSE,
-    LayoutRelation.INSIDE: RelationMethod.POSE,
-    LayoutRelation.UNDER: RelationMethod.POSE,
-    LayoutRelation.COVERED: RelationMethod.FACT,
-    LayoutRelation.FILLED: RelationMethod.FACT,
-    LayoutRelation.SATURATED: RelationMethod.FACT,
-    LayoutRelation.ATTACHED: RelationMethod.POSE,
-    LayoutRelation.DRAPED: RelationMethod.NONE,
-    LayoutRelation.OVERLAID: RelationMethod.NONE,
-}
+CLOTH_RELATIONS: Final = frozenset({LayoutRelation.DRAPED, LayoutRelation.OVERLAID})
+"""Relations that need cloth. Rigid bodies can't fulfil them."""
 
 
 class PlacementClass(StrEnum):

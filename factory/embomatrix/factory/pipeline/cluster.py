@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.admission import SEED, RefusalReason
 from embomatrix.factory.pipeline.store import Rejection
@@ -14,7 +15,7 @@ from embomatrix.skills.parse import plan_from_json
 from embomatrix.world.dataset import DatasetError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from embomatrix.factory.pipeline.variants import VariantYield
     from embomatrix.world.dataset import TaskRecord
@@ -23,66 +24,44 @@ RUN: Final = "factory"
 """Name of the run on the manager's pages."""
 
 
-class ClusterCheck:
-    """Context manager of one event loop and one run on the cluster. ``token`` and ``ca`` (PEM) are those of a client."""
+@contextlib.contextmanager
+def cluster_check(
+    address: str, token: str = "", ca: bytes = b""
+) -> Iterator[Callable[[VariantYield], VariantYield]]:
+    """Yield a check that executes a variant's plans in one run on the cluster. Raise ClusterError.
 
-    def __init__(self, address: str, token: str = "", ca: bytes = b"") -> None:
-        self._client = ClusterClient(address, token, ca=ca)
-        self._runner = asyncio.Runner()
-        self._run_id = ""
+    ``token`` and ``ca`` (PEM) are those of a client. The check raises DatasetError if a slot can't execute a plan.
+    """
+    with asyncio.Runner() as runner, contextlib.ExitStack() as stack:
+        client = runner.run(ClusterClient(address, token, ca=ca).__aenter__())
+        stack.callback(lambda: runner.run(client.__aexit__(None, None, None)))
+        run_id = runner.run(client.open_run(RUN))
+        stack.callback(lambda: runner.run(client.close_run(run_id)))
 
-    def __enter__(self) -> Self:
-        """Open the run. Raise ClusterError."""
-        try:
-            self._run_id = self._runner.run(self._open())
-        except BaseException:
-            self._runner.close()
-            raise
-        return self
+        def check(variant: VariantYield) -> VariantYield:
+            if not variant.result.records:
+                return variant
+            return admitted_by(variant, runner.run(_execute(client, run_id, variant)))
 
-    def __exit__(self, *_: object) -> None:
-        try:
-            self._runner.run(self._close())
-        finally:
-            self._runner.close()
+        yield check
 
-    def check(self, variant: VariantYield) -> VariantYield:
-        """Return the variant with the tasks that the cluster admits.
 
-        Raise ClusterError, or DatasetError if a slot can't execute a plan.
-        """
-        if not variant.result.records:
-            return variant
-        return admitted_by(variant, self._runner.run(self._execute(variant)))
-
-    async def _open(self) -> str:
-        await self._client.__aenter__()
-        return await self._client.open_run(RUN)
-
-    async def _close(self) -> None:
-        try:
-            await self._client.close_run(self._run_id)
-        finally:
-            await self._client.__aexit__(None, None, None)
-
-    async def _execute(self, variant: VariantYield) -> dict[str, RolloutResult]:
-        records = variant.result.records
-        await self._client.put_bundles({records[0].bundle_digest: variant.bundle})
-        rollouts = tuple(
-            Rollout(
-                rollout_id=record.task.task_id,
-                group_id=record.task.task_id,
-                bundle_digest=record.bundle_digest,
-                task_id=record.task.task_id,
-                plan=plan_from_json(list(record.oracle), record.task.profile),
-                seed=SEED,
-            )
-            for record in records
+async def _execute(client: ClusterClient, run_id: str, variant: VariantYield) -> dict[str, RolloutResult]:
+    records = variant.result.records
+    await client.put_bundles({records[0].bundle_digest: variant.bundle})
+    rollouts = tuple(
+        Rollout(
+            rollout_id=record.task.task_id,
+            group_id=record.task.task_id,
+            bundle_digest=record.bundle_digest,
+            task_id=record.task.task_id,
+            plan=plan_from_json(list(record.oracle), record.task.profile),
+            seed=SEED,
         )
-        batch = Batch(
-            self._run_id, f"{variant.result.split}-{variant.result.number}", variant.result.number, rollouts
-        )
-        return {result.rollout_id: result async for result in self._client.execute(batch)}
+        for record in records
+    )
+    batch = Batch(run_id, f"{variant.result.split}-{variant.result.number}", variant.result.number, rollouts)
+    return {result.rollout_id: result async for result in client.execute(batch)}
 
 
 def admitted_by(variant: VariantYield, results: Mapping[str, RolloutResult]) -> VariantYield:

@@ -113,7 +113,7 @@ class VariantMaker:
         variant = build_variant(
             base, focus, f"{base.base}-{order.split}-{order.number:03d}", rng, self._layout
         )
-        result = _VariantJob(variant, order, self._tools).run(rng)
+        result = _VariantWork(variant, order, self._tools).run(rng)
         return replace(result, cpu_s=time.process_time() - began)
 
     def close(self) -> None:
@@ -146,7 +146,7 @@ def _focus(
     return tuple(order[:FOCUS_ROOMS])
 
 
-class _VariantJob:
+class _VariantWork:
     """Writing and judging of one variant's tasks."""
 
     def __init__(self, variant: Variant, order: VariantOrder, tools: _SharedTools) -> None:

@@ -102,13 +102,9 @@ def _renumbered(scene: Scene, word: str, rng: np.random.Generator) -> list[str]:
 
 
 def _room_choices(words: list[str], options: Mapping[str, list[str]]) -> Iterator[dict[str, str]]:
-    if not words:
-        yield {}
-        return
-    for room in options[words[0]]:
-        for rest in _room_choices(words[1:], options):
-            if room not in rest.values():
-                yield {words[0]: room, **rest}
+    for rooms in itertools.product(*(options[word] for word in words)):
+        if len(set(rooms)) == len(rooms):
+            yield dict(zip(words, rooms, strict=True))
 
 
 def abilities_needed(problem: BddlProblem) -> Mapping[str, frozenset[str]]:

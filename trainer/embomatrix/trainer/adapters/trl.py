@@ -154,5 +154,4 @@ def outcome_summary(outcome: PlanOutcome) -> str:
         return outcome.problem
     if outcome.reward is None:
         return "lost to the infrastructure"
-    steps = getattr(outcome.outcome, "steps", ())
-    return steps[-1].message if steps else "an empty plan"
+    return outcome.steps[-1].message if outcome.steps else "an empty plan"

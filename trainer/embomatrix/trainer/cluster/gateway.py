@@ -17,7 +17,16 @@ from typing import TYPE_CHECKING, Final, Protocol, Self, TypeVar
 from embomatrix.reward.hierarchy import unparsable
 from embomatrix.rpc.logs import bind
 from embomatrix.rpc.status import ClusterError, DeadlineError, PreconditionError, UnavailableError
-from embomatrix.rpc.wire.values import Batch, Completed, LookaheadEntry, Rollout, RunStats, RunTerms
+from embomatrix.rpc.wire.values import (
+    Batch,
+    Cancelled,
+    Completed,
+    InfraFailure,
+    LookaheadEntry,
+    Rollout,
+    RunStats,
+    RunTerms,
+)
 from embomatrix.skills.parse import PlanError, parse_plan
 from embomatrix.skills.prompt import Codec, with_indices
 from embomatrix.trainer.config.errors import TrainerError
@@ -36,6 +45,7 @@ if TYPE_CHECKING:
     from embomatrix.rpc.wire.values import Outcome
     from embomatrix.skills.prompt import Situation
     from embomatrix.skills.syntax import Plan
+    from embomatrix.skills.trace import Step
     from embomatrix.trainer.data.tasks import TrainingTask
 
 logger = logging.getLogger(__name__)
@@ -67,6 +77,21 @@ class PlanOutcome:
     def value(self) -> float:
         """Total reward, NaN if there is none."""
         return math.nan if self.reward is None else self.reward.total
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        """Executed steps; none for a lost or unparsable plan."""
+        return self.outcome.steps if isinstance(self.outcome, Completed) else ()
+
+    @property
+    def lost(self) -> str:
+        """Reason why the infrastructure lost the rollout, else ""."""
+        match self.outcome:
+            case InfraFailure(code=code, message=message):
+                return f"{code.value}: {message}"
+            case Cancelled():
+                return "cancelled"
+        return ""
 
     def weighted_reward(self, relevance: float) -> float:
         """Reward with a weight on its relevance tier, NaN if there is none."""

@@ -6,7 +6,7 @@ import contextlib
 import functools
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -17,12 +17,9 @@ from embomatrix.rpc.logs import LogFormat, log_to_stderr
 from embomatrix.trainer.config.errors import TrainerError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from embomatrix.rpc.client import ClusterClient
-    from embomatrix.trainer.cluster.gateway import Gateway
-    from embomatrix.trainer.config.settings import OnLost, TrainSettings
-    from embomatrix.trainer.data.tasks import TaskSet
     from embomatrix.trainer.lifecycle.checkpoint import ImitationState
     from embomatrix.trainer.logging.report import TrainingSummary
     from embomatrix.trainer.run.starting import RunStart
@@ -109,11 +106,7 @@ def train(
             "track": track,
             **_coefficients(reward or ()),
         }
-        from embomatrix.trainer.run.starting import resume_run, start_run
-
-        new = functools.partial(start_run, dataset, out, model, settings_file, changes)
-        again = functools.partial(resume_run, dataset, out, changes, model=model, settings_file=settings_file)
-        start = again() if resume else new()
+        start = _start(dataset, out, model, settings_file, changes, resume=resume)
         _show_summary(_run(start, connect, out))
 
 
@@ -151,12 +144,18 @@ def imitate(
             "imitation.patience": patience,
             "track": track,
         }
-        from embomatrix.trainer.run.starting import resume_run, start_run
-
-        new = functools.partial(start_run, dataset, out, model, settings_file, changes)
-        again = functools.partial(resume_run, dataset, out, changes, model=model, settings_file=settings_file)
-        start = again() if resume else new()
+        start = _start(dataset, out, model, settings_file, changes, resume=resume)
         _show_imitation(_imitated(start, out), out)
+
+
+def _start(
+    dataset: Path, out: Path, model: str, file: Path | None, changes: Mapping[str, Any], *, resume: bool
+) -> RunStart:
+    from embomatrix.trainer.run.starting import resume_run, start_run
+
+    if resume:
+        return resume_run(dataset, out, changes, model=model, settings_file=file)
+    return start_run(dataset, out, model, file, changes)
 
 
 @contextlib.contextmanager
@@ -202,20 +201,10 @@ def _connector(manager: str, token: str, ca: Path | None) -> Connect:
     return functools.partial(ClusterClient, manager, read_token(token), ca=read_ca(ca))
 
 
-def _gateway(
-    tasks: TaskSet, connect: Connect, name: str, settings: TrainSettings, on_lost: OnLost
-) -> Gateway:
+def _run(start: RunStart, connect: Connect, out: Path) -> TrainingSummary:
     from embomatrix.rpc.wire.values import GroupPolicy, RunTerms
     from embomatrix.trainer.cluster.gateway import Gateway
     from embomatrix.trainer.config.settings import OnLost
-
-    fails_group = on_lost is OnLost.GROUP
-    policy = GroupPolicy.RETRY_THEN_FAIL_GROUP if fails_group else GroupPolicy.PARTIAL
-    terms = RunTerms(policy, reward=settings.reward.settings())
-    return Gateway(connect, tasks.bundle_bytes, run_name=name, run_seed=settings.seed, terms=terms)
-
-
-def _run(start: RunStart, connect: Connect, out: Path) -> TrainingSummary:
     from embomatrix.trainer.logging.display import display_on
     from embomatrix.trainer.logging.trackers import trackers_of
     from embomatrix.trainer.policy.loading import saved_policy
@@ -224,8 +213,13 @@ def _run(start: RunStart, connect: Connect, out: Path) -> TrainingSummary:
     settings, tasks, policy = start.settings, start.tasks, start.policy
     grpo_ready = start.progress.grpo_ready
     reference = saved_policy(out / REFERENCE, settings).frozen_copy() if grpo_ready else None
+    fails_group = settings.grpo.on_lost is OnLost.GROUP
+    policy_on_loss = GroupPolicy.RETRY_THEN_FAIL_GROUP if fails_group else GroupPolicy.PARTIAL
+    terms = RunTerms(policy_on_loss, reward=settings.reward.settings())
     with (
-        _gateway(tasks, connect, out.name, settings, settings.grpo.on_lost) as gateway,
+        Gateway(
+            connect, tasks.bundle_bytes, run_name=out.name, run_seed=settings.seed, terms=terms
+        ) as gateway,
         trackers_of(settings, out) as trackers,
         display_on(Console()) as display,
     ):

@@ -55,24 +55,35 @@ def load_tasks(folder: Path) -> TaskSet:
             f"no dataset at {folder}: build one with `embomatrix factory build --out={folder}`, or pass --dataset"
         )
     kinds = KindTable()
-    tasks: dict[str, TrainingTask] = {}
     try:
         dataset = Dataset.load(folder)
-        by_bundle: dict[str, list[TaskRecord]] = {}
-        for record in dataset.records:
-            by_bundle.setdefault(record.bundle_digest, []).append(record)
-        for digest, records in by_bundle.items():
-            # One scene at a time: decoding all of them would use the memory that simulators need.
-            bundle = dataset.read_bundle(digest)
-            kinds.add(bundle.scene)
-            tasks |= {record.task.task_id: training_task(bundle, record) for record in records}
     except DatasetError as error:
         raise TrainerError(str(error)) from error
+    tasks = read_tasks(dataset, kinds.add)
     train = tuple(tasks[record.task.task_id] for record in dataset.train)
     if not train:
         raise TrainerError(f"the dataset at {folder} has no training tasks: build it again with more tasks")
     heldout = tuple(tasks[record.task.task_id] for record in dataset.heldout)
     return TaskSet(train, heldout, dataset.bundle_bytes, kinds.table())
+
+
+def read_tasks(
+    dataset: Dataset, on_scene: Callable[[Scene], None] = lambda _: None
+) -> dict[str, TrainingTask]:
+    """Read all tasks of a dataset by id. ``on_scene`` gets each scene once. Raises TrainerError."""
+    by_bundle: dict[str, list[TaskRecord]] = {}
+    for record in dataset.records:
+        by_bundle.setdefault(record.bundle_digest, []).append(record)
+    tasks: dict[str, TrainingTask] = {}
+    for digest, records in by_bundle.items():
+        try:
+            # One scene at a time: decoding all of them would use the memory that simulators need.
+            bundle = dataset.read_bundle(digest)
+        except DatasetError as error:
+            raise TrainerError(str(error)) from error
+        on_scene(bundle.scene)
+        tasks |= {record.task.task_id: training_task(bundle, record) for record in records}
+    return tasks
 
 
 _KIND_ABILITIES: Final = ("toggleable", "heatSource", "coldSource", "cookable", "freezable")

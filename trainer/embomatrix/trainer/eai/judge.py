@@ -66,7 +66,7 @@ class NativeJudge:
 
     def __enter__(self) -> Self:
         self._folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="embomatrix-eai-")))
-        # Alone, without our other packages beside it: theirs have the same names.
+        # Copied to its own root, because the judge's packages have the names of ours.
         inside = Path(__file__).parent / INSIDE[-1]
         shutil.copytree(inside, self._folder.joinpath(*INSIDE), ignore=shutil.ignore_patterns("__pycache__"))
         return self

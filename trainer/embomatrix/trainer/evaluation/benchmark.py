@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.data.tasks import training_task
+from embomatrix.trainer.data.tasks import read_tasks
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, record_to_json
 from embomatrix.world.task import Profile
 
@@ -66,16 +66,7 @@ class Benchmark:
     @cached_property
     def tasks(self) -> Mapping[str, TrainingTask]:
         """Tasks with the content of their prompts, by id. Raises TrainerError if a bundle is missing."""
-        found: dict[str, TrainingTask] = {}
-        by_bundle: dict[str, list[TaskRecord]] = {}
-        for record in self.records:
-            by_bundle.setdefault(record.bundle_digest, []).append(record)
-        try:
-            for digest, records in by_bundle.items():
-                bundle = self.dataset.read_bundle(digest)
-                found |= {record.task.task_id: training_task(bundle, record) for record in records}
-        except DatasetError as error:
-            raise TrainerError(str(error)) from error
+        found = read_tasks(self.dataset)
         return {record.task.task_id: found[record.task.task_id] for record in self.records}
 
     def scene(self, record: TaskRecord) -> Scene:
@@ -96,16 +87,13 @@ def find_benchmark(
     TrainerError.
     """
     path = NAMED.get(named, Path(named))
-    if path.is_file():
-        records = _records_of_file(path)
-        folder = path.parent
-    elif path.is_dir():
-        records, folder = _records_of_folder(path), path
-    else:
+    if not path.exists():
         remedy = _BUILD_IT.get(
             named, f"pass a dataset folder, its {TASKS_FILE}, or one of {', '.join(NAMED)}"
         )
         raise TrainerError(f"no benchmark at {path}: {remedy}")
+    folder = path if path.is_dir() else path.parent
+    records = _read_records(path)
     chosen, found_split = _select_split(records, split, path)
     within = [record for record in chosen if record.task.profile in (Profile.PAPER, profile)]
     inexpressible = {record.task.task_id for record in chosen} - {record.task.task_id for record in within}
@@ -132,25 +120,21 @@ def _rejected(folder: Path) -> set[str]:
         ) from error
 
 
-def _records_of_folder(folder: Path) -> tuple[TaskRecord, ...]:
+def _read_records(path: Path) -> tuple[TaskRecord, ...]:
+    """Read the records of a dataset folder, or of a file with any name whose bundles lie beside it."""
     try:
-        return Dataset.load(folder).records
+        found = Dataset.load(path) if path.is_dir() else Dataset.load_file(path)
     except DatasetError as error:
         raise TrainerError(str(error)) from error
-
-
-def _records_of_file(path: Path) -> tuple[TaskRecord, ...]:
-    """Read the records of a file with any name. Their bundles must lie beside it."""
-    try:
-        found = Dataset.load_file(path)
-    except DatasetError as error:
-        raise TrainerError(str(error)) from error
-    for record in found.records:
-        if not found.has_bundle(record.bundle_digest):
-            raise TrainerError(
-                f"the task {record.task.task_id!r} of {path} is in the unknown scene {record.task.scene_id!r}: its bundle "
-                f"{record.bundle_digest} is not in {path.parent / 'bundles'}; copy it there from the task's original dataset"
-            )
+    missing = [
+        record for record in found.records if path.is_file() and not found.has_bundle(record.bundle_digest)
+    ]
+    if missing:
+        record = missing[0]
+        raise TrainerError(
+            f"the task {record.task.task_id!r} of {path} is in the unknown scene {record.task.scene_id!r}: its bundle "
+            f"{record.bundle_digest} is not in {path.parent / 'bundles'}; copy it there from the task's original dataset"
+        )
     return found.records
 
 

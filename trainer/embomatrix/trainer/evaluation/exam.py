@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 from embomatrix.skills.prompt import limited, prompt_for
-from embomatrix.trainer.evaluation.judging import AnswerJudge
+from embomatrix.trainer.evaluation.judging import judge_answers
 from embomatrix.trainer.evaluation.pictures import chosen_pictures
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
 
@@ -86,7 +86,7 @@ class WorldExam:
     def judge(
         self, setup: EvaluationSetup, answers: Sequence[Answer], report: Callable[[int, int], None]
     ) -> ExamResult:
-        judged = AnswerJudge(self.bench, setup, self._executor).judge(answers, report)
+        judged = judge_answers(self.bench, setup, self._executor, answers, report)
         categories = {record.task.task_id: record.task.category for record in self.bench.records}
         board = Scoreboard.of(categories, judged.verdicts, self.by_rule)
         return ExamResult(board, chosen_pictures(self.bench, board, judged.plans))

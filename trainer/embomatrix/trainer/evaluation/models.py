@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import torch
 
 from embomatrix.skills.prompt import Codec
-from embomatrix.trainer.config.errors import TrainerError, reason_of
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, LoraSettings, read_settings
 from embomatrix.trainer.lifecycle.checkpoint import read_state
 from embomatrix.trainer.policy.hf import HfPolicy
-from embomatrix.trainer.policy.loading import saved_policy
+from embomatrix.trainer.policy.loading import configure_torch, saved_policy
 from embomatrix.trainer.policy.tiny import TinyPolicy
 
 if TYPE_CHECKING:
@@ -34,12 +34,12 @@ def load_model(named: str, codec: Codec | None, *, threads: int | None, device: 
     folder = Path(named)
     if folder.is_dir() and (folder / "policy").is_dir():
         _, settings = read_state(folder)
-        # A checkpoint holds the merged model: the one that adapters were added to need not be here.
+        # A checkpoint holds the merged model, so the base model of its adapters is not needed.
         settings = settings.model_copy(update={"device": device, "lora": LoraSettings()})
-        _configure_torch(threads or settings.threads, device)
+        configure_torch(threads or settings.threads, device)
         policy: Policy = saved_policy(folder / "policy", settings)
         return LoadedModel(policy, settings.prompt.rows, settings.grpo.max_new)
-    _configure_torch(threads or torch.get_num_threads(), device)
+    configure_torch(threads or torch.get_num_threads(), device)
     if folder.is_dir() and TinyPolicy.is_saved_in(folder):
         settings = read_settings(None, {"device": device})
         return LoadedModel(saved_policy(folder, settings), settings.prompt.rows, settings.grpo.max_new)
@@ -53,13 +53,3 @@ def load_model(named: str, codec: Codec | None, *, threads: int | None, device: 
         settings.prompt.rows,
         settings.grpo.max_new,
     )
-
-
-def _configure_torch(threads: int, device: str) -> None:
-    torch.set_num_threads(threads)
-    try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise TrainerError(
-            f"the device {device!r} can't be used ({reason_of(error)}): expected cpu, or cuda where torch finds a GPU"
-        ) from error

@@ -35,7 +35,7 @@ class ExecutedPlan:
 
 
 def plan_view(scene: Scene, task: Task, executed: ExecutedPlan) -> str:
-    """Return inline SVG. The page's CSS colours the classes room, thing, used, way, ok, bad and not."""
+    """Return inline SVG. The page's CSS colours the classes room, piece, used, route, ok, bad and not."""
     view = PlanView(scene, _rooms(scene, task, executed.plan), margin_m=0.25, fit=FIT_PX)
     used = {name for call in executed.plan for name in _names(task, call)} & scene.by_name.keys()
     marks = _marks(scene, task, executed.plan)
@@ -46,7 +46,7 @@ def plan_view(scene: Scene, task: Task, executed: ExecutedPlan) -> str:
         *_furniture(scene, view, used),
         *(view.text(*room.low_m, room.name, 'class="name"', 4, -4) for room in scene.rooms),
         *_labels(scene, view, used),
-        view.line([start, *(point for _, point in marks)], "way"),
+        view.line([start, *(point for _, point in marks)], "route"),
         f'<circle class="robot" cx="{x}" cy="{y}" r="6"><title>initial position of the robot</title></circle>',
     ]
     marks_at: dict[Vec2, int] = {}
@@ -101,7 +101,7 @@ def _furniture(scene: Scene, view: PlanView, used: set[str]) -> list[str]:
     ]
     shown.sort(key=lambda entry: (entry[0], entry[1].low_m[2]))
     return [
-        view.box(box.low_m, box.high_m, "used" if is_used else "thing", name) for is_used, box, name in shown
+        view.box(box.low_m, box.high_m, "used" if is_used else "piece", name) for is_used, box, name in shown
     ]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
@@ -13,7 +13,7 @@ from embomatrix.trainer.evaluation.taxonomy import Cause
 from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
 
@@ -159,15 +159,10 @@ class Scoreboard:
 
 def estimate_to_json(estimate: Estimate) -> dict[str, Any]:
     """JSON-serialisable dict of an estimate. Unknown numbers are null."""
-    interval = estimate.interval
-    plain: Callable[[float], float | None] = lambda value: None if math.isnan(value) else value  # noqa: E731
-    return {
-        "value": plain(interval.value),
-        "low": plain(interval.low),
-        "high": plain(interval.high),
-        "method": estimate.method.value,
-        "tasks": estimate.tasks,
+    numbers = {
+        name: None if math.isnan(value) else value for name, value in asdict(estimate.interval).items()
     }
+    return {**numbers, "method": estimate.method.value, "tasks": estimate.tasks}
 
 
 def _task_to_json(task: TaskResult) -> dict[str, Any]:

@@ -66,9 +66,7 @@ def read_row(path: Path, bench_digest: str) -> ScoreRow:
     except (ValueError, KeyError, TypeError) as error:
         raise TrainerError(f"{path} is not an evaluation report: expected its report.json") from error
     if digest != bench_digest:
-        raise TrainerError(
-            f"{path} reports on other tasks: only rows on the same benchmark stand in one table"
-        )
+        raise TrainerError(f"{path} reports on other tasks: pass a report on the same benchmark")
     return row
 
 

@@ -121,7 +121,7 @@ def atomic_folder(final: Path) -> Iterator[Path]:
         yield partial
         shutil.rmtree(final, ignore_errors=True)
         os.replace(partial, final)
-    except (OSError, RuntimeError) as error:  # torch's writer raises RuntimeError where a disk is full
+    except (OSError, RuntimeError) as error:  # torch's writer raises RuntimeError for a full disk
         full = shutil.disk_usage(final.parent if final.parent.is_dir() else ".").free < DISK_FULL_BYTES
         raise TrainerError(
             f"{final} can't be written ({'the disk is full' if full else reason_of(error)}): free space or fix the "

@@ -13,7 +13,6 @@ from embomatrix.rpc.wire.training import (
     SampledStep,
     TrainingReport,
 )
-from embomatrix.rpc.wire.values import Cancelled, Completed, InfraFailure
 from embomatrix.trainer.logging.trackers import GRPO_PHASE
 
 if TYPE_CHECKING:
@@ -68,18 +67,7 @@ def _plan(log: GroupLog, outcome: PlanOutcome, advantage: float) -> SampledPlan:
     tiers = None
     if reward is not None:
         tiers = RewardTiers(reward.format, reward.relevance, reward.goal, reward.success)
-    problem = outcome.problem
-    steps: tuple[SampledStep, ...] = ()
-    match outcome.outcome:
-        case Completed():
-            steps = tuple(
-                SampledStep(step.call.skill.value, step.ok, step.message) for step in outcome.outcome.steps
-            )
-        case InfraFailure(code=code, message=message):
-            problem = f"{code.value}: {message}"
-        case Cancelled():
-            problem = "cancelled"
-        case None:
-            pass
+    steps = tuple(SampledStep(step.call.skill.value, step.ok, step.message) for step in outcome.steps)
+    problem = outcome.problem or outcome.lost
     finite = advantage if math.isfinite(advantage) else 0.0
     return SampledPlan(task.task_id, task.instruction, outcome.text, tiers, finite, problem, steps)

@@ -6,12 +6,13 @@ import json
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from pydantic import TypeAdapter
+
 from embomatrix.trainer.config.errors import TrainerError, reason_of
 from embomatrix.trainer.lifecycle.stopwatch import TimeShares
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
 
 OUTCOME: Final = "outcome.json"
@@ -42,7 +43,7 @@ class RunOutcome:
     lost: int
     wall_s: float
     grpo_s: float
-    spent_s: Mapping[str, float]
+    spent_s: dict[str, float]
     before: tuple[TaskRate, ...]
     after: tuple[TaskRate, ...]
     peak_mb: float = 0.0
@@ -73,10 +74,8 @@ def read_outcome(folder: Path) -> RunOutcome:
         value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         if value.pop("schema") != SCHEMA:
             raise TrainerError(f"{path} has another version than {SCHEMA}: train again with another --out")
-        for name in ("before", "after"):
-            value[name] = tuple(TaskRate(**item) for item in value[name])
-        return RunOutcome(**value)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        return TypeAdapter(RunOutcome).validate_python(value)
+    except (OSError, ValueError, KeyError, AttributeError) as error:
         raise TrainerError(
             f"{path} is not the outcome of a finished run ({reason_of(error)}): finish the run with `embomatrix train --resume`"
         ) from error

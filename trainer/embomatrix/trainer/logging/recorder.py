@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from embomatrix.rpc.wire.values import Cancelled, Completed, InfraFailure
 from embomatrix.trainer.logging.trackers import GRPO_PHASE, IMITATION_PHASE
 from embomatrix.world.whole_file import write_whole
 
@@ -119,13 +118,10 @@ def _plan_to_json(outcome: PlanOutcome) -> dict[str, Any]:
             "success": reward.success,
             "atoms": [[atom.text, atom.holds] for atom in reward.atoms],
         }
-    match outcome.outcome:
-        case Completed(steps=steps):
-            row["steps"] = [[step.call.skill.value, step.ok, step.message] for step in steps]
-        case InfraFailure(code=code, message=message):
-            row["lost"] = f"{code.value}: {message}"
-        case Cancelled():
-            row["lost"] = "cancelled"
-        case None:
-            row["unparsable"] = outcome.problem
+    if outcome.problem:
+        row["unparsable"] = outcome.problem
+    elif outcome.lost:
+        row["lost"] = outcome.lost
+    else:
+        row["steps"] = [[step.call.skill.value, step.ok, step.message] for step in outcome.steps]
     return row

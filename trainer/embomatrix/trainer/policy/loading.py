@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+import torch
+
 from embomatrix.trainer.config.errors import DAMAGE, TrainerError, reason_of
 from embomatrix.trainer.policy.compute_dtype import torch_dtype
 from embomatrix.trainer.policy.decoder import DecoderShape
@@ -19,6 +21,17 @@ if TYPE_CHECKING:
     from embomatrix.trainer.policy.protocol import Policy
 
 TINY: Final = "tiny"
+
+
+def configure_torch(threads: int, device: str) -> None:
+    """Set torch's threads and check its device. Raises TrainerError if torch does not support the device."""
+    torch.set_num_threads(threads)
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise TrainerError(
+            f"the device {device!r} can't be used ({reason_of(error)}): expected cpu, or cuda with a GPU"
+        ) from error
 
 
 def is_word_level(model: str) -> bool:

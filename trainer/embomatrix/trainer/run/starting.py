@@ -7,16 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import torch
-
 from embomatrix.host.cores import usable_cores
-from embomatrix.trainer.config.errors import TrainerError, reason_of
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, read_settings, with_changes
 from embomatrix.trainer.data.tasks import load_tasks
 from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
 from embomatrix.trainer.policy.hf import HfPolicy
-from embomatrix.trainer.policy.loading import TINY, is_word_level, new_policy, saved_policy
+from embomatrix.trainer.policy.loading import TINY, configure_torch, is_word_level, new_policy, saved_policy
 from embomatrix.trainer.policy.prompts import PromptBuilder
 
 if TYPE_CHECKING:
@@ -62,7 +60,8 @@ def start_run(
         settings = settings.model_copy(update={"processes": _processes_for(settings)})
     if any((out / CHECKPOINTS).glob("[!.]*")):
         raise TrainerError(f"{out} holds another run: pass --resume to continue it, or another --out")
-    tasks = load_dataset(dataset, settings)
+    configure_torch(settings.threads, settings.device)
+    tasks = load_tasks(dataset)
     policy = new_policy(settings, tasks)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -115,7 +114,8 @@ def resume_run(
     given |= {} if model == TINY else {"model": model}
     settings = with_changes(original.model_dump(), given)
     _check_unchanged(out, original, settings, grpo_ready=progress.grpo_ready)
-    tasks = load_dataset(dataset, settings)
+    configure_torch(settings.threads, settings.device)
+    tasks = load_tasks(dataset)
     if progress.dataset != digest_of(tasks):
         raise TrainerError(
             f"the run in {out} was started with other tasks than those of {dataset}: pass its original --dataset, "
@@ -154,18 +154,6 @@ def digest_of(tasks: TaskSet) -> str:
 def has_checkpoint(out: Path) -> bool:
     """True if the folder holds a run that can be resumed."""
     return CheckpointStore(out / CHECKPOINTS, keep=1).latest() is not None
-
-
-def load_dataset(dataset: Path, settings: TrainSettings) -> TaskSet:
-    """Load the dataset after checking that torch supports the device. Raises TrainerError."""
-    torch.set_num_threads(settings.threads)
-    try:
-        torch.empty(0, device=settings.device)
-    except (RuntimeError, AssertionError) as error:
-        raise TrainerError(
-            f"the device {settings.device!r} can't be used ({reason_of(error)}): expected cpu, or cuda where torch finds a GPU"
-        ) from error
-    return load_tasks(dataset)
 
 
 def prompt_builder_for(policy: Policy, tasks: TaskSet, settings: TrainSettings) -> PromptBuilder:

@@ -123,7 +123,7 @@ class Demo:
         }
         self._init = self._conditions.parsed_initial_conditions
         self.room = {fact[1]: fact[2] for fact in self._init if fact[0] == "inroom"}
-        self.things: dict[str, Any] = {}
+        self.objects: dict[str, Any] = {}
         """The object that each instance is, whole where it can be sliced."""
         self.object_scope: dict[str, Any] = {
             instance: object() for instance in scope if instance.startswith("agent.")
@@ -152,13 +152,13 @@ class Demo:
             name, unary = entry["name"], self._states_of(instance, entry["name"])
             box = list(self._box(instance, containers))
             if name.startswith("room_floor"):
-                thing = self.object_scope[instance] = make_object(*_FLOOR, name, box, unary)
+                item = self.object_scope[instance] = make_object(*_FLOOR, name, box, unary)
             else:
-                thing = make_object(*_ARTICULATED, name, box, unary)
+                item = make_object(*_ARTICULATED, name, box, unary)
                 self.object_scope[instance] = (
-                    self._sliceable(thing, name, box, unary) if "Sliced" in unary else thing
+                    self._sliceable(item, name, box, unary) if "Sliced" in unary else item
                 )
-            self.things[instance] = thing
+            self.objects[instance] = item
 
     def _sliceable(self, whole: Any, name: str, box: list[float], unary: set[str]) -> Any:
         """Stand-in for iGibson's switch between an object and its two halves."""
@@ -200,46 +200,46 @@ class Demo:
         return CONTAINER_M if self.synset[instance] in containers else SMALL_M
 
     def _set_first_state(self) -> None:
-        for instance, thing in self.things.items():
+        for instance, item in self.objects.items():
             opens = state_class("Open")
-            if self.synset[instance] in STARTS_OPEN and opens in thing.states:
-                thing.states[opens].holds = True
+            if self.synset[instance] in STARTS_OPEN and opens in item.states:
+                item.states[opens].holds = True
         for fact in self._init:
             holds = fact[0] != "not"
             predicate, *args = fact if holds else fact[1]
             if predicate != "inroom" and not any(arg.startswith("agent.") for arg in args):
                 self._set(predicate, args, holds=holds)
         self._stand_on_floors()
-        # What the real simulator found true at the start, although nobody asked for it.
+        # Facts that the real simulator found true initially, although the task does not state them.
         truths = self._package.first_truths.get(self.name, {"subgoals": (), "subgoal_success": ()})
         for tokens, true in zip(truths["subgoals"], truths["subgoal_success"], strict=False):
-            known = len(tokens) == 3 and tokens[0] in RELATIONS and set(tokens[1:]) <= self.things.keys()
+            known = len(tokens) == 3 and tokens[0] in RELATIONS and set(tokens[1:]) <= self.objects.keys()
             if true and known:
                 self._set(tokens[0], tokens[1:], holds=True)
 
     def _set(self, predicate: str, args: list[str], *, holds: bool) -> None:
-        state = self.things[args[0]].states[state_class(PREDICATES[predicate])]
+        state = self.objects[args[0]].states[state_class(PREDICATES[predicate])]
         if predicate in RELATIONS:
-            state.related.add(self.things[args[1]].name)
+            state.related.add(self.objects[args[1]].name)
         else:
             state.holds = holds
 
     def _stand_on_floors(self) -> None:
         on_floor = state_class("OnFloor")
         floors = {
-            room: self.things[instance].name
+            room: self.objects[instance].name
             for instance, room in self.room.items()
-            if self.things[instance].name.startswith("room_floor")
+            if self.objects[instance].name.startswith("room_floor")
         }
         for instance, room in self.room.items():
-            thing = self.things[instance]
-            if room in floors and not thing.name.startswith(OFF_FLOOR):
-                thing.states[on_floor].related.add(floors[room])
+            item = self.objects[instance]
+            if room in floors and not item.name.startswith(OFF_FLOOR):
+                item.states[on_floor].related.add(floors[room])
         for instance in self.instances:
-            thing = self.things[instance]
-            if thing.name.startswith("room_floor"):
-                # The published graph stops on a scene without any edge; this one is about nothing that a goal names.
-                thing.states[on_floor].related.add(thing.name)
+            item = self.objects[instance]
+            if item.name.startswith("room_floor"):
+                # The published graph crashes on a scene without any edge. No goal mentions this one.
+                item.states[on_floor].related.add(item.name)
 
 
 _truths: list[Callable[..., bool]] = []
@@ -283,7 +283,7 @@ def exact_truths(demo: Demo) -> list[bool]:
     The published check compares with a truncated list instead.
     """
     state = demo.graph.get_state_dict(demo)
-    name = {instance: thing.name for instance, thing in demo.things.items()}
+    name = {instance: item.name for instance, item in demo.objects.items()}
     unary = {node: set(value["states"]) for node, value in state["nodes"].items()}
     relations = {(edge["relation"], edge["from_name"], edge["to_name"]) for edge in state["edges"]}
     above = {one: other for relation, one, other in relations if relation in ("inside", "ontop")}
@@ -304,14 +304,14 @@ def exact_truths(demo: Demo) -> list[bool]:
 
 
 def _is_within(
-    thing: str, container: str, above: dict[str, str], relations: set[tuple[str, str, str]]
+    item: str, container: str, above: dict[str, str], relations: set[tuple[str, str, str]]
 ) -> bool:
     seen: set[str] = set()
     entered = False
-    while thing in above and thing not in seen:
-        seen.add(thing)
-        entered = entered or ("inside", thing, above[thing]) in relations
-        thing = above[thing]
-        if thing == container:
+    while item in above and item not in seen:
+        seen.add(item)
+        entered = entered or ("inside", item, above[item]) in relations
+        item = above[item]
+        if item == container:
             return entered
     return False

@@ -1,4 +1,4 @@
-"""Drawers and doors: what lies in them rides along, what is in their way stops them, and a reset undoes it all."""
+"""Drawers and doors carry their contents, stop at obstacles, and are reset exactly."""
 
 import dataclasses
 
@@ -50,14 +50,14 @@ def flat():
     simulator.close()
 
 
-def test_what_lies_in_a_drawer_is_inside_and_shut_in(flat):
+def test_object_in_a_shut_drawer_is_inside_and_enclosed(flat):
     executed(flat, "go_to_room kitchen_0")
     assert flat.facts.holds("inside", ("mug_2", "bottom_cabinet_1"))
     assert flat.world.closed_around("mug_2") == "bottom_cabinet_1"
     assert flat.world.relations.host_of("book_1").spot == "upper"
 
 
-def test_robot_steps_out_of_the_place_that_a_drawer_takes_and_still_reaches_it(flat):
+def test_robot_steps_aside_from_an_opening_drawer_and_still_reaches_it(flat):
     executed(flat, OPENED)
     world = flat.world
     ground, robot = world.navigator.ground, world.robot
@@ -68,7 +68,7 @@ def test_robot_steps_out_of_the_place_that_a_drawer_takes_and_still_reaches_it(f
     assert not executed(flat, f"{OPENED}; pick_up mug_2").failure
 
 
-def test_nobody_stands_in_an_open_drawer_and_a_shut_one_gives_its_room_back(flat):
+def test_open_drawer_takes_floor_and_a_shut_one_returns_it(flat):
     executed(flat, "go_to_room kitchen_0")
     navigator, origin = flat.world.navigator, flat.world.robot
     before = navigator.stands("bottom_cabinet_1", origin)
@@ -81,7 +81,7 @@ def test_nobody_stands_in_an_open_drawer_and_a_shut_one_gives_its_room_back(flat
     assert navigator.stands("bottom_cabinet_1", origin) == before
 
 
-def test_open_drawer_in_an_aisle_bars_the_way_by_name():
+def test_open_drawer_that_blocks_an_aisle_is_named():
     scene, can = drawer_scene(), make.apple()
     aisle = box((4.2, 1.2, 1.2), (1.6, 0.1, 2.4))
     at_its_end = placed("apple_9", can, "kitchen_0", upright(4.75, 0.3, 0.0, can))
@@ -99,7 +99,7 @@ def test_open_drawer_in_an_aisle_bars_the_way_by_name():
         simulator.close()
 
 
-def test_contents_ride_out_with_their_drawer_and_back_in(flat):
+def test_contents_move_with_their_drawer(flat):
     task = task_over(flat.world.scene)
     flat.reset(task, 0)
     before = flat.world.engine.pose("mug_2")
@@ -115,13 +115,13 @@ def test_contents_ride_out_with_their_drawer_and_back_in(flat):
     assert flat.world.closed_around("mug_2") == "bottom_cabinet_1"
 
 
-def test_thing_is_taken_out_of_an_open_drawer(flat):
+def test_object_is_picked_up_from_an_open_drawer(flat):
     trace = executed(flat, f"{OPENED}; pick_up mug_2; move coffee_table_1; place coffee_table_1 ontop")
     assert trace.failure is None
     assert not flat.facts.holds("inside", ("mug_2", "bottom_cabinet_1"))
 
 
-def test_thing_is_placed_in_an_open_drawer_and_shut_in(flat):
+def test_object_is_placed_in_an_open_drawer_that_then_shuts(flat):
     trace = executed(
         flat,
         f"{OPENED}; move apple_1; pick_up apple_1; move bottom_cabinet_1; place bottom_cabinet_1 inside; "
@@ -141,7 +141,7 @@ def test_nothing_is_placed_in_a_shut_drawer(flat):
     assert trace.failure is FailureReason.CONTAINER_CLOSED
 
 
-def test_a_drawer_that_something_stops_comes_out_up_to_it():
+def test_blocked_drawer_opens_up_to_the_obstacle():
     wall = box((4.0, 0.8, 0.25), (1.0, 0.1, 0.5))
     scene = dataclasses.replace(drawer_scene(), walls=(*drawer_scene().walls, wall))
     simulator = load_simulator(Bundle(scene, {}))
@@ -158,7 +158,7 @@ def test_a_drawer_that_something_stops_comes_out_up_to_it():
         simulator.close()
 
 
-def test_what_sticks_out_of_a_drawer_keeps_it_from_closing(flat):
+def test_protruding_object_keeps_a_drawer_from_closing(flat):
     task = task_over(flat.world.scene)
     flat.reset(task, 0)
     for call in plan_of(task, OPENED):
@@ -176,7 +176,7 @@ def test_what_sticks_out_of_a_drawer_keeps_it_from_closing(flat):
     assert engine.state_bytes() == before
 
 
-def test_what_stands_before_a_drawer_keeps_it_from_opening(flat):
+def test_object_before_a_drawer_keeps_it_from_opening(flat):
     task = task_over(flat.world.scene)
     flat.reset(task, 0)
     engine = flat.world.engine
@@ -190,7 +190,7 @@ def test_what_stands_before_a_drawer_keeps_it_from_opening(flat):
     assert engine.state_bytes() == before
 
 
-def test_what_rests_on_a_rider_rides_along(flat):
+def test_objects_on_carried_objects_are_carried_too(flat):
     task = task_over(flat.world.scene)
     flat.reset(task, 0)
     engine = flat.world.engine

@@ -1,4 +1,4 @@
-"""An arm does not reach through a door that stands open, nor through the wall behind its hinge."""
+"""The arm reaches neither through an open door nor through the wall behind its hinge."""
 
 from __future__ import annotations
 
@@ -44,14 +44,12 @@ def is_behind(
     ],
     ids=["from the front", "through the leaf", "through the wall", "a shut door", "over the leaf"],
 )
-def test_only_what_lies_past_an_open_leaf_or_the_wall_beside_it_is_behind(
-    stand, point, fraction, behind
-) -> None:
+def test_only_places_past_an_open_panel_or_its_wall_are_behind(stand, point, fraction, behind) -> None:
     assert is_behind(stand, point, fraction, Pose((0.0, 0.0, 0.8))) is behind
 
 
 @given(COORDINATE, COORDINATE, st.floats(-math.pi, math.pi), st.sampled_from((AHEAD, LEFT, FAR_LEFT)))
-def test_where_the_thing_stands_makes_no_difference(x, y, yaw, stand) -> None:
+def test_result_does_not_depend_on_the_object_pose(x, y, yaw, stand) -> None:
     point = (0.1, 0.05, 0.0)
     moved = Pose.from_xyz_yaw(x, y, 0.8, yaw)
     assert is_behind(stand, point, 1.0, moved) is is_behind(stand, point, 1.0, Pose((0.0, 0.0, 0.8)))

@@ -1,4 +1,4 @@
-"""Scenes that come and go leave nothing behind, in Python or in what pybullet holds of it."""
+"""Loading and closing scenes leaks nothing, in Python or in pybullet."""
 
 import dataclasses
 import gc
@@ -40,7 +40,7 @@ def blocks_after(loads: int, pool: ClientPool) -> int:
     return sys.getallocatedblocks()
 
 
-def test_scenes_of_hulls_that_are_loaded_and_closed_leave_no_objects_behind() -> None:
+def test_loading_and_closing_scenes_of_hulls_leaks_no_objects() -> None:
     pool = ClientPool()
     before = blocks_after(3, pool)
     # A vertex that pybullet kept would be four blocks: 16 corners would leave 64 of them at each load.

@@ -1,4 +1,4 @@
-"""Effects of temperature follow from the state, whichever call brought it about."""
+"""Effects of temperature follow from the state, whichever call caused it."""
 
 from dataclasses import replace
 
@@ -37,7 +37,7 @@ def after(simulator, text):
 HEAT_ON_STOVE = "move apple_1; pick_up apple_1; move stove_1; place stove_1 ontop; toggle_on stove_1"
 
 
-def test_what_lies_in_the_closed_fridge_at_the_start_is_frozen(flat):
+def test_object_in_the_closed_fridge_is_frozen_at_the_start(flat):
     assert after(flat, "turn 0").holds("frozen", ("chicken_leg_1",))
     assert not after(flat, "turn 0").holds("frozen", ("apple_1",))
 
@@ -50,7 +50,7 @@ def test_the_fridge_freezes_only_when_it_is_closed(flat):
     assert after(flat, f"{stock}; close fridge_1").holds("frozen", ("apple_1",))
 
 
-def test_what_is_frozen_stays_so_outside_until_it_is_heated(flat):
+def test_frozen_object_stays_frozen_until_it_is_heated(flat):
     fetch = "move fridge_1; open fridge_1; pick_up chicken_leg_1; move stove_1; place stove_1 ontop"
     assert after(flat, fetch).holds("frozen", ("chicken_leg_1",))
     facts = after(flat, f"{fetch}; toggle_on stove_1")
@@ -59,7 +59,7 @@ def test_what_is_frozen_stays_so_outside_until_it_is_heated(flat):
     assert facts.holds("cooked", ("chicken_leg_1",))
 
 
-def test_a_stove_acts_when_the_switch_comes_last_and_when_the_food_does(flat):
+def test_stove_acts_after_switching_on_and_after_placing_food(flat):
     assert after(flat, HEAT_ON_STOVE).holds("cooked", ("apple_1",))
     other_way = (
         "move stove_1; toggle_on stove_1; move apple_1; pick_up apple_1; move stove_1; place stove_1 ontop"
@@ -88,17 +88,17 @@ def test_food_in_a_bowl_in_the_microwave_gets_hot(flat):
     assert facts.holds("hot", ("apple_1",))
 
 
-def test_what_can_not_be_cooked_gets_hot_only(flat):
+def test_uncookable_object_only_gets_hot(flat):
     facts = after(flat, "move mug_1; pick_up mug_1; move stove_1; place stove_1 ontop; toggle_on stove_1")
     assert facts.holds("hot", ("mug_1",))
     assert not facts.holds("cooked", ("mug_1",))
 
 
-def test_what_lies_beside_a_source_stays_as_it_is(flat):
+def test_object_beside_a_source_is_unaffected(flat):
     assert not after(flat, HEAT_ON_STOVE).holds("hot", ("bowl_1",))
 
 
-def test_what_is_hot_freezes_in_the_fridge_and_stays_cooked(flat):
+def test_hot_object_freezes_in_the_fridge_and_stays_cooked(flat):
     facts = after(
         flat,
         f"{HEAT_ON_STOVE}; move fridge_1; open fridge_1; move apple_1; pick_up apple_1; move fridge_1; "
@@ -109,12 +109,12 @@ def test_what_is_hot_freezes_in_the_fridge_and_stays_cooked(flat):
     assert not facts.holds("hot", ("apple_1",))
 
 
-def test_a_reset_undoes_what_temperature_did(flat):
+def test_reset_undoes_thermal_effects(flat):
     after(flat, HEAT_ON_STOVE)
     assert not after(flat, "turn 0").holds("hot", ("apple_1",))
 
 
-def test_a_change_is_told_once(flat):
+def test_change_is_reported_once(flat):
     after(flat, HEAT_ON_STOVE)
     assert flat.world.let_sources_act() == ()
     assert flat.world.states["apple_1"] == {State.HOT, State.COOKED}

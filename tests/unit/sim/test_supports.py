@@ -1,4 +1,4 @@
-"""Footings that are kept: whatever moves, they are those that a fresh look would give."""
+"""Cached support states equal fresh ones after any change."""
 
 import numpy as np
 import pytest
@@ -60,7 +60,7 @@ def change(engine, kind, name, seed) -> None:
 
 @settings(max_examples=150, deadline=None)
 @given(st.lists(CHANGE, max_size=12))
-def test_kept_footings_are_those_of_a_fresh_look(engine, changes) -> None:
+def test_cached_support_states_equal_fresh_ones(engine, changes) -> None:
     engine.reset()
     kept = SupportTracker(engine)
     for kind, name, seed in changes:
@@ -107,7 +107,7 @@ def test_nothing_is_inside_and_on_top_of_one_closable_cavity(engine, changes) ->
             assert not (relations.inside(name, container) and relations.inside(container, name))
 
 
-def test_what_is_parked_stands_nowhere(engine) -> None:
+def test_parked_object_has_no_support(engine) -> None:
     engine.reset()
     engine.park("bowl_1")
     assert SupportTracker(engine).of("bowl_1") == UNSUPPORTED

@@ -1,4 +1,4 @@
-"""Many poses at once: the arrays must say what one pose at a time says."""
+"""Batch pose tests agree with tests of single poses."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def lineup_of(boxes: list[Aabb]) -> PoseBoxes:
 
 
 @given(st.lists(st.tuples(POSE, st.sampled_from(("", "drawer"))), min_size=1, max_size=5), POSE, POSE, POSE)
-def test_boxes_of_many_poses_are_those_of_each(spots, frame, drawer, then) -> None:
+def test_batch_boxes_equal_single_boxes(spots, frame, drawer, then) -> None:
     poses, links = [pose for pose, _ in spots], [link for _, link in spots]
     frames = {"": frame, "drawer": drawer}
     bounds = bounds_of(LAMP)
@@ -71,7 +71,7 @@ SQUARE_POSE = st.builds(
     SQUARE_POSE,
     SQUARE_POSE,
 )
-def test_boxes_kept_in_a_supports_frame_are_those_in_the_world_where_it_stands_square(spots, frame, drawer):
+def test_boxes_in_a_square_supports_frame_equal_world_boxes(spots, frame, drawer):
     places = PoseSet.of(pose_rows([pose for pose, _ in spots]), [link for _, link in spots])
     frames = {"": frame, "drawer": drawer}
     expected = places.world_boxes(bounds_of(LAMP), (0.0,), frames)
@@ -84,12 +84,12 @@ def test_boxes_kept_in_a_supports_frame_are_those_in_the_world_where_it_stands_s
 @pytest.mark.parametrize(
     "askew", [Pose.from_xyz_yaw(0.0, 0.0, 0.0, 0.1), Pose((0.0, 0.0, 0.0), (0.6, 0.0, 0.0, 0.8))]
 )
-def test_boxes_kept_in_a_supports_frame_tell_nothing_of_one_that_stands_askew(askew) -> None:
+def test_boxes_in_a_tilted_supports_frame_have_no_world_boxes(askew) -> None:
     places = PoseSet.of(pose_rows([Pose((0.0, 0.0, 0.5))]), [""])
     assert places.boxes(bounds_of(LAMP)).world_boxes({"": askew}) is None
 
 
-def test_boxes_that_are_moved_keep_their_links_and_sizes() -> None:
+def test_moved_boxes_keep_their_links_and_sizes() -> None:
     places = PoseSet.of(pose_rows([Pose((0.0, 0.0, 0.5)), Pose((0.0, 0.0, 0.9))]), ["", "drawer"])
     boxes = places.boxes(bounds_of(LAMP))
     moved = boxes.moved(np.array([1, 0, 1]), np.array([(1.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, 3.0)]))
@@ -99,7 +99,7 @@ def test_boxes_that_are_moved_keep_their_links_and_sizes() -> None:
 
 
 @given(st.lists(BOX, min_size=1, max_size=6), COORDINATE, COORDINATE)
-def test_reach_to_many_boxes_is_that_to_each(boxes, x, y) -> None:
+def test_batch_reach_equals_single_reach(boxes, x, y) -> None:
     stand = StandPose(x, y, 0.0)
     assert lineup_of(boxes).reached_from(stand).tolist() == [in_reach(box, stand) for box in boxes]
 
@@ -108,12 +108,12 @@ def test_reach_to_many_boxes_is_that_to_each(boxes, x, y) -> None:
     ("away_m", "height_m", "handy"),
     [(0.6, 0.8, True), (0.9, 0.8, False), (0.6, 0.1, False), (0.6, 1.8, False)],
 )
-def test_a_place_is_handy_that_is_near_and_neither_low_nor_overhead(away_m, height_m, handy) -> None:
+def test_near_place_at_medium_height_is_handy(away_m, height_m, handy) -> None:
     cube = Aabb((away_m, -0.05, height_m - 0.05), (away_m + 0.1, 0.05, height_m + 0.05))
     assert lineup_of([cube]).handy_from(StandPose(0.0, 0.0, 0.0)).tolist() == [handy]
 
 
-def test_a_thing_in_the_middle_of_a_solid_one_is_taken_and_beside_it_not() -> None:
+def test_pose_inside_a_solid_object_is_taken_and_beside_it_is_free() -> None:
     boxes = [Aabb((0.0, 0.0, 0.0), (0.1, 0.1, 0.1)), Aabb((0.19, 0.0, 0.0), (0.29, 0.1, 0.1))]
     near = [Aabb((9.0, 9.0, 9.0), (9.1, 9.1, 9.1)), Aabb((0.0, 0.0, 0.0), (0.2, 0.2, 0.2))]
     taken, most = lineup_of(boxes).overlaps(Neighbours.of(near, [True, True], [False, False]))
@@ -121,13 +121,13 @@ def test_a_thing_in_the_middle_of_a_solid_one_is_taken_and_beside_it_not() -> No
     assert most.tolist() == [1, 1]
 
 
-def test_what_has_a_hollow_is_taken_only_on_its_own_level() -> None:
+def test_object_with_a_cavity_is_taken_only_on_its_own_level() -> None:
     boxes = [Aabb((0.05, 0.05, z), (0.15, 0.15, z + 0.1)) for z in (0.0, 0.05)]
     bowl = Neighbours.of([Aabb((0.0, 0.0, 0.0), (0.2, 0.2, 0.2))], [False], [True])
     assert lineup_of(boxes).overlaps(bowl)[0].tolist() == [True, False]
 
 
-def test_a_pose_on_a_link_without_a_frame_is_in_nobodys_reach() -> None:
+def test_pose_on_a_link_without_a_frame_is_out_of_reach() -> None:
     boxes = PoseSet.of(pose_rows([Pose((0.0, 0.0, 0.5))]), ["drawer"]).world_boxes(
         bounds_of(LAMP), (0.0,), {"": Pose((0.0, 0.0, 0.0))}
     )
@@ -142,7 +142,7 @@ def test_poses_taken_in_turn_keep_their_rotations() -> None:
 
 
 @given(BOX, COORDINATE, COORDINATE, st.sampled_from((0, 1, 2, 3)))
-def test_a_box_is_turned_by_right_angles_as_its_solid_is(box, x, y, quarters) -> None:
+def test_quarter_turn_of_a_box_equals_that_of_its_solid(box, x, y, quarters) -> None:
     solid = Asset(
         "box-test",
         "box",
@@ -159,12 +159,12 @@ def test_a_box_is_turned_by_right_angles_as_its_solid_is(box, x, y, quarters) ->
 
 
 @pytest.mark.parametrize("quat", [(0.1, 0.0, 0.0, math.sqrt(0.99)), (0.0, 0.0, 0.1, math.sqrt(0.99))])
-def test_a_box_is_not_turned_by_any_other_angle(quat) -> None:
+def test_box_is_not_turned_by_other_angles(quat) -> None:
     assert square_box(Aabb((0.0, 0.0, 0.0), (1.0, 2.0, 3.0)), Pose((0.0, 0.0, 0.0), quat)) is None
 
 
 @given(st.lists(BOX, min_size=1, max_size=5), COORDINATE)
-def test_raised_boxes_begin_over_the_height_and_rise_no_farther(boxes, height) -> None:
+def test_raised_boxes_begin_exactly_over_the_height(boxes, height) -> None:
     raised = lineup_of(boxes).raised_over(height)
     for box, low, high in zip(boxes, raised.lows_m, raised.highs_m, strict=True):
         assert low[2] == pytest.approx(max(box.low_m[2], height))

@@ -1,4 +1,4 @@
-"""The hash of boxes finds what comparing all of them finds."""
+"""The spatial hash finds the same boxes as an exhaustive comparison."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,7 +19,7 @@ BOX = st.builds(box_at, PLACE, SIZE)
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 8), st.none() | BOX), max_size=30), BOX, st.floats(0.0, 1.0))
-def test_near_boxes_are_those_that_a_comparison_of_all_finds(changes, asked, reach_m) -> None:
+def test_near_boxes_equal_those_of_an_exhaustive_comparison(changes, asked, reach_m) -> None:
     around, boxes = SpatialHash(), {}
     for number, box in changes:
         if box is None:
