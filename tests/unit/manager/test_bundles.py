@@ -21,7 +21,7 @@ class Folder:
         self.needed = set()
         self.path = path
         self.store = BundleStore(path, total_bytes=3 * SIZE, keep_s=keep_s, clock=lambda: self.now_s)
-        self.store.keep(lambda: {digest_of(name) for name in self.needed})
+        self.store.protect(lambda: {digest_of(name) for name in self.needed})
 
     async def put(self, name, after_s=100.0):
         self.now_s += after_s

@@ -128,9 +128,9 @@ async def test_damaged_bundle_is_requested_again(tmp_path):
     data = packed(b"content")
     digest = digest_of(data)
     await store.put(digest, pieces(data))
-    assert await store.lacking([digest, digest]) == []
+    assert await store.missing_or_damaged([digest, digest]) == []
     next(tmp_path.iterdir()).write_bytes(b"contemt")
-    assert await store.lacking([digest, digest]) == [digest]
+    assert await store.missing_or_damaged([digest, digest]) == [digest]
     assert list(tmp_path.iterdir()) == []
 
 
