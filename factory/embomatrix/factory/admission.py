@@ -129,19 +129,31 @@ def admit(
     if trace.failure is not None or not reward.success:
         last = trace.steps[-1].message if trace.steps else "the plan is empty"
         return TaskRefusal(RefusalReason.ORACLE_FAILED, f"the oracle's plan earns {reward.total:.1f}: {last}")
-    failure = plan_failure(physics, task, plan) if physics is not None else ""
-    if failure:
+    failure = plan_failure(physics, task, plan) if physics is not None else None
+    if failure is not None:
         return TaskRefusal(
             RefusalReason.PHYSICS_FAILED, f"the oracle's plan fails in stepped physics: {failure}"
         )
     return Admitted(plan, held)
 
 
-def plan_failure(executor: PlanExecutor, task: Task, plan: Plan) -> str:
-    """Execute a plan and return the reason for its failure, or an empty string if it reaches the goal."""
+@dataclass(frozen=True, slots=True)
+class PlanFailure:
+    """Failure of an executed plan. ``reason``: failure reason of its last step, or ``goal_missed``."""
+
+    reason: str
+    detail: str
+
+    def __str__(self) -> str:
+        return f"{self.reason}: {self.detail}"
+
+
+def plan_failure(executor: PlanExecutor, task: Task, plan: Plan) -> PlanFailure | None:
+    """Execute a plan and return its failure, None if it reaches the goal."""
     trace = executor.execute(task, plan, SEED)
     if trace.failure is None:
         reached = score(task, trace.touched, executor.facts).success
-        return "" if reached else "goal_missed: every step succeeds, but the goal does not hold at the end"
+        missed = PlanFailure("goal_missed", "every step succeeds, but the goal does not hold at the end")
+        return None if reached else missed
     last = trace.steps[-1]
-    return f"{last.failure}: step {len(trace.steps)}, {last.call.skill}: {last.message}"
+    return PlanFailure(trace.failure.value, f"step {len(trace.steps)}, {last.call.skill}: {last.message}")

@@ -91,8 +91,8 @@ def outcome(
 def test_rates_are_shares_and_only_the_tree_has_goals() -> None:
     found = [
         outcome(LayoutMethod.TREE),
-        outcome(LayoutMethod.TREE, "geometry: a floats", verified=False),
-        outcome(LayoutMethod.TREE, "does_not_fit: full", generated=False, verified=False),
+        outcome(LayoutMethod.TREE, "geometry", verified=False),
+        outcome(LayoutMethod.TREE, "does_not_fit", generated=False, verified=False),
         outcome(LayoutMethod.RANDOM),
     ]
     evaluation = evaluation_of(found, {})
@@ -137,7 +137,7 @@ def test_a_run_that_was_stopped_makes_only_what_is_missing_and_keeps_it(tmp_path
     _, outcomes = evaluate_scenes(tasks, list(LayoutMethod), 0, 1, told.append, OutcomeLog.open(path, 0))
     assert outcomes[:3] == KNOWN
     assert [(each.task, each.method) for each in outcomes[3:]] == [("new", method) for method in LayoutMethod]
-    assert all("unicorn" in each.reason for each in outcomes[3:])
+    assert all("unicorn" in each.detail for each in outcomes[3:])
     assert told == [3, 4, 5, 6]
     assert OutcomeLog.open(path, 0).outcomes == outcomes
 

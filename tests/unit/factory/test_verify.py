@@ -8,6 +8,7 @@ import pytest
 from tests.fakes.datasets import write_kitchen_dataset
 from typer.testing import CliRunner
 
+from embomatrix.factory.admission import PlanFailure
 from embomatrix.factory.commands.app import app
 from embomatrix.factory.verification.again import Look, sampled, verdict_of
 from embomatrix.factory.verification.figures import evaluation_of, objections
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 FINE = Look("fetch", "", "sha256:1", same_plan=True)
+SLIPPED = PlanFailure("grasp_slipped", "step 2, pick_up: it fell")
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +36,8 @@ def test_two_looks_that_agree_with_the_dataset_are_equal() -> None:
 
 def test_shares_are_of_what_was_asked_and_objections_name_the_task() -> None:
     verdicts = [
-        verdict_of(FINE, dataclasses.replace(FINE, physical="")),
-        verdict_of(FINE, dataclasses.replace(FINE, physical="grasp_slipped: step 2, pick_up: it fell")),
+        verdict_of(FINE, dataclasses.replace(FINE, in_physics=True)),
+        verdict_of(FINE, dataclasses.replace(FINE, in_physics=True, physical=SLIPPED)),
     ]
     evaluation = evaluation_of(verdicts, {})
     assert evaluation.figure("oracle_cached").value == 100

@@ -90,6 +90,7 @@ class LayoutOutcome:
     scene_s: float
     planar_s: tuple[float, ...]
     aesthetics: float | None
+    detail: str = ""
 
 
 def fixed_tasks(sample: Path) -> list[SceneTask]:
@@ -142,6 +143,7 @@ def judge(
 
     def outcome(
         reason: str,
+        detail: str,
         *,
         generated: bool = False,
         verified: bool = False,
@@ -149,23 +151,23 @@ def judge(
         beauty: float | None = None,
     ) -> LayoutOutcome:
         facts = (task.source.name, task.scene, method, generated, verified, solved, reason)
-        return LayoutOutcome(*facts, spent, timed.planar_s, beauty)
+        return LayoutOutcome(*facts, spent, timed.planar_s, beauty, detail)
 
     if isinstance(imported, TaskRefusal):
-        return outcome(f"{imported.reason}: {imported.sentence}")
+        return outcome(imported.reason, imported.sentence)
     beauty = _beauty(imported)
     refusal, lost = _executed(imported, library, seed)
     if refusal is not None and refusal.reason is RefusalReason.INIT_NOT_MET:
-        return outcome(f"{refusal.reason}: {refusal.sentence}", beauty=beauty)
+        return outcome(refusal.reason, refusal.sentence, beauty=beauty)
     solved = refusal is None
     flaws = flaws_of(imported.scene, timed.names)
     if flaws:
         words = ", ".join(f"{name} {flaw}" for name, flaw in flaws)
-        return outcome(f"geometry: {words}", generated=True, solved=solved, beauty=beauty)
+        return outcome("geometry", words, generated=True, solved=solved, beauty=beauty)
     if lost:
-        return outcome(f"out_of_hand: {', '.join(lost)}", generated=True, solved=solved, beauty=beauty)
-    reason = "" if refusal is None else f"{refusal.reason}: {refusal.sentence}"
-    return outcome(reason, generated=True, verified=True, solved=solved, beauty=beauty)
+        return outcome("out_of_hand", ", ".join(lost), generated=True, solved=solved, beauty=beauty)
+    reason, detail = ("", "") if refusal is None else (refusal.reason.value, refusal.sentence)
+    return outcome(reason, detail, generated=True, verified=True, solved=solved, beauty=beauty)
 
 
 def _executed(
@@ -195,7 +197,7 @@ def evaluation_of(outcomes: Sequence[LayoutOutcome], conditions: Mapping[str, An
         if mine:
             figures += _figures(mine, method)
             figures += _shared_aesthetics(outcomes, method)
-            reasons = Counter(outcome.reason.split(":")[0] for outcome in mine if outcome.reason)
+            reasons = Counter(outcome.reason for outcome in mine if outcome.reason)
             told = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common(5)) or "none"
             notes.append(f"Commonest reasons against a scene, {method}: {told}.")
     return EvaluationFigures("scenes", conditions, tuple(figures), tuple(notes))

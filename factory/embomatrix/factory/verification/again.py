@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
+    from embomatrix.factory.admission import PlanFailure
     from embomatrix.sim.executor import Simulator
     from embomatrix.world.bundle import Bundle
     from embomatrix.world.dataset import TaskRecord
@@ -36,16 +37,17 @@ SUCCESS: Final = ""
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """What one process found. ``cached`` and ``physical`` are sentences against the task, None where it was not asked.
+    """Findings of one process: an objection in cached mode, "" for none, and a failure in physics if ``in_physics``.
 
-    ``digest`` is of every pose and state after every step of the plan found; ``same_plan``: it is the dataset's own.
+    ``digest`` covers every pose and state after every step of the plan found. ``same_plan``: it is the dataset's own plan.
     """
 
     task: str
     cached: str
     digest: str
     same_plan: bool
-    physical: str | None = None
+    in_physics: bool = False
+    physical: PlanFailure | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +57,8 @@ class VerificationOutcome:
     task: str
     cached: str
     equal: bool
-    physical: str | None
+    in_physics: bool
+    physical: PlanFailure | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +111,9 @@ def verdict_of(first: Look, second: Look) -> VerificationOutcome:
     """What two looks at one task come to."""
     same = (first.cached, first.digest) == (second.cached, second.digest)
     equal = same and first.same_plan and second.same_plan
-    return VerificationOutcome(first.task, first.cached or second.cached, equal, second.physical)
+    return VerificationOutcome(
+        first.task, first.cached or second.cached, equal, second.in_physics, second.physical
+    )
 
 
 def _looked(orders: Sequence[_Order], jobs: int) -> Iterator[list[Look]]:
@@ -131,7 +136,7 @@ def _look_at(order: _Order) -> list[Look]:
     if not order.physical:
         return looks
     return [
-        Look(look.task, look.cached, look.digest, look.same_plan, _physical(bundle, record))
+        replace(look, in_physics=True, physical=_physical(bundle, record))
         for look, record in zip(looks, records, strict=True)
     ]
 
@@ -146,8 +151,8 @@ def _cached(stage: Simulator, record: TaskRecord) -> Look:
     return Look(record.task.task_id, SUCCESS, trace.digest, same)
 
 
-def _physical(bundle: Bundle, record: TaskRecord) -> str:
-    """What is against the dataset's plan when a robot carries it out in physics; empty where it reaches the goal."""
+def _physical(bundle: Bundle, record: TaskRecord) -> PlanFailure | None:
+    """Return the failure of the dataset's plan in stepped physics, None if it reaches the goal."""
     plan = plan_from_json(list(record.oracle), record.task.profile)
     with contextlib.closing(physical_simulator(bundle)) as stage:
         return plan_failure(stage, record.task, plan)

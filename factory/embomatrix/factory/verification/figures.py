@@ -21,16 +21,16 @@ def evaluation_of(
     verdicts: Sequence[VerificationOutcome], conditions: Mapping[str, Any]
 ) -> EvaluationFigures:
     """Shares in percent of the tasks, and the reasons against plans in physics, the commonest first."""
-    physical = [verdict.physical for verdict in verdicts if verdict.physical is not None]
+    physical = [verdict.physical for verdict in verdicts if verdict.in_physics]
     figures = [
         _figure("oracle_cached", [not verdict.cached for verdict in verdicts], GOAL_PERCENT),
         _figure("reverified_bit_equal", [verdict.equal for verdict in verdicts], GOAL_PERCENT),
     ]
     if physical:
         figures.append(
-            _figure("oracle_physical", [not sentence for sentence in physical], PHYSICAL_GOAL_PERCENT)
+            _figure("oracle_physical", [failure is None for failure in physical], PHYSICAL_GOAL_PERCENT)
         )
-    reasons = Counter(sentence.split(":")[0] for sentence in physical if sentence)
+    reasons = Counter(failure.reason for failure in physical if failure is not None)
     told = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
     notes = (f"Against plans in physics: {told}.",) if told else ()
     return EvaluationFigures("verification", conditions, tuple(figures), notes)
