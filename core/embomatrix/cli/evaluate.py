@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from embomatrix.cli.failure import INTERRUPTED, fail
-from embomatrix.host.cores import usable_cores
+from embomatrix.host.limits import usable_cores
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.config.errors import TrainerError
@@ -159,6 +159,7 @@ _Samples = Annotated[
     int | None, _option(_QUESTIONS, min=1, max=MOST_SAMPLES, help="Plans per task. Default: 10.")
 ]
 _Temperature = Annotated[float | None, _option(_QUESTIONS, min=0, help="Sampling temperature. Default: 1.")]
+_Seed = Annotated[int | None, _option(_QUESTIONS, min=0, help="Seed of sampling and execution. Default: 0.")]
 _MaxTokens = Annotated[int | None, _option(_QUESTIONS, min=1, help="Maximum tokens of an answer.")]
 _Codec = Annotated[Codec | None, _option(_QUESTIONS, help="Plan format of a language model: json or lines.")]
 _Settings = Annotated[
@@ -198,6 +199,7 @@ def evaluate(
     tasks: _Tasks = None,
     samples: _Samples = None,
     temperature: _Temperature = None,
+    seed: _Seed = None,
     max_tokens: _MaxTokens = None,
     codec: _Codec = None,
     settings_file: _Settings = None,
@@ -221,6 +223,7 @@ def evaluate(
         options = {
             "samples": samples,
             "temperature": temperature,
+            "seed": seed,
             "max_tokens": max_tokens,
             "codec": codec,
             "profile": profile,

@@ -92,10 +92,16 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         """Execute one call. ``info`` has the reward's tiers, success, and the reason of a failed call."""
         if self._episode is None:
             raise RuntimeError("no episode was begun: call reset() first")
-        turn = self._episode.act(call_of(action, self._episode.situation.rooms))
-        self._message = turn.step.message
-        success = turn.reward.success
-        return self._observed(self._episode), turn.gain, success, turn.over and not success, told(turn)
+        outcome = self._episode.act(call_of(action, self._episode.situation.rooms))
+        self._message = outcome.step.message
+        success = outcome.reward.success
+        return (
+            self._observed(self._episode),
+            outcome.gain,
+            success,
+            outcome.over and not success,
+            step_info(outcome),
+        )
 
     def render(self) -> str | None:
         """State in words, with ``render_mode="ansi"``."""
@@ -144,12 +150,12 @@ def action_of(call: SkillCall, rooms: tuple[str, ...]) -> dict[str, Any]:
     }
 
 
-def told(turn: EpisodeStep) -> dict[str, Any]:
+def step_info(outcome: EpisodeStep) -> dict[str, Any]:
     """Entries of ``info`` for a step."""
-    reward = turn.reward
+    reward = outcome.reward
     return {
         "success": reward.success,
-        "failure": turn.step.failure.value if turn.step.failure is not None else "",
+        "failure": outcome.step.failure.value if outcome.step.failure is not None else "",
         "format": reward.format,
         "relevance": reward.relevance,
         "goal": reward.goal,

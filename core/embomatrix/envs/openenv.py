@@ -93,11 +93,11 @@ class HouseholdEnvironment(Environment[PlanAction, HouseholdObservation, Househo
             return self._observation(self._episode, PAPER.unparsable, [str(error)], done=False)
         gain, messages, done = 0.0, [], False
         for call in plan:
-            turn = self._episode.act(call)
-            gain += turn.gain
-            messages.append(turn.step.message)
-            reward = turn.reward
-            done = reward.success or turn.over
+            outcome = self._episode.act(call)
+            gain += outcome.gain
+            messages.append(outcome.step.message)
+            reward = outcome.reward
+            done = reward.success or outcome.over
             self._state = self._state.model_copy(
                 update={
                     "step_count": self._state.step_count + 1,
@@ -107,7 +107,7 @@ class HouseholdEnvironment(Environment[PlanAction, HouseholdObservation, Househo
                     "goal": reward.goal,
                 }
             )
-            if done or not turn.step.ok:
+            if done or not outcome.step.ok:
                 break
         return self._observation(self._episode, gain, messages, done=done)
 

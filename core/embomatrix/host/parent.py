@@ -1,4 +1,4 @@
-"""Processes that don't outlive the one that started them."""
+"""Child processes that end with their parent."""
 
 from __future__ import annotations
 
@@ -16,13 +16,15 @@ _PR_SET_PDEATHSIG: Final = 1
 
 
 def with_this_process(by: signal.Signals = signal.SIGKILL) -> Callable[[], None] | None:
-    """The ``preexec_fn`` of a child process that is to end with this one; None where the system has no means for that."""
+    """Return a ``preexec_fn`` for child processes that end with this one; None if the system cannot do that."""
     return functools.partial(die_with_parent, os.getpid(), by) if sys.platform == "linux" else None
 
 
 def die_with_parent(parent: int, by: signal.Signals = signal.SIGKILL) -> None:
-    """Have the kernel send ``by`` to this process when the one that started it, of the number ``parent``, ends, however that
-    ends. On other systems than Linux only a parent that is gone already is noticed."""
+    """Have the kernel send the signal ``by`` to this process when its parent, process id ``parent``, ends.
+
+    On systems other than Linux only a parent that has ended already is noticed.
+    """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, by)
     if os.getppid() != parent:

@@ -1,4 +1,4 @@
-"""Figures of benches and evaluations: a number, how often it was measured, and how it stands to its goal."""
+"""Figures of benchmarks and evaluations: a value, its number of measurements, and its goal."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MOST_DIGITS: Final = 6
 
 
 class Better(StrEnum):
-    """Which way a figure improves."""
+    """Direction in which a figure improves."""
 
     HIGHER = "higher"
     LOWER = "lower"
@@ -24,7 +24,7 @@ class Better(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One number of ``n`` measurements. ``goal`` is in the same unit, None where none is set."""
+    """A value from ``n`` measurements. ``goal`` has the same unit; None if there is no goal."""
 
     name: str
     value: float
@@ -35,14 +35,14 @@ class Figure:
 
     @property
     def is_reached(self) -> bool:
-        """Whether the value is at least as good as its goal; true without one."""
+        """True if the value is at least as good as its goal, or there is no goal."""
         if self.goal is None:
             return True
         return self.value <= self.goal if self.better is Better.LOWER else self.value >= self.goal
 
     @property
     def verdict(self) -> str:
-        """How the value stands to its goal, in words; empty without a goal."""
+        """Relation of the value to its goal, in words; empty without a goal."""
         if self.goal is None:
             return ""
         if self.is_reached:
@@ -51,19 +51,19 @@ class Figure:
 
     @property
     def told(self) -> str:
-        """The value for a person: a goal that is missed by little is not rounded to."""
+        """The formatted value. A narrowly missed goal is not rounded up to."""
         return shown(self.value, other_than=None if self.is_reached else self.goal)
 
     @property
     def bound(self) -> str:
-        """The goal and the side of it on which the value should lie; empty without a goal."""
+        """The goal with ≤ or ≥; empty without a goal."""
         if self.goal is None:
             return ""
         return f"{'≤' if self.better is Better.LOWER else '≥'} {shown(self.goal)}"
 
 
 def shown(value: float, *, other_than: float | None = None) -> str:
-    """Three digits, or all of them left of the point; up to three more where it would read like ``other_than``."""
+    """Format a value with three digits, or more if it would otherwise read like ``other_than``."""
     for digits in range(_DIGITS, _MOST_DIGITS):
         text = _rounded(value, digits)
         if other_than is None or text != _rounded(other_than, digits):
@@ -77,7 +77,7 @@ def _rounded(value: float, digits: int) -> str:
 
 
 def figure_to_json(figure: Figure) -> dict[str, Any]:
-    """Plain JSON values; numbers with six digits."""
+    """Return a JSON-serialisable dict, numbers with six digits."""
     return {
         "name": figure.name,
         "value": float(f"{figure.value:.6g}"),
@@ -89,7 +89,7 @@ def figure_to_json(figure: Figure) -> dict[str, Any]:
 
 
 def figure_from_json(item: Mapping[str, Any]) -> Figure:
-    """What ``figure_to_json`` made. Raises KeyError, TypeError or ValueError where it is none."""
+    """Read a dict made by ``figure_to_json``. Raise KeyError, TypeError or ValueError if it is malformed."""
     goal = None if item["goal"] is None else float(item["goal"])
     return Figure(
         str(item["name"]),

@@ -1,4 +1,4 @@
-"""What the self-contained pages share: the head of an HTML file, with colours for light and dark and one style of tables."""
+"""Shared HTML head of self-contained pages: colours for light and dark themes, and table styles."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from importlib.resources import files
 
 
 def page_head(title: str) -> str:
-    """HTML from the doctype on, up to where a page adds rules of its own in a ``style`` element, then ends its head.
+    """Return the HTML from the doctype up to the page's own ``style`` element. The page closes the head.
 
     ``title`` is plain text.
     """

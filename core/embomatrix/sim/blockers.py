@@ -30,7 +30,7 @@ WALL: Final = "a wall"
 
 def arm_refusal(world: LiveWorld, handling: Handling, target: str) -> SkillRefusal | None:
     """Refusal if the scene's analysis found no arm path for this action. It holds while the objects stay where they were."""
-    other = world.barred.get(handling, {}).get(target, "")
+    other = world.arm_blockers.get(handling, {}).get(target, "")
     if not other or not _are_as_loaded(world, target, other):
         return None
     return refuse(FailureReason.ARM_BLOCKED, target=target, other=other)
@@ -41,7 +41,7 @@ def placing_refusal(world: LiveWorld, held: str, target: str, relation: Relation
 
     It holds while the objects stay where they were.
     """
-    other = world.barred_places.get(relation, {}).get(held, {}).get(target, "")
+    other = world.placing_blockers.get(relation, {}).get(held, {}).get(target, "")
     if not other or not _are_as_loaded(world, target, other):
         return None
     return refuse(FailureReason.ARM_BLOCKED, target=f"a place for {held}", other=other)

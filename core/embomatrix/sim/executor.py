@@ -177,8 +177,8 @@ class Simulator:
 
     def describe(self, task: Task) -> tuple[str, ...]:
         """State in words of the goal's objects and of those that a call succeeded on, in the table's order."""
-        told = task.goal_objects | self._touched
-        names = [name for name in task.table if name in told]
+        described = task.goal_objects | self._touched
+        names = [name for name in task.table if name in described]
         return final_lines([self._sight(name) for name in names])
 
     def survey(self, task: Task) -> tuple[str, ...]:

@@ -87,9 +87,9 @@ class LiveWorld:
         self.navigator = Navigator(engine, self.relations, bundle.poses.stands, PreparedScene.of(bundle))
         self.swings = Swings(engine, self.relations)
         self.placer = Placer(engine, self.relations, bundle.poses, self.navigator)
-        self.barred = bundle.poses.barred
+        self.arm_blockers = bundle.poses.arm_blockers
         """Blockers of the arm in the scene as loaded, by handling and target."""
-        self.barred_places = bundle.poses.barred_places
+        self.placing_blockers = bundle.poses.placing_blockers
         """Blockers of placing in the scene as loaded, by relation, held object and target."""
         self.states: TrackedSets[State] = TrackedSets()
         self.substances: TrackedSets[SubstanceFact] = TrackedSets()

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.host.cgroup import MIB
+from embomatrix.host.limits import MIB
 from embomatrix.host.parent import die_with_parent
 
 if TYPE_CHECKING:

@@ -319,7 +319,7 @@ def _description(scene_id: str, rooms: tuple[RoomInventory, ...]) -> str:
     """Describe an inventory: ``Rs_int: 5 rooms (bathroom, bedroom ...), 55 objects, 71 m2 of floor.``"""
     types = Counter(room.type.replace("_", " ") for room in rooms)
     listed = ", ".join(name if n == 1 else f"{n} {name}s" for name, n in sorted(types.items()))
-    things = sum(count for room in rooms for _, _, count in room.items)
+    objects = sum(count for room in rooms for _, _, count in room.items)
     area = sum(room.floor_m[0] * room.floor_m[1] for room in rooms)
     noun = "room" if len(rooms) == 1 else "rooms"
-    return f"{scene_id}: {len(rooms)} {noun} ({listed}), {things} objects, {area:.0f} m2 of floor."
+    return f"{scene_id}: {len(rooms)} {noun} ({listed}), {objects} objects, {area:.0f} m2 of floor."

@@ -76,8 +76,8 @@ def poses_to_json(poses: PoseCache, tables: TableWriter) -> Json:
         for name, found in poses.stands.items()
     }
     arm: Json = {
-        "barred": {handling.value: dict(found) for handling, found in poses.barred.items() if found},
-        "barred_places": _by_relation(poses.barred_places),
+        "barred": {handling.value: dict(found) for handling, found in poses.arm_blockers.items() if found},
+        "barred_places": _by_relation(poses.placing_blockers),
         "reached": _by_relation(poses.reached),
     }
     return {"placements": names, "stands": stands, **{key: found for key, found in arm.items() if found}}

@@ -45,14 +45,14 @@ class PoseCache:
     """Result of the offline analysis of a scene.
 
     ``placements``: poses of the placed asset in the *support's* asset frame, each verified by settling in physics. ``stands``:
-    standing poses by object name, in the world, best first. ``barred``: the object that blocks the arm, by handling and
+    standing poses by object name, in the world, best first. ``arm_blockers``: the object that blocks the arm, by handling and
     target, for targets that the arm can't reach in the scene as loaded. ``reached``: by relation, held object and target, the
-    index of a pose that the arm reached, in the first set of ``placements``. ``barred_places``: by the same keys, the object
+    index of a pose that the arm reached, in the first set of ``placements``. ``placing_blockers``: by the same keys, the object
     that blocks the arm from all poses.
     """
 
     placements: Mapping[PlacementKey, tuple[Pose, ...]] = field(default_factory=dict)
     stands: Mapping[str, tuple[StandPose, ...]] = field(default_factory=dict)
-    barred: Mapping[Handling, Mapping[str, str]] = field(default_factory=dict)
+    arm_blockers: Mapping[Handling, Mapping[str, str]] = field(default_factory=dict)
     reached: Mapping[Relation, Mapping[str, Mapping[str, int]]] = field(default_factory=dict)
-    barred_places: Mapping[Relation, Mapping[str, Mapping[str, str]]] = field(default_factory=dict)
+    placing_blockers: Mapping[Relation, Mapping[str, Mapping[str, str]]] = field(default_factory=dict)

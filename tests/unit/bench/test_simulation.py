@@ -1,5 +1,6 @@
 """Simulated clusters: scenarios stay within bounds, a slow manager saturates, and figures show both sides of the edge."""
 
+import functools
 from dataclasses import replace
 
 import pytest
@@ -16,6 +17,7 @@ EXECUTIONS_PER_S = 60.0
 """Upper bound for these slots: executions take a second, and a little more on average."""
 
 
+@functools.cache
 def report(pace):
     return simulate(replace(in_flight(SLOTS // 8, 4 * SLOTS), manager=pace))
 

@@ -1,4 +1,4 @@
-"""The report of a run as a file: whole, for itself, and the same for any theme."""
+"""Report page of a run."""
 
 import re
 from html.parser import HTMLParser
@@ -77,7 +77,7 @@ class Outline(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_the_page_needs_nothing_but_itself():
+def test_report_page_is_self_contained():
     page = report_page(summary(), EVENTS)
     outline = Outline(page)
     assert outline.open == []
@@ -87,7 +87,7 @@ def test_the_page_needs_nothing_but_itself():
     assert len(outline.ids) == len(set(outline.ids)), "an id stands twice"
 
 
-def test_what_people_wrote_is_text_and_never_markup():
+def test_user_texts_are_escaped():
     page = report_page(summary(), EVENTS)
     assert "&lt;evening&gt;" in page
     assert "no &lt;mesh&gt; of 3 µm" in page
@@ -95,7 +95,7 @@ def test_what_people_wrote_is_text_and_never_markup():
     assert "<evening>" not in page
 
 
-def test_every_colour_of_a_chart_is_one_of_the_page():
+def test_chart_colours_are_css_variables_of_the_page():
     page = report_page(summary(), EVENTS)
     charts = re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL)
     assert len(charts) == 3
@@ -104,7 +104,7 @@ def test_every_colour_of_a_chart_is_one_of_the_page():
         assert "var(--" in chart
 
 
-def test_figures_stand_on_the_page_as_they_were_counted():
+def test_report_shows_the_counted_figures():
     words = re.sub(r"<[^>]*>", " ", report_page(summary(), EVENTS))
     words = " ".join(words.split())
     assert "Completed 3 1 failed, 2 rollouts re-dispatched" in words
@@ -114,7 +114,7 @@ def test_figures_stand_on_the_page_as_they_were_counted():
     assert "All 3 events of the run are kept." in words
 
 
-def test_a_run_without_anything_has_a_report_all_the_same():
+def test_empty_run_has_a_report():
     nothing = dict.fromkeys(RolloutPhase, PhaseSummary())
     empty = summary(
         run=RunInfo("r1", "", RunStats(), 0, 1_000.0),
@@ -129,11 +129,11 @@ def test_a_run_without_anything_has_a_report_all_the_same():
     assert "None: every lease brought a result." in page
 
 
-def test_a_log_that_dropped_events_says_so():
+def test_report_states_dropped_events():
     assert "1,234 earlier ones were dropped" in report_page(summary(events_dropped=1234), EVENTS)
 
 
-def test_durations_are_told_in_the_unit_that_suits_them():
+def test_durations_are_formatted_in_fitting_units():
     assert [seconds_text(seconds) for seconds in (0.0, 3e-5, 0.0123, 4.2, 600.0)] == [
         "0",
         "30 µs",

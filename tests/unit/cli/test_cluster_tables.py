@@ -1,4 +1,4 @@
-"""Tables in a terminal that is too narrow for them: nothing is cut off."""
+"""Tables in a narrow terminal."""
 
 import pytest
 
@@ -15,7 +15,7 @@ def terminal(request, monkeypatch):
 
 
 @pytest.mark.usefixtures("terminal")
-def test_no_figure_and_no_name_is_cut_off(capsys):
+def test_tables_cut_no_figure_and_no_name(capsys):
     show(run_table([RunInfo("run-0123456789ab", "an evening's run", STATS, 65_536, 1.0, 0.0)]))
     reason = "paused: its owner is at the keyboard, and the machine runs on battery besides"
     show(

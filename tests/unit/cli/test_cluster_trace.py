@@ -1,4 +1,4 @@
-"""When slots worked, and the trace that is made of it: durations of the workers on the manager's clock."""
+"""Slot spans and the Chrome trace made of them: worker durations on the manager's clock."""
 
 import itertools
 from collections import Counter
@@ -45,7 +45,7 @@ def histories(draw):
 
 
 @given(histories())
-def test_spans_of_a_slot_never_overlap_and_are_never_earlier_than_they_were(history):
+def test_spans_of_a_slot_never_overlap_and_never_start_early(history):
     truth, events = history
     for key, spans in slot_spans(events).items():
         was = sorted((begin_s, end_s) for slot, begin_s, end_s, _ in truth if slot == key.slot)
@@ -56,7 +56,7 @@ def test_spans_of_a_slot_never_overlap_and_are_never_earlier_than_they_were(hist
 
 
 @given(histories())
-def test_a_track_of_the_trace_has_no_overlap_and_every_rollout_once(history):
+def test_track_has_no_overlap_and_each_rollout_once(history):
     _, events = history
     trace = chrome_trace(events, (), "a run")["traceEvents"]
     tracks = {}
@@ -75,7 +75,7 @@ def test_a_track_of_the_trace_has_no_overlap_and_every_rollout_once(history):
     assert all(event["ts"] >= 0 for event in trace if "ts" in event)
 
 
-def test_a_slot_that_waits_is_idle_and_one_that_waits_for_a_scene_is_loading():
+def test_gaps_are_split_into_idle_and_load_time():
     events = [submitted(1, 10.0, 2), completed(2, 11.0, 1.0), completed(3, 15.0, 1.0, load_s=2.0)]
     trace = chrome_trace(events, (), "a run")["traceEvents"]
     parts = [(event["name"], event["ts"], event["dur"]) for event in trace if event["ph"] == "X"]
@@ -88,7 +88,7 @@ def test_a_slot_that_waits_is_idle_and_one_that_waits_for_a_scene_is_loading():
     ]
 
 
-def test_a_failed_lease_takes_its_slot_and_has_no_flow():
+def test_failed_lease_occupies_its_slot_and_has_no_flow():
     failed = completed(2, 12.0, 0.0)._replace(
         kind=EventKind.FAILED, timings=None, held_s=2.0, code="slot_crashed", message="died"
     )
@@ -98,13 +98,13 @@ def test_a_failed_lease_takes_its_slot_and_has_no_flow():
     assert not [event for event in trace if event["ph"] in "sf"]
 
 
-def test_a_rollout_whose_submission_was_dropped_from_the_log_has_no_flow():
+def test_rollout_with_a_dropped_submission_has_no_flow():
     trace = chrome_trace([completed(2, 12.0, 1.0)], (), "a run")["traceEvents"]
     assert [event["name"] for event in trace if event["ph"] == "X"] == ["execute"]
     assert not [event for event in trace if event["ph"] in "sf"]
 
 
-def test_scenes_and_losses_stand_beside_the_slots_of_their_worker():
+def test_scene_loads_and_losses_are_shown_beside_the_slots():
     run = [submitted(1, 10.0, 1), completed(3, 12.0, 1.0)]
     warm = RunEvent(2, 11.0, EventKind.SCENE_WARM, worker_id="w1", bundle_digest="sha256:kitchen", held_s=0.5)
     lost = RunEvent(4, 13.0, EventKind.WORKER_LOST, worker_id="w1", message="it left")
@@ -118,7 +118,7 @@ def test_scenes_and_losses_stand_beside_the_slots_of_their_worker():
     ]
 
 
-def test_the_share_of_slots_at_work_is_counted_by_time():
+def test_share_of_busy_slots_is_weighted_by_time():
     spans = slot_spans([completed(1, 1.0, 1.0, slot=1), completed(2, 2.0, 0.5, slot=2)])
     assert set(spans) == {SlotKey("w1", 1), SlotKey("w1", 2)}
     assert busy_share(spans, 0.0, 1.0, 3) == [0.5, 0.25, 0.0]

@@ -1,4 +1,4 @@
-"""Every command that a page of the project shows exists, and has the options that it is shown with."""
+"""Commands shown in the documentation exist with their options."""
 
 import re
 from importlib.metadata import entry_points
@@ -16,7 +16,7 @@ PAGES = [
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
 WORDS = {"COMMAND", "NAME", "--help"}
-"""What stands for a name, and what every command has."""
+"""Placeholders, and options of every command."""
 
 
 def shown(text: str) -> list[list[str]]:

@@ -1,4 +1,4 @@
-"""`embomatrix doctor`: what it makes of what it measured, and of managers that are there, elsewhere, or of another kind."""
+"""`embomatrix doctor`: findings about this machine and about managers."""
 
 import asyncio
 
@@ -45,11 +45,11 @@ def levels(findings):
         ((3, 10), "Linux", "x86_64", Level.WRONG),
     ],
 )
-def test_python_is_judged_by_what_the_engine_has_wheels_for(version, system, processor, level):
+def test_python_is_judged_by_the_wheels_of_the_engine(version, system, processor, level):
     assert python(version, system, processor).level is level
 
 
-def test_a_part_without_its_packages_is_named_with_the_extra_that_brings_them():
+def test_part_with_missing_packages_names_the_extra():
     found = parts({"pybullet", "scipy", *NEEDED["manager"]})
     assert levels(found) == {
         "worker": Level.NOTE,
@@ -63,13 +63,13 @@ def test_a_part_without_its_packages_is_named_with_the_extra_that_brings_them():
     )
 
 
-def test_little_memory_is_told_and_less_is_wrong(tmp_path):
+def test_low_memory_is_a_note_and_very_low_memory_wrong(tmp_path):
     assert [memory(free_mb).level for free_mb in (4096, 1024, 100)] == [Level.FINE, Level.NOTE, Level.WRONG]
     assert "100 MB are free" in disk(tmp_path, 100.0).found
     assert port("port of the status page", 8070, free=False).level is Level.NOTE
 
 
-def test_a_certificate_near_its_end_and_a_clock_an_hour_off_are_told():
+def test_expiring_certificate_and_wrong_clock_are_notes():
     assert [certificate(days).level for days in (300, 29, -1)] == [Level.FINE, Level.NOTE, Level.NOTE]
     assert [clock(offset_s).level for offset_s in (0.7, 3600.0, -3600.0)] == [
         Level.FINE,
@@ -79,13 +79,13 @@ def test_a_certificate_near_its_end_and_a_clock_an_hour_off_are_told():
     assert "behind" in clock(-3600.0).found
 
 
-def test_a_certificate_that_does_not_hold_yet_may_be_the_fault_of_the_clock():
+def test_not_yet_valid_certificate_suggests_checking_the_clock():
     assert "clock" in mistrust(9, "certificate is not yet valid").remedy
     assert "clock" in mistrust(10, "certificate has expired").remedy
     assert "--ca" in mistrust(20, "unable to get local issuer certificate").remedy
 
 
-def test_a_manager_that_speaks_no_common_version_is_wrong_and_another_release_is_not():
+def test_manager_without_a_common_version_is_wrong_and_another_release_a_note():
     newer = versions(Capabilities(VersionRange(PROTOCOL_VERSION + 5, PROTOCOL_VERSION + 6), "9.0.0"))
     assert newer.level is Level.WRONG
     assert "pip install --upgrade" in newer.remedy
@@ -93,7 +93,7 @@ def test_a_manager_that_speaks_no_common_version_is_wrong_and_another_release_is
     assert other.level is Level.NOTE
 
 
-def test_the_verdict_names_what_is_wrong():
+def test_verdict_names_wrong_findings():
     fine, note, wrong = (Finding(level.value, level, "") for level in Level)
     assert verdict([fine]) == "all is well"
     assert verdict([fine, note]) == "nothing is wrong; 1 of 2 things is worth a look"
@@ -106,13 +106,13 @@ def test_this_machine_can_run_its_own_tests():
     assert found["memory"] is not Level.WRONG
 
 
-async def test_a_manager_that_is_not_there_is_wrong_only_for_who_named_it():
+async def test_missing_manager_is_wrong_only_if_it_was_named():
     (named,) = await manager(Visit("127.0.0.1:1"))
     (default,) = await manager(Visit("127.0.0.1:1", expected=False))
     assert (named.level, default.level) == (Level.WRONG, Level.NOTE)
 
 
-async def test_a_manager_in_the_clear_is_fine(tmp_path):
+async def test_manager_without_tls_is_fine(tmp_path):
     async with a_manager(tmp_path) as endpoints:
         page_port = int(endpoints.status_url.rstrip("/").rpartition(":")[2])
         found = await manager(Visit(endpoints.address, page_port=page_port))
@@ -120,7 +120,7 @@ async def test_a_manager_in_the_clear_is_fine(tmp_path):
     assert {finding.level for finding in found} == {Level.FINE}
 
 
-async def test_a_cluster_that_stands_still_is_worth_a_look_and_no_fault_of_this_machine(tmp_path):
+async def test_paused_cluster_is_a_note(tmp_path):
     async with a_manager(tmp_path) as endpoints:
         async with AdminClient(endpoints.address) as client:
             await client.pause_dispatch()
@@ -129,7 +129,7 @@ async def test_a_cluster_that_stands_still_is_worth_a_look_and_no_fault_of_this_
     assert "Dispatch is paused" in next(f.found for f in found if f.thing == "cluster")
 
 
-async def test_a_port_of_another_kind_is_told_once(tmp_path):
+async def test_port_of_another_program_is_reported_once(tmp_path):
     async with a_manager(tmp_path) as endpoints:
         page_port = int(endpoints.status_url.rstrip("/").rpartition(":")[2])
         found = await manager(Visit(f"127.0.0.1:{page_port}", page_port=page_port))
@@ -137,7 +137,7 @@ async def test_a_port_of_another_kind_is_told_once(tmp_path):
     assert (found[-1].level, "is this the port" in found[-1].remedy) == (Level.WRONG, True)
 
 
-async def test_ports_that_a_manager_on_this_machine_holds_are_no_reason_for_a_note(tmp_path):
+async def test_ports_of_a_local_manager_are_fine(tmp_path):
     async with a_manager(tmp_path) as endpoints:
         page_port = int(endpoints.status_url.rstrip("/").rpartition(":")[2])
         here = Visit(endpoints.address, page_port=page_port)
@@ -151,7 +151,7 @@ async def test_ports_that_a_manager_on_this_machine_holds_are_no_reason_for_a_no
     assert (held.level, held.remedy) == (Level.FINE, "")
 
 
-async def test_a_guarded_manager_says_what_is_missing_step_by_step(tmp_path):
+async def test_guarded_manager_reports_each_missing_credential(tmp_path):
     await asyncio.to_thread(prepare, tmp_path, sans=())
     access = tmp_path / "access"
     ca, viewer = (access / "ca.pem").read_bytes(), (access / "tokens" / "viewer").read_text().strip()

@@ -1,4 +1,4 @@
-"""A command that another one runs: its failure is told, also where it could say nothing itself."""
+"""Commands run in the foreground of another one: failures and exit status."""
 
 import pytest
 
@@ -20,7 +20,7 @@ def leave_by(monkeypatch, script):
         (15, "signal 15 (Terminated): what it had saved is kept"),
     ],
 )
-def test_a_command_that_a_signal_ended_is_told(monkeypatch, capsys, number, told):
+def test_command_ended_by_a_signal_is_reported(monkeypatch, capsys, number, told):
     leave_by(monkeypatch, f"kill -{number} $$")
     with pytest.raises(SystemExit) as left:
         run_command("experiment", no_problem, "train", "--seed=0")
@@ -30,7 +30,7 @@ def test_a_command_that_a_signal_ended_is_told(monkeypatch, capsys, number, told
     assert told in said
 
 
-def test_a_command_that_failed_has_told_why_and_its_status_is_ours(monkeypatch, capsys):
+def test_failed_command_passes_its_status_on(monkeypatch, capsys):
     leave_by(monkeypatch, "exit 7")
     with pytest.raises(SystemExit) as left:
         run_command("experiment", no_problem, "train")
@@ -38,6 +38,6 @@ def test_a_command_that_failed_has_told_why_and_its_status_is_ours(monkeypatch, 
     assert capsys.readouterr().err == ""
 
 
-def test_a_command_that_succeeds_is_gone_on_from(monkeypatch):
+def test_successful_command_returns(monkeypatch):
     leave_by(monkeypatch, "exit 0")
     run_command("experiment", no_problem, "train")

@@ -1,4 +1,4 @@
-"""The command line: help without loading a service, and one clear sentence for a wrong command."""
+"""The `embomatrix` command: help and errors, without importing a service."""
 
 import subprocess
 import sys
@@ -47,7 +47,7 @@ def test_every_command_explains_itself():
         assert "Usage" in result.stdout
 
 
-def test_unknown_option_is_a_sentence_and_status_two():
+def test_unknown_option_exits_with_status_two():
     result = _run("demo", "--wrokers=3")
     assert result.returncode == 2
     assert "No such option" in result.stderr

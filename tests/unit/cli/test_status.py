@@ -1,4 +1,4 @@
-"""`embomatrix status` and `top`: what they say of a cluster, and that they show it of a real manager."""
+"""`embomatrix status` and `top`: sentences, screen, and a real manager."""
 
 import asyncio
 import io
@@ -33,14 +33,14 @@ def test_start_of_a_worker_is_suggested_where_none_is_present():
     assert nobody[1].startswith("Start a worker with `embomatrix worker run`")
 
 
-def test_what_the_manager_says_of_itself_is_the_verdict():
+def test_health_sentence_of_the_manager_comes_first():
     full = "Nothing can be written down, so nothing goes on: no space left on device."
     assert sentences(FleetStatus((worker(),), full), (), ())[0] == full
     assert sentences(FleetStatus((), full), (), ())[0] == full, "also where nobody is there"
     assert full in "\n".join(drawn(Glance(0.0, FleetStatus((worker(),), full), ()), 24))
 
 
-def test_words_tell_what_runs_what_is_warm_and_who_does_not_work():
+def test_sentences_cover_runs_warm_scenes_and_idle_workers():
     warm = Resident("sha256:aa", ResidentState.WARM)
     stats = RunStats(delivered=40, warm_starts=30, cold_starts=10, infra_failures=2, redispatched=5)
     plan = [
@@ -63,7 +63,7 @@ def test_words_tell_what_runs_what_is_warm_and_who_does_not_work():
     ]
 
 
-def test_who_left_in_order_is_counted_and_no_trouble():
+def test_workers_that_left_in_order_are_only_counted():
     ready = "Ready: 1 worker waits for a run."
     told = sentences(FleetStatus((worker(), worker("w2", "left", reason="it left")), ready), (), ())
     assert told == [
@@ -72,7 +72,7 @@ def test_who_left_in_order_is_counted_and_no_trouble():
     ]
 
 
-def test_words_of_a_thousand_workers_fit_on_a_screen():
+def test_sentences_about_a_thousand_workers_fit_on_a_screen():
     assert len(sentences(FleetStatus(tuple(worker(f"w{n}", "lost") for n in range(1000))), (), ())) < 16
 
 
@@ -82,7 +82,7 @@ def drawn(now, lines):
     return console.file.getvalue().splitlines()
 
 
-def test_the_screen_shows_those_that_do_not_work_first_and_no_more_than_fits():
+def test_screen_shows_idle_workers_first_and_fits_the_terminal():
     crowd = (*(worker(f"w{n:04}", running=n % 3) for n in range(1000)), worker("broken", "lost"))
     lines = drawn(Glance(0.0, FleetStatus(crowd, "All is well."), ()), 24)
     assert len(lines) <= 24
@@ -91,19 +91,19 @@ def test_the_screen_shows_those_that_do_not_work_first_and_no_more_than_fits():
     assert lines[-1].startswith("and 9")
 
 
-def test_who_left_has_no_slots_on_the_screen():
+def test_workers_that_left_have_no_slots_on_the_screen():
     (head, *_) = drawn(Glance(0.0, FleetStatus((worker(running=1), worker("w2", "left"))), ()), 24)
     assert head.split("   ")[1:] == ["1 of 2 slots busy", "1 of 2 workers at work", "0 runs"]
 
 
-def test_throughput_is_that_of_the_last_seconds_and_never_negative():
+def test_throughput_covers_the_last_seconds_and_is_never_negative():
     glances = [Glance(float(at_s), FleetStatus((worker(completed=100 * at_s),)), ()) for at_s in range(10)]
     assert rate(earliest(glances, 5.0), glances[-1]) == 100.0
     assert rate(glances[-1], Glance(10.0, FleetStatus(()), ())) == 0.0
     assert rate(glances[-1], glances[-1]) == 0.0
 
 
-async def test_both_commands_show_a_real_manager(tmp_path, capsys):
+async def test_status_and_top_show_a_real_manager(tmp_path, capsys):
     async with manager(tmp_path) as endpoints, FakeWorker(endpoints.address, "w1"):
         await asyncio.to_thread(status, manager=endpoints.address)
         words = capsys.readouterr().out
@@ -115,12 +115,12 @@ async def test_both_commands_show_a_real_manager(tmp_path, capsys):
         paused = capsys.readouterr().out
     assert "Workers: 1 ready" in words
     assert words.startswith("Ready: 1 worker waits for a run.")
-    assert paused.startswith("Dispatch is paused: nothing new is executed")
+    assert paused.startswith("Dispatch is paused: no new rollouts start")
     assert "0 rollouts/s" in live
     assert "w1" in live
 
 
 @pytest.mark.parametrize("name", ["status", "top"])
-def test_a_manager_that_is_not_there_is_told_in_a_sentence(name):
+def test_unreachable_manager_is_reported_in_a_sentence(name):
     told = run(name, "--manager=127.0.0.1:1")
     assert (told.status, told.text.startswith(f"embomatrix {name}: no manager answers")) == (2, True)

@@ -1,4 +1,4 @@
-"""The supervisor keeps its children alive, ends what it started, and gives up on what can't live."""
+"""Supervisor: restarts, shutdown, and children that are given up."""
 
 import os
 import signal
@@ -35,7 +35,7 @@ def _alive(pid: int) -> bool:
     return True
 
 
-def test_killed_child_is_started_anew(tmp_path):
+def test_killed_child_is_restarted(tmp_path):
     with Supervisor((_child("one", SLEEPER), _child("two", SLEEPER)), tmp_path) as children:
         first, other = children.pid("one"), children.pid("two")
         os.kill(first, signal.SIGKILL)
@@ -50,7 +50,7 @@ def test_children_end_with_the_supervisor(tmp_path):
     assert not any(_alive(pid) for pid in pids)
 
 
-def test_child_that_ignores_the_request_to_end_is_killed(tmp_path):
+def test_child_that_ignores_sigterm_is_killed(tmp_path):
     with Supervisor((_child("one", STUBBORN),), tmp_path, grace_s=0.5) as children:
         pid = children.pid("one")
         _until(lambda: b"up" in children.log_path("one").read_bytes())
@@ -65,7 +65,7 @@ def test_child_that_keeps_dying_is_given_up_and_its_log_kept(tmp_path):
         assert children.last_words("broken") == "no such scene"
 
 
-def test_child_that_needs_a_person_is_given_up_at_once(tmp_path):
+def test_child_with_a_user_error_is_given_up_at_once(tmp_path):
     told = (sys.executable, "-c", "print('no engine: install it', flush=True); raise SystemExit(2)")
     with Supervisor((_child("told", told), _child("one", SLEEPER)), tmp_path) as children:
         _until(lambda: children.failed() == ("told",))
@@ -78,7 +78,7 @@ def test_interrupt_of_the_terminal_does_not_reach_the_children(tmp_path):
         assert os.getpgid(children.pid("one")) != os.getpgid(0)
 
 
-def test_output_of_every_life_is_kept_in_one_log(tmp_path):
+def test_output_of_all_restarts_is_kept_in_one_log(tmp_path):
     with Supervisor((_child("one", SLEEPER),), tmp_path) as children:
         _until(lambda: children.log_path("one").read_bytes().count(b"up") == 1)
         os.kill(children.pid("one"), signal.SIGKILL)

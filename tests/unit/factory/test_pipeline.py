@@ -319,10 +319,10 @@ def test_invalid_bddl_exits_with_2_and_one_sentence(tmp_path: Path, old: str, ne
         (["build", "--out", "OUT/a", "--agent", "room-organiser=llm"], "NAME one of scene-distributor"),
         (
             ["build", "--out", "OUT/a", "--cassette", "OUT/a.jsonl"],
-            "say which, as --agent room-organizer=llm",
+            "select some, as in --agent room-organizer=llm",
         ),
-        (["build", "--out", "OUT/a", "--agent", "object-sampler=llm"], "no form with a language model"),
-        (["build", "--out", "OUT/a", "--agent", "room-organizer=llm"], "give --llm URL and --model NAME"),
+        (["build", "--out", "OUT/a", "--agent", "object-sampler=llm"], "can't be a language model"),
+        (["build", "--out", "OUT/a", "--agent", "room-organizer=llm"], "add --llm URL and --model NAME"),
     ],
 )
 def test_unknown_names_exit_with_2_and_one_sentence(
@@ -341,7 +341,7 @@ def test_conversation_tasks_are_proved_in_physics_and_keep_transcripts(tmp_path)
     summary = build_dataset(tmp_path, settings)
     dataset = Dataset.load(tmp_path)
     assert summary.total("train") == len(dataset.train) == 4
-    assert summary.rejected["physics_failed"] > 0, "with this seed the arm does not get everywhere"
+    assert summary.rejected["physics_failed"] > 0, "with this seed, some plans fail in physics"
     for record in dataset.train:
         transcript = (tmp_path / "transcripts" / f"{record.task.task_id}.md").read_text(encoding="utf-8")
         assert transcript.startswith(f"# {record.task.instruction}\n")

@@ -17,7 +17,7 @@ from embomatrix.factory.scenes.check import STABLE_SHARE, ProblemKind, check_sce
 from embomatrix.factory.scenes.floor import ReachableFloor
 from embomatrix.factory.scenes.report import report_of, report_on, unaccounted
 from embomatrix.factory.scenes.tables import TABLE_COLUMNS, report_table
-from embomatrix.host.cores import usable_cores
+from embomatrix.host.limits import usable_cores
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.codec import scene_from_json
 from embomatrix.world.geometry import ConvexPart, Pose, Shape

@@ -1,4 +1,4 @@
-"""What the machine leaves this process: control groups as files, the cores of its affinity."""
+"""Limits of this process: control groups and CPU affinity."""
 
 import os
 import signal
@@ -8,8 +8,7 @@ import sys
 import psutil
 import pytest
 
-from embomatrix.host.cgroup import Limits, find_limits
-from embomatrix.host.cores import usable_cores
+from embomatrix.host.limits import Limits, find_limits, usable_cores
 
 
 def _group(mount, name, **files):
@@ -19,7 +18,7 @@ def _group(mount, name, **files):
         (folder / file.replace("__", ".")).write_text(text + "\n")
 
 
-def test_the_tightest_group_around_this_process_counts(tmp_path):
+def test_tightest_cgroup_counts(tmp_path):
     mount, membership = tmp_path / "cgroup", tmp_path / "membership"
     membership.write_text("0::/user.slice/worker.service\n")
     _group(mount, "user.slice/worker.service", cpu__max="max 100000", memory__max="max", memory__current="5")
@@ -29,7 +28,7 @@ def test_the_tightest_group_around_this_process_counts(tmp_path):
     assert find_limits(mount, membership) == Limits(2.5, 2048.0)
 
 
-def test_groups_of_the_first_version_count_too(tmp_path):
+def test_cgroups_of_version_1_count(tmp_path):
     mount, membership = tmp_path / "cgroup", tmp_path / "membership"
     membership.write_text("5:memory:/docker/1\n4:cpu,cpuacct:/docker/1\n")
     _group(mount, "cpu,cpuacct/docker/1", cpu__cfs_quota_us="150000", cpu__cfs_period_us="100000")
@@ -55,7 +54,7 @@ def test_groups_of_the_first_version_count_too(tmp_path):
         ),
     ],
 )
-def test_files_that_were_read_long_ago_leave_their_memory_to_others(tmp_path, membership, files):
+def test_inactive_page_cache_counts_as_free(tmp_path, membership, files):
     (tmp_path / "membership").write_text(membership)
     account = f"anon 5\n{files['memory__stat']} {1 << 28}\nfile 7"
     group = "w" if membership.startswith("0") else "memory/w"
@@ -63,11 +62,11 @@ def test_files_that_were_read_long_ago_leave_their_memory_to_others(tmp_path, me
     assert find_limits(tmp_path / "cgroup", tmp_path / "membership").memory_mb == 512.0
 
 
-def test_without_groups_nothing_is_limited(tmp_path):
+def test_no_limits_without_cgroups(tmp_path):
     assert find_limits(tmp_path, tmp_path / "none") == Limits()
 
 
-def test_cores_are_those_of_the_affinity_as_far_as_the_quota_goes():
+def test_usable_cores_are_the_smaller_of_affinity_and_quota():
     assert usable_cores(Limits(cores=0.5)) == 1
     assert usable_cores(Limits()) == len(psutil.Process().cpu_affinity())
     assert usable_cores() == usable_cores(find_limits())
@@ -84,7 +83,7 @@ time.sleep(300)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the kernel's own means")
-def test_a_process_does_not_outlive_one_that_is_killed():
+def test_child_does_not_outlive_a_killed_parent():
     with subprocess.Popen([sys.executable, "-c", DIES_WITH_ITS_PARENT], stdout=subprocess.PIPE) as parent:
         child = psutil.Process(int(parent.stdout.readline()))
         os.kill(parent.pid, signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""What one result says of another, who is wrong among several, and what is remembered of a worker."""
+"""Opinions, verdicts and reputations."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ def opinion(worker_id="w1", versions=SAME, **changes):
     return opinion_of(worker_id, versions, replace(completed(worker_id), **changes))
 
 
-def test_on_one_platform_traces_must_be_equal_to_the_bit_and_across_platforms_outcomes():
+def test_traces_are_compared_within_a_platform_and_facts_across_platforms():
     assert opinion().agrees(opinion("w2"))
     assert not opinion().agrees(opinion("w2", trace_digest="sha256:another"))
     assert opinion().agrees(opinion("w2", OTHER, trace_digest="sha256:another"))
@@ -26,11 +26,11 @@ def test_on_one_platform_traces_must_be_equal_to_the_bit_and_across_platforms_ou
     assert not opinion().agrees(opinion("w2", OTHER, reward=richer))
 
 
-def test_workers_that_tell_no_fingerprint_are_compared_by_outcomes_alone():
+def test_workers_without_a_fingerprint_are_compared_by_facts():
     assert opinion(versions={}).agrees(opinion("w2", {}, trace_digest="sha256:another"))
 
 
-def test_only_who_contradicts_two_that_agree_is_wrong():
+def test_only_an_opinion_against_two_that_agree_is_wrong():
     first, second, third = opinion("w1"), opinion("w2"), opinion("w3", trace_digest="invented")
     assert judge([first]).ruling is Ruling.OPEN
     assert judge([first, third]).ruling is Ruling.OPEN
@@ -40,7 +40,7 @@ def test_only_who_contradicts_two_that_agree_is_wrong():
     assert judge([first, third, opinion("w2", OTHER)]).wrong == ()
 
 
-def test_a_repute_is_written_when_it_changed_and_read_without_the_disputes_that_were_open():
+def test_changed_reputation_is_stored_without_open_disputes():
     auditor = Auditor(AuditRules(probation=2), b"key")
     auditor.took("w1")
     auditor.agreed("w1")
@@ -55,7 +55,7 @@ def test_a_repute_is_written_when_it_changed_and_read_without_the_disputes_that_
     assert successor.take_changed() == []
 
 
-def test_after_probation_a_share_is_drawn_by_a_key_that_no_worker_has():
+def test_share_after_probation_is_drawn_by_a_secret_key():
     rules = AuditRules(probation=2, share=0.1)
     drawn = {}
     for key in (b"one", b"two"):

@@ -1,4 +1,4 @@
-"""Results that are executed again elsewhere: who is asked, what is compared, who is blamed, and what is delivered."""
+"""Audits: choice of the second worker, comparison, quarantine, and delivery."""
 
 from dataclasses import replace
 
@@ -113,7 +113,7 @@ def lie(worker_id):
     return replace(completed(worker_id), trace_digest=f"invented by {worker_id}")
 
 
-def test_a_verified_result_is_delivered_when_a_second_worker_came_to_the_same():
+def test_verified_result_is_delivered_after_a_second_worker_agrees():
     bench = Bench()
     bench.submit()
     first = bench.only_lease()
@@ -127,7 +127,7 @@ def test_a_verified_result_is_delivered_when_a_second_worker_came_to_the_same():
     assert (bench.stats().audited, bench.stats().audit_mismatches) == (1, 0)
 
 
-def test_a_third_worker_decides_and_the_liar_gets_nothing_more():
+def test_third_worker_decides_and_the_wrong_one_is_quarantined():
     bench = Bench()
     bench.submit()
     liar = bench.only_lease().worker_id
@@ -141,7 +141,7 @@ def test_a_third_worker_decides_and_the_liar_gets_nothing_more():
     assert len(bench.results) == 21
 
 
-def test_what_a_liar_did_and_nobody_has_seen_yet_is_executed_again():
+def test_unconfirmed_results_of_a_quarantined_worker_are_executed_again():
     bench = Bench()
     bench.submit(2)
     (one, two) = (lease for lease in bench.live.values() if lease.worker_id in ("w1", "w2"))
@@ -153,7 +153,7 @@ def test_what_a_liar_did_and_nobody_has_seen_yet_is_executed_again():
     assert {r.outcome.trace_digest for r in bench.results.values()} == {completed().trace_digest}
 
 
-def test_a_new_session_does_not_end_the_quarantine_and_an_operator_does():
+def test_quarantine_survives_a_new_session_and_ends_by_an_operator():
     bench = Bench()
     bench.submit()
     liar = bench.only_lease().worker_id
@@ -167,7 +167,7 @@ def test_a_new_session_does_not_end_the_quarantine_and_an_operator_does():
     assert liar in {lease.worker_id for lease in bench.live.values()}
 
 
-def test_three_results_that_all_differ_are_no_result_and_nobody_is_blamed():
+def test_three_different_results_fail_the_rollout_and_blame_no_worker():
     bench = Bench()
     bench.submit()
     bench.answer(lies={"w1", "w2", "w3"})
@@ -175,7 +175,7 @@ def test_three_results_that_all_differ_are_no_result_and_nobody_is_blamed():
     assert not bench.caught
 
 
-def test_two_workers_that_differ_wait_for_a_third_and_then_end_without_a_result():
+def test_two_different_results_fail_after_waiting_for_a_third_worker():
     bench = Bench(workers=("w1", "w2"))
     bench.submit()
     bench.answer(lies={"w1"})
@@ -186,7 +186,7 @@ def test_two_workers_that_differ_wait_for_a_third_and_then_end_without_a_result(
     assert not bench.caught
 
 
-def test_a_third_worker_that_comes_in_time_decides():
+def test_third_worker_that_joins_in_time_decides():
     bench = Bench(workers=("w1", "w2"))
     bench.submit()
     liar = bench.only_lease().worker_id
@@ -196,7 +196,7 @@ def test_a_third_worker_that_comes_in_time_decides():
     assert bench.caught == [liar]
 
 
-def test_with_one_worker_nothing_is_audited_and_that_shows():
+def test_single_worker_is_not_audited_and_the_state_says_so():
     bench = Bench(workers=("w1",))
     assert not bench.cluster.dispatcher.auditor.lone
     bench.submit(3)
@@ -206,7 +206,7 @@ def test_with_one_worker_nothing_is_audited_and_that_shows():
     assert bench.cluster.dispatcher.auditor.lone
 
 
-def test_a_result_whose_second_worker_left_for_good_is_delivered_after_a_while():
+def test_held_result_is_delivered_after_its_second_worker_left():
     bench = Bench(workers=("w1", "w2"))
     bench.submit()
     bench.finish(bench.only_lease())
@@ -220,7 +220,7 @@ def test_a_result_whose_second_worker_left_for_good_is_delivered_after_a_while()
     assert isinstance(bench.results["b1-0"].outcome, Completed)
 
 
-def test_a_plan_that_only_its_second_worker_can_not_execute_blames_nobody():
+def test_failed_check_blames_no_worker():
     bench = Bench()
     bench.submit()
     bench.finish(bench.only_lease())
@@ -233,7 +233,7 @@ def test_a_plan_that_only_its_second_worker_can_not_execute_blames_nobody():
 
 
 @pytest.mark.parametrize("event", [BatchCancelled("r1", "b1"), RunClosed("r1")])
-def test_audits_end_with_what_they_are_about(event):
+def test_audits_end_with_their_rollout_or_run(event):
     bench = Bench()
     bench.submit()
     bench.finish(bench.only_lease())
@@ -244,7 +244,7 @@ def test_audits_end_with_what_they_are_about(event):
     assert not bench.cluster.dispatcher.queued
 
 
-def test_other_runs_deliver_at_once_and_are_audited_on_slots_that_nobody_wants():
+def test_background_audits_deliver_at_once_and_use_idle_slots():
     bench = Bench(terms=PLAIN, rules=AuditRules(background=True))
     bench.submit(3)
     leases = list(bench.live.values())
@@ -265,7 +265,7 @@ def test_other_runs_deliver_at_once_and_are_audited_on_slots_that_nobody_wants()
     assert bench.stats().audited == 3
 
 
-def test_no_audit_of_a_plain_run_begins_while_a_rollout_waits():
+def test_background_audit_waits_for_queued_rollouts():
     bench = Bench(workers=("w1", "w2"), terms=PLAIN, rules=AuditRules(background=True))
     bench.submit(40)
     while len(bench.results) < 40:
@@ -274,7 +274,7 @@ def test_no_audit_of_a_plain_run_begins_while_a_rollout_waits():
         bench.finish(next(lease for lease in bench.live.values() if not lease.audit))
 
 
-def test_audits_of_plain_runs_are_off_unless_they_are_asked_for():
+def test_background_audits_are_off_by_default():
     bench = Bench(terms=PLAIN)
     bench.submit(9)
     bench.answer()
@@ -285,7 +285,7 @@ def test_audits_of_plain_runs_are_off_unless_they_are_asked_for():
 
 @settings(max_examples=150, deadline=None)
 @given(st.randoms(use_true_random=False), st.booleans())
-def test_in_any_order_of_events_the_honest_stay_and_every_rollout_gets_one_outcome(dice, verified):
+def test_honest_workers_stay_and_every_rollout_gets_one_outcome_in_any_order(dice, verified):
     terms = RunTerms(GroupPolicy.PARTIAL, verified=verified)
     bench = Bench(("w1", "w2", "w3"), terms, AuditRules(probation=4, share=0.3, background=True))
     bench.submit(8)
@@ -338,7 +338,7 @@ TEST_OF_LIARS = SimulationScenario(
 )
 
 
-def test_workers_that_lie_on_a_tenth_of_their_rollouts_are_caught_on_probation():
+def test_workers_falsifying_a_tenth_of_results_are_caught_on_probation():
     report = simulate(TEST_OF_LIARS)
     counts = sorted(report.caught.values())
     expected = 1.0 - 0.9 ** AuditRules().probation

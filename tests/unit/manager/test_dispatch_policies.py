@@ -1,4 +1,4 @@
-"""What the Task-Dispatcher does about lost members, stragglers, stuck slots, pauses, and runs beside one another."""
+"""Policies of the Task-Dispatcher: lost members, late rollouts, stalls, pauses, and fair sharing between runs."""
 
 import hypothesis.strategies as st
 import pytest
@@ -104,7 +104,7 @@ def policy(desk, group_policy, **terms):
 # Group policies
 
 
-def test_the_default_cancels_what_is_left_of_a_group_that_lost_a_member_and_nothing_else(desk):
+def test_default_policy_cancels_the_rest_of_a_failed_group_only(desk):
     desk.worker("w1", slots=8)
     desk.submit(3, 2)
     desk.finish("b1.0.0")
@@ -118,7 +118,7 @@ def test_the_default_cancels_what_is_left_of_a_group_that_lost_a_member_and_noth
     assert desk.dispatcher.counters("r1").groups_failed == 1
 
 
-def test_partial_groups_go_on_without_the_lost_member(desk):
+def test_partial_policy_keeps_the_other_members(desk):
     policy(desk, GroupPolicy.PARTIAL)
     desk.worker("w1", slots=8)
     desk.submit(2)
@@ -128,7 +128,7 @@ def test_partial_groups_go_on_without_the_lost_member(desk):
     assert isinstance(desk.results["b1.0.1"], Completed)
 
 
-def test_fail_fast_tries_nothing_twice_and_cancels_the_batch(desk):
+def test_fail_fast_retries_nothing_and_cancels_the_batch(desk):
     policy(desk, GroupPolicy.FAIL_FAST)
     desk.worker("w1", slots=8)
     desk.submit(2, 2, 2)
@@ -139,7 +139,7 @@ def test_fail_fast_tries_nothing_twice_and_cancels_the_batch(desk):
     assert desk.dispatcher.counters("r1").groups_failed == 3
 
 
-def test_what_a_failed_group_frees_is_used_in_the_same_step(desk):
+def test_slots_freed_by_a_failed_group_are_filled_at_once(desk):
     desk.worker("w1", slots=1)
     desk.submit(2, 2)
     desk.tell(Tick(), after_s=601.0)
@@ -147,7 +147,7 @@ def test_what_a_failed_group_frees_is_used_in_the_same_step(desk):
     assert "b2.0.0" in desk.held
 
 
-def test_the_deadline_of_a_run_goes_before_the_manager_s(desk):
+def test_deadline_of_a_run_overrides_the_default(desk):
     policy(desk, GroupPolicy.PARTIAL, rollout_deadline_s=5.0)
     desk.submit(1)
     desk.tell(Tick(), after_s=5.0)
@@ -166,7 +166,7 @@ def known(desk, count=20):
         desk.finish(f"b1.0.{index}", after_s=1.0 if not index else 0.0)
 
 
-def test_a_straggler_at_the_end_of_its_group_gets_a_second_lease_and_the_first_result_counts(desk):
+def test_late_rollout_in_a_tail_is_hedged_and_the_first_result_counts(desk):
     known(desk)
     desk.worker("w2")
     desk.tell(Tick(), after_s=0.5)
@@ -185,7 +185,7 @@ def test_a_straggler_at_the_end_of_its_group_gets_a_second_lease_and_the_first_r
     assert not desk.dispatcher.live_leases
 
 
-def test_a_second_lease_that_fails_leaves_the_first_alone(desk):
+def test_failed_hedge_leaves_the_first_lease_alone(desk):
     known(desk)
     desk.worker("w2")
     desk.tell(Tick(), after_s=3.0)
@@ -195,7 +195,7 @@ def test_a_second_lease_that_fails_leaves_the_first_alone(desk):
     assert isinstance(desk.results["b1.0.19"], Completed)
 
 
-def test_a_rollout_is_hedged_once_and_a_run_within_its_budget():
+def test_rollout_is_hedged_once_and_a_run_within_its_budget():
     desk = Desk(DispatchLimits(known_after=4, hedge_share=0.05))
     desk.worker("w1", slots=40)
     desk.submit(40)
@@ -207,7 +207,7 @@ def test_a_rollout_is_hedged_once_and_a_run_within_its_budget():
     assert len(desk.hedges) == 2
 
 
-def test_what_ran_out_of_memory_is_not_started_twice_at_once(desk):
+def test_rollout_that_ran_out_of_memory_is_not_hedged(desk):
     desk.worker("w1", slots=20)
     desk.submit(20)
     desk.finish("b1.0.19", InfraFailure(InfraCode.SLOT_OOM, "MemoryError"))
@@ -218,7 +218,7 @@ def test_what_ran_out_of_memory_is_not_started_twice_at_once(desk):
     assert desk.hedges == []
 
 
-def test_a_straggler_whose_scene_is_nowhere_else_has_it_loaded(desk):
+def test_scene_of_a_late_rollout_is_loaded_on_another_worker(desk):
     known(desk)
     desk.worker("w2", warm=())
     desk.tell(Tick(), after_s=3.0)
@@ -233,7 +233,7 @@ def test_a_straggler_whose_scene_is_nowhere_else_has_it_loaded(desk):
 # Slow workers
 
 
-def test_a_worker_that_was_slow_beside_nobody_takes_what_waits_at_the_next_tick(desk):
+def test_last_worker_is_no_longer_treated_as_slow_at_the_next_tick(desk):
     desk.worker("w1", slots=2)
     desk.submit(30)
     for index in range(24):
@@ -245,7 +245,7 @@ def test_a_worker_that_was_slow_beside_nobody_takes_what_waits_at_the_next_tick(
     assert len([name for name in desk.held if name.startswith("b2") and desk.held[name]]) >= 2
 
 
-def test_what_failed_on_the_only_worker_that_is_left_is_given_to_it_again_in_time(desk):
+def test_only_worker_gets_a_failed_rollout_again_after_a_pause(desk):
     desk.worker("w1", slots=2)
     desk.worker("w2", warm=())
     desk.submit(1)
@@ -264,7 +264,7 @@ def beat(desk, worker_id, rollout_id, steps, after_s):
     return desk.tell(LeasesRenewed(worker_id, (ref,), (LeaseProgress(ref, steps),)), after_s)
 
 
-def test_a_slot_that_does_no_step_any_more_loses_its_lease_to_another_worker(desk):
+def test_stalled_lease_moves_to_another_worker(desk):
     known(desk)
     desk.submit(1, batch_id="b2")
     (worker_id,) = desk.held["b2.0.0"]
@@ -278,7 +278,7 @@ def test_a_slot_that_does_no_step_any_more_loses_its_lease_to_another_worker(des
     assert desk.dispatcher.counters("r1").redispatched == 1
 
 
-def test_a_worker_that_tells_no_progress_is_not_judged_by_it(desk):
+def test_worker_that_reports_no_progress_never_stalls(desk):
     known(desk)
     ref = desk.held["b1.0.19"]["w1"]
     for _ in range(20):
@@ -286,7 +286,7 @@ def test_a_worker_that_tells_no_progress_is_not_judged_by_it(desk):
     assert desk.held["b1.0.19"] == {"w1": ref}
 
 
-def test_three_stalls_end_a_rollout_as_stalled(desk):
+def test_third_stall_fails_a_rollout(desk):
     known(desk)
     for _ in range(3):
         beat(desk, "w1", "b1.0.19", 3, after_s=1.0)
@@ -298,7 +298,7 @@ def test_three_stalls_end_a_rollout_as_stalled(desk):
 # Pauses
 
 
-def test_nothing_is_leased_while_dispatch_is_paused_and_everything_after(desk):
+def test_paused_dispatch_grants_no_leases_until_it_is_resumed(desk):
     desk.worker("w1", slots=2)
     desk.tell(DispatchPaused())
     desk.submit(2)
@@ -309,7 +309,7 @@ def test_nothing_is_leased_while_dispatch_is_paused_and_everything_after(desk):
     assert set(desk.held) == {"b1.0.0", "b1.0.1"}
 
 
-def test_a_paused_worker_finishes_what_it_holds_and_gets_nothing_new(desk):
+def test_paused_worker_finishes_its_leases_and_gets_no_new_ones(desk):
     desk.worker("w1")
     desk.submit(3)
     desk.report("w1", paused="the owner is back")
@@ -319,7 +319,7 @@ def test_a_paused_worker_finishes_what_it_holds_and_gets_nothing_new(desk):
     assert "b1.0.2" in desk.held
 
 
-def test_a_drain_that_is_taken_back_gives_work_again_unless_the_worker_itself_leaves(desk):
+def test_resumed_worker_gets_work_unless_it_is_leaving(desk):
     desk.worker("w1")
     desk.tell(WorkerDrained("w1"))
     desk.submit(1)
@@ -334,7 +334,7 @@ def test_a_drain_that_is_taken_back_gives_work_again_unless_the_worker_itself_le
 # Rendering
 
 
-def test_rollouts_that_render_go_to_slots_that_render_and_no_more_than_there_are(desk):
+def test_rendering_rollouts_are_limited_to_rendering_slots(desk):
     desk.worker("w1", slots=4)
     desk.worker("w2", slots=4, render_slots=1)
     desk.submit(3, render=True)
@@ -348,7 +348,7 @@ def test_rollouts_that_render_go_to_slots_that_render_and_no_more_than_there_are
 # Runs beside one another
 
 
-def test_a_late_run_gets_the_next_free_slot_beside_a_large_batch(desk):
+def test_later_run_gets_the_next_free_slot_beside_a_large_batch(desk):
     desk.worker("w1", slots=2)
     desk.submit(200, run_id="large", batch_id="large")
     desk.submit(1, run_id="small", batch_id="small")
@@ -357,7 +357,7 @@ def test_a_late_run_gets_the_next_free_slot_beside_a_large_batch(desk):
 
 
 @pytest.mark.parametrize(("weight", "share"), [(1.0, 0.5), (3.0, 0.25)])
-def test_a_run_that_comes_when_nobody_knows_how_short_rollouts_are_has_its_share_at_once(desk, weight, share):
+def test_new_run_gets_its_share_before_slot_times_are_known(desk, weight, share):
     desk.worker("w1")
     desk.submit(1, run_id="before", batch_id="before")
     # From here on the worker is given many leases ahead, and each run's are charged as if they took a second.
@@ -375,7 +375,7 @@ def test_a_run_that_comes_when_nobody_knows_how_short_rollouts_are_has_its_share
     st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 2), st.floats(1.0, 9.0)), max_size=30),
     st.fixed_dictionaries({run: st.sampled_from([0.5, 1.0, 4.0]) for run in "abc"}),
 )
-def test_claims_keep_their_order_in_each_run_and_no_run_is_ahead_of_its_weight(entries, weights):
+def test_claims_keep_their_order_and_runs_their_weights(entries, weights):
     class Claim:
         def __init__(self, run, rank, cost):
             self.rank, self.cost, self.share = rank, cost, RunShare(run, weights[run])
@@ -405,7 +405,7 @@ def test_claims_keep_their_order_in_each_run_and_no_run_is_ahead_of_its_weight(e
     ),
     st.integers(0, 200),
 )
-def test_quotas_use_all_slots_that_anybody_wants_and_give_nobody_more(wanted, slots):
+def test_quotas_use_all_wanted_slots_and_no_run_exceeds_its_demand(wanted, slots):
     given_slots = quotas(wanted, slots)
     assert all(given_slots[share] <= wanted[share] + 1e-9 for share in wanted)
     assert sum(given_slots.values()) == pytest.approx(min(slots, sum(wanted.values())))

@@ -1,4 +1,4 @@
-"""The Task-Dispatcher, driven by hand: each test tells what happened and what should be done about it."""
+"""Task-Dispatcher: commands that follow from events."""
 
 import pytest
 from tests.fakes.dispatch import Table, crash, leases
@@ -36,7 +36,7 @@ def table():
     return Table()
 
 
-def test_a_rollout_goes_to_the_worker_that_has_its_scene_warm(table):
+def test_rollout_goes_to_the_worker_with_its_scene_warm(table):
     table.worker("w1", warm=["bedroom"])
     table.worker("w2", warm=["kitchen"])
     (lease,) = leases(table.submit())
@@ -45,7 +45,7 @@ def test_a_rollout_goes_to_the_worker_that_has_its_scene_warm(table):
     assert isinstance(table.results["b1-0"].outcome, Completed)
 
 
-def test_a_rollout_waits_while_its_scene_is_nowhere_warm(table):
+def test_rollout_waits_while_its_scene_is_warm_nowhere(table):
     table.worker(warm=[])
     assert leases(table.submit(3)) == []
     demand = table.dispatcher.demand()
@@ -54,17 +54,17 @@ def test_a_rollout_waits_while_its_scene_is_nowhere_warm(table):
     assert len(leases(table.report(warm=["kitchen"]))) == 2
 
 
-def test_a_worker_that_has_not_reported_yet_gets_nothing(table):
+def test_worker_gets_no_lease_before_its_first_report(table):
     table.tell(WorkerJoined("w1", Resources(4, 4, 1024)))
     assert leases(table.submit()) == []
 
 
-def test_a_worker_holds_one_lease_per_slot_and_one_behind_each(table):
+def test_worker_holds_one_lease_per_slot_and_one_queued_behind_each(table):
     table.worker(slots=2)
     assert len(leases(table.submit(10))) == 4
 
 
-def test_a_freed_slot_is_used_in_the_same_step(table):
+def test_freed_slot_is_filled_by_the_same_event(table):
     table.worker()
     first, _ = leases(table.submit(3))
     (third,) = leases(table.finish(first))
@@ -78,7 +78,7 @@ def test_rollouts_spread_over_the_least_busy_workers(table):
     assert sorted(given) == ["w1", "w2", "w2", "w2"]
 
 
-def test_the_batch_ends_after_its_last_result_with_cursors_from_one(table):
+def test_batch_finishes_after_its_last_result_with_cursors_from_one(table):
     table.worker(slots=4)
     given = leases(table.submit(3))
     commands = [command for lease in given for command in table.finish(lease)]
@@ -86,7 +86,7 @@ def test_the_batch_ends_after_its_last_result_with_cursors_from_one(table):
     assert [result.cursor for result in table.results.values()] == [1, 2, 3]
 
 
-def test_a_lost_worker_gives_its_rollouts_back_at_once(table):
+def test_rollouts_of_a_lost_worker_are_redispatched_at_once(table):
     table.worker("w1", slots=2)
     table.submit(4)
     table.worker("w2", slots=2)
@@ -106,7 +106,7 @@ def test_only_started_leases_of_a_lost_worker_cost_an_attempt(table):
     assert "b1-1" not in table.results
 
 
-def test_a_poison_rollout_ends_after_three_crashes_and_the_others_live(table):
+def test_poison_rollout_fails_after_three_crashes_and_others_complete(table):
     table.worker()
     given = leases(table.submit(3))
     while given:
@@ -118,7 +118,7 @@ def test_a_poison_rollout_ends_after_three_crashes_and_the_others_live(table):
     assert all(isinstance(table.results[name].outcome, Completed) for name in ("b1-1", "b1-2"))
 
 
-def test_a_late_result_is_acknowledged_counted_and_dropped(table):
+def test_late_result_is_acknowledged_counted_and_dropped(table):
     table.worker("w1")
     (old,) = leases(table.submit())
     table.worker("w2")
@@ -131,7 +131,7 @@ def test_a_late_result_is_acknowledged_counted_and_dropped(table):
     assert table.dispatcher.counters("r1").stale_results == 2
 
 
-def test_a_result_under_another_epoch_or_worker_is_stale(table):
+def test_result_under_another_epoch_or_worker_is_stale(table):
     table.worker()
     (lease,) = leases(table.submit())
     for worker_id, ref in (("w1", LeaseRef(lease.ref.lease_id, 99)), ("w2", lease.ref)):
@@ -141,7 +141,7 @@ def test_a_result_under_another_epoch_or_worker_is_stale(table):
     assert len(table.results) == 1
 
 
-def test_a_lease_that_nobody_renews_expires(table):
+def test_lease_without_renewal_expires(table):
     table.worker()
     (lease,) = leases(table.submit())
     table.tell(LeasesRenewed("w1", (lease.ref,)), after_s=29)
@@ -151,7 +151,7 @@ def test_a_lease_that_nobody_renews_expires(table):
     assert leases(commands)[0].ref.lease_epoch > lease.ref.lease_epoch
 
 
-def test_a_lease_that_is_renewed_for_ever_expires_too(table):
+def test_renewed_lease_expires_at_its_limit(table):
     table.worker()
     (lease,) = leases(table.submit())
     for _ in range(9):
@@ -192,7 +192,7 @@ def test_worker_skips_any_number_of_rollouts_that_failed_on_it():
     assert held == {f"b1-{index}" for index in range(12, 36)}
 
 
-def test_leases_that_a_reconnected_worker_never_got_are_given_again(table):
+def test_leases_missing_after_a_reconnect_are_redispatched(table):
     table.worker(slots=2)
     first, second = leases(table.submit(2))
     commands = table.report(warm=["kitchen"], held=[first.ref], resync=True)
@@ -201,26 +201,26 @@ def test_leases_that_a_reconnected_worker_never_got_are_given_again(table):
     assert first.ref.lease_id in table.dispatcher.live_leases
 
 
-def test_a_later_report_takes_no_lease_back(table):
+def test_later_report_returns_no_lease(table):
     table.worker(slots=2)
     table.submit(2)
     assert table.report(warm=["kitchen"], held=[]) == []
 
 
-def test_a_lease_of_a_former_manager_is_called_off(table):
+def test_unknown_lease_of_a_former_manager_is_cancelled(table):
     table.tell(WorkerJoined("w1", Resources(1, 1, 1024)))
     ghost = LeaseRef("other-1", 1)
     assert table.report(held=[ghost], resync=True) == [CancelLease("w1", ghost)]
 
 
-def test_a_suspected_worker_gets_nothing_until_it_is_heard(table):
+def test_suspected_worker_gets_no_lease_until_it_is_heard(table):
     table.worker()
     table.tell(WorkerSuspected("w1"))
     assert leases(table.submit()) == []
     assert len(leases(table.tell(WorkerRecovered("w1")))) == 1
 
 
-def test_a_drained_worker_finishes_what_it_holds_and_gets_nothing_new(table):
+def test_drained_worker_finishes_its_leases_and_gets_no_new_ones(table):
     table.worker()
     first, second = leases(table.submit(5))
     table.tell(WorkerDrained("w1"))
@@ -228,7 +228,7 @@ def test_a_drained_worker_finishes_what_it_holds_and_gets_nothing_new(table):
     assert len(table.results) == 2
 
 
-def test_an_idle_slot_takes_what_waits_behind_a_busy_one(table):
+def test_idle_slot_steals_a_lease_queued_behind_a_busy_one(table):
     table.worker("w1", slots=1)
     running, waiting = leases(table.submit(2))
     table.worker("w2", slots=1)
@@ -241,7 +241,7 @@ def test_an_idle_slot_takes_what_waits_behind_a_busy_one(table):
     assert {result.attempt for result in table.results.values()} == {1}
 
 
-def test_a_cancelled_batch_ends_at_once_and_frees_its_slots(table):
+def test_cancelled_batch_finishes_at_once_and_frees_its_slots(table):
     table.worker()
     given = leases(table.submit(3))
     table.submit(1, batch_id="b2")
@@ -251,7 +251,7 @@ def test_a_cancelled_batch_ends_at_once_and_frees_its_slots(table):
     assert [lease.rollout.rollout_id for lease in leases(commands)] == ["b2-0"]
 
 
-def test_a_closed_run_cancels_its_batches_and_leaves_the_others(table):
+def test_closed_run_cancels_only_its_own_batches(table):
     table.submit(2)
     rollout = Rollout("other", "g", "kitchen", "t", (), 0)
     table.tell(BatchSubmitted(Batch("r2", "b1", 1, (rollout,))))
@@ -260,7 +260,7 @@ def test_a_closed_run_cancels_its_batches_and_leaves_the_others(table):
     assert table.dispatcher.pending_of("r2") == 1
 
 
-def test_a_rollout_has_a_deadline(table):
+def test_rollout_fails_at_its_deadline(table):
     table.worker(warm=[])
     table.submit()
     table.tell(Tick(), after_s=599)
@@ -269,7 +269,7 @@ def test_a_rollout_has_a_deadline(table):
     assert table.results["b1-0"].outcome.code is InfraCode.DEADLINE
 
 
-def test_without_a_worker_rollouts_end_after_the_bounded_wait(table):
+def test_rollouts_without_a_worker_fail_after_the_bounded_wait(table):
     table.submit()
     table.tell(Tick(), after_s=59)
     assert table.results == {}
@@ -277,14 +277,14 @@ def test_without_a_worker_rollouts_end_after_the_bounded_wait(table):
     assert table.results["b1-0"].outcome.code is InfraCode.NO_CAPACITY
 
 
-def test_a_rollout_that_came_late_waits_as_long_as_the_others(table):
+def test_later_rollout_waits_for_the_whole_limit_too(table):
     table.tell(Tick(), after_s=100)
     table.submit()
     table.tell(Tick(), after_s=30)
     assert table.results == {}
 
 
-def test_a_scene_that_fits_nowhere_fails_its_rollouts_with_the_reason(table):
+def test_unplaceable_scene_fails_its_rollouts_with_the_reason(table):
     table.worker(warm=[])
     table.submit()
     table.tell(ScenesUnplaceable({"kitchen": "needs 900 MB"}))
@@ -292,7 +292,7 @@ def test_a_scene_that_fits_nowhere_fails_its_rollouts_with_the_reason(table):
     assert table.results["b1-0"].outcome == InfraFailure(InfraCode.NO_CAPACITY, "needs 900 MB")
 
 
-def test_a_scene_that_fails_on_two_workers_fails_its_rollouts(table):
+def test_scene_that_fails_on_two_workers_fails_its_rollouts(table):
     table.worker("w1", warm=[])
     table.worker("w2", warm=[])
     table.submit(2)
@@ -303,7 +303,7 @@ def test_a_scene_that_fails_on_two_workers_fails_its_rollouts(table):
     assert "no mesh" in table.results["b1-0"].outcome.message
 
 
-def test_one_worker_that_fails_is_to_blame_itself_while_another_has_the_scene(table):
+def test_single_load_failure_is_ignored_while_another_worker_has_the_scene(table):
     table.worker("w1", warm=[])
     table.worker("w2")
     table.report("w1", failed=["kitchen"])
@@ -311,7 +311,7 @@ def test_one_worker_that_fails_is_to_blame_itself_while_another_has_the_scene(ta
     assert lease.worker_id == "w2"
 
 
-def test_the_only_worker_may_fail_for_a_while_before_its_rollouts_end(table):
+def test_only_worker_may_fail_to_load_for_a_while(table):
     table.worker(warm=[])
     table.submit()
     table.report(failed=["kitchen"])
@@ -321,7 +321,7 @@ def test_the_only_worker_may_fail_for_a_while_before_its_rollouts_end(table):
     assert table.results["b1-0"].outcome.code is InfraCode.SCENE_LOAD_FAILED
 
 
-def test_a_lease_that_found_its_scene_broken_does_not_come_straight_back(table):
+def test_worker_with_a_broken_scene_does_not_get_the_rollout_straight_back(table):
     table.worker("w1")
     table.worker("w2", warm=[])
     (lease,) = leases(table.submit())
@@ -330,14 +330,14 @@ def test_a_lease_that_found_its_scene_broken_does_not_come_straight_back(table):
     assert leases(table.report("w2", warm=["kitchen"]))[0].worker_id == "w2"
 
 
-def test_a_newer_session_of_a_worker_loses_the_leases_of_the_older(table):
+def test_newer_session_loses_the_leases_of_the_older_one(table):
     table.worker("w1")
     (old,) = leases(table.submit())
     (new,) = leases(table.worker("w1"))
     assert new.ref.lease_epoch > old.ref.lease_epoch
 
 
-def test_waiting_time_is_part_of_the_result(table):
+def test_result_contains_the_queue_time(table):
     table.worker()
     first, second = leases(table.submit(2))
     table.tell(Tick(), after_s=2.0)
@@ -349,7 +349,7 @@ def test_waiting_time_is_part_of_the_result(table):
     assert table.finish(second)
 
 
-def test_warm_and_cold_starts_are_told_apart(table):
+def test_warm_and_cold_starts_are_counted_separately(table):
     table.worker(warm=[])
     table.submit(1)
     (cold,) = leases(table.report(warm=["kitchen"]))

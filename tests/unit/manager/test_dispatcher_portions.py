@@ -1,4 +1,4 @@
-"""Batches that are taken in pieces: their rest is cancelled, failed and timed out with what has come."""
+"""Large batches that are queued in pieces: cancellation, failure and deadline of the rest."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ def table():
     return Table()
 
 
-def test_a_large_batch_is_taken_in_pieces_and_ends_when_all_of_them_are_done(table):
+def test_large_batch_is_queued_in_pieces_and_finishes_after_the_last(table):
     table.worker(slots=1)
     first = leases(table.submit_in_pieces(5, 2))
     assert [lease.rollout.rollout_id for lease in first] == ["b1-0", "b1-1"]
@@ -38,7 +38,7 @@ def test_a_large_batch_is_taken_in_pieces_and_ends_when_all_of_them_are_done(tab
     assert sorted(table.results) == [f"b1-{i}" for i in range(5)]
 
 
-def test_what_is_still_coming_is_cancelled_with_its_batch(table):
+def test_rollouts_still_coming_are_cancelled_with_their_batch(table):
     table.worker(slots=1)
     table.submit_in_pieces(5, 2)
     commands = table.tell(BatchCancelled("r1", "b1"))
@@ -48,7 +48,7 @@ def test_what_is_still_coming_is_cancelled_with_its_batch(table):
     assert table.tell(BatchContinued("r1", "b1", 2)) == []
 
 
-def test_members_that_are_still_coming_fail_with_their_group_and_the_others_are_queued():
+def test_members_still_coming_fail_with_their_group_and_others_are_queued():
     table = Table(replace(LIMITS, max_attempts=1))
     table.worker(slots=1)
     (lease, *_) = leases(table.submit_in_pieces(6, 2, group_size=3))
@@ -58,14 +58,14 @@ def test_members_that_are_still_coming_fail_with_their_group_and_the_others_are_
     assert table.tell(BatchContinued("r1", "b1", 4)) == []
 
 
-def test_the_deadline_of_a_batch_ends_what_is_still_coming(table):
+def test_batch_deadline_fails_rollouts_still_coming(table):
     table.submit_in_pieces(3, 1)
     table.tell(Tick(), after_s=601.0)
     assert {result.outcome.code for result in table.results.values()} == {InfraCode.DEADLINE}
     assert len(table.results) == 3
 
 
-def test_a_batch_that_comes_while_another_one_is_taken_goes_behind_all_of_it(table):
+def test_second_batch_queues_behind_all_of_a_partly_queued_one(table):
     table.submit_in_pieces(3, 1)
     table.submit(1, batch_id="b2")
     table.tell(BatchContinued("r1", "b1", 2))

@@ -1,4 +1,4 @@
-"""Workers in a large cluster: found by scene, by free slots and by backlog, without looking at all of them."""
+"""Worker pool of a large cluster: look-up by scene, free slots and backlog without scanning all workers."""
 
 import pytest
 
@@ -15,7 +15,7 @@ def has_credit(worker):
 
 
 def pool_of(count, scene="kitchen"):
-    """So many workers with one slot each, all with the scene warm."""
+    """Return a pool of workers with one slot each and the scene warm."""
     pool = WorkerPool()
     for index in range(count):
         pool.join(f"w{index:04d}", Resources(1, 1, 1024))
@@ -35,7 +35,7 @@ def load(pool, worker_id, leases, given_s=0.0):
         pool.add_lease(worker, LeaseRecord(LeaseRef(name, 1), worker_id, record, given_s, 30.0, 180.0))
 
 
-def test_the_only_one_of_many_holders_with_a_credit_is_found():
+def test_only_holder_with_a_credit_is_found_among_many():
     pool = pool_of(MANY)
     for worker_id in list(pool.workers)[:-1]:
         load(pool, worker_id, 2)
@@ -44,7 +44,7 @@ def test_the_only_one_of_many_holders_with_a_credit_is_found():
     assert pool.least_busy("kitchen", has_credit) is None
 
 
-def test_all_of_many_holders_get_their_turn():
+def test_all_of_many_holders_get_leases():
     pool = pool_of(MANY)
     chosen = []
     for _ in range(MANY):
@@ -67,7 +67,7 @@ def test_an_idle_worker_finds_a_lease_behind_a_busy_slot():
     # Three rollouts of 0.1 s each, of which the first began at 1 s: the last begins at 1.2 s.
     [(1.05, False), (1.15, True), (1.2, True), (1.39, True), (1.41, False)],
 )
-def test_a_lease_that_is_about_to_begin_behind_its_slot_is_left_to_it(now_s, left_alone):
+def test_lease_about_to_start_is_not_stolen(now_s, left_alone):
     pool = pool_of(2)
     pool.workers["w0000"].note_completed(0.1)
     load(pool, "w0000", 3, given_s=1.0)
@@ -75,7 +75,7 @@ def test_a_lease_that_is_about_to_begin_behind_its_slot_is_left_to_it(now_s, lef
     assert (found is None) == left_alone
 
 
-def test_of_two_slots_the_one_that_began_last_tells_when_the_next_lease_begins():
+def test_next_start_is_predicted_from_the_slot_that_started_last():
     pool = pool_of(1)
     thief, victim = pool.workers["w0000"], pool.join("twice", Resources(2, 2, 1024))
     victim.note_completed(0.1)
@@ -86,14 +86,14 @@ def test_of_two_slots_the_one_that_began_last_tells_when_the_next_lease_begins()
     assert pool.stealable_lease(thief, before_s=3.0, now_s=3.5).ref.lease_id == "twice.2"
 
 
-def test_different_idle_workers_look_each_time():
+def test_idle_workers_are_rotated():
     pool = pool_of(2 * SEEKERS + 1)
     load(pool, "w0000", 2)
     first, second = pool.rotate_idle(), pool.rotate_idle()
     assert len(set(first) | set(second)) == 2 * SEEKERS
 
 
-def test_a_worker_that_drains_or_is_suspected_is_neither_live_nor_idle():
+def test_draining_or_suspected_worker_is_neither_live_nor_idle():
     pool = pool_of(3)
     pool.workers["w0000"].drained = True
     pool.workers["w0001"].suspect = True
@@ -105,7 +105,7 @@ def test_a_worker_that_drains_or_is_suspected_is_neither_live_nor_idle():
     assert (pool.live_count, pool.idle) == (0, frozenset())
 
 
-def test_a_worker_holds_as_many_leases_ahead_as_it_executes_until_others_come():
+def test_credits_follow_the_pace_of_a_worker():
     pool = pool_of(1)
     worker = pool.workers["w0000"]
     assert worker.credits == 2

@@ -1,4 +1,4 @@
-"""A19: the whole machine against chaos: crashes, lost messages, late, repeated and reordered results, in any order."""
+"""A19: property test of the dispatcher and scheduler under crashes, lost messages, and late or repeated results."""
 
 import hypothesis.strategies as st
 import pytest
@@ -84,7 +84,7 @@ workers = st.sampled_from(WORKERS)
 
 
 class LeaseMachine(RuleBasedStateMachine):
-    """The world around the manager: workers that hold what they were told, and a network that loses and repeats."""
+    """Workers and a network around the manager. The state's own invariants are checked after every event."""
 
     @initialize()
     def begin(self):
@@ -101,7 +101,7 @@ class LeaseMachine(RuleBasedStateMachine):
         self.steps = {}
         self.hedges = 0
         for worker in WORKERS:
-            self.a_worker_joins(worker, 2, 1000)
+            self.worker_joins(worker, 2, 1000)
 
     def tell(self, event, *, lost=False):
         self.now_s += 0.01
@@ -128,7 +128,7 @@ class LeaseMachine(RuleBasedStateMachine):
                     pass
 
     @rule(worker=workers, slots=st.integers(1, 3), memory_mb=st.sampled_from([64, 150, 1000]))
-    def a_worker_joins(self, worker, slots, memory_mb):
+    def worker_joins(self, worker, slots, memory_mb):
         self.live[worker] = {}
         self.desired.pop(worker, None)
         renders = 0 if worker == "w3" else slots
@@ -141,7 +141,7 @@ class LeaseMachine(RuleBasedStateMachine):
         reconnect=st.booleans(),
         paused=st.sampled_from([*[""] * 7, "the owner is back"]),
     )
-    def a_worker_reports(self, worker, failing, reconnect, paused=""):
+    def worker_reports(self, worker, failing, reconnect, paused=""):
         if worker not in self.live:
             return
         residents = tuple(
@@ -153,12 +153,12 @@ class LeaseMachine(RuleBasedStateMachine):
         )
 
     @rule(worker=workers)
-    def a_worker_is_killed(self, worker):
+    def worker_is_killed(self, worker):
         self.live.pop(worker, None)
         self.tell(WorkerLost(worker, "killed"))
 
     @rule(worker=workers)
-    def a_stream_breaks_with_leases_on_their_way(self, worker):
+    def stream_breaks_with_leases_under_way(self, worker):
         if self.live.get(worker):
             self.live[worker].popitem()
 
@@ -166,15 +166,15 @@ class LeaseMachine(RuleBasedStateMachine):
         worker=workers,
         event=st.sampled_from(STANDINGS),
     )
-    def a_worker_changes_its_standing(self, worker, event):
+    def standing_of_a_worker_changes(self, worker, event):
         self.tell(event(worker))
 
     @rule(paused=st.sampled_from([True, False, False, False]))
-    def an_operator_pauses_or_resumes(self, paused):
+    def operator_pauses_or_resumes(self, paused):
         self.tell(DispatchPaused() if paused else DispatchResumed())
 
     @rule(run=st.sampled_from(RUNS), terms=TERMS)
-    def a_run_is_opened(self, run, terms):
+    def run_is_opened(self, run, terms):
         self.tell(RunOpened(run, terms))
 
     @rule(
@@ -185,7 +185,7 @@ class LeaseMachine(RuleBasedStateMachine):
         render=st.sampled_from([False, False, True]),
         piece=st.sampled_from([None, None, 1, 3]),
     )
-    def a_batch_comes(self, run, count, size, scene, render, piece):
+    def batch_is_submitted(self, run, count, size, scene, render, piece):
         name = f"b{len(self.batches)}"
         rollouts = tuple(
             Rollout(f"{name}-{i}", f"{name}.{i // size}", scene, "t", (), 0, render) for i in range(count)
@@ -197,33 +197,33 @@ class LeaseMachine(RuleBasedStateMachine):
 
     @precondition(lambda self: self.batches)
     @rule(data=st.data(), piece=st.integers(1, 4))
-    def more_of_a_batch_is_taken(self, data, piece):
+    def batch_is_continued(self, data, piece):
         batch = data.draw(st.sampled_from(list(self.batches.values())))
         self.tell(BatchContinued(batch.run_id, batch.batch_id, piece))
 
     @rule(scenes=st.lists(st.sampled_from(SCENES), max_size=4))
-    def a_window_comes(self, scenes):
+    def look_ahead_is_announced(self, scenes):
         entries = tuple(LookaheadEntry(len(self.batches) + 1 + i, scene, 4) for i, scene in enumerate(scenes))
         self.tell(LookaheadAnnounced("r1", len(self.batches) + 1, entries))
 
     @precondition(lambda self: len(self.batches) % 4 == 3)
     @rule(data=st.data())
-    def a_batch_is_cancelled(self, data):
+    def batch_is_cancelled(self, data):
         batch = data.draw(st.sampled_from(list(self.batches.values())))
         self.tell(BatchCancelled(batch.run_id, batch.batch_id))
 
     @rule(rounds=st.integers(1, 6))
-    def the_cluster_works(self, rounds):
-        """Otherwise too much goes wrong for anything to come about."""
+    def cluster_works(self, rounds):
+        """Let workers make progress: random events alone rarely complete a rollout."""
         for _ in range(rounds):
             for worker in list(self.live):
-                self.a_worker_reports(worker, set(), False)
+                self.worker_reports(worker, set(), False)
             for worker in list(self.live)[:-1]:
-                self.a_lease_ends(worker, None, 1)
+                self.lease_ends(worker, None, 1)
             self.time_passes(0.5, True, 1)
 
     @rule(worker=workers, failing=st.sampled_from([None, None, None, *InfraCode]), repeats=st.integers(1, 2))
-    def a_lease_ends(self, worker, failing, repeats):
+    def lease_ends(self, worker, failing, repeats):
         if not self.live.get(worker):
             return
         ref = next(iter(self.live[worker]))
@@ -234,7 +234,7 @@ class LeaseMachine(RuleBasedStateMachine):
 
     @precondition(lambda self: self.old)
     @rule(data=st.data(), worker=workers)
-    def an_old_result_arrives(self, data, worker):
+    def stale_result_arrives(self, data, worker):
         lease = data.draw(st.sampled_from(self.old))
         for held in self.live.values():
             held.pop(lease.ref, None)
@@ -254,10 +254,10 @@ class LeaseMachine(RuleBasedStateMachine):
                 told = tuple(LeaseProgress(ref, self.steps[ref]) for ref in held if self.steps[ref] >= 0)
                 self.tell(LeasesRenewed(worker, tuple(held), told))
         self.tell(Tick())
-        self.nobody_idles_while_something_waits()
+        self.no_worker_idles_while_an_acceptable_rollout_waits()
 
-    def nobody_idles_while_something_waits(self):
-        """After a tick a free slot has looked at what waits, whatever kept it from that before."""
+    def no_worker_idles_while_an_acceptable_rollout_waits(self):
+        """After a tick, no free slot is left while a rollout waits that its worker may take."""
         state = self.cluster.dispatcher.state
         for record in () if state.paused else state.queues:
             for worker in state.pool.workers.values():
@@ -280,13 +280,13 @@ class LeaseMachine(RuleBasedStateMachine):
         assert sum(map(dispatcher.pending_of, RUNS)) == len(self.submitted) - len(self.delivered)
 
     @invariant()
-    def second_leases_keep_to_their_budget(self):
+    def hedges_keep_to_their_budget(self):
         if hasattr(self, "cluster"):
             counted = sum(self.cluster.dispatcher.counters(run).hedged for run in RUNS)
             assert counted == self.hedges <= LIMITS.hedge_share * len(self.submitted)
 
     @invariant()
-    def nobody_is_called_off_without_a_reason(self):
+    def cancellations_have_a_reason(self):
         if hasattr(self, "cluster"):
             outcomes = [result.outcome for result in self.delivered.values()]
             assert all(outcome.reason for outcome in outcomes if isinstance(outcome, Cancelled))
@@ -301,23 +301,23 @@ class LeaseMachine(RuleBasedStateMachine):
         assert held == set(self.cluster.dispatcher.live_leases)
 
     @invariant()
-    def a_failure_of_the_infrastructure_has_no_reward(self):
+    def infrastructure_failures_have_no_reward(self):
         if hasattr(self, "cluster"):
             outcomes = [result.outcome for result in self.delivered.values()]
             assert all(hasattr(o, "reward") == isinstance(o, Completed) for o in outcomes)
 
     def teardown(self):
-        """With a sound worker and enough time, everything ends: nothing is lost."""
+        """With one healthy worker and enough time, every rollout gets its outcome."""
         if not hasattr(self, "cluster"):
             return
         self.tell(DispatchResumed())
         for worker in WORKERS:
-            self.a_worker_is_killed(worker)
-        self.a_worker_joins("w1", 3, 1000)
+            self.worker_is_killed(worker)
+        self.worker_joins("w1", 3, 1000)
         for _ in range(100):
-            self.a_worker_reports("w1", set(), False)
+            self.worker_reports("w1", set(), False)
             while self.live["w1"]:
-                self.a_lease_ends("w1", None, 1)
+                self.lease_ends("w1", None, 1)
             self.time_passes(1.0, True, 1)
         assert set(self.delivered) == set(self.submitted)
         assert not self.cluster.dispatcher.live_leases
@@ -329,7 +329,7 @@ TestLeaseMachine.settings = settings(max_examples=100, stateful_step_count=40, d
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_the_lease_machine_holds_for_a_hundred_thousand_steps():
+def test_lease_machine_holds_for_a_hundred_thousand_steps():
     run_state_machine_as_test(
         LeaseMachine,
         settings=settings(

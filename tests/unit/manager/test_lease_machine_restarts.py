@@ -1,4 +1,4 @@
-"""The lease machine while managers, too, come and go: whoever takes over knows batches and outcomes, the workers the rest."""
+"""The lease machine with manager restarts: the new manager knows batches and outcomes, the workers their leases."""
 
 import hypothesis.strategies as st
 from hypothesis import settings
@@ -12,7 +12,7 @@ from embomatrix.rpc.wire.values import Resources
 
 
 class RestartedMachine(LeaseMachine):
-    """Some workers come back to the new manager and say what they hold; the others went with the old one."""
+    """Some workers reconnect to the new manager and claim their leases; the others are gone."""
 
     @initialize()
     def begin(self):
@@ -20,7 +20,7 @@ class RestartedMachine(LeaseMachine):
         self.managers = 1
 
     @rule(gone=st.sets(st.sampled_from(WORKERS), max_size=1), roster=st.booleans())
-    def another_manager_takes_over(self, gone, roster):
+    def manager_is_replaced(self, gone, roster):
         slots = {name: worker.slots for name, worker in self.cluster.dispatcher.workers.items()}
         self.managers += 1
         self.hedges = 0
@@ -37,9 +37,9 @@ class RestartedMachine(LeaseMachine):
             if worker in gone or worker not in slots:
                 del self.live[worker]
             else:
-                self.comes_back(worker, slots[worker])
+                self.worker_returns(worker, slots[worker])
 
-    def comes_back(self, worker, slots):
+    def worker_returns(self, worker, slots):
         self.desired.pop(worker, None)
         held = dict(self.live[worker])
         claims = tuple(LeaseClaim(ref, command.origin) for ref, command in held.items())
@@ -49,14 +49,14 @@ class RestartedMachine(LeaseMachine):
 
     @invariant()
     def workers_hold_no_more_than_their_credits(self):
-        """But for what they bring along: a manager that is new has not learnt yet how much a quick worker may hold."""
+        """Adopted leases may exceed the credits: a new manager has not measured the pace of a worker yet."""
         if hasattr(self, "cluster"):
             workers = self.cluster.dispatcher.workers.values()
             held = {lease_id for worker in workers for lease_id in worker.held}
             assert held == set(self.cluster.dispatcher.live_leases)
 
     @invariant()
-    def cursors_of_a_batch_are_given_once(self):
+    def cursors_of_a_batch_are_unique(self):
         if hasattr(self, "cluster"):
             cursors = [(name.rpartition("-")[0], result.cursor) for name, result in self.delivered.items()]
             assert len(set(cursors)) == len(cursors)

@@ -1,4 +1,4 @@
-"""Recovery after a manager change: reported leases are adopted, others re-dispatched after a grace."""
+"""Takeover by a new manager: claimed leases are adopted, the others are re-dispatched after a grace time."""
 
 import pytest
 from hypothesis import given
@@ -81,7 +81,7 @@ def given_to(commands):
     return [(command.worker_id, command.rollout.rollout_id) for command in kinds(commands, GiveLease)]
 
 
-def test_running_lease_is_adopted_and_its_result_counts():
+def test_running_lease_of_a_former_manager_is_adopted_and_its_result_counts():
     successor = Successor(1)
     assert successor.worker("w1", claim("x0")) == []
     assert successor.wait_out_the_grace() == []
@@ -90,7 +90,7 @@ def test_running_lease_is_adopted_and_its_result_counts():
     assert commands[-1] == FinishBatch("r1", "b1")
 
 
-def test_unacknowledged_result_counts_after_reconnect():
+def test_unacknowledged_result_counts_when_its_worker_returns():
     successor = Successor(1)
     successor.worker("w1", claim("x0"))
     commands = successor.tell(LeaseFinished("w1", claim("x0").ref, completed()))
@@ -98,14 +98,14 @@ def test_unacknowledged_result_counts_after_reconnect():
     assert len(kinds(commands, DeliverResult)) == 1
 
 
-def test_unclaimed_rollouts_are_dispatched_after_the_grace():
+def test_unclaimed_rollouts_are_leased_only_after_the_grace_time():
     successor = Successor(2)
     assert given_to(successor.worker("w1", slots=4)) == []
     assert given_to(successor.tell(Tick(), after_s=GRACE_S - 0.1)) == []
     assert given_to(successor.tell(Tick(), after_s=0.2)) == [("w1", "x0"), ("w1", "x1")]
 
 
-def test_grace_ends_when_all_former_workers_have_reported():
+def test_wait_ends_when_all_expected_workers_have_reported():
     successor = Successor(2)
     successor.tell(WorkersExpected(frozenset({"w1", "w2"})))
     successor.worker("w1", claim("x0"), slots=4)
@@ -114,14 +114,14 @@ def test_grace_ends_when_all_former_workers_have_reported():
     assert [rollout for _, rollout in given_to(successor.tell(Tick(), after_s=0.1))] == ["x1"]
 
 
-def test_grace_is_skipped_without_former_workers():
+def test_no_wait_if_no_worker_was_present_before():
     successor = Successor(1)
     successor.tell(WorkersExpected(frozenset()))
     successor.worker("w1")
     assert given_to(successor.tell(Tick(), after_s=0.1)) == [("w1", "x0")]
 
 
-def test_missing_worker_is_awaited_for_the_grace_only():
+def test_wait_for_a_missing_worker_ends_after_the_grace_time():
     successor = Successor(1)
     successor.tell(WorkersExpected(frozenset({"w1", "gone"})))
     successor.worker("w1")
@@ -130,19 +130,19 @@ def test_missing_worker_is_awaited_for_the_grace_only():
     assert given_to(successor.tell(Tick(), after_s=0.2)) == [("w1", "x0")]
 
 
-def test_new_batch_does_not_wait_for_the_grace():
+def test_batch_submitted_meanwhile_does_not_wait():
     successor = Successor(1)
     successor.worker("w1", slots=4)
     assert given_to(successor.tell(BatchSubmitted(batch(1, "b2")))) == [("w1", "x0")]
 
 
-def test_scenes_of_awaited_rollouts_are_preloaded():
+def test_scenes_of_awaited_rollouts_are_in_demand():
     demand = Successor(3).dispatcher.demand()
     assert demand.pending == {"kitchen": 3}
     assert demand.waited_s == {"kitchen": 0.0}
 
 
-def test_later_of_two_leases_of_a_rollout_counts():
+def test_later_of_two_claimed_leases_counts():
     for order in (("w1", "w2"), ("w2", "w1")):
         successor = Successor(1)
         claims = {"w1": claim("x0", epoch=5), "w2": claim("x0", epoch=9)}
@@ -155,14 +155,14 @@ def test_later_of_two_leases_of_a_rollout_counts():
         assert len(kinds(good, DeliverResult)) == 1
 
 
-def test_claim_after_redispatch_is_rejected():
+def test_claim_after_the_rollout_was_redispatched_is_rejected():
     successor = Successor(1)
     successor.worker("w2")
     assert given_to(successor.wait_out_the_grace()) == [("w2", "x0")]
     assert kinds(successor.worker("w1", claim("x0")), CancelLease) == [CancelLease("w1", claim("x0").ref)]
 
 
-def test_late_claim_before_redispatch_is_accepted():
+def test_late_claim_of_a_queued_rollout_is_adopted():
     successor = Successor(1)
     successor.wait_out_the_grace()
     assert successor.worker("w1", claim("x0")) == []
@@ -178,12 +178,12 @@ def test_late_claim_before_redispatch_is_accepted():
         claim("x1", epoch=FIRST_EPOCH + 7),  # as if this manager had given it: its book would know
     ],
 )
-def test_unadoptable_leases_are_cancelled(stray):
+def test_leases_that_cannot_be_adopted_are_cancelled(stray):
     successor = Successor(2, delivered=("x0",))
     assert kinds(successor.worker("w1", stray), CancelLease) == [CancelLease("w1", stray.ref)]
 
 
-def test_leases_without_origin_are_not_executed_twice_at_once():
+def test_leases_claimed_without_origin_are_cancelled():
     successor = Successor(1)
     old = claim("x0").ref
     successor.tell(WorkerJoined("w1", Resources(1, 1, 1024)))
@@ -208,21 +208,21 @@ def test_adopted_lease_expires_like_any_other():
     assert len(given_to(commands)) == 1
 
 
-def test_fully_delivered_batch_ends_at_once():
+def test_fully_delivered_batch_finishes_at_once_and_counts():
     successor = Successor(2, delivered=("x0", "x1"), failures=1)
     assert successor.first == [FinishBatch("r1", "b1")]
     counters = successor.dispatcher.counters("r1")
     assert (counters.delivered, counters.infra_failures) == (2, 1)
 
 
-def test_cursors_continue_after_a_manager_change():
+def test_cursors_continue_after_those_of_the_former_manager():
     successor = Successor(3, delivered=("x0", "x1"))
     successor.worker("w1", claim("x2"))
     (delivered,) = kinds(successor.tell(LeaseFinished("w1", claim("x2").ref, completed())), DeliverResult)
     assert delivered.result.cursor == 3
 
 
-def test_cancelled_batch_is_not_dispatched_after_the_grace():
+def test_batch_cancelled_during_the_wait_is_not_leased():
     successor = Successor(2)
     assert len(kinds(successor.tell(BatchCancelled("r1", "b1")), DeliverResult)) == 2
     successor.worker("w1", slots=4)
@@ -233,7 +233,7 @@ def test_cancelled_batch_is_not_dispatched_after_the_grace():
     held=st.lists(st.tuples(st.sampled_from(["w1", "w2", "w3"]), st.integers(0, 5)), max_size=12),
     back=st.permutations(["w1", "w2", "w3"]),
 )
-def test_every_rollout_has_one_outcome_under_any_claims(held, back):
+def test_every_rollout_gets_one_outcome_whatever_workers_claim(held, back):
     successor = Successor(6)
     claims = {name: [] for name in back}
     for epoch, (name, number) in enumerate(held, 1):

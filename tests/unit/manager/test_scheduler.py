@@ -1,4 +1,4 @@
-"""The Resource-Scheduler: who holds which scene, when, and what that was worth."""
+"""Resource-Scheduler: placement of scenes, and hits and waste of loading ahead."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ MB = 100.0
 
 
 class Cluster:
-    """A scheduler with obedient workers: what they are told to hold they report, loading first and warm when asked."""
+    """A scheduler with workers that load what they are told to hold."""
 
     def __init__(self):
         self.pool = WorkerPool()
@@ -103,7 +103,7 @@ def test_announced_scenes_are_loaded_nearest_step_first(cluster):
     assert cluster.desired["w1"] == ("a", "b", "c")
 
 
-def test_memory_bounds_what_is_loaded_and_the_furthest_use_is_left_out(cluster):
+def test_scene_with_the_furthest_use_is_left_out_when_memory_is_full(cluster):
     cluster.worker(memory_mb=250)
     cluster.announce(["a"], ["b"], ["c"])
     assert cluster.desired["w1"] == ("a", "b")
@@ -114,7 +114,7 @@ def test_memory_bounds_what_is_loaded_and_the_furthest_use_is_left_out(cluster):
     ]
 
 
-def test_the_scene_that_is_needed_last_is_evicted(cluster):
+def test_scene_needed_last_is_evicted(cluster):
     cluster.worker(memory_mb=250)
     cluster.announce(["a"], ["b"])
     cluster.report()
@@ -122,14 +122,14 @@ def test_the_scene_that_is_needed_last_is_evicted(cluster):
     assert cluster.desired["w1"] == ("c", "a")
 
 
-def test_what_rollouts_wait_for_comes_before_what_was_announced(cluster):
+def test_scenes_of_waiting_rollouts_come_before_announced_ones(cluster):
     cluster.worker(memory_mb=250)
     cluster.announce(["a"], ["b"])
     cluster.demand(z=3)
     assert cluster.desired["w1"] == ("z", "a")
 
 
-def test_a_desired_set_is_told_only_when_it_changes(cluster):
+def test_desired_set_is_sent_only_when_it_changes(cluster):
     cluster.worker()
     assert len(cluster.announce(["a", "b"])) == 1
     assert cluster.announce(["a", "b"], version=2) == []
@@ -138,7 +138,7 @@ def test_a_desired_set_is_told_only_when_it_changes(cluster):
     assert cluster.tell(Tick()) == []
 
 
-def test_a_window_of_a_lower_version_is_ignored(cluster):
+def test_window_of_a_lower_version_is_ignored(cluster):
     cluster.worker()
     cluster.announce(["a"], version=5)
     cluster.announce(["b"], version=4)
@@ -154,28 +154,28 @@ def test_scenes_spread_over_workers_by_slots(cluster):
     assert len(cluster.desired["w2"]) == 1
 
 
-def test_a_faster_worker_gets_more(cluster):
+def test_faster_worker_gets_more_scenes(cluster):
     cluster.worker("w1", score=1.0)
     cluster.worker("w2", score=3.0)
     cluster.announce(["a", "b", "c", "d"], count=1)
     assert len(cluster.desired["w2"]) == 3
 
 
-def test_a_big_group_gets_its_scene_on_several_workers(cluster):
+def test_scene_of_a_large_group_is_placed_on_several_workers(cluster):
     for name in ("w1", "w2", "w3"):
         cluster.worker(name, slots=2)
     cluster.demand(big=16)
     assert all("big" in cluster.desired[name] for name in ("w1", "w2", "w3"))
 
 
-def test_a_small_group_stays_on_one_worker(cluster):
+def test_scene_of_a_small_group_is_placed_on_one_worker(cluster):
     for name in ("w1", "w2"):
         cluster.worker(name, slots=4)
     cluster.demand(small=2)
     assert sum("small" in scenes for scenes in cluster.desired.values()) == 1
 
 
-def test_idle_workers_load_a_scene_whose_rollouts_waited_too_long(cluster):
+def test_idle_workers_load_a_scene_after_its_rollouts_waited_too_long(cluster):
     cluster.worker("w1", slots=1)
     cluster.worker("w2", slots=1)
     cluster.demand(a=1, b=1)
@@ -189,7 +189,7 @@ def test_idle_workers_load_a_scene_whose_rollouts_waited_too_long(cluster):
     assert "a" in cluster.desired[other]
 
 
-def test_copies_do_not_come_and_go_while_a_batch_runs_down(cluster):
+def test_number_of_copies_is_stable_while_a_batch_runs_down(cluster):
     for name in ("w1", "w2"):
         cluster.worker(name, slots=1, memory_mb=150)
     cluster.announce(["next"])
@@ -200,7 +200,7 @@ def test_copies_do_not_come_and_go_while_a_batch_runs_down(cluster):
     assert changes == [[]] * 15
 
 
-def test_a_report_that_lags_behind_changes_nothing(cluster):
+def test_outdated_report_changes_nothing(cluster):
     cluster.worker("w1", memory_mb=250)
     cluster.worker("w2", memory_mb=250)
     cluster.announce(["a", "b"], ["c", "d"])
@@ -220,7 +220,7 @@ def test_scenes_with_running_rollouts_are_not_evicted(cluster):
     assert cluster.desired["w1"] == ("b",)
 
 
-def test_what_nobody_needs_stays_while_there_is_room_and_the_oldest_goes_first(cluster):
+def test_unneeded_scenes_stay_while_there_is_room_and_leave_by_last_use(cluster):
     cluster.worker(memory_mb=250)
     cluster.demand(a=1, b=1)
     cluster.report()
@@ -230,7 +230,7 @@ def test_what_nobody_needs_stays_while_there_is_room_and_the_oldest_goes_first(c
     assert cluster.desired["w1"] == ("c", "a")
 
 
-def test_measured_memory_replaces_the_guess(cluster):
+def test_measured_memory_replaces_the_estimate(cluster):
     cluster.worker(memory_mb=1000)
     cluster.announce(["a", "b", "c"])
     cluster.report(memory_mb=400.0)
@@ -238,7 +238,7 @@ def test_measured_memory_replaces_the_guess(cluster):
     assert len(cluster.desired["w1"]) == 2
 
 
-def test_a_scene_larger_than_every_worker_is_unplaceable_and_says_why(cluster):
+def test_scene_larger_than_every_worker_is_unplaceable_with_the_reason(cluster):
     cluster.worker(memory_mb=300)
     cluster.announce(["a"])
     cluster.report(memory_mb=900.0)
@@ -249,7 +249,7 @@ def test_a_scene_larger_than_every_worker_is_unplaceable_and_says_why(cluster):
     assert "900 MB" in cluster.scheduler.unplaceable["a"]
 
 
-def test_a_failed_load_moves_to_another_worker_and_comes_back_later(cluster):
+def test_failed_load_moves_to_another_worker_and_is_retried_later(cluster):
     cluster.worker("w1")
     cluster.worker("w2")
     cluster.demand(a=1)
@@ -265,7 +265,7 @@ def test_a_failed_load_moves_to_another_worker_and_comes_back_later(cluster):
 
 
 @pytest.mark.parametrize("event", [WorkerDrained("w1"), WorkerSuspected("w1"), WorkerLost("w1", "killed")])
-def test_scenes_move_away_from_a_worker_that_cannot_work(cluster, event):
+def test_scenes_move_away_from_an_unusable_worker(cluster, event):
     cluster.worker("w1")
     cluster.announce(["a"])
     cluster.worker("w2")
@@ -273,13 +273,13 @@ def test_scenes_move_away_from_a_worker_that_cannot_work(cluster, event):
     assert cluster.desired["w2"] == ("a",)
 
 
-def test_a_reconnected_worker_is_told_again(cluster):
+def test_reconnected_worker_gets_its_desired_set_again(cluster):
     cluster.worker()
     cluster.announce(["a"])
     assert cluster.report(resync=True) == [SetDesired("w1", ("a",))]
 
 
-def test_a_scene_that_was_warm_in_time_is_a_hit_with_its_lead(cluster):
+def test_scene_that_is_warm_in_time_is_a_hit_with_its_lead(cluster):
     cluster.worker()
     cluster.announce(["a"])
     cluster.report()
@@ -291,7 +291,7 @@ def test_a_scene_that_was_warm_in_time_is_a_hit_with_its_lead(cluster):
     assert cluster.scheduler.prewarm.counters("r1").leads.count == 1
 
 
-def test_a_load_ahead_that_nobody_used_is_waste(cluster):
+def test_unused_load_ahead_is_waste(cluster):
     cluster.worker(memory_mb=150)
     cluster.announce(["a"])
     cluster.report()
@@ -300,7 +300,7 @@ def test_a_load_ahead_that_nobody_used_is_waste(cluster):
     assert cluster.scheduler.prewarm.counters("r1").wasted == 1
 
 
-def test_a_load_ahead_that_was_used_is_no_waste(cluster):
+def test_used_load_ahead_is_no_waste(cluster):
     cluster.worker()
     cluster.announce(["a", "b"])
     cluster.report()
@@ -310,14 +310,14 @@ def test_a_load_ahead_that_was_used_is_no_waste(cluster):
     assert cluster.scheduler.prewarm.counters("r1").wasted == 1
 
 
-def test_steps_that_came_leave_the_window(cluster):
+def test_submitted_steps_leave_the_window(cluster):
     cluster.worker()
     cluster.announce(["a"], ["b"], ["c"])
     cluster.submit("b", step=2)
     assert [entry.bundle_digest for entry in cluster.scheduler.windows["r1"].entries] == ["c"]
 
 
-def test_a_scene_counts_at_its_next_use():
+def test_scene_counts_at_its_next_use():
     entries = [LookaheadEntry(7, "a", 4), LookaheadEntry(5, "a", 2), LookaheadEntry(5, "b", 1)]
     assert needs_of({"c": 3}, [entries]) == [Need("c", 0, 3), Need("a", 1, 2), Need("b", 1, 1)]
 
@@ -351,7 +351,7 @@ scene_names = st.sampled_from("abcdefgh")
     memories=st.lists(st.integers(0, 600), min_size=1, max_size=4),
     residents=st.lists(st.lists(scene_names, unique=True, max_size=5), min_size=4, max_size=4),
 )
-def test_placement_keeps_to_memory_and_prefers_the_sooner_use(needs, memories, residents):
+def test_placement_respects_memory_and_prefers_the_sooner_use(needs, memories, residents):
     sites = [Site(f"w{i}", 2, 1.0, mb, tuple(residents[i])) for i, mb in enumerate(memories)]
     desired = place(Listed(sites), needs, lambda _: MB).desired
     for site in sites:
@@ -368,14 +368,14 @@ def test_placement_keeps_to_memory_and_prefers_the_sooner_use(needs, memories, r
     assert not lost & {need.bundle_digest for need in needs if need.rank == 0}
 
 
-def test_the_other_groups_of_a_step_that_has_begun_stay_in_the_window(cluster):
+def test_other_groups_of_a_started_step_stay_in_the_window(cluster):
     cluster.worker()
     cluster.announce(["a", "b"], ["c"])
     cluster.submit("a", step=1)
     assert [entry.bundle_digest for entry in cluster.scheduler.windows["r1"].entries] == ["b", "c"]
 
 
-def test_a_scene_is_not_loaded_again_where_that_takes_longer_than_it_saves(cluster):
+def test_scene_is_not_copied_if_loading_takes_longer_than_it_saves(cluster):
     for name in ("w1", "w2", "w3"):
         cluster.worker(name, slots=1)
     cluster.demand(known=1)
@@ -390,7 +390,7 @@ def test_a_scene_is_not_loaded_again_where_that_takes_longer_than_it_saves(clust
     assert sum("long" in scenes for scenes in cluster.desired.values()) == 3
 
 
-def test_what_a_lost_worker_left_behind_is_loaded_before_what_was_sent_later(cluster):
+def test_scenes_of_redispatched_rollouts_are_loaded_before_later_ones(cluster):
     cluster.worker()
     cluster.tell(DemandObserved({"later": 30, "earlier": 2}, {"earlier": 5.0, "later": 1.0}))
     assert cluster.desired["w1"] == ("earlier", "later")

@@ -1,4 +1,4 @@
-"""The simulated cluster: the manager's own decisions among machines that die, hang and lose their network."""
+"""The cluster simulation: the real state machines among machines that die, hang and lose their network."""
 
 import dataclasses
 
@@ -8,9 +8,8 @@ from hypothesis import HealthCheck, given, settings
 
 from embomatrix.manager.control.commands import AcknowledgeLease, DeliverResult, FinishBatch, GiveLease
 from embomatrix.manager.control.dispatch.state import DispatchLimits
-from embomatrix.manager.simulation.agenda import Agenda
-from embomatrix.manager.simulation.auditor import BrokenInvariantError, InvariantChecker
-from embomatrix.manager.simulation.line import Line
+from embomatrix.manager.simulation.invariants import BrokenInvariantError, InvariantChecker
+from embomatrix.manager.simulation.network import EventQueue, NetworkPath
 from embomatrix.manager.simulation.run import simulate
 from embomatrix.manager.simulation.scenario import LOCAL, MIXED, Faults, Scenes, SimulationScenario, Trainer
 from embomatrix.reward.breakdown import RewardBreakdown
@@ -89,7 +88,7 @@ scenarios = st.builds(
 
 @given(scenarios)
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-def test_whatever_dies_each_rollout_has_one_outcome_and_no_failure_a_reward(scenario):
+def test_each_rollout_has_one_outcome_and_no_failure_a_reward_under_faults(scenario):
     report = simulate(scenario)
     assert report.delivered == report.submitted == scenario.rollouts
 
@@ -103,7 +102,7 @@ REWARD = RewardBreakdown(0.5, 0.0, 0.0, (), False)
 @pytest.fixture
 def auditor():
     """One rollout was submitted; two workers said that they have its scene."""
-    auditor = InvariantChecker(Agenda())
+    auditor = InvariantChecker(EventQueue())
     auditor.submit(Batch("r", "b", 1, (ROLLOUT,)))
     warm = WorkerState((Resident("kitchen", ResidentState.WARM),))
     for worker in ("w1", "w2"):
@@ -119,64 +118,64 @@ def completed(trace="x1"):
     return Completed(REWARD, (), (), trace, "w1", Timings(), warm=True)
 
 
-def test_a_second_outcome_of_a_rollout_is_found(auditor):
+def test_checker_detects_a_second_outcome(auditor):
     lost = InfraFailure(InfraCode.WORKER_LOST, "gone")
     auditor.watch([outcome(lost)])
     with pytest.raises(BrokenInvariantError, match="x1 was delivered twice"):
         auditor.watch([outcome(lost, cursor=2)])
 
 
-def test_a_reward_that_no_slot_gave_is_found(auditor):
-    with pytest.raises(BrokenInvariantError, match="x1 has a reward that w1 never gave"):
+def test_checker_detects_a_reward_without_execution(auditor):
+    with pytest.raises(BrokenInvariantError, match="x1 has a reward that w1 never computed"):
         auditor.watch([outcome(completed())])
     auditor.executed("x1", "w1")
 
 
-def test_the_reward_of_another_rollout_is_found(auditor):
+def test_checker_detects_the_reward_of_another_rollout(auditor):
     auditor.executed("x1", "w1")
     with pytest.raises(BrokenInvariantError, match="x1 has the reward of x2"):
         auditor.watch([outcome(completed(trace="x2"))])
 
 
-def test_two_good_leases_of_a_rollout_are_found_and_a_new_one_after_the_old_is_none(auditor):
+def test_checker_detects_two_valid_leases_but_allows_a_successor(auditor):
     auditor.watch([GiveLease("w1", REF, ROLLOUT, 1.0, ORIGIN), AcknowledgeLease("w1", REF)])
     auditor.watch([GiveLease("w1", LeaseRef("lease", 2), ROLLOUT, 1.0, ORIGIN)])
     with pytest.raises(BrokenInvariantError, match="x1 has two leases at once"):
         auditor.watch([GiveLease("w2", LeaseRef("lease", 3), ROLLOUT, 1.0, ORIGIN)])
 
 
-def test_an_epoch_that_is_given_twice_is_found(auditor):
+def test_checker_detects_a_reused_epoch(auditor):
     auditor.watch([GiveLease("w1", REF, ROLLOUT, 1.0, ORIGIN), AcknowledgeLease("w1", REF)])
     with pytest.raises(BrokenInvariantError, match="epoch 1 was given twice"):
         auditor.watch([GiveLease("w2", REF, ROLLOUT, 1.0, ORIGIN)])
 
 
-def test_a_lease_to_a_worker_that_never_reported_the_scene_is_found(auditor):
-    with pytest.raises(BrokenInvariantError, match="w3, which never said"):
+def test_checker_detects_a_lease_to_a_worker_without_the_scene(auditor):
+    with pytest.raises(BrokenInvariantError, match="w3, which never reported"):
         auditor.watch([GiveLease("w3", REF, ROLLOUT, 1.0, ORIGIN)])
 
 
-def test_a_batch_that_ends_too_early_is_found(auditor):
+def test_checker_detects_a_batch_that_ends_too_early(auditor):
     with pytest.raises(BrokenInvariantError, match="batch b ended with 1 rollouts open"):
         auditor.watch([FinishBatch("r", "b")])
 
 
 def test_messages_arrive_in_order_and_after_a_cut():
-    agenda, heard = Agenda(), []
-    line = Line(agenda, 0.1)
-    line.up(lambda: heard.append(("first", agenda.now_s)))
+    queue, heard = EventQueue(), []
+    line = NetworkPath(queue, 0.1)
+    line.up(lambda: heard.append(("first", queue.now_s)))
     line.cut(5.0, up=True, down=False)
-    line.up(lambda: heard.append(("second", agenda.now_s)))
-    line.down(lambda: heard.append(("down", agenda.now_s)))
-    agenda.run(until=lambda: len(heard) == 3, limit_s=60.0)
+    line.up(lambda: heard.append(("second", queue.now_s)))
+    line.down(lambda: heard.append(("down", queue.now_s)))
+    queue.run(until=lambda: len(heard) == 3, limit_s=60.0)
     assert heard == [("first", 0.1), ("down", 0.1), ("second", 5.1)]
 
 
-def test_what_is_under_way_on_a_connection_that_ends_never_arrives():
-    agenda, heard = Agenda(), []
-    line = Line(agenda, 0.1)
+def test_messages_under_way_on_an_ended_connection_are_lost():
+    queue, heard = EventQueue(), []
+    line = NetworkPath(queue, 0.1)
     line.up(lambda: heard.append("old"))
     line.hang_up()
     line.up(lambda: heard.append("new"))
-    assert not agenda.run(until=lambda: len(heard) == 2, limit_s=60.0)
+    assert not queue.run(until=lambda: len(heard) == 2, limit_s=60.0)
     assert heard == ["new"]

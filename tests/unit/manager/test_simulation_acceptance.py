@@ -1,4 +1,4 @@
-"""Acceptance of a cluster as a whole, on the simulator's clock: unlike workers, look-ahead, stuck slots, rendering, scale."""
+"""Acceptance tests of a simulated cluster: heterogeneous workers, look-ahead, stuck slots, rendering, scale."""
 
 import math
 from dataclasses import replace
@@ -19,7 +19,7 @@ from embomatrix.rpc.wire.values import GroupPolicy, RunTerms
 
 UNLIKE = tuple(MachineKind(f"{slots} slots", 1.0, slots, 2048, 1.0, 0.0005, 100.0) for slots in (8, 4, 2, 1))
 MEAN_OVER_MEDIAN = math.exp(0.2**2 / 2)
-"""Of log-normal durations with the spread used here."""
+"""Mean over median of the log-normal execution times."""
 
 
 def unlike(trainer, seed=0):
@@ -69,21 +69,21 @@ def check_unlike(seed):
     return report
 
 
-def test_a_slow_worker_holds_no_group_once_it_is_known():
+def test_known_slow_worker_delays_no_group():
     """A12: 8, 4, 2 and 1 slots, one worker ten times slower than it says: hedges ≤ 5 %, nobody waits for it."""
     check_unlike(seed=0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3, 4, 5])
-def test_a_slow_worker_of_any_size_holds_no_group_once_it_is_known(seed):
+def test_known_slow_worker_of_any_size_delays_no_group(seed):
     """A12, other machines."""
     check_unlike(seed)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_unlike_workers_that_are_all_wanted_finish_within_a_quarter_of_the_bound(seed):
+def test_saturated_heterogeneous_workers_finish_within_a_quarter_of_the_bound(seed):
     """A12: makespan ≤ 1.25 × the bound of all slots together."""
     at_once = Trainer(steps=2, groups=60, group_size=16, write_s=0.0, update_s=0.0, start_s=5.0)
     simulation = ClusterSimulation(unlike(at_once, seed))
@@ -98,7 +98,7 @@ def test_unlike_workers_that_are_all_wanted_finish_within_a_quarter_of_the_bound
 
 
 @pytest.mark.slow
-def test_look_ahead_makes_starts_warm_where_memory_suffices():
+def test_look_ahead_makes_starts_warm_if_memory_suffices():
     """A13: 45 scenes, k = 1 to 4, loads of 2 s, 16 slots: hits ≥ 95 % at k ≥ 2, starts ≤ 5 % of cold, waste ≤ 10 %."""
     cold = simulate(looking_ahead(0))
     for k in (1, 2, 3, 4):
@@ -115,7 +115,7 @@ def test_look_ahead_makes_starts_warm_where_memory_suffices():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("surprises", [0.5, 1.0])
-def test_a_wrong_look_ahead_costs_a_twentieth_at_most_and_starves_nobody(surprises):
+def test_wrong_look_ahead_costs_at_most_five_percent_and_starves_no_run(surprises):
     """A14: half or all of what was announced turns out to be something else."""
     none, wrong = (simulate(looking_ahead(k, surprises=surprises)) for k in (0, 3))
     ratio = wrong.elapsed_s / none.elapsed_s
@@ -127,7 +127,7 @@ def test_a_wrong_look_ahead_costs_a_twentieth_at_most_and_starves_nobody(surpris
     assert longest_s <= 2 * max(none.groups_s["run"])
 
 
-def test_sixty_four_who_ask_for_the_same_scenes_at_once_have_each_loaded_once():
+def test_scenes_wanted_by_64_runs_at_once_are_loaded_once():
     """A14: over-creation is 1.0 though the manager hears of a load half a second late."""
     first = Trainer(name="first", steps=1, groups=4, group_size=8, start_s=5.0)
     one = Trainer(steps=1, groups=2, group_size=1, write_s=0.01, update_s=0.0, start_s=20.0)
@@ -143,7 +143,7 @@ def test_sixty_four_who_ask_for_the_same_scenes_at_once_have_each_loaded_once():
         return [r.bundle_digest for worker in simulation.workers for r in worker.slots.residents()]
 
     before = []
-    simulation.agenda.after(19.0, lambda: before.extend(held()))
+    simulation.queue.after(19.0, lambda: before.extend(held()))
     report = simulation.run()
     loads, asked_for = len(held()) - len(before), scenes.count - len(set(before))
     print(f"A14: {loads} loads of {asked_for} scenes, for {report.delivered} rollouts of 65 runs")
@@ -151,7 +151,7 @@ def test_sixty_four_who_ask_for_the_same_scenes_at_once_have_each_loaded_once():
     assert loads == asked_for > 0
 
 
-def test_a_stuck_slot_is_noticed_by_its_progress_long_before_the_execution_limit():
+def test_stuck_slot_is_detected_by_its_progress_before_the_execution_limit():
     """A3 on the simulated clock: flat for 10 s is enough, where the limit of an execution is 60 s."""
     alone = RunTerms(GroupPolicy.PARTIAL)
     trainer = Trainer(steps=4, groups=10, group_size=8, write_s=4.0, update_s=1.0, terms=alone)
@@ -175,7 +175,7 @@ def test_a_stuck_slot_is_noticed_by_its_progress_long_before_the_execution_limit
     assert max(hedged.groups_s["run"][10:]) <= max(later_s)
 
 
-def test_what_renders_runs_where_there_is_a_gpu_and_nowhere_else():
+def test_rendering_rollouts_run_only_on_workers_with_a_gpu():
     """VRAM gates the slots that render: two of the eight workers have two such slots each."""
     gpu = MachineKind("with a GPU", 0.25, 8, 2048, 1.0, 0.0005, 100.0, render_slots=2)
     plain = replace(LOCAL, share=0.75)
@@ -189,7 +189,7 @@ def test_what_renders_runs_where_there_is_a_gpu_and_nowhere_else():
     assert report.counts["rendered without a slot for it"] == 0
 
 
-def test_what_renders_fails_with_the_reason_where_nothing_can():
+def test_rendering_rollouts_without_a_gpu_fail_with_the_reason():
     limits = replace(SimulationScenario().dispatch, no_capacity_s=5.0)
     trainer = Trainer(steps=1, groups=1, group_size=4, render=True)
     report = simulate(SimulationScenario(workers=2, trainers=(trainer,), dispatch=limits))
@@ -199,7 +199,7 @@ def test_what_renders_fails_with_the_reason_where_nothing_can():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("rollouts", "workers"), [(512, 32), (4_096, 256), (16_000, 1_000)])
-def test_scale_points_start_at_once_and_keep_the_slots_at_work(rollouts, workers):
+def test_scale_points_start_at_once_and_keep_slots_busy(rollouts, workers):
     """A15, simulated: 512, 4,096 and 16,000 in flight: first result ≤ 1 s after it could be, overhead ≤ 20 %."""
     report = simulate(in_flight(workers, rollouts))
     print(

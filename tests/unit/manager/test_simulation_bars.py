@@ -1,4 +1,4 @@
-"""Time bars of a cluster, on the simulator's clock: the manager's own decisions, and machines that fail when they are told."""
+"""Time limits of a simulated cluster with injected faults."""
 
 import math
 from dataclasses import replace
@@ -17,7 +17,7 @@ from embomatrix.manager.simulation.scenario import (
 )
 
 AT_ONCE = Trainer(steps=2, groups=60, group_size=16, write_s=0.0, update_s=0.0, start_s=5.0)
-"""A trainer that sends its steps at once: the cluster is what it waits for."""
+"""Trainer that submits its steps at once: the cluster is the bottleneck."""
 ROLLOUTS = AT_ONCE.rollouts
 BUSY = SimulationScenario(
     workers=10,
@@ -29,7 +29,7 @@ BUSY = SimulationScenario(
 
 
 FEW = Trainer(steps=5, groups=30, group_size=4, write_s=8.0, update_s=1.0)
-"""A trainer that writes for long: whatever is lost finds a free slot."""
+"""Trainer that writes slowly: lost rollouts find free slots."""
 
 
 def spread_out(trainer=FEW, **changes):
@@ -37,17 +37,17 @@ def spread_out(trainer=FEW, **changes):
 
 
 def after(simulation, seconds, action):
-    simulation.agenda.after(seconds, action)
+    simulation.queue.after(seconds, action)
 
 
-def test_a_soak_without_faults_loses_nothing_and_keeps_the_slots_at_work():
+def test_soak_without_faults_loses_nothing_and_keeps_slots_busy():
     report = simulate(BUSY)
     assert report.delivered == ROLLOUTS
     assert report.infra_failures == report.stats.redispatched == report.stats.stale_results == 0
     assert report.pressed_utilisation >= 0.95
 
 
-def test_a_worker_killed_every_two_seconds_costs_a_fifth_of_what_is_left_at_most():
+def test_killing_a_worker_every_two_seconds_costs_at_most_a_fifth_of_the_rest():
     sound = simulate(BUSY)
     report = simulate(replace(BUSY, faults=Faults(death_rate=0.05, silent_deaths=0.0, respawn_s=2.0)))
     assert report.delivered == ROLLOUTS
@@ -56,7 +56,7 @@ def test_a_worker_killed_every_two_seconds_costs_a_fifth_of_what_is_left_at_most
     assert report.elapsed_s <= sound.elapsed_s / (0.9 * 0.8)
 
 
-def test_a_worker_that_falls_silent_is_noticed_in_ten_seconds_and_its_rollouts_go_elsewhere_in_one():
+def test_silent_worker_is_detected_in_ten_seconds_and_its_rollouts_move_in_one():
     simulation = ClusterSimulation(spread_out(faults=Faults(respawn_s=60.0)))
     for index, at_s in enumerate((8.0, 14.0, 20.0)):
         after(simulation, at_s, lambda index=index: simulation.workers[index].kill(silent=True))
@@ -69,7 +69,7 @@ def test_a_worker_that_falls_silent_is_noticed_in_ten_seconds_and_its_rollouts_g
     assert max(report.orphaned_s) <= 1.0
 
 
-def test_slots_that_crash_or_hang_cost_no_rollout_and_no_worker():
+def test_crashing_or_hanging_slots_cost_no_rollout_and_no_worker():
     faults = Faults(crash=0.05, hang=0.01)
     report = simulate(replace(BUSY, faults=faults, dispatch=replace(BUSY.dispatch, execute_deadline_s=2.0)))
     assert report.delivered == ROLLOUTS
@@ -80,7 +80,7 @@ def test_slots_that_crash_or_hang_cost_no_rollout_and_no_worker():
 
 
 @pytest.mark.parametrize("directions", [{}, {"up": False}, {"down": False}])
-def test_a_short_partition_moves_nothing_that_runs(directions):
+def test_short_partition_moves_no_running_rollout(directions):
     simulation = ClusterSimulation(spread_out())
     after(simulation, 10.0, lambda: simulation.workers[0].cut(5.0, **directions))
     report = simulation.run()
@@ -90,7 +90,7 @@ def test_a_short_partition_moves_nothing_that_runs(directions):
 
 
 @pytest.mark.parametrize("directions", [{}, {"up": True, "down": False}])
-def test_a_long_partition_moves_rollouts_once_and_late_results_are_fenced(directions):
+def test_long_partition_moves_rollouts_once_and_fences_late_results(directions):
     few = Trainer(steps=6, groups=4, group_size=4, write_s=8.0, update_s=4.0)
     simulation = ClusterSimulation(spread_out(few, execute_s=6.0))
     # Where the first group goes, so that rollouts run there when the network is gone.
@@ -106,10 +106,10 @@ def test_a_long_partition_moves_rollouts_once_and_late_results_are_fenced(direct
     assert max(report.orphaned_s) <= 1.0
 
 
-def test_a_drained_worker_gets_nothing_new_and_costs_no_attempt():
+def test_drained_worker_gets_no_leases_and_costs_no_attempt():
     simulation = ClusterSimulation(spread_out())
     drained = simulation.workers[0]
-    after(simulation, 10.0, lambda: simulation.front.drain(drained.machine.worker_id))
+    after(simulation, 10.0, lambda: simulation.manager.drain(drained.machine.worker_id))
     idle = []
     after(simulation, 20.0, lambda: idle.append(not drained.slots.held()))
     report = simulation.run()
@@ -118,7 +118,7 @@ def test_a_drained_worker_gets_nothing_new_and_costs_no_attempt():
 
 
 @pytest.mark.parametrize("slow", [0.0, 0.125])
-def test_unlike_workers_finish_within_a_quarter_of_the_bound(slow):
+def test_heterogeneous_workers_finish_within_a_quarter_of_the_bound(slow):
     """One of the eight may be ten times slower than it says."""
     kinds = tuple(
         MachineKind(f"{slots} slots", 1.0, slots, 2048, 1.0, 0.0005, 100.0) for slots in (8, 4, 2, 1)
@@ -147,7 +147,7 @@ def test_two_steps_of_look_ahead_make_starts_warm_and_waste_little(lookahead):
     assert ahead.start_latency_s <= 0.05 * cold.start_latency_s
 
 
-def test_a_look_ahead_that_is_always_wrong_costs_a_twentieth_at_most():
+def test_always_wrong_look_ahead_costs_at_most_five_percent():
     none, wrong = loaded_slowly(0), loaded_slowly(3)
     surprised = replace(wrong, trainers=(replace(wrong.trainers[0], surprises=1.0),))
     honest = replace(none, trainers=(replace(none.trainers[0], surprises=1.0),))
@@ -155,14 +155,14 @@ def test_a_look_ahead_that_is_always_wrong_costs_a_twentieth_at_most():
 
 
 @pytest.mark.parametrize(("rollouts", "workers"), [(512, 32), (4_096, 256)])
-def test_many_rollouts_in_flight_start_at_once_and_keep_the_slots_at_work(rollouts, workers):
+def test_many_rollouts_in_flight_start_at_once_and_keep_slots_busy(rollouts, workers):
     report = simulate(in_flight(workers, rollouts))
     assert report.delivered == 2 * rollouts
     assert report.pressed_utilisation >= 0.8
     assert report.first_result_s <= 1.0 + report.scenario.execute_s
 
 
-def test_two_runs_share_a_cluster_and_neither_starves():
+def test_two_runs_share_a_cluster_without_starvation():
     small = replace(AT_ONCE, name="small", groups=10, steps=5, start_s=6.0)
     report = simulate(replace(BUSY, trainers=(AT_ONCE, small)))
     assert report.delivered == report.submitted == ROLLOUTS + 5 * 160

@@ -1,4 +1,4 @@
-"""Several runs on one simulated cluster: who gets how much, and how long a small one waits beside a large one."""
+"""Fair sharing of a simulated cluster between runs."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ CLUSTER = SimulationScenario(
     scenes=Scenes(count=40, load_s=0.3),
 )
 LARGE = Trainer(name="large", steps=1, groups=60, group_size=16, write_s=0.0, update_s=0.0)
-"""All at once: 960 rollouts, thirty seconds of all slots."""
+"""960 rollouts at once: thirty seconds of all slots."""
 SMALL = Trainer(name="small", steps=4, groups=1, group_size=16, write_s=0.1, update_s=0.5, start_s=7.0)
 
 
@@ -29,19 +29,19 @@ def rival(weight=1.0, length=1.0, priority=0, groups=40):
     return replace(LARGE, name="rival", terms=terms, length=length, groups=groups)
 
 
-def test_slot_time_follows_the_weights_and_not_the_length_of_rollouts():
+def test_slot_time_follows_weights_not_rollout_lengths():
     report = beside(rival(weight=3.0, length=4.0, groups=12))
     assert report.shares["rival"] == pytest.approx(0.75, abs=0.05)
     assert report.pressed_utilisation >= 0.95
 
 
-def test_a_higher_priority_is_served_first():
+def test_higher_priority_is_served_first():
     report = beside(rival(priority=1, groups=20))
     assert report.shares["rival"] >= 0.9
 
 
 @pytest.mark.parametrize("memory_mb", [2048, 100])
-def test_a_small_run_does_not_wait_for_a_large_batch(memory_mb):
+def test_small_run_does_not_wait_for_a_large_batch(memory_mb):
     """In the smaller memory there is room for a few of the forty scenes only: residents are shared as well."""
     kinds = (replace(CLUSTER.kinds[0], memory_mb=memory_mb),)
     report = beside(SMALL, kinds=kinds)
@@ -51,7 +51,7 @@ def test_a_small_run_does_not_wait_for_a_large_batch(memory_mb):
 
 
 @pytest.mark.slow
-def test_sharing_leaves_scenes_where_they_are():
+def test_sharing_moves_no_scenes():
     alone = [simulate(replace(CLUSTER, trainers=(run,))).loads for run in (LARGE, rival())]
     for weight, length in ((1.0, 1.0), (3.0, 1.0), (1.0, 4.0), (3.0, 4.0)):
         report = beside(rival(weight, length))

@@ -1,4 +1,4 @@
-"""The head that self-contained pages share: titles stay text, nothing is fetched, every colour of a page is given."""
+"""Shared head of self-contained pages."""
 
 import re
 from importlib.resources import files
@@ -14,7 +14,7 @@ PAGES = (
 )
 
 
-def test_a_title_stays_text_and_nothing_is_fetched():
+def test_title_is_escaped_and_nothing_is_fetched():
     head = page_head("</title><script>alert(1)</script> $title")
     assert "<script" not in head
     assert "&lt;script&gt;alert(1)&lt;/script&gt; $title</title>" in head
@@ -22,7 +22,7 @@ def test_a_title_stays_text_and_nothing_is_fetched():
 
 
 @pytest.mark.parametrize(("package", "name"), PAGES)
-def test_every_colour_of_a_page_is_given_for_light_and_for_dark(package, name):
+def test_page_colours_are_defined_for_light_and_dark(package, name):
     page = page_head("a page") + files(package).joinpath(name).read_text(encoding="utf-8")
     used = set(re.findall(r"var\(--(\w+)\)", page))
     given = re.findall(r"--(\w+):", page)

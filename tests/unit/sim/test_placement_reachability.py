@@ -64,7 +64,7 @@ def without_prospects(poses):
 
 def test_pose_on_an_open_counter_is_reachable(known):
     assert known.reached[Relation.ONTOP]["apple_1"]["countertop_1"] >= 0
-    assert known.barred_places == {}
+    assert known.placing_blockers == {}
 
 
 def test_reachable_pose_comes_first_for_every_seed(known):
@@ -79,7 +79,7 @@ def test_reachability_is_ignored_for_a_moved_target(known):
 
 def test_equal_queries_give_equal_answers(known):
     again = looked_ahead(kitchen_scene(), (ON_COUNTER, INTO_BOWL))
-    assert (again.reached, again.barred_places) == (known.reached, known.barred_places)
+    assert (again.reached, again.placing_blockers) == (known.reached, known.placing_blockers)
 
 
 def boxed_in():
@@ -107,7 +107,7 @@ def test_nothing_is_placed_where_nothing_could_be_picked_up():
     placing = PlacementQuery("slice_1", "stand_1", Relation.ONTOP)
     scene = boxed_in()
     poses = looked_ahead(scene, (placing,))
-    other = poses.barred_places[Relation.ONTOP]["slice_1"]["stand_1"]
+    other = poses.placing_blockers[Relation.ONTOP]["slice_1"]["stand_1"]
     assert other.startswith(("side", "lid", "stand"))
     trace = execute(scene, poses, "move slice_1; pick_up slice_1; move stand_1; place stand_1 ontop")
     assert trace.failure is FailureReason.ARM_BLOCKED
@@ -115,7 +115,7 @@ def test_nothing_is_placed_where_nothing_could_be_picked_up():
 
 
 def test_place_is_reachable_after_its_blocker_is_removed():
-    poses = PoseCache(barred_places={Relation.ONTOP: {"apple_1": {"coffee_table_1": "mug_1"}}})
+    poses = PoseCache(placing_blockers={Relation.ONTOP: {"apple_1": {"coffee_table_1": "mug_1"}}})
     brings = "move apple_1; pick_up apple_1; move coffee_table_1; place coffee_table_1 ontop"
     clears = "move mug_1; pick_up mug_1; move countertop_1; place countertop_1 ontop"
     assert execute(kitchen_scene(), poses, brings).failure is FailureReason.ARM_BLOCKED
@@ -128,9 +128,11 @@ def execute(scene, poses, text):
 
 
 def test_reachable_poses_are_stored_in_the_bundle(known):
-    poses = PoseCache(reached=known.reached, barred_places={Relation.INSIDE: {"mug_1": {"sink_1": "wall"}}})
+    poses = PoseCache(
+        reached=known.reached, placing_blockers={Relation.INSIDE: {"mug_1": {"sink_1": "wall"}}}
+    )
     found = decode_bundle(encode_bundle(Bundle(kitchen_scene(), {}, poses))).poses
-    assert (found.reached, found.barred_places) == (poses.reached, poses.barred_places)
+    assert (found.reached, found.placing_blockers) == (poses.reached, poses.placing_blockers)
 
 
 @pytest.mark.parametrize("number", ["3", -1, 0.5, True, None])

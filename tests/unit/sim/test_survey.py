@@ -70,13 +70,13 @@ def flat():
 
 
 def test_open_flat_has_no_blockers(flat):
-    assert flat.barred == {}
+    assert flat.arm_blockers == {}
 
 
 def test_walled_in_object_is_refused_in_cached_mode_with_its_blocker():
     scene = walled_in()
     poses = surveyed(scene, ("apple_1",))
-    other = poses.barred[Handling.TAKE]["apple_1"]
+    other = poses.arm_blockers[Handling.TAKE]["apple_1"]
     assert other.startswith(("board", "lid"))
     trace = executed_with(scene, poses, "move apple_1; pick_up apple_1")
     assert trace.failure is FailureReason.ARM_BLOCKED
@@ -84,7 +84,7 @@ def test_walled_in_object_is_refused_in_cached_mode_with_its_blocker():
 
 
 def test_object_is_reachable_after_its_blocker_is_removed():
-    poses = PoseCache(barred={Handling.TAKE: {"apple_1": "bowl_1"}})
+    poses = PoseCache(arm_blockers={Handling.TAKE: {"apple_1": "bowl_1"}})
     scene = kitchen_scene()
     barred = executed_with(scene, poses, "move apple_1; pick_up apple_1")
     assert barred.failure is FailureReason.ARM_BLOCKED
@@ -93,7 +93,7 @@ def test_object_is_reachable_after_its_blocker_is_removed():
 
 
 def test_moved_object_is_not_blocked_at_its_new_place():
-    poses = PoseCache(barred={Handling.PRESS: {"table_lamp_1": "wall"}})
+    poses = PoseCache(arm_blockers={Handling.PRESS: {"table_lamp_1": "wall"}})
     barred = executed_with(kitchen_scene(), poses, "move table_lamp_1; toggle_on table_lamp_1")
     assert barred.failure is FailureReason.ARM_BLOCKED
     moved = "move table_lamp_1; pick_up table_lamp_1; move coffee_table_1; place coffee_table_1 ontop; toggle_on table_lamp_1"
@@ -110,7 +110,7 @@ def test_object_in_an_opened_drawer_stays_blocked():
     )
     text = "move bottom_cabinet_1; open bottom_cabinet_1; pick_up apple_9"
     assert executed_with(scene, PoseCache(), text).failure is None
-    barred = PoseCache(barred={Handling.TAKE: {"apple_9": "bottom_cabinet_1"}})
+    barred = PoseCache(arm_blockers={Handling.TAKE: {"apple_9": "bottom_cabinet_1"}})
     assert executed_with(scene, barred, text).failure is FailureReason.ARM_BLOCKED
 
 
@@ -118,7 +118,7 @@ def test_lid_of_a_portable_object_is_blocked():
     scene = kitchen_scene()
     objects = tuple(replace(item, fixed=item.fixed and item.name != "microwave_1") for item in scene.objects)
     found = surveyed(replace(scene, objects=objects), ("microwave_1",))
-    assert found.barred[Handling.OPEN] == {"microwave_1": "microwave_1"}
+    assert found.arm_blockers[Handling.OPEN] == {"microwave_1": "microwave_1"}
 
 
 def test_results_of_other_scenes_do_not_change_answers(flat):
@@ -128,8 +128,10 @@ def test_results_of_other_scenes_do_not_change_answers(flat):
 
 
 def test_blockers_are_stored_in_the_bundle():
-    poses = PoseCache(barred={Handling.OPEN: {"fridge_1": "wall"}, Handling.TAKE: {"apple_1": "bowl_1"}})
+    poses = PoseCache(
+        arm_blockers={Handling.OPEN: {"fridge_1": "wall"}, Handling.TAKE: {"apple_1": "bowl_1"}}
+    )
     bundle = Bundle(kitchen_scene(), {}, poses)
-    assert decode_bundle(encode_bundle(bundle)).poses.barred == poses.barred
+    assert decode_bundle(encode_bundle(bundle)).poses.arm_blockers == poses.arm_blockers
     none = replace(bundle, poses=PoseCache())
-    assert decode_bundle(encode_bundle(none)).poses.barred == {}
+    assert decode_bundle(encode_bundle(none)).poses.arm_blockers == {}

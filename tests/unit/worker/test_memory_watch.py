@@ -10,7 +10,7 @@ from tests.fakes.real_cluster import until
 from tests.fakes.simulation import PROGRAM
 from tests.unit.worker.test_slots import running
 
-from embomatrix.host.cgroup import MIB
+from embomatrix.host.limits import MIB
 from embomatrix.rpc.wire.values import Completed, ResidentState, Resources
 from embomatrix.worker.host.settings import WorkerSettings
 from embomatrix.worker.link.daemon import Daemon

@@ -24,7 +24,7 @@ from embomatrix.pages.figures import Better, Figure
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from embomatrix.manager.simulation.run import Report
+    from embomatrix.manager.simulation.report import Report
 
 GROUP: Final = 16
 USUAL_WORKERS: Final = 100

@@ -33,19 +33,21 @@ from embomatrix.worker.slots.physics import CLIENTS_PER_SCENE
 from embomatrix.world.bundle import decode_bundle
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping
 
     from embomatrix.bench.engine.workload import Execution, SceneWork, Workload
     from embomatrix.sim.engine import Settled
     from embomatrix.world.bundle import Bundle
 
-LOAD_GOAL_MS: Final = 25.0
-RESPAWN_GOAL_MS: Final = 10.0
-RESET_GOAL_MS: Final = 0.1
-ROLLOUT_GOAL_MS: Final = 1.5
-ROLLOUT_P99_GOAL_MS: Final = 10.0
+GOALS: Final = {
+    "cold_load_ms": 25.0,
+    "slot_respawn_ms": 10.0,
+    "reset_ms": 0.1,
+    "rollout_p50_ms": 1.5,
+    "rollout_p99_ms": 10.0,
+    "private_mb_per_slot": 10.0,
+}
 RATE_GOAL: Final = 700.0
-SLOT_GOAL_MB: Final = 10.0
 LEAK_GOAL_KB: Final = 1.0
 """The allocator's own bookkeeping moves less than this; the goal is no growth."""
 POSES_GOAL: Final = 1000.0
@@ -110,7 +112,7 @@ def bench_engine(workload: Workload, cycles: int, on_step: Callable[[str], None]
         *_skill_figures(by_size[workload.bodies][0]),
     ]
     for size in sizes:
-        figures += _size_figures(size, *by_size[size])
+        figures += _size_figures(f" at {size} bodies", *by_size[size], {})
     return tuple(figures)
 
 
@@ -212,14 +214,9 @@ def _analysis_figures(bundle: Bundle) -> Iterator[Figure]:
 
 
 def _main_figures(samples: EngineSamples, slots: SlotSample) -> Iterator[Figure]:
-    yield _milliseconds("cold_load_ms", slots.load_s, 0.5, LOAD_GOAL_MS)
-    yield _milliseconds("slot_respawn_ms", slots.respawn_s, 0.5, RESPAWN_GOAL_MS)
-    yield _milliseconds("reset_ms", samples.reset_s, 0.5, RESET_GOAL_MS)
-    yield _milliseconds("rollout_p50_ms", samples.rollout_s, 0.5, ROLLOUT_GOAL_MS)
-    yield _milliseconds("rollout_p99_ms", samples.rollout_s, 0.99, ROLLOUT_P99_GOAL_MS)
+    yield from _size_figures("", samples, slots, GOALS)
     rate = len(slots.execute_s) / sum(slots.execute_s)
     yield Figure("rollouts_per_s", rate, "1/s", Better.HIGHER, len(slots.execute_s), RATE_GOAL)
-    yield _private_mb("private_mb_per_slot", slots, SLOT_GOAL_MB)
     settled, verified = len(samples.skill_s[SETTLED]), len(samples.skill_s[VERIFIED])
     places, calls = settled + verified, len(samples.calls_ok)
     yield Figure("places_settled_live", settled / max(1, places), "share", Better.LOWER, places)
@@ -236,23 +233,21 @@ def _skill_figures(samples: EngineSamples) -> Iterator[Figure]:
             yield quantile_figure(f"skill {name}", seconds, 0.5, "µs", goal_us)
 
 
-def _size_figures(size: int, samples: EngineSamples, slots: SlotSample) -> Iterator[Figure]:
-    """Cost by size. Goals are for the main size only."""
-    at = f"at {size} bodies"
-    yield _milliseconds(f"cold_load_ms {at}", slots.load_s, 0.5)
-    yield _milliseconds(f"slot_respawn_ms {at}", slots.respawn_s, 0.5)
-    yield _milliseconds(f"reset_ms {at}", samples.reset_s, 0.5)
-    yield _milliseconds(f"rollout_p50_ms {at}", samples.rollout_s, 0.5)
-    yield _milliseconds(f"rollout_p99_ms {at}", samples.rollout_s, 0.99)
-    yield _private_mb(f"private_mb_per_slot {at}", slots)
-
-
-def _private_mb(name: str, slots: SlotSample, goal: float | None = None) -> Figure:
-    return Figure(name, quantile(slots.private_mb, 0.5), "MB", Better.LOWER, len(slots.private_mb), goal)
-
-
-def _milliseconds(name: str, seconds: Sequence[float], share: float, goal: float | None = None) -> Figure:
-    return Figure(name, quantile(seconds, share) * 1e3, "ms", Better.LOWER, len(seconds), goal)
+def _size_figures(
+    at: str, samples: EngineSamples, slots: SlotSample, goals: Mapping[str, float]
+) -> Iterator[Figure]:
+    """Cost of scenes of one size; ``at`` names the size."""
+    for name, seconds, share in (
+        ("cold_load_ms", slots.load_s, 0.5),
+        ("slot_respawn_ms", slots.respawn_s, 0.5),
+        ("reset_ms", samples.reset_s, 0.5),
+        ("rollout_p50_ms", samples.rollout_s, 0.5),
+        ("rollout_p99_ms", samples.rollout_s, 0.99),
+    ):
+        value = quantile(seconds, share) * 1e3
+        yield Figure(f"{name}{at}", value, "ms", Better.LOWER, len(seconds), goals.get(name))
+    name, value = "private_mb_per_slot", quantile(slots.private_mb, 0.5)
+    yield Figure(f"{name}{at}", value, "MB", Better.LOWER, len(slots.private_mb), goals.get(name))
 
 
 @contextlib.contextmanager

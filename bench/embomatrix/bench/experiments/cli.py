@@ -34,7 +34,7 @@ from embomatrix.bench.report.figures import BenchResult, commit_here, describe_m
 from embomatrix.bench.report.output import write
 from embomatrix.cli.failure import fail
 from embomatrix.cli.local_cluster import no_problem, run_command
-from embomatrix.host.cores import usable_cores
+from embomatrix.host.limits import usable_cores
 from embomatrix.pages.figures import shown
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import checked_settings

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import psutil
 
-from embomatrix.host.cgroup import MIB
-from embomatrix.host.cores import usable_cores
+from embomatrix.host.limits import MIB, usable_cores
 from embomatrix.pages.figures import Better, Figure, figure_from_json, figure_to_json
 from embomatrix.worker.host.gpu import find_gpu
 from embomatrix.worker.host.resources import measure_score, versions

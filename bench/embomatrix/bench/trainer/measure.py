@@ -16,7 +16,7 @@ from embomatrix.bench.report.figures import BenchError
 from embomatrix.bench.trainer.steps import load_of, own_step_s, run_command, trl_step_s
 from embomatrix.cli.local_cluster import local_cluster
 from embomatrix.cli.supervisor import embomatrix_command
-from embomatrix.host.cores import usable_cores
+from embomatrix.host.limits import usable_cores
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.data.tasks import load_tasks

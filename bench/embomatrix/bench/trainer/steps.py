@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from embomatrix.bench.report.figures import BenchError
+from embomatrix.bench.trainer.trl_steps import model_of, tokenizer_of
 from embomatrix.cli.local_cluster import without_membership
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.skills.prompt import Codec, limited, prompt_for
@@ -121,27 +122,9 @@ def own_step_s(load: Load, tasks: Sequence[TrainingTask]) -> list[float]:
 
 
 def policy_of(load: Load) -> HfPolicy:
-    """A random Llama of the load's shape over its words."""
-    from tokenizers import Tokenizer, models, pre_tokenizers
-    from transformers import LlamaConfig, LlamaForCausalLM, PreTrainedTokenizerFast
-
-    model = models.WordLevel({word: at for at, word in enumerate(load.words)}, unk_token=UNKNOWN)
-    inner = Tokenizer(model)
-    inner.pre_tokenizer = pre_tokenizers.WhitespaceSplit()
-    words: Any = PreTrainedTokenizerFast  # transformers leaves it untyped
-    tokenizer = words(tokenizer_object=inner, unk_token=UNKNOWN, eos_token=END)
-    config = LlamaConfig(
-        vocab_size=len(load.words),
-        hidden_size=load.width,
-        intermediate_size=load.inner,
-        num_hidden_layers=load.layers,
-        num_attention_heads=load.heads,
-        num_key_value_heads=load.heads,
-        max_position_embeddings=2048,
-        tie_word_embeddings=True,
-        eos_token_id=load.words.index(END),
-    )
-    return HfPolicy(LlamaForCausalLM(config), tokenizer, Codec.LINES, "a random Llama")
+    """Random Llama of the load's shape over its words, the same as TRL's."""
+    values = asdict(load)
+    return HfPolicy(model_of(values), tokenizer_of(values["words"]), Codec.LINES, "a random Llama")
 
 
 def trl_step_s(load: Load, python: Path, folder: Path) -> list[float]:

@@ -44,8 +44,8 @@ def measure(load: dict[str, Any]) -> list[float]:
     clock = Clock()
     with tempfile.TemporaryDirectory() as folder:
         GRPOTrainer(
-            model=_model(load),
-            processing_class=_tokenizer(load["words"]),
+            model=model_of(load),
+            processing_class=tokenizer_of(load["words"]),
             reward_funcs=_by_length,
             args=_settings(load, folder),
             train_dataset=Dataset.from_list([{"prompt": prompt} for prompt in load["prompts"]]),
@@ -58,7 +58,8 @@ def _by_length(completions: list[str], **_: Any) -> list[float]:
     return [float(len(text)) for text in completions]
 
 
-def _tokenizer(words: list[str]) -> Any:
+def tokenizer_of(words: list[str]) -> Any:
+    """Whitespace tokenizer over the words: the first stands for unknown ones, the second ends a text."""
     from tokenizers import Tokenizer, models, pre_tokenizers
     from transformers import PreTrainedTokenizerFast
 
@@ -74,7 +75,8 @@ def _tokenizer(words: list[str]) -> Any:
     )
 
 
-def _model(load: dict[str, Any]) -> Any:
+def model_of(load: dict[str, Any]) -> Any:
+    """Random Llama of the load's shape."""
     from transformers import LlamaConfig, LlamaForCausalLM
 
     return LlamaForCausalLM(

@@ -73,8 +73,8 @@ class Obstacles:
 
     def owners_near(self, points: FloatArray) -> dict[int, int]:
         """Number of points, shape (n, 2), at which each owner keeps the robot from standing."""
-        bars = self._blocks_base()
-        boxes, owners = self.boxes[bars], self.owners[bars]
+        blocks = self._blocks_base()
+        boxes, owners = self.boxes[blocks], self.owners[blocks]
         counts: dict[int, int] = {}
         for owner in dict.fromkeys(owners.tolist()):
             mine = boxes[owners == owner]

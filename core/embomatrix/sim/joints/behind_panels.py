@@ -39,9 +39,9 @@ def behind_panels(
     doors = list(_open_doors(asset, pose, fractions))
     if not doors:
         return np.zeros(len(middles), dtype=np.bool_)
-    behind = _barred(middles, stand, pose, parts_of(asset).base_boxes(IDENTITY), 0.0)
+    behind = _blocked(middles, stand, pose, parts_of(asset).base_boxes(IDENTITY), 0.0)
     for frame, box in doors:
-        behind |= _barred(middles, stand, frame, [box], ARM_M)
+        behind |= _blocked(middles, stand, frame, [box], ARM_M)
     return behind
 
 
@@ -58,7 +58,7 @@ def _open_doors(asset: Asset, pose: Pose, fractions: Sequence[float]) -> Iterato
             yield pose @ joint_motion(joint, fraction), box
 
 
-def _barred(
+def _blocked(
     middles: FloatArray, stand: StandPose, frame: Pose, boxes: Sequence[Aabb], margin_m: float
 ) -> BoolArray:
     """Tell for each world point, shape (n, 3), if any of k boxes lies between it and the standing pose, in the plan.

@@ -82,16 +82,16 @@ class DoorPanels:
         self._put(last)
         return reached, ""
 
-    def advance(self, free: Sequence[float], barred: Sequence[float]) -> None:
+    def advance(self, free: Sequence[float], blocked: Sequence[float]) -> None:
         """Bisect after a swing: move from reached joint positions as far as possible towards unreached ones."""
         low, high = 0.0, 1.0
         for _ in range(HALVINGS):
             middle = (low + high) / 2
-            fractions = [one + middle * (other - one) for one, other in zip(free, barred, strict=True)]
+            fractions = [one + middle * (other - one) for one, other in zip(free, blocked, strict=True)]
             near = self._near_panels(fractions)
             self._put(fractions)
             low, high = (low, middle) if self._stopped_by(near) else (middle, high)
-        self._put([one + low * (other - one) for one, other in zip(free, barred, strict=True)])
+        self._put([one + low * (other - one) for one, other in zip(free, blocked, strict=True)])
 
     def restore(self) -> None:
         """Undo the swing exactly, to the bit."""

@@ -69,7 +69,7 @@ class PlacementReachability:
                 reached.setdefault(query.relation, {}).setdefault(query.held, {})[query.target] = number
             if other:
                 blockers.setdefault(query.relation, {}).setdefault(query.held, {})[query.target] = other
-        return replace(self._poses, reached=reached, barred_places=blockers)
+        return replace(self._poses, reached=reached, placing_blockers=blockers)
 
     def _answer(self, query: PlacementQuery) -> tuple[int | None, str]:
         """Return the number of the first reachable pose, and the blocker if all poses are certainly unreachable."""

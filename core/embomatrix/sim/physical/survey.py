@@ -133,7 +133,7 @@ class _Surveyor:
                     blockers.setdefault(handling, {})[name] = other
                 elif reached is not None and handling is handlings[0]:
                     stands[name] = _preferring(reached, stands.get(name, ()))
-        return replace(poses, stands=stands, barred=blockers)
+        return replace(poses, stands=stands, arm_blockers=blockers)
 
     def _answer(self, name: str, handling: Handling) -> tuple[StandPose | None, str]:
         """Return the first suitable standing pose; else None and the blocker."""

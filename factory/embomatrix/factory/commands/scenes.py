@@ -26,7 +26,7 @@ from embomatrix.factory.scenes.batch import SceneBuildJob, run_batch
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.scene_file import SUFFIX, SceneFileError, read_scene
 from embomatrix.factory.scenes.tables import TABLE_COLUMNS, problem_lines, report_table
-from embomatrix.host.cores import usable_cores
+from embomatrix.host.limits import usable_cores
 from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.sim.engine import EngineError
 from embomatrix.world.catalog import Catalog, CatalogError

@@ -185,12 +185,12 @@ class SceneSurvey:
         """Return standing poses and arm limits of these objects as a bundle carries them, without placements."""
         wanted = dict.fromkeys(names)
         self._compute(wanted)
-        barred = {
+        blockers = {
             handling: {name: found[name] for name in wanted if name in found}
             for handling in Handling
             if (found := self._blocked.get(handling, {})).keys() & wanted.keys()
         }
-        return PoseCache({}, {name: self._stands[name] for name in wanted}, barred)
+        return PoseCache({}, {name: self._stands[name] for name in wanted}, blockers)
 
     def placement_reachability(self, poses: PoseCache, placings: Iterable[PlacementQuery]) -> PoseCache:
         """Return the cache with the reachable poses of each placed object."""
@@ -204,7 +204,7 @@ class SceneSurvey:
         if self._foresight is not None:
             found = self._foresight.survey(self._world, found, fresh)
         self._stands.update(found.stands)
-        for handling, others in found.barred.items():
+        for handling, others in found.arm_blockers.items():
             self._blocked.setdefault(handling, {}).update(others)
 
 

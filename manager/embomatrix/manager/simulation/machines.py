@@ -1,4 +1,4 @@
-"""The machines and scenes of a scenario, drawn from its seed."""
+"""Machines and scenes of a scenario, drawn from its seed."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ if TYPE_CHECKING:
     from embomatrix.manager.simulation.scenario import MachineKind, SimulationScenario
 
 DURATIONS = 4096
-"""Distinct execution times: rollouts take them in turn, which costs less than drawing one for each."""
+"""Number of distinct execution times; drawing one per rollout would cost more."""
 
 RENDER_MB = 2048
-"""Memory of the GPU for each slot that renders."""
+"""GPU memory for each slot that renders."""
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatedMachine:
-    """A worker's hardware and its way to the manager. ``speed`` is the true one; ``resources`` say what it claims."""
+    """Hardware of a worker and its path to the manager. ``speed`` is the true one, ``resources`` has the claimed one."""
 
     worker_id: str
     kind: str
@@ -31,12 +31,12 @@ class SimulatedMachine:
     latency_s: float
     bandwidth_mb_s: float
     lies: float = 0.0
-    """Share of its executions whose result it makes up."""
+    """Share of its executions with an invented result."""
 
 
 @dataclass(frozen=True, slots=True)
 class SceneSize:
-    """What a scene costs on a machine of speed 1."""
+    """Memory and load time of a scene on a machine of speed 1."""
 
     digest: str
     memory_mb: float
@@ -46,16 +46,16 @@ class SceneSize:
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """A scenario with its dice thrown. ``execute_s`` are the durations that rollouts take in turn."""
+    """A scenario with drawn machines, scenes and execution times."""
 
     machines: tuple[SimulatedMachine, ...]
     scenes: dict[str, SceneSize]
     execute_s: tuple[float, ...]
     lengths: dict[str, float]
-    """How many times longer the rollouts of each run take."""
+    """Factor on the execution times of each run."""
 
     def duration_s(self, rollout_id: str) -> float:
-        """Of this rollout's execution on a machine of speed 1: the same wherever it is executed."""
+        """Return the execution time of a rollout on a machine of speed 1."""
         run_id = rollout_id.split(".", 1)[0]
         return self.lengths[run_id] * self.execute_s[zlib.crc32(rollout_id.encode()) % len(self.execute_s)]
 
@@ -65,7 +65,7 @@ class Setting:
 
 
 def rng_for(scenario: SimulationScenario, *key: int) -> np.random.Generator:
-    """The generator of one part of the scenario: parts do not disturb one another."""
+    """Return the random generator of one part of the scenario."""
     return np.random.default_rng(np.random.SeedSequence((scenario.seed, *key)))
 
 
@@ -88,7 +88,7 @@ def setting_of(scenario: SimulationScenario) -> Setting:
 
 def _machines(scenario: SimulationScenario, rng: np.random.Generator) -> tuple[SimulatedMachine, ...]:
     shares = np.array([kind.share for kind in scenario.kinds])
-    # The shares hold as exactly as whole machines allow, in an order that the seed gives.
+    # Shares are rounded to whole machines; the order is random.
     edges = np.round(np.cumsum(shares) / shares.sum() * scenario.workers).astype(int)
     kinds: list[MachineKind] = []
     for kind, edge in zip(scenario.kinds, edges, strict=True):

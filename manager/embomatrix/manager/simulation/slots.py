@@ -1,4 +1,4 @@
-"""A simulated worker's slots and residents: what it was leased it executes, what it shall hold it loads, in simulated time."""
+"""Slots and resident scenes of a simulated worker: executions and loads in simulated time."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
     import random
     from collections.abc import Callable
 
-    from embomatrix.manager.simulation.agenda import Agenda
-    from embomatrix.manager.simulation.gauge import Gauge
     from embomatrix.manager.simulation.machines import Setting, SimulatedMachine
+    from embomatrix.manager.simulation.network import EventQueue
+    from embomatrix.manager.simulation.report import Measurements
     from embomatrix.manager.simulation.scenario import Faults
     from embomatrix.rpc.wire.leases import Lease, LeaseRef
 
 RETRY_LOAD_S: Final = 10.0
-"""A scene that failed to load is tried again after this long, as the real worker does."""
+"""Pause before a failed load is tried again, as in the real worker."""
 RESPAWN_S: Final = 0.02
-"""A slot whose process was killed or crashed has a new one after this long."""
+"""Time until a killed or crashed slot has a new process."""
 STEP_S: Final = 0.1
 REWARD: Final = RewardBreakdown(0.5, 0.2, 15.0, (), False)
 INVENTED: Final = RewardBreakdown(0.5, 0.2, 30.0, (), True)
@@ -48,19 +48,19 @@ class _Scene:
 
 @dataclass(frozen=True, slots=True)
 class SlotEnvironment:
-    """What slots need of the simulation, and whom they tell."""
+    """Parts of the simulation that slots use, and their callbacks."""
 
-    agenda: Agenda
+    queue: EventQueue
     setting: Setting
     faults: Faults
     dice: random.Random
-    gauge: Gauge
+    measured: Measurements
     on_result: Callable[[LeaseResult], None]
     on_change: Callable[[], None]
 
 
 class SimulatedSlots:
-    """One life of a worker's process. After ``stop`` nothing happens any more; ``fetched`` bundles outlive it on disk."""
+    """Slots of one worker process. ``stop`` ends all activity; ``fetched`` bundles stay on disk."""
 
     def __init__(self, machine: SimulatedMachine, around: SlotEnvironment, fetched: set[str]) -> None:
         self._machine = machine
@@ -72,7 +72,7 @@ class SimulatedSlots:
         self._waiting: deque[Lease] = deque()
         self._running: dict[LeaseRef, tuple[Lease, float]] = {}
         self._stuck_s: dict[LeaseRef, float] = {}
-        """When executions that never end did their last step."""
+        """Time of the last step of executions that never end."""
         self._free = machine.resources.slots
         self._clock = 0
 
@@ -81,19 +81,19 @@ class SimulatedSlots:
         return len(self._running)
 
     def executing_of(self) -> Counter[str]:
-        """How many rollouts of each run it executes."""
+        """Return the number of executing rollouts by run."""
         return Counter(lease.rollout.rollout_id.split(".", 1)[0] for lease, _ in self._running.values())
 
     def progress(self) -> tuple[LeaseProgress, ...]:
-        """Steps of what runs: one in each ``STEP_S``, until it hangs."""
-        now_s = self._around.agenda.now_s
+        """Return the steps of running leases: one per ``STEP_S`` until the execution hangs."""
+        now_s = self._around.queue.now_s
         return tuple(
             LeaseProgress(ref, int((min(now_s, self._stuck_s.get(ref, now_s)) - began_s) / STEP_S))
             for ref, (_, began_s) in self._running.items()
         )
 
     def held(self) -> tuple[LeaseRef, ...]:
-        """Leases that run or wait."""
+        """Return the leases that run or wait."""
         return (*self._running, *(lease.ref for lease in self._waiting))
 
     def residents(self) -> tuple[Resident, ...]:
@@ -109,15 +109,15 @@ class SimulatedSlots:
         )
 
     def stop(self) -> None:
-        """The process ended: nothing of what it had begun happens any more."""
+        """End the process and all its activity."""
         self._stopped = True
         self._running.clear()
         self._waiting.clear()
 
     def count_unused(self) -> None:
-        """The simulation is over: note what was loaded and never used."""
+        """Count loads that were never used, at the end of the simulation."""
         for scene in self._scenes.values():
-            self._around.gauge.loads_unused += scene.state is ResidentState.WARM and not scene.last_used
+            self._around.measured.loads_unused += scene.state is ResidentState.WARM and not scene.last_used
 
     def want(self, digests: tuple[str, ...]) -> None:
         self._wanted = digests
@@ -133,15 +133,15 @@ class SimulatedSlots:
         self._start()
 
     def cancel(self, refs: set[LeaseRef]) -> None:
-        """Forget these leases; slots that run them are killed and come back."""
+        """Drop these leases; slots that run them are killed and respawn."""
         for ref in [ref for ref in self._running if ref in refs]:
             lease, began_s = self._running.pop(ref)
             self._leave(lease, began_s)
-            self._around.agenda.after(RESPAWN_S, self._free_slot)
+            self._around.queue.after(RESPAWN_S, self._free_slot)
         self._waiting = deque(lease for lease in self._waiting if lease.ref not in refs)
 
     def _settle(self) -> None:
-        """Load what is wanted first, as many at a time as there are slots."""
+        """Load the most urgent scenes, one per slot at a time."""
         loading = sum(scene.state is ResidentState.LOADING for scene in self._scenes.values())
         begun = False
         while loading < self._machine.resources.slots and not self._stopped:
@@ -154,8 +154,8 @@ class SimulatedSlots:
             self._around.on_change()
 
     def _next_load(self) -> str:
-        """The most urgent scene that is missing and for which there is room, once others have gone; or none."""
-        now_s = self._around.agenda.now_s
+        """Evict for, and return, the most urgent missing scene that fits; empty if there is none."""
+        now_s = self._around.queue.now_s
         for digest, scene in list(self._scenes.items()):
             if scene.state is ResidentState.FAILED and now_s - scene.failed_s >= RETRY_LOAD_S:
                 del self._scenes[digest]
@@ -178,7 +178,7 @@ class SimulatedSlots:
         if need_mb > free_mb and len(evicted) < len(held):
             return ""
         for victim in evicted:
-            self._around.gauge.loads_unused += not self._scenes.pop(victim).last_used
+            self._around.measured.loads_unused += not self._scenes.pop(victim).last_used
         return digest
 
     def _load(self, digest: str) -> None:
@@ -189,18 +189,17 @@ class SimulatedSlots:
             self._fetched.add(digest)
             fetch_s = 2 * machine.latency_s + size.bundle_mb / machine.bandwidth_mb_s
         scene = self._scenes[digest] = _Scene(size.memory_mb, load_s)
-        self._around.gauge.loads += 1
-        self._around.gauge.load_s += load_s
+        self._around.measured.loads += 1
         fails = self._around.dice.random() < self._around.faults.load_failure
-        self._around.agenda.after(fetch_s + load_s, lambda: self._loaded(digest, scene, fails=fails))
+        self._around.queue.after(fetch_s + load_s, lambda: self._loaded(digest, scene, fails=fails))
 
     def _loaded(self, digest: str, scene: _Scene, *, fails: bool) -> None:
         if self._stopped or self._scenes.get(digest) is not scene:
             return
         scene.state = ResidentState.FAILED if fails else ResidentState.WARM
         if fails:
-            scene.failed_s = self._around.agenda.now_s
-            self._around.agenda.after(RETRY_LOAD_S, self._settle)
+            scene.failed_s = self._around.queue.now_s
+            self._around.queue.after(RETRY_LOAD_S, self._settle)
             failure = InfraFailure(InfraCode.SCENE_LOAD_FAILED, "no such mesh", self._machine.worker_id)
             for lease in [lease for lease in self._waiting if lease.rollout.bundle_digest == digest]:
                 self.cancel({lease.ref})
@@ -210,7 +209,7 @@ class SimulatedSlots:
         self._start()
 
     def _start(self) -> None:
-        """Give free slots the leases that wait and whose scene is warm, in order."""
+        """Start waiting leases with a warm scene on free slots, in order."""
         for _ in range(len(self._waiting)):
             if not self._free:
                 return
@@ -227,10 +226,10 @@ class SimulatedSlots:
         scene.last_used = self._clock
         scene.running += 1
         self._free -= 1
-        began_s = around.agenda.now_s
+        began_s = around.queue.now_s
         self._running[lease.ref] = lease, began_s
         rendering = sum(running.rollout.render for running, _ in self._running.values())
-        around.gauge.counts["rendered without a slot for it"] += (
+        around.measured.counts["rendered without a slot for it"] += (
             rendering > self._machine.resources.render_slots
         )
         rollout_id = lease.rollout.rollout_id
@@ -248,10 +247,10 @@ class SimulatedSlots:
         else:
             timings = Timings(execute_s=seconds)
             outcome = self._result(rollout_id, timings)
-        around.agenda.after(seconds, lambda: self._finished(lease, outcome))
+        around.queue.after(seconds, lambda: self._finished(lease, outcome))
 
     def _result(self, rollout_id: str, timings: Timings) -> Completed:
-        """The trace names its rollout, unless the machine lies."""
+        """Return a result whose trace names its rollout, unless the machine lies."""
         lies, worker_id = self._machine.lies, self._machine.worker_id
         if lies and self._around.dice.random() < lies:
             return Completed(
@@ -267,13 +266,13 @@ class SimulatedSlots:
         if isinstance(outcome, Completed):
             self._free += 1
         else:
-            self._around.agenda.after(RESPAWN_S, self._free_slot)
+            self._around.queue.after(RESPAWN_S, self._free_slot)
         self._around.on_result(LeaseResult(lease.ref, outcome))
         self._start()
 
     def _leave(self, lease: Lease, began_s: float) -> None:
         self._stuck_s.pop(lease.ref, None)
-        self._around.gauge.busy_s += self._around.agenda.now_s - began_s
+        self._around.measured.busy_s += self._around.queue.now_s - began_s
         scene = self._scenes.get(lease.rollout.bundle_digest)
         if scene is not None:
             scene.running -= 1
@@ -284,7 +283,7 @@ class SimulatedSlots:
 
 
 def _victims(wanted: tuple[str, ...], place: int, held: dict[str, _Scene]) -> list[str]:
-    """Who may go for the scene at that place, the most dispensable first: what nobody wants, then what is less urgent."""
+    """Return the scenes to evict for the scene at ``place``: unwanted ones by last use, then less urgent ones."""
     kept = set(wanted)
     unwanted = [digest for digest in held if digest not in kept and not held[digest].running]
     unwanted.sort(key=lambda digest: held[digest].last_used)

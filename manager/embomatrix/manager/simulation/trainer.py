@@ -1,4 +1,4 @@
-"""A simulated trainer: announces its window, writes groups of plans, waits for their outcomes, and updates."""
+"""Simulated trainer: announces its look-ahead, submits groups of plans, waits for their outcomes, and updates."""
 
 from __future__ import annotations
 
@@ -13,39 +13,39 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.manager.simulation.agenda import Agenda
-    from embomatrix.manager.simulation.front import SimulatedManager
-    from embomatrix.manager.simulation.gauge import Gauge
+    from embomatrix.manager.simulation.manager import SimulatedManager
+    from embomatrix.manager.simulation.network import EventQueue
+    from embomatrix.manager.simulation.report import Measurements
     from embomatrix.manager.simulation.scenario import Trainer
     from embomatrix.rpc.wire.values import RolloutResult
 
 
 class SimulatedTrainer:
-    """One run over the scenes, in an order that ``rng`` gives: every epoch a permutation, as the real schedule."""
+    """One run over the scenes, in a random permutation per epoch, as the real schedule."""
 
     def __init__(
         self,
         plan: Trainer,
         scenes: Sequence[str],
-        agenda: Agenda,
-        front: SimulatedManager,
-        gauge: Gauge,
+        queue: EventQueue,
+        manager: SimulatedManager,
+        measured: Measurements,
         rng: np.random.Generator,
     ) -> None:
         self.plan = plan
         self.done = False
         self.ended_s = 0.0
         self.warmed_up_s = plan.start_s
-        """When its first step was over, which nobody could announce in time; where there is only one, when it began."""
+        """End of its first step, which could not be announced in time; the start if there is only one step."""
         self.groups_s: list[float] = []
-        """From the submission of each group to its last result."""
+        """Time from the submission of each group to its last result."""
         self.waited_s = 0.0
-        """Since then: from the last submission of each step to its last result."""
+        """Total time after the first step that it only waited for results."""
         self.first_result_s = math.inf
-        """From the first submission to the first result."""
-        self._agenda = agenda
-        self._front = front
-        self._gauge = gauge
+        """Time from the first submission to the first result."""
+        self._queue = queue
+        self._manager = manager
+        self._measured = measured
         self._announced, self._actual = _schedule(plan, scenes, rng)
         self._step = 0
         self._left = 0
@@ -54,9 +54,9 @@ class SimulatedTrainer:
         self._began_s = math.inf
         self._sent_s = 0.0
         self._open: dict[str, tuple[int, float]] = {}
-        """By group: results to come, and when it was sent."""
-        front.open_run(plan.name, plan.terms, self._take)
-        agenda.after(plan.start_s, self._begin_step)
+        """Missing results and submission time of each group."""
+        manager.open_run(plan.name, plan.terms, self._take)
+        queue.after(plan.start_s, self._begin_step)
 
     @property
     def warmed_up(self) -> bool:
@@ -73,14 +73,14 @@ class SimulatedTrainer:
             for at, scenes in window
             for scene in scenes
         )
-        self._agenda.after(plan.latency_s, lambda: self._front.announce(plan.name, step + 1, entries))
+        self._queue.after(plan.latency_s, lambda: self._manager.announce(plan.name, step + 1, entries))
         self._left = plan.groups * plan.group_size
         for group in range(plan.groups):
             written_s = (group + 1) / plan.groups * plan.write_s
-            self._agenda.after(written_s, functools.partial(self._send, group))
+            self._queue.after(written_s, functools.partial(self._send, group))
 
     def _send(self, group: int) -> None:
-        """One batch for each group, as soon as its plans are written."""
+        """Submit a group as a batch."""
         plan, step = self.plan, self._step
         name = f"{plan.name}.{step}.{group}"
         scene = self._actual[step][group]
@@ -88,51 +88,51 @@ class SimulatedTrainer:
             Rollout(f"{name}.{index}", name, scene, scene, (), step, plan.render)
             for index in range(plan.group_size)
         )
-        self._sent_s = self._agenda.now_s
+        self._sent_s = self._queue.now_s
         self._open[name] = plan.group_size, self._sent_s
         self._began_s = min(self._began_s, self._sent_s)
         batch = Batch(plan.name, name, step + 1, rollouts)
-        self._agenda.after(plan.latency_s, lambda: self._front.submit(batch))
+        self._queue.after(plan.latency_s, lambda: self._manager.submit(batch))
 
     def _take(self, results: Sequence[RolloutResult]) -> None:
         for result in results:
             left, sent_s = self._open[result.group_id]
             self._open[result.group_id] = left - 1, sent_s
             if left == 1:
-                self.groups_s.append(self._agenda.now_s - sent_s)
+                self.groups_s.append(self._queue.now_s - sent_s)
             if isinstance(result.outcome, Completed):
-                self._gauge.queued_s.append(result.outcome.timings.queued_s)
+                self._measured.queued_s.append(result.outcome.timings.queued_s)
                 self._starts_s.setdefault(result.group_id, []).append(result.outcome.timings.queued_s)
                 self._warm[result.group_id] = result.outcome.warm
-        self._agenda.after(self.plan.latency_s, lambda: self._count(len(results)))
+        self._queue.after(self.plan.latency_s, lambda: self._count(len(results)))
 
     def _count(self, results: int) -> None:
-        self.first_result_s = min(self.first_result_s, self._agenda.now_s - self._began_s)
+        self.first_result_s = min(self.first_result_s, self._queue.now_s - self._began_s)
         self._left -= results
         if self._left:
             return
-        self._gauge.first_queued_s += [min(starts) for starts in self._starts_s.values()]
+        self._measured.first_queued_s += [min(starts) for starts in self._starts_s.values()]
         if self._step:
-            self._gauge.foretold += len(self._warm)
-            self._gauge.warm += sum(self._warm.values())
+            self._measured.foretold += len(self._warm)
+            self._measured.warm += sum(self._warm.values())
         self._starts_s.clear()
         self._warm.clear()
-        self._gauge.waits_s.append(self._agenda.now_s - self._sent_s)
+        self._measured.waits_s.append(self._queue.now_s - self._sent_s)
         if self._step or self.plan.steps == 1:
-            self.waited_s += self._agenda.now_s - self._sent_s
+            self.waited_s += self._queue.now_s - self._sent_s
         else:
-            self.warmed_up_s = self._agenda.now_s
+            self.warmed_up_s = self._queue.now_s
         self._step += 1
         if self._step < self.plan.steps:
-            self._agenda.after(self.plan.update_s, self._begin_step)
+            self._queue.after(self.plan.update_s, self._begin_step)
         else:
-            self.done, self.ended_s = True, self._agenda.now_s
+            self.done, self.ended_s = True, self._queue.now_s
 
 
 def _schedule(
     plan: Trainer, scenes: Sequence[str], rng: np.random.Generator
 ) -> tuple[list[list[str]], list[list[str]]]:
-    """What each step's groups are announced to need, and what they will need."""
+    """Return the announced and the actual scenes of each step's groups."""
     order: list[str] = []
     while len(order) < plan.steps * plan.groups:
         order += [scenes[at] for at in rng.permutation(len(scenes))]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from embomatrix.host.cores import usable_cores
+from embomatrix.host.limits import usable_cores
 from embomatrix.trainer.data.tasks import Curriculum, Schedule
 from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation, evaluate_policy
 from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers

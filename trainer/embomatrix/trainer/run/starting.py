@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.host.cores import usable_cores
+from embomatrix.host.limits import usable_cores
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, read_settings, with_changes
 from embomatrix.trainer.data.tasks import load_tasks

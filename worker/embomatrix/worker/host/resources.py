@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import psutil
 
-from embomatrix.host.cgroup import MIB, find_limits
-from embomatrix.host.cores import usable_cores
+from embomatrix.host.limits import MIB, find_limits, usable_cores
 from embomatrix.rpc.wire.values import Resources
 from embomatrix.worker.host.gpu import find_gpu
 

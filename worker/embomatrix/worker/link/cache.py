@@ -12,7 +12,7 @@ import secrets
 import time
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.host.cgroup import MIB
+from embomatrix.host.limits import MIB
 from embomatrix.rpc.wire.values import InfraCode
 from embomatrix.worker.slots.residents import LoadError
 from embomatrix.world.inflation import bundle_digest

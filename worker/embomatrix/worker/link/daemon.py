@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.host.backoff import Backoff
-from embomatrix.host.cgroup import MIB
+from embomatrix.host.limits import MIB
 from embomatrix.rpc.logs import bind, hide
 from embomatrix.rpc.managers import Managers
 from embomatrix.rpc.status import (

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 
-from embomatrix.host.cgroup import MIB, find_limits
+from embomatrix.host.limits import MIB, find_limits
 from embomatrix.worker.host.owner_policy import WORKING, next_pause_state
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""The manager in the simulation: its real intake, state machines and registry, with simulated streams around them."""
+"""The manager in the simulation: the real intake, state machines and registry behind simulated streams."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from embomatrix.manager.control.commands import Command
     from embomatrix.manager.runtime.intake import Intake
     from embomatrix.manager.runtime.registry import WorkerSession
-    from embomatrix.manager.simulation.agenda import Agenda
-    from embomatrix.manager.simulation.auditor import InvariantChecker
-    from embomatrix.manager.simulation.gauge import Gauge
+    from embomatrix.manager.simulation.invariants import InvariantChecker
+    from embomatrix.manager.simulation.network import EventQueue
+    from embomatrix.manager.simulation.report import Measurements
     from embomatrix.manager.simulation.scenario import ManagerPace
     from embomatrix.rpc.wire.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
     from embomatrix.rpc.wire.values import (
@@ -41,92 +41,97 @@ REPORTS: Final = {True: "first report", False: "report"}
 
 
 @dataclass(slots=True)
-class Letter:
-    """What a worker is told at once. ``desired`` is None when it did not change."""
+class WorkerMessage:
+    """Commands sent to a worker together. ``desired`` is None if it is unchanged."""
 
     desired: tuple[str, ...] | None = None
     leases: list[Lease] = field(default_factory=list)
     ended: list[LeaseRef] = field(default_factory=list)
-    """Acknowledged results: to be forgotten."""
+    """Leases with acknowledged results."""
     cancelled: list[LeaseRef] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stream:
-    """Where a worker hears the manager. ``ended`` tells it that its session is over."""
+    """Receiving end of a worker. ``ended`` reports the end of its session."""
 
-    take: Callable[[Letter], None]
+    take: Callable[[WorkerMessage], None]
     ended: Callable[[], None]
 
 
 class SimulatedManager:
-    """Calls arrive here in simulated time; deciding costs real CPU, which the gauge notes.
+    """Handles calls in simulated time and measures their CPU time.
 
-    They are answered at once, or, by a manager that takes time, one after the other.
+    A manager with a ``pace`` handles them one after the other, any other at once.
     """
 
     def __init__(
-        self, agenda: Agenda, intake: Intake, auditor: InvariantChecker, gauge: Gauge, pace: ManagerPace
+        self,
+        queue: EventQueue,
+        intake: Intake,
+        checker: InvariantChecker,
+        measured: Measurements,
+        pace: ManagerPace,
     ) -> None:
-        self._agenda = agenda
+        self._queue = queue
         self._pace = pace
         self._free_s = 0.0
-        """When the manager has dealt with all that came so far."""
+        """Time at which all calls so far are handled."""
         self._intake = intake
-        self._auditor = auditor
-        self._gauge = gauge
+        self._checker = checker
+        self._measured = measured
         self._streams: dict[str, Stream] = {}
         self._trainers: dict[str, Callable[[Sequence[RolloutResult]], None]] = {}
 
-    def hear(self, call: Callable[[], None], *, results: int = 0) -> None:
-        """A message of a worker has come, with so many results: the call is made when the manager has dealt with it."""
-        takes_s = results * self._pace.rollout_s or self._pace.message_s
-        if not takes_s:
+    def receive(self, call: Callable[[], None], *, results: int = 0) -> None:
+        """Receive a worker's message with ``results`` results; make the call when earlier messages are handled."""
+        cost_s = results * self._pace.rollout_s or self._pace.message_s
+        if not cost_s:
             call()
             return
-        now_s = self._agenda.now_s
+        now_s = self._queue.now_s
         begins_s = max(now_s, self._free_s)
-        self._free_s = begins_s + takes_s
-        self._gauge.lags_s.append(begins_s - now_s)
-        self._agenda.after(self._free_s - now_s, call)
+        self._free_s = begins_s + cost_s
+        self._measured.lags_s.append(begins_s - now_s)
+        self._queue.after(self._free_s - now_s, call)
 
-    def keep_time(self) -> None:
-        """Tick, for as long as the simulation runs."""
-        with self._gauge.deciding("tick"):
-            lost, commands = self._intake.tick(now_s=self._agenda.now_s)
+    def tick_forever(self) -> None:
+        """Tick now and at every interval from now on."""
+        with self._measured.deciding("tick"):
+            lost, commands = self._intake.tick(now_s=self._queue.now_s)
         names = [event.worker_id for event in lost]
         for name in names:
-            self._gauge.counts["workers lost"] += 1
-            self._gauge.lost(name, self._agenda.now_s)
+            self._measured.counts["workers lost"] += 1
+            self._measured.lost(name, self._queue.now_s)
             self._end_stream(name)
         self._carry_out(commands, lost=names)
-        self._agenda.after(TICK_S, self.keep_time)
+        self._queue.after(TICK_S, self.tick_forever)
 
     def register(self, worker_id: str, boot_id: str, resources: Resources) -> WorkerSession:
-        with self._gauge.deciding("register"):
-            session, commands = self._intake.register(worker_id, boot_id, resources, now_s=self._agenda.now_s)
-        self._gauge.lost(worker_id, self._agenda.now_s)
+        with self._measured.deciding("register"):
+            session, commands = self._intake.register(worker_id, boot_id, resources, now_s=self._queue.now_s)
+        self._measured.lost(worker_id, self._queue.now_s)
         self._end_stream(worker_id)
         self._carry_out(commands, lost=(worker_id,))
         return session
 
     def drain(self, worker_id: str) -> None:
-        """An operator takes the worker out."""
+        """Drain the worker, as an operator would."""
         events = self._intake.registry.drain(worker_id)
-        self._carry_out(self._intake.feed(*events, now_s=self._agenda.now_s))
+        self._carry_out(self._intake.feed(*events, now_s=self._queue.now_s))
 
     def attach(self, session: WorkerSession, state: WorkerState, stream: Stream) -> None:
-        """A stream opens with the worker's full state. Raises SupersededError."""
+        """Open a stream with the worker's full state. Raise SupersededError."""
         session = self._intake.registry.find(session.session_id, session.epoch)
         self._end_stream(session.worker_id)
         self._streams[session.worker_id] = stream
-        self._intake.registry.attach(session, now_s=self._agenda.now_s)
+        self._intake.registry.attach(session, now_s=self._queue.now_s)
         self.report(session, state, (), resync=True)
 
     def detach(self, session: WorkerSession, stream: Stream) -> None:
         if self._streams.get(session.worker_id) is stream:
             del self._streams[session.worker_id]
-            self._intake.registry.detach(session, now_s=self._agenda.now_s)
+            self._intake.registry.detach(session, now_s=self._queue.now_s)
 
     def report(
         self,
@@ -136,43 +141,43 @@ class SimulatedManager:
         *,
         resync: bool = False,
     ) -> None:
-        """Raises SupersededError."""
+        """Raise SupersededError if the session is over."""
         if state is not None:
-            self._auditor.report(session.worker_id, state, resync=resync)
-        with self._gauge.deciding("result" if state is None else REPORTS[resync]):
-            commands = self._intake.report(session, state, results, resync=resync, now_s=self._agenda.now_s)
+            self._checker.report(session.worker_id, state, resync=resync)
+        with self._measured.deciding("result" if state is None else REPORTS[resync]):
+            commands = self._intake.report(session, state, results, resync=resync, now_s=self._queue.now_s)
         self._carry_out(commands)
 
     def heartbeat(
         self, session: WorkerSession, held: tuple[LeaseRef, ...], progress: tuple[LeaseProgress, ...]
     ) -> float:
-        """Raises SupersededError."""
-        with self._gauge.deciding("heartbeat"):
+        """Raise SupersededError if the session is over."""
+        with self._measured.deciding("heartbeat"):
             interval_s, commands = self._intake.heartbeat(
                 session.session_id,
                 session.epoch,
                 Heartbeat(held, progress=progress),
-                now_s=self._agenda.now_s,
+                now_s=self._queue.now_s,
             )
         self._carry_out(commands)
         return interval_s
 
     def open_run(self, run_id: str, terms: RunTerms, take: Callable[[Sequence[RolloutResult]], None]) -> None:
-        """The run's results are handed to ``take`` as they come."""
+        """Open a run; ``take`` receives its results."""
         self._trainers[run_id] = take
-        self._auditor.open_run(run_id, terms.group_policy)
-        self._carry_out(self._intake.feed(RunOpened(run_id, terms), now_s=self._agenda.now_s))
+        self._checker.open_run(run_id, terms.group_policy)
+        self._carry_out(self._intake.feed(RunOpened(run_id, terms), now_s=self._queue.now_s))
 
     def announce(self, run_id: str, version: int, entries: tuple[LookaheadEntry, ...]) -> None:
-        with self._gauge.deciding("look-ahead"):
+        with self._measured.deciding("look-ahead"):
             event = LookaheadAnnounced(run_id, version, entries)
-            commands = self._intake.feed(event, now_s=self._agenda.now_s)
+            commands = self._intake.feed(event, now_s=self._queue.now_s)
         self._carry_out(commands)
 
     def submit(self, batch: Batch) -> None:
-        self._auditor.submit(batch)
-        with self._gauge.deciding("batch"):
-            commands = self._intake.feed(BatchSubmitted(batch), now_s=self._agenda.now_s)
+        self._checker.submit(batch)
+        with self._measured.deciding("batch"):
+            commands = self._intake.feed(BatchSubmitted(batch), now_s=self._queue.now_s)
         self._carry_out(commands)
 
     def _end_stream(self, worker_id: str) -> None:
@@ -181,8 +186,8 @@ class SimulatedManager:
             stream.ended()
 
     def _carry_out(self, commands: Sequence[Command], *, lost: Iterable[str] = ()) -> None:
-        self._auditor.watch(commands, lost=lost)
-        letters: dict[str, Letter] = {}
+        self._checker.watch(commands, lost=lost)
+        messages: dict[str, WorkerMessage] = {}
         results: dict[str, list[RolloutResult]] = {}
         for command in commands:
             match command:
@@ -191,25 +196,25 @@ class SimulatedManager:
                 case FinishBatch():
                     pass
                 case QuarantineWorker():
-                    self._gauge.caught[command.worker_id] = command.audited
+                    self._measured.caught[command.worker_id] = command.audited
                 case _:
-                    _write(letters.setdefault(command.worker_id, Letter()), command)
-        for worker_id, letter in letters.items():
-            # Without a stream the command is lost; the worker's next full state shows that.
+                    _add(messages.setdefault(command.worker_id, WorkerMessage()), command)
+        for worker_id, message in messages.items():
+            # Without a stream the message is lost; the worker's next full state shows that.
             stream = self._streams.get(worker_id)
             if stream is not None:
-                stream.take(letter)
+                stream.take(message)
         for run_id, found in results.items():
             self._trainers[run_id](found)
 
 
-def _write(letter: Letter, command: SetDesired | GiveLease | CancelLease | AcknowledgeLease) -> None:
+def _add(message: WorkerMessage, command: SetDesired | GiveLease | CancelLease | AcknowledgeLease) -> None:
     match command:
         case SetDesired(_, scenes):
-            letter.desired = scenes
+            message.desired = scenes
         case GiveLease(_, ref, rollout, deadline_s):
-            letter.leases.append(Lease(ref, rollout, deadline_s))
+            message.leases.append(Lease(ref, rollout, deadline_s))
         case CancelLease(_, ref):
-            letter.cancelled.append(ref)
+            message.cancelled.append(ref)
         case AcknowledgeLease(_, ref):
-            letter.ended.append(ref)
+            message.ended.append(ref)

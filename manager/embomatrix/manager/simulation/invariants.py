@@ -1,4 +1,4 @@
-"""The invariants, asserted on everything that the manager orders: a broken one ends the simulation."""
+"""Invariants of the manager's commands, checked from outside during a simulation."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from embomatrix.rpc.wire.values import Completed, GroupPolicy, InfraFailure, Res
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from embomatrix.manager.simulation.agenda import Agenda
+    from embomatrix.manager.simulation.network import EventQueue
     from embomatrix.rpc.wire.leases import LeaseRef, WorkerState
     from embomatrix.rpc.wire.values import Batch, RolloutResult
 
 
 HEDGE_SHARE: Final = 0.05
-"""No more rollouts than this may have had two leases at once."""
+"""Largest share of rollouts that may be hedged."""
 
 
 class BrokenInvariantError(Exception):
-    """The manager promised otherwise; says what happened to which rollout."""
+    """A command broke an invariant; the message names the rollout."""
 
 
 class InvariantChecker:
-    """Watches from outside: it sees what is submitted, executed and ordered, and nothing of the manager's own books."""
+    """Sees submissions, executions and commands, and nothing of the manager's state."""
 
-    def __init__(self, agenda: Agenda) -> None:
+    def __init__(self, queue: EventQueue) -> None:
         self.orphaned_s: list[float] = []
-        """From the loss of a worker to the next lease of each rollout that it held."""
-        self._agenda = agenda
+        """Time from the loss of a worker to the next lease of each rollout that it held."""
+        self._queue = queue
         self._lost_s: dict[str, float] = {}
         self.submitted = 0
         self.delivered = 0
@@ -46,14 +46,14 @@ class InvariantChecker:
         self._open: dict[tuple[str, str], set[str]] = {}
         self._cursors: dict[tuple[str, str], int] = {}
         self._epochs: set[int] = set()
-        self._holders: dict[str, list[str]] = {}
-        """Who has good leases of a rollout."""
+        self._workers_of: dict[str, list[str]] = {}
+        """Workers with valid leases of each rollout."""
         self.hedges = 0
         self._policies: dict[str, GroupPolicy] = {}
         self._lost_in: set[tuple[str, str]] = set()
-        """Groups and batches of which the infrastructure lost a rollout."""
+        """Groups and batches that lost a rollout to an infrastructure failure."""
         self._held_by: dict[str, dict[str, LeaseRef]] = {}
-        """By worker: the good leases by rollout."""
+        """Valid leases by worker and rollout."""
         self._warm: dict[str, set[str]] = {}
         self._rollout_of: dict[LeaseRef, str] = {}
         self._gone: frozenset[str] = frozenset()
@@ -61,7 +61,7 @@ class InvariantChecker:
 
     @property
     def complete(self) -> bool:
-        """Whether every rollout has its outcome, and every batch its end."""
+        """True if every rollout has its outcome and every batch has ended."""
         return not self._open
 
     @property
@@ -70,7 +70,7 @@ class InvariantChecker:
 
     @property
     def open_by_run(self) -> Counter[str]:
-        """Rollouts without an outcome."""
+        """Rollouts without an outcome, by run."""
         counts: Counter[str] = Counter()
         for (run_id, _), left in self._open.items():
             counts[run_id] += len(left)
@@ -87,15 +87,15 @@ class InvariantChecker:
         self.submitted += len(ids)
 
     def executed(self, rollout_id: str, worker_id: str) -> None:
-        """A slot really executed this, and its result was not thrown away on the worker."""
+        """Note an execution whose result left the worker."""
         self._executed.add((rollout_id, worker_id))
 
     def watch(self, commands: Iterable[Command], *, lost: Iterable[str] = ()) -> None:
-        """Check what the manager orders; the leases of workers that it has just ``lost`` are void."""
-        # Several may be lost at once, and what the first held may be given to the second before that one's loss is seen.
+        """Check commands. The leases of workers that the manager has just ``lost`` are void."""
+        # A lease of the first lost worker may be granted to the second before its loss is handled.
         self._gone = frozenset(lost)
         for worker_id in self._gone:
-            self._lost_s |= dict.fromkeys(self._held_by.get(worker_id, ()), self._agenda.now_s)
+            self._lost_s |= dict.fromkeys(self._held_by.get(worker_id, ()), self._queue.now_s)
         self._forget_all(self._gone)
         for command in commands:
             match command:
@@ -112,7 +112,7 @@ class InvariantChecker:
         self._forget_all(self._gone)
 
     def report(self, worker_id: str, state: WorkerState, *, resync: bool) -> None:
-        """What the manager is about to hear. What a first state does not hold, the worker never got."""
+        """Note a report before the manager gets it. Leases missing in a first report never reached the worker."""
         self._warm[worker_id] = {
             resident.bundle_digest for resident in state.residents if resident.state is ResidentState.WARM
         }
@@ -127,21 +127,21 @@ class InvariantChecker:
         _check(
             command.ref.lease_epoch not in self._epochs, f"epoch {command.ref.lease_epoch} was given twice"
         )
-        for name in self._gone.intersection(self._holders.get(rollout_id, ())):
+        for name in self._gone.intersection(self._workers_of.get(rollout_id, ())):
             self._forget(rollout_id, name)
-        holders = self._holders.setdefault(rollout_id, [])
-        _check(command.hedge or not holders, f"{rollout_id} has two leases at once")
-        _check(not command.hedge or len(holders) == 1, f"{rollout_id} is hedged with {len(holders)} leases")
-        _check(worker_id not in holders, f"{rollout_id} has two leases on {worker_id}")
+        workers = self._workers_of.setdefault(rollout_id, [])
+        _check(command.hedge or not workers, f"{rollout_id} has two leases at once")
+        _check(not command.hedge or len(workers) == 1, f"{rollout_id} is hedged with {len(workers)} leases")
+        _check(worker_id not in workers, f"{rollout_id} has two leases on {worker_id}")
         self.hedges += command.hedge
         _check(
             command.rollout.bundle_digest in self._warm.get(worker_id, ()),
-            f"{rollout_id} was leased to {worker_id}, which never said that it has its scene",
+            f"{rollout_id} was leased to {worker_id}, which never reported its scene as warm",
         )
         if rollout_id in self._lost_s:
-            self.orphaned_s.append(self._agenda.now_s - self._lost_s.pop(rollout_id))
+            self.orphaned_s.append(self._queue.now_s - self._lost_s.pop(rollout_id))
         self._epochs.add(command.ref.lease_epoch)
-        holders.append(worker_id)
+        workers.append(worker_id)
         self._held_by.setdefault(worker_id, {})[rollout_id] = command.ref
         self._rollout_of[command.ref] = rollout_id
 
@@ -157,9 +157,9 @@ class InvariantChecker:
 
     def _forget(self, rollout_id: str, worker_id: str) -> None:
         del self._held_by[worker_id][rollout_id]
-        self._holders[rollout_id].remove(worker_id)
-        if not self._holders[rollout_id]:
-            del self._holders[rollout_id]
+        self._workers_of[rollout_id].remove(worker_id)
+        if not self._workers_of[rollout_id]:
+            del self._workers_of[rollout_id]
 
     def _deliver(self, key: tuple[str, str], result: RolloutResult) -> None:
         rollout_id = result.rollout_id
@@ -174,7 +174,8 @@ class InvariantChecker:
         if isinstance(outcome, Completed):
             evidence = (rollout_id, outcome.worker_id)
             _check(
-                evidence in self._executed, f"{rollout_id} has a reward that {outcome.worker_id} never gave"
+                evidence in self._executed,
+                f"{rollout_id} has a reward that {outcome.worker_id} never computed",
             )
             _check(
                 outcome.trace_digest == rollout_id, f"{rollout_id} has the reward of {outcome.trace_digest}"
@@ -186,8 +187,8 @@ class InvariantChecker:
         else:
             policy = self._policies.get(key[0], GroupPolicy.PARTIAL)
             whole = "" if policy is GroupPolicy.FAIL_FAST else result.group_id
-            _check(policy is not GroupPolicy.PARTIAL, f"{rollout_id} was called off by nobody")
-            _check((key[1], whole) in self._lost_in, f"{rollout_id} was called off and nothing was lost")
+            _check(policy is not GroupPolicy.PARTIAL, f"{rollout_id} was cancelled by nobody")
+            _check((key[1], whole) in self._lost_in, f"{rollout_id} was cancelled and nothing was lost")
 
     def _finish(self, key: tuple[str, str]) -> None:
         left = self._open.get(key)

@@ -1,4 +1,4 @@
-"""What the control groups of this process leave it of the machine: a container or a systemd slice may have less than all.
+"""Limits of this process on its host: cores and memory left by control groups and CPU affinity.
 
 The files are those of version 2, and of version 1 for the processor and memory controllers: Linux, Documentation/admin-guide/
 cgroup-v2.rst and cgroup-v1/.
@@ -7,6 +7,7 @@ cgroup-v2.rst and cgroup-v1/.
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -18,19 +19,19 @@ MOUNT: Final = Path("/sys/fs/cgroup")
 MEMBERSHIP: Final = Path("/proc/self/cgroup")
 MIB: Final = 1024 * 1024
 UNLIMITED_BYTES: Final = 2**60
-"""Version 1 writes "no limit" as the largest multiple of a page that fits, which nobody has."""
+"""Version 1 writes "no limit" as the largest multiple of the page size."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Infinite where nothing is limited. ``memory_mb`` is what may still be taken beyond what is used now."""
+    """Limits by control groups, infinite if there are none. ``memory_mb`` is the memory that is still free."""
 
     cores: float = math.inf
     memory_mb: float = math.inf
 
 
 def find_limits(mount: Path = MOUNT, membership: Path = MEMBERSHIP) -> Limits:
-    """The tightest limits of this process's groups and of those around them. No groups here: no limits."""
+    """Return the tightest limits of this process's control groups and their parents."""
     cores = memory_mb = math.inf
     for folder in _folders(mount, membership):
         cores = min(cores, _cores(folder))
@@ -39,7 +40,7 @@ def find_limits(mount: Path = MOUNT, membership: Path = MEMBERSHIP) -> Limits:
 
 
 def _folders(mount: Path, membership: Path) -> Iterator[Path]:
-    """Of each group and of all around it. Inside a container the mount may begin at the group itself."""
+    """Yield the folders of each group and its parents. In a container the mount may start at the group itself."""
     try:
         lines = membership.read_text().splitlines()
     except OSError:
@@ -74,8 +75,8 @@ def _memory_mb(folder: Path) -> float:
 
 
 def _stat(folder: Path, name: str) -> int:
-    """Bytes by name in the group's account; 0 where it has none. Files read long ago count as used there, though the system
-    drops them whenever memory is wanted."""
+    """Return the bytes under a name in the group's account, or 0. The account counts inactive page cache as used, although the
+    kernel drops it on demand."""
     words = _words(folder / "memory.stat")
     return int(words[words.index(name) + 1]) if name in words else 0
 
@@ -85,3 +86,12 @@ def _words(path: Path) -> list[str]:
         return path.read_text().split()
     except OSError:
         return []
+
+
+def usable_cores(limits: Limits | None = None) -> int:
+    """Return the cores that this process may keep busy, by affinity and control groups, rounded down.
+
+    ``limits`` default to this process's own.
+    """
+    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, int(min(allowed, (limits or find_limits()).cores)))
