@@ -1,4 +1,4 @@
-"""What every state store must do: memory, SQLite, and Redis, which runs as a real server from a wheel."""
+"""Contract of the state stores: in memory, SQLite, and a real Redis server."""
 
 import asyncio
 import contextlib
@@ -77,7 +77,7 @@ def rows(*cursors):
     return [ResultRow(cursor, f"rollout:{cursor}", bytes([cursor, 0, 255])) for cursor in cursors]
 
 
-async def test_a_run_is_there_until_it_is_closed(store):
+async def test_run_is_stored_until_it_is_closed(store):
     await store.open_run(RunRow("r1", "first", b"\x08\x01 terms"))
     await store.open_run(RunRow("r2", "second"))
     await store.open_run(RunRow("r1", "another name", b"others"))
@@ -87,7 +87,7 @@ async def test_a_run_is_there_until_it_is_closed(store):
     assert await store.runs() == [RunRow("r2", "second")]
 
 
-async def test_a_batch_is_put_once_under_an_open_run(store):
+async def test_batch_is_put_once_under_an_open_run(store):
     assert await store.put_batch(BATCH) is PutOutcome.NO_RUN
     await store.open_run(RunRow("r1", ""))
     assert await store.put_batch(BATCH) is PutOutcome.CREATED
@@ -113,7 +113,7 @@ async def test_results_are_read_from_a_cursor_in_order(store):
     assert await store.results_after("r1", "b1", 5, 100) == []
 
 
-async def test_of_each_rollout_only_the_first_result_counts(store):
+async def test_first_result_of_each_rollout_counts(store):
     await store.open_run(RunRow("r1", ""))
     await store.put_batch(BATCH)
     await store.append_results([BatchResults("r1", "b1", rows(1))])
@@ -144,7 +144,7 @@ async def test_results_of_an_unknown_batch_are_not_kept(store):
     assert await store.results_after("r1", "b1", 0, 100) == []
 
 
-async def test_a_closed_run_takes_its_batches_and_results_along(store):
+async def test_closing_a_run_deletes_its_batches_and_results(store):
     await store.open_run(RunRow("r1", ""))
     await store.put_batch(BATCH)
     await store.append_results([BatchResults("r1", "b1", rows(1))])
@@ -155,7 +155,7 @@ async def test_a_closed_run_takes_its_batches_and_results_along(store):
     assert await store.results_after("r1", "b1", 0, 100) == []
 
 
-async def test_a_run_that_is_closed_takes_its_window_along_and_no_other(store):
+async def test_closing_a_run_deletes_its_window_only(store):
     for run_id in ("r1", "r2"):
         await store.open_run(RunRow(run_id, ""))
     await store.put_rows(Shelf.WINDOWS, [ShelfRow("r1", b"of r1"), ShelfRow("r2", b"of r2")])
@@ -165,7 +165,7 @@ async def test_a_run_that_is_closed_takes_its_window_along_and_no_other(store):
     assert await store.rows(Shelf.SWITCHES) == [ShelfRow("r1", b"on")]
 
 
-async def test_a_dropped_batch_leaves_the_others(store):
+async def test_dropped_batch_leaves_the_others(store):
     await store.open_run(RunRow("r1", ""))
     await store.put_batch(BATCH)
     await store.put_batch(BatchRow("r1", "b2", "d", b""))
@@ -175,7 +175,7 @@ async def test_a_dropped_batch_leaves_the_others(store):
     assert await store.results_after("r1", "b2", 0, 100) == rows(1)
 
 
-async def test_the_list_of_workers_is_replaced_as_a_whole(store, openings):
+async def test_list_of_workers_is_replaced_as_a_whole(store, openings):
     assert await store.workers() == frozenset()
     await store.put_workers(["w1", "w2"])
     await store.put_workers(["w2", "w3"])
@@ -196,9 +196,7 @@ async def test_another_process_finds_everything_again(store, openings):
 
 
 @pytest.mark.parametrize("shelf", Shelf)
-async def test_what_is_kept_by_name_is_known_to_whoever_opens_the_state_and_the_last_word_counts(
-    store, openings, shelf
-):
+async def test_named_rows_survive_reopening_and_the_latest_counts(store, openings, shelf):
     await store.put_rows(shelf, [ShelfRow("a", b"\x00first"), ShelfRow("b", b"of b")])
     await store.put_rows(shelf, [ShelfRow("a", b"second\xff")])
     again = openings()
@@ -215,20 +213,20 @@ async def test_only_one_of_two_managers_leads_and_the_other_learns_its_address(s
     await store.open_run(RunRow("r1", ""))
 
 
-async def test_a_lead_that_was_given_up_goes_to_the_next(store, openings):
+async def test_released_leader_lease_goes_to_the_next_manager(store, openings):
     other = openings()
     await store.close()
     assert await other.claim(SECOND) == Lead(2, "host:2", mine=True)
 
 
-async def test_who_was_overtaken_takes_no_lead_away_when_it_ends(store, openings):
+async def test_replaced_leader_does_not_release_the_new_lease(store, openings):
     newer, third = openings(), openings()
     await newer.claim(FIRST)
     await store.close()
     assert not (await third.claim(SECOND)).mine
 
 
-async def test_a_lead_lapses_unless_it_is_renewed(openings):
+async def test_leader_lease_lapses_without_renewal(openings):
     brief, other = openings(), openings()
     await brief.claim(dataclasses.replace(FIRST, ttl_s=0.4))
     for _ in range(3):
@@ -241,7 +239,7 @@ async def test_a_lead_lapses_unless_it_is_renewed(openings):
         await brief.renew()
 
 
-async def test_a_lead_that_lapsed_unnoticed_is_taken_up_again(openings):
+async def test_unclaimed_lapsed_leader_lease_can_be_renewed(openings):
     store = openings()
     await store.claim(dataclasses.replace(FIRST, ttl_s=0.05))
     await asyncio.sleep(0.1)
@@ -250,14 +248,14 @@ async def test_a_lead_that_lapsed_unnoticed_is_taken_up_again(openings):
     assert await store.runs() == [RunRow("r1", "")]
 
 
-async def test_a_restarted_manager_does_not_wait_for_its_former_life(store, openings):
+async def test_restarted_manager_reclaims_its_own_leader_lease(store, openings):
     again = openings()
     assert await again.claim(FIRST) == Lead(2, "host:1", mine=True)
     with pytest.raises(FencedError):
         await store.open_run(RunRow("r1", ""))
 
 
-async def test_the_manager_that_claimed_last_is_the_only_one_that_writes(store, openings):
+async def test_only_the_latest_leader_may_write(store, openings):
     await store.open_run(RunRow("r1", ""))
     await store.put_batch(BATCH)
     newer = openings()
@@ -276,7 +274,7 @@ async def test_the_manager_that_claimed_last_is_the_only_one_that_writes(store, 
     assert await newer.append_results([BatchResults("r1", "b1", rows(1))]) == 1
 
 
-async def test_a_store_that_cannot_be_used_says_what_to_do(tmp_path):
+async def test_store_that_cannot_be_used_says_what_to_do(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(StateError, match="--state"):
         open_store(f"sqlite:{tmp_path}/file/state.sqlite")
@@ -299,7 +297,7 @@ def no_file_grows(limit=200_000):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-async def test_a_full_disk_is_told_and_what_was_written_before_is_still_there(tmp_path):
+async def test_full_disk_raises_and_keeps_earlier_data(tmp_path):
     store = SqliteStore(tmp_path / "state.sqlite")
     await store.claim(FIRST)
     await store.open_run(RunRow("r1", ""))
@@ -314,7 +312,7 @@ async def test_a_full_disk_is_told_and_what_was_written_before_is_still_there(tm
     await store.close()
 
 
-async def test_what_the_file_takes_back_by_itself_is_told_with_its_own_reason(tmp_path):
+async def test_automatic_rollback_keeps_its_own_error(tmp_path):
     store = SqliteStore(tmp_path / "state.sqlite")
     await store.claim(FIRST)
     other = sqlite3.connect(tmp_path / "state.sqlite", isolation_level=None)
@@ -329,7 +327,7 @@ async def test_what_the_file_takes_back_by_itself_is_told_with_its_own_reason(tm
     await store.close()
 
 
-async def test_a_write_waits_while_another_process_writes_to_the_file(tmp_path):
+async def test_write_waits_while_another_process_writes_to_the_file(tmp_path):
     store = SqliteStore(tmp_path / "state.sqlite")
     await store.claim(FIRST)
     other = sqlite3.connect(tmp_path / "state.sqlite", isolation_level=None)
@@ -344,7 +342,7 @@ async def test_a_write_waits_while_another_process_writes_to_the_file(tmp_path):
     await store.close()
 
 
-async def test_a_batch_is_kept_while_the_file_is_read_and_the_journal_is_emptied_later(tmp_path):
+async def test_batch_is_kept_while_the_file_is_read_and_the_journal_is_emptied_later(tmp_path):
     store = SqliteStore(tmp_path / "state.sqlite")
     journal = tmp_path / "state.sqlite-wal"
     await store.claim(FIRST)
@@ -366,7 +364,7 @@ async def fill(store):
         await store.put_batch(BatchRow("r1", f"b{number}", "d", bytes(100_000)))
 
 
-async def test_a_redis_without_memory_left_is_told_and_nothing_is_evicted(tmp_path):
+async def test_full_redis_raises_and_evicts_nothing(tmp_path):
     with RedisServer(tmp_path, free_port(), maxmemory="3mb") as server:
         store = RedisStore(server.url)
         await store.claim(FIRST)
@@ -377,7 +375,7 @@ async def test_a_redis_without_memory_left_is_told_and_nothing_is_evicted(tmp_pa
         await store.close()
 
 
-async def test_a_redis_that_evicts_is_refused_with_the_remedy(tmp_path):
+async def test_redis_that_evicts_is_refused_with_the_remedy(tmp_path):
     with RedisServer(
         tmp_path, free_port(), maxmemory="10mb", **{"maxmemory-policy": "allkeys-lru"}
     ) as server:

@@ -1,4 +1,4 @@
-"""The status page in a real browser, before a real manager with a real worker: what the cluster does is what the page shows."""
+"""Dashboard in a real browser, with a real manager and worker."""
 
 import asyncio
 import contextlib
@@ -99,7 +99,7 @@ async def test_page_of_training_shows_curves_and_plans_and_runs_no_script_of_a_m
     assert f"infrastructure failure, no reward · t1 worker_lost: it went silent {script}" in sampled
 
 
-async def test_page_of_training_says_what_to_do_where_nobody_trains(browser, tmp_path):
+async def test_training_page_without_reports_shows_the_command(browser, tmp_path):
     async with manager(tmp_path / "data") as at:
         page = await asyncio.to_thread(shown, browser, f"{at.status_url}#training", tmp_path)
     assert page.words["nothing"].startswith("No trainer has reported yet.")
@@ -135,7 +135,7 @@ async def test_page_of_tasks_says_how_to_show_a_dataset(browser, tmp_path):
     assert page.words["cards"] == "no dataset is shown: start the manager with --dataset FOLDER"
 
 
-def test_page_of_a_cluster_with_a_token_asks_for_it_and_shows_nothing(browser, tmp_path):
+def test_dashboard_asks_for_a_token(browser, tmp_path):
     with cluster(tmp_path / "cluster", "--token=the-secret") as (_, url):
         page = shown(browser, url, tmp_path)
     assert page.words["link"] == "the token is missing or wrong"

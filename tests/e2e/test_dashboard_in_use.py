@@ -1,4 +1,4 @@
-"""The dashboard as people use it: in both themes, on desks and phones, by keyboard, while workers die and managers are away."""
+"""Dashboard in both themes, on desktops and phones, by keyboard, and without its manager."""
 
 import asyncio
 import contextlib
@@ -124,7 +124,7 @@ async def test_every_page_fits_its_window_is_legible_and_names_its_parts(browser
         assert opened.wrong == []
 
 
-async def test_what_died_failed_or_was_called_a_script_is_told_as_it_is(browser, tmp_path):
+async def test_failures_and_script_names_are_shown_as_text(browser, tmp_path):
     async with manager(tmp_path) as at, ten_workers(at.address), window(browser, at.status_url) as opened:
         await opened.open("workers")
         rows = await opened.until("#workers", "lost")
@@ -141,7 +141,7 @@ async def test_what_died_failed_or_was_called_a_script_is_told_as_it_is(browser,
         assert "taken" not in await opened.page.title()
 
 
-async def test_the_look_ahead_is_read_by_keyboard(browser, tmp_path):
+async def test_look_ahead_is_read_by_keyboard(browser, tmp_path):
     async with manager(tmp_path) as at, ten_workers(at.address), window(browser, at.status_url) as opened:
         await opened.open("lookahead")
         await opened.until("#cell", "Each cell shows")
@@ -179,7 +179,7 @@ async def _point_at_a_rollout(opened):
     raise AssertionError("no rollout is on the timeline")
 
 
-async def test_the_timeline_is_zoomed_and_drawn_along_by_the_mouse(browser, tmp_path):
+async def test_timeline_zooms_and_pans_with_the_mouse(browser, tmp_path):
     async with (
         manager(tmp_path) as at,
         FakeWorker(at.address, "office", slots=1, execute_s=0.3),
@@ -224,7 +224,7 @@ async def _held_down(page, key):
     await page.keyboard.up(key)
 
 
-async def test_a_page_without_its_manager_says_from_when_it_is_and_goes_on_with_the_next(browser, tmp_path):
+async def test_page_shows_its_age_without_a_manager_and_recovers(browser, tmp_path):
     port = free_port()
     serve = (
         "manager",
@@ -254,7 +254,7 @@ async def test_a_page_without_its_manager_says_from_when_it_is_and_goes_on_with_
 
 
 @pytest.mark.slow
-async def test_a_thousand_workers_come_in_pages_of_fifty(browser, tmp_path):
+async def test_thousand_workers_are_shown_in_pages_of_fifty(browser, tmp_path):
     async with manager(tmp_path, heartbeat_s=10.0) as at, contextlib.AsyncExitStack() as stack:
         for first in range(0, 1000, 20):
             some = [FakeWorker(at.address, f"pc-{number:04}") for number in range(first, first + 20)]

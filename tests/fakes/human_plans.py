@@ -55,7 +55,7 @@ class OneArm:
                 self._shut.append(names[0])
             case _ if deed in STATES:
                 self._lay_down()
-                self._say(STATES[deed], names[0])
+                self._send(STATES[deed], names[0])
             case "SLICE" | "CLEAN":
                 self._use(Skill.SLICE if deed == "SLICE" else Skill.CLEAN, names[0])
             case "SOAK":
@@ -83,7 +83,7 @@ class OneArm:
     def _take(self, name):
         if self._arm != name:
             self._lay_down()
-            self._say(Skill.PICK_UP, name)
+            self._send(Skill.PICK_UP, name)
             self._arm = name
 
     def _lay_down(self):
@@ -92,7 +92,7 @@ class OneArm:
             host, relation = self._home.get(self._arm, ("", None))
             if not host:
                 raise UntoldError("nowhere to lay a tool down")
-            self._say(Skill.PLACE, host, relation=relation)
+            self._send(Skill.PLACE, host, relation=relation)
             self._arm = ""
 
     def _place(self, hand, target, relation):
@@ -100,7 +100,7 @@ class OneArm:
         if not name:
             raise UntoldError("an empty hand")
         self._take(name)
-        self._say(Skill.PLACE, target, relation=relation)
+        self._send(Skill.PLACE, target, relation=relation)
         self._home[name] = (target, relation)
         self._hands[hand] = self._arm = ""
 
@@ -109,20 +109,20 @@ class OneArm:
         if not tool:
             raise UntoldError("a tool that lies in a sink")
         self._take(tool)
-        self._say(skill, name, source=tool)
+        self._send(skill, name, source=tool)
 
     def _soak(self, name):
         source = self._home.get(name, ("", None))[0]
         if not source:
             raise UntoldError("SOAK outside of a sink")
         self._take(name)
-        self._say(Skill.SOAK, name, source=source)
+        self._send(Skill.SOAK, name, source=source)
 
     def _close_what_is_done(self):
         if not any(self._hands.values()):
             for name in self._shut:
                 self._lay_down()
-                self._say(Skill.CLOSE, name)
+                self._send(Skill.CLOSE, name)
             self._shut = []
 
 

@@ -1,4 +1,4 @@
-"""Whoever opens connections and says nothing: the port stays open to others, and lets go of them."""
+"""Connection floods: silent clients are bounded and do not block others."""
 
 import asyncio
 import contextlib
@@ -10,30 +10,30 @@ import pytest
 import uvicorn
 
 from embomatrix.manager.access.folder import prepare
-from embomatrix.manager.web.connections import BoundedConnections, BoundedListener, connections_through
+from embomatrix.manager.web.connections import BoundedConnections, BoundedListener, connections_of
 
 pytestmark = pytest.mark.timeout(120)
 MOST = 8
 
 
 class Few(BoundedConnections):
-    most = MOST
+    limit = MOST
     silent_s = 0.5
 
 
 class Patient(BoundedConnections):
-    most = MOST
+    limit = MOST
     silent_s = 60.0
 
 
-class NarrowDoor(BoundedListener):
-    most = MOST
-    patience_s = 0.5
+class HastyListener(BoundedListener):
+    limit = MOST
+    handshake_s = 0.5
 
 
-class PatientDoor(BoundedListener):
-    most = MOST
-    patience_s = 60.0
+class PatientListener(BoundedListener):
+    limit = MOST
+    handshake_s = 60.0
 
 
 async def answer(scope, receive, send):
@@ -57,14 +57,14 @@ async def serving(kind, bound=None, **options):
 
 @contextlib.asynccontextmanager
 async def serving_by_tls(kind, folder):
-    """Yields the port of such a server behind this kind of door, and what trusts it."""
+    """Yields the port of such a server behind this kind of listener, and what trusts it."""
     prepare(folder, sans=())
     access = folder / "access"
     files = {"ssl_certfile": access / "server.pem", "ssl_keyfile": access / "server.key"}
-    door = kind(socket.AF_INET, socket.SOCK_STREAM)
-    door.bind(("127.0.0.1", 0))
-    door.listen()
-    async with serving(connections_through(door), door, **files) as port:
+    listener = kind(socket.AF_INET, socket.SOCK_STREAM)
+    listener.bind(("127.0.0.1", 0))
+    listener.listen()
+    async with serving(connections_of(listener), listener, **files) as port:
         yield port, ssl.create_default_context(cafile=access / "ca.pem")
 
 
@@ -74,7 +74,7 @@ async def ended(reader):
     return True
 
 
-async def test_connections_beyond_the_bound_end_at_once_and_the_others_go_on():
+async def test_connections_beyond_the_limit_are_closed_at_once():
     async with serving(Patient) as port:
         opened = []
         for _ in range(MOST):
@@ -87,7 +87,7 @@ async def test_connections_beyond_the_bound_end_at_once_and_the_others_go_on():
             writer.close()
 
 
-async def test_connections_that_say_nothing_or_never_end_their_request_make_room():
+async def test_silent_connections_are_closed():
     async with serving(Few) as port:
         silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MOST)]
         for _, writer in silent[::2]:
@@ -99,8 +99,8 @@ async def test_connections_that_say_nothing_or_never_end_their_request_make_room
             writer.close()
 
 
-async def test_connections_that_never_shake_hands_are_few_and_cost_nobody_his_place(tmp_path):
-    async with serving_by_tls(PatientDoor, tmp_path) as (port, trusting):
+async def test_pending_handshakes_are_bounded(tmp_path):
+    async with serving_by_tls(PatientListener, tmp_path) as (port, trusting):
         asking = await asyncio.open_connection("127.0.0.1", port, ssl=trusting)
         silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MOST)]
         more = [await asyncio.open_connection("127.0.0.1", port) for _ in range(40 * MOST)]
@@ -114,8 +114,8 @@ async def test_connections_that_never_shake_hands_are_few_and_cost_nobody_his_pl
             writer.close()
 
 
-async def test_a_door_lets_go_of_those_that_never_shake_hands(tmp_path):
-    async with serving_by_tls(NarrowDoor, tmp_path) as (port, trusting):
+async def test_pending_handshakes_time_out(tmp_path):
+    async with serving_by_tls(HastyListener, tmp_path) as (port, trusting):
         silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MOST)]
         assert await asyncio.gather(*(ended(reader) for reader, _ in silent)) == [True] * MOST
         _, writer = await _shaking_hands(port, trusting)

@@ -1,4 +1,4 @@
-"""Rewards over HTTP: the shape that OpenRLHF reads, who may ask, and what is refused by a sentence."""
+"""Rewards over HTTP: OpenRLHF's format, access, and refusals."""
 
 import asyncio
 
@@ -28,7 +28,7 @@ def asked(*answers, prompt=PROMPT, label=LABEL, mark=""):
     }
 
 
-async def test_plans_are_executed_and_scored_in_their_order_and_texts_that_are_none_never_are(tmp_path):
+async def test_plans_are_scored_in_order_and_unparsable_texts_are_not_executed(tmp_path):
     async with (
         manager(tmp_path) as at,
         open_run(at.address),
@@ -50,7 +50,7 @@ async def test_plans_are_executed_and_scored_in_their_order_and_texts_that_are_n
     assert RUN_ID in {run["run_id"] for run in runs}
 
 
-async def test_requests_at_the_same_time_share_a_run_and_get_each_their_own(tmp_path):
+async def test_concurrent_requests_share_a_run(tmp_path):
     async with (
         manager(tmp_path) as at,
         open_run(at.address),
@@ -63,7 +63,7 @@ async def test_requests_at_the_same_time_share_a_run_and_get_each_their_own(tmp_
     assert [len(answer.json()["rewards"]) for answer in answers] == [1, 2, 3]
 
 
-async def test_a_lost_rollout_is_an_answer_to_try_again_and_no_number(tmp_path):
+async def test_infrastructure_failure_returns_503_without_a_reward(tmp_path):
     async with (
         manager(tmp_path) as at,
         open_run(at.address),
@@ -94,21 +94,21 @@ async def test_a_lost_rollout_is_an_answer_to_try_again_and_no_number(tmp_path):
         ),
     ],
 )
-async def test_what_can_not_be_scored_is_refused_by_a_sentence(tmp_path, body, status, words):
+async def test_invalid_requests_are_refused_with_a_message(tmp_path, body, status, words):
     async with manager(tmp_path) as at, open_run(at.address), http_at(at) as http:
         answer = await http.post(REWARDS, json=body)
     assert answer.status_code == status
     assert words in answer.json()["detail"]
 
 
-async def test_text_that_is_no_json_and_more_than_fits_are_refused(tmp_path):
+async def test_invalid_json_and_oversized_bodies_are_refused(tmp_path):
     async with manager(tmp_path) as at, http_at(at) as http:
         broken = await http.post(REWARDS, content=b"{")
         large = await http.post(REWARDS, content=b" " * (64 * 1024 * 1024 + 1), timeout=50)
     assert (broken.status_code, large.status_code) == (422, 413)
 
 
-async def test_it_takes_a_token_of_the_trainer_role(tmp_path):
+async def test_rewards_need_a_trainer_token(tmp_path):
     async with guarded(tmp_path) as at, httpx.AsyncClient(base_url=at.page, verify=False) as http:
         told = {
             role: (
@@ -126,5 +126,5 @@ async def test_it_takes_a_token_of_the_trainer_role(tmp_path):
     assert anonymous.status_code == 401
 
 
-def test_a_label_can_be_read_back():
+def test_label_round_trips():
     assert RewardLabel.parse(LABEL) == RewardLabel("t", KITCHEN, Profile.PAPER, 7)

@@ -1,4 +1,4 @@
-"""How a machine joins a guarded cluster: what `manager init` makes, one string, and a credential from then on."""
+"""Joining a guarded cluster: `manager init`, invitations and credentials."""
 
 import asyncio
 import json
@@ -25,14 +25,14 @@ from embomatrix.worker.link.membership import membership_of
 pytestmark = pytest.mark.timeout(120)
 
 
-def test_no_port_is_opened_to_others_without_both_tls_and_tokens(tmp_path):
+def test_serving_beyond_loopback_needs_tls_and_tokens(tmp_path):
     told = run("manager", "serve", "--host=0.0.0.0", "--port=0", "--http-port=0", f"--data-dir={tmp_path}")
     assert told.status == 2
     assert "refusing to serve on 0.0.0.0 without TLS and tokens" in told.text
     assert f"embomatrix manager init --data-dir {tmp_path} --san HOST" in told.text
 
 
-def test_what_init_made_is_private_and_never_made_twice(tmp_path):
+def test_init_files_are_private_and_never_overwritten(tmp_path):
     told = run("manager", "init", f"--data-dir={tmp_path}", "--san=lab.example", "--san=10.1.2.3")
     assert told.status == 0, told.text
     assert "lab.example" in told.text
@@ -63,7 +63,7 @@ def daemon(membership, folder):
     )
 
 
-async def test_a_daemon_joins_once_and_shows_its_credential_from_then_on(tmp_path):
+async def test_daemon_joins_once_and_then_uses_its_credential(tmp_path):
     async with (
         guarded(tmp_path / "manager", stream_grace_s=60.0) as at,
         ClusterClient(at.address, at.token(AccessRole.VIEWER), ca=at.ca) as viewer,
@@ -90,7 +90,7 @@ async def test_a_daemon_joins_once_and_shows_its_credential_from_then_on(tmp_pat
 
 
 @pytest.mark.slow
-async def test_a_spare_pc_joins_with_one_string_and_is_known_from_then_on(tmp_path):
+async def test_spare_pc_joins_with_an_invitation(tmp_path):
     """The commands of an operator and of the PC's owner, each a process of its own."""
     home = tmp_path / "pc"
     async with guarded(tmp_path / "manager") as at:

@@ -100,7 +100,7 @@ async def test_every_rollout_of_a_batch_comes_back_with_its_reward(tmp_path):
         assert (stats.delivered, stats.infra_failures, stats.cold_starts) == (100, 0, 100)
 
 
-async def test_a_message_with_many_results_holds_up_no_leases(tmp_path):
+async def test_large_result_message_does_not_delay_leases(tmp_path):
     async with (
         manager(tmp_path) as at,
         open_run(at.address) as client,
@@ -136,7 +136,7 @@ async def test_an_announced_scene_is_warm_before_its_batch_comes(tmp_path):
         assert (stats.prewarm_hits, stats.prewarm_misses, stats.warm_starts) == (1, 0, 8)
 
 
-async def test_a_killed_worker_costs_time_and_nothing_else(tmp_path):
+async def test_killed_worker_loses_no_rollout(tmp_path):
     async with manager(tmp_path) as at, open_run(at.address) as client:
         victim = await FakeWorker(at.address, worker_id="victim", slots=4, stuck={"t"}).__aenter__()
         running_batch = asyncio.create_task(outcomes(client, batch(40)))
@@ -247,7 +247,7 @@ async def test_a_cancelled_batch_ends_at_once(tmp_path):
         await until(lambda: len(worker.cancelled) == 2)
 
 
-async def test_a_restarted_manager_goes_on_where_the_former_one_stopped(tmp_path):
+async def test_restarted_manager_continues_its_batches(tmp_path):
     state = f"sqlite:{tmp_path / 'state.sqlite'}"
     async with (
         manager(tmp_path, state=state) as at,
@@ -270,7 +270,7 @@ async def test_a_restarted_manager_goes_on_where_the_former_one_stopped(tmp_path
         assert len(fresh.executed) == 4
 
 
-async def test_a_restarted_manager_loads_ahead_what_was_announced_to_the_former_one(tmp_path):
+async def test_restarted_manager_keeps_the_look_ahead_window(tmp_path):
     state = f"sqlite:{tmp_path / 'state.sqlite'}"
     async with manager(tmp_path, state=state) as at, open_run(at.address) as client, FakeWorker(at.address):
         window = [LookaheadEntry(1, KITCHEN, 4), LookaheadEntry(2, BEDROOM, 8)]
@@ -387,7 +387,7 @@ async def test_calls_without_the_token_are_refused(tmp_path):
             assert (await http.get("/api/v1/overview", headers=signed)).status_code == 200
 
 
-async def test_the_status_page_tells_what_happens(tmp_path):
+async def test_status_page_shows_the_cluster(tmp_path):
     async with manager(tmp_path) as at, open_run(at.address) as client, FakeWorker(at.address, slots=2):
         await outcomes(client, batch(10))
         await client.announce_lookahead(

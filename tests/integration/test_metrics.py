@@ -1,4 +1,4 @@
-"""What Prometheus scrapes from a manager that is at work."""
+"""Prometheus metrics of a busy manager."""
 
 import asyncio
 import itertools
@@ -93,7 +93,7 @@ async def test_runs_and_events_can_be_read_without_grpc(tmp_path):
     assert (missing.status_code, "no run 'r2'" in missing.text) == (404, True)
 
 
-async def test_the_page_does_not_grow_with_what_the_cluster_does(tmp_path):
+async def test_metrics_page_size_is_bounded(tmp_path):
     async with (
         manager(tmp_path) as at,
         open_run(at.address) as client,

@@ -1,4 +1,4 @@
-"""The REST API and the page's files before a real manager: one snapshot for all, changes by admins alone, streams that end."""
+"""REST API and dashboard files of a real manager."""
 
 import asyncio
 import json
@@ -24,7 +24,7 @@ def http_at(at, **headers):
     return httpx.AsyncClient(base_url=at.status_url, trust_env=False, headers=headers)
 
 
-async def test_every_list_tells_the_same_moment(tmp_path):
+async def test_all_lists_come_from_one_snapshot(tmp_path):
     async with (
         manager(tmp_path) as at,
         open_run(at.address) as client,
@@ -52,7 +52,7 @@ async def seen_until(http, true):
     raise AssertionError(seen)
 
 
-async def test_a_scene_that_no_worker_can_hold_is_told_with_its_reason(tmp_path):
+async def test_unplaceable_scene_is_reported_with_its_reason(tmp_path):
     async with (
         manager(tmp_path) as at,
         open_run(at.address) as client,
@@ -72,7 +72,7 @@ async def test_a_scene_that_no_worker_can_hold_is_told_with_its_reason(tmp_path)
     assert stuck["problem"] == f"scene {BEDROOM} fails to load: the mesh has no triangles"
 
 
-async def test_a_full_disk_is_told_by_its_name_though_nothing_runs(tmp_path):
+async def test_full_disk_is_reported_in_the_health_sentence(tmp_path):
     state = tmp_path / "state.sqlite"
     async with (
         manager(tmp_path, state=f"sqlite:{state}", leader_ttl_s=0.6) as at,
@@ -92,7 +92,7 @@ async def _hear(client, words):
             await asyncio.sleep(0.05)
 
 
-async def test_what_a_lost_worker_completed_is_still_counted(tmp_path):
+async def test_completed_rollouts_of_a_lost_worker_stay_counted(tmp_path):
     async with (
         manager(tmp_path) as at,
         open_run(at.address) as client,
@@ -107,7 +107,7 @@ async def test_what_a_lost_worker_completed_is_still_counted(tmp_path):
     assert seen["overview"]["outcomes"] == {"completed": 10}
 
 
-async def test_an_operator_steers_by_rest_as_by_grpc(tmp_path):
+async def test_rest_commands_equal_the_grpc_commands(tmp_path):
     async with (
         manager(tmp_path) as at,
         open_run(at.address) as client,
@@ -137,7 +137,7 @@ async def test_an_operator_steers_by_rest_as_by_grpc(tmp_path):
         assert (unguarded.status_code, "manager init" in unguarded.json()["detail"]) == (409, True)
 
 
-async def test_a_page_that_can_not_be_is_refused_by_name(tmp_path):
+async def test_invalid_page_parameters_are_refused(tmp_path):
     queries = (
         "workers?limit=0",
         "workers?limit=100000",
@@ -152,7 +152,7 @@ async def test_a_page_that_can_not_be_is_refused_by_name(tmp_path):
     assert named == [["query", name] for name in ("limit", "limit", "offset", "limit", "after")]
 
 
-async def test_changes_are_refused_to_viewers_and_to_pages_elsewhere(tmp_path):
+async def test_commands_are_refused_to_viewers_and_foreign_origins(tmp_path):
     async with manager(tmp_path, token="secret") as at, http_at(at) as http:
         foreign = {"authorization": "Bearer secret", "origin": "https://evil.example"}
         told = [
@@ -163,7 +163,7 @@ async def test_changes_are_refused_to_viewers_and_to_pages_elsewhere(tmp_path):
     assert (told, own.status_code) == ([401, 401, 403], 200)
 
 
-async def test_events_stream_as_they_come_and_can_be_taken_up_again(tmp_path):
+async def test_event_stream_resumes_after_a_sequence_number(tmp_path):
     async def read(http, count, after=0):
         async with http.stream(
             "GET", f"{PREFIX}/events/stream", params={"run": "r1", "after": after}
@@ -194,7 +194,7 @@ async def test_events_stream_as_they_come_and_can_be_taken_up_again(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-async def test_viewers_that_never_read_their_streams_hold_up_nobody(tmp_path):
+async def test_unread_event_streams_delay_nobody(tmp_path):
     async with (
         manager(tmp_path) as at,
         open_run(at.address) as client,
@@ -227,7 +227,7 @@ def named_in(text):
     return [*own, *(f"/static/{name}" for name in re.findall(r'"\./(\w+\.js)"', text))]
 
 
-async def test_answers_are_small_for_who_takes_that_and_made_once_for_all(tmp_path):
+async def test_answers_are_compressed_on_request(tmp_path):
     async with manager(tmp_path) as at, http_at(at) as http, FakeWorker(at.address, "w1"):
         page = f"{PREFIX}/snapshot"
         plain = await http.get(page, headers={"accept-encoding": "identity"})
@@ -243,7 +243,7 @@ async def test_answers_are_small_for_who_takes_that_and_made_once_for_all(tmp_pa
     assert (again.status_code, again.content, other.status_code) == (304, b"", 200)
 
 
-async def test_the_page_loads_nothing_from_elsewhere_and_no_file_but_its_own(tmp_path):
+async def test_dashboard_loads_only_its_own_files(tmp_path):
     async with manager(tmp_path, token="secret") as at, http_at(at) as http:
         page = await http.get("/")
         texts = {"/": page}
@@ -267,7 +267,7 @@ async def test_the_page_loads_nothing_from_elsewhere_and_no_file_but_its_own(tmp
     assert set(outside) <= {401, 404}
 
 
-async def test_the_openapi_page_describes_every_answer(tmp_path):
+async def test_openapi_page_describes_every_answer(tmp_path):
     async with manager(tmp_path) as at, http_at(at) as http:
         told = (await http.get(f"{PREFIX}/openapi.json")).json()
         for path, methods in told["paths"].items():
@@ -277,7 +277,7 @@ async def test_the_openapi_page_describes_every_answer(tmp_path):
     assert {"SnapshotPage", "WorkerPage", "Timeline", "Changed"} <= set(told["components"]["schemas"])
 
 
-async def test_training_is_shown_as_it_is_reported_and_after_its_run_was_closed(tmp_path):
+async def test_training_reports_are_shown_after_their_run_closed(tmp_path):
     plan = SampledPlan("t1", "tidy <b>up</b>", "move 3", RewardTiers(0.5, 0.2, 15.0, False), 1.0)
     async with manager(tmp_path) as at, open_run(at.address) as client, http_at(at) as http:
         for step in (1, 2):
@@ -298,7 +298,7 @@ async def test_training_is_shown_as_it_is_reported_and_after_its_run_was_closed(
     assert (unknown.status_code, "nobody" in unknown.json()["detail"]) == (404, True)
 
 
-async def test_tasks_are_told_to_viewers_alone_and_refused_by_name(tmp_path):
+async def test_tasks_need_a_viewer_token(tmp_path):
     async with manager(tmp_path, token="secret", dataset=tmp_path / "nowhere") as at, http_at(at) as http:
         stranger = await http.get(f"{PREFIX}/tasks")
         own = {"authorization": "Bearer secret"}

@@ -1,4 +1,4 @@
-"""What a manager tells of a run: where the time of each rollout went, what happened, and what is left once it is closed."""
+"""Run history: phase durations, events, and the archive of closed runs."""
 
 import pytest
 from tests.fakes.worker import FakeWorker
@@ -28,7 +28,7 @@ async def test_every_phase_of_every_rollout_is_timed_and_nothing_is_counted_twic
     assert sums[RolloutPhase.DELIVER] == pytest.approx(sum(timing.deliver_s for timing in timings))
 
 
-async def test_the_log_has_each_lease_and_its_end_in_order(tmp_path):
+async def test_log_holds_begin_and_end_of_each_lease_in_order(tmp_path):
     async with manager(tmp_path) as at, open_run(at.address) as client:
         async with FakeWorker(at.address, slots=2, poison={"poison"}):
             good, bad = batch(10), batch(1, batch_id="b2", task="poison")
@@ -54,7 +54,7 @@ async def test_the_log_has_each_lease_and_its_end_in_order(tmp_path):
     assert {EventKind.WORKER_JOINED, EventKind.SCENE_WARM} <= {event.kind for event in fleet}
 
 
-async def test_a_closed_run_is_kept_with_its_log_and_its_last_counters(tmp_path):
+async def test_closed_run_is_archived_with_log_and_counters(tmp_path):
     async with manager(tmp_path) as at, open_run(at.address) as client, AdminClient(at.address) as logs:
         async with FakeWorker(at.address) as worker:
             await client.announce_lookahead("r1", 1, [LookaheadEntry(1, KITCHEN, 8)])

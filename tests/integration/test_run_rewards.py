@@ -49,7 +49,7 @@ async def _runs(address):
         return await admin.list_runs()
 
 
-async def test_a_rollout_that_is_leased_again_keeps_its_run_s_coefficients_also_under_another_manager(
+async def test_redispatched_rollout_keeps_its_reward_coefficients(
     tmp_path,
 ):
     state = {"state": f"sqlite:{tmp_path / 'state.sqlite'}", "restart_grace_s": 0.3}
@@ -87,7 +87,7 @@ async def test_coefficients_that_make_no_reward_are_refused_when_the_run_is_open
         assert await _runs(at.address) == ()
 
 
-async def test_a_run_that_is_open_keeps_its_coefficients_and_whoever_asks_for_others_is_told(tmp_path):
+async def test_open_run_refuses_other_reward_coefficients(tmp_path):
     async with manager(tmp_path) as at, ClusterClient(at.address) as client:
         await open_run(client, TERMS)
         assert await client.open_run("again", "r1", TERMS) == "r1"

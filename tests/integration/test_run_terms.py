@@ -1,4 +1,4 @@
-"""What a run asks for and what an operator says, through a real gRPC server: group policies, ends of groups, pauses, drains."""
+"""Run terms and operator commands over gRPC: group policies, group ends, pauses, drains."""
 
 import asyncio
 import contextlib
@@ -65,7 +65,7 @@ async def until(condition, within_s=5.0):
             await asyncio.sleep(0.01)
 
 
-async def test_a_lost_rollout_calls_off_its_group_and_no_other(tmp_path):
+async def test_lost_rollout_cancels_its_own_group_only(tmp_path):
     async with (
         manager(tmp_path) as address,
         open_run(address) as client,
@@ -80,7 +80,7 @@ async def test_a_lost_rollout_calls_off_its_group_and_no_other(tmp_path):
         assert (await client.close_run("r1")).groups_failed == 1
 
 
-async def test_partial_groups_keep_what_came_of_the_others(tmp_path):
+async def test_partial_groups_keep_the_other_results(tmp_path):
     async with (
         manager(tmp_path) as address,
         open_run(address, GroupPolicy.PARTIAL) as client,
@@ -92,7 +92,7 @@ async def test_partial_groups_keep_what_came_of_the_others(tmp_path):
         assert set(groups) == {GroupDone("g0", completed=1, infra_failures=1), GroupDone("g1", completed=1)}
 
 
-async def test_the_first_failure_ends_a_batch_that_wants_to_fail_fast(tmp_path):
+async def test_fail_fast_batch_ends_with_its_first_failure(tmp_path):
     async with (
         manager(tmp_path) as address,
         open_run(address, GroupPolicy.FAIL_FAST) as client,
@@ -105,7 +105,7 @@ async def test_the_first_failure_ends_a_batch_that_wants_to_fail_fast(tmp_path):
         assert worker.executed.count("x1") == 1
 
 
-async def test_the_end_of_a_group_is_told_once_from_whatever_cursor(tmp_path):
+async def test_group_end_is_reported_once_from_any_cursor(tmp_path):
     async with manager(tmp_path) as address, open_run(address) as client, FakeWorker(address, slots=2):
         await events(client, batch_of(*"tttt"))
         for cursor in range(5):
@@ -123,7 +123,7 @@ async def test_the_end_of_a_group_is_told_once_from_whatever_cursor(tmp_path):
                 assert told == []
 
 
-async def test_the_terms_of_a_run_outlive_a_restart_of_the_manager(tmp_path):
+async def test_run_terms_survive_a_manager_restart(tmp_path):
     state = {"state": f"sqlite:{tmp_path / 'state.sqlite'}"}
     async with manager(tmp_path, **state) as address, open_run(address, GroupPolicy.PARTIAL):
         pass
@@ -153,7 +153,7 @@ async def test_nothing_is_leased_while_dispatch_is_paused(tmp_path):
         assert all(isinstance(outcome, Completed) for outcome in results.values())
 
 
-async def test_a_paused_worker_keeps_its_scenes_and_gets_nothing_new(tmp_path):
+async def test_paused_worker_keeps_its_scenes_and_gets_nothing_new(tmp_path):
     async with (
         manager(tmp_path) as address,
         open_run(address) as client,
@@ -176,7 +176,7 @@ async def test_a_paused_worker_keeps_its_scenes_and_gets_nothing_new(tmp_path):
         assert isinstance((await waiting)[0]["y0"], Completed)
 
 
-async def test_a_drain_is_taken_back(tmp_path):
+async def test_drain_can_be_cancelled(tmp_path):
     async with (
         manager(tmp_path) as address,
         open_run(address) as client,
@@ -194,7 +194,7 @@ async def test_a_drain_is_taken_back(tmp_path):
             await admin.resume("w2")
 
 
-async def test_the_plan_shows_what_comes_and_who_has_it(tmp_path):
+async def test_plan_shows_coming_scenes_and_their_workers(tmp_path):
     async with (
         manager(tmp_path) as address,
         open_run(address) as client,
@@ -213,7 +213,7 @@ async def test_the_plan_shows_what_comes_and_who_has_it(tmp_path):
             await admin.plan("other")
 
 
-async def test_a_straggler_is_started_once_more_and_its_group_comes_back(tmp_path):
+async def test_straggler_is_hedged_and_its_group_completes(tmp_path):
     async with (
         manager(tmp_path, hedge_after_s=0.3) as address,
         open_run(address) as client,

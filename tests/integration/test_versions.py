@@ -53,14 +53,14 @@ async def collected(client, submitted):
     return [result async for result in client.execute(submitted, deadline_s=40)]
 
 
-async def test_a_manager_tells_what_it_speaks_before_it_asks_for_anything(tmp_path):
+async def test_capabilities_need_no_token(tmp_path):
     async with manager(tmp_path, token="secret") as at, open_channel(at.address) as channel:
         found = await capabilities_of(rollout_service_pb2_grpc.RolloutServiceStub(channel), timeout_s=5)
     assert found.protocol == SPOKEN
     assert (found.batch_rollouts, found.bundle_bytes) == (65_536, 8 * 1024 * 1024)
 
 
-async def test_a_trainer_of_a_version_that_nobody_knows_yet_is_refused(tmp_path):
+async def test_trainer_of_an_unknown_version_is_refused(tmp_path):
     async with manager(tmp_path) as at, open_channel(at.address) as channel:
         stub = rollout_service_pb2_grpc.RolloutServiceStub(channel)
         with (
@@ -91,7 +91,7 @@ def test_two_sides_speak_the_newest_version_of_both(ours, theirs, agreed):
         ((1, 2), (3, 4), r"upgrade this manager with `pip install --upgrade 'embomatrix\[manager\]==7\.0'`"),
     ],
 )
-def test_who_is_behind_is_told_the_command_that_upgrades_it(ours, theirs, sentence):
+def test_version_error_names_the_upgrade_command(ours, theirs, sentence):
     with pytest.raises(PreconditionError, match=sentence):
         agree(
             VersionRange(*ours),

@@ -1,4 +1,4 @@
-"""A real manager and real worker daemons, each a process of its own: what is killed costs time and nothing else."""
+"""Real manager and worker processes: kills lose no rollout."""
 
 import asyncio
 import contextlib
@@ -124,7 +124,7 @@ async def _put(client, *contents):
     return list(bundles)
 
 
-async def test_a_batch_over_two_workers_comes_back_complete(tmp_path):
+async def test_batch_over_two_workers_comes_back_complete(tmp_path):
     async with cluster(tmp_path, "w1", "w2") as (_, client):
         digests = await _put(client, b"ok", b"ok ")
         run_id = await client.open_run("test")
@@ -136,7 +136,7 @@ async def test_a_batch_over_two_workers_comes_back_complete(tmp_path):
     assert stats.infra_failures == 0
 
 
-async def test_an_announced_scene_is_warm_before_it_is_needed(tmp_path):
+async def test_announced_scene_is_warm_before_it_is_needed(tmp_path):
     async with cluster(tmp_path, "w1") as (_, client):
         [digest] = await _put(client, b"ok")
         run_id = await client.open_run("test")
@@ -150,7 +150,7 @@ async def test_an_announced_scene_is_warm_before_it_is_needed(tmp_path):
     assert all(result.outcome.warm for result in results)
 
 
-async def test_a_worker_killed_in_the_middle_costs_no_rollout(tmp_path):
+async def test_worker_killed_in_the_middle_costs_no_rollout(tmp_path):
     async with cluster(tmp_path, "w1", "w2") as (made, client):
         digests = await _put(client, b"ok", b"ok ")
         run_id = await client.open_run("test")
@@ -165,7 +165,7 @@ async def test_a_worker_killed_in_the_middle_costs_no_rollout(tmp_path):
     assert stats.redispatched > 0
 
 
-async def test_a_manager_killed_in_the_middle_costs_no_rollout(tmp_path):
+async def test_manager_killed_in_the_middle_costs_no_rollout(tmp_path):
     async with cluster(tmp_path, "w1", "w2") as (made, client):
         digests = await _put(client, b"ok")
         run_id = await client.open_run("test")
@@ -179,7 +179,7 @@ async def test_a_manager_killed_in_the_middle_costs_no_rollout(tmp_path):
     assert all(isinstance(result.outcome, Completed) for result in results)
 
 
-async def test_crashes_and_exceptions_end_as_failures_of_the_infrastructure_and_never_as_rewards(tmp_path):
+async def test_crashes_are_infrastructure_failures_without_rewards(tmp_path):
     async with cluster(tmp_path, "w1") as (_, client):
         [digest] = await _put(client, b"ok")
         run_id = await client.open_run("test")
@@ -193,7 +193,7 @@ async def test_crashes_and_exceptions_end_as_failures_of_the_infrastructure_and_
     assert all(isinstance(result.outcome, Completed) for result in results)
 
 
-async def test_a_drained_worker_leaves_and_the_other_does_the_rest(tmp_path):
+async def test_drained_worker_leaves_and_the_other_finishes(tmp_path):
     async with cluster(tmp_path, "w1", "w2") as (made, client):
         [digest] = await _put(client, b"ok")
         run_id = await client.open_run("test")
@@ -210,7 +210,7 @@ async def test_a_drained_worker_leaves_and_the_other_does_the_rest(tmp_path):
     assert stats.redispatched == 0
 
 
-async def test_two_workers_of_one_name_do_not_fight_for_ever(tmp_path):
+async def test_two_workers_of_one_name_settle(tmp_path):
     async with cluster(tmp_path, "w1") as (made, client):
         made.processes["first"] = made.processes.pop("w1")
         made.start_worker("w1")
@@ -252,7 +252,7 @@ def _kitchen():
     return data, plan
 
 
-async def test_real_physics_scores_every_plan_once_though_a_worker_is_killed(tmp_path):
+async def test_every_plan_is_scored_once_though_a_worker_is_killed(tmp_path):
     data, plan = _kitchen()
     failing = (SkillCall(Skill.PICK_UP, object_index=99),)
     digest = bundle_digest(data)

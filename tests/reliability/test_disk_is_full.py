@@ -1,4 +1,4 @@
-"""The manager's disk runs full in the middle of a batch: nothing is lost, and it goes on when there is room again."""
+"""The manager's disk fills up during a batch: no result is lost, and the batch continues once there is space."""
 
 import asyncio
 import resource

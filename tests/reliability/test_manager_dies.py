@@ -1,4 +1,4 @@
-"""A4: the manager is killed in the middle of a batch. Nothing is lost, nothing comes twice, nothing alive runs twice."""
+"""A4: the manager is killed during a batch. No result is lost or duplicated, and live rollouts are not repeated."""
 
 import asyncio
 import signal
@@ -53,18 +53,18 @@ async def killed_in_the_middle(folder, *, count, task, kill_at, away_s, grace_s)
         assert stats.delivered == count
 
 
-async def test_a_killed_manager_goes_on_and_nothing_alive_is_executed_again(tmp_path):
+async def test_killed_manager_resumes_without_repeating_live_rollouts(tmp_path):
     # As many as the two workers hold: nobody has to wait for the grace to end.
     await killed_in_the_middle(tmp_path, count=10, task="slow", kill_at=2, away_s=0.1, grace_s=15.0)
 
 
 @pytest.mark.slow
-async def test_a_manager_that_was_away_for_five_seconds_finds_what_was_finished_meanwhile(tmp_path):
+async def test_restarted_manager_receives_results_finished_meanwhile(tmp_path):
     await killed_in_the_middle(tmp_path, count=400, task="brief", kill_at=100, away_s=5.0, grace_s=8.0)
 
 
 @pytest.mark.slow
-async def test_a_batch_goes_on_though_its_trainer_does_not_ask(tmp_path):
+async def test_batch_continues_without_its_trainer(tmp_path):
     with RealCluster(tmp_path, restart_grace_s=0.5) as cluster:
         cluster.start_manager()
         cluster.start_worker("w1")
@@ -86,7 +86,7 @@ async def test_a_batch_goes_on_though_its_trainer_does_not_ask(tmp_path):
         assert counted.clean
 
 
-async def test_a_manager_that_stood_still_gives_no_worker_up_for_its_own_silence(tmp_path):
+async def test_suspended_manager_loses_no_worker(tmp_path):
     async with two_workers(tmp_path, lost_after_s=2.0) as (cluster, client):
         batch = batch_of(await opened(client), 40, "slow")
         running = asyncio.create_task(outcomes(client, batch))

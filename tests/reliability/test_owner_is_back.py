@@ -1,4 +1,4 @@
-"""A spare PC whose owner comes back in the middle of a batch: real processes, and a real terminal's time of access."""
+"""A spare PC whose owner returns during a batch, with real processes and a real terminal."""
 
 import asyncio
 
@@ -21,7 +21,7 @@ async def _until_standing(client, name, expected, limit_s=60.0):
             await asyncio.sleep(0.05)
 
 
-async def test_a_worker_whose_owner_comes_back_pauses_and_goes_on_later_and_nothing_is_lost(tmp_path):
+async def test_worker_pauses_for_its_owner_and_resumes_without_loss(tmp_path):
     with RealCluster(tmp_path) as cluster:
         cluster.start_manager()
         cluster.start_worker("spare", idle_s=3.0, grace_s=0.2, calm_s=0.2, check_s=0.1)

@@ -1,4 +1,4 @@
-"""A6: the line between a worker and the manager is cut, in either direction or in both, for a while or for long."""
+"""A6: network partitions between worker and manager, in one or both directions."""
 
 import asyncio
 import re
@@ -40,7 +40,7 @@ async def cut_while_it_runs(cluster, directions, *, count, task, cut_s, other):
 
 @DIRECTIONS
 @pytest.mark.slow
-async def test_a_short_cut_costs_time_and_nothing_else(tmp_path, directions):
+async def test_short_partition_loses_nothing(tmp_path, directions):
     with RealCluster(tmp_path) as cluster:
         counted, stats, lost_s = await cut_while_it_runs(
             cluster, directions, count=60, task="slow", cut_s=5.0, other=""
@@ -76,7 +76,7 @@ async def cut_for_long(folder, directions, *, cut_s, **settings):
         return stats
 
 
-async def test_what_runs_behind_a_long_cut_is_given_to_another_and_comes_once(tmp_path):
+async def test_rollout_on_partitioned_worker_is_redispatched_once(tmp_path):
     both = (TO_MANAGER, TO_WORKER)
     stats = await cut_for_long(tmp_path, both, cut_s=4.0, heartbeat_s=0.2, lost_after_s=1.0)
     assert stats.stale_results == 2
@@ -84,14 +84,14 @@ async def test_what_runs_behind_a_long_cut_is_given_to_another_and_comes_once(tm
 
 @DIRECTIONS
 @pytest.mark.slow
-async def test_what_runs_behind_a_cut_of_a_minute_is_given_to_another_and_comes_once(tmp_path, directions):
+async def test_rollout_on_worker_partitioned_for_a_minute_is_redispatched_once(tmp_path, directions):
     stats = await cut_for_long(tmp_path, directions, cut_s=60.0)
     # Where the worker hears that it was given up it stops; else its results come late and are fenced.
     assert stats.stale_results in (0, 2)
 
 
 @pytest.mark.slow
-async def test_a_worker_that_cannot_renew_its_leases_stops_what_it_runs(tmp_path):
+async def test_worker_stops_leases_that_it_cannot_renew(tmp_path):
     settings = {"heartbeat_s": 0.2, "lost_after_s": 1.5, "lease_ttl_s": 4.0}
     with RealCluster(tmp_path, **settings) as cluster:
         counted, stats, _ = await cut_while_it_runs(

@@ -1,4 +1,4 @@
-"""A7 and A16: a trainer that dies reads what was missed, and faults change no advantage of a group that is complete."""
+"""A7 and A16: a restarted trainer reads missed results, and faults change no advantage of a complete group."""
 
 import pytest
 import torch
@@ -21,7 +21,7 @@ from embomatrix.trainer.grpo.objective import group_advantages
 pytestmark = [pytest.mark.timeout(240), pytest.mark.slow]
 
 
-async def test_a_trainer_that_was_killed_is_replaced_and_reads_everything_without_anything_running_again(
+async def test_restarted_trainer_reads_all_results_without_repeats(
     tmp_path,
 ):
     with RealCluster(tmp_path) as cluster:
@@ -46,7 +46,7 @@ async def test_a_trainer_that_was_killed_is_replaced_and_reads_everything_withou
         assert set(cluster.executed().values()) == {1}
 
 
-async def test_advantages_of_complete_groups_are_those_of_a_run_without_faults(tmp_path):
+async def test_faults_do_not_change_advantages_of_complete_groups(tmp_path):
     async with two_workers(tmp_path, restart_grace_s=8.0) as (cluster, client):
         await opened(client, "quiet")
         await opened(client, "faulty")

@@ -1,4 +1,4 @@
-"""A8: two managers on one Redis. One dispatches; the other takes over when it dies, and what it wrote before is all there."""
+"""A8: two managers on one Redis. The standby takes over with the full state."""
 
 import asyncio
 import signal
@@ -91,12 +91,12 @@ async def test_another_manager_takes_over_within_ten_seconds_at_the_default_sett
 
 
 @pytest.mark.slow
-async def test_a_leader_that_is_stopped_in_order_hands_over_at_once(tmp_path):
+async def test_orderly_stopped_leader_hands_over_at_once(tmp_path):
     await failed_over(tmp_path, count=10, kill_at=2, ttl_s=30.0, number=signal.SIGTERM)
 
 
 @pytest.mark.slow
-async def test_a_leader_that_was_frozen_is_refused_by_the_store_and_ends(tmp_path):
+async def test_frozen_leader_is_fenced_and_exits(tmp_path):
     with (
         RedisServer(tmp_path / "redis", free_port()) as redis,
         RealCluster(tmp_path, state=redis.url, leader_ttl_s=1.0) as cluster,
@@ -120,7 +120,7 @@ async def test_a_leader_that_was_frozen_is_refused_by_the_store_and_ends(tmp_pat
 
 
 @pytest.mark.slow
-async def test_a_manager_that_stands_by_names_the_leader(tmp_path):
+async def test_standby_names_the_leader(tmp_path):
     with RealCluster(tmp_path, leader_ttl_s=60.0) as cluster:
         cluster.start_manager("first")
         await leads(cluster, "first")

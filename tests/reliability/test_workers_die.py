@@ -1,4 +1,4 @@
-"""A1 and A2: runs without faults, and runs whose workers are killed again and again."""
+"""A1 and A2: runs without faults, and runs with repeatedly killed workers."""
 
 import asyncio
 import contextlib
@@ -26,7 +26,7 @@ WORKERS = 10
 ROLLOUTS = 20_000
 
 
-async def test_where_nothing_dies_hardly_anything_is_executed_twice(tmp_path):
+async def test_fault_free_runs_repeat_hardly_any_rollout(tmp_path):
     batches, size = 20, 43
     async with two_workers(tmp_path) as (cluster, client):
         run_id = await opened(client)
@@ -81,7 +81,7 @@ async def soak(folder, *, killing):
 
 
 @pytest.mark.slow
-async def test_twenty_thousand_rollouts_have_one_outcome_each_also_while_workers_are_killed(tmp_path):
+async def test_twenty_thousand_rollouts_have_one_outcome_each_while_workers_are_killed(tmp_path):
     (tmp_path / "quiet").mkdir()
     (tmp_path / "killing").mkdir()
     counted, _, quiet_s, _, _ = await soak(tmp_path / "quiet", killing=False)
@@ -103,7 +103,7 @@ async def test_twenty_thousand_rollouts_have_one_outcome_each_also_while_workers
 
 
 @pytest.mark.slow
-async def test_daemons_that_are_killed_again_and_again_cost_no_rollout(tmp_path):
+async def test_repeatedly_killed_daemons_lose_no_rollout(tmp_path):
     with RealCluster(tmp_path, max_attempts=10) as cluster:
         cluster.start_manager()
         for name in ("w1", "w2", "w3"):

@@ -1,4 +1,4 @@
-"""A9 and A11: a second worker under a name that is taken, and workers that are told to leave while they are at work."""
+"""A9 and A11: two workers of one name, and workers that drain during work."""
 
 import asyncio
 import signal
@@ -20,7 +20,7 @@ from tests.fakes.real_cluster import (
 pytestmark = [pytest.mark.timeout(240), pytest.mark.slow]
 
 
-async def test_of_two_workers_of_one_name_the_older_stops_and_no_rollout_comes_twice(tmp_path):
+async def test_older_of_two_workers_with_one_name_stops(tmp_path):
     with RealCluster(tmp_path) as cluster:
         cluster.start_manager()
         cluster.start_worker("w1")
@@ -45,7 +45,7 @@ async def test_of_two_workers_of_one_name_the_older_stops_and_no_rollout_comes_t
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-async def test_a_worker_that_is_told_to_leave_finishes_what_it_runs(tmp_path, number):
+async def test_draining_worker_finishes_its_leases(tmp_path, number):
     async with two_workers(tmp_path) as (cluster, client):
         batch = batch_of(await opened(client), 40, "slow")
         running = asyncio.create_task(outcomes(client, batch))
@@ -66,7 +66,7 @@ async def test_a_worker_that_is_told_to_leave_finishes_what_it_runs(tmp_path, nu
         assert {result.attempt for result in results} == {1}
 
 
-async def test_a_second_signal_ends_a_worker_at_once_and_others_do_its_work(tmp_path):
+async def test_second_signal_ends_a_worker_at_once(tmp_path):
     with RealCluster(tmp_path) as cluster:
         cluster.start_manager()
         cluster.start_worker("w1")

@@ -1,4 +1,4 @@
-"""A17: a worker that makes results up is found out by others that execute the same, before anybody gets to see them."""
+"""A17: audits find a worker that fabricates results before they are delivered."""
 
 import asyncio
 
@@ -12,7 +12,7 @@ HONEST = ("w1", "w2", "w3")
 LIAR = "liar"
 
 
-async def test_a_worker_that_lies_on_a_tenth_is_shut_out_and_what_it_made_up_is_never_delivered(tmp_path):
+async def test_lying_worker_is_quarantined_before_any_false_result_is_delivered(tmp_path):
     batch = batch_of("run", 400, "graded")
     # Nobody is lucky for so long: 0.9^100 is 3 in 100,000.
     with RealCluster(tmp_path, audit_probation=100) as cluster:
@@ -44,7 +44,7 @@ async def test_a_worker_that_lies_on_a_tenth_is_shut_out_and_what_it_made_up_is_
         assert f"worker quarantined worker={LIAR}" in cluster.log("manager")
 
 
-async def test_one_worker_alone_is_not_audited_and_the_manager_says_so_once(tmp_path):
+async def test_single_worker_is_not_audited_with_one_warning(tmp_path):
     batch = batch_of("run", 20)
     with RealCluster(tmp_path) as cluster:
         cluster.start_manager()

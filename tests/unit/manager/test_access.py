@@ -1,4 +1,4 @@
-"""Who may call what: the table of roles, and the life of tokens as a state machine."""
+"""Roles of methods, and the life of tokens."""
 
 import itertools
 from dataclasses import dataclass
@@ -33,13 +33,13 @@ def methods():
     }
 
 
-def test_every_method_of_every_service_says_who_may_call_it():
+def test_every_method_has_roles():
     ours = {method for method in ROLES if "/embomatrix." in method}
     assert ours == methods()
     assert {method for method in OPEN if "/embomatrix." in method} <= ours
 
 
-def test_an_admin_may_call_everything_that_is_named_and_nobody_what_is_not():
+def test_admins_may_call_every_listed_method_and_nobody_others():
     assert all(may_call(AccessRole.ADMIN, method) for method in ROLES)
     assert not any(may_call(role, "/embomatrix.proto.v1.AdminService/DropEverything") for role in AccessRole)
 
@@ -71,7 +71,7 @@ def issued(book, role, *, valid_s=0.0, now_s=0.0, label=""):
     return credential, token
 
 
-def test_a_token_is_known_by_its_hash_alone_and_survives_being_written_down():
+def test_tokens_are_stored_as_hashes_and_survive_a_round_trip():
     book = book_of()
     credential, token = issued(book, AccessRole.TRAINER, label="ann")
     row = credential.row()
@@ -83,7 +83,7 @@ def test_a_token_is_known_by_its_hash_alone_and_survives_being_written_down():
 @pytest.mark.parametrize(
     "wrong", ["", "id1", "id1.", ".secret1", "id1.secret2", "other.secret1", "id1.secret1.x", "ö.ü"]
 )
-def test_a_token_that_is_not_exactly_right_is_none(wrong):
+def test_inexact_tokens_are_refused(wrong):
     book = book_of()
     issued(book, AccessRole.TRAINER)
     with pytest.raises(NotSignedInError, match="missing or unknown token"):
@@ -106,7 +106,7 @@ def test_expired_and_revoked_tokens_say_so():
     assert book.infos(now_s=HOUR) == ()
 
 
-def test_a_token_to_join_is_good_for_a_day_at_most():
+def test_join_token_is_valid_for_one_day_at_most():
     book = book_of()
     assert book.issue(AccessRole.JOIN, valid_s=0.0, label="", now_s=5.0)[0].expires_s == 5.0 + LONGEST_JOIN_S
     for seconds in (LONGEST_JOIN_S + 1, -1.0, float("inf"), float("nan")):
@@ -120,7 +120,7 @@ def joined(book, join, worker_id="w1", boot_id="b1", now_s=0.0):
     return changed[0], token
 
 
-def test_a_token_to_join_is_changed_once_for_a_credential_of_one_worker():
+def test_join_token_is_exchanged_once_for_a_worker_credential():
     book = book_of()
     join, _ = issued(book, AccessRole.JOIN)
     own, token = joined(book, join)
@@ -132,7 +132,7 @@ def test_a_token_to_join_is_changed_once_for_a_credential_of_one_worker():
             book.redeem(used, worker_id, boot_id, now_s=0.0)
 
 
-def test_a_lost_answer_to_a_join_is_given_again_to_the_same_process_and_voids_the_first():
+def test_same_process_may_repeat_a_join():
     book = book_of()
     join, join_token = issued(book, AccessRole.JOIN)
     _, lost = joined(book, join)
@@ -142,7 +142,7 @@ def test_a_lost_answer_to_a_join_is_given_again_to_the_same_process_and_voids_th
     assert book.find(token, now_s=0.0).worker_id == "w1"
 
 
-def test_a_name_belongs_to_whoever_joined_under_it():
+def test_worker_name_belongs_to_its_first_machine():
     book = book_of()
     own, _ = joined(book, issued(book, AccessRole.JOIN)[0])
     fleet, _ = issued(book, AccessRole.WORKER)
@@ -156,7 +156,7 @@ def test_a_name_belongs_to_whoever_joined_under_it():
     book.check_name(fleet.token_id, "", "w2")
 
 
-def test_a_revoked_worker_comes_back_only_by_joining_anew():
+def test_revoked_worker_must_join_again():
     book = book_of()
     _, token = joined(book, issued(book, AccessRole.JOIN)[0])
     book.keep(*book.revoke_worker("w1", "its results were wrong"))

@@ -5,7 +5,7 @@ from dataclasses import replace
 from tests.fakes.worker import completed
 
 from embomatrix.manager.control.reputation import Auditor, AuditRules, Reputation, Ruling, judge, opinion_of
-from embomatrix.manager.runtime.serialization import repute_of, repute_row
+from embomatrix.manager.runtime.serialization import reputation_of, reputation_row
 from embomatrix.reward.breakdown import AtomResult
 
 SAME = {"platform": "a1", "pybullet": "3.2.7"}
@@ -46,10 +46,10 @@ def test_changed_reputation_is_stored_without_open_disputes():
     auditor.agreed("w1")
     auditor.of("w1").disputed += 1
     auditor.convict("w2", "it contradicts w1 and w3")
-    written = [repute_row(worker_id, auditor.of(worker_id)) for worker_id in auditor.take_changed()]
+    written = [reputation_row(worker_id, auditor.of(worker_id)) for worker_id in auditor.take_changed()]
     assert auditor.take_changed() == []
     successor = Auditor(AuditRules(probation=2), b"key")
-    successor.know({row.key: repute_of(row) for row in written})
+    successor.know({row.key: reputation_of(row) for row in written})
     assert successor.of("w1") == Reputation(taken=1, agreed=1, audited=1)
     assert successor.quarantined("w2") == "it contradicts w1 and w3"
     assert successor.take_changed() == []

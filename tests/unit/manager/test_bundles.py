@@ -1,4 +1,4 @@
-"""The folder of bundles: bounded, and never without what somebody needs."""
+"""Bounded folder of bundles that keeps needed ones."""
 
 import hashlib
 import os
@@ -21,7 +21,7 @@ class Folder:
         self.needed = set()
         self.path = path
         self.store = BundleStore(path, total_bytes=3 * SIZE, keep_s=keep_s, clock=lambda: self.now_s)
-        self.store.keep(lambda: {digest_of(name) for name in self.needed})
+        self.store.protect(lambda: {digest_of(name) for name in self.needed})
 
     async def put(self, name, after_s=100.0):
         self.now_s += after_s
@@ -56,33 +56,33 @@ async def full(tmp_path):
     return folder
 
 
-async def test_a_full_folder_lets_the_longest_unused_go(full):
+async def test_full_folder_deletes_the_least_recently_used(full):
     await full.put("d")
     assert full.there() == "bcd"
 
 
-async def test_what_is_asked_for_counts_as_used(full):
+async def test_requested_bundle_counts_as_used(full):
     full.now_s += 50
     assert full.store.missing([digest_of("a"), digest_of("f")]) == [digest_of("f")]
     await full.put("d")
     assert full.there() == "acd"
 
 
-async def test_what_is_fetched_counts_as_used(full):
+async def test_fetched_bundle_counts_as_used(full):
     full.now_s += 50
     assert b"".join([chunk async for chunk in full.store.get(digest_of("a"))]) == content_of("a")
     await full.put("d")
     assert full.there() == "acd"
 
 
-async def test_what_somebody_needs_stays_however_long_it_was_not_used(full):
+async def test_needed_bundles_are_never_deleted(full):
     full.needed = {"a", "b"}
     await full.put("d")
     await full.put("e")
     assert full.there() == "abe"
 
 
-async def test_a_folder_full_of_what_is_needed_refuses_and_keeps_everything(full):
+async def test_folder_full_of_needed_bundles_refuses_new_ones(full):
     full.needed = set("abc")
     with pytest.raises(OverloadedError, match="needed or were used recently"):
         await full.put("d")
@@ -92,7 +92,7 @@ async def test_a_folder_full_of_what_is_needed_refuses_and_keeps_everything(full
     assert full.there() == "bcd"
 
 
-async def test_what_was_used_lately_is_not_deleted(full):
+async def test_recently_used_bundles_are_not_deleted(full):
     await full.put("d", after_s=0.0)
     await full.put("e", after_s=0.0)
     with pytest.raises(OverloadedError):
@@ -100,7 +100,7 @@ async def test_what_was_used_lately_is_not_deleted(full):
     assert full.there() == "cde"
 
 
-async def test_what_was_left_half_written_by_a_killed_manager_goes_at_the_next_start(tmp_path):
+async def test_incomplete_files_are_deleted_at_start(tmp_path):
     old, young = tmp_path / "incoming-old", tmp_path / "incoming-young"
     for path, at_s in ((old, 1_000_000.0 - 3600), (young, 1_000_000.0 - 1)):
         path.write_bytes(b"half")

@@ -1,4 +1,4 @@
-"""The log of runs: bounded, whole where it can be, and honest about what it dropped."""
+"""Run history log: bounds, completeness, and dropped events."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ def lease(number, run_id="r1"):
     )
 
 
-def test_a_busy_run_drops_its_own_oldest_events_and_counts_them():
+def test_busy_run_drops_its_own_oldest_events_and_counts_them():
     told = chronicle("busy", "quiet")
     for number in range(EVENTS_KEPT):
         told.leased(lease(number, "busy"), now_s=2.0)
@@ -48,7 +48,7 @@ def test_a_busy_run_drops_its_own_oldest_events_and_counts_them():
     assert told.page("quiet", 0).dropped == 0
 
 
-def test_every_run_keeps_something_however_many_there_are():
+def test_every_run_keeps_a_minimum_of_events():
     told = chronicle(*(f"r{number}" for number in range(2 * EVENTS_KEPT // LEAST_KEPT)))
     for number in range(2 * LEAST_KEPT):
         told.leased(lease(number), now_s=2.0)
@@ -66,7 +66,7 @@ def test_pages_of_a_log_come_one_after_the_other():
     assert told.page("another", 0) is None
 
 
-def test_a_lease_of_a_run_that_was_closed_is_left_out():
+def test_leases_of_closed_runs_are_not_logged():
     told = chronicle("r1")
     told.close_run("r1", now_s=2.0)
     told.leased(lease(1), now_s=3.0)
@@ -80,7 +80,7 @@ def live(command):
     return {command.ref.lease_id: LeaseRecord(command.ref, "w1", record, 2.0, 30.0, 60.0)}
 
 
-def test_a_hedge_is_won_when_its_own_result_comes():
+def test_hedge_is_won_by_its_own_result():
     told = chronicle("r1")
     first, second = lease(1), replace(lease(2), hedge=True)
     for command in (first, second):
@@ -92,7 +92,7 @@ def test_a_hedge_is_won_when_its_own_result_comes():
     assert told.hedges_won == 1
 
 
-def test_results_of_leases_that_are_not_live_are_nobodys():
+def test_results_of_dead_leases_are_not_logged():
     told = chronicle("r1")
     told.reported("w1", [LeaseResult(LeaseRef("l1", 1), completed())], {}, now_s=3.0)
     told.reported("w2", [LeaseResult(lease(1).ref, completed())], live(lease(1)), now_s=3.0)
@@ -108,7 +108,7 @@ def test_phases_of_a_lease_add_up_to_its_life():
     assert (event.slot, event.held_s, event.attempt) == (3, 1.2, 1)
 
 
-def test_scenes_are_told_when_they_change_and_not_before():
+def test_scene_events_are_logged_on_change_only():
     told = chronicle()
     loading = Resident("a", ResidentState.LOADING)
     warm = Resident("a", ResidentState.WARM, load_s=0.5)
@@ -130,7 +130,7 @@ def summary(run_id):
     return RunSummary(run, {}, (), RunSeries(1.0, (), ()), (), 0.0, nothing, nothing, 0, "1")
 
 
-async def test_the_archive_keeps_the_latest_and_passes_over_what_is_damaged(tmp_path):
+async def test_archive_keeps_the_latest_runs_and_skips_damaged_files(tmp_path):
     archive = RunArchive(tmp_path / "runs", kept=3)
     for number in range(5):
         await archive.keep(summary(f"r{number}"), chronicle("r").page("r", 0).events)

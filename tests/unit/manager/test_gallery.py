@@ -1,4 +1,4 @@
-"""A dataset on the dashboard: found by words, shown with its plan, and never a way to a file beside it."""
+"""Dataset pages of the dashboard, and their file access limits."""
 
 import json
 from dataclasses import replace
@@ -8,7 +8,7 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
-from embomatrix.manager.web.floor_plan import floor_plan, played, small_things
+from embomatrix.manager.web.floor_plan import floor_plan, moments_of, movable_objects
 from embomatrix.manager.web.gallery import Gallery
 from embomatrix.manager.web.gallery_values import SceneName
 from embomatrix.manager.web.rest_tasks import NO_DATASET, task_routes
@@ -57,7 +57,7 @@ async def test_tasks_are_found_by_words_and_scene_and_come_in_pages(folder):
     assert (await gallery.page(**{**EVERY, "scene": "elsewhere"})).total == 0
 
 
-async def test_bundles_are_called_by_their_scenes_where_there_is_a_dataset(folder):
+async def test_dataset_names_the_scenes_of_bundles(folder):
     gallery = Gallery(folder)
     assert await gallery.scenes(offset=0, limit=9) == [SceneName(digest_of(folder), SCENE.scene_id)]
     assert await gallery.scenes(offset=1, limit=9) == []
@@ -72,7 +72,7 @@ def test_manager_without_a_dataset_shows_no_tasks():
     assert http.get("/api/v1/tasks/tidy").status_code == 404
 
 
-async def test_a_task_is_shown_with_its_objects_what_was_said_and_its_tree(folder):
+async def test_task_page_shows_objects_transcript_and_tree(folder):
     (folder / "transcripts" / "tidy.md").write_text("**Mia** (need): tidy up")
     (folder / "trees" / "tidy.json").write_text(json.dumps({"kitchen_0": ["apple"]}))
     told = await Gallery(folder).detail("tidy")
@@ -83,7 +83,7 @@ async def test_a_task_is_shown_with_its_objects_what_was_said_and_its_tree(folde
     assert "kitchen_0" in told.rooms
 
 
-async def test_a_name_that_is_a_path_leads_to_no_file(folder):
+async def test_name_that_is_a_path_leads_to_no_file(folder):
     gallery = Gallery(folder)
     assert (await gallery.detail("..")).transcript == ""
     for name in ("../secret.md", "/etc/passwd", "transcripts/tidy", ""):
@@ -94,14 +94,14 @@ async def test_a_name_that_is_a_path_leads_to_no_file(folder):
             await gallery.floor(digest)
 
 
-async def test_a_link_out_of_the_folder_and_a_file_without_end_are_not_read(folder):
+async def test_link_out_of_the_folder_and_a_file_without_end_are_not_read(folder):
     (folder / "transcripts" / "tidy.md").symlink_to(folder.parent / "secret.md")
     (folder / "trees" / "tidy.json").write_text("[" * 400_000)
     told = await Gallery(folder).detail("tidy")
     assert (told.transcript, told.tree) == ("", None)
 
 
-async def test_a_picture_is_a_jpeg_or_none(folder):
+async def test_picture_is_a_jpeg_or_none(folder):
     gallery, digest = Gallery(folder), digest_of(folder)
     with pytest.raises(NotFoundError, match="factory pictures"):
         await gallery.picture(digest)
@@ -114,7 +114,7 @@ async def test_a_picture_is_a_jpeg_or_none(folder):
     assert (await gallery.page(**EVERY)).items[0].picture
 
 
-async def test_a_dataset_that_is_not_there_or_damaged_is_told_in_a_sentence(folder, tmp_path):
+async def test_missing_or_damaged_dataset_is_reported(folder, tmp_path):
     with pytest.raises(UnavailableError, match="--dataset"):
         await Gallery(tmp_path / "nowhere").page(**EVERY)
     gallery = Gallery(folder)
@@ -124,14 +124,14 @@ async def test_a_dataset_that_is_not_there_or_damaged_is_told_in_a_sentence(fold
         await gallery.page(**EVERY)
 
 
-def test_a_plan_carries_what_it_picks_up_to_where_it_is_put():
-    things = small_things(SCENE, TASK)
+def test_plan_moves_picked_objects_to_their_targets():
+    things = movable_objects(SCENE, TASK)
     thing = next(iter(things))
     row = TASK.table.index(thing)
     target = next(name for name in TASK.table if SCENE.by_name[name].fixed)
     to = TASK.table.index(target)
     plan = parse_plan(f"move {row}\npick_up {row}\nmove {to}\nopen {to}\nplace {to} inside\nclose {to}")
-    start, at_thing, carried, moved, opened, placed, closed = played(SCENE, TASK, plan)
+    start, at_thing, carried, moved, opened, placed, closed = moments_of(SCENE, TASK, plan)
     assert (start.held, start.things) == ([], {})
     assert at_thing.robot != start.robot
     assert carried.held == [thing]
@@ -142,7 +142,7 @@ def test_a_plan_carries_what_it_picks_up_to_where_it_is_put():
     assert placed.things[thing] == pytest.approx([x, y], abs=0.01)
 
 
-def test_a_floor_plan_holds_rooms_and_what_stands_in_them():
+def test_floor_plan_holds_rooms_and_objects():
     plan = floor_plan(SCENE)
     assert [room[0] for room in plan.rooms] == [room.name for room in SCENE.rooms]
     names = {piece[0] for piece in plan.pieces}

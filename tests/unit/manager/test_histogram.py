@@ -1,4 +1,4 @@
-"""Durations in buckets: what a person and Prometheus read from them."""
+"""Histogram quantiles and Prometheus buckets."""
 
 import math
 
@@ -23,13 +23,13 @@ def histogram_of(values):
 
 
 @given(durations, st.sampled_from([0.5, 0.95, 0.99]))
-def test_a_quantile_is_right_to_four_percent(values, share):
+def test_quantile_error_is_at_most_four_percent(values, share):
     exact = sorted(values)[max(0, math.ceil(share * len(values)) - 1)]
     assert histogram_of(values).quantile(share) == pytest.approx(exact, rel=0.04)
 
 
 @given(durations)
-def test_what_prometheus_sees_is_exact_but_for_rounding_at_a_bound(values):
+def test_prometheus_buckets_are_exact_up_to_rounding(values):
     assert histogram_of(values).cumulative() == [
         sum(value <= bound_s for value in values) for bound_s in BOUNDS_S
     ]
@@ -43,16 +43,16 @@ def test_merging_loses_nothing(first, second):
 
 
 @pytest.mark.parametrize("value", [0.0, -1e-9, 1e9])
-def test_a_duration_beyond_the_buckets_is_counted_at_their_end(value):
+def test_duration_beyond_the_buckets_is_counted_at_their_end(value):
     assert sum(histogram_of([value]).counts) == 1
 
 
-def test_nothing_has_no_quantile():
+def test_empty_histogram_has_quantile_zero():
     assert Histogram().quantile(0.99) == 0.0
 
 
 @given(st.lists(st.floats(0.0, 1e5), max_size=50))
-def test_a_series_keeps_every_count_in_bounded_memory(times):
+def test_series_keeps_every_count_in_bounded_memory(times):
     series = Series(10.0)
     for at_s in sorted(times):
         series.count(10.0 + at_s, completed=2, failed=1)

@@ -1,4 +1,4 @@
-"""What the manager keeps: result logs, bundles, figures; and the settings it is started with."""
+"""Result logs, bundles, figures and settings of the manager."""
 
 import asyncio
 import dataclasses
@@ -33,7 +33,7 @@ def rows(first, last):
     return [ResultRow(cursor, f"x{cursor}", b"") for cursor in range(first, last + 1)]
 
 
-async def test_a_reader_waits_for_results_and_ends_with_the_batch():
+async def test_reader_waits_for_results_and_ends_with_the_batch():
     log = BatchLog("r1", "b1", "d")
     reader = asyncio.create_task(log.after(0))
     await asyncio.sleep(0)
@@ -55,13 +55,13 @@ async def test_results_of_a_batch_are_yielded_until_it_ends():
     assert sent == [rows(1, 2), rows(3, 4)]
 
 
-async def test_a_message_holds_a_bounded_number_of_results():
+async def test_message_holds_a_bounded_number_of_results():
     log = BatchLog("r1", "b1", "d", rows(1, PER_MESSAGE + 1))
     assert await log.after(0) == rows(1, PER_MESSAGE)
     assert await log.after(PER_MESSAGE) == rows(PER_MESSAGE + 1, PER_MESSAGE + 1)
 
 
-def test_a_group_ends_with_its_last_result_from_whatever_cursor_one_reads():
+def test_group_ends_with_its_last_result_from_any_cursor():
     log = BatchLog("r1", "b1", "d", groups={"g1": 3, "g2": 1})
     outcomes = (("g1", Completed), ("g2", Cancelled), ("g1", InfraFailure), ("g1", Completed))
     for cursor, (group_id, kind) in enumerate(outcomes, start=1):
@@ -71,7 +71,7 @@ def test_a_group_ends_with_its_last_result_from_whatever_cursor_one_reads():
     assert log.ends.among(rows(3, 3)) == []
 
 
-def test_a_row_tells_how_long_its_delivery_took_beside_what_it_told():
+def test_delivery_time_is_added_to_the_row():
     result = RolloutResult("x1", "g1", 1, 1, completed())
     row = timed_row(result_row(result), 0.25)
     told = rollout_result_from_proto(RolloutResultMessage.FromString(row.payload))
@@ -80,7 +80,7 @@ def test_a_row_tells_how_long_its_delivery_took_beside_what_it_told():
     assert group_and_kind(row) == ("g1", Completed)
 
 
-async def test_a_dropped_log_lets_its_readers_go():
+async def test_dropped_log_ends_its_readers():
     log = BatchLog("r1", "b1", "d")
     reader = asyncio.create_task(log.after(0))
     await asyncio.sleep(0)
@@ -88,7 +88,7 @@ async def test_a_dropped_log_lets_its_readers_go():
     assert await reader == []
 
 
-async def test_finished_logs_go_when_old_or_too_many():
+async def test_old_or_excess_finished_logs_are_discarded():
     logs = ResultLogs(ttl_s=100, limit=25)
     for name, finished_s in (("old", 0.0), ("mid", 60.0), ("new", 70.0)):
         log = BatchLog("r1", name, "d", rows(1, 10))
@@ -113,7 +113,7 @@ def packed(content):
     return zlib.compress(content, level=0)
 
 
-async def test_a_bundle_appears_only_when_its_digest_is_right(tmp_path):
+async def test_bundle_appears_only_when_its_digest_is_right(tmp_path):
     store = BundleStore(tmp_path, total_bytes=1000)
     data = packed(b"something")
     with pytest.raises(InvalidRequestError, match="expected sha256:"):
@@ -123,14 +123,14 @@ async def test_a_bundle_appears_only_when_its_digest_is_right(tmp_path):
     assert b"".join([part async for part in store.get(digest_of(data))]) == data
 
 
-async def test_a_bundle_damaged_on_disk_is_asked_for_again(tmp_path):
+async def test_damaged_bundle_is_requested_again(tmp_path):
     store = BundleStore(tmp_path, total_bytes=1000)
     data = packed(b"content")
     digest = digest_of(data)
     await store.put(digest, pieces(data))
-    assert await store.lacking([digest, digest]) == []
+    assert await store.missing_or_damaged([digest, digest]) == []
     next(tmp_path.iterdir()).write_bytes(b"contemt")
-    assert await store.lacking([digest, digest]) == [digest]
+    assert await store.missing_or_damaged([digest, digest]) == [digest]
     assert list(tmp_path.iterdir()) == []
 
 
@@ -151,9 +151,7 @@ async def counted(data, size, taken):
     ],
     ids=["noise", "too large", "bomb", "cut short", "too long"],
 )
-async def test_what_no_worker_would_take_is_refused_before_it_is_whole(
-    tmp_path, data, sentence, pieces_taken
-):
+async def test_unloadable_bundle_is_refused_during_upload(tmp_path, data, sentence, pieces_taken):
     store, taken = BundleStore(tmp_path, total_bytes=100 * MIB), []
     with pytest.raises(InvalidRequestError, match=sentence):
         await store.put(digest_of(data), counted(data, MIB, taken))
@@ -163,27 +161,27 @@ async def test_what_no_worker_would_take_is_refused_before_it_is_whole(
         decode_bundle(data)
 
 
-async def test_a_full_folder_takes_no_more(tmp_path):
+async def test_full_folder_refuses_bundles(tmp_path):
     store = BundleStore(tmp_path, total_bytes=70)
     await store.put(digest_of(packed(b"a" * 40)), pieces(packed(b"a" * 40)))
     with pytest.raises(OverloadedError, match="no room"):
         await store.put(digest_of(packed(b"b" * 40)), pieces(packed(b"b" * 40)))
 
 
-async def test_a_folder_that_is_gone_is_named(tmp_path):
+async def test_missing_folder_is_named(tmp_path):
     store = BundleStore(tmp_path / "bundles", total_bytes=50)
     (tmp_path / "bundles").rmdir()
     with pytest.raises(OverloadedError, match=r"bundles can't be written \(No such file or directory\)"):
         await store.put(digest_of(b"a"), pieces(b"a"))
 
 
-async def test_a_bundle_that_was_never_put_is_not_found(tmp_path):
+async def test_unknown_bundle_is_not_found(tmp_path):
     store = BundleStore(tmp_path, total_bytes=1000)
     with pytest.raises(NotFoundError, match="upload it first"):
         await anext(store.get(digest_of(b"nothing")))
 
 
-def test_the_meter_counts_outcomes_and_keeps_reasons():
+def test_meter_counts_outcomes_and_keeps_reasons():
     meter = Meter()
     failure = InfraFailure(InfraCode.SLOT_CRASHED, "signal 11", "w1")
     for cursor, outcome in enumerate([completed(), completed(), failure, Cancelled()]):
@@ -207,7 +205,7 @@ def test_unknown_settings_are_refused_and_the_token_is_never_shown():
     assert "secret" not in repr(ManagerSettings(token="secret"))
 
 
-def test_the_state_lies_in_the_data_folder_unless_told_otherwise():
+def test_state_file_is_in_the_data_folder_by_default():
     assert ManagerSettings(data_dir=Path("/d")).state_url == "sqlite:/d/state.sqlite"
     assert ManagerSettings(state="memory:").state_url == "memory:"
 
@@ -232,7 +230,7 @@ def test_bad_options_get_one_sentence_and_status_2(arguments, sentence, tmp_path
     assert "Traceback" not in result.output
 
 
-def test_a_data_folder_that_is_a_file_is_explained(tmp_path):
+def test_data_folder_that_is_a_file_is_explained(tmp_path):
     (tmp_path / "file").write_text("")
     result = CliRunner().invoke(
         app, ["serve", "--data-dir", str(tmp_path / "file"), "--port", "0", "--http-port", "0"]
@@ -241,7 +239,7 @@ def test_a_data_folder_that_is_a_file_is_explained(tmp_path):
     assert "--data-dir" in result.output
 
 
-def test_asking_a_manager_that_is_not_there_says_how_to_start_one():
+def test_unreachable_manager_error_names_the_serve_command():
     result = CliRunner().invoke(app, ["token", "list", "--address", "127.0.0.1:1"])
     assert result.exit_code == 2
     assert "embomatrix manager serve" in result.output

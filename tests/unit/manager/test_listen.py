@@ -1,4 +1,4 @@
-"""A port that can't be had is a sentence with the option to change; secrets of a state URL are not shown."""
+"""Ports that cannot be bound, and masked passwords in state URLs."""
 
 import socket
 
@@ -8,7 +8,7 @@ from embomatrix.manager.services.listen import PortInUseError, bound_socket
 from embomatrix.rpc.logs import without_secrets
 
 
-def test_free_port_is_bound_and_given_back():
+def test_free_port_is_bound_and_released():
     with bound_socket("127.0.0.1", 0) as first:
         port = first.getsockname()[1]
     with bound_socket("127.0.0.1", port) as again:

@@ -1,4 +1,4 @@
-"""The table of metrics in the operator's guide is the code's."""
+"""The operator guide lists exactly the exported metrics."""
 
 import re
 from pathlib import Path
@@ -28,7 +28,7 @@ async def page(tmp_path):
     return metrics_page(runtime)
 
 
-async def test_every_metric_stands_in_the_guide_with_its_labels_and_no_other(page):
+async def test_documented_metrics_equal_the_exported_ones(page):
     found = re.findall(
         r"^\| `(embo_\w+)` \|([^|]*)\| [^|]+\| [^|]+ \|$", GUIDE.read_text(), flags=re.MULTILINE
     )
@@ -39,13 +39,13 @@ async def test_every_metric_stands_in_the_guide_with_its_labels_and_no_other(pag
         assert names == set(re.findall(r"`(\w+)`", labels)), name
 
 
-async def test_every_state_and_outcome_is_told_before_it_first_happens(page):
+async def test_every_state_and_outcome_has_an_initial_sample(page):
     assert 'embo_slots{state="quarantined"} 0.0' in page
     assert 'embo_rollouts_total{outcome="slot_crashed"} 0.0' in page
     assert 'embo_hedges_total{won="true"} 0.0' in page
 
 
-def test_overhead_is_of_the_last_minute():
+def test_overhead_covers_the_last_minute():
     effort = ManagerLoad()
     effort.sample(0.0, 0.0, 0.0)
     assert effort.overhead() == 0.0
@@ -56,7 +56,7 @@ def test_overhead_is_of_the_last_minute():
     assert effort.overhead() == pytest.approx(0.1)
 
 
-async def test_a_store_is_timed_by_operation_and_otherwise_the_same():
+async def test_store_operations_are_timed():
     took = []
     store = timed_store(open_store("memory:"), lambda name, seconds: took.append((name, seconds >= 0.0)))
     assert await store.runs() == []

@@ -1,4 +1,4 @@
-"""With what a manager may start: certificates that fit, and tokens where they are needed; and what `init` makes of a folder."""
+"""Required protection at start, and the files of `manager init`."""
 
 from datetime import UTC, datetime, timedelta
 
@@ -46,7 +46,7 @@ def test_beyond_loopback_both_are_needed(tmp_path, host, where):
     assert "127.0.0.1" in found.tls.names
 
 
-def test_certificates_of_ones_own_need_tokens_beside_them(tmp_path):
+def test_own_certificates_need_tokens_too(tmp_path):
     prepare(tmp_path / "own", sans=("lab.example",))
     folder = AccessFolder(tmp_path / "own")
     own = {"tls_cert": folder.server, "tls_key": folder.server_key, "tls_ca": folder.ca}
@@ -56,7 +56,7 @@ def test_certificates_of_ones_own_need_tokens_beside_them(tmp_path):
     assert found.tls.authority == folder.ca.read_bytes()
 
 
-def test_a_key_of_another_certificate_is_told(tmp_path):
+def test_key_of_another_certificate_is_refused(tmp_path):
     for name in ("one", "two"):
         prepare(tmp_path / name, sans=())
     one, two = AccessFolder(tmp_path / "one"), AccessFolder(tmp_path / "two")
@@ -68,7 +68,7 @@ def test_a_key_of_another_certificate_is_told(tmp_path):
         protection_of(settings(tmp_path, tls_cert=one.server, tls_key=one.server_key, tls_ca=one.hashes))
 
 
-def test_an_expired_certificate_is_told_and_init_renews_it_under_the_same_authority(tmp_path):
+def test_expired_certificate_is_refused_and_init_renews_it(tmp_path):
     prepare(tmp_path, sans=("lab.example",), now=NOW - timedelta(days=3000))
     folder = AccessFolder(tmp_path)
     authority = folder.ca.read_bytes()
@@ -79,7 +79,7 @@ def test_an_expired_certificate_is_told_and_init_renews_it_under_the_same_author
     assert "lab.example" in names_in(folder.server.read_bytes())
 
 
-def test_a_certificate_is_left_alone_until_a_month_before_its_end(tmp_path):
+def test_certificate_is_renewed_in_its_last_month_only(tmp_path):
     prepare(tmp_path, sans=(), now=NOW)
     certificate = AccessFolder(tmp_path).server.read_bytes()
     assert life_left(certificate, NOW) == timedelta(days=730)
@@ -89,7 +89,7 @@ def test_a_certificate_is_left_alone_until_a_month_before_its_end(tmp_path):
     assert AccessFolder(tmp_path).server.read_bytes() != certificate
 
 
-def test_without_the_authoritys_key_nothing_new_is_signed(tmp_path):
+def test_signing_needs_the_authority_key(tmp_path):
     prepare(tmp_path, sans=())
     AccessFolder(tmp_path).ca_key.unlink()
     prepare(tmp_path, sans=())
@@ -97,14 +97,14 @@ def test_without_the_authoritys_key_nothing_new_is_signed(tmp_path):
         prepare(tmp_path, sans=("new.example",))
 
 
-def test_a_name_that_is_none_is_refused():
+def test_invalid_certificate_name_is_refused():
     authority = make_authority("test", NOW)
     for name in ("", "two words", "http://x", "é.example"):
         with pytest.raises(ValueError, match="neither a host name nor an IP address"):
             make_server_certificate(authority, [name], NOW)
 
 
-def test_what_is_handed_out_holds_no_more_than_one_role(tmp_path):
+def test_handed_out_folder_holds_one_role(tmp_path):
     prepare(tmp_path / "data", sans=(), roles=(AccessRole.ADMIN, AccessRole.WORKER))
     hand_out_to(tmp_path / "data", AccessRole.WORKER, tmp_path / "w")
     assert {path.name for path in (tmp_path / "w").iterdir()} == {"ca.pem", "token"}
@@ -114,7 +114,7 @@ def test_what_is_handed_out_holds_no_more_than_one_role(tmp_path):
         hand_out_to(tmp_path / "data", AccessRole.WORKER, tmp_path / "elsewhere")
 
 
-async def test_a_token_of_a_role_can_not_become_the_secret_of_all(tmp_path):
+async def test_role_token_cannot_be_the_shared_token(tmp_path):
     prepare(tmp_path, sans=())
     folder = AccessFolder(tmp_path)
     store = open_store("memory:")
@@ -124,7 +124,7 @@ async def test_a_token_of_a_role_can_not_become_the_secret_of_all(tmp_path):
         await gate.open(folder.first_credentials())
 
 
-def test_an_invitation_is_read_as_it_is_written_and_nothing_of_a_wrong_one_is_told(tmp_path):
+def test_invitation_round_trips_and_errors_hide_the_token(tmp_path):
     prepare(tmp_path, sans=())
     pinned = fingerprint_of(AccessFolder(tmp_path).ca.read_text())
     for address in ("lab.example:50070", "[::1]:1", "a:1,b:2"):

@@ -1,4 +1,4 @@
-"""What the page and the REST API show: health in a sentence, pages of one snapshot, tracks of slots."""
+"""Health sentence, list pages, and slot timelines."""
 
 from dataclasses import replace
 
@@ -36,7 +36,7 @@ def mood(*, paused=False, now_s=1010.0, **changes):
     return told.mood, told.sentence
 
 
-def test_health_says_first_what_matters_most():
+def test_health_reports_the_most_important_fact():
     assert mood() == (Mood.GOOD, "All is well.")
     assert mood(runs=0, queued=0) == (Mood.IDLE, "Ready: 2 workers wait for a run.")
     assert mood(workers={}, queued=0) == (Mood.IDLE, "No worker has joined yet.")
@@ -65,7 +65,7 @@ def test_health_says_first_what_matters_most():
     assert mood(paused=True, workers={})[1].startswith("Dispatch is paused")
 
 
-def test_failures_are_news_for_five_minutes():
+def test_failures_are_reported_for_five_minutes():
     assert mood(failures=[NOTE])[1] == "1 rollout failed in the last 5 minutes, with slot_crashed."
     assert mood(failures=[NOTE] * FAILURES_KEPT)[1].startswith(f"{FAILURES_KEPT} or more rollouts")
     assert mood(failures=[NOTE], now_s=2000.0) == (Mood.GOOD, "All is well.")
@@ -91,7 +91,7 @@ SEEN = Snapshot(
 )
 
 
-def test_pages_of_a_list_hold_every_row_once_and_trouble_comes_first():
+def test_pages_hold_every_worker_once_with_trouble_first():
     found = []
     while len(page := worker_page(SEEN, offset=len(found), limit=300).items):
         found += [row.worker_id for row in page]
@@ -100,7 +100,7 @@ def test_pages_of_a_list_hold_every_row_once_and_trouble_comes_first():
     assert [row.run_id for row in run_page(SEEN, offset=1, limit=2).items] == ["r3", "r2"]
 
 
-def test_a_page_is_of_those_that_were_asked_for():
+def test_page_holds_matching_workers_only():
     assert [row.worker_id for row in worker_page(SEEN, state="lost").items] == ["Zoe"]
     assert worker_page(SEEN, search="W000", limit=3).total == 10
     attic = replace(SEEN.workers[0], worker_id="by-label", labels={"room": "Attic"})
@@ -110,7 +110,7 @@ def test_a_page_is_of_those_that_were_asked_for():
     assert (beyond.total, beyond.items) == (1002, [])
 
 
-def test_the_timeline_shows_the_last_seconds_of_each_slot():
+def test_timeline_shows_the_last_seconds_of_each_slot():
     def done(sequence, at_s, kind=EventKind.COMPLETED, code=""):
         timings = Timings(execute_s=0.5, load_s=0.25, deliver_s=0.125)
         rollout = f"x{sequence}"
@@ -131,7 +131,7 @@ def test_the_timeline_shows_the_last_seconds_of_each_slot():
     assert timeline("r1", EventPage((), 0), seconds=5.0).tracks == []
 
 
-def test_the_timeline_tells_how_many_slots_did_anything_and_shows_those_of_one_worker():
+def test_timeline_counts_busy_slots_and_filters_by_worker():
     def done(number):
         timings = Timings(execute_s=0.5)
         worker = f"desk-{number:03}"

@@ -1,4 +1,4 @@
-"""Large batches, taken in pieces."""
+"""Large batches are queued in slices."""
 
 import asyncio
 import contextlib
@@ -27,12 +27,12 @@ async def told(batches):
     return events
 
 
-async def test_a_batch_of_usual_size_is_taken_at_once():
+async def test_small_batch_is_queued_at_once():
     small = batch("b1", PIECE)
     assert await told([small]) == [BatchSubmitted(small, PIECE)]
 
 
-async def test_batches_that_come_together_take_turns_until_all_of_both_is_taken():
+async def test_concurrent_large_batches_take_turns():
     large, larger = batch("b1", 2 * PIECE + 1), batch("b2", 3 * PIECE)
     assert await told([large, larger]) == [
         BatchSubmitted(large, PIECE),

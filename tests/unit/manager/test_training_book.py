@@ -1,4 +1,4 @@
-"""What the manager keeps of training: curves that fit into memory however long a run is, and the latest runs."""
+"""Training curves in bounded memory."""
 
 import pytest
 from hypothesis import given
@@ -21,7 +21,7 @@ def curves_of(book, run_id="r1"):
     return {curves.phase: curves for curves in book.detail(run_id).phases}
 
 
-def test_a_step_that_is_told_twice_has_the_figures_of_both():
+def test_repeated_step_merges_its_figures():
     book = TrainingBook()
     book.note("r1", "evening", TrainingReport("grpo", 1, {"reward": 1.5}), at_s=1.0)
     book.note("r1", "evening", TrainingReport("grpo", 2, {"reward": 2.0}), at_s=2.0)
@@ -39,14 +39,14 @@ def test_a_step_that_is_told_twice_has_the_figures_of_both():
     )
 
 
-def test_a_lower_step_takes_back_what_a_resumed_run_will_do_again():
+def test_lower_step_discards_later_ones():
     book = TrainingBook()
     for step in (1, 2, 3, 2):
         book.note("r1", "", TrainingReport("grpo", step, {"reward": float(step)}), at_s=0.0)
     assert curves_of(book)["grpo"] == Curves("grpo", [1, 2], {"reward": [1.0, 2.0]})
 
 
-def test_a_long_run_keeps_its_first_and_its_last_step():
+def test_long_run_keeps_its_first_and_its_last_step():
     book = TrainingBook()
     for step in range(1, 5 * STEPS_KEPT):
         book.note("r1", "", TrainingReport("grpo", step, {"reward": float(step)}), at_s=0.0)
@@ -56,7 +56,7 @@ def test_a_long_run_keeps_its_first_and_its_last_step():
     assert curves.figures["reward"] == [float(step) for step in curves.steps]
 
 
-def test_the_run_that_was_silent_longest_makes_room():
+def test_longest_silent_run_is_dropped():
     book = TrainingBook()
     for number in range(RUNS_KEPT):
         book.note(f"r{number}", "", TrainingReport("grpo", 1, {"reward": 0.0}), at_s=0.0)

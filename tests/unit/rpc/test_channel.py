@@ -1,4 +1,4 @@
-"""What a person gives as address and token is checked before anything is sent."""
+"""Addresses and tokens are validated before any call."""
 
 import pytest
 
@@ -25,17 +25,17 @@ def test_host_and_port_are_an_address(text):
         "::1:5",
     ],
 )
-def test_anything_else_is_none(text):
+def test_other_texts_are_no_address(text):
     assert not is_address(text)
 
 
-async def test_wrong_address_is_told_what_one_looks_like():
+async def test_wrong_address_error_shows_the_expected_form():
     with pytest.raises(InvalidRequestError, match=r"'nowhere' .* expected HOST:PORT"):
         open_channel("nowhere")
 
 
 @pytest.mark.parametrize("token", ["a b", "wröng", "line\n"])
-async def test_token_that_metadata_can_not_carry_is_refused_and_not_shown(token):
+async def test_unsendable_token_is_refused_and_not_shown(token):
     with pytest.raises(InvalidRequestError, match="visible ASCII") as refusal:
         open_channel("127.0.0.1:1", token)
     assert token.strip() not in str(refusal.value)

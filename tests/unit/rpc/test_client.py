@@ -1,4 +1,4 @@
-"""The client: every rollout's outcome once, whatever happens to the stream; and sentences instead of gRPC errors."""
+"""Client: one outcome per rollout across broken streams, and readable errors."""
 
 import pytest
 from tests.fakes.cluster import FakeCluster, serving
@@ -30,42 +30,42 @@ async def _execute(cluster, count, *, deadline_s=10.0):
         return [result.rollout_id async for result in client.execute(_batch(count), deadline_s=deadline_s)]
 
 
-async def test_every_rollout_of_a_batch_comes_once():
+async def test_every_rollout_of_a_batch_has_one_result():
     assert await _execute(FakeCluster(), 50) == [f"r{i}" for i in range(50)]
 
 
-async def test_an_empty_batch_ends_at_once():
+async def test_empty_batch_ends_at_once():
     cluster = FakeCluster()
     assert await _execute(cluster, 0) == []
     assert cluster.submissions == 0
 
 
 @pytest.mark.parametrize("break_streams", [False, True])
-async def test_a_stream_that_ends_early_is_attached_again_after_its_cursor(break_streams):
+async def test_stream_that_ends_early_is_attached_again_after_its_cursor(break_streams):
     cluster = FakeCluster(results_per_stream=2, break_streams=break_streams)
     assert await _execute(cluster, 5) == ["r0", "r1", "r2", "r3", "r4"]
     assert cluster.submissions == 1
     assert cluster.attachments == [2, 4]
 
 
-async def test_a_batch_that_the_manager_forgot_is_submitted_again_and_nothing_comes_twice():
+async def test_forgotten_batch_is_resubmitted_without_duplicate_results():
     cluster = FakeCluster(results_per_stream=2, forget_after=1)
     assert await _execute(cluster, 5) == ["r0", "r1", "r2", "r3", "r4"]
     assert cluster.submissions == 2
 
 
-async def test_a_deadline_says_how_many_outcomes_are_missing():
+async def test_deadline_says_how_many_outcomes_are_missing():
     with pytest.raises(DeadlineError, match="batch b-1: 3 of 3 rollouts had no outcome"):
         await _execute(FakeCluster(results_per_stream=0), 3, deadline_s=0.3)
 
 
-async def test_a_batch_waits_for_a_manager_that_is_away_until_its_deadline():
+async def test_batch_waits_for_an_unreachable_manager_until_its_deadline():
     async with ClusterClient("127.0.0.1:1", limits=LIMITS) as client:
         with pytest.raises(DeadlineError, match="2 of 2 rollouts had no outcome"):
             [result async for result in client.execute(_batch(2), deadline_s=0.5)]
 
 
-async def test_a_duplicate_rollout_is_refused_with_its_field():
+async def test_duplicate_rollout_is_refused_with_its_field():
     batch = _batch(1)
     twice = Batch(batch.run_id, batch.batch_id, 0, batch.rollouts * 2)
     async with serving(FakeCluster()) as address, ClusterClient(address, limits=LIMITS) as client:
@@ -73,7 +73,7 @@ async def test_a_duplicate_rollout_is_refused_with_its_field():
             [result async for result in client.execute(twice, deadline_s=5.0)]
 
 
-async def test_an_absent_manager_is_named_with_the_remedy():
+async def test_absent_manager_is_named_with_the_remedy():
     async with ClusterClient("127.0.0.1:1", limits=LIMITS) as client:
         with pytest.raises(
             ManagerUnreachableError, match=r"no manager answers at 127\.0\.0\.1:1: start one with"
@@ -81,20 +81,20 @@ async def test_an_absent_manager_is_named_with_the_remedy():
             await client.open_run("demo")
 
 
-async def test_a_defect_of_the_manager_stays_in_its_log():
+async def test_internal_errors_of_the_manager_stay_in_its_log():
     async with serving(FakeCluster()) as address, ClusterClient(address, limits=LIMITS) as client:
         with pytest.raises(InternalError, match="its log has the details") as caught:
             await client.close_run("run-1")
     assert "a defect" not in str(caught.value)
 
 
-async def test_a_service_that_lacks_the_call_is_told_from_a_manager():
+async def test_server_without_the_call_is_reported_as_no_manager():
     async with serving(FakeCluster()) as address, ClusterClient(address, limits=LIMITS) as client:
         with pytest.raises(PreconditionError, match="no manager of this version"):
             await client.list_workers()
 
 
-async def test_the_token_goes_with_every_kind_of_call():
+async def test_token_is_sent_with_every_kind_of_call():
     cluster = FakeCluster(token="secret")
     async with serving(cluster) as address, ClusterClient(address, "secret", limits=LIMITS) as client:
         assert await client.open_run("demo") == "run-1"
@@ -102,7 +102,7 @@ async def test_the_token_goes_with_every_kind_of_call():
         assert len([result async for result in client.execute(_batch(3), deadline_s=5.0)]) == 3
 
 
-async def test_a_wrong_token_is_refused_with_the_manager_s_sentence():
+async def test_wrong_token_is_refused_with_the_manager_s_sentence():
     async with (
         serving(FakeCluster(token="secret")) as address,
         ClusterClient(address, "x", limits=LIMITS) as client,

@@ -1,4 +1,4 @@
-"""What goes over the wire comes back equal, and a malformed message names its field."""
+"""Values round-trip through protobuf, and malformed messages name their field."""
 
 import dataclasses
 import math
@@ -112,24 +112,24 @@ def _over_the_wire(message):
 
 
 @given(CALLS)
-def test_every_skill_call_comes_back_equal(call):
+def test_every_skill_call_round_trips(call):
     assert convert.skill_call_from_proto(_over_the_wire(convert.skill_call_to_proto(call))) == call
 
 
 @given(st.lists(ROLLOUTS, max_size=4, unique_by=lambda rollout: rollout.rollout_id).map(tuple), NAMES, UINT64)
-def test_a_batch_comes_back_equal(rollouts, name, step):
+def test_batch_round_trips(rollouts, name, step):
     batch = Batch("run-1", name, step, rollouts)
     assert convert.batch_from_proto(_over_the_wire(convert.batch_to_proto(batch))) == batch
 
 
 @given(RESULTS)
-def test_a_result_comes_back_equal_whatever_its_outcome(result):
+def test_results_of_every_outcome_round_trip(result):
     message = _over_the_wire(convert_outcome.rollout_result_to_proto(result))
     assert convert_outcome.rollout_result_from_proto(message) == result
 
 
 @given(COMPLETED, NUMBERS, NAMES, st.booleans())
-def test_a_result_that_is_passed_on_says_what_was_noted_on_its_way(completed, queued_s, worker_id, warm):
+def test_forwarded_result_carries_noted_fields(completed, queued_s, worker_id, warm):
     message = _over_the_wire(convert_outcome.completed_to_proto(completed))
     timings = Timings(queued_s, completed.timings.load_s, completed.timings.execute_s)
     came = convert_outcome.completed_from_proto(message)
@@ -139,9 +139,7 @@ def test_a_result_that_is_passed_on_says_what_was_noted_on_its_way(completed, qu
 
 
 @given(COMPLETED, NUMBERS, NAMES, st.booleans())
-def test_a_result_that_nobody_looked_at_is_passed_on_like_one_that_was_read(
-    completed, load_s, worker_id, warm
-):
+def test_unparsed_result_is_forwarded_like_a_parsed_one(completed, load_s, worker_id, warm):
     message = convert_outcome.completed_to_proto(completed)
     timings = Timings(load_s=load_s)
     unread = convert_outcome.unread_completed(message.SerializeToString(), timings=timings, warm=not warm)
@@ -155,7 +153,7 @@ def test_a_result_that_nobody_looked_at_is_passed_on_like_one_that_was_read(
 
 
 @given(ROLLOUTS)
-def test_a_rollout_that_nobody_looked_at_is_passed_on_like_one_that_was_read(rollout):
+def test_unparsed_rollout_is_forwarded_like_a_parsed_one(rollout):
     message = convert.rollout_to_proto(rollout)
     unread = convert.unread_rollout(message)
     assert unread.bundle_digest == rollout.bundle_digest
@@ -164,7 +162,7 @@ def test_a_rollout_that_nobody_looked_at_is_passed_on_like_one_that_was_read(rol
     assert dataclasses.replace(unread, seed=7) == dataclasses.replace(rollout, seed=7)
 
 
-def test_what_can_not_be_read_is_told_when_somebody_looks():
+def test_malformed_unparsed_value_raises_on_first_access():
     unread = convert_outcome.unread_completed(
         types_pb2.Completed(trace_digest="t").SerializeToString(), timings=Timings(), warm=True
     )
@@ -174,7 +172,7 @@ def test_what_can_not_be_read_is_told_when_somebody_looks():
         _ = unread.stops
 
 
-def test_fields_that_this_side_does_not_know_are_passed_on():
+def test_unknown_fields_are_forwarded():
     rollout = convert.rollout_to_proto(Rollout("r", "g", "b", "t", (), 1)).SerializeToString()
     passed = convert.rollout_to_proto(
         convert.rollout_from_proto(types_pb2.Rollout.FromString(rollout + NEWER))
@@ -182,13 +180,13 @@ def test_fields_that_this_side_does_not_know_are_passed_on():
     assert passed.SerializeToString() == rollout + NEWER
 
 
-def test_a_rollout_that_is_changed_is_not_passed_on_as_it_came():
+def test_changed_rollout_is_serialized_anew():
     came = convert.rollout_from_proto(convert.rollout_to_proto(Rollout("r", "g", "b", "t", (), 1)))
     assert convert.rollout_to_proto(dataclasses.replace(came, rollout_id="other")).rollout_id == "other"
 
 
 @given(RESOURCES)
-def test_resources_come_back_equal(resources):
+def test_resources_round_trip(resources):
     assert (
         convert_session.resources_from_proto(_over_the_wire(convert_session.resources_to_proto(resources)))
         == resources
@@ -196,12 +194,12 @@ def test_resources_come_back_equal(resources):
 
 
 @given(st.builds(RunStats, *[UINT64] * len(RunStats.__slots__)))
-def test_run_counters_come_back_equal(stats):
+def test_run_counters_round_trip(stats):
     assert convert_run.run_stats_from_proto(_over_the_wire(convert_run.run_stats_to_proto(stats))) == stats
 
 
 @given(st.builds(LookaheadEntry, UINT64, NAMES, UINT32, st.booleans()))
-def test_an_announced_scene_comes_back_equal(entry):
+def test_lookahead_entry_round_trips(entry):
     message = _over_the_wire(convert_run.lookahead_entry_to_proto(entry))
     assert convert_run.lookahead_entry_from_proto(message) == entry
 
@@ -215,46 +213,46 @@ def test_an_announced_scene_comes_back_equal(entry):
         st.floats(0, 1e6),
     )
 )
-def test_what_a_run_asks_for_comes_back_equal(terms):
+def test_run_terms_round_trip(terms):
     message = _over_the_wire(convert_run.run_terms_to_proto(terms))
     assert convert_run.run_terms_from_proto(message) == terms
 
 
-def test_a_run_that_asks_for_nothing_gets_the_defaults():
+def test_empty_run_terms_are_the_defaults():
     assert convert_run.run_terms_from_proto(rollout_service_pb2.OpenRunRequest(name="old")) == RunTerms()
 
 
-def test_a_weight_below_zero_is_refused_with_its_field():
+def test_weight_below_zero_is_refused_with_its_field():
     with pytest.raises(ConvertError, match=r"weight: is -1\.0"):
         convert_run.run_terms_from_proto(rollout_service_pb2.OpenRunRequest(weight=-1.0))
 
 
 @given(st.builds(GroupDone, NAMES, UINT32, UINT32, UINT32))
-def test_the_end_of_a_group_comes_back_equal(done):
+def test_group_done_round_trips(done):
     assert convert_run.group_done_from_proto(_over_the_wire(convert_run.group_done_to_proto(done))) == done
 
 
 @given(st.builds(LookaheadAnswer, NAMES, st.sampled_from(Warmth), NUMBERS, TEXTS))
-def test_an_answer_to_the_look_ahead_comes_back_equal(answer):
+def test_lookahead_answer_round_trips(answer):
     message = _over_the_wire(convert_run.lookahead_answer_to_proto(answer))
     assert convert_run.lookahead_answer_from_proto(message) == answer
 
 
 @pytest.mark.parametrize("warmth", Warmth)
-def test_every_warmth_comes_back_equal(warmth):
+def test_every_warmth_round_trips(warmth):
     answer = LookaheadAnswer("sha256:0", warmth)
     message = _over_the_wire(convert_run.lookahead_answer_to_proto(answer))
     assert convert_run.lookahead_answer_from_proto(message) == answer
 
 
-def test_every_enum_value_of_the_wire_has_a_meaning_here():
+def test_every_wire_enum_value_has_a_member():
     assert set(convert.SKILL_KINDS) == set(Skill)
     assert len(convert.SKILL_KINDS) == len(types_pb2.SkillKind.keys()) - 1
     assert len(InfraCode) == len(types_pb2.InfraCode.keys()) - 1
     assert len(Warmth) == len(types_pb2.Warmth.keys()) - 1
 
 
-def test_an_index_that_no_table_has_still_travels():
+def test_negative_object_index_round_trips():
     call = SkillCall(Skill.MOVE, object_index=-1)
     assert convert.skill_call_from_proto(_over_the_wire(convert.skill_call_to_proto(call))) == call
 
@@ -278,7 +276,7 @@ PLACE_ABOVE = types_pb2.SkillCall(skill=types_pb2.SKILL_KIND_PLACE, object_index
         ([MOVE] * (MAX_STEPS + 1), "rollouts[0].plan"),
     ],
 )
-def test_a_malformed_plan_names_the_field(calls, field):
+def test_malformed_plan_names_the_field(calls, field):
     rollout = types_pb2.Rollout(rollout_id="r", group_id="g", bundle_digest="d", task_id="t", plan=calls)
     request = rollout_service_pb2.ExecuteRequest(run_id="run", batch_id="b", rollouts=[rollout])
     with pytest.raises(ConvertError) as caught:
@@ -294,12 +292,12 @@ def test_two_rollouts_of_one_id_are_refused():
         convert.batch_from_proto(request)
 
 
-def test_a_result_without_an_outcome_is_refused():
+def test_result_without_an_outcome_is_refused():
     with pytest.raises(ConvertError, match="outcome: is missing"):
         convert_outcome.rollout_result_from_proto(types_pb2.RolloutResult(rollout_id="r"))
 
 
-def test_a_completed_rollout_without_a_reward_is_refused_instead_of_scored_zero():
+def test_completed_rollout_without_a_reward_is_refused_instead_of_scored_zero():
     message = types_pb2.RolloutResult(rollout_id="r", completed=types_pb2.Completed(trace_digest="x"))
     with pytest.raises(ConvertError, match=r"completed\.reward: is missing"):
         convert_outcome.rollout_result_from_proto(message)
@@ -330,24 +328,22 @@ def whole(**changed):
         (whole(steps=[types_pb2.StepResult()]), r"steps\[0\].call.skill: 0 is no known skill"),
     ],
 )
-def test_a_malformed_result_is_refused_by_whoever_reads_it_and_by_whoever_passes_it_on(
-    read, message, problem
-):
+def test_malformed_result_is_refused_by_reader_and_forwarder(read, message, problem):
     with pytest.raises(ConvertError, match=problem):
         read(message)
 
 
-def test_timings_of_which_only_the_sum_is_too_large_are_taken():
+def test_finite_timings_with_an_infinite_sum_are_accepted():
     timings = types_pb2.Timings(queued_s=1.7e308, execute_s=1.7e308)
     assert convert_outcome.timings_from_proto(timings) == Timings(queued_s=1.7e308, execute_s=1.7e308)
 
 
 @given(COMPLETED)
-def test_a_result_that_was_only_checked_says_the_same_when_somebody_looks(completed):
+def test_checked_result_equals_the_parsed_one(completed):
     message = convert_outcome.completed_to_proto(completed)
     assert convert_outcome.checked_completed(message) == completed
 
 
-def test_a_worker_without_slots_is_refused():
+def test_worker_without_slots_is_refused():
     with pytest.raises(ConvertError, match="slots: is 0"):
         convert_session.resources_from_proto(types_pb2.Resources(cores=4))

@@ -1,4 +1,4 @@
-"""The worker's session and the operator's view come back equal from the wire."""
+"""Values of worker sessions and operator lists round-trip through protobuf."""
 
 import pytest
 from hypothesis import given
@@ -70,12 +70,12 @@ def _over_the_wire(message):
 
 
 @given(STATES)
-def test_the_state_of_a_worker_comes_back_equal(state):
+def test_worker_state_round_trips(state):
     assert convert.worker_state_from_proto(_over_the_wire(convert.worker_state_to_proto(state))) == state
 
 
 @given(st.builds(LeaseProgress, REFS, st.integers(0, 2**64 - 1)))
-def test_the_progress_of_a_lease_comes_back_equal(progress):
+def test_lease_progress_round_trips(progress):
     message = _over_the_wire(convert.lease_progress_to_proto(progress))
     assert convert.lease_progress_from_proto(message) == progress
 
@@ -91,39 +91,39 @@ def test_the_progress_of_a_lease_comes_back_equal(progress):
         st.lists(NAMES, max_size=3).map(tuple),
     )
 )
-def test_a_cell_of_the_look_ahead_grid_comes_back_equal(cell):
+def test_plan_cell_round_trips(cell):
     assert convert.plan_cell_from_proto(_over_the_wire(convert.plan_cell_to_proto(cell))) == cell
 
 
 @given(
     st.builds(Lease, REFS, st.builds(Rollout, NAMES, NAMES, NAMES, NAMES, st.just(PLAN), st.just(7)), SECONDS)
 )
-def test_a_lease_comes_back_equal(lease):
+def test_lease_round_trips(lease):
     assert convert.lease_from_proto(_over_the_wire(lease_to_proto(lease))) == lease
 
 
 @given(st.lists(RESIDENTS, max_size=2).map(tuple), SECONDS)
-def test_a_listed_worker_comes_back_equal(residents, last_seen_s):
+def test_worker_info_round_trips(residents, last_seen_s):
     info = WorkerInfo("w1", "ready", Resources(2, 4, 1024), residents, 1, 17, last_seen_s)
     assert convert.worker_info_from_proto(_over_the_wire(convert.worker_info_to_proto(info))) == info
 
 
-def test_a_listed_run_comes_back_equal():
+def test_run_info_round_trips():
     info = RunInfo("run-1", "demo", RunStats(delivered=5, stale_results=1), 3)
     assert convert.run_info_from_proto(_over_the_wire(convert.run_info_to_proto(info))) == info
 
 
-def test_every_resident_state_of_the_wire_has_a_meaning_here():
+def test_every_wire_resident_state_has_a_member():
     assert len(ResidentState) == len(worker_service_pb2.ResidentState.keys()) - 1
 
 
-def test_a_lease_without_a_deadline_is_refused():
+def test_lease_without_a_deadline_is_refused():
     message = worker_service_pb2.Lease(ref=worker_service_pb2.LeaseRef(lease_id="l1", lease_epoch=1))
     with pytest.raises(ConvertError, match=r"deadline_s: is 0\.0: it must be above 0"):
         convert.lease_from_proto(message)
 
 
-def test_a_result_names_the_element_that_is_malformed():
+def test_malformed_result_error_names_the_element():
     message = worker_service_pb2.WorkerState(finished=[worker_service_pb2.LeaseResult()])
     with pytest.raises(ConvertError, match=r"finished\[0\].lease.lease_id: is empty"):
         convert.worker_state_from_proto(message)

@@ -1,4 +1,4 @@
-"""Reports of training arrive as they were sent, cut to their bounds; what is beyond them is refused by name."""
+"""Training reports round-trip within their limits."""
 
 import pytest
 
@@ -22,12 +22,12 @@ LOST = SampledPlan("t1", "tidy up", "move 3", None, 0.0, "worker_lost: it went a
 REPORT = TrainingReport("grpo", 7, {"reward": 1.25, "success_by_category/compound": 0.5}, (SOLVED, LOST))
 
 
-def test_a_report_arrives_as_it_was_sent():
+def test_training_report_round_trips():
     message = pb.ReportTrainingRequest.FromString(training_report_to_proto("r1", REPORT).SerializeToString())
     assert (message.run_id, training_report_from_proto(message)) == ("r1", REPORT)
 
 
-def test_what_a_model_writes_without_end_or_in_half_characters_is_cut_and_sent():
+def test_long_or_malformed_model_text_is_cut_before_sending():
     plan = SampledPlan("t1", "tidy up", "\ud83c" + "x" * 9000, None, 0.0)
     told = training_report_from_proto(
         training_report_to_proto("r1", TrainingReport("grpo", 1, plans=(plan,)))
@@ -61,6 +61,6 @@ def test_what_a_model_writes_without_end_or_in_half_characters_is_cut_and_sent()
         ),
     ],
 )
-def test_a_report_beyond_its_bounds_is_refused_by_its_field(message, field):
+def test_report_beyond_its_bounds_is_refused_by_its_field(message, field):
     with pytest.raises(ConvertError, match=field):
         training_report_from_proto(message)

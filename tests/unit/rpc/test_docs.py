@@ -33,25 +33,25 @@ def rows(first_heading: str) -> dict[str, str]:
     return {name.strip(" `"): value for name, value, *_ in cells}
 
 
-def test_every_service_of_the_manager_is_looked_at():
+def test_every_service_is_checked():
     assert set(CALLS) == set(SERVICES)
 
 
 @pytest.mark.parametrize("service", CALLS)
-def test_every_call_stands_there(service: str):
+def test_every_call_is_documented(service: str):
     assert f"`{service.rpartition('.')[2]}`" in PAGE
     assert [call for call in CALLS[service] if f"`{call}`" not in PAGE] == []
 
 
-def test_every_code_of_an_infrastructure_failure_stands_there():
+def test_every_infrastructure_failure_code_is_documented():
     assert list(rows("code")) == [*InfraCode]
 
 
-def test_every_status_stands_there():
+def test_every_status_is_documented():
     assert list(rows("status")) == [code.name for code in STATUS.values()]
 
 
-def test_settings_stand_there_with_their_defaults():
+def test_settings_are_documented_with_their_defaults():
     settings = ManagerSettings()
     written = {name: float(value) for name, value in rows("setting of the manager").items()}
     assert written == {name: getattr(settings, name) for name in written}

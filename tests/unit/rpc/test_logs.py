@@ -1,4 +1,4 @@
-"""Log lines: sentences for people, objects for programs, ids on both, and no secret on any."""
+"""Log lines as text and JSON, with ids and without secrets."""
 
 import asyncio
 import contextvars
@@ -28,7 +28,7 @@ def alone(function):
     return contextvars.Context().run(function)
 
 
-def test_what_a_message_names_is_a_field():
+def test_named_values_of_a_message_are_json_fields():
     line = as_json(MANAGER_LINE, "x1", "w1", 2.5, 80)
     assert line["message"] == "lease expired rollout=x1 worker=w1 after=2.5 s (80 % of its life)"
     assert (line["rollout"], line["worker"], line["after"]) == ("x1", "w1", 2.5)
@@ -36,7 +36,7 @@ def test_what_a_message_names_is_a_field():
     assert line["time"].endswith("Z")
 
 
-def test_bound_ids_are_on_every_line_and_the_message_says_more():
+def test_bound_ids_are_on_every_line():
     def told():
         bind("worker", "w1")
         bind("session", "abc")
@@ -51,7 +51,7 @@ def test_bound_ids_are_on_every_line_and_the_message_says_more():
     assert "worker" not in alone(lambda: as_json("nothing is bound here"))
 
 
-def test_tasks_have_ids_of_their_own():
+def test_bound_ids_are_per_task():
     async def serve(run):
         bind("run", run)
         await asyncio.sleep(0)
@@ -65,7 +65,7 @@ def test_tasks_have_ids_of_their_own():
     assert "run" not in line
 
 
-def test_an_exception_is_part_of_its_line():
+def test_exception_is_part_of_its_line():
     try:
         raise ValueError("two\nlines")
     except ValueError as error:
@@ -90,21 +90,21 @@ def test_secrets_are_never_written(formatter):
     assert "about" in formatter.format(record("about")), "a short word is left alone"
 
 
-def test_a_message_without_arguments_is_told_as_it_is():
+def test_message_without_arguments_is_logged_unchanged():
     assert as_json("plain id=%s without arguments")["message"] == "plain id=%s without arguments"
 
 
-def test_no_message_can_pass_for_another_time_or_level():
+def test_message_fields_cannot_override_time_or_level():
     line = as_json("level=%s message=%s", "info", "all is well")
     assert (line["level"], line["message"]) == ("warning", "level=info message=all is well")
 
 
-def test_an_unknown_level_is_refused():
+def test_unknown_level_is_refused():
     with pytest.raises(ValueError, match="expected debug, info, warning or error"):
         log_to_stderr("loud", None)
 
 
-def test_libraries_are_heard_only_when_something_is_wrong():
+def test_libraries_log_warnings_and_errors_only():
     program = (
         "import logging; from embomatrix.rpc.logs import *; log_to_stderr('debug', LogFormat.JSON)\n"
         "logging.getLogger('asyncio').info('chatter'); logging.getLogger('asyncio').error('trouble')\n"

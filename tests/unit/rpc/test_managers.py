@@ -1,4 +1,4 @@
-"""Where to turn to when a manager does not answer."""
+"""Choice of the manager to call."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from embomatrix.rpc.managers import Managers
 from embomatrix.rpc.status import InvalidRequestError, StandbyError, UnavailableError
 
 
-def test_managers_take_turns():
+def test_unreachable_managers_are_tried_in_turn():
     managers = Managers("a:1, b:2,c:3")
     seen = []
     for _ in range(4):
@@ -15,19 +15,19 @@ def test_managers_take_turns():
     assert seen == ["a:1", "b:2", "c:3", "a:1"]
 
 
-def test_a_standby_leads_to_the_leader_it_names():
+def test_client_follows_the_leader_named_by_a_standby():
     managers = Managers("a:1,b:2,c:3")
     managers.move(StandbyError("c leads", "c:3"))
     assert managers.current == "c:3"
 
 
-def test_nobody_is_led_to_an_address_that_was_not_told():
+def test_unknown_leader_addresses_are_ignored():
     managers = Managers("a:1,b:2")
     managers.move(StandbyError("follow me", "evil:1"))
     assert managers.current == "b:2"
 
 
-def test_a_lone_manager_stays_the_one():
+def test_single_manager_is_retried():
     managers = Managers("a:1")
     managers.move(UnavailableError("nobody answers"))
     assert managers.current == "a:1"
@@ -35,6 +35,6 @@ def test_a_lone_manager_stays_the_one():
 
 
 @pytest.mark.parametrize("text", ["", "a", "a:1,", "a:1;b:2", "a:0"])
-def test_what_is_no_address_is_refused(text):
+def test_invalid_addresses_are_refused(text):
     with pytest.raises(InvalidRequestError, match="expected HOST:PORT"):
         Managers(text)

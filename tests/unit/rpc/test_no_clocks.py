@@ -1,4 +1,4 @@
-"""A20: no clock of one machine is told to another, so none that is wrong can do harm."""
+"""A20: no message carries a wall-clock time, so wrong clocks do no harm."""
 
 from google.protobuf.descriptor import FieldDescriptor
 
@@ -22,7 +22,7 @@ def fields():
                 yield f"{message.name}.{field.name}", field
 
 
-def test_no_message_between_machines_carries_a_moment():
+def test_no_message_carries_a_wall_clock_time():
     told = [name for name, _ in fields() if any(part in name.split(".")[1].split("_") for part in CLOCKS)]
     told += [name for name, _ in fields() if name.endswith(("_at", "_at_s", "_until_s", "_ts"))]
     assert set(told) <= SHOWN_TO_PEOPLE

@@ -1,4 +1,4 @@
-"""`proto/check.sh` as CI runs it: it finds what would break older sides, and works in whatever clone it is given."""
+"""`proto/check.sh` finds breaking changes, and runs in any clone."""
 
 import shutil
 import subprocess
@@ -57,13 +57,13 @@ def checked(folder):
     )
 
 
-def test_a_first_commit_has_nothing_to_compare_with_and_says_so(repository):
+def test_first_commit_has_nothing_to_compare_with_and_says_so(repository):
     told = checked(repository)
     assert told.returncode == 0, told.stderr
     assert "skipped, this checkout has one commit only" in told.stdout
 
 
-def test_a_field_that_is_added_breaks_nothing_and_one_that_is_gone_does(repository):
+def test_adding_a_field_passes_and_removing_one_fails(repository):
     commit(repository, PROTO.replace(FIELD, f"{FIELD}  string more = 2;\n"))
     assert "nothing broken since" in checked(repository).stdout
     git(repository, "checkout", "-b", "work")
@@ -73,7 +73,7 @@ def test_a_field_that_is_added_breaks_nothing_and_one_that_is_gone_does(reposito
     assert 'field "1" with name "release"' in told.stdout
 
 
-def test_a_clone_of_one_commit_is_linted_all_the_same(repository, tmp_path):
+def test_shallow_clone_is_linted(repository, tmp_path):
     commit(repository, PROTO.replace("NoteService", "Notes"))
     git(tmp_path, "clone", "--depth=1", f"file://{repository}", "shallow")
     told = checked(tmp_path / "shallow")

@@ -55,7 +55,7 @@ class BundleStore:
             if clock() - left_over.stat().st_mtime > keep_s:
                 left_over.unlink(missing_ok=True)
 
-    def keep(self, needed: Callable[[], AbstractSet[str]]) -> None:
+    def protect(self, needed: Callable[[], AbstractSet[str]]) -> None:
         """Protect the bundles whose digests this function returns."""
         self._needed = needed
 
@@ -72,7 +72,7 @@ class BundleStore:
         """Return the digests of bundles that are absent, in the same order."""
         return [digest for digest in dict.fromkeys(digests) if not self.has(digest)]
 
-    async def lacking(self, digests: list[str]) -> list[str]:
+    async def missing_or_damaged(self, digests: list[str]) -> list[str]:
         """Return the digests of bundles that are absent or damaged. Damaged files are deleted."""
 
         def check() -> list[str]:

@@ -52,7 +52,7 @@ logger = logging.getLogger(__name__)
 
 UNAUDITED: Final = "results are not audited: auditing needs a second worker"
 CLEANUP_S: Final = 5.0
-STOOD_STILL_S: Final = 1.0
+STALLED_S: Final = 1.0
 """A tick that is this late means that no worker was heard meanwhile."""
 LET_GO_S: Final = 30.0
 """A manager without its store for this long disconnects its workers, which then turn to another manager. Equals the
@@ -88,7 +88,7 @@ class ManagerRuntime:
         self.cluster = cluster
         self.registry = registry
         self.bundles = bundles
-        bundles.keep(cluster.needed_scenes)
+        bundles.protect(cluster.needed_scenes)
         self.meter = Meter()
         self.training = TrainingBook()
         self.load = ManagerLoad()
@@ -99,19 +99,19 @@ class ManagerRuntime:
         self.runs = Runs(cluster, store, bundles, logs, self._carry_out, limits or RunLimits(), self.history)
         self._intake = Intake(cluster, registry)
         self._journal = StateJournal(store, registry, cluster)
-        self._delivery = ResultDelivery(store, logs, self._say, self.event_log.in_log)
+        self._delivery = ResultDelivery(store, logs, self._send, self.event_log.in_log)
         self._links: dict[str, WorkerLink] = {}
         self._lapsed_s = lapsed_s
         self._unrenewed = unrenewed
         self._suspended = False
         self._paused = False
-        self._said_unaudited = False
+        self._warned_unaudited = False
 
     async def start(self) -> None:
         """Restore the state of a former manager."""
-        self._carry_out(self._intake.feed(await self._journal.reputes(), now_s=time.monotonic()))
+        self._carry_out(self._intake.feed(await self._journal.reputations(), now_s=time.monotonic()))
         self._paused = await self._journal.paused()
-        self._dispatch_or_not()
+        self._update_dispatch()
         await self.runs.restore()
 
     async def serve(self) -> None:
@@ -142,7 +142,7 @@ class ManagerRuntime:
         self.event_log.fleet.joined(worker_id, resources, now_s=time.monotonic())
         self._carry_out(commands)
         logger.info("worker registered worker=%s slots=%d", worker_id, resources.slots)
-        await self._journal.noted(worker_id)
+        await self._journal.wait_until_noted(worker_id)
         return session, self.registry.interval_s
 
     @contextlib.contextmanager
@@ -161,7 +161,7 @@ class ManagerRuntime:
                 self.registry.detach(session, now_s=time.monotonic())
                 logger.info("session stream ended worker=%s", session.worker_id)
 
-    def take_report(
+    def process_report(
         self, link: WorkerLink, state: WorkerState | None, results: Sequence[LeaseResult], *, resync: bool
     ) -> None:
         """Process a worker's message, or a slice of it; ``deliver`` follows the last slice. ``resync`` marks the
@@ -177,9 +177,9 @@ class ManagerRuntime:
 
     def deliver(self) -> None:
         """Write the results of a worker's message in one transaction, after its last slice."""
-        self._delivery.hurry()
+        self._delivery.flush()
 
-    def take_heartbeat(self, session_id: str, epoch: int, beat: Heartbeat) -> float:
+    def process_heartbeat(self, session_id: str, epoch: int, beat: Heartbeat) -> float:
         """Renew the leases that the worker names. Return the seconds until the next heartbeat."""
         interval_s, commands = self._intake.heartbeat(session_id, epoch, beat, now_s=time.monotonic())
         self._carry_out(commands)
@@ -210,7 +210,7 @@ class ManagerRuntime:
         self._carry_out(self._intake.feed(*self.registry.resume(worker_id), now_s=time.monotonic()))
         if worker_id in self._links:
             self._links[worker_id].resume()
-        self._journal.hurry()
+        self._journal.flush()
 
     @property
     def paused(self) -> bool:
@@ -230,16 +230,16 @@ class ManagerRuntime:
         Raises UnavailableError if later managers could not be told.
         """
         self._paused = True
-        self._dispatch_or_not()
+        self._update_dispatch()
         await self._journal.note_pause(True)
 
     async def resume_dispatch(self) -> None:
         """Give leases again, unless the store is away. Raises UnavailableError like ``pause_dispatch``."""
         self._paused = False
-        self._dispatch_or_not()
+        self._update_dispatch()
         await self._journal.note_pause(False)
 
-    def _dispatch_or_not(self) -> None:
+    def _update_dispatch(self) -> None:
         event = DispatchPaused() if self._paused or self._suspended else DispatchResumed()
         self._carry_out(self._intake.feed(event, now_s=time.monotonic()))
 
@@ -248,9 +248,9 @@ class ManagerRuntime:
         for command in commands:
             match command:
                 case SetDesired() | CancelLease():
-                    self._say(command)
+                    self._send(command)
                 case GiveLease():
-                    self._say(command)
+                    self._send(command)
                     if not command.audit:
                         self.event_log.leased(command, now_s=now_s)
                 case AcknowledgeLease():
@@ -263,11 +263,11 @@ class ManagerRuntime:
                     self._delivery.put(command)
                 case QuarantineWorker():
                     logger.error("worker quarantined worker=%s: %s", command.worker_id, command.reason)
-                    self._journal.hurry()
+                    self._journal.flush()
         if not more:
-            self._delivery.hurry()
+            self._delivery.flush()
 
-    def _say(self, command: WorkerCommand) -> None:
+    def _send(self, command: WorkerCommand) -> None:
         """Send a command. Without a stream the command is lost; the worker's next full state shows that, and it is
         repeated.
         """
@@ -281,21 +281,21 @@ class ManagerRuntime:
             taken = f"another session of worker {worker_id} took over: stop this one"
             link.close(reason or SupersededError(taken))
 
-    def _watch_the_lead(self) -> None:
+    def _watch_leadership(self) -> None:
         """Suspend dispatch while another manager may lead, and disconnect the workers after ``LET_GO_S``."""
         lapsed_s = self._lapsed_s()
         if (lapsed_s > 0.0) != self._suspended:
             self._suspended = not self._suspended
             logger.warning("dispatch %s: the store %s", *_SUSPENSION[self._suspended])
-            self._dispatch_or_not()
+            self._update_dispatch()
         if lapsed_s > LET_GO_S:
             for worker_id in list(self._links):
                 self.registry.detach(self._links[worker_id].session, now_s=time.monotonic())
                 self._close_link(worker_id, UnavailableError(STORE_AWAY))
 
-    def _say_what_is_not_audited(self) -> None:
-        if self.cluster.dispatcher.auditor.lone and not self._said_unaudited:
-            self._said_unaudited = True
+    def _warn_unaudited(self) -> None:
+        if self.cluster.dispatcher.auditor.lone and not self._warned_unaudited:
+            self._warned_unaudited = True
             logger.warning(UNAUDITED)
 
     async def _keep_time(self) -> None:
@@ -304,13 +304,13 @@ class ManagerRuntime:
             await asyncio.sleep(TICK_S)
             late_s = time.monotonic() - due_s
             self.load.lag.observe(late_s)
-            if late_s >= STOOD_STILL_S:
+            if late_s >= STALLED_S:
                 logger.warning(
                     "the manager did not run for %.1f s: is its machine paused, or short of memory?", late_s
                 )
-                self.registry.stood_still(late_s, now_s=time.monotonic())
-            self._watch_the_lead()
-            self._say_what_is_not_audited()
+                self.registry.excuse_silence(late_s, now_s=time.monotonic())
+            self._watch_leadership()
+            self._warn_unaudited()
             lost, commands = self._intake.tick(now_s=time.monotonic())
             for event in lost:
                 logger.warning("worker lost worker=%s: %s", event.worker_id, event.reason)

@@ -79,7 +79,7 @@ class Intake:
         events: list[Event] = self.registry.heard(session, now_s=now_s)
         events += [LeaseFinished(session.worker_id, result.ref, result.outcome) for result in finished]
         if state is not None:
-            self.registry.told(session, draining=state.draining, paused=state.paused)
+            self.registry.note_state(session, draining=state.draining, paused=state.paused)
             held = (*state.running, *(result.ref for result in state.finished))
             reported = WorkerReported(
                 session.worker_id, state.residents, held, state.draining, resync, state.claims, state.paused

@@ -88,7 +88,7 @@ class WorkerSession:
     memory_used_mb: int = 0
     credential_id: str = ""
     """Token that opened the session. No other token may use it."""
-    asked: set[str] = field(default_factory=set)
+    allowed_bundles: set[str] = field(default_factory=set)
     """Bundles that the worker may fetch, since it was told to hold or execute them."""
 
 
@@ -188,7 +188,7 @@ class Registry:
             raise SupersededError(f"worker {worker_id} is lost ({session.reason}): register again")
         return session
 
-    def holder(self, session_id: str) -> WorkerSession:
+    def find_by_id(self, session_id: str) -> WorkerSession:
         """Return the live session, for calls without an epoch."""
         session = self._sessions.get(self._worker_of.get(session_id, ""))
         return self.find(session_id, session.epoch if session is not None else 0)
@@ -235,7 +235,7 @@ class Registry:
         session.drained, session.standing = False, WorkerStanding.READY
         return [WorkerResumed(worker_id)]
 
-    def told(self, session: WorkerSession, *, draining: bool, paused: str) -> None:
+    def note_state(self, session: WorkerSession, *, draining: bool, paused: str) -> None:
         """Note the worker's own report that it drains or is paused."""
         if draining or session.drained:
             session.standing = WorkerStanding.DRAINING
@@ -243,7 +243,7 @@ class Registry:
             session.standing = WorkerStanding.PAUSED if paused else WorkerStanding.READY
         session.reason = paused
 
-    def stood_still(self, seconds: float, *, now_s: float) -> None:
+    def excuse_silence(self, seconds: float, *, now_s: float) -> None:
         """Excuse the silence of all workers during ``seconds`` in which the manager did not run."""
         for session in self._by_silence.values():
             session.last_seen_s = min(session.last_seen_s + seconds, now_s)
@@ -274,7 +274,7 @@ class Registry:
     def _there(self, worker_id: str) -> WorkerSession:
         session = self._sessions.get(worker_id)
         if session is None:
-            raise NotFoundError(f"there is no worker {worker_id!r}: connected are {listed(self.present)}")
+            raise NotFoundError(f"there is no worker {worker_id!r}: connected are {name_list(self.present)}")
         if session.standing.is_gone:
             raise NotFoundError(f"worker {worker_id!r} is gone ({session.reason}): restart it on its machine")
         return session
@@ -309,7 +309,7 @@ class Registry:
         return WorkerLost(session.worker_id, reason)
 
 
-def listed(worker_ids: Iterable[str]) -> str:
+def name_list(worker_ids: Iterable[str]) -> str:
     """Return the first names for a message, and the number of others."""
     names = sorted(worker_ids)
     more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""

@@ -27,6 +27,8 @@ logger = logging.getLogger(__name__)
 
 PER_MESSAGE: Final = 256
 """Results of one message at most."""
+MESSAGE_S: Final = 0.1
+"""Interval between partial messages. Without it, a trainer gets a message for every message of every worker."""
 
 
 class BatchLog:
@@ -55,6 +57,7 @@ class BatchLog:
         self.dropped = False
         """The run was closed, or the log was discarded: no more results follow."""
         self._changed = asyncio.Event()
+        self._over = asyncio.Event()
 
     def append(self, rows: Sequence[ResultRow]) -> None:
         self.rows.extend(rows)
@@ -62,10 +65,12 @@ class BatchLog:
 
     def finish(self, now_s: float) -> None:
         self.finished_s = now_s
+        self._over.set()
         self._wake()
 
     def drop(self) -> None:
         self.dropped = True
+        self._over.set()
         self._wake()
 
     @property
@@ -73,10 +78,14 @@ class BatchLog:
         return self.dropped or self.finished_s is not None
 
     async def messages(self, cursor: int) -> AsyncIterator[list[ResultRow]]:
-        """Yield all results after the cursor, as they arrive, until the batch ends."""
+        """Yield all results after the cursor until the batch ends, at most one partial message per ``MESSAGE_S``."""
         while rows := await self.after(cursor):
             cursor = rows[-1].cursor
             yield rows
+            if len(rows) < PER_MESSAGE and not self.ended:
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(MESSAGE_S):
+                        await self._over.wait()
 
     async def after(self, cursor: int) -> list[ResultRow]:
         """Wait for results after the cursor and return some of them; nothing once the batch has ended.
@@ -174,7 +183,7 @@ class ResultDelivery:
         """Queue an acknowledgement, which is sent after everything queued before it is stored."""
         self._acknowledgements.append(command)
 
-    def hurry(self) -> None:
+    def flush(self) -> None:
         """Start to write the queue: no related results follow."""
         if self._waiting or self._acknowledgements:
             self._fresh.set()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from embomatrix.manager.runtime.registry import listed
+from embomatrix.manager.runtime.registry import name_list
 from embomatrix.rpc.status import NotFoundError, NotSignedInError
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ class Revocation:
         registry = self._sessions.registry
         if not self._gate.knows_worker(worker_id) and worker_id not in registry.sessions:
             raise NotFoundError(
-                f"there is no worker {worker_id!r}, so none was revoked: connected are {listed(registry.present)}; "
+                f"there is no worker {worker_id!r}, so none was revoked: connected are {name_list(registry.present)}; "
                 "`embomatrix manager token list` lists all credentials"
             )
         await self._gate.revoke_worker(worker_id, reason)

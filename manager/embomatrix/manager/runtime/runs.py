@@ -243,7 +243,7 @@ class Runs:
                 with contextlib.suppress(UnavailableError):
                     await self.close_run(run_id)
 
-    def hear_of(self, run_id: str) -> RunRow:
+    def touch(self, run_id: str) -> RunRow:
         """Return the open run and note a sign of life of its trainer. Raises NotFoundError."""
         self._check_run(run_id)
         return self._runs[run_id]

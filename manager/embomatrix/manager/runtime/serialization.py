@@ -80,14 +80,14 @@ def timed_row(row: ResultRow, deliver_s: float) -> ResultRow:
     return ResultRow(row.cursor, row.rollout_id, row.payload + _DELIVERED + _DOUBLE.pack(deliver_s))
 
 
-def repute_row(worker_id: str, repute: Reputation) -> ShelfRow:
+def reputation_row(worker_id: str, repute: Reputation) -> ShelfRow:
     """Return the row of a reputation. Open disputes are dropped, since their rollouts are executed again."""
     kept = {name: value for name, value in asdict(repute).items() if name != "disputed"}
     return ShelfRow(worker_id, json.dumps(kept, separators=(",", ":")).encode())
 
 
-def repute_of(row: ShelfRow) -> Reputation:
-    """Return the reputation of `repute_row`."""
+def reputation_of(row: ShelfRow) -> Reputation:
+    """Return the reputation of `reputation_row`."""
     return Reputation(**json.loads(row.payload))
 
 

@@ -8,7 +8,7 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.control.events import ReputationsKnown
-from embomatrix.manager.runtime.serialization import repute_of, repute_row, window_row
+from embomatrix.manager.runtime.serialization import reputation_of, reputation_row, window_row
 from embomatrix.manager.store.protocol import Shelf, ShelfRow, StateError
 from embomatrix.rpc.status import UnavailableError
 
@@ -41,10 +41,10 @@ class StateJournal:
         """Set after the next write of the present workers."""
         self._urgent = asyncio.Event()
 
-    async def reputes(self) -> ReputationsKnown:
+    async def reputations(self) -> ReputationsKnown:
         """Return the reputations that former managers stored."""
-        rows = await self._store.rows(Shelf.REPUTES)
-        return ReputationsKnown({row.key: repute_of(row) for row in rows})
+        rows = await self._store.rows(Shelf.REPUTATIONS)
+        return ReputationsKnown({row.key: reputation_of(row) for row in rows})
 
     async def paused(self) -> bool:
         """Return True if an operator paused dispatch and did not resume it."""
@@ -61,11 +61,11 @@ class StateJournal:
                 f"dispatch is {done}, but other managers were not told ({error}): repeat the command when the store is back"
             ) from error
 
-    def hurry(self) -> None:
+    def flush(self) -> None:
         """Write changes now, such as a worker's quarantine."""
         self._urgent.set()
 
-    async def noted(self, worker_id: str) -> None:
+    async def wait_until_noted(self, worker_id: str) -> None:
         """Return after the worker is journaled, so that a later manager waits for it.
 
         It gets no lease earlier, since a later manager would re-dispatch it at once. Workers that join together are
@@ -74,7 +74,7 @@ class StateJournal:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(NOTED_S):
                 while worker_id not in (self._present or ()):
-                    self.hurry()
+                    self.flush()
                     await self._written.wait()
 
     async def serve(self) -> None:
@@ -86,10 +86,10 @@ class StateJournal:
                         await self._urgent.wait()
                 self._urgent.clear()
                 await self._note_present()
-                await self._note_reputes()
+                await self._note_reputations()
                 await self._note_windows()
         finally:
-            await self._note_reputes()
+            await self._note_reputations()
             await self._note_windows()
 
     async def _note_present(self) -> None:
@@ -116,13 +116,13 @@ class StateJournal:
             await self._store.put_rows(Shelf.WINDOWS, rows)
             self._announced = now
 
-    async def _note_reputes(self) -> None:
+    async def _note_reputations(self) -> None:
         auditor = self._dispatcher.auditor
         changed = auditor.take_changed()
-        rows = [repute_row(worker_id, auditor.of(worker_id)) for worker_id in changed]
+        rows = [reputation_row(worker_id, auditor.of(worker_id)) for worker_id in changed]
         if not rows:
             return
         try:
-            await self._store.put_rows(Shelf.REPUTES, rows)
+            await self._store.put_rows(Shelf.REPUTATIONS, rows)
         except StateError:
             auditor.note(*changed)

@@ -41,10 +41,10 @@ class WorkerLink:
     def put(self, command: WorkerCommand) -> None:
         match command:
             case SetDesired():
-                self.session.asked.update(command.bundle_digests)
+                self.session.allowed_bundles.update(command.bundle_digests)
                 self._outbox.desired = command.bundle_digests
             case GiveLease():
-                self.session.asked.add(command.rollout.bundle_digest)
+                self.session.allowed_bundles.add(command.rollout.bundle_digest)
                 self._outbox.leases.append(
                     Lease(command.ref, command.rollout, command.deadline_s, command.origin, command.reward)
                 )

@@ -33,7 +33,7 @@ from embomatrix.manager.settings import is_every_address, is_loopback
 from embomatrix.manager.store.opening import open_store
 from embomatrix.manager.store.protocol import Candidate, StateError
 from embomatrix.manager.web.api import build_api
-from embomatrix.manager.web.connections import allow_files, connections_through
+from embomatrix.manager.web.connections import allow_files, connections_of
 from embomatrix.manager.web.http_rules import HttpRules, allowed_hosts
 
 if TYPE_CHECKING:
@@ -264,7 +264,7 @@ class _HttpServer:
         config = uvicorn.Config(
             self._answer,
             interface="asgi3",
-            http=connections_through(bound),
+            http=connections_of(bound),
             # Uvicorn's log lines go through our handlers.
             log_config=None,
             log_level="warning",

@@ -119,7 +119,7 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
         async with translate(context):
             bind("run", request.run_id)
             report = training_report_from_proto(request)
-            name = self._runs.hear_of(request.run_id).name
+            name = self._runs.touch(request.run_id).name
             self._training.note(request.run_id, name, report, at_s=time.time())
         return pb.ReportTrainingResponse()
 

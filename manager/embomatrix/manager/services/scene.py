@@ -24,7 +24,7 @@ class SceneServicer(scene_service_pb2_grpc.SceneServiceServicer):
         self, request: pb.MissingBundlesRequest, context: grpc.aio.ServicerContext
     ) -> pb.MissingBundlesResponse:
         async with translate(context):
-            missing = await self._bundles.lacking(list(request.bundle_digests))
+            missing = await self._bundles.missing_or_damaged(list(request.bundle_digests))
         return pb.MissingBundlesResponse(bundle_digests=missing)
 
     async def PutBundle(

@@ -104,8 +104,8 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
         self, request: pb.HeartbeatRequest, context: grpc.aio.ServicerContext
     ) -> pb.HeartbeatResponse:
         async with translate(context):
-            self._check_session(context, self._runtime.registry.holder(request.session_id))
-            interval_s = self._runtime.take_heartbeat(
+            self._check_session(context, self._runtime.registry.find_by_id(request.session_id))
+            interval_s = self._runtime.process_heartbeat(
                 request.session_id,
                 request.session_epoch,
                 Heartbeat(
@@ -121,9 +121,9 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
         self, request: pb.FetchBundleRequest, context: grpc.aio.ServicerContext
     ) -> AsyncIterator[pb.FetchBundleResponse]:
         async with translate(context):
-            session = self._runtime.registry.holder(request.session_id)
+            session = self._runtime.registry.find_by_id(request.session_id)
             self._check_session(context, session)
-            if request.bundle_digest not in session.asked:
+            if request.bundle_digest not in session.allowed_bundles:
                 raise NotAllowedError(
                     f"worker {session.worker_id} was not asked to hold bundle {request.bundle_digest[:80]!r}"
                 )
@@ -150,10 +150,10 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
     async def _take(self, link: WorkerLink, request: pb.SessionRequest, *, resync: bool) -> None:
         state = inside("state", worker_state_from_proto, request.state) if request.HasField("state") else None
         try:
-            self._runtime.take_report(link, state, _results(request, 0), resync=resync)
+            self._runtime.process_report(link, state, _results(request, 0), resync=resync)
             for first in range(RESULTS_AT_ONCE, len(request.results), RESULTS_AT_ONCE):
                 await asyncio.sleep(0)  # lets other coroutines send leases and hear workers
-                self._runtime.take_report(link, None, _results(request, first), resync=False)
+                self._runtime.process_report(link, None, _results(request, first), resync=False)
         finally:
             self._runtime.deliver()
 

@@ -99,7 +99,7 @@ class Shelf(StrEnum):
 
     CREDENTIALS = "credentials"
     """Credentials by token id, with the hash of the secret."""
-    REPUTES = "reputes"
+    REPUTATIONS = "reputes"
     """Audit reputations by worker id."""
     SWITCHES = "switches"
     """Switches of the operator."""

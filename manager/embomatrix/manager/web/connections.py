@@ -27,9 +27,9 @@ FILES: Final = 65_536
 class BoundedConnections(H11Protocol):
     """HTTP connection that is closed at once above ``CONNECTIONS``, and after ``SILENT_S`` without a request."""
 
-    most = CONNECTIONS
+    limit = CONNECTIONS
     silent_s = SILENT_S
-    door: BoundedListener | None = None
+    listener: BoundedListener | None = None
     """Listener that accepted the connections."""
 
     def __init__(
@@ -40,21 +40,21 @@ class BoundedConnections(H11Protocol):
         _loop: asyncio.AbstractEventLoop | None = None,
     ) -> None:
         super().__init__(config, server_state, app_state, _loop)
-        self._patience: asyncio.TimerHandle | None = None
+        self._timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         # uvicorn narrows the parameter's type; a server passes a stream transport only.
         super().connection_made(cast("asyncio.Transport", transport))
-        if self.door is not None:
-            self.door.entered(transport.get_extra_info("peername"))
-        if len(self.connections) > self.most:
+        if self.listener is not None:
+            self.listener.handshake_done(transport.get_extra_info("peername"))
+        if len(self.connections) > self.limit:
             self.transport.abort()
         else:
-            self._patience = self.loop.call_later(self.silent_s, self._close_silent)
+            self._timer = self.loop.call_later(self.silent_s, self._close_silent)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        if self._patience is not None:
-            self._patience.cancel()
+        if self._timer is not None:
+            self._timer.cancel()
         super().connection_lost(exc)
 
     def _close_silent(self) -> None:
@@ -63,9 +63,9 @@ class BoundedConnections(H11Protocol):
             self.transport.abort()
 
 
-def connections_through(door: BoundedListener) -> type[BoundedConnections]:
+def connections_of(listener: BoundedListener) -> type[BoundedConnections]:
     """Return the connection class of a server that uses this listener."""
-    return type("ConnectionsThroughADoor", (BoundedConnections,), {"door": door})
+    return type("ListenerConnections", (BoundedConnections,), {"listener": listener})
 
 
 def allow_files() -> None:
@@ -80,7 +80,7 @@ WAITING: Final = 256
 """Accepted connections without a finished handshake at most. TLS takes 300 kB for each."""
 HANDSHAKE_S: Final = 10.0
 """Time limit of a handshake, in seconds."""
-TURNED_AWAY_AT_A_TIME: Final = 256
+REJECTED_AT_ONCE: Final = 256
 """Rejected connections before other work of the process gets a turn."""
 
 
@@ -89,34 +89,34 @@ class BoundedListener(socket.socket):
     once.
     """
 
-    most = WAITING
-    patience_s = HANDSHAKE_S
+    limit = WAITING
+    handshake_s = HANDSHAKE_S
 
     def __init__(self, *given: Any, **options: Any) -> None:
         super().__init__(*given, **options)
         self._waiting: dict[object, asyncio.TimerHandle] = {}
 
     def accept(self) -> tuple[socket.socket, Any]:
-        for _ in range(TURNED_AWAY_AT_A_TIME):
+        for _ in range(REJECTED_AT_ONCE):
             plain, peer = super().accept()
-            if len(self._waiting) < self.most:
+            if len(self._waiting) < self.limit:
                 return self._take_in(plain, peer), peer
             plain.close()
         raise BlockingIOError
 
-    def entered(self, peer: object) -> None:
+    def handshake_done(self, peer: object) -> None:
         """Note that the connection from this address finished its handshake, or is closed."""
         timer = self._waiting.pop(peer, None)
         if timer is not None:
             timer.cancel()
 
     def _take_in(self, plain: socket.socket, peer: object) -> socket.socket:
-        guest = _Guest(plain, lambda: self.entered(peer))
-        self._waiting[peer] = asyncio.get_running_loop().call_later(self.patience_s, guest.send_away)
-        return guest
+        accepted = _AcceptedSocket(plain, lambda: self.handshake_done(peer))
+        self._waiting[peer] = asyncio.get_running_loop().call_later(self.handshake_s, accepted.shut_down)
+        return accepted
 
 
-class _Guest(socket.socket):
+class _AcceptedSocket(socket.socket):
     """Accepted connection that reports its end."""
 
     def __init__(self, plain: socket.socket, on_close: Callable[[], None]) -> None:
@@ -127,7 +127,7 @@ class _Guest(socket.socket):
         self._on_close()
         super().close()
 
-    def send_away(self) -> None:
+    def shut_down(self) -> None:
         """Shut the connection down, which wakes its readers."""
         with contextlib.suppress(OSError):
             self.shutdown(socket.SHUT_RDWR)

@@ -47,13 +47,13 @@ def floor_plan(scene: Scene) -> FloorPlanView:
     )
 
 
-def small_things(scene: Scene, task: Task) -> dict[str, list[float]]:
+def movable_objects(scene: Scene, task: Task) -> dict[str, list[float]]:
     """Return the start positions of the task's movable objects."""
     found = [scene.by_name[name] for name in task.table if name in scene.by_name]
     return {item.name: _middle(scene, item.name) for item in found if not item.fixed and not item.absent}
 
 
-def played(scene: Scene, task: Task, plan: Plan) -> list[MomentView]:
+def moments_of(scene: Scene, task: Task, plan: Plan) -> list[MomentView]:
     """Return the state after each call of the plan, assuming that every call succeeds."""
     moments = [MomentView("", _rounded(scene.robot.x_m, scene.robot.y_m))]
     for call in plan:

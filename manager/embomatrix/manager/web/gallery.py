@@ -12,7 +12,7 @@ import re
 from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.web.floor_plan import floor_plan, played, small_things
+from embomatrix.manager.web.floor_plan import floor_plan, moments_of, movable_objects
 from embomatrix.manager.web.gallery_values import (
     ObjectRow,
     SceneCount,
@@ -168,10 +168,10 @@ class Gallery:
     def _read_detail(self, record: TaskRecord) -> TaskDetail:
         task, scene = record.task, self._scene(record.bundle_digest)
         about: frozenset[str] = frozenset()
-        problem, moments = "", [*played(scene, task, ())]
+        problem, moments = "", [*moments_of(scene, task, ())]
         try:
             about = task.goal_objects
-            moments = played(scene, task, plan_from_json(list(record.oracle), task.profile))
+            moments = moments_of(scene, task, plan_from_json(list(record.oracle), task.profile))
         except (GoalError, PlanError) as error:
             problem = str(error)
         tree = self._note("trees", task.task_id, "json")
@@ -186,7 +186,7 @@ class Gallery:
             transcript=self._note("transcripts", task.task_id, "md"),
             tree=_parsed(tree),
             floor=self._read_floor(record.bundle_digest),
-            things=small_things(scene, task),
+            things=movable_objects(scene, task),
             moments=moments,
             problem=problem,
         )

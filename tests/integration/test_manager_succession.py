@@ -1,4 +1,4 @@
-"""What operators and audits decided outlives the manager that it was told: the next one on the same state knows it."""
+"""Operator and audit decisions survive a change of the manager."""
 
 import asyncio
 import contextlib
@@ -45,9 +45,7 @@ async def states(admin):
     return {info.worker_id: info.state for info in await admin.list_workers()}
 
 
-async def test_a_worker_in_quarantine_stays_there_under_the_next_manager_until_an_operator_trusts_it(
-    tmp_path, state
-):
+async def test_quarantine_survives_a_manager_change(tmp_path, state):
     async with manager(tmp_path, state=state) as at, people(at.address) as (client, admin):
         await client.open_run("verified", "r1", VERIFIED)
         async with (
@@ -76,7 +74,7 @@ async def test_a_worker_in_quarantine_stays_there_under_the_next_manager_until_a
         assert await states(admin) == {"liar": "ready"}
 
 
-async def test_the_next_manager_waits_for_a_worker_from_the_moment_it_has_joined(tmp_path, state):
+async def test_next_manager_waits_for_every_joined_worker(tmp_path, state):
     async with manager(tmp_path, state=state) as at:
         for name in ("w1", "w2", "w3"):
             await register(Membership(at.address, name), boot_id=name, resources=Resources(1, 1, 100))
@@ -85,9 +83,7 @@ async def test_the_next_manager_waits_for_a_worker_from_the_moment_it_has_joined
             await store.close()
 
 
-async def test_dispatch_that_was_paused_stays_paused_under_the_next_manager_until_it_is_resumed(
-    tmp_path, state
-):
+async def test_dispatch_pause_survives_a_manager_change(tmp_path, state):
     async with manager(tmp_path, state=state) as at, people(at.address) as (client, admin):
         await client.open_run("test", "r2")
         await admin.pause_dispatch()
@@ -104,9 +100,7 @@ async def test_dispatch_that_was_paused_stays_paused_under_the_next_manager_unti
         assert len(await outcomes(client, batch(2, batch_id="b2", run_id="r2"))) == 2
 
 
-async def test_a_manager_with_another_data_folder_than_the_one_before_says_so_at_its_start(
-    tmp_path, state, caplog
-):
+async def test_manager_warns_of_another_data_folder(tmp_path, state, caplog):
     warned = {}
     for turn, folder in enumerate(("one", "one", "other")):
         caplog.clear()
@@ -121,7 +115,7 @@ async def test_a_manager_with_another_data_folder_than_the_one_before_says_so_at
     assert "--data-dir" in line
 
 
-async def test_a_pause_that_can_not_be_noted_holds_and_says_so(tmp_path):
+async def test_pause_without_the_store_holds_and_reports_it(tmp_path):
     server = RedisServer(tmp_path, free_port())
     with server:
         async with manager(tmp_path, state=server.url) as at, people(at.address) as (client, admin):

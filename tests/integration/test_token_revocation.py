@@ -1,4 +1,4 @@
-"""Tokens that are taken back, shared, or handed on: to whoever holds them at once, and under every manager that comes."""
+"""Revoked, shared and passed-on tokens, also under later managers."""
 
 import asyncio
 import contextlib
@@ -36,7 +36,7 @@ from embomatrix.rpc.wire.values import Batch, Completed
 pytestmark = pytest.mark.timeout(120)
 
 
-async def test_a_revoked_worker_ends_at_once_and_its_rollouts_go_elsewhere(tmp_path):
+async def test_revoked_worker_stops_and_its_rollouts_are_redispatched(tmp_path):
     async with (
         guarded(tmp_path) as at,
         trainer(at) as client,
@@ -56,7 +56,7 @@ async def test_a_revoked_worker_ends_at_once_and_its_rollouts_go_elsewhere(tmp_p
     assert all(isinstance(result.outcome, Completed) for result in results)
 
 
-async def test_a_name_that_nobody_knows_is_not_revoked_and_those_that_are_there_are_named(tmp_path):
+async def test_revoking_an_unknown_worker_names_the_connected_ones(tmp_path):
     async with guarded(tmp_path) as at, await joined(at, "office") as spare, at.operator() as operator:
         with pytest.raises(NotFoundError, match=r"no worker 'offcie'.*connected are office;"):
             await operator.revoke_worker("offcie", "its results were wrong")
@@ -68,7 +68,7 @@ async def test_a_name_that_nobody_knows_is_not_revoked_and_those_that_are_there_
         assert "sold" in caught.value.details()
 
 
-async def test_a_worker_whose_token_is_revoked_ends_as_well(tmp_path):
+async def test_revoking_a_token_ends_its_worker_sessions(tmp_path):
     async with guarded(tmp_path) as at:
         fleet = await at.issue(AccessRole.WORKER, label="the lab")
         async with worker(at, "pod-1", token=fleet) as pod:
@@ -79,7 +79,7 @@ async def test_a_worker_whose_token_is_revoked_ends_as_well(tmp_path):
             await until(lambda: not pod._tasks)
 
 
-async def test_a_trainer_whose_token_is_revoked_reads_no_further(tmp_path):
+async def test_trainer_whose_token_is_revoked_reads_no_further(tmp_path):
     async with guarded(tmp_path) as at, trainer(at) as client, await joined(at, "w1", execute_s=0.05):
         token = await at.issue(AccessRole.TRAINER)
         async with ClusterClient(at.address, token, ca=at.ca) as revoked:
@@ -94,7 +94,7 @@ async def test_a_trainer_whose_token_is_revoked_reads_no_further(tmp_path):
         assert len(await collect(client, 40)) == 40
 
 
-async def test_tokens_and_credentials_outlive_the_manager_and_what_was_revoked_stays_so(tmp_path):
+async def test_tokens_and_revocations_survive_a_restart(tmp_path):
     async with guarded(tmp_path) as at:
         first = await joined(at, "w1")
         async with first:
@@ -115,7 +115,7 @@ async def test_tokens_and_credentials_outlive_the_manager_and_what_was_revoked_s
     assert first.token.partition(".")[2].encode() not in stored
 
 
-async def test_who_takes_a_cluster_over_knows_its_tokens(tmp_path):
+async def test_standby_knows_the_tokens_after_take_over(tmp_path):
     """Two managers on one Redis: what the first handed out and took back holds at the second, which stood by with TLS too."""
     with RedisServer(tmp_path / "redis", free_port()) as redis:
         options = {"state": redis.url, "leader_ttl_s": 4.0}
@@ -153,7 +153,7 @@ def stands_by(port):
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
-async def test_one_shared_token_is_an_admins_for_everybody_beside_the_others(tmp_path):
+async def test_shared_token_has_the_admin_role(tmp_path):
     async with guarded(tmp_path, token="one-for-all") as at, worker(at, "w1", token="one-for-all") as w1:
         async with ClusterClient(at.address, "one-for-all", ca=at.ca) as client:
             await client.open_run("test", "r1")
@@ -165,7 +165,7 @@ async def test_one_shared_token_is_an_admins_for_everybody_beside_the_others(tmp
             assert [found.worker_id for found in await client.list_workers()] == ["w1"]
 
 
-async def test_an_open_manager_has_no_tokens_to_hand_out(tmp_path):
+async def test_unguarded_manager_issues_no_tokens(tmp_path):
     settings = ManagerSettings(port=0, http_port=0, data_dir=tmp_path, state="memory:")
     async with running(settings) as at, AdminClient(at.address) as operator:
         with pytest.raises(PreconditionError, match="embomatrix manager init"):
