@@ -128,7 +128,7 @@ def test_section_has_configuration_success_curves_and_times():
     text = learning_section(DESIGN, ARMS, MACHINE, "abc", TODAY)
     assert text.startswith("## 2026-11-21: learning")
     assert "at most 60 s of imitation" in text
-    assert "50 steps of GRPO an" in text
+    assert "50 steps of GRPO per" in text
     assert "| without-relevance | `grpo.relevance = 0.0` |" in text
     assert "| with-relevance | all |  |  |  | 35.0%" in text
     assert "| with-relevance | 1 | zero-variance groups | 0.50 |" in text

@@ -51,7 +51,7 @@ def evaluate_admissions(folder: Path) -> EvaluationFigures:
         "in physics": "yes" if settings["physical"] else "no",
     }
     return EvaluationFigures(
-        "admission", conditions, figures, (f"Against drafts{f' of {label}' if label else ''}: {told}.",)
+        "admission", conditions, figures, (f"Rejected drafts{f' of {label}' if label else ''}: {told}.",)
     )
 
 

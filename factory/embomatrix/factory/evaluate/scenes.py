@@ -202,7 +202,7 @@ def evaluation_of(outcomes: Sequence[LayoutOutcome], conditions: Mapping[str, An
             figures += _shared_aesthetics(outcomes, method)
             reasons = Counter(outcome.reason for outcome in mine if outcome.reason)
             told = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common(5)) or "none"
-            notes.append(f"Commonest reasons against a scene, {method}: {told}.")
+            notes.append(f"Most common reasons for rejection, {method}: {told}.")
     return EvaluationFigures("scenes", conditions, tuple(figures), tuple(notes))
 
 
