@@ -96,7 +96,7 @@ async def test_batch_is_put_once_under_an_open_run(store):
     assert await store.batches("r1") == [BATCH]
 
 
-async def test_batches_come_back_in_the_order_they_were_put(store):
+async def test_batches_are_returned_in_insertion_order(store):
     await store.open_run(RunRow("r1", ""))
     for name in ("b9", "b1", "b5"):
         await store.put_batch(BatchRow("r1", name, "d", b""))
@@ -124,7 +124,7 @@ async def test_first_result_of_each_rollout_counts(store):
     assert await store.results_after("r1", "b1", 0, 100) == rows(1, 3)
 
 
-async def test_results_of_several_batches_are_written_at_once(store):
+async def test_results_of_several_batches_are_written_together(store):
     await store.open_run(RunRow("r1", ""))
     await store.put_batch(BATCH)
     await store.put_batch(BatchRow("r1", "b2", "d", b""))
@@ -138,7 +138,7 @@ async def test_results_of_several_batches_are_written_at_once(store):
     assert await store.results_after("r1", "b2", 0, 100) == rows(1, 2, 3)
 
 
-async def test_results_of_an_unknown_batch_are_not_kept(store):
+async def test_results_of_an_unknown_batch_are_dropped(store):
     await store.open_run(RunRow("r1", ""))
     assert await store.append_results([BatchResults("r1", "b1", rows(1))]) == 0
     assert await store.results_after("r1", "b1", 0, 100) == []
@@ -184,7 +184,7 @@ async def test_list_of_workers_is_replaced_as_a_whole(store, openings):
     assert await store.workers() == frozenset()
 
 
-async def test_another_process_finds_everything_again(store, openings):
+async def test_another_process_reads_the_same_state(store, openings):
     await store.open_run(RunRow("r1", "name"))
     await store.put_batch(BATCH)
     await store.append_results([BatchResults("r1", "b1", rows(1, 2))])
@@ -205,7 +205,7 @@ async def test_named_rows_survive_reopening_and_the_latest_counts(store, opening
     assert not any([await again.rows(other) for other in Shelf if other is not shelf])
 
 
-async def test_only_one_of_two_managers_leads_and_the_other_learns_its_address(store, openings):
+async def test_one_manager_leads_and_the_other_learns_its_address(store, openings):
     other = openings()
     assert await other.claim(SECOND) == Lead(1, "host:1", mine=False)
     with pytest.raises(FencedError):

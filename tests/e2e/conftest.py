@@ -1,4 +1,4 @@
-"""What the commands under test work on: one small dataset, and the browser that looks at their pages."""
+"""Fixtures of the end-to-end tests: a small dataset, and a browser for the pages."""
 
 import os
 import shutil

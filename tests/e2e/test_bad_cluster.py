@@ -1,4 +1,4 @@
-"""What a person gets wrong between the parts of a cluster: addresses, ports, tokens, state, damaged bundles, interrupts."""
+"""Operator errors in a cluster: addresses, ports, tokens, state, damaged bundles, interrupts."""
 
 import contextlib
 import re
@@ -78,7 +78,7 @@ def checkpoint(kitchen, tmp_path_factory):
     ],
     ids=lambda arguments: " ".join(arguments[:2]),
 )
-def test_manager_that_can_not_be_reached_is_named(kitchen, checkpoint, tmp_path, arguments):
+def test_unreachable_manager_is_named(kitchen, checkpoint, tmp_path, arguments):
     places = {"DATASET": kitchen, "OUT": tmp_path / "out", "CHECKPOINT": checkpoint}
     filled = [_placed(item, places) for item in arguments]
     assert_told(run(*filled, f"--manager={NOWHERE}"), 2, UNREACHABLE)
@@ -109,7 +109,7 @@ def test_wrong_token_is_refused_and_never_shown(served, kitchen, tmp_path, argum
 
 
 @pytest.mark.parametrize("option", ["", "http-"])
-def test_port_in_use_is_named_and_whoever_uses_it_is_left_alone(tmp_path, option):
+def test_used_port_is_named_and_its_process_keeps_running(tmp_path, option):
     """The second manager shares the data folder of the first: it must not take its state before it knows it can serve."""
     with manager(tmp_path / "data") as (first, address, page):
         taken = address if not option else page.removeprefix("http://").rstrip("/")
@@ -124,7 +124,7 @@ def test_port_in_use_is_named_and_whoever_uses_it_is_left_alone(tmp_path, option
         assert first.process.poll() is None, first.text
 
 
-def test_redis_that_can_not_be_reached_is_named_without_its_password(tmp_path):
+def test_unreachable_redis_is_named_without_its_password(tmp_path):
     state = "--state=redis://:hidden@127.0.0.1:1/0"
     told = run("manager", "serve", "--port=0", "--http-port=0", f"--data-dir={tmp_path}", state)
     assert_told(
@@ -134,14 +134,14 @@ def test_redis_that_can_not_be_reached_is_named_without_its_password(tmp_path):
 
 
 @pytest.mark.parametrize("option", ["--host=0.0.0.0", "--http-host=0.0.0.0"])
-def test_no_port_is_opened_to_others_without_tls(tmp_path, option):
+def test_non_loopback_address_without_tls_is_refused(tmp_path, option):
     told = run("manager", "serve", option, "--token=secret", f"--data-dir={tmp_path}")
     assert_told(
         told, 2, "refusing to serve on 0.0.0.0 without TLS,", "run `embomatrix manager init --data-dir"
     )
 
 
-async def test_bundle_under_a_wrong_digest_is_refused(served):
+async def test_bundle_with_wrong_digest_is_refused(served):
     _, address, _ = served
     wrong = f"sha256:{'0' * 64}"
     async with ClusterClient(address, SECRET) as client:
@@ -164,7 +164,7 @@ async def _reward(address, record, data, run_name):
     return result.outcome.reward.total if isinstance(result.outcome, Completed) else None
 
 
-async def test_bundle_damaged_in_a_cache_is_fetched_again(kitchen, tmp_path):
+async def test_damaged_cached_bundle_is_downloaded_again(kitchen, tmp_path):
     dataset = Dataset.load(kitchen)
     record = dataset.train[0]
     data = dataset.bundle_bytes(record.bundle_digest)
@@ -181,7 +181,7 @@ async def test_bundle_damaged_in_a_cache_is_fetched_again(kitchen, tmp_path):
         assert "bundle damaged on disk, removed" in serving.text
 
 
-def test_training_tells_how_it_was_interrupted_and_what_could_not_be_written(kitchen, tmp_path):
+def test_training_reports_interrupts_and_write_errors(kitchen, tmp_path):
     with manager(tmp_path / "data") as (_, address, _), worker(tmp_path / "cache", address):
         common = ("train", f"--dataset={kitchen}", f"--manager={address}", "--threads=1")
         short = ("--imitate-seconds=0.5", "--steps=1000000")
@@ -206,7 +206,7 @@ def test_training_tells_how_it_was_interrupted_and_what_could_not_be_written(kit
         assert not list((tmp_path / "full").glob("reference*"))
 
 
-def test_interrupted_demo_ends_what_it_started(kitchen, tmp_path):
+def test_interrupted_demo_ends_its_processes(kitchen, tmp_path):
     out = tmp_path / "out"
     arguments = ("demo", f"--dataset={kitchen}", f"--out={out}", "--imitate-seconds=0.5", "--minutes=30")
     with background(tmp_path / "log", *arguments) as demo:

@@ -1,4 +1,4 @@
-"""What a person gets wrong: one sentence that names the thing and the remedy, an exit status, and never a traceback."""
+"""Invalid input to commands: one sentence with thing and remedy, an exit status, and never a traceback."""
 
 import json
 import shutil
@@ -41,7 +41,7 @@ def assert_told(told, status, *words):
         (("trian",), "did you mean `train`?"),
     ],
 )
-def test_unknown_name_is_told_with_what_is_near(kitchen, tmp_path, arguments, words):
+def test_unknown_name_error_suggests_similar_names(kitchen, tmp_path, arguments, words):
     out = tmp_path / "out"
     filled = [item.replace("DATASET", str(kitchen)).replace("OUT", str(out)) for item in arguments]
     assert_told(run(*filled, HF_HUB_OFFLINE="1"), 2, words)
@@ -69,7 +69,7 @@ def test_unknown_name_is_told_with_what_is_near(kitchen, tmp_path, arguments, wo
     ],
     ids=["prose", "cut", "skill", "steps", "bytes", "nan", "argument", "empty", "binary"],
 )
-def test_text_that_is_no_plan_earns_minus_one_and_is_told_why(kitchen, tmp_path, plan, words):
+def test_unparsable_text_earns_minus_one_with_a_reason(kitchen, tmp_path, plan, words):
     file = tmp_path / "plan"
     file.write_bytes(plan if isinstance(plan, bytes) else plan.encode())
     told = run("play", TASK, f"--plan={file}", f"--dataset={kitchen}")
@@ -84,7 +84,7 @@ def test_text_that_is_no_plan_earns_minus_one_and_is_told_why(kitchen, tmp_path,
         ("pick_up 10", "out_of_reach: "),
     ],
 )
-def test_step_that_can_not_be_done_is_told_its_reason_and_the_rest_left_out(kitchen, plan, words):
+def test_failed_step_shows_its_reason_and_ends_the_plan(kitchen, plan, words):
     told = run("play", TASK, "--plan=-", f"--dataset={kitchen}", text=f"{plan}\nmove 0")
     assert_told(told, 0, words, "not executed", "the goal is not reached")
 
@@ -110,7 +110,7 @@ def test_step_that_can_not_be_done_is_told_its_reason_and_the_rest_left_out(kitc
     ],
     ids=["parenthesis", "type", "undeclared", "empty", "binary", "absent"],
 )
-def test_bddl_that_can_not_be_read_is_told_where(tmp_path, content, words):
+def test_bddl_error_names_line_and_column(tmp_path, content, words):
     file, out = tmp_path / "problem.bddl", tmp_path / "out"
     if content is not None:
         file.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -119,7 +119,7 @@ def test_bddl_that_can_not_be_read_is_told_where(tmp_path, content, words):
     assert not (out / "tasks.jsonl").exists()
 
 
-def test_import_does_not_write_over_a_dataset(kitchen, tmp_path):
+def test_import_refuses_to_overwrite_a_dataset(kitchen, tmp_path):
     (tmp_path / "problem.bddl").write_text(BDDL)
     before = (kitchen / "tasks.jsonl").read_bytes()
     told = run("factory", "import", f"--bddl={tmp_path / 'problem.bddl'}", f"--out={kitchen}")
@@ -152,7 +152,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_dataset_that_is_missing_or_damaged_is_named_with_a_remedy(kitchen, tmp_path, damage):
+def test_missing_or_damaged_dataset_error_names_the_remedy(kitchen, tmp_path, damage):
     folder = tmp_path / "dataset"
     shutil.copytree(kitchen, folder)
     change, words = DAMAGES[damage]
@@ -161,7 +161,7 @@ def test_dataset_that_is_missing_or_damaged_is_named_with_a_remedy(kitchen, tmp_
 
 
 @pytest.mark.parametrize("damage", ["no folder", "bundle cut"])
-def test_trainer_tells_the_same_of_a_dataset(kitchen, tmp_path, damage):
+def test_trainer_reports_the_same_dataset_errors(kitchen, tmp_path, damage):
     folder = tmp_path / "dataset"
     shutil.copytree(kitchen, folder)
     DAMAGES[damage][0](folder)
@@ -181,7 +181,7 @@ def test_trainer_tells_the_same_of_a_dataset(kitchen, tmp_path, damage):
         ("pybullet", ("demo", "--dataset=DATASET", "--out=OUT"), "the cluster can't work, worker-"),
     ],
 )  # fmt: skip
-def test_missing_package_is_named_with_what_brings_it(kitchen, tmp_path, package, arguments, words):
+def test_missing_package_error_names_the_extra(kitchen, tmp_path, package, arguments, words):
     out = tmp_path / "out"
     filled = [item.replace("DATASET", str(kitchen)).replace("OUT", str(out)) for item in arguments]
     assert_told(run_anew(*filled, **without(tmp_path, package)), 2, words)
@@ -207,11 +207,11 @@ def test_missing_package_is_named_with_what_brings_it(kitchen, tmp_path, package
         (("worker", "run", "--nice=50"), "--nice 50: input should be less than or equal to 19"),
     ],
 )
-def test_wrong_value_of_an_option_is_named_with_what_was_expected(tmp_path, arguments, words):
+def test_invalid_option_value_error_names_the_expected_one(tmp_path, arguments, words):
     assert_told(run(*arguments, HOME=str(tmp_path)), 2, words)
 
 
-def test_unknown_setting_of_a_training_is_named(kitchen, tmp_path):
+def test_unknown_training_setting_is_named(kitchen, tmp_path):
     (tmp_path / "settings.toml").write_text("speed = 3")
     told = run(
         "train",
@@ -242,25 +242,25 @@ def test_unknown_setting_of_a_training_is_named(kitchen, tmp_path):
         ),
     ],
 )
-def test_folder_that_can_not_be_written_is_named(kitchen, tmp_path, arguments, words):
+def test_unwritable_folder_is_named(kitchen, tmp_path, arguments, words):
     (tmp_path / "file").write_text("no folder")
     out = tmp_path / "file" / "out"
     filled = [item.replace("DATASET", str(kitchen)).replace("OUT", str(out)) for item in arguments]
     assert_told(run(*filled), 2, str(out), words)
 
 
-def test_full_disk_leaves_no_half_scene(tmp_path):
+def test_full_disk_leaves_no_partial_scene_file(tmp_path):
     told = run_anew("scene", "build", "Rs_int", f"--out={tmp_path}", largest_file=4096)
     assert_told(told, 2, "Rs_int.json can't be written (File too large): make room")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_there_is_nothing_to_resume_without_a_checkpoint(kitchen, tmp_path):
+def test_resume_without_checkpoint_is_refused(kitchen, tmp_path):
     told = run("train", "--resume", f"--dataset={kitchen}", f"--out={tmp_path}")
     assert_told(told, 2, f"no checkpoint in {tmp_path} to resume from: leave out --resume")
 
 
-def test_folder_of_another_run_is_left_alone(kitchen, tmp_path):
+def test_folder_of_another_run_stays_unchanged(kitchen, tmp_path):
     (tmp_path / "checkpoints" / "step-000001").mkdir(parents=True)
     told = run("train", f"--dataset={kitchen}", f"--out={tmp_path}")
     assert_told(told, 2, f"{tmp_path} holds another run: pass --resume to continue it, or another --out")
@@ -269,7 +269,7 @@ def test_folder_of_another_run_is_left_alone(kitchen, tmp_path):
     )
 
 
-def test_interrupted_evaluation_keeps_its_answers_and_goes_on_from_them(kitchen, tmp_path):
+def test_interrupted_evaluation_resumes_from_its_answers(kitchen, tmp_path):
     out = tmp_path / "out"
     arguments = ("eval", f"--bench={kitchen}", "--split=all", "--model-name=m", "--samples=3", f"--out={out}")
     late = (200, {}, json.dumps(completion("move 10")), 6.0)
@@ -287,7 +287,7 @@ def _lines(out):
     return (out / "answers.jsonl").read_bytes().splitlines()
 
 
-def test_interrupted_build_leaves_no_dataset_and_can_be_gone_on_with(tmp_path):
+def test_interrupted_build_leaves_no_dataset_and_resumes(tmp_path):
     out = tmp_path / "out"
     arguments = (
         "factory", "build", f"--out={out}", "--scene=Rs_int", "--train=8", "--heldout=0", "--no-look-ahead"

@@ -65,7 +65,7 @@ def assert_a_trace_of(events, rollouts):
 
 
 @pytest.mark.browser
-async def test_report_and_trace_of_a_run_that_is_over_show_what_it_did(browser, kitchen, tmp_path):
+async def test_report_and_trace_of_a_closed_run_show_its_rollouts(browser, kitchen, tmp_path):
     report, trace = tmp_path / "report.html", tmp_path / "trace.json"
     with cluster(tmp_path / "cluster") as (address, _):
         results = await lived_run(kitchen, address)
@@ -88,12 +88,12 @@ async def test_report_and_trace_of_a_run_that_is_over_show_what_it_did(browser, 
 
 
 @pytest.mark.parametrize("command", ["workers", "plan", "events"])
-def test_a_manager_that_can_not_be_reached_is_named(command):
+def test_cluster_command_names_an_unreachable_manager(command):
     answer = run("cluster", command, f"--manager={NOWHERE}")
     assert (answer.status, UNREACHABLE in answer.text, "Traceback" in answer.text) == (2, True, False)
 
 
-async def test_what_is_not_there_is_named_with_what_to_do(tmp_path):
+async def test_unknown_run_or_worker_error_names_the_remedy(tmp_path):
     async with manager(tmp_path) as at:
         there = f"--manager={at.address}"
         report = await told("report", "r9", there)
@@ -108,7 +108,7 @@ async def test_what_is_not_there_is_named_with_what_to_do(tmp_path):
         assert (written.status, "can't be written" in written.text) == (2, True)
 
 
-async def test_a_worker_is_drained_and_taken_back_and_dispatch_is_paused(tmp_path):
+async def test_operator_drains_and_resumes_a_worker_and_pauses_dispatch(tmp_path):
     async with (
         manager(tmp_path) as at,
         open_run(at.address) as client,

@@ -93,7 +93,7 @@ def test_two_workers_register_with_the_manager(cluster):
     _until(lambda: cluster.ready_workers() == 2)
 
 
-def test_images_are_small_and_run_without_root_on_a_system_that_they_can_not_write():
+def test_images_are_small_and_run_unprivileged_on_a_read_only_system():
     for name, most_mb in (("manager", 200), ("worker", 400)):
         size = int(_docker("image", "inspect", "--format", "{{.Size}}", f"embomatrix/{name}"))
         assert size <= most_mb * 1e6, f"{name} has {size / 1e6:.0f} MB"
@@ -102,7 +102,7 @@ def test_images_are_small_and_run_without_root_on_a_system_that_they_can_not_wri
         assert _compose("exec", "-T", service, "touch", "/opt/here", check=False).returncode != 0
 
 
-def test_starting_twice_changes_nothing_and_workers_can_be_more(cluster):
+def test_second_start_changes_nothing_and_workers_scale(cluster):
     before = _compose(
         "exec", "-T", "manager", "sha256sum", "/data/access/ca.pem", "/data/access/tokens/worker"
     ).stdout
@@ -116,7 +116,7 @@ def test_starting_twice_changes_nothing_and_workers_can_be_more(cluster):
     _until(lambda: cluster.ready_workers() == 2)
 
 
-def test_a_worker_that_dies_comes_back_and_the_cluster_outlives_redis_and_the_manager(cluster):
+def test_dead_worker_restarts_and_cluster_survives_redis_and_manager_restarts(cluster):
     _until(lambda: cluster.ready_workers() == 2)
     _compose(
         "exec", "-T", "worker", "python", "-c", "import os, signal; os.kill(-1, signal.SIGKILL)", check=False
@@ -127,7 +127,7 @@ def test_a_worker_that_dies_comes_back_and_the_cluster_outlives_redis_and_the_ma
         _until(lambda: cluster.ready_workers() == 2)
 
 
-def test_a_trainer_in_a_container_trains_on_tasks_made_in_a_container(cluster):
+def test_trainer_container_trains_on_tasks_built_in_a_container(cluster):
     _until(lambda: cluster.ready_workers() == 2)
     _compose(
         "run",

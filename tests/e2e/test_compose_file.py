@@ -15,13 +15,13 @@ SERVICES = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]
 VOLUMES = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["volumes"]
 
 
-def test_host_ports_are_published_on_loopback_alone():
+def test_host_ports_are_published_on_loopback_only():
     published = [port for service in SERVICES.values() for port in service.get("ports", ())]
     assert published
     assert all(port.startswith("127.0.0.1:") for port in published)
 
 
-def test_only_init_and_the_manager_see_keys_and_all_tokens():
+def test_only_init_and_manager_see_keys_and_all_tokens():
     holders = {
         name
         for name, service in SERVICES.items()
@@ -34,18 +34,18 @@ def test_only_init_and_the_manager_see_keys_and_all_tokens():
     assert named == set(VOLUMES)
 
 
-def test_nobody_starts_before_certificates_and_tokens_are_there():
+def test_services_wait_for_certificates_and_tokens():
     assert SERVICES["manager"]["depends_on"]["init"] == {"condition": "service_completed_successfully"}
     for name in ("worker", "trainer"):
         assert SERVICES[name]["depends_on"]["manager"] == {"condition": "service_healthy"}
 
 
-def test_there_is_no_secret_in_the_file():
+def test_compose_file_contains_no_secret():
     tokens = [service.get("environment", {}).get("EMBOMATRIX_TOKEN", "@") for service in SERVICES.values()]
     assert all(token.startswith("@") for token in tokens)
 
 
-def test_every_service_runs_confined_within_limits_and_comes_back():
+def test_every_service_is_confined_limited_and_restarted():
     for name, service in SERVICES.items():
         assert service["read_only"], name
         assert service["cap_drop"] == ["ALL"], name
@@ -66,7 +66,7 @@ def placed(arguments, folder):
 
 
 @pytest.mark.slow
-def test_the_commands_of_the_file_make_a_cluster_that_a_worker_joins_by_what_it_was_handed(tmp_path):
+def test_worker_joins_the_cluster_of_the_compose_commands_with_its_own_token(tmp_path):
     told = run("manager", "init", *placed(SERVICES["init"]["command"], tmp_path))
     assert told.status == 0, told.text
     assert "manager, localhost" in told.text

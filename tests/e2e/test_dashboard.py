@@ -106,9 +106,7 @@ async def test_training_page_without_reports_shows_the_command(browser, tmp_path
     assert "sampled" not in page.words
 
 
-async def test_pages_of_tasks_show_a_gallery_and_the_oracle_s_plan_on_the_plan_view(
-    browser, kitchen, tmp_path
-):
+async def test_task_pages_show_gallery_and_oracle_plan(browser, kitchen, tmp_path):
     dataset = Dataset.load(kitchen)
     record = dataset.train[0]
     async with manager(tmp_path / "data", dataset=kitchen) as at:
@@ -129,7 +127,7 @@ async def test_pages_of_tasks_show_a_gallery_and_the_oracle_s_plan_on_the_plan_v
     assert "the dataset holds no task 'nothing'" in none.words["main"]
 
 
-async def test_page_of_tasks_says_how_to_show_a_dataset(browser, tmp_path):
+async def test_task_page_without_dataset_shows_the_option(browser, tmp_path):
     async with manager(tmp_path / "data") as at:
         page = await asyncio.to_thread(shown, browser, f"{at.status_url}#tasks", tmp_path)
     assert page.words["cards"] == "no dataset is shown: start the manager with --dataset FOLDER"

@@ -87,7 +87,7 @@ async def window(browser, url, *, size="desk", theme="light"):
 
 @contextlib.asynccontextmanager
 async def ten_workers(address):
-    """Of which one was killed, one pauses and one says much; one of two scenes does not load anywhere."""
+    """Ten workers: one was killed, one is paused, one logs much; one of two scenes loads nowhere."""
     names = [LONG, *(f"office-{number}" for number in range(1, 10))]
     async with contextlib.AsyncExitStack() as stack, open_run(address) as client:
         workers = [FakeWorker(address, name, slots=2, broken={BEDROOM}) for name in names]
@@ -108,7 +108,7 @@ async def ten_workers(address):
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
 @pytest.mark.parametrize("size", SIZES)
-async def test_every_page_fits_its_window_is_legible_and_names_its_parts(browser, tmp_path, size, theme):
+async def test_every_page_fits_its_window_and_labels_its_parts(browser, tmp_path, size, theme):
     async with (
         manager(tmp_path) as at,
         ten_workers(at.address),
@@ -163,13 +163,13 @@ async def test_look_ahead_is_read_by_keyboard(browser, tmp_path):
 
 
 async def _slots_shown_s(opened, pattern="shown"):
-    """How long the part of the timeline is that is shown, once its words fit."""
+    """Return the visible duration of the timeline in seconds, once its labels fit."""
     number, unit = (await opened.until("#range", pattern)).split()[:2]
     return float(number) * {"ms": 0.001, "s": 1, "min": 60}[unit]
 
 
 async def _point_at_a_rollout(opened):
-    """Where on the page the mouse found one."""
+    """Return the page position at which the mouse points at a rollout."""
     await opened.page.locator("canvas.gantt").wait_for()
     box = await opened.page.locator("canvas.gantt").bounding_box()
     for left in range(int(box["x"]) + 160, int(box["x"] + box["width"]), 6):

@@ -22,7 +22,7 @@ def lines(log):
     ]
 
 
-async def test_lines_of_manager_and_worker_are_objects_with_ids_and_without_the_token(kitchen, tmp_path):
+async def test_json_log_lines_have_ids_and_no_token(kitchen, tmp_path):
     dataset = Dataset.load(kitchen)
     record = dataset.train[0]
     digest, task, plan = record.bundle_digest, record.task.task_id, plan_from_json(list(record.oracle))
@@ -68,7 +68,7 @@ async def test_lines_of_manager_and_worker_are_objects_with_ids_and_without_the_
         assert SECRET not in (tmp_path / log).read_text()
 
 
-def test_a_format_that_there_is_none_of_is_refused():
+def test_unknown_log_format_is_refused():
     told = run("manager", "serve", "--log-format=xml")
     assert told.status == 2
     assert "xml" in told.text

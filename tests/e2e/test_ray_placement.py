@@ -41,7 +41,7 @@ def until(condition, seconds=120.0):
     return found
 
 
-async def test_a_worker_that_ray_places_executes_and_is_made_anew_when_it_is_lost(kitchen, tmp_path):
+async def test_worker_on_ray_executes_and_restarts_after_a_loss(kitchen, tmp_path):
     dataset = Dataset.load(kitchen)
     record = dataset.train[0]
     digest, task_id = record.bundle_digest, record.task.task_id

@@ -55,7 +55,7 @@ class Shell:
         self._services.close()
 
     def type(self, line):
-        """What the line says in the end. One that goes on, goes on until the terminals are closed."""
+        """Return the line's final output. A command that keeps running ends when the terminals close."""
         line = line.replace("HOST:50070", f"localhost:{self.port}").replace("HOST", "localhost")
         for part, options in SHORT.items():
             line += options if part in line else ""
@@ -105,7 +105,7 @@ def _stop(process):
     process.wait(timeout=60)
 
 
-def test_every_command_of_the_start_page_does_what_it_says(tmp_path):
+def test_every_command_of_the_start_page_works(tmp_path):
     with Shell(tmp_path) as shell:
         _, build, *looks = lines_below("A plan in a scene")
         shell.type(build)

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.timeout(1200)
 
 @dataclass(frozen=True)
 class Run:
-    """What a training told and wrote whose first worker was killed in the middle, and who was started varied."""
+    """Output and files of a training run whose first worker was killed during it."""
 
     told: str
     out: Path
@@ -62,7 +62,7 @@ def run(tmp_path_factory):
     return Run(told, out, _metrics(out), restarts)
 
 
-def test_rollouts_of_a_killed_worker_are_executed_elsewhere_and_none_is_lost(run):
+def test_rollouts_of_a_killed_worker_are_redispatched_and_none_is_lost(run):
     assert run.restarts == {"manager": 0, "worker-1": 1, "worker-2": 0}
     assert [line["step"] for line in run.metrics] == list(range(1, STEPS + 1))
     assert sum(line["lost"] for line in run.metrics) == 0, "a rollout without a result"
@@ -71,7 +71,7 @@ def test_rollouts_of_a_killed_worker_are_executed_elsewhere_and_none_is_lost(run
     assert _counted("re-dispatched", run.told) >= 1, "the kill hit no rollout: the test shows nothing"
 
 
-def test_equal_plans_of_a_group_have_equal_rewards_on_any_worker(run):
+def test_equal_plans_have_equal_rewards_on_any_worker(run):
     rewards = {}
     for line in (run.out / "samples.jsonl").read_text().splitlines():
         sample = json.loads(line)
@@ -80,7 +80,7 @@ def test_equal_plans_of_a_group_have_equal_rewards_on_any_worker(run):
     assert all(len(found) == 1 for found in rewards.values())
 
 
-def test_a_run_ends_with_a_report_and_a_checkpoint(run):
+def test_run_ends_with_report_and_checkpoint(run):
     assert (run.out / "report.html").read_text().count("<svg") >= 2
     assert any((run.out / "checkpoints").glob(f"step-*{STEPS}"))
 

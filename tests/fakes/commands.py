@@ -36,14 +36,14 @@ sys.meta_path[:] = [Finder if finder is importlib.machinery.PathFinder else find
 
 @dataclass(frozen=True)
 class Told:
-    """What a person sees of a command that ended: its exit status and its words, however they were wrapped."""
+    """Exit status and text of a finished command, with line breaks removed."""
 
     status: int
     text: str
 
 
 def environment(**changes):
-    """Of this process, without what would change where a command looks or how much it shows."""
+    """Return this process's environment without variables that change paths or output of a command."""
     plain = {
         name: value for name, value in os.environ.items() if not name.startswith(("EMBOMATRIX_", "GRPC_"))
     }
@@ -116,7 +116,7 @@ def _server():
 
 
 def without(folder, *packages):
-    """What hides packages from a command, as if they had never been installed: changes of its environment."""
+    """Return environment changes that hide packages from a command, as if they were not installed."""
     (folder / "sitecustomize.py").write_text(HIDING)
     return {"PYTHONPATH": str(folder), "HIDDEN_PACKAGES": ",".join(packages)}
 

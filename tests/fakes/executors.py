@@ -1,4 +1,4 @@
-"""Where an evaluation's plans are executed in tests: in this process, by the code that local processes run."""
+"""Executor of an evaluation's plans in this process, with the code of the local processes."""
 
 from embomatrix.worker.slots.rollout_pool import execute_scene
 

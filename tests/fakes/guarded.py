@@ -20,7 +20,7 @@ from embomatrix.world.inflation import bundle_digest
 
 @dataclass
 class Guarded:
-    """Where the manager answers, and what opens it."""
+    """Address of a manager and the credentials for it."""
 
     address: str
     page: str

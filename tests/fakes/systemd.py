@@ -1,4 +1,4 @@
-"""What systemd itself says of a unit."""
+"""systemd's own check of a unit file."""
 
 import os
 import shutil

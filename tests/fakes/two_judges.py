@@ -150,7 +150,7 @@ WORDS = {"sliced": PIECES, "CLEAN": TOOLS, "not open": START, "open": START}
 
 
 def cause(trace, verdict):
-    """Why the judges disagree: by our step's reason where ours refuses, by their words where theirs does.
+    """Cause of a disagreement: our step's reason if ours refuses, their message if theirs does.
 
     Empty for none that is known.
     """

@@ -121,7 +121,7 @@ async def test_large_result_message_does_not_delay_leases(tmp_path):
         assert len(execution.result()) == 1000
 
 
-async def test_an_announced_scene_is_warm_before_its_batch_comes(tmp_path):
+async def test_announced_scene_is_warm_before_its_batch_arrives(tmp_path):
     async with manager(tmp_path) as at, open_run(at.address) as client, FakeWorker(at.address) as worker:
         first = await client.announce_lookahead("r1", 1, [LookaheadEntry(1, KITCHEN, 8)])
         assert first[KITCHEN] in (Warmth.WARMING, Warmth.QUEUED)
@@ -170,7 +170,7 @@ async def test_history_of_a_rollout_names_its_leases_and_an_unknown_one_is_refus
     assert abs(found.steps[0].at_s - time.time()) < 60
 
 
-async def test_a_late_result_is_acknowledged_and_never_delivered(tmp_path):
+async def test_late_result_is_acknowledged_and_never_delivered(tmp_path):
     async with manager(tmp_path) as at, open_run(at.address) as client:
         async with FakeWorker(at.address, worker_id="slow", stuck={"t"}) as slow:
             running_batch = asyncio.create_task(outcomes(client, batch(1)))
@@ -186,7 +186,7 @@ async def test_a_late_result_is_acknowledged_and_never_delivered(tmp_path):
         assert (await client.close_run("r1")).stale_results == 2
 
 
-async def test_a_plan_that_crashes_its_slot_ends_alone(tmp_path):
+async def test_plan_that_crashes_its_slot_fails_alone(tmp_path):
     async with manager(tmp_path) as at, open_run(at.address) as client:
         async with FakeWorker(at.address, slots=2, poison={"poison"}):
             good, bad = batch(20), batch(1, batch_id="b2", task="poison")
@@ -197,7 +197,7 @@ async def test_a_plan_that_crashes_its_slot_ends_alone(tmp_path):
         assert all(isinstance(result.outcome, Completed) for result in results.values())
 
 
-async def test_a_scene_that_two_workers_cannot_load_fails_its_rollouts_with_their_reason(tmp_path):
+async def test_scene_that_two_workers_cannot_load_fails_its_rollouts(tmp_path):
     async with (
         manager(tmp_path) as at,
         open_run(at.address) as client,
@@ -210,14 +210,14 @@ async def test_a_scene_that_two_workers_cannot_load_fails_its_rollouts_with_thei
         assert len(await outcomes(client, batch(4, batch_id="b2"))) == 4
 
 
-async def test_without_a_worker_rollouts_fail_after_a_bounded_wait(tmp_path):
+async def test_rollouts_without_a_worker_fail_after_a_bounded_wait(tmp_path):
     async with manager(tmp_path, no_capacity_s=0.3) as at, open_run(at.address) as client:
         results = await outcomes(client, batch(2))
     assert {result.outcome.code for result in results.values()} == {InfraCode.NO_CAPACITY}
     assert "embomatrix worker" in results["b1-0"].outcome.message
 
 
-async def test_a_trainer_attaches_again_from_its_cursor(tmp_path):
+async def test_trainer_reattaches_from_its_cursor(tmp_path):
     async with manager(tmp_path) as at, open_run(at.address) as client, FakeWorker(at.address) as worker:
         first = [result async for result in client.execute(batch(30))]
         async with ClusterClient(at.address) as another:
@@ -226,14 +226,14 @@ async def test_a_trainer_attaches_again_from_its_cursor(tmp_path):
         assert len(worker.executed) == 30
 
 
-async def test_the_same_batch_id_with_other_content_is_refused(tmp_path):
+async def test_batch_id_with_other_content_is_refused(tmp_path):
     async with manager(tmp_path) as at, open_run(at.address) as client, FakeWorker(at.address):
         await outcomes(client, batch(2))
         with pytest.raises(ConflictError, match="use a new id"):
             await outcomes(client, batch(3))
 
 
-async def test_a_cancelled_batch_ends_at_once(tmp_path):
+async def test_cancelled_batch_ends_at_once(tmp_path):
     async with (
         manager(tmp_path) as at,
         open_run(at.address) as client,
@@ -286,7 +286,7 @@ async def test_restarted_manager_keeps_the_look_ahead_window(tmp_path):
         assert await admin.plan("r1") == ()
 
 
-async def test_a_manager_whose_state_was_taken_over_stops(tmp_path):
+async def test_deposed_manager_stops(tmp_path):
     state = f"sqlite:{tmp_path / 'state.sqlite'}"
 
     async def serve_until_fenced():
@@ -313,7 +313,7 @@ async def test_a_manager_whose_state_was_taken_over_stops(tmp_path):
     assert caught.group_contains(FencedError, match="another manager took over")
 
 
-async def test_a_bundle_with_a_wrong_digest_is_refused(tmp_path):
+async def test_uploaded_bundle_with_wrong_digest_is_refused(tmp_path):
     async with manager(tmp_path) as at, ClusterClient(at.address) as client:
         with pytest.raises(InvalidRequestError, match="damaged"):
             await client.put_bundles({KITCHEN: BEDROOM_DATA})
@@ -324,7 +324,7 @@ async def test_a_bundle_with_a_wrong_digest_is_refused(tmp_path):
     assert [path.suffix for path in (tmp_path / "bundles").iterdir()] == [".bundle"]
 
 
-async def test_a_bundle_of_many_chunks_comes_back_unchanged(tmp_path):
+async def test_bundle_of_many_chunks_round_trips(tmp_path):
     digest, data = bundle_of("x" * 3_500_000)
     async with (
         manager(tmp_path) as at,
@@ -340,7 +340,7 @@ async def test_a_bundle_of_many_chunks_comes_back_unchanged(tmp_path):
     assert b"".join(parts) == data
 
 
-async def test_rollouts_of_a_missing_bundle_or_run_are_refused(tmp_path):
+async def test_rollouts_without_bundle_or_run_are_refused(tmp_path):
     async with manager(tmp_path) as at, ClusterClient(at.address) as client:
         with pytest.raises(NotFoundError, match="OpenRun"):
             await outcomes(client, batch(1))
@@ -349,7 +349,7 @@ async def test_rollouts_of_a_missing_bundle_or_run_are_refused(tmp_path):
             await outcomes(client, batch(1))
 
 
-async def test_a_second_worker_of_the_same_id_ends_the_first_session(tmp_path):
+async def test_second_worker_with_the_same_id_ends_the_first_session(tmp_path):
     async with manager(tmp_path) as at, FakeWorker(at.address) as first:
         call = first._stub.Session(first._requests())
         await call.read()
@@ -359,7 +359,7 @@ async def test_a_second_worker_of_the_same_id_ends_the_first_session(tmp_path):
         assert isinstance(cluster_error(caught.value, at.address), SupersededError)
 
 
-async def test_a_drained_worker_gets_nothing_new(tmp_path):
+async def test_drained_worker_gets_no_new_leases(tmp_path):
     async with (
         manager(tmp_path) as at,
         open_run(at.address) as client,

@@ -33,7 +33,7 @@ async def warmed(client, entries):
             await asyncio.sleep(0.02)
 
 
-async def test_metrics_of_a_manager_under_load_add_up(tmp_path):
+async def test_metrics_under_load_are_consistent(tmp_path):
     async with (
         manager(tmp_path) as at,
         open_run(at.address) as client,

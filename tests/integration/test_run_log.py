@@ -12,7 +12,7 @@ from embomatrix.rpc.wire.values import Batch, LookaheadEntry
 pytestmark = pytest.mark.timeout(60)
 
 
-async def test_every_phase_of_every_rollout_is_timed_and_nothing_is_counted_twice(tmp_path):
+async def test_every_phase_of_every_rollout_is_timed_once(tmp_path):
     async with manager(tmp_path) as at, open_run(at.address) as client, FakeWorker(at.address, slots=2):
         results = await outcomes(client, batch(40))
         async with AdminClient(at.address) as logs:

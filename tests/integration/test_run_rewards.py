@@ -30,7 +30,7 @@ async def open_run(client, terms, run_id="r1"):
     await client.put_bundles(BUNDLES)
 
 
-async def test_each_run_is_scored_with_its_own_coefficients_on_the_same_worker(tmp_path):
+async def test_each_run_is_scored_with_its_own_coefficients(tmp_path):
     async with manager(tmp_path) as at, ClusterClient(at.address) as client, FakeWorker(at.address, slots=2):
         await open_run(client, TERMS)
         await open_run(client, RunTerms(), "r2")
@@ -70,7 +70,7 @@ async def test_redispatched_rollout_keeps_its_reward_coefficients(
         assert totals(await outcomes(client, batch(2))) == {5.0}
 
 
-async def test_coefficients_that_make_no_reward_are_refused_when_the_run_is_opened(tmp_path):
+async def test_invalid_coefficients_are_refused_at_open_run(tmp_path):
     async with manager(tmp_path) as at, open_channel(at.address) as channel:
         stub = rollout_service_pb2_grpc.RolloutServiceStub(channel)
         bad = types_pb2.RewardSettings(unparsable=-1, format=0.5, goal=-30)

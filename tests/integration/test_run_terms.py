@@ -136,7 +136,7 @@ async def test_run_terms_survive_a_manager_restart(tmp_path):
         assert isinstance(results["x1"], Completed)
 
 
-async def test_nothing_is_leased_while_dispatch_is_paused(tmp_path):
+async def test_paused_dispatch_gives_no_leases(tmp_path):
     async with (
         manager(tmp_path) as address,
         open_run(address) as client,

@@ -135,9 +135,7 @@ for text in sys.argv[2:]:
 """
 
 
-async def test_equal_plans_have_equal_digests_in_every_slot_in_a_fresh_process_and_after_other_plans(
-    tmp_path, kitchen
-):
+async def test_equal_plans_have_equal_digests_in_every_slot(tmp_path, kitchen):
     async with running(tmp_path, kitchen, slots=2) as harness:
         rounds = [list(enumerate(PLANS)), list(enumerate(PLANS))[::-1], list(enumerate(PLANS)) * 2]
         for number, plans in enumerate(rounds):
@@ -165,7 +163,7 @@ def _words(call):
     return [call.skill.value, *(str(value) for value in values if value is not None)]
 
 
-async def test_a_plan_is_scored_with_the_coefficients_of_its_run_and_does_the_same(tmp_path, kitchen):
+async def test_run_coefficients_change_the_score_and_not_the_execution(tmp_path, kitchen):
     own = RewardSettings(format=2.0, relevance_per_object=1.0, relevance_limit=9.0, goal=3.0)
     async with running(tmp_path, kitchen) as harness:
         harness.submit("own", harness.plan(PLANS[0]), reward=own)
@@ -179,9 +177,7 @@ async def test_a_plan_is_scored_with_the_coefficients_of_its_run_and_does_the_sa
     assert mine.reward.goal == pytest.approx(usual.reward.goal / 10)
 
 
-async def test_a_slot_that_was_stopped_is_killed_at_the_deadline_and_the_next_rollout_is_executed(
-    tmp_path, kitchen
-):
+async def test_stopped_slot_is_killed_at_its_deadline_and_replaced(tmp_path, kitchen):
     async with running(tmp_path, kitchen) as harness:
         harness.submit("first", harness.plan(PLANS[0]))
         first = await harness.outcome("first")
@@ -195,9 +191,7 @@ async def test_a_slot_that_was_stopped_is_killed_at_the_deadline_and_the_next_ro
         await harness.until(lambda: not psutil.pid_exists(slot.pid))
 
 
-async def test_a_scene_that_was_stopped_is_noticed_killed_and_loaded_anew_and_its_slots_finish(
-    tmp_path, kitchen
-):
+async def test_stopped_resident_is_replaced_and_its_slots_finish(tmp_path, kitchen):
     async with running(tmp_path, kitchen, slots=2) as harness:
         harness.submit("first", harness.plan(PLANS[0]))
         first = await harness.outcome("first")
@@ -216,7 +210,7 @@ async def test_a_scene_that_was_stopped_is_noticed_killed_and_loaded_anew_and_it
         assert [resident.state for resident in harness.pool.residents()] == [ResidentState.WARM]
 
 
-async def test_a_slot_that_was_killed_costs_its_rollout_and_no_other(tmp_path, kitchen):
+async def test_killed_slot_costs_only_its_rollout(tmp_path, kitchen):
     async with running(tmp_path, kitchen, slots=2) as harness:
         harness.submit("first", harness.plan(PLANS[0]))
         await harness.outcome("first")
@@ -233,7 +227,7 @@ async def test_a_slot_that_was_killed_costs_its_rollout_and_no_other(tmp_path, k
         assert len(digests) == 1
 
 
-async def test_a_plan_that_goes_in_circles_ends_with_its_last_step(tmp_path, kitchen):
+async def test_circular_plan_ends_with_its_last_step(tmp_path, kitchen):
     async with running(tmp_path, kitchen) as harness:
         circle = harness.plan("; ".join(["move apple_1; move fridge_1"] * (MAX_STEPS // 2)))
         assert len(circle) == MAX_STEPS
@@ -249,9 +243,7 @@ async def test_a_plan_that_goes_in_circles_ends_with_its_last_step(tmp_path, kit
         assert isinstance(await harness.outcome("next"), Completed)
 
 
-async def test_a_bundle_of_a_gigabyte_or_of_another_digest_fails_its_leases_at_once_and_no_others(
-    tmp_path, kitchen
-):
+async def test_invalid_bundle_fails_only_its_own_leases(tmp_path, kitchen):
     async with running(tmp_path, kitchen) as harness:
         huge, other = "sha256:" + "1" * 64, "sha256:" + "2" * 64
         harness.paths[huge] = tmp_path / "huge.bundle"
@@ -272,7 +264,7 @@ def takes_small_pages(pid):
     return "THP_enabled:\t0" in Path(f"/proc/{pid}/status").read_text()
 
 
-async def test_many_rollouts_leave_a_slot_as_small_as_a_few(tmp_path, kitchen):
+async def test_slot_memory_stays_constant_over_many_rollouts(tmp_path, kitchen):
     async with running(tmp_path, kitchen) as harness:
         sizes_mb = []
         for stretch in range(4):

@@ -27,7 +27,7 @@ def batch(count, batch_id="b1"):
     return Batch("r1", batch_id, 1, rollouts)
 
 
-async def test_replacing_a_worker_during_a_batch_drops_no_rollout(tmp_path, capsys):
+async def test_replacing_a_worker_during_a_batch_loses_no_rollout(tmp_path, capsys):
     async with manager(tmp_path) as at, ClusterClient(at.address) as client:
         await client.open_run("upgrade", "r1")
         await client.put_bundles({KITCHEN: DATA})
@@ -74,7 +74,7 @@ async def test_trainer_of_an_unknown_version_is_refused(tmp_path):
     ("ours", "theirs", "agreed"),
     [((1, 2), (1, 2), 2), ((1, 2), (2, 3), 2), ((1, 2), (1, 1), 1), ((2, 3), (1, 2), 2), ((2, 2), (2, 2), 2)],
 )
-def test_two_sides_speak_the_newest_version_of_both(ours, theirs, agreed):
+def test_newest_common_version_is_negotiated(ours, theirs, agreed):
     sides = {"us": "this manager", "them": "worker w1"}
     assert agree(VersionRange(*ours), VersionRange(*theirs), **sides) == agreed
     assert agree(VersionRange(*theirs), VersionRange(*ours), **sides) == agreed

@@ -1,4 +1,4 @@
-"""Which of EAI's hundred goals the skills of each profile can bring about, and what stands in the way of the others."""
+"""EAI's hundred goals: those that each profile's skills can reach, and the predicates that block the others."""
 
 import collections
 import re
@@ -21,7 +21,7 @@ def problems():
 
 
 def blocking(problems, profile):
-    """How many goals each set of predicates bars."""
+    """Count the goals that each set of predicates blocks."""
     found = {name: unreachable_atoms(problem, profile) for name, problem in problems.items()}
     told = []
     for atoms in filter(None, found.values()):

@@ -43,7 +43,7 @@ def marked(exam, texts):
 
 
 def verdict(exam, *steps, text=None):
-    """What is said of one plan for the task of the fruit."""
+    """Return the judge's verdict on one plan for the fruit task."""
     plan = text if text is not None else json.dumps([{"action": a, "object": o} for a, o in steps])
     board = marked(exam, {FRUIT: plan}).board
     return next(task for task in board.tasks if task.task_id == FRUIT).verdicts[0]

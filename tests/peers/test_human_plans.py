@@ -51,7 +51,7 @@ def homes_of(scene, table):
 
 
 def judged(source, native, judge, base, library):
-    """What becomes of a task: a word, then why."""
+    """Return the result of a task in one word, and the reason."""
     imported, found = in_its_scene(source, base, library)
     task, names = found.record.task, names_of(imported, native)
     bundle = decode_bundle(found.bundle)

@@ -47,7 +47,7 @@ ROUNDS = 3
 
 
 def compared(imported, found, native, judge):
-    """For each plan: its kind, whether each judge calls it a success, and the cause where they disagree."""
+    """Return kind, both verdicts and the cause of disagreement of each plan."""
     record = found.record
     table, names = record.task.table, names_of(imported, native)
     deeds = deeds_of(plan_from_json(list(record.oracle), record.task.profile))

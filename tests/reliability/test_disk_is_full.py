@@ -14,7 +14,7 @@ from embomatrix.rpc.status import OverloadedError
 pytestmark = [pytest.mark.timeout(240), pytest.mark.slow]
 
 
-async def test_results_wait_for_room_on_the_disk_and_new_runs_are_refused_with_the_remedy(tmp_path):
+async def test_full_disk_delays_results_and_refuses_new_runs(tmp_path):
     with RealCluster(tmp_path) as cluster:
         page_port = free_port()
         cluster.start_manager(http_port=page_port)

@@ -74,7 +74,7 @@ async def test_faults_do_not_change_advantages_of_complete_groups(tmp_path):
 
 
 def advantages(results):
-    """By group, in the order of the rollouts; groups with a failure of the infrastructure are left out."""
+    """Return advantages by group in rollout order, without groups that had an infrastructure failure."""
     rewards = {}
     for result in sorted(results, key=lambda one: int(one.rollout_id.rpartition("-")[2])):
         complete = isinstance(result.outcome, Completed)

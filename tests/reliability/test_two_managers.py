@@ -19,7 +19,7 @@ pytestmark = pytest.mark.timeout(240)
 
 
 async def answers(cluster, name):
-    """What a manager's health check says; nothing while it ceases to stand by and has not begun to lead."""
+    """Return a manager's health status, or nothing while it changes from standby to leader."""
     async with grpc.aio.insecure_channel(f"127.0.0.1:{cluster.ports[name]}") as channel:
         stub = health_pb2_grpc.HealthStub(channel)
         try:
@@ -81,12 +81,12 @@ async def failed_over(folder, *, count, kill_at, ttl_s, number=signal.SIGKILL):
         assert again == 0
 
 
-async def test_another_manager_takes_over_when_the_leader_is_killed(tmp_path):
+async def test_standby_takes_over_when_the_leader_is_killed(tmp_path):
     await failed_over(tmp_path, count=10, kill_at=2, ttl_s=1.0)
 
 
 @pytest.mark.slow
-async def test_another_manager_takes_over_within_ten_seconds_at_the_default_settings(tmp_path):
+async def test_standby_takes_over_within_ten_seconds_by_default(tmp_path):
     await failed_over(tmp_path, count=10, kill_at=2, ttl_s=6.0)
 
 

@@ -38,7 +38,7 @@ METRIC = re.compile(r"\bembo_\w+")
 
 
 def options(app, name):
-    """What a command of ours takes."""
+    """Return the options of one of our commands."""
     return {
         option for parameter in typer.main.get_command(app).commands[name].params for option in parameter.opts
     }
@@ -49,11 +49,11 @@ def named(arguments):
 
 
 @pytest.mark.parametrize("item", OBJECTS, ids=lambda item: f"{item['kind']}-{item['metadata']['name']}")
-def test_what_kubernetes_reads_fits_its_schema(item):
+def test_kubernetes_manifests_match_the_schema(item):
     kubernetes_validate.validate(item, "1.30", strict=True)
 
 
-def test_pods_run_without_root_rights_or_a_system_that_they_can_write():
+def test_pods_run_unprivileged_on_a_read_only_system():
     assert set(PODS) == {"redis", "manager", "worker"}
     for name, pod in PODS.items():
         assert pod["securityContext"]["runAsNonRoot"], name
@@ -66,7 +66,7 @@ def test_pods_run_without_root_rights_or_a_system_that_they_can_write():
             assert container["resources"]["limits"]["memory"], name
 
 
-def test_pods_are_given_options_that_there_are():
+def test_pod_options_exist():
     (manager,) = PODS["manager"]["containers"]
     (init,) = PODS["manager"]["initContainers"]
     (worker,) = PODS["worker"]["containers"]
@@ -75,7 +75,7 @@ def test_pods_are_given_options_that_there_are():
     assert named(worker["args"]) <= options(worker_app, "run")
 
 
-def test_a_slurm_task_runs_a_worker_with_its_cores_under_a_name_of_its_own(tmp_path):
+def test_slurm_task_runs_a_worker_with_its_cores_and_a_unique_name(tmp_path):
     fake = tmp_path / "srun"
     fake.write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')
     fake.chmod(0o755)
@@ -93,7 +93,7 @@ def test_a_slurm_task_runs_a_worker_with_its_cores_under_a_name_of_its_own(tmp_p
     assert (nameless.returncode, "set it to the HOST:PORT" in nameless.stderr) == (1, True)
 
 
-def test_the_unit_of_the_manager_gives_options_that_there_are():
+def test_manager_unit_options_exist():
     calls = re.findall(
         r"^ExecStart(?:Pre)?=\S+ manager (\w+) (.*)$", MANAGER_UNIT.read_text(), flags=re.MULTILINE
     )
@@ -102,13 +102,13 @@ def test_the_unit_of_the_manager_gives_options_that_there_are():
 
 
 @needs_systemd
-def test_systemd_finds_nothing_wrong_with_the_unit_of_the_manager(tmp_path):
+def test_systemd_accepts_the_manager_unit(tmp_path):
     unit = tmp_path / MANAGER_UNIT.name
     unit.write_text(MANAGER_UNIT.read_text().replace("/opt/embomatrix/bin/embomatrix", shutil.which("true")))
     assert_valid_unit(unit, system=True)
 
 
-def test_what_the_manager_s_image_imports_needs_no_package_that_it_lacks():
+def test_manager_image_contains_all_imported_packages():
     built = (DEPLOY / "docker" / "Dockerfile").read_text()
     (lacked,) = re.findall(r"pyproject\.toml manager \| grep -v \^(\w+)", built)
     (modules,) = re.findall(r"slim\.py (.*embomatrix\.manager\.services\.app.*)", built)
@@ -120,14 +120,14 @@ def test_what_the_manager_s_image_imports_needs_no_package_that_it_lacks():
 
 
 @pytest.mark.parametrize("name", ["prometheus/rules.yml", "grafana/dashboard.json"])
-def test_alarms_and_panels_ask_for_metrics_that_the_guide_explains(name):
+def test_alarms_and_panels_use_documented_metrics(name):
     explained = set(re.findall(r"^\| `(embo_\w+)` \|", GUIDE, flags=re.MULTILINE))
     asked = {re.sub(r"_bucket$", "", metric) for metric in METRIC.findall((DEPLOY / name).read_text())}
     assert asked
     assert asked <= explained
 
 
-def test_the_dashboard_of_grafana_has_panels_that_do_not_overlap():
+def test_grafana_panels_do_not_overlap():
     panels = json.loads((DEPLOY / "grafana" / "dashboard.json").read_text())["panels"]
     taken = set()
     for panel in panels:
@@ -138,14 +138,14 @@ def test_the_dashboard_of_grafana_has_panels_that_do_not_overlap():
     assert max(x for x, _ in taken) < 24
 
 
-def test_every_alarm_says_what_to_do():
+def test_every_alarm_names_a_remedy():
     (group,) = yaml.safe_load((DEPLOY / "prometheus" / "rules.yml").read_text())["groups"]
     for rule in group["rules"]:
         assert rule["annotations"]["action"], rule["alert"]
         assert rule["labels"]["severity"] in ("warning", "critical")
 
 
-def test_every_alarm_is_tested_for_what_it_says_and_for_keeping_quiet():
+def test_every_alarm_has_a_firing_and_a_silent_test():
     (group,) = yaml.safe_load((PROMETHEUS / "rules.yml").read_text())["groups"]
     quiet, idle, *loud = [
         {case["alertname"]: case.get("exp_alerts") for case in test["alert_rule_test"]}
@@ -167,6 +167,6 @@ def test_every_alarm_is_tested_for_what_it_says_and_for_keeping_quiet():
     ],
     ids=" ".join,
 )
-def test_prometheus_reads_the_rules_and_sounds_each_alarm(asked):
+def test_prometheus_accepts_the_rules_and_fires_each_alarm(asked):
     ran = subprocess.run(("promtool", *asked), cwd=PROMETHEUS, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stdout + ran.stderr

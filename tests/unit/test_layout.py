@@ -29,7 +29,7 @@ def test_manager_and_trainer_import_without_a_physics_engine():
     subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
 
 
-def test_every_decision_stands_in_the_index_by_its_title():
+def test_index_lists_every_decision_by_its_title():
     folder = ROOT / "docs" / "decisions"
     pages = sorted(page for page in folder.glob("*.md") if page.name != "README.md")
     titles = [

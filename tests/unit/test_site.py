@@ -23,7 +23,7 @@ def hook(name):
 diagrams, outside = hook("diagrams"), hook("outside")
 
 
-def test_every_diagram_of_the_pages_is_drawn_for_both_themes_and_has_a_title():
+def test_every_diagram_has_a_title_and_a_picture_per_theme():
     sources = [source for page in DOCS.rglob("*.md") for source in diagrams.FENCE.findall(page.read_text())]
     assert sources
     assert all(diagrams.TITLE.search(source) for source in sources)
@@ -33,7 +33,7 @@ def test_every_diagram_of_the_pages_is_drawn_for_both_themes_and_has_a_title():
         assert not re.search(r"(?:href|src)=\"(?!#)|url\((?!#|\"#)|@import", path.read_text()), path.name
 
 
-def test_a_fence_becomes_a_light_and_a_dark_picture_with_the_diagram_s_title(tmp_path):
+def test_mermaid_fence_becomes_a_light_and_a_dark_picture(tmp_path):
     config = SimpleNamespace(docs_dir=str(tmp_path))
     text = f"Before.\n\n```mermaid\n{DRAWN}```\n\nAfter.\n"
     with pytest.raises(FileNotFoundError, match="run `make diagrams`"):
@@ -59,12 +59,12 @@ def test_a_fence_becomes_a_light_and_a_dark_picture_with_the_diagram_s_title(tmp
         '<pre class="mermaid"><code>a --> b</code></pre>',
     ],
 )
-def test_a_page_that_would_ask_another_site_is_refused(fetched):
+def test_page_that_loads_from_another_site_is_refused(fetched):
     with pytest.raises(ValueError, match="from another site"):
         outside.on_post_page(f"<p>words</p>{fetched}", PAGE, None)
 
 
-def test_a_link_that_a_person_may_follow_is_none_of_a_page_s_requests():
+def test_ordinary_links_to_other_sites_are_allowed():
     page = (
         '<a href="https://ui.perfetto.dev">Perfetto</a><img src="pictures/a.png"><script src="x.js"></script>'
     )

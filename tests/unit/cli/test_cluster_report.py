@@ -51,7 +51,7 @@ EVENTS = tuple(
 
 
 class Outline(HTMLParser):
-    """What a page asks for, and whether its elements are closed in order."""
+    """Resources that a page loads, and a check that its elements are closed in order."""
 
     VOID = frozenset(("meta", "link", "br"))
 

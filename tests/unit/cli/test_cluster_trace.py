@@ -28,7 +28,7 @@ def submitted(sequence, at_s, size, batch="b"):
 
 @st.composite
 def histories(draw):
-    """What a few slots truly did, and what a manager sees of it: results come late, and several at a time."""
+    """Draw true slot histories and the manager's view of them, with late and batched results."""
     truth, seen = [], []
     for slot in range(1, draw(st.integers(1, 3)) + 1):
         now_s = 100.0

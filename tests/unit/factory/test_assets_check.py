@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from typer.testing import CliRunner
 
-from embomatrix.factory.assets.check import EXCUSED_FROM_PROBE, PROBE_M, AssetFinding, Rule, check_asset
+from embomatrix.factory.assets.check import EXCUSED_FROM_PROBE, PROBE_M, AssetFinding, AssetRule, check_asset
 from embomatrix.factory.assets.contact_sheet import TILE_PX, draw_sheet
 from embomatrix.factory.assets.families import Family
 from embomatrix.factory.assets.library import build_asset, family_of
@@ -29,7 +29,7 @@ def box_at(center: tuple[float, float, float], size: tuple[float, float, float])
     return ConvexPart(Shape.BOX, Pose(center), size)
 
 
-def wrong(findings: tuple[AssetFinding, ...]) -> list[Rule]:
+def wrong(findings: tuple[AssetFinding, ...]) -> list[AssetRule]:
     return [finding.rule for finding in findings if not finding.excused]
 
 
@@ -89,7 +89,7 @@ def test_every_exemption_from_the_probe_is_needed_and_has_a_reason() -> None:
     excused = {
         family_of(CATALOG, name)
         for name in CATALOG.used_categories
-        if any(f.rule is Rule.FILLABLE and f.excused for f in check_asset(CATALOG, first_of(name)))
+        if any(f.rule is AssetRule.FILLABLE and f.excused for f in check_asset(CATALOG, first_of(name)))
     }
     assert all(EXCUSED_FROM_PROBE.values())
     assert set(EXCUSED_FROM_PROBE) <= excused
@@ -98,7 +98,7 @@ def test_every_exemption_from_the_probe_is_needed_and_has_a_reason() -> None:
 def test_model_of_wrong_size_is_reported() -> None:
     apple = first_of("apple")
     taller = replace(apple, size_m=(*apple.size_m[:2], apple.size_m[2] * 1.06))
-    assert wrong(check_asset(CATALOG, taller)) == [Rule.SIZE]
+    assert wrong(check_asset(CATALOG, taller)) == [AssetRule.SIZE]
     assert not check_asset(CATALOG, replace(apple, size_m=(*apple.size_m[:2], apple.size_m[2] * 1.04)))
 
 
@@ -106,7 +106,7 @@ def test_too_narrow_cavity_is_reported() -> None:
     bucket = first_of("bucket")
     slit = Interior("inside", (0.0, 0.0, 0.0), (0.1, PROBE_M - 1e-3, 0.1))
     (finding,) = check_asset(CATALOG, replace(bucket, interiors=(slit,)))
-    assert (finding.rule, finding.excused) == (Rule.FILLABLE, False)
+    assert (finding.rule, finding.excused) == (AssetRule.FILLABLE, False)
     assert "0.029 m wide" in finding.detail
 
 
@@ -116,7 +116,7 @@ def test_door_that_penetrates_its_frame_is_reported() -> None:
     assert door.joint is not None
     inward = replace(door, joint=replace(door.joint, axis=(0.0, 0.0, 1.0)))
     (finding,) = check_asset(CATALOG, replace(fridge, links=(base, inward)))
-    assert finding.rule is Rule.OPENABLE
+    assert finding.rule is AssetRule.OPENABLE
     assert finding.detail.startswith("door at 5% of its travel")
 
 
@@ -127,12 +127,12 @@ def test_overlapping_drawers_are_reported() -> None:
     other = Link("other", (box_at((0.3, -0.2, 0.0), (0.1, 0.1, 0.1)),), replace(out, axis=side))
     base = Link("base", (box_at((0.0, 0.0, -0.3), (0.2, 0.2, 0.1)),))
     findings = check_asset(CATALOG, replace(fridge, links=(base, one, other)))
-    assert Rule.OPENABLE in wrong(findings)
+    assert AssetRule.OPENABLE in wrong(findings)
 
 
 def test_openable_asset_without_a_joint_is_reported() -> None:
     fridge = first_of("fridge")
-    assert Rule.OPENABLE in wrong(check_asset(CATALOG, replace(fridge, links=fridge.links[:1])))
+    assert AssetRule.OPENABLE in wrong(check_asset(CATALOG, replace(fridge, links=fridge.links[:1])))
 
 
 def test_sheet_shows_an_asset_closed_and_open() -> None:

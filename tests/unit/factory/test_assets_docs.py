@@ -7,7 +7,7 @@ from collections import Counter
 from dataclasses import fields
 from pathlib import Path
 
-from embomatrix.factory.assets.check import Rule
+from embomatrix.factory.assets.check import AssetRule
 from embomatrix.factory.assets.families import Family
 from embomatrix.factory.assets.library import family_of
 from embomatrix.world.asset import Asset
@@ -38,7 +38,7 @@ def test_table_of_families_counts_every_category_in_use_once() -> None:
 
 
 def test_every_rule_has_its_row() -> None:
-    assert [name.strip("` ") for name, _ in rows("rule")] == list(Rule)
+    assert [name.strip("` ") for name, _ in rows("rule")] == list(AssetRule)
 
 
 def test_fields_of_the_page_are_those_of_an_asset() -> None:

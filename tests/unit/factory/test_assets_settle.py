@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from embomatrix.factory.assets.check import GLANCE_STEPS, AssetFinding, Rule, check_standing
+from embomatrix.factory.assets.check import GLANCE_STEPS, AssetFinding, AssetRule, check_standing
 from embomatrix.factory.assets.check import STEPS as STEPS_OF_TWO_SECONDS
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.world.asset import Link
@@ -75,7 +75,7 @@ def test_object_on_its_edge_is_reported() -> None:
     book = build_asset(CATALOG, "hardback", CATALOG.models_of("hardback")[0].model_id)
     lean = Link("base", tuple(replace(part, pose=LEANING @ part.pose) for part in book.links[0].parts))
     (finding,) = check_standing(CATALOG, [replace(book, links=(lean,), size_m=(0.2, 0.2, 0.2))])
-    assert finding.rule is Rule.STANDS
+    assert finding.rule is AssetRule.STANDS
     assert not finding.excused
 
 

@@ -109,7 +109,7 @@ def digest_of(data):
 
 
 def packed(content):
-    """As a bundle is: a whole zlib stream, here of the size of its content and 11 bytes."""
+    """Return a complete zlib stream, 11 bytes longer than its content."""
     return zlib.compress(content, level=0)
 
 

@@ -307,7 +307,7 @@ class LeaseMachine(RuleBasedStateMachine):
             assert all(hasattr(o, "reward") == isinstance(o, Completed) for o in outcomes)
 
     def teardown(self):
-        """With one healthy worker and enough time, every rollout gets its outcome."""
+        """Check that every rollout gets its outcome with one healthy worker and enough time."""
         if not hasattr(self, "cluster"):
             return
         self.tell(DispatchResumed())

@@ -42,7 +42,7 @@ def test_higher_priority_is_served_first():
 
 @pytest.mark.parametrize("memory_mb", [2048, 100])
 def test_small_run_does_not_wait_for_a_large_batch(memory_mb):
-    """In the smaller memory there is room for a few of the forty scenes only: residents are shared as well."""
+    """The smaller memory holds only a few of the forty scenes, so runs share residents too."""
     kinds = (replace(CLUSTER.kinds[0], memory_mb=memory_mb),)
     report = beside(SMALL, kinds=kinds)
     assert max(report.groups_s["large"]) >= 25.0

@@ -64,7 +64,7 @@ def test_unknown_task_raises_a_dataset_error(household):
 
 
 class Closing:
-    """What a household does with simulators; it executes nothing."""
+    """Fake simulator that executes nothing and records that it was closed."""
 
     def __init__(self, bundle):
         self.open = True

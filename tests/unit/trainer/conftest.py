@@ -10,13 +10,13 @@ import torch
 
 @pytest.fixture(autouse=True)
 def one_thread():
-    """What is compared to the bit is computed by one thread; several are no faster on networks of a test's size."""
+    """Use one thread: bit comparisons need it, and more are no faster on networks of this size."""
     torch.set_num_threads(1)
 
 
 @pytest.fixture
 def small_files():
-    """For a while the kernel refuses to write files larger than so many bytes, as a full disk refuses to write."""
+    """Make the kernel refuse files above a size, as a full disk would."""
 
     @contextmanager
     def limited(most_bytes):

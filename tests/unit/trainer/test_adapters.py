@@ -148,7 +148,7 @@ class Accelerator:
 
 
 class TrainerOfTheirs:
-    """What the mixin relies on in TRL's trainer; that TRL has it, a test beside TRL says."""
+    """Part of TRL's trainer that the mixin uses; tests/peers checks that TRL has it."""
 
     args, accelerator = Arguments, Accelerator
     num_generations, num_iterations = 2, 1

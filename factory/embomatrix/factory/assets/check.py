@@ -33,7 +33,7 @@ TRAVEL: Final = (0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)
 """Shares of the travel at which moving parts are tested."""
 
 
-class Rule(StrEnum):
+class AssetRule(StrEnum):
     """Requirement that an asset is checked against."""
 
     SIZE = "size"
@@ -47,7 +47,7 @@ class AssetFinding:
     """A violated rule. ``excused`` means that the rule does not apply, for the reason in ``detail``."""
 
     asset_id: str
-    rule: Rule
+    rule: AssetRule
     detail: str
     excused: bool = False
 
@@ -73,7 +73,7 @@ def _size(asset: Asset) -> Iterator[AssetFinding]:
         if abs(found - wanted) > SIZE_TOLERANCE * wanted:
             yield AssetFinding(
                 asset.asset_id,
-                Rule.SIZE,
+                AssetRule.SIZE,
                 f"{found:.4f} m along {axis}, the catalog has {wanted:.4f} m: expected within {SIZE_TOLERANCE:.0%}",
             )
 
@@ -87,19 +87,19 @@ def _fillable(catalog: Catalog, asset: Asset) -> Iterator[AssetFinding]:
     model = asset.asset_id.removeprefix(f"{asset.category}-")
     family = family_of_model(catalog, asset.category, model)
     if not asset.interiors and family in EXCUSED_FROM_PROBE:
-        yield AssetFinding(asset.asset_id, Rule.FILLABLE, EXCUSED_FROM_PROBE[family], excused=True)
+        yield AssetFinding(asset.asset_id, AssetRule.FILLABLE, EXCUSED_FROM_PROBE[family], excused=True)
         return
     # Walls take part of the box: an asset less than two probes wide may have no room for one.
     small = min(asset.size_m) < 2 * PROBE_M
     detail = f"its largest cavity is {widest:.3f} m wide, the probe {PROBE_M} m; the catalog's box is {asset.size_m} m"
-    yield AssetFinding(asset.asset_id, Rule.FILLABLE, detail, excused=small)
+    yield AssetFinding(asset.asset_id, AssetRule.FILLABLE, detail, excused=small)
 
 
 def _openable(asset: Asset) -> Iterator[AssetFinding]:
     if asset.can("openable") != bool(asset.joints):
         yield AssetFinding(
             asset.asset_id,
-            Rule.OPENABLE,
+            AssetRule.OPENABLE,
             "it is openable without a joint, or has a joint and is not openable",
         )
     base, moving = asset.links[0], asset.links[1:]
@@ -115,7 +115,7 @@ def _openable(asset: Asset) -> Iterator[AssetFinding]:
             if depth > DEPTH_M:
                 yield AssetFinding(
                     asset.asset_id,
-                    Rule.OPENABLE,
+                    AssetRule.OPENABLE,
                     f"{link.name} at {share:.0%} of its travel is {depth * 1000:.1f} mm deep in another part",
                 )
                 return
@@ -156,7 +156,7 @@ def check_standing(
             excuse = _excuse(catalog, asset)
             problem = "" if excuse else _let_go(world, asset, least_steps)
             if excuse or problem:
-                yield AssetFinding(asset.asset_id, Rule.STANDS, excuse or problem, excused=bool(excuse))
+                yield AssetFinding(asset.asset_id, AssetRule.STANDS, excuse or problem, excused=bool(excuse))
     finally:
         world.close()
         pool.close()

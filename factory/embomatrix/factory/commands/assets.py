@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from embomatrix.factory.assets.check import GLANCE_STEPS, STEPS, Rule, check_asset, check_standing
+from embomatrix.factory.assets.check import GLANCE_STEPS, STEPS, AssetRule, check_asset, check_standing
 from embomatrix.factory.assets.contact_sheet import draw_sheet
 from embomatrix.factory.assets.library import build_asset, family_of
 from embomatrix.factory.importers.assemble import import_model, read_model
@@ -74,7 +74,7 @@ def check(
             console.print(f"{finding.asset_id}: {finding.rule}: {finding.detail}", highlight=False)
     table = Table("rule", "wrong", "excused", title=f"{len(assets)} models")
     counts = Counter((finding.rule, finding.excused) for finding in findings)
-    for rule in Rule:
+    for rule in AssetRule:
         table.add_row(rule, str(counts[rule, False]), str(counts[rule, True]))
     console.print(table)
     reasons = Counter(f"{finding.rule}: {finding.detail}" for finding in findings if finding.excused)
