@@ -76,7 +76,7 @@ class OneArm:
             raise UntoldError(theirs)
         return self._ours[theirs]
 
-    def _say(self, skill, name, source="", relation=None):
+    def _send(self, skill, name, source="", relation=None):
         at = self._row[source] if source else None
         self.deeds.append(SkillCall(skill, object_index=self._row[name], source_index=at, relation=relation))
 
