@@ -106,9 +106,7 @@ async def test_manager_warns_of_another_data_folder(tmp_path, state, caplog):
         caplog.clear()
         async with manager(tmp_path / folder, state=state):
             pass
-        warned[turn] = [
-            line for line in caplog.messages if "differs from that of the last leader" in line
-        ]
+        warned[turn] = [line for line in caplog.messages if "differs from that of the last leader" in line]
     assert warned[1] == []
     [line] = warned[2]
     assert f"the data folder {tmp_path / 'other'} is not" in line
