@@ -102,4 +102,4 @@ async def test_what_it_cannot_do_is_no_reward_and_what_a_plan_may_not_ask_is_a_f
     assert [step.failure for step in walked.steps] == [None, FailureReason.UNKNOWN_ROOM]
     assert "the rooms are" in walked.steps[1].message
     assert lost.code is InfraCode.SLOT_CRASHED
-    assert "SKILL_KIND_PICK_UP is beyond this worker" in lost.message
+    assert "this worker does not support SKILL_KIND_PICK_UP" in lost.message
