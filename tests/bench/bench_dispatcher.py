@@ -1,6 +1,7 @@
-"""Throughput of the manager's state machines in decisions a second: python tests/bench/bench_dispatcher.py [ROLLOUTS WORKERS]
+"""Throughput of the manager's state machines in decisions per second.
 
-Every rollout is submitted, leased and finished; the workers are values, not processes. Prints one JSON object.
+Usage: ``python tests/bench/bench_dispatcher.py [ROLLOUTS WORKERS]``. Every rollout is submitted, leased and finished;
+workers are values, not processes. Prints one JSON object.
 """
 
 import json

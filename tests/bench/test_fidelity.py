@@ -101,7 +101,7 @@ def test_zero_processes_sum_up_the_results_so_far(suite, dataset, tmp_path):
         run_fidelity(dataset, SMALL, tmp_path, 0, modes, QUIET)
     lines = (folder / RESULTS_FILE).read_text().splitlines()
     (tmp_path / RESULTS_FILE).write_text("\n".join(lines[:3]) + "\n" + lines[3][:40])
-    with (tmp_path / RESULTS_FILE).open("a") as running:  # of a suite that goes on meanwhile
+    with (tmp_path / RESULTS_FILE).open("a") as running:  # a suite that is still running
         assert len(run_fidelity(dataset, SMALL, tmp_path, 0, modes, QUIET).comparisons) == 3
         running.write(lines[3][40:] + "\n")
     assert (tmp_path / RESULTS_FILE).read_text().splitlines() == lines[:4]

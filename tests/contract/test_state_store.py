@@ -41,7 +41,7 @@ _prefixes = itertools.count()
 
 @pytest.fixture(params=["memory", "sqlite", "redis"])
 async def openings(request, tmp_path):
-    """A function that opens the same state once more, as another process of the manager would."""
+    """Return a function that opens the same state once more, as another manager process would."""
     opened = []
     prefix = f"test-{next(_prefixes)}"
 
@@ -288,7 +288,7 @@ async def test_store_that_cannot_be_used_says_what_to_do(tmp_path):
 
 @contextlib.contextmanager
 def no_file_grows(limit=200_000):
-    """A disk that is full, for this process: no file may become larger than ``limit`` bytes."""
+    """Limit file sizes of this process to ``limit`` bytes, like a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
     try:

@@ -35,7 +35,7 @@ def assert_told(told, status, *words):
 
 @contextlib.contextmanager
 def manager(folder, *options):
-    """A manager on free ports; yields the command, its address and its page."""
+    """Yield the command, gRPC address and HTTP address of a manager on free ports."""
     folder.mkdir(exist_ok=True)
     arguments = ("manager", "serve", "--port=0", "--http-port=0", f"--data-dir={folder}", *options)
     with background(folder / "log", *arguments) as command:
@@ -60,7 +60,7 @@ def served(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def checkpoint(kitchen, tmp_path_factory):
-    """A policy that knows nothing yet, saved as training would."""
+    """Save an untrained policy in the format of a training run."""
     settings = read_settings(None, {"tiny.layers": 1, "tiny.width": 16, "tiny.heads": 1, "tiny.inner": 16})
     policy = new_policy(settings, load_tasks(kitchen))
     store = CheckpointStore(tmp_path_factory.mktemp("run") / "checkpoints", keep=1)
@@ -110,7 +110,7 @@ def test_wrong_token_is_refused_and_never_shown(served, kitchen, tmp_path, argum
 
 @pytest.mark.parametrize("option", ["", "http-"])
 def test_used_port_is_named_and_its_process_keeps_running(tmp_path, option):
-    """The second manager shares the data folder of the first: it must not take its state before it knows it can serve."""
+    """The second manager shares the first one's data folder; it must bind its ports before it claims the state."""
     with manager(tmp_path / "data") as (first, address, page):
         taken = address if not option else page.removeprefix("http://").rstrip("/")
         port = taken.rpartition(":")[2]
@@ -153,7 +153,7 @@ async def test_bundle_with_wrong_digest_is_refused(served):
 
 
 async def _reward(address, record, data, run_name):
-    """Put the bundle, execute the oracle's plan once, and give the reward; None where the rollout was lost."""
+    """Upload the bundle, execute the oracle's plan once and return the reward; None if the rollout was lost."""
     rollout = Rollout(
         "r", "g", record.bundle_digest, record.task.task_id, plan_from_json(list(record.oracle)), 0
     )

@@ -1,4 +1,4 @@
-"""Invalid input to commands: one sentence with thing and remedy, an exit status, and never a traceback."""
+"""Invalid input to commands: one sentence with object and remedy, an exit status, and no traceback."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""`embomatrix cluster` before a real manager: it shows what the cluster does, and what a person gets wrong in a sentence."""
+"""`embomatrix cluster` with a real manager: tables and files of the cluster, and one sentence for each user error."""
 
 import asyncio
 import itertools
@@ -25,7 +25,7 @@ async def told(*arguments):
 
 
 async def lived_run(kitchen, address):
-    """A run of 40 rollouts on two slots and one more that crashes each time; closed when this ends."""
+    """Closed run of 41 rollouts on two slots; the last one crashes its slot at every attempt."""
     dataset = Dataset.load(kitchen)
     record = dataset.train[0]
     digest, task, plan = record.bundle_digest, record.task.task_id, plan_from_json(list(record.oracle))
@@ -49,7 +49,7 @@ async def lived_run(kitchen, address):
 
 
 def assert_a_trace_of(events, rollouts):
-    """No two spans of a slot overlap, and every rollout was executed once, after it was submitted."""
+    """Assert that spans of a slot never overlap and that every rollout ran once, after its submission."""
     tracks, executed = {}, []
     for event in events:
         if event["ph"] == "X":

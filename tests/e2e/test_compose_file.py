@@ -1,4 +1,4 @@
-"""The compose file without Docker: its commands are real ones, and what they open is closed to everyone else."""
+"""The compose file without Docker: its commands exist, and its ports are closed to other machines."""
 
 import contextlib
 import re
@@ -57,7 +57,7 @@ def test_every_service_is_confined_limited_and_restarted():
 
 
 def placed(arguments, folder):
-    """The container's folders as ones of this test; the published ports as free ones."""
+    """Replace the container's folders with temporary ones and the published ports with free ones."""
     moved = [
         re.sub(r"(=|:)/(data|for-worker|for-trainer|cache|tmp/worker)", rf"\1{folder}/\2", each)
         for each in arguments

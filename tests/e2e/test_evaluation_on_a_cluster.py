@@ -1,4 +1,4 @@
-"""Plans of an evaluation on a manager with a worker: the same bytes come out as from processes of one machine."""
+"""Evaluations on a cluster write the same bytes as local evaluations."""
 
 import pytest
 from tests.fakes.commands import run

@@ -1,4 +1,4 @@
-"""The log lines of real daemons as JSON: every line an object, with the ids that it is about, and no secret on any."""
+"""JSON logs of real daemons: every line is an object with the ids that it concerns, and no line holds a secret."""
 
 import json
 import re
@@ -15,7 +15,7 @@ JSON = "--log-format=json"
 
 
 def lines(log):
-    """The objects of a log, and what else stands there."""
+    """Return the JSON objects of a log and its other lines."""
     told = log.read_text().splitlines()
     return [json.loads(line) for line in told if line.startswith("{")], [
         line for line in told if not line.startswith("{")

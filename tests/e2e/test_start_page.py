@@ -1,4 +1,4 @@
-"""The commands of the start page, typed one after the other in a fresh folder by somebody who has read nothing else."""
+"""Commands of the start page, typed one after the other in an empty folder."""
 
 import contextlib
 import os
@@ -24,14 +24,14 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
 
 def lines_below(heading):
-    """The lines of the code blocks of a section, without their comments."""
+    """Return the lines of the code blocks in a section, without comments."""
     section = PAGE.read_text(encoding="utf-8").split(f"\n## {heading}\n")[1].split("\n## ")[0]
     blocks = re.findall(r"^```\n(.*?)^```", section, re.MULTILINE | re.DOTALL)
     return [line.split("  #")[0].strip() for block in blocks for line in block.splitlines()]
 
 
 class Shell:
-    """A person's terminals on one machine: a folder and a home of their own, and ports that nobody else has."""
+    """Terminals of one user on one machine, with a dedicated folder, home and ports."""
 
     def __init__(self, folder):
         self.folder = folder
@@ -68,7 +68,7 @@ class Shell:
         return self._ended(line) if told is None else self._serving(line, told)
 
     def close_terminals(self):
-        """Ctrl-C in all that serve."""
+        """Send Ctrl-C to every command that still serves."""
         self._services.close()
 
     def _ended(self, line):

@@ -1,4 +1,4 @@
-"""The whole path with real processes: factory, cluster, trainer; one worker is killed in the middle."""
+"""Factory, cluster and trainer as real processes; one worker is killed during training."""
 
 import json
 import os
@@ -20,7 +20,7 @@ STEPS = 12
 HOLD_S = 2.8
 """Shorter than the silence after which the manager gives a worker nothing."""
 TOLD_S = 1.5
-"""What the manager tells by then is of a look after the workers were stopped."""
+"""Delay after which the manager's report reflects the stopped workers."""
 NOTICED_S = 1.5
 """A worker whose connection broke is given up after a second."""
 pytestmark = pytest.mark.timeout(1200)
@@ -53,7 +53,7 @@ def run(tmp_path_factory):
         both = [children.pid("worker-1"), children.pid("worker-2")]
         _until(lambda: _stopped_with_work(both, cluster.dashboard), trainer)
         os.kill(both[0], signal.SIGKILL)
-        # Until the manager knows: the other one would take from the dead what waits behind what it ran.
+        # Until the manager notices: otherwise the other worker would steal the dead worker's queued leases.
         time.sleep(NOTICED_S)
         os.kill(both[1], signal.SIGCONT)
         told, _ = trainer.communicate(timeout=600)
@@ -107,9 +107,9 @@ def _metrics(out):
 
 
 def _stopped_with_work(pids, dashboard):
-    """Stop the workers for a while: whether the manager gave the first one more than it runs. Else they go on.
+    """Stop the workers and return True if the first one holds queued leases; otherwise continue them.
 
-    What it runs may be hedged as a straggler's; what waits behind it nobody else has.
+    A running lease may be hedged; a queued lease has no second copy, so only a re-dispatch can finish it.
     """
     for pid in pids:
         os.kill(pid, signal.SIGSTOP)
@@ -135,7 +135,7 @@ def _until(condition, process, limit_s=180.0):
 
 
 def _counted(what, told):
-    """The number that stands before the words in the closing summary."""
+    """Return the number before these words in the closing summary."""
     found = re.search(rf"([\d,]+) {what}", " ".join(told.split()))
     assert found, told
     return int(found[1].replace(",", ""))

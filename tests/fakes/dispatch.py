@@ -1,4 +1,4 @@
-"""A dispatcher driven by hand: tests tell it what happened, it tells what should be done."""
+"""Dispatcher driven by hand: a test applies events and reads the resulting commands."""
 
 from tests.fakes.worker import completed
 
@@ -27,7 +27,7 @@ LIMITS = DispatchLimits(
 
 
 class Table:
-    """A dispatcher and its clock. Commands are kept by kind."""
+    """Dispatcher with its clock. Keeps its commands by kind."""
 
     def __init__(self, limits=LIMITS):
         self.dispatcher = Dispatcher(limits, boot_id="boot")
@@ -70,10 +70,10 @@ class Table:
 
 
 def leases(commands):
-    """The leases that were given, in order."""
+    """Return the granted leases in order."""
     return [command for command in commands if isinstance(command, GiveLease)]
 
 
 def crash():
-    """A slot that died."""
+    """Return the outcome of a slot that died."""
     return InfraFailure(InfraCode.SLOT_CRASHED, "signal 11")

@@ -1,4 +1,4 @@
-"""EAI's human plans in our world's words: for two hands and a graph without places there, for one arm here."""
+"""Conversion of EAI's human plans, which assume two hands and a graph without positions, to our one-armed skills."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ STATES = {"OPEN": Skill.OPEN, "TOGGLE_ON": Skill.TOGGLE_ON, "TOGGLE_OFF": Skill.
 
 
 class UntoldError(Exception):
-    """A step has no word in our skills; the message is the step's."""
+    """A step has no equivalent among our skills. The message names the step."""
 
 
 class OneArm:
-    """Reads a plan step by step. What two hands take is picked up when it is put down or used, one after the other.
+    """Converter that reads a plan step by step.
 
-    Doors are closed once nothing is left to be picked up from behind them.
+    Objects that two hands take are picked up one after the other, when they are put down or used. Doors are closed once
+    no object behind them is still to be picked up.
     """
 
     def __init__(self, table, ours, homes):
@@ -39,7 +40,7 @@ class OneArm:
         if hand not in self._hands:
             hand, deed = "", action
         if told.startswith(FLOOR) and told not in self._ours:
-            deed = "RELEASE"  # a floor that no goal is about is none of our objects: just somewhere to leave things
+            deed = "RELEASE"  # a floor outside the goals is not in our table: the object is only released
         names = [] if deed == "RELEASE" else [self._name(name) for name in told.split(", ")]
         match deed:
             case "GRASP":
@@ -87,7 +88,7 @@ class OneArm:
             self._arm = name
 
     def _lay_down(self):
-        """Put what the arm holds back to where it was last; on the first step that is where it came from."""
+        """Return the held object to its last position; on the first step, to its initial position."""
         if self._arm:
             host, relation = self._home.get(self._arm, ("", None))
             if not host:
@@ -127,9 +128,10 @@ class OneArm:
 
 
 def from_eai(text, table, names, homes):
-    """A human plan's deeds in our skills. ``names``: EAI's names by ours; ``homes``: what things rest on or in at the start.
+    """Convert a human plan's steps to our skills.
 
-    Raises UntoldError for a step that our skills have no word for: to put something next to something, above all.
+    ``names``: EAI's names by ours; ``homes``: initial support or container of each object. Raises UntoldError for a
+    step without an equivalent skill, mostly "put next to".
     """
     arm = OneArm(table, {theirs: ours for ours, theirs in names.items()}, homes)
     for step in json.loads(text):

@@ -80,7 +80,7 @@ async def test_daemon_joins_once_and_then_uses_its_credential(tmp_path):
                     await asyncio.sleep(0.05)
             working.stop()
             await serving
-            # It said that it leaves: nobody waits for the minute after which it would be missed.
+            # The worker announced its departure, so the manager does not wait for the one-minute timeout.
             async with asyncio.timeout(20):
                 while [w.state for w in await viewer.list_workers()] != ["left"]:  # noqa: ASYNC110
                     await asyncio.sleep(0.05)
@@ -91,7 +91,7 @@ async def test_daemon_joins_once_and_then_uses_its_credential(tmp_path):
 
 @pytest.mark.slow
 async def test_spare_pc_joins_with_an_invitation(tmp_path):
-    """The commands of an operator and of the PC's owner, each a process of its own."""
+    """The commands of the operator and of the PC's owner each run as a dedicated process."""
     home = tmp_path / "pc"
     async with guarded(tmp_path / "manager") as at:
         ca = at.folder.ca

@@ -43,7 +43,7 @@ async def test_all_lists_come_from_one_snapshot(tmp_path):
 
 
 async def seen_until(http, true):
-    """The first snapshot of which this is true."""
+    """Return the first snapshot for which this is true."""
     for _ in range(300):
         seen = (await http.get(f"{PREFIX}/snapshot")).json()
         if true(seen):
@@ -84,7 +84,7 @@ async def test_full_disk_is_reported_in_the_health_sentence(tmp_path):
 
 
 async def _hear(client, words):
-    """Until the manager says so of itself."""
+    """Wait until the manager reports this about itself."""
     async with asyncio.timeout(30):
         while True:
             if words in (await client.fleet()).health:
@@ -222,7 +222,7 @@ async def test_unread_event_streams_delay_nobody(tmp_path):
 
 
 def named_in(text):
-    """Files that the page, or a script of it, asks for."""
+    """Return the files that the page, or one of its scripts, requests."""
     own = re.findall(r'"(/static/[^"]+)"', text)
     return [*own, *(f"/static/{name}" for name in re.findall(r'"\./(\w+\.js)"', text))]
 

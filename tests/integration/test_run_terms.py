@@ -48,7 +48,7 @@ async def open_run(address, policy=GroupPolicy.RETRY_THEN_FAIL_GROUP, run_id="r1
 
 
 def batch_of(*tasks, size=2, run_id="r1"):
-    """Rollouts in groups of so many; a rollout of the task "poison" kills its slot."""
+    """Return rollouts in groups of this size; a rollout of the task "poison" kills its slot."""
     rollouts = tuple(Rollout(f"x{i}", f"g{i // size}", KITCHEN, task, (), i) for i, task in enumerate(tasks))
     return Batch(run_id, "b1", 1, rollouts)
 

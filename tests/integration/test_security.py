@@ -43,13 +43,13 @@ MIB = 1024 * 1024
 
 @dataclass
 class Intruder:
-    """Calls with any token, over any channel; the answer is the status it was refused with, and its sentence."""
+    """Caller with any token over any channel; returns the refusal's status and message."""
 
     address: str
     ca: bytes
 
     async def call(self, method, request, token="", stream=False):
-        # Without our own client's limits: it would not send what the manager has to refuse.
+        # Without our client's limits, which would refuse these requests before the manager can.
         trusted = grpc.ssl_channel_credentials(self.ca)
         metadata = (("authorization", f"Bearer {token}"),) if token else ()
         options = (("grpc.max_send_message_length", -1),)
@@ -93,12 +93,12 @@ def register(name, **fields):
 
 
 def long_plan(size):
-    """One call that is as long as that."""
+    """Return a plan whose one call has this length."""
     return [types_pb2.SkillCall(skill=types_pb2.SKILL_KIND_GO_TO_ROOM, room_name="k" * size)]
 
 
 async def grpc_cases(at, victim, other):
-    """(what is tried, the documented status, what it answered)."""
+    """Return (attempt, documented status, response) for gRPC calls."""
     viewer, trainer_token = at.token(AccessRole.VIEWER), at.token(AccessRole.TRAINER)
     expired = await at.issue(AccessRole.TRAINER, valid_s=0.05)
     late_join = await at.issue(AccessRole.JOIN, valid_s=0.05)
@@ -238,7 +238,7 @@ async def grpc_cases(at, victim, other):
 
 
 async def bundle_cases(at):
-    """The same for bundles, through the client that a trainer uses; limits are met before all of it is sent."""
+    """Return the same for bundles through a trainer's client; limits apply before the whole bundle is sent."""
     bomb = zlib.compress(bytes(64 * MIB), level=9)
     tries = [
         ("a bomb, 1000 to 1", bomb),

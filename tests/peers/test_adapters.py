@@ -1,4 +1,4 @@
-"""Other trainers' own code on a real cluster: a manager, a worker with physics, and the examples in docs/."""
+"""Adapters of other trainers on a real cluster: a manager, a worker with physics, and the examples in docs/."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""EAI's hundred goals: those that each profile's skills can reach, and the predicates that block the others."""
+"""EAI's hundred goals: the reachable ones by profile, and the predicates that block the others."""
 
 import collections
 import re

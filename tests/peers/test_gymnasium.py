@@ -1,4 +1,4 @@
-"""The environment before Gymnasium's own checker, and the example of the docs."""
+"""Gymnasium's environment checker, and the example of the docs."""
 
 import pytest
 from tests.fakes.datasets import write_kitchen_dataset

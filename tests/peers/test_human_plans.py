@@ -1,6 +1,6 @@
-"""EAI's human plans before our judge: in the tasks that our world holds, told for one arm.
+"""EAI's human plans before our judge, in the tasks that our scenes support, converted for one arm.
 
-``pytest -m eai -s`` prints what became of each, and the figures.
+``pytest -m eai -s`` prints each result and the figures.
 """
 
 import collections

@@ -30,7 +30,7 @@ CASES = list(
 
 
 class Case:
-    """A small model, and a batch whose plans end early, whose old log-probabilities differ, and of which one was lost."""
+    """Small model and a batch whose plans end early, whose old log-probabilities differ, and of which one was lost."""
 
     def __init__(self, folder):
         from transformers import LlamaConfig, LlamaForCausalLM

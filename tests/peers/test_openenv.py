@@ -1,4 +1,4 @@
-"""The environment behind OpenEnv's own server, asked by OpenEnv's own client."""
+"""The environment behind OpenEnv's server, called by OpenEnv's client."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""The worker of docs/examples in JavaScript, written from docs/protocol.md, in a cluster of real processes."""
+"""JavaScript worker of docs/examples, written from docs/protocol.md, in a cluster of real processes."""
 
 import asyncio
 import os
@@ -32,7 +32,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def program():
-    """The worker beside its packages."""
+    """Copy the worker beside its packages."""
     base = os.environ.get("EMBOMATRIX_PEERS") or Path.home() / ".cache" / "embomatrix" / "peers"
     folder = Path(base) / "node"
     folder.mkdir(parents=True, exist_ok=True)
@@ -44,14 +44,14 @@ def program():
 
 @pytest.fixture(scope="module")
 def bundle():
-    """Its bytes and the id of one of its tasks."""
+    """Return the bundle's bytes and the id of one of its tasks."""
     scene = kitchen_scene()
     tasks = {task.task_id: task for task in kitchen_tasks(scene)}
     return encode_bundle(Bundle(scene, tasks)), next(iter(tasks))
 
 
 async def opened(client, data, task_id, plans, run_id="run"):
-    """A run and a batch of these plans in it."""
+    """Open a run with a batch of these plans."""
     digest = bundle_digest(data)
     await client.put_bundles({digest: data})
     await client.open_run("another language", run_id)

@@ -1,6 +1,6 @@
-"""E3: one plan before both judges, our simulator and EAI's graph: oracle plans, and mutants of them.
+"""E3: oracle plans and mutants of them before both judges, our simulator and EAI's graph.
 
-The graph knows no places, so that ways are left out of what is compared. ``pytest -m eai -s`` prints the figures.
+The graph has no locations, so `move` calls are not compared. ``pytest -m eai -s`` prints the figures.
 """
 
 import collections

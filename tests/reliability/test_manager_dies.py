@@ -54,7 +54,7 @@ async def killed_in_the_middle(folder, *, count, task, kill_at, away_s, grace_s)
 
 
 async def test_killed_manager_resumes_without_repeating_live_rollouts(tmp_path):
-    # As many as the two workers hold: nobody has to wait for the grace to end.
+    # As many rollouts as the two workers hold: none has to wait for the end of the grace time.
     await killed_in_the_middle(tmp_path, count=10, task="slow", kill_at=2, away_s=0.1, grace_s=15.0)
 
 
@@ -99,7 +99,7 @@ async def test_suspended_manager_loses_no_worker(tmp_path):
         counted = tally(batch, results)
         tell("A4 stands still 5 s", counted, redispatched=stats.redispatched)
         assert counted.clean
-        # What the manager gave on a connection that was broken by then never came to a worker, and is given again.
+        # Leases sent over a broken connection never reached a worker and are re-dispatched.
         assert set(cluster.executed().values()) == {1}
         assert {result.attempt for result in results} == {1}
         assert "worker lost" not in cluster.log("manager")

@@ -16,7 +16,7 @@ DIRECTIONS = pytest.mark.parametrize(
 
 
 async def cut_while_it_runs(cluster, directions, *, count, task, cut_s, other):
-    """One worker's line is cut for ``cut_s`` once it has begun; ``other`` joins directly meanwhile. Returns what came of it."""
+    """Cut one worker's line for ``cut_s`` during its work; ``other`` joins directly meanwhile. Returns the outcome."""
     cluster.start_manager()
     async with Proxy(cluster.ports["manager"]) as proxy, cluster.client() as client:
         cluster.start_worker("w1", manager=proxy.address)
@@ -49,7 +49,7 @@ async def test_short_partition_loses_nothing(tmp_path, directions):
     tell(f"A6 5 s, {' and '.join(directions)}", counted, **figures)
     assert counted.clean
     assert lost_s is None
-    # A lease that was on its way may be given again, and a result be sent twice: nothing that ran runs again.
+    # A lease in transit may be re-dispatched and a result sent twice, but no rollout runs twice.
     assert set(cluster.executed().values()) == {1}
 
 

@@ -1,6 +1,6 @@
-"""A3: rollouts that crash, hang or devour memory end alone, in a cluster whose other rollouts go on meanwhile.
+"""A3: rollouts that crash, hang or exhaust memory fail alone while the cluster's other rollouts continue.
 
-What a slot with real physics does is in tests/integration/test_slots_with_physics.py.
+Slots with real physics are tested in tests/integration/test_slots_with_physics.py.
 """
 
 import asyncio

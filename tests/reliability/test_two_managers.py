@@ -39,12 +39,12 @@ async def leads(cluster, name, status="SERVING"):
 
 
 async def stands_by(cluster, name):
-    """Wait until this manager is up while another one leads."""
+    """Wait until this manager is ready as standby."""
     await leads(cluster, name, "NOT_SERVING")
 
 
 async def both(cluster):
-    """The first manager leads, the second stands by, two workers know both."""
+    """Start a leader and a standby manager, and two workers that know both."""
     cluster.start_manager("first")
     await leads(cluster, "first")
     cluster.start_manager("second")

@@ -42,7 +42,7 @@ async def test_fault_free_runs_repeat_hardly_any_rollout(tmp_path):
 
 
 async def kill_again_and_again(cluster, rng, kills):
-    """``kill -9`` a random worker every two seconds, and start it varied."""
+    """Kill a random worker with SIGKILL every two seconds and restart it after varying delays."""
     with contextlib.suppress(asyncio.CancelledError):
         while True:
             await asyncio.sleep(2.0)
@@ -52,7 +52,7 @@ async def kill_again_and_again(cluster, rng, kills):
 
 
 async def soak(folder, *, killing):
-    """20,000 rollouts on ten workers, with or without the killing. Returns the tally, the seconds and the detections."""
+    """Run 20,000 rollouts on ten workers, with or without kills; returns the tally, the seconds and the detections."""
     with RealCluster(folder) as cluster:
         cluster.start_manager()
         names = [f"w{number}" for number in range(WORKERS)]

@@ -1,4 +1,4 @@
-"""Files that place a cluster elsewhere: they are valid, confined, and name commands, options and metrics that there are."""
+"""Deployment files are valid and confined, and name existing commands, options and metrics."""
 
 import json
 import os
@@ -32,7 +32,7 @@ PODS = {
 }
 PROMETHEUS = DEPLOY / "prometheus"
 needs_promtool = pytest.mark.skipif(
-    shutil.which("promtool") is None, reason="needs promtool, which Debian's package prometheus brings"
+    shutil.which("promtool") is None, reason="needs promtool, which Debian's package prometheus provides"
 )
 METRIC = re.compile(r"\bembo_\w+")
 

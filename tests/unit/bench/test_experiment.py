@@ -46,7 +46,7 @@ MACHINE = {"cores": 2, "cpu": "a processor", "load_before": 0.1}
 
 
 def outcome(before, after):
-    """One of two tasks, whose success rates are these."""
+    """Return an outcome of two tasks with these success rates."""
     spent = {"sampling": 40.0, "update": 50.0, "waiting for simulation": 4.0, "imitation": 60.0}
     tasks = [
         [TaskRate(f"t{at}", "compound", rate) for at, rate in enumerate(rates)] for rates in (before, after)
@@ -72,7 +72,7 @@ ARMS = (
 
 
 def told(*arguments):
-    """Exit status and all that a person reads."""
+    """Return the exit status and all visible output."""
     result = CliRunner().invoke(app, [str(item) for item in arguments])
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     return result.exit_code, " ".join(result.output.split())
@@ -188,7 +188,7 @@ def test_experiment_resumes_only_with_the_same_design(tmp_path):
 
 
 def test_finished_runs_are_not_repeated(tmp_path):
-    """There is no dataset: a command that was run would end in SystemExit."""
+    """Without a dataset, a repeated run would end in SystemExit."""
     conductor = Conductor(DESIGN, tmp_path / "nowhere", tmp_path, lambda heading: None)
     place = Venue(("--manager=127.0.0.1:1",), no_problem)
     (conductor.folder_of(0, IMITATED) / "reference").mkdir(parents=True)

@@ -17,7 +17,7 @@ def kitchen(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def measured(kitchen, tmp_path_factory):
-    """The folder of an evaluation of random plans."""
+    """Folder of an evaluation of random plans."""
     out = tmp_path_factory.mktemp("measured")
     arguments = (f"--bench={kitchen}", "--split=all", "--baseline=random", "--samples=3", "--jobs=1")
     assert told(*arguments, f"--out={out}")[0] == 0
@@ -25,7 +25,7 @@ def measured(kitchen, tmp_path_factory):
 
 
 def told(*arguments):
-    """Exit status and all that a person reads."""
+    """Return the exit status and all visible output."""
     app = typer.Typer()
     app.command()(evaluate)
     result = CliRunner().invoke(app, [str(item) for item in arguments])
@@ -116,7 +116,7 @@ def test_unexpected_answer_is_rejected(measured, tmp_path, field, value):
 
 
 def write_other(folder):
-    """The same dataset with another oracle's plan: other records."""
+    """Write the same dataset with another oracle plan, which changes the records."""
     other = write_kitchen_dataset(folder / "other")
     lines = [json.loads(line) for line in (other / "tasks.jsonl").read_text().splitlines()]
     lines[0]["task"]["instruction"] = "Do something else."

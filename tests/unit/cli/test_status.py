@@ -36,7 +36,7 @@ def test_start_of_a_worker_is_suggested_where_none_is_present():
 def test_health_sentence_of_the_manager_comes_first():
     full = "Nothing can be written down, so nothing goes on: no space left on device."
     assert sentences(FleetStatus((worker(),), full), (), ())[0] == full
-    assert sentences(FleetStatus((), full), (), ())[0] == full, "also where nobody is there"
+    assert sentences(FleetStatus((), full), (), ())[0] == full, "also without a worker"
     assert full in "\n".join(drawn(Glance(0.0, FleetStatus((worker(),), full), ()), 24))
 
 

@@ -24,7 +24,7 @@ PAGE = (Path(__file__).parents[3] / "docs" / "tasks.md").read_text(encoding="utf
 
 
 def rows(first_heading: str) -> dict[str, str]:
-    """The table whose first column has this heading: name of each row to the next cell."""
+    """Return the table whose first column has this heading: row names mapped to the next cell."""
     found = re.search(rf"^\| {first_heading} \|.*\n\| ---.*\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
     assert found, f"docs/tasks.md has no table of {first_heading}"
     cells = [line.strip("|").split(" | ") for line in found[1].splitlines()]
@@ -32,7 +32,7 @@ def rows(first_heading: str) -> dict[str, str]:
 
 
 def imported() -> ImportedTask:
-    """The problem of the page, bound to a kitchen."""
+    """Return the page's problem, bound to a kitchen."""
     text = re.search(r"```lisp\n(.*?)```", PAGE, re.DOTALL)
     assert text
     outcome = import_problem(SourceText("apple", text[1], "file"), kitchen_scene())

@@ -182,7 +182,7 @@ def test_failed_concurrent_draft_does_not_affect_the_others():
 
 def test_build_numbers_concurrent_drafts_in_the_order_kept():
     class Twice(PlainWriter):
-        """Gives the same draft twice, whatever it is asked for: one of the two is kept."""
+        """Writer that returns the same draft twice; only one of them is kept."""
 
         at_once = 3
 

@@ -1,4 +1,4 @@
-"""Each social agent runs alone; the answer of one agent is the brief of the next."""
+"""Each social agent runs alone; its answer is the input of the next agent."""
 
 import json
 from pathlib import Path

@@ -56,7 +56,7 @@ def test_roles_are_kept_apart():
 
 
 def book_of(*credentials):
-    """Secrets and ids that a test can read."""
+    """Return a token book with readable secrets and ids."""
     numbers = itertools.count(1)
     return CredentialBook(
         credentials,
@@ -180,7 +180,7 @@ class Known:
 
 
 class TokenMachine(RuleBasedStateMachine):
-    """Whatever happens in whatever order: a token opens a door if and only if it is one, is not void, and is not late."""
+    """State machine: a token grants access exactly while it is issued, not revoked and not expired."""
 
     def __init__(self):
         super().__init__()

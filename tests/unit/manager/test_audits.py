@@ -47,7 +47,7 @@ PLAIN = RunTerms(GroupPolicy.PARTIAL)
 
 
 class Bench:
-    """A cluster whose workers have the scene, and do what the test says."""
+    """Cluster whose workers have the scene and act as scripted."""
 
     def __init__(self, workers=("w1", "w2", "w3"), terms=VERIFIED, rules=None, versions=SAME):
         limits = DispatchLimits(audit=rules or AuditRules())
@@ -99,7 +99,7 @@ class Bench:
         return lease
 
     def answer(self, lies=(), limit=1000):
-        """Finish whatever is leased; workers in ``lies`` make their results up."""
+        """Finish all leases; workers in ``lies`` fabricate their results."""
         while self.live and limit:
             limit -= 1
             lease = next(iter(self.live.values()))
@@ -350,5 +350,5 @@ def test_workers_falsifying_a_tenth_of_results_are_caught_on_probation():
     assert report.delivered == report.submitted
     assert set(report.caught) <= {f"w{index:05d}" for index in range(LIARS)}, "an honest worker was blamed"
     assert len(report.caught) >= LIARS - 1
-    # Two liars may meet, and the third worker be one as well: a result that nobody confirms is none.
+    # Two liars may meet, and the third worker may lie as well: an unconfirmed result is lost.
     assert report.infra_failures <= 0.01 * report.submitted

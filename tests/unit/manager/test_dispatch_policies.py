@@ -43,7 +43,7 @@ CRASH = InfraFailure(InfraCode.SLOT_CRASHED, "signal 11")
 
 
 class Desk:
-    """A dispatcher, its clock, and the leases that its workers hold."""
+    """Dispatcher with its clock and the leases that its workers hold."""
 
     def __init__(self, limits=LIMITS):
         self.dispatcher = Dispatcher(limits, boot_id="boot")
@@ -77,7 +77,7 @@ class Desk:
         return self.tell(WorkerReported(worker_id, residents, **changes))
 
     def submit(self, *groups, run_id="r1", batch_id="b1", scene="kitchen", render=False):
-        """So many rollouts in each group, named "group.index"."""
+        """Submit a batch of groups with these sizes; rollouts are named "batch.group.index"."""
         rollouts = tuple(
             Rollout(f"{batch_id}.{group}.{index}", f"{batch_id}.{group}", scene, "t", (), 0, render)
             for group, size in enumerate(groups)
@@ -159,7 +159,7 @@ def test_deadline_of_a_run_overrides_the_default(desk):
 
 
 def known(desk, count=20):
-    """A run of which the manager knows that its rollouts take a second; one is left that runs on w1."""
+    """Teach the manager a rollout duration of one second; one rollout remains, on w1."""
     desk.worker("w1", slots=count)
     desk.submit(count)
     for index in range(count - 1):

@@ -163,9 +163,10 @@ def test_renewed_lease_expires_at_its_limit(table):
 
 
 def test_leases_that_expire_behind_a_busy_slot_cost_no_attempt_and_are_leased_again():
-    """Counterexample of the lease machine: expiring the running lease "started" the one behind it, and so on.
+    """Counterexample that the lease machine found.
 
-    All of them then counted as failures of their worker, which kept its slots free although rollouts waited.
+    The expiry of the running lease "started" the lease behind it, and so on. All of them then counted as failures of their
+    worker, whose slots stayed free although rollouts waited.
     """
     table = Table()
     table.worker("w1")

@@ -1,4 +1,4 @@
-"""Worker pool of a large cluster: look-up by scene, free slots and backlog without scanning all workers."""
+"""Worker pool of a large cluster: lookups by scene, free slots and backlog scan only some of the workers."""
 
 import pytest
 
@@ -64,7 +64,7 @@ def test_an_idle_worker_finds_a_lease_behind_a_busy_slot():
 
 @pytest.mark.parametrize(
     ("now_s", "left_alone"),
-    # Three rollouts of 0.1 s each, of which the first began at 1 s: the last begins at 1.2 s.
+    # Three rollouts of 0.1 s each; the first began at 1 s, so the last begins at 1.2 s.
     [(1.05, False), (1.15, True), (1.2, True), (1.39, True), (1.41, False)],
 )
 def test_lease_about_to_start_is_not_stolen(now_s, left_alone):

@@ -25,7 +25,7 @@ EVERY = {"search": "", "scene": "", "category": "", "offset": 0, "limit": 24}
 
 @pytest.fixture
 def folder(tmp_path):
-    """Tasks by an honest name, by one that has a meaning in paths, and by a script."""
+    """Dataset whose tasks have a plain name, a name with a meaning in paths, and a script as name."""
     names = ("tidy", "..", "<script>alert(1)<b>")
     tasks = [replace(TASK, task_id=name, instruction=f"Please {name} up") for name in names]
     data = encode_bundle(Bundle(SCENE, {task.task_id: task for task in tasks}))

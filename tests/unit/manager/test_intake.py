@@ -22,7 +22,7 @@ WARM = (Resident("kitchen", ResidentState.WARM, 0.1, 50.0),)
 
 
 class Manager:
-    """An intake with one worker of one slot, which has the scene and as many leases as it may hold."""
+    """Intake with one worker of one slot, which has the scene and its full number of leases."""
 
     def __init__(self, rollouts):
         self.intake = Intake(ClusterState(boot_id="boot"), Registry(LivenessLimits()))

@@ -48,7 +48,7 @@ def claim(rollout_id, epoch=1, attempt=1, batch_id="b1"):
 
 
 class Successor:
-    """A manager that has just taken a batch over, and its clock."""
+    """Manager that has just taken over a batch, and its clock."""
 
     def __init__(self, count=2, delivered=(), failures=0):
         limits = DispatchLimits(restart_grace_s=GRACE_S)
@@ -62,7 +62,7 @@ class Successor:
         return [command for event in events for command in self.dispatcher.handle(event, now_s=self.now_s)]
 
     def worker(self, worker_id="w1", *claims, slots=1):
-        """A worker comes back and says what it holds."""
+        """Reconnect a worker that reports its held leases."""
         held = tuple(claim.ref for claim in claims)
         return self.tell(
             WorkerJoined(worker_id, Resources(slots, slots, 1024)),

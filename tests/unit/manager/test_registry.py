@@ -101,7 +101,7 @@ def test_silence_during_a_manager_stall_is_excused(registry):
     assert [event.worker_id for event in registry.tick(now_s=32.0)] == ["w2"]
     assert registry.tick(now_s=34.6) == [WorkerSuspected("w1")]
     registry.excuse_silence(30.0, now_s=35.0)
-    assert session.last_seen_s == 35.0, "nobody was heard in the future"
+    assert session.last_seen_s == 35.0, "no worker was heard in the future"
 
 
 def test_heartbeats_slow_down_in_a_large_cluster(registry):

@@ -40,7 +40,7 @@ MB = 100.0
 
 
 class Cluster:
-    """A scheduler with workers that load what they are told to hold."""
+    """Scheduler with workers that load every assigned scene."""
 
     def __init__(self):
         self.pool = WorkerPool()
@@ -61,7 +61,7 @@ class Cluster:
         return commands
 
     def change_standing(self, event):
-        """Apply what the dispatcher would."""
+        """Apply a change of the worker's state, as the dispatcher would."""
         match event:
             case WorkerJoined(worker_id, resources):
                 self.pool.join(worker_id, resources)
@@ -323,7 +323,7 @@ def test_scene_counts_at_its_next_use():
 
 
 class Listed:
-    """Sites in a list, all to be looked at."""
+    """List of sites without an index."""
 
     def __init__(self, sites):
         self._sites = {site.worker_id: site for site in sites}

@@ -13,7 +13,7 @@ def batch(name, count):
 
 
 async def told(batches):
-    """The events of these batches, which come at the same time."""
+    """Return the events of these batches, which arrive at the same time."""
     events = []
     submissions = Submissions(events.append)
     serving = asyncio.create_task(submissions.serve())

@@ -24,7 +24,7 @@ def as_json(*args, **kwargs):
 
 
 def alone(function):
-    """Bind ids without a trace in other tests, and with none of theirs."""
+    """Run in a fresh context, so that bound ids neither enter nor leave the test."""
     return contextvars.Context().run(function)
 
 

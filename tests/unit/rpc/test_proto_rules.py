@@ -39,9 +39,9 @@ def commit(folder, proto):
 
 @pytest.fixture
 def repository(tmp_path):
-    """A repository of one commit with a protocol of its own and our rules."""
+    """Repository with one commit, a small protocol and our rules."""
     if not BUF.exists():
-        pytest.fail(f"{BUF} is missing: install the extra dev, whose wheel buf-bin brings it")
+        pytest.fail(f"{BUF} is missing: install the extra dev: its wheel buf-bin provides it")
     folder = tmp_path / "repository"
     (folder / "proto/embomatrix/proto/v1").mkdir(parents=True)
     for name in ("check.sh", "buf.yaml"):

@@ -1,4 +1,4 @@
-"""Physical mode: the robot carries out every skill once in the flat, and fails where it must."""
+"""Physical mode: the robot carries out every skill once in the flat and reports failures."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Films of physical mode: the arm moves, and objects move only while something moves them."""
+"""Films of physical mode: the arm moves, and objects move only while they are pushed or carried."""
 
 import itertools
 import math

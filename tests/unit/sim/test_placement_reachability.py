@@ -83,7 +83,7 @@ def test_equal_queries_give_equal_answers(known):
 
 
 def boxed_in():
-    """The flat with a low stand on its table, in a closed box high enough for a slice of bread."""
+    """Return the flat with a low stand on its table, in a closed box high enough for a slice of bread."""
     x, y, top, high, wide = 1.9, 1.3, 0.75, 0.11, 0.2
     stand = make.block("stand", "board.n.01", (0.06, 0.06, 0.04), {})
     slice_of = replace(make.block("slice", "bread.n.01", (0.05, 0.05, 0.03), {}), mass_kg=0.1)

@@ -1,4 +1,4 @@
-"""Oracle planner: for every kind of goal a minimal working plan, or the reason why there is none."""
+"""Oracle planner: a minimal working plan for every kind of goal, or the reason for its absence."""
 
 from dataclasses import replace
 

@@ -26,7 +26,7 @@ PLANS = (
 
 @pytest.fixture(scope="module")
 def bundle():
-    """The flat, prepared by a simulator that has been used before, as it comes out of a bundle's bytes."""
+    """Bundle of the flat, prepared by a used simulator and decoded from bytes."""
     scene = kitchen_scene()
     task = task_over(scene)
     bare = Bundle(scene, {task.task_id: task})

@@ -151,7 +151,7 @@ def test_prompt_shows_substances_and_absent_objects():
     situation = situation_of(scene, replace(task_over(scene), profile=Profile.HOUSEHOLD))
     states = {row.name: row.states for row in situation.rows}
     assert states["plate_1"] == ("dusty",)
-    assert states["plate_2"] == ("stained",), "a covering that has a word of its own is told by it"
+    assert states["plate_2"] == ("stained",), "a covering with a dedicated word is described by that word"
     assert states["liquid_soap__bottle_1"] == ("filled_with_liquid_soap",)
     assert states["half_melon_1"] == ("absent",)
     assert situation.profile is Profile.HOUSEHOLD

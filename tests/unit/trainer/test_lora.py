@@ -70,7 +70,7 @@ def policy_of(tokenizer, *, seed=0, recompute=False):
 
 
 def adapters(module):
-    """Adapted layers by name."""
+    """Return the adapted layers by name."""
     return {name: layer for name, layer in module.named_modules() if hasattr(layer, "lora_B")}
 
 
@@ -84,7 +84,7 @@ def moved(policy):
 
 
 def scored(policy, *, rows=4):
-    """Log-probabilities of the same plans under any policy; prompts differ in length."""
+    """Return log-probabilities of the same plans under any policy; prompts differ in length."""
     told = [policy.encode(prompt_for(task.situation, Codec.LINES)) for task in TASKS.train[:2]]
     told[0] = told[0][20:]
     tokens = torch.arange(rows * 5).view(rows, 5) % 30 + 2

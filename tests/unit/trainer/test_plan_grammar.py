@@ -1,4 +1,4 @@
-"""A policy that is held to the grammar writes plans, and calls only what its prompt tells."""
+"""A policy constrained by the grammar writes valid plans about objects in its prompt."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ TASKS = make_tasks(12, 3)
 
 
 def twins(situation):
-    """A situation with two more object_tokens of one category, so that names need numbers."""
+    """Return a situation with two more objects of one category, so that names need numbers."""
     first = situation.rows[0]
     more = [PromptRow(100 + at, f"{first.category}_{at}", first.category, first.room) for at in (7, 3)]
     return replace(situation, rows=(*situation.rows[1:], *more), table_size=102)
@@ -45,7 +45,7 @@ def prompt_of(situation):
 
 
 def next_words(situation, written):
-    """Words that may follow what is written, in its prompt."""
+    """Return the words that may follow this text in its prompt."""
     names = GRAMMAR.prompt_names(torch.tensor([prompt_of(situation)]))
     state = GRAMMAR.start(1)
     for token in WORDS.encode(written):

@@ -25,7 +25,7 @@ def kitchen(tmp_path_factory):
 
 @pytest.fixture
 def begun(kitchen, tmp_path):
-    """Saves the checkpoint of a run that took one step of imitation, and of GRPO once it is ``grpo_ready``."""
+    """Save the checkpoint of a run after one step of imitation; with ``grpo_ready``, after one step of GRPO too."""
 
     def begin(*, grpo_ready=False):
         start = start_run(kitchen, tmp_path, "tiny", None, SMALL)

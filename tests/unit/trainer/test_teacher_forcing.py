@@ -29,7 +29,7 @@ TASKS = make_tasks(20, 0, objects=7)
 
 
 class CutError(Exception):
-    """Ends a run in its midst."""
+    """Error that ends a run before its last step."""
 
 
 def settings_of(**changes):

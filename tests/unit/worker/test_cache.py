@@ -17,7 +17,7 @@ from embomatrix.world.inflation import bundle_digest
 
 
 class Source:
-    """Bundles by digest, and a record of what was asked for."""
+    """Bundles by digest, and a record of the requests."""
 
     def __init__(self, *contents, wrong=0):
         self.bundles = {bundle_digest(content): content for content in contents}

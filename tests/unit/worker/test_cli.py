@@ -1,4 +1,4 @@
-"""Command line of the worker: one sentence and status 2 for every error that a user can mend."""
+"""Command line of the worker: one sentence and status 2 for every user error."""
 
 import subprocess
 import sys

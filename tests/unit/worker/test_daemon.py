@@ -23,7 +23,7 @@ def _daemon(address, folder, **options):
 
 @contextlib.asynccontextmanager
 async def joined(manager, folder, **options):
-    """A daemon that has joined the manager and is told to leave at the end."""
+    """Run a daemon that has joined the manager; stop it at the end."""
     async with serving(manager) as address:
         daemon = _daemon(address, folder, **options)
         task = asyncio.create_task(daemon.run())
@@ -87,7 +87,7 @@ async def test_many_leases_are_executed_once_each(tmp_path):
 
 
 async def test_results_share_messages_while_slots_have_enough_leases(tmp_path, monkeypatch):
-    # So long that what is counted does not depend on the machine's speed.
+    # Long enough to make the count independent of the machine's speed.
     monkeypatch.setattr(session, "LINGER_S", 60.0)
     manager = FakeManager()
     digest = manager.bundle(b"ok")

@@ -73,7 +73,7 @@ def test_load_of_others_is_busy_time_without_our_processes():
 def test_descendants_count_as_ours_even_after_their_end():
     before_s = family_cpu_s(os.getpid())
     subprocess.run([sys.executable, "-c", BUSY], check=True)
-    # The kernel tells of whole ticks here, hundredths of a second, of which it may drop one at each end.
+    # The kernel counts whole ticks of 0.01 s here and may drop one at each end.
     assert family_cpu_s(os.getpid()) - before_s >= 0.38
 
 
@@ -86,7 +86,7 @@ def test_ended_process_has_no_cpu_time():
 def test_only_other_programs_are_load_of_others():
     ours, nobody = HostMachine(lambda: [os.getpid()]), HostMachine(list)
     subprocess.run([sys.executable, "-c", BUSY], check=True)
-    # Whatever else this machine does, both saw it; between them lies what was ours.
+    # Both observed all other load of this machine; their difference is our load.
     share, whole = ours.observe().others_load, nobody.observe().others_load
     assert whole > share
 

@@ -19,7 +19,7 @@ SCARCE = Observation(0, owner_idle_s=0.0, free_memory=0.02)
 
 
 class Room:
-    """The probe of a machine whose owner the test plays."""
+    """Probe of a machine whose owner the test plays."""
 
     def __init__(self):
         self.seen = AWAY
@@ -30,7 +30,7 @@ class Room:
 
 @contextlib.asynccontextmanager
 async def lent(manager, folder, *, slots=1, grace_s=30.0):
-    """A daemon that works while its owner is away."""
+    """Run a daemon that works while its owner is away."""
     room = Room()
     wishes = Preferences(idle_s=60, grace_s=grace_s, calm_s=0.05, check_s=0.02)
     async with serving(manager) as address:

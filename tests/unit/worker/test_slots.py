@@ -1,4 +1,4 @@
-"""Slots: every lease ends in one result, whatever happens to simulator processes."""
+"""Slots: every lease ends in one result, even if simulator processes fail."""
 
 import asyncio
 import contextlib
@@ -27,7 +27,7 @@ from embomatrix.worker.slots.residents import LoadError, SlotLimits
 
 
 class Harness:
-    """A pool whose bundles are files that say how their scene behaves."""
+    """Pool whose bundle files script the behaviour of their scenes."""
 
     def __init__(self, folder, *, slots=2, memory_mb=500.0, program=PROGRAM, fork_s=10.0):
         self.folder = folder
@@ -90,7 +90,7 @@ def _living():
 
 def _simulators(parent=None):
     below = psutil.Process(parent or os.getpid()).children(recursive=True)
-    # Other children of this process, such as the resource tracker of a process pool, are not the slots' doing.
+    # Other children of this process, such as a pool's resource tracker, do not belong to the slots.
     return [process for process in below if _is_simulator(process)]
 
 
@@ -243,7 +243,7 @@ async def test_stopped_scene_process_is_replaced_while_its_rollout_continues(tmp
     async with running(tmp_path, slots=2, fork_s=0.3) as harness:
         harness.submit("other", digest="other")
         await harness.outcomes(1)
-        harness.submit("running", "stop")  # its slot stops the scene's process and goes on for a second
+        harness.submit("running", "stop")  # its slot stops the scene's process and continues for a second
         [root] = [child for child in psutil.Process().children() if _is_simulator(child)]
         await harness.until(lambda: any(scene.status() == psutil.STATUS_STOPPED for scene in root.children()))
         [stopped] = [scene for scene in root.children() if scene.status() == psutil.STATUS_STOPPED]

@@ -180,7 +180,7 @@ def test_unprivileged_unit_gets_root_files_as_credentials():
 
 
 def test_worker_and_manager_of_a_machine_keep_their_files_apart():
-    """Each runs as a user of its own, and systemd gives a folder of state to the one that started last."""
+    """Each service runs as a dedicated user; systemd assigns a shared state folder to the service that started last."""
     manager = (DEPLOY / "systemd" / "embomatrix-manager.service").read_text()
     folders = [
         line
