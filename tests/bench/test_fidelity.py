@@ -43,7 +43,7 @@ def suite(dataset, tmp_path_factory):
     return folder, run_fidelity(dataset, SMALL, folder, 2, Modes(load_simulator, clumsy), QUIET)
 
 
-def test_a_suite_compares_every_plan_and_writes_the_disagreements(suite):
+def test_suite_compares_every_plan_and_writes_the_disagreements(suite):
     folder, outcome = suite
     plans = (folder / PLANS_FILE).read_text().splitlines()
     assert len(plans) == len(outcome.comparisons) >= SMALL.plans
@@ -107,7 +107,7 @@ def test_zero_processes_sum_up_the_results_so_far(suite, dataset, tmp_path):
     assert (tmp_path / RESULTS_FILE).read_text().splitlines() == lines[:4]
 
 
-def test_a_folder_of_other_settings_is_refused(suite, dataset):
+def test_folder_with_other_settings_is_refused(suite, dataset):
     with pytest.raises(BenchError, match="other settings"):
         run_fidelity(dataset, FidelitySettings(21, 0, 0), suite[0], 1, Modes(load_simulator, clumsy), QUIET)
 
@@ -196,7 +196,7 @@ def test_wrong_option_is_one_sentence(dataset, options, sentence):
     assert "Traceback" not in answer.output
 
 
-def test_a_damaged_suite_is_refused_with_its_folder(dataset, suite, tmp_path):
+def test_damaged_suite_is_refused_with_its_folder(dataset, suite, tmp_path):
     for name in (PLANS_FILE, "settings.json"):
         (tmp_path / name).write_text((suite[0] / name).read_text())
     (tmp_path / RESULTS_FILE).write_text("not JSON\n{}\n")

@@ -207,7 +207,7 @@ def test_missing_package_error_names_the_extra(kitchen, tmp_path, package, argum
         (("worker", "run", "--nice=50"), "--nice 50: input should be less than or equal to 19"),
     ],
 )
-def test_invalid_option_value_error_names_the_expected_one(tmp_path, arguments, words):
+def test_invalid_option_error_names_the_expected_value(tmp_path, arguments, words):
     assert_told(run(*arguments, HOME=str(tmp_path)), 2, words)
 
 

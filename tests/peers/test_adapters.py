@@ -45,7 +45,7 @@ async def cluster(tmp_path):
             yield started, client
 
 
-async def test_trl_trains_on_the_cluster_and_announces_what_comes(cluster, dataset, tmp_path):
+async def test_trl_trains_on_the_cluster_and_announces_the_next_scenes(cluster, dataset, tmp_path):
     started, client = cluster
     peer = Peer("trl", TORCH, "trl==1.16.0")
     peer.run("-c", SMALL_MODEL, tmp_path / "model")

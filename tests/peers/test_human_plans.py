@@ -70,7 +70,7 @@ def judged(source, native, judge, base, library):
     return "differ", f"ours {ours}: {cause(trace, verdict) or UNKNOWN}; {last}; {dict(verdict.errors)}"
 
 
-def test_human_plans_are_judged_alike_and_every_disagreement_has_its_cause(capsys):
+def test_human_plans_are_judged_alike_or_the_disagreement_has_a_known_cause(capsys):
     library, found = PlacementLibrary(), {}
     with NativeJudge(install()) as judge, contextlib.closing(library):
         natives = {task.task: task for task in judge.tasks()}

@@ -131,7 +131,7 @@ def their_loss(case, folder, kind, level, kl_coef):
 
 
 @pytest.mark.parametrize(("kind", "level", "kl_coef"), CASES)
-def test_loss_and_gradient_are_those_of_trl(case, tmp_path, kind, level, kl_coef):
+def test_loss_and_gradient_equal_those_of_trl(case, tmp_path, kind, level, kl_coef):
     theirs = their_loss(case, tmp_path, kind, level, kl_coef)
     their_gradient = case.gradient(theirs)
     terms = LossInputs(case.logprobs(), case.old, case.mask, case.advantages, case.reference)

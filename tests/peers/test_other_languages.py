@@ -59,9 +59,7 @@ async def opened(client, data, task_id, plans, run_id="run"):
     return Batch(run_id, "b1", 0, tuple(rollouts))
 
 
-async def test_it_executes_through_a_death_of_the_manager_and_leaves_when_it_is_told(
-    tmp_path, program, bundle
-):
+async def test_javascript_worker_survives_a_manager_restart_and_leaves_on_sigterm(tmp_path, program, bundle):
     plans = [[ROOM] * 20] * 150
     with RealCluster(tmp_path) as cluster:
         cluster.start_manager()
@@ -87,9 +85,7 @@ async def test_it_executes_through_a_death_of_the_manager_and_leaves_when_it_is_
         assert [len(result.outcome.steps) for result in results] == [20] * len(plans)
 
 
-async def test_what_it_cannot_do_is_no_reward_and_what_a_plan_may_not_ask_is_a_failed_step(
-    tmp_path, program, bundle
-):
+async def test_unsupported_skill_fails_the_rollout_and_unknown_room_fails_the_step(tmp_path, program, bundle):
     with RealCluster(tmp_path) as cluster:
         cluster.start_manager()
         cluster.start_program("w1", "node", program, ROOT / "proto")

@@ -137,7 +137,7 @@ def test_section_has_configuration_success_curves_and_times():
     assert widths == {14}
 
 
-def test_section_has_the_memory_of_a_run_that_recorded_it():
+def test_section_shows_memory_only_for_runs_that_recorded_it():
     told = run(0, "a", (), ())
     found = findings_of("a", [replace(told, outcome=replace(told.outcome, peak_mb=2345.6))])
     assert "| 10.0% | 2,346 MB |" in learning_section(DESIGN, [found], MACHINE, "abc", TODAY)
@@ -160,7 +160,7 @@ def test_sections_are_appended_and_never_removed(tmp_path):
     assert text.index("## one") < text.index("By hand: it failed.") < text.index("## two")
 
 
-def test_settings_of_arms_are_read_as_the_trainer_reads_its_file(tmp_path):
+def test_arm_settings_are_parsed_like_the_trainers_file(tmp_path):
     arm = parse_arm("fast:grpo.learning_rate=4e-4, grpo.loss=grpo,grpo.relevance_final=0.5")
     path = tmp_path / "settings.toml"
     path.write_text(toml_of(arm.settings))
@@ -170,7 +170,7 @@ def test_settings_of_arms_are_read_as_the_trainer_reads_its_file(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["grpo.group", "=3", "grpo.group="])
-def test_a_setting_without_key_or_value_is_refused(text):
+def test_setting_without_key_or_value_is_refused(text):
     with pytest.raises(TrainerError, match="expected KEY=VALUE"):
         parse_settings([text])
 

@@ -141,7 +141,7 @@ def test_page_command_renders_figures_that_were_measured_before(tmp_path):
     assert "Commit `def`" in fidelity
 
 
-def test_parts_of_a_benchmark_merge_if_they_are_of_one_commit():
+def test_parts_of_a_benchmark_merge_if_their_commits_match():
     old, new, other = (
         Figure(name, value, "ms", Better.LOWER, 1) for name, value in (("x", 1.0), ("x", 2.0), ("y", 3.0))
     )

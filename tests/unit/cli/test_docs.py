@@ -53,5 +53,5 @@ def test_every_command_on_the_page_exists_with_its_options(page: Path) -> None:
         assert given - WORDS <= known, f"embomatrix {' '.join(words)}"
 
 
-def test_the_pages_show_commands() -> None:
+def test_pages_show_commands() -> None:
     assert sum(len(shown(page.read_text(encoding="utf-8"))) for page in PAGES) > 40

@@ -139,7 +139,7 @@ def test_box_of_an_asset_is_the_size_of_its_model() -> None:
         assert box.center_m == pytest.approx((0.0, 0.0, 0.0), abs=1e-5), asset.asset_id
 
 
-def test_links_keep_to_what_the_engine_can_hold() -> None:
+def test_links_stay_within_the_engines_limits() -> None:
     for asset in ASSETS:
         names = [link.name for link in asset.links]
         assert len(names) == len(set(names))
@@ -229,7 +229,7 @@ def test_cavities_hold_a_probe_of_three_centimetres_where_their_size_allows() ->
         assert max(min(interior.size_m) for interior in asset.interiors) >= 0.03, asset.asset_id
 
 
-def test_closed_doors_touch_neither_the_frame_nor_what_is_inside() -> None:
+def test_closed_doors_touch_neither_the_frame_nor_the_contents() -> None:
     for asset in WITH_JOINTS:
         assert_clear(asset, (0.0,))
 

@@ -40,7 +40,7 @@ def imported() -> ImportedTask:
     return outcome
 
 
-def test_every_refusal_stands_there_in_the_order_in_which_it_is_looked_for():
+def test_every_refusal_is_documented_in_the_order_of_its_check():
     assert list(rows("refusal")) == [*RefusalReason]
 
 
@@ -64,7 +64,7 @@ def test_problem_on_the_page_can_be_bound():
     assert imported().task.instruction == "Put the apple in the fridge."
 
 
-def test_commands_on_the_page_have_the_options_they_are_shown_with():
+def test_commands_on_the_page_exist_with_their_options():
     apps = {"factory": cli.app, "scene": scene_cli.app, "play": typer.Typer()}
     apps["play"].command()(play_cli.play)
     for name, rest in re.findall(r"^embomatrix (\w+) (.*?)(?:#.*)?$", PAGE, re.MULTILINE):

@@ -111,7 +111,7 @@ def test_survey_answers_do_not_depend_on_the_order_of_queries(home: Scene) -> No
         ),
     ],
 )
-def test_model_is_told_the_infeasible_wish(home: Scene, wish: RequestedAtom, sentence: str) -> None:
+def test_infeasible_request_is_reported_to_the_model(home: Scene, wish: RequestedAtom, sentence: str) -> None:
     request = TaskRequest(instruction="Please do this for me.", wishes=(wish,))
     with pytest.raises(ValueError, match=f"the robot tried and {sentence}"):
         check_request(request, SceneView(home, Clumsy()), frozenset(home.by_name))

@@ -282,7 +282,7 @@ def a_door():
         (lambda: RequestedAtom(predicate=RequestPredicate.HOT, thing=HOST, holds=False), "not the contrary"),
     ],
 )
-def test_infeasible_wish_is_rejected_with_its_reason(wish, sentence):
+def test_infeasible_request_is_rejected_with_its_reason(wish, sentence):
     request = TaskRequest(instruction="Ann asks for it, please.", wishes=(wish(),))
     with pytest.raises(ValueError, match=sentence):
         check_request(request, VIEW, KNOWN)

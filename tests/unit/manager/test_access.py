@@ -39,7 +39,7 @@ def test_every_method_has_roles():
     assert {method for method in OPEN if "/embomatrix." in method} <= ours
 
 
-def test_admins_may_call_every_listed_method_and_nobody_others():
+def test_admins_may_call_listed_methods_and_no_role_may_call_others():
     assert all(may_call(AccessRole.ADMIN, method) for method in ROLES)
     assert not any(may_call(role, "/embomatrix.proto.v1.AdminService/DropEverything") for role in AccessRole)
 

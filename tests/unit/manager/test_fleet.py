@@ -35,7 +35,7 @@ def load(pool, worker_id, leases, given_s=0.0):
         pool.add_lease(worker, LeaseRecord(LeaseRef(name, 1), worker_id, record, given_s, 30.0, 180.0))
 
 
-def test_only_holder_with_a_credit_is_found_among_many():
+def test_only_worker_with_a_credit_is_found_among_many():
     pool = pool_of(MANY)
     for worker_id in list(pool.workers)[:-1]:
         load(pool, worker_id, 2)
@@ -53,7 +53,7 @@ def test_all_of_many_holders_get_leases():
     assert len(set(chosen)) == MANY
 
 
-def test_an_idle_worker_finds_a_lease_behind_a_busy_slot():
+def test_idle_worker_finds_a_lease_behind_a_busy_slot():
     pool = pool_of(2)
     load(pool, "w0000", 2, given_s=1.0)
     thief = pool.workers["w0001"]

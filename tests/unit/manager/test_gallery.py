@@ -83,7 +83,7 @@ async def test_task_page_shows_objects_transcript_and_tree(folder):
     assert "kitchen_0" in told.rooms
 
 
-async def test_name_that_is_a_path_leads_to_no_file(folder):
+async def test_path_as_name_opens_no_file(folder):
     gallery = Gallery(folder)
     assert (await gallery.detail("..")).transcript == ""
     for name in ("../secret.md", "/etc/passwd", "transcripts/tidy", ""):

@@ -81,7 +81,7 @@ def test_broken_stream_loses_a_worker_after_a_second(registry):
     assert [type(event) for event in registry.tick(now_s=2.0)] == [WorkerLost]
 
 
-def test_stream_that_comes_back_in_time_costs_nothing(registry):
+def test_stream_restored_within_the_grace_costs_nothing(registry):
     session, _ = join(registry)
     registry.attach(session, now_s=0.0)
     registry.detach(session, now_s=1.0)

@@ -127,7 +127,7 @@ def test_wrong_look_ahead_costs_at_most_five_percent_and_starves_no_run(surprise
     assert longest_s <= 2 * max(none.groups_s["run"])
 
 
-def test_scenes_wanted_by_64_runs_at_once_are_loaded_once():
+def test_scenes_needed_by_64_runs_are_loaded_once():
     """A14: over-creation is 1.0 although reports of loads arrive half a second late."""
     first = Trainer(name="first", steps=1, groups=4, group_size=8, start_s=5.0)
     one = Trainer(steps=1, groups=2, group_size=1, write_s=0.01, update_s=0.0, start_s=20.0)

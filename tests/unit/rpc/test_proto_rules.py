@@ -57,7 +57,7 @@ def checked(folder):
     )
 
 
-def test_first_commit_has_nothing_to_compare_with_and_says_so(repository):
+def test_first_commit_reports_a_missing_baseline(repository):
     told = checked(repository)
     assert told.returncode == 0, told.stderr
     assert "skipped, this checkout has one commit only" in told.stdout

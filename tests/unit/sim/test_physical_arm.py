@@ -63,7 +63,7 @@ def test_tool_moves_with_base_lift_and_heading():
     np.testing.assert_allclose(turned[0], arm.about_z(np.array([np.pi / 2]))[0] @ turn[0], atol=1e-9)
 
 
-def test_the_folded_arm_keeps_within_the_robots_disc_and_off_its_own_trunk():
+def test_folded_arm_stays_within_the_robots_disc_and_clear_of_its_trunk():
     from embomatrix.sim.bullet.robot import TUCKED_ARM
     from embomatrix.skills.limits import ROBOT
 

@@ -103,7 +103,7 @@ def boxed_in():
     return with_objects(kitchen_scene(), [*sides, *boxed, (free, slice_of)])
 
 
-def test_nothing_is_placed_where_nothing_could_be_picked_up():
+def test_no_object_is_placed_at_an_unreachable_pose():
     placing = PlacementQuery("slice_1", "stand_1", Relation.ONTOP)
     scene = boxed_in()
     poses = looked_ahead(scene, (placing,))

@@ -134,7 +134,7 @@ def test_cooked_food_is_served_elsewhere(flat):
     )
 
 
-def test_a_microwave_is_switched_off_before_the_food_is_taken_out(flat):
+def test_microwave_is_switched_off_before_the_food_is_taken_out(flat):
     task = task_over(
         flat.world.scene, And((atom("hot", "apple_1"), atom("ontop", "apple_1", "coffee_table_1")))
     )
@@ -161,7 +161,7 @@ def test_a_microwave_is_switched_off_before_the_food_is_taken_out(flat):
         And((atom("touching", "apple_1", "coffee_table_1"),)),
     ],
 )
-def test_a_plan_is_found_for_the_goal(flat, goal):
+def test_oracle_finds_a_plan_for_the_goal(flat, goal):
     assert oracle(flat, goal).startswith("move")
 
 
@@ -222,7 +222,7 @@ def test_goal_without_a_plan_is_refused_with_a_reason(flat, goal, reason):
     assert oracle(flat, goal) == reason
 
 
-def test_a_goal_that_needs_an_object_outside_the_table_has_no_plan(flat):
+def test_goal_with_an_object_outside_the_table_has_no_plan(flat):
     task = task_over(flat.world.scene, atom("ontop", "apple_1", "countertop_1"))
     task = replace(task, table=task.table[:5])
     assert find_plan(flat, task) == PlanNotFound("apple_1 is not in the object table: no plan can name it")

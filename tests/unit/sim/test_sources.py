@@ -42,7 +42,7 @@ def test_object_in_the_closed_fridge_is_frozen_at_the_start(flat):
     assert not after(flat, "turn 0").holds("frozen", ("apple_1",))
 
 
-def test_the_fridge_freezes_only_when_it_is_closed(flat):
+def test_fridge_freezes_only_when_closed(flat):
     stock = (
         "move fridge_1; open fridge_1; move apple_1; pick_up apple_1; move fridge_1; place fridge_1 inside"
     )

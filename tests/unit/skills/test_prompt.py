@@ -69,7 +69,7 @@ def test_system_text_lists_every_skill_and_the_example_of_its_codec(codec):
 
 
 @pytest.mark.parametrize("codec", Codec)
-def test_the_example_of_every_codec_parses_to_the_same_plan(codec):
+def test_example_of_every_codec_parses_to_the_same_plan(codec):
     text = EXAMPLES[codec]
     plan = parse_plan(with_indices(text, SITUATION) if codec is Codec.NAMES else text)
     assert plan == parse_plan(EXAMPLES[Codec.JSON])

@@ -52,7 +52,7 @@ async def test_texts_of_several_tasks_are_scored_in_order_with_one_batch_per_tas
     assert (len(cluster.batches), cluster.executed) == (2, 3)
 
 
-async def test_a_scorer_serves_several_event_loops(on_cluster):
+async def test_scorer_serves_several_event_loops(on_cluster):
     def in_a_loop_of_its_own():
         return asyncio.run(on_cluster.score([FIRST.task.task_id], [oracle(FIRST)]))
 
@@ -167,7 +167,7 @@ class LookingAhead(ClusterLookahead, TrainerOfTheirs):
     lookahead_steps = 1
 
 
-def test_the_mixin_announces_each_generation_and_the_next_to_the_cluster(cluster, on_cluster):
+def test_mixin_announces_the_current_and_the_next_generation(cluster, on_cluster):
     sampler = LookingAhead(ClusterReward(on_cluster))._get_train_sampler()
     drawn = iter(sampler)
     next(drawn)

@@ -35,7 +35,7 @@ def _cache(folder, source, limit_bytes=10_000):
     return BundleCache(folder / "bundles", limit_bytes=limit_bytes, fetch=source.fetch)
 
 
-async def test_a_bundle_is_fetched_once_and_then_found(tmp_path):
+async def test_bundle_is_fetched_once_and_then_cached(tmp_path):
     source = Source(b"scene")
     cache = _cache(tmp_path, source)
     [digest] = source.bundles
@@ -45,7 +45,7 @@ async def test_a_bundle_is_fetched_once_and_then_found(tmp_path):
     assert source.asked == [digest]
 
 
-async def test_a_bundle_damaged_on_disk_is_fetched_again(tmp_path):
+async def test_bundle_damaged_on_disk_is_fetched_again(tmp_path):
     source = Source(b"scene")
     cache = _cache(tmp_path, source)
     [digest] = source.bundles
@@ -166,7 +166,7 @@ def test_full_disk_evicts_all_other_bundles(tmp_path):
     assert result.stdout == "False False True 1\n", result.stderr
 
 
-async def test_a_bundle_that_cannot_be_written_leaves_nothing_behind(tmp_path):
+async def test_failed_bundle_write_leaves_no_file(tmp_path):
     # The limit is the system's own, and lifted again.
     source = Source(b"a" * 400, b"b" * 4000)
     cache = _cache(tmp_path, source)

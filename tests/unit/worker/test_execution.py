@@ -142,7 +142,7 @@ async def test_lease_of_another_scene_is_executed_despite_endless_leases_of_a_bu
             await asyncio.sleep(0.002)
 
 
-async def test_lease_given_again_after_a_cancellation_has_one_result(tmp_path):
+async def test_lease_repeated_after_a_cancellation_has_one_result(tmp_path):
     async with running(tmp_path, slots=1) as harness:
         await learn_pace(harness)
         submit(harness, "first", "slow")

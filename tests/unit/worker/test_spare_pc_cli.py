@@ -45,7 +45,7 @@ def test_options_take_precedence_over_the_file_and_the_file_over_defaults(tmp_pa
         (["--cache-mb=0"], "--cache-mb 0: input should be greater than or equal to 1"),
     ],
 )
-def test_a_wrong_preference_is_named_with_what_was_expected(arguments, said):
+def test_wrong_preference_is_named_with_the_expected_value(arguments, said):
     result = CliRunner().invoke(app, ["run", *arguments])
     assert result.exit_code == 2
     assert said in " ".join(result.stderr.split())
@@ -107,7 +107,7 @@ def test_status_files_of_killed_daemons_are_ignored(tmp_path):
     assert running_daemons(tmp_path) == [STATUS]
 
 
-def test_a_status_that_cannot_be_written_is_no_error(tmp_path):
+def test_unwritable_status_file_is_no_error(tmp_path):
     (tmp_path / "running").write_text("a file where a folder should be")
     file = StatusFile(tmp_path, "w1")
     file.write(STATUS)
@@ -217,7 +217,7 @@ def test_special_characters_are_quoted_for_systemd():
 
 @needs_systemd
 @pytest.mark.parametrize("system", [False, True])
-def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path, system):
+def test_systemd_accepts_the_unit(tmp_path, system):
     path = tmp_path / "embomatrix-worker.service"
     path.write_text(
         unit_text(
