@@ -51,8 +51,8 @@ def test_suite_compares_every_plan_and_writes_the_disagreements(suite):
     differing = [item for item in outcome.comparisons if item.first_difference is not None]
     assert differing
     assert {item.pairs[item.first_difference][0].skill.value for item in differing} == {"toggle_on"}
-    told = [json.loads(line) for line in (folder / DISAGREEMENTS_FILE).read_text().splitlines()]
-    assert {value["trial"] for value in told} >= {item.trial.trial_id for item in differing}
+    disagreements = [json.loads(line) for line in (folder / DISAGREEMENTS_FILE).read_text().splitlines()]
+    assert {value["trial"] for value in disagreements} >= {item.trial.trial_id for item in differing}
 
 
 def test_figures_have_their_documented_names(suite):

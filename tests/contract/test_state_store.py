@@ -280,10 +280,10 @@ async def test_store_that_cannot_be_used_says_what_to_do(tmp_path):
         open_store(f"sqlite:{tmp_path}/file/state.sqlite")
     with pytest.raises(StateError, match="expected memory:"):
         open_store("postgres://x")
-    nobody = open_store("redis://127.0.0.1:1/0")
+    unreachable = open_store("redis://127.0.0.1:1/0")
     with pytest.raises(StateError, match="can't be reached"):
-        await nobody.claim(FIRST)
-    await nobody.close()
+        await unreachable.claim(FIRST)
+    await unreachable.close()
 
 
 @contextlib.contextmanager

@@ -67,9 +67,9 @@ def placed(arguments, folder):
 
 @pytest.mark.slow
 def test_worker_joins_the_cluster_of_the_compose_commands_with_its_own_token(tmp_path):
-    told = run("manager", "init", *placed(SERVICES["init"]["command"], tmp_path))
-    assert told.status == 0, told.text
-    assert "manager, localhost" in told.text
+    result = run("manager", "init", *placed(SERVICES["init"]["command"], tmp_path))
+    assert result.status == 0, result.text
+    assert "manager, localhost" in result.text
     again = run("manager", "init", *placed(SERVICES["init"]["command"], tmp_path))
     assert again.status == 0, again.text
     serve = [*placed(SERVICES["manager"]["command"], tmp_path), "--port=0", "--http-port=0"]

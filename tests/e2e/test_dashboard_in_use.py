@@ -202,11 +202,11 @@ async def test_timeline_zooms_and_pans_with_the_mouse(browser, tmp_path):
             longer = await _slots_shown_s(opened) > before_s
             assert longer == (times > 0), f"{key} and the wheel by {times}"
         await opened.page.mouse.move(left, top)
-        told = await opened.words("#one")
+        shown = await opened.words("#one")
         await opened.page.mouse.down()
         await opened.page.mouse.move(left + 400, top, steps=8)
         await opened.page.mouse.up()
-        assert (await opened.words("#one")) == told, "what was grabbed stays under the mouse"
+        assert (await opened.words("#one")) == shown, "what was grabbed stays under the mouse"
         await opened.page.wait_for_timeout(1200)
         assert await _slots_shown_s(opened) == pytest.approx(one_s, rel=0.1), "a refresh takes no view away"
         await opened.page.locator("canvas.gantt").focus()

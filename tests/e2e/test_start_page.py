@@ -64,8 +64,8 @@ class Shell:
         if re.match(r"[A-Z]+=", line):
             self._assigned.append(line)
             return ""
-        told = next((words for part, words in SERVES.items() if part in line), None)
-        return self._ended(line) if told is None else self._serving(line, told)
+        ready_words = next((words for part, words in SERVES.items() if part in line), None)
+        return self._ended(line) if ready_words is None else self._serving(line, ready_words)
 
     def close_terminals(self):
         """Send Ctrl-C to every command that still serves."""
@@ -77,13 +77,13 @@ class Shell:
         assert result.returncode == 0, f"{line}\n{said.decode()}"
         return said.decode()
 
-    def _serving(self, line, told):
+    def _serving(self, line, ready_words):
         log = self.folder / f"{time.monotonic_ns()}.log"
         with log.open("wb") as file:
             process = self._run(f"exec {line}", stdout=file, stderr=subprocess.STDOUT)
         self._services.callback(_stop, process)
         ends_s = time.monotonic() + LIMIT_S
-        while told not in log.read_text():
+        while ready_words not in log.read_text():
             assert process.poll() is None, f"{line}\n{log.read_text()}"
             assert time.monotonic() < ends_s, f"{line}\n{log.read_text()}"
             time.sleep(0.1)

@@ -35,7 +35,7 @@ sys.meta_path[:] = [Finder if finder is importlib.machinery.PathFinder else find
 
 
 @dataclass(frozen=True)
-class Told:
+class CommandResult:
     """Exit status and text of a finished command, with line breaks removed."""
 
     status: int
@@ -52,17 +52,17 @@ def environment(**changes):
 
 def run(*arguments, text="", **changes):
     """Run the command to its end in a fork of the command server. ``changes`` apply to its environment."""
-    with tempfile.TemporaryFile() as said, tempfile.TemporaryFile() as given:
+    with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as given:
         given.write(_bytes(text))
         given.seek(0)
-        streams = (given.fileno(), said.fileno(), said.fileno())
+        streams = (given.fileno(), output.fileno(), output.fileno())
         ended = ask(_server(), map(str, arguments), environment(**changes), streams)
         with contextlib.closing(ended):
             if not select.select([ended], [], [], LIMIT_S)[0]:
                 raise TimeoutError(f"embomatrix {' '.join(map(str, arguments))}: no end after {LIMIT_S:g} s")
             (status,) = STATUS.unpack(ended.read(STATUS.size))
-        said.seek(0)
-        return Told(status, _words(said.read()))
+        output.seek(0)
+        return CommandResult(status, _words(output.read()))
 
 
 # What a process does before it becomes the command. Not a ``preexec_fn``: that runs in a fork of this process, where gRPC's
@@ -89,15 +89,15 @@ def run_anew(*arguments, text="", largest_file=None, **changes):
         timeout=LIMIT_S,
         check=False,
     )
-    return Told(result.returncode, _words(result.stdout))
+    return CommandResult(result.returncode, _words(result.stdout))
 
 
 def _bytes(text):
     return text.encode() if isinstance(text, str) else text
 
 
-def _words(said):
-    return " ".join(said.decode(errors="replace").split())
+def _words(output):
+    return " ".join(output.decode(errors="replace").split())
 
 
 @functools.cache
@@ -155,7 +155,7 @@ class Background:
         return self.end()
 
     def end(self):
-        return Told(self.process.wait(timeout=LIMIT_S), self.text)
+        return CommandResult(self.process.wait(timeout=LIMIT_S), self.text)
 
 
 @contextlib.contextmanager

@@ -15,7 +15,7 @@ FLOOR = "room_floor"
 STATES = {"OPEN": Skill.OPEN, "TOGGLE_ON": Skill.TOGGLE_ON, "TOGGLE_OFF": Skill.TOGGLE_OFF}
 
 
-class UntoldError(Exception):
+class InexpressibleError(Exception):
     """A step has no equivalent among our skills. The message names the step."""
 
 
@@ -35,13 +35,13 @@ class OneArm:
         self._shut = []
         self.deeds = []
 
-    def read(self, action, told):
+    def read(self, action, arguments):
         hand, _, deed = action.partition("_")
         if hand not in self._hands:
             hand, deed = "", action
-        if told.startswith(FLOOR) and told not in self._ours:
+        if arguments.startswith(FLOOR) and arguments not in self._ours:
             deed = "RELEASE"  # a floor outside the goals is not in our table: the object is only released
-        names = [] if deed == "RELEASE" else [self._name(name) for name in told.split(", ")]
+        names = [] if deed == "RELEASE" else [self._name(name) for name in arguments.split(", ")]
         match deed:
             case "GRASP":
                 self._hands[hand] = names[0]
@@ -64,7 +64,7 @@ class OneArm:
             case "UNFREEZE":
                 pass  # none of our skills thaws, and no goal of these tasks asks for it
             case _:
-                raise UntoldError(action)
+                raise InexpressibleError(action)
         self._close_what_is_done()
 
     def end(self):
@@ -74,7 +74,7 @@ class OneArm:
 
     def _name(self, theirs):
         if theirs not in self._ours:
-            raise UntoldError(theirs)
+            raise InexpressibleError(theirs)
         return self._ours[theirs]
 
     def _say(self, skill, name, source="", relation=None):
@@ -92,14 +92,14 @@ class OneArm:
         if self._arm:
             host, relation = self._home.get(self._arm, ("", None))
             if not host:
-                raise UntoldError("nowhere to lay a tool down")
+                raise InexpressibleError("nowhere to lay a tool down")
             self._send(Skill.PLACE, host, relation=relation)
             self._arm = ""
 
     def _place(self, hand, target, relation):
         name = self._hands[hand]
         if not name:
-            raise UntoldError("an empty hand")
+            raise InexpressibleError("an empty hand")
         self._take(name)
         self._send(Skill.PLACE, target, relation=relation)
         self._home[name] = (target, relation)
@@ -108,14 +108,14 @@ class OneArm:
     def _use(self, skill, name):
         tool = next((held for held in self._hands.values() if held not in ("", name)), "")
         if not tool:
-            raise UntoldError("a tool that lies in a sink")
+            raise InexpressibleError("a tool that lies in a sink")
         self._take(tool)
         self._send(skill, name, source=tool)
 
     def _soak(self, name):
         source = self._home.get(name, ("", None))[0]
         if not source:
-            raise UntoldError("SOAK outside of a sink")
+            raise InexpressibleError("SOAK outside of a sink")
         self._take(name)
         self._send(Skill.SOAK, name, source=source)
 
@@ -130,7 +130,7 @@ class OneArm:
 def from_eai(text, table, names, homes):
     """Convert a human plan's steps to our skills.
 
-    ``names``: EAI's names by ours; ``homes``: initial support or container of each object. Raises UntoldError for a
+    ``names``: EAI's names by ours; ``homes``: initial support or container of each object. Raises InexpressibleError for a
     step without an equivalent skill, mostly "put next to".
     """
     arm = OneArm(table, {theirs: ours for ours, theirs in names.items()}, homes)

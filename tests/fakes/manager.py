@@ -106,8 +106,8 @@ class FakeManager(worker_service_pb2_grpc.WorkerServiceServicer):
             if not self.answering_heartbeats:
                 await asyncio.sleep(60)
             self.renewed.append([ref.lease_id for ref in request.running])
-            for told in request.progress:
-                self.steps.setdefault(told.ref.lease_id, []).append(told.steps)
+            for reported in request.progress:
+                self.steps.setdefault(reported.ref.lease_id, []).append(reported.steps)
             return pb.HeartbeatResponse(next_interval_s=0.1)
 
     async def Session(self, request_iterator, context):

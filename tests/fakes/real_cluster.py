@@ -221,7 +221,7 @@ def tally(batch, results, reward=30.7):
     )
 
 
-def tell(name, counted, **figures):
+def print_figures(name, counted, **figures):
     """Print the figures of a test, for the table in docs/reliability.md."""
     parts = {**vars(counted), **figures}
     text = " ".join(

@@ -221,17 +221,17 @@ def _goal(rng, names, small, host, is_open, index):
     opened = dict(is_open)
     goal, words, plan = [], [], []
 
-    def carry(thing: str, target: str) -> None:
-        plan.append(SkillCall(Skill.MOVE, object_index=index[thing]))
-        _opened(plan, host[thing], opened, index)
-        plan.append(SkillCall(Skill.PICK_UP, object_index=index[thing]))
+    def carry(carried: str, target: str) -> None:
+        plan.append(SkillCall(Skill.MOVE, object_index=index[carried]))
+        _opened(plan, host[carried], opened, index)
+        plan.append(SkillCall(Skill.PICK_UP, object_index=index[carried]))
         plan.append(SkillCall(Skill.MOVE, object_index=index[target]))
         _opened(plan, target, opened, index)
         inside = target in CONTAINERS
         relation = PlaceRelation.INSIDE if inside else PlaceRelation.ONTOP
         plan.append(SkillCall(Skill.PLACE, object_index=index[target], relation=relation))
-        goal.append(Atom(relation.value, (f"{thing}_1", f"{target}_1")))
-        words.append(f"put the {thing.replace('_', ' ')} {'in' if inside else 'on'} the {target}")
+        goal.append(Atom(relation.value, (f"{carried}_1", f"{target}_1")))
+        words.append(f"put the {carried.replace('_', ' ')} {'in' if inside else 'on'} the {target}")
 
     kind = rng.integers(4)
     if kind == 3:
@@ -242,9 +242,9 @@ def _goal(rng, names, small, host, is_open, index):
         plan.append(SkillCall(Skill.TOGGLE_ON, object_index=index[lamp]))
         return (Atom("toggled_on", (f"{lamp}_1",)),), f"switch on the {lamp}", plan
     things = _pick(rng, small, 2 if kind == 2 else 1)
-    for thing in things:
-        targets = [name for name in names if name not in SWITCHES and name != host[thing]]
-        carry(thing, str(rng.choice(targets)))
+    for carried in things:
+        targets = [name for name in names if name not in SWITCHES and name != host[carried]]
+        carry(carried, str(rng.choice(targets)))
     if kind == 1 and plan[-1].relation is PlaceRelation.INSIDE:
         target = goal[0].args[1]
         goal.append(Not(Atom("open", (target,))))

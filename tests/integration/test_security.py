@@ -64,8 +64,8 @@ class Intruder:
                 else:
                     answers = [await made(request, timeout=10, metadata=metadata)]
             except grpc.aio.AioRpcError as error:
-                told = any(key == ERROR_KEY for key, _ in error.trailing_metadata() or ())
-                return error.code().name, error.details(), told
+                named = any(key == ERROR_KEY for key, _ in error.trailing_metadata() or ())
+                return error.code().name, error.details(), named
         return "OK", answers, True
 
 
@@ -320,7 +320,7 @@ async def test_a18_unauthorized_calls_are_refused_with_the_documented_code(tmp_p
     assert [(what, status) for what, _, (status, _, _) in table] == [
         (what, expected) for what, expected, _ in table
     ]
-    assert all(told for what, _, (_, _, told) in table if "33 MiB" not in what)
+    assert all(named for what, _, (_, _, named) in table if "33 MiB" not in what)
 
 
 async def test_client_without_trust_sends_no_token(tmp_path):

@@ -9,7 +9,7 @@ import itertools
 
 import pytest
 from tests.fakes.eai_tasks import in_its_scene
-from tests.fakes.human_plans import UntoldError, from_eai
+from tests.fakes.human_plans import InexpressibleError, from_eai
 from tests.fakes.two_judges import cause, names_of, with_ways
 
 from embomatrix.factory.scenes.build import build_base_scene
@@ -57,7 +57,7 @@ def judged(source, native, judge, base, library):
     bundle = decode_bundle(found.bundle)
     try:
         deeds = from_eai(native.human, task.table, names, homes_of(bundle.scene, task.table))
-    except UntoldError as error:
+    except InexpressibleError as error:
         return "no word", str(error)
     with contextlib.closing(load_simulator(bundle)) as simulator:
         trace = simulator.execute(task, with_ways(deeds), 0)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from tests.fakes.peers import EXAMPLES, ROOT
-from tests.fakes.real_cluster import RealCluster, connected, outcomes, tally, tell, until
+from tests.fakes.real_cluster import RealCluster, connected, outcomes, print_figures, tally, until
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
 from embomatrix.rpc.wire.values import Batch, Completed, InfraCode, Rollout
@@ -79,7 +79,7 @@ async def test_javascript_worker_survives_a_manager_restart_and_leaves_on_sigter
             (gone,) = await client.list_workers()
             assert (gone.state, gone.reason) == ("left", "it left")
         counted = tally(batch, results, reward=0.5)
-        tell("a worker in JavaScript", counted, redispatched=run.stats.redispatched)
+        print_figures("a worker in JavaScript", counted, redispatched=run.stats.redispatched)
         assert counted.clean
         assert run.stats.redispatched == 0
         assert [len(result.outcome.steps) for result in results] == [20] * len(plans)

@@ -11,8 +11,8 @@ from tests.fakes.real_cluster import (
     connected,
     opened,
     outcomes,
+    print_figures,
     tally,
-    tell,
     two_workers,
     until,
 )
@@ -47,7 +47,7 @@ async def killed_in_the_middle(folder, *, count, task, kill_at, away_s, grace_s)
         )
         recovery_s = min(at_s for at_s in times.values() if at_s > began_s) - began_s
         figures = {"executed_again": again, "start_s": serves_s - wall_s, "rejoin_s": joined_s - serves_s}
-        tell(f"A4 away {away_s:g} s", counted, **figures, first_result_s=recovery_s)
+        print_figures(f"A4 away {away_s:g} s", counted, **figures, first_result_s=recovery_s)
         assert counted.clean
         assert again == 0
         assert stats.delivered == count
@@ -82,7 +82,7 @@ async def test_batch_continues_without_its_trainer(tmp_path):
                     await asyncio.sleep(0.05)
             results = await outcomes(client, batch)
         counted = tally(batch, results)
-        tell("A4 without its trainer", counted, executed=sum(cluster.executed().values()))
+        print_figures("A4 without its trainer", counted, executed=sum(cluster.executed().values()))
         assert counted.clean
 
 
@@ -97,7 +97,7 @@ async def test_suspended_manager_loses_no_worker(tmp_path):
         results = await running
         stats = await client.close_run(batch.run_id)
         counted = tally(batch, results)
-        tell("A4 stands still 5 s", counted, redispatched=stats.redispatched)
+        print_figures("A4 stands still 5 s", counted, redispatched=stats.redispatched)
         assert counted.clean
         # Leases sent over a broken connection never reached a worker and are re-dispatched.
         assert set(cluster.executed().values()) == {1}

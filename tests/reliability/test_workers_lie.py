@@ -2,7 +2,7 @@
 
 import asyncio
 
-from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell
+from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, print_figures, tally
 from tests.fakes.simulation import graded_total
 
 from embomatrix.manager.runtime.intake import TICK_S
@@ -28,7 +28,7 @@ async def test_lying_worker_is_quarantined_before_any_false_result_is_delivered(
             stats = await client.close_run("run")
         counted = tally(batch, results, reward=graded_total)
         liar = workers[LIAR]
-        tell(
+        print_figures(
             "A17",
             counted,
             audited=stats.audited,

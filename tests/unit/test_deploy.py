@@ -80,9 +80,9 @@ def test_slurm_task_runs_a_worker_with_its_cores_and_a_unique_name(tmp_path):
     fake.write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')
     fake.chmod(0o755)
     known = {"PATH": f"{tmp_path}:{os.environ['PATH']}", "SLURM_CPUS_PER_TASK": "4"}
-    told = {"EMBOMATRIX_MANAGER": "m:50070", "SLURM_ARRAY_JOB_ID": "7", "SLURM_ARRAY_TASK_ID": "3"}
+    variables = {"EMBOMATRIX_MANAGER": "m:50070", "SLURM_ARRAY_JOB_ID": "7", "SLURM_ARRAY_TASK_ID": "3"}
     script = ("bash", str(DEPLOY / "slurm" / "workers.sbatch"))
-    ran = subprocess.run(script, env=known | told, capture_output=True, text=True, check=True)
+    ran = subprocess.run(script, env=known | variables, capture_output=True, text=True, check=True)
     words = ran.stdout.splitlines()
     assert words[:3] == ["embomatrix", "worker", "run"]
     assert named(words) <= options(worker_app, "run")

@@ -71,7 +71,7 @@ ARMS = (
 )
 
 
-def told(*arguments):
+def invoke(*arguments):
     """Return the exit status and all visible output."""
     result = CliRunner().invoke(app, [str(item) for item in arguments])
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
@@ -115,11 +115,11 @@ def test_curve_has_ten_stretches_or_one_for_each_step():
 
 
 def test_steps_without_a_metric_are_left_out_of_the_curve():
-    told = run(0, "a", (0.0,), (0.0,))
+    recorded = run(0, "a", (0.0,), (0.0,))
     metrics = [
-        dict(row, entropy=None if step in (1, 18, 19) else 0.3) for step, row in enumerate(told.metrics)
+        dict(row, entropy=None if step in (1, 18, 19) else 0.3) for step, row in enumerate(recorded.metrics)
     ]
-    values = curve(replace(told, metrics=metrics), "entropy")
+    values = curve(replace(recorded, metrics=metrics), "entropy")
     assert values[:9] == pytest.approx([0.3] * 9)
     assert math.isnan(values[9])
 
@@ -138,8 +138,8 @@ def test_section_has_configuration_success_curves_and_times():
 
 
 def test_section_shows_memory_only_for_runs_that_recorded_it():
-    told = run(0, "a", (), ())
-    found = findings_of("a", [replace(told, outcome=replace(told.outcome, peak_mb=2345.6))])
+    recorded = run(0, "a", (), ())
+    found = findings_of("a", [replace(recorded, outcome=replace(recorded.outcome, peak_mb=2345.6))])
     assert "| 10.0% | 2,346 MB |" in learning_section(DESIGN, [found], MACHINE, "abc", TODAY)
 
 
@@ -201,12 +201,12 @@ def test_finished_runs_are_not_repeated(tmp_path):
 def test_so_far_reports_finished_runs_only(dataset, tmp_path):
     out, page = tmp_path / "out", tmp_path / "page.md"
     options = ("--seed=0", "--seed=1", "--so-far", f"--dataset={dataset}", f"--out={out}", f"--page={page}")
-    status, text = told("learning", *options)
+    status, text = invoke("learning", *options)
     assert (status, "no run in" in text) == (2, True)
     done = out / "seed-1" / "with-relevance"
     done.mkdir(parents=True)
     write_outcome(done, outcome((0.2, 0.2), (0.5, 0.9)))
-    status, text = told("learning", *options, f"--json={tmp_path / 'figures.json'}")
+    status, text = invoke("learning", *options, f"--json={tmp_path / 'figures.json'}")
     assert status == 0, text
     assert "| with-relevance | 1 | 20 | 320 | 0 | 20.0% | 70.0% |" in page.read_text()
     figures = {
@@ -238,7 +238,7 @@ def test_outcome_survives_a_round_trip(tmp_path):
 def test_impossible_experiment_is_refused_at_once(dataset, tmp_path, arguments, words):
     filled = [item.replace("DS", str(dataset)) for item in arguments]
     out = () if arguments[0] == "table" else (f"--out={tmp_path / 'out'}",)
-    status, text = told(*filled, *out)
+    status, text = invoke(*filled, *out)
     assert status == 2
     assert words in text
     assert not (tmp_path / "out").exists()

@@ -73,8 +73,8 @@ def test_window_wider_than_its_wall_is_narrowed() -> None:
 def test_windows_without_a_wall_are_reported() -> None:
     plan = house(*[OpeningSpec("bay", 3.0, 1.5)] * 40)
     assert 0 < len(plan.windows) < 40
-    told = [sentence for sentence in plan.left_out if "window-bay" in sentence]
-    assert told == [f"{40 - len(plan.windows)} window-bay in living_room_0: no outer wall has room for it"]
+    reasons = [sentence for sentence in plan.left_out if "window-bay" in sentence]
+    assert reasons == [f"{40 - len(plan.windows)} window-bay in living_room_0: no outer wall has room for it"]
 
 
 def test_windows_may_face_a_garden() -> None:

@@ -75,12 +75,12 @@ def test_manager_without_a_dataset_shows_no_tasks():
 async def test_task_page_shows_objects_transcript_and_tree(folder):
     (folder / "transcripts" / "tidy.md").write_text("**Mia** (need): tidy up")
     (folder / "trees" / "tidy.json").write_text(json.dumps({"kitchen_0": ["apple"]}))
-    told = await Gallery(folder).detail("tidy")
-    assert (told.transcript, told.tree) == ("**Mia** (need): tidy up", {"kitchen_0": ["apple"]})
-    assert [row.name for row in told.objects] == list(TASK.table)
-    assert {row.name for row in told.objects if row.goal} == set(TASK.goal_objects) & set(TASK.table)
-    assert len(told.moments) == 3
-    assert "kitchen_0" in told.rooms
+    detail = await Gallery(folder).detail("tidy")
+    assert (detail.transcript, detail.tree) == ("**Mia** (need): tidy up", {"kitchen_0": ["apple"]})
+    assert [row.name for row in detail.objects] == list(TASK.table)
+    assert {row.name for row in detail.objects if row.goal} == set(TASK.goal_objects) & set(TASK.table)
+    assert len(detail.moments) == 3
+    assert "kitchen_0" in detail.rooms
 
 
 async def test_path_as_name_opens_no_file(folder):
@@ -97,8 +97,8 @@ async def test_path_as_name_opens_no_file(folder):
 async def test_link_out_of_the_folder_and_a_file_without_end_are_not_read(folder):
     (folder / "transcripts" / "tidy.md").symlink_to(folder.parent / "secret.md")
     (folder / "trees" / "tidy.json").write_text("[" * 400_000)
-    told = await Gallery(folder).detail("tidy")
-    assert (told.transcript, told.tree) == ("", None)
+    detail = await Gallery(folder).detail("tidy")
+    assert (detail.transcript, detail.tree) == ("", None)
 
 
 async def test_picture_is_a_jpeg_or_none(folder):

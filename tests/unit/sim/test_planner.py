@@ -178,16 +178,16 @@ def test_plans_for_the_flat_succeed_with_several_seeds(flat):
 def test_source_named_in_the_instruction_is_preferred(flat):
     task = task_over(flat.world.scene, atom("cooked", "apple_1"))
     by_stove = words_of(find_plan(flat, replace(task, instruction="Cook the apple.")), task)
-    told = replace(task, instruction="Cook the apple in the microwave, please.")
+    instructed = replace(task, instruction="Cook the apple in the microwave, please.")
     assert by_stove.endswith("place stove_1 ontop; toggle_on stove_1")
-    assert words_of(find_plan(flat, told), task).endswith("close microwave_1; toggle_on microwave_1")
+    assert words_of(find_plan(flat, instructed), task).endswith("close microwave_1; toggle_on microwave_1")
 
 
 def test_object_in_the_named_room_is_preferred(flat):
     task = task_over(flat.world.scene, Exists("?a", "apple.n.01", atom("inside", "?a", "bowl_1")))
-    told = replace(task, instruction="Put the apple in the living room into the bowl.")
+    instructed = replace(task, instruction="Put the apple in the living room into the bowl.")
     assert words_of(find_plan(flat, task), task).startswith("move apple_1")
-    assert words_of(find_plan(flat, told), task).startswith("move apple_2")
+    assert words_of(find_plan(flat, instructed), task).startswith("move apple_2")
 
 
 def test_every_call_of_a_plan_is_necessary(flat):

@@ -116,13 +116,13 @@ def test_text_without_a_plan_is_unchanged(text):
 
 
 def test_limit_keeps_named_rows_and_their_hosts():
-    told = limited(SITUATION, 3)
-    assert {row.name for row in told.rows} == {"apple_1", "fridge_1", "countertop_1"}
+    reduced = limited(SITUATION, 3)
+    assert {row.name for row in reduced.rows} == {"apple_1", "fridge_1", "countertop_1"}
     assert limited(SITUATION, 7) is SITUATION
 
 
 def test_limit_ignores_names_inside_other_words():
-    told = limited(
+    reduced = limited(
         Situation(
             (),
             "",
@@ -132,12 +132,16 @@ def test_limit_ignores_names_inside_other_words():
         ),
         1,
     )
-    assert [row.name for row in told.rows] == ["apple_1"]
+    assert [row.name for row in reduced.rows] == ["apple_1"]
 
 
 def test_contents_of_an_omitted_row_are_listed_in_the_room():
-    told = subset(SITUATION, {4, 2})
-    assert prompt_for(told, Codec.NAMES).user.splitlines()[:3] == ["room kitchen_0", "fridge closed", "apple"]
+    reduced = subset(SITUATION, {4, 2})
+    assert prompt_for(reduced, Codec.NAMES).user.splitlines()[:3] == [
+        "room kitchen_0",
+        "fridge closed",
+        "apple",
+    ]
 
 
 def test_prompt_never_contains_the_goal():

@@ -48,11 +48,11 @@ def test_two_processes_are_bit_identical_to_one(tmp_path, remotes, changes):
     two = learnt(tmp_path / "two", processes=2, **changes)
     assert len(remotes) == 1
     assert torch.equal(one, two)
-    told = [
+    results = [
         [{**row, "seconds": 0, "spent_s": {}} for row in read_metrics(tmp_path / name)]
         for name in ("one", "two")
     ]
-    assert told[0] == told[1]
+    assert results[0] == results[1]
 
 
 def test_more_processes_than_microbatches_are_bit_identical(tmp_path, remotes):

@@ -85,12 +85,12 @@ def moved(policy):
 
 def scored(policy, *, rows=4):
     """Return log-probabilities of the same plans under any policy; prompts differ in length."""
-    told = [policy.encode(prompt_for(task.situation, Codec.LINES)) for task in TASKS.train[:2]]
-    told[0] = told[0][20:]
+    prompt_ids = [policy.encode(prompt_for(task.situation, Codec.LINES)) for task in TASKS.train[:2]]
+    prompt_ids[0] = prompt_ids[0][20:]
     tokens = torch.arange(rows * 5).view(rows, 5) % 30 + 2
     mask = torch.ones(rows, 5, dtype=torch.bool)
     mask[1, 3:] = False
-    return policy.logprobs(told, tokens, mask, rows // 2, 0.9)
+    return policy.logprobs(prompt_ids, tokens, mask, rows // 2, 0.9)
 
 
 def train(out, changes, *, resume=False):

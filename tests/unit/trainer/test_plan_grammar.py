@@ -61,10 +61,10 @@ def test_untrained_policy_writes_valid_plans(task):
     )
     ended = (samples.tokens == END).any(dim=1).tolist()
     assert sum(ended) >= 20
-    told = {row.index for row in task.situation.rows}
+    listed = {row.index for row in task.situation.rows}
     for text in (text for text, whole in zip(samples.texts, ended, strict=True) if whole):
         for call in parse_policy_text(text, replace(task.situation, profile=Profile.HOUSEHOLD), Codec.NAMES):
-            assert {call.object_index, call.source_index} - {None} <= told
+            assert {call.object_index, call.source_index} - {None} <= listed
             assert call.room_name is None or call.room_name in task.situation.rooms
 
 
@@ -119,9 +119,9 @@ def test_objects_only_in_the_instruction_are_masked():
 
 def test_arguments_follow_the_signature_of_the_skill():
     situation = TASKS.train[0].situation
-    thing = situation.rows[0].category
-    assert next_words(situation, f"place {thing}") == {"ontop", "inside", "under"}
-    assert thing in next_words(situation, f"heat_object_with_source {thing}")
+    kind = situation.rows[0].category
+    assert next_words(situation, f"place {kind}") == {"ontop", "inside", "under"}
+    assert kind in next_words(situation, f"heat_object_with_source {kind}")
     assert "1.57" in next_words(situation, "turn")
     assert next_words(situation, "turn 1.57") == {"\n", "<end>"}
     room = next(iter(next_words(situation, "go_to_room")))

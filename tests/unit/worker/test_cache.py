@@ -99,12 +99,12 @@ async def test_two_daemons_share_a_cache_folder(tmp_path):
     sources = [Source(*contents), Source(*contents)]
     caches = [_cache(tmp_path, source, limit_bytes=1300) for source in sources]
 
-    async def bring(cache, digests):
+    async def fetch_all(cache, digests):
         for digest in digests:
             assert (await cache.path_of(digest)).suffix == ".bundle"
 
     digests = list(sources[0].bundles)
-    await asyncio.gather(bring(caches[0], digests * 3), bring(caches[1], digests[::-1] * 3))
+    await asyncio.gather(fetch_all(caches[0], digests * 3), fetch_all(caches[1], digests[::-1] * 3))
     left = list((tmp_path / "bundles").iterdir())
     assert all(bundle_digest(path.read_bytes()).endswith(path.stem) for path in left)
     assert sum(path.stat().st_size for path in left) <= 1300

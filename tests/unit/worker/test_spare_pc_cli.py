@@ -30,8 +30,8 @@ def test_options_take_precedence_over_the_file_and_the_file_over_defaults(tmp_pa
     settings = settings_of(["--config", str(config), "--slots=2", "--idle-s=60", "--label=owner=ann"])
     assert (settings.name, settings.slots, settings.cache_mb, settings.nice) == ("attic", 2, 77, 10)
     assert settings.labels == {"room": "attic", "owner": "ann"}
-    wishes = settings.preferences
-    assert (wishes.hours, wishes.idle_s, wishes.mains_only, wishes.max_load) == ("18:00-08:00", 60, True, 0)
+    chosen = settings.preferences
+    assert (chosen.hours, chosen.idle_s, chosen.mains_only, chosen.max_load) == ("18:00-08:00", 60, True, 0)
 
 
 @pytest.mark.parametrize(

@@ -166,8 +166,8 @@ def evaluation_of(
             _figure("oracle_physical", [failure is None for failure in physical], PHYSICAL_GOAL_PERCENT)
         )
     reasons = Counter(failure.reason for failure in physical if failure is not None)
-    told = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
-    notes = (f"Against plans in physics: {told}.",) if told else ()
+    counts = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
+    notes = (f"Against plans in physics: {counts}.",) if counts else ()
     return EvaluationFigures("verification", conditions, tuple(figures), notes)
 
 
