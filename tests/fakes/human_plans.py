@@ -56,7 +56,7 @@ class OneArm:
                 self._shut.append(names[0])
             case _ if deed in STATES:
                 self._lay_down()
-                self._send(STATES[deed], names[0])
+                self._append_call(STATES[deed], names[0])
             case "SLICE" | "CLEAN":
                 self._use(Skill.SLICE if deed == "SLICE" else Skill.CLEAN, names[0])
             case "SOAK":
@@ -77,14 +77,14 @@ class OneArm:
             raise InexpressibleError(theirs)
         return self._ours[theirs]
 
-    def _say(self, skill, name, source="", relation=None):
+    def _append_call(self, skill, name, source="", relation=None):
         at = self._row[source] if source else None
         self.deeds.append(SkillCall(skill, object_index=self._row[name], source_index=at, relation=relation))
 
     def _take(self, name):
         if self._arm != name:
             self._lay_down()
-            self._send(Skill.PICK_UP, name)
+            self._append_call(Skill.PICK_UP, name)
             self._arm = name
 
     def _lay_down(self):
@@ -93,7 +93,7 @@ class OneArm:
             host, relation = self._home.get(self._arm, ("", None))
             if not host:
                 raise InexpressibleError("nowhere to lay a tool down")
-            self._send(Skill.PLACE, host, relation=relation)
+            self._append_call(Skill.PLACE, host, relation=relation)
             self._arm = ""
 
     def _place(self, hand, target, relation):
@@ -101,7 +101,7 @@ class OneArm:
         if not name:
             raise InexpressibleError("an empty hand")
         self._take(name)
-        self._send(Skill.PLACE, target, relation=relation)
+        self._append_call(Skill.PLACE, target, relation=relation)
         self._home[name] = (target, relation)
         self._hands[hand] = self._arm = ""
 
@@ -110,20 +110,20 @@ class OneArm:
         if not tool:
             raise InexpressibleError("a tool that lies in a sink")
         self._take(tool)
-        self._send(skill, name, source=tool)
+        self._append_call(skill, name, source=tool)
 
     def _soak(self, name):
         source = self._home.get(name, ("", None))[0]
         if not source:
             raise InexpressibleError("SOAK outside of a sink")
         self._take(name)
-        self._send(Skill.SOAK, name, source=source)
+        self._append_call(Skill.SOAK, name, source=source)
 
     def _close_what_is_done(self):
         if not any(self._hands.values()):
             for name in self._shut:
                 self._lay_down()
-                self._send(Skill.CLOSE, name)
+                self._append_call(Skill.CLOSE, name)
             self._shut = []
 
 
