@@ -1,4 +1,4 @@
-"""The taskset under a name of one word, as `vf-eval` looks for them: PYTHONPATH=docs/examples vf-eval embomatrix-household"""
+"""Module that `vf-eval` imports by environment name: PYTHONPATH=docs/examples vf-eval embomatrix-household"""
 
 from embomatrix.trainer.adapters.verifiers import HouseholdTaskset
 

@@ -1,4 +1,4 @@
-"""Oracle plans and a random agent in the Gymnasium environment: python gymnasium_episode.py DATASET"""
+"""Run the oracle plans and a random agent in the Gymnasium environment: python gymnasium_episode.py DATASET"""
 
 import sys
 

@@ -1,6 +1,6 @@
-"""TRL's GRPO with rewards from a cluster: python train_with_trl.py DATASET MODEL OUT [--steps N]
+"""Train with TRL's GRPO and rewards from a cluster: python train_with_trl.py DATASET MODEL OUT [--steps N]
 
-The cluster's address, token and authority come from EMBOMATRIX_MANAGER, EMBOMATRIX_TOKEN and EMBOMATRIX_CA.
+EMBOMATRIX_MANAGER, EMBOMATRIX_TOKEN and EMBOMATRIX_CA give the cluster's address, token and CA certificate.
 """
 
 import argparse
@@ -13,7 +13,7 @@ from embomatrix.trainer.adapters.trl import ClusterLookahead, ClusterReward
 
 
 class Trainer(ClusterLookahead, GRPOTrainer):
-    """Announces the tasks of three generations ahead."""
+    """GRPO trainer that announces the tasks of the next three generations to the cluster."""
 
 
 def main() -> None:

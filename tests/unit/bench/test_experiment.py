@@ -107,7 +107,7 @@ def test_figures_have_the_names_of_the_ablation():
     assert figures["success_gain"].is_reached
 
 
-def test_curve_has_ten_stretches_or_one_for_each_step():
+def test_curve_has_ten_parts_or_one_per_step():
     long = run(0, "a", (0.0,), (0.0,))
     assert curve(long, "success") == pytest.approx([(2 * at + 0.5) / 20 for at in range(10)])
     assert len(curve(replace(long, metrics=long.metrics[:3]), "success")) == 3
@@ -128,10 +128,10 @@ def test_section_has_configuration_success_curves_and_times():
     text = learning_section(DESIGN, ARMS, MACHINE, "abc", TODAY)
     assert text.startswith("## 2026-11-21: learning")
     assert "at most 60 s of imitation" in text
-    assert "50 steps of GRPO an" in text
+    assert "50 steps of GRPO per" in text
     assert "| without-relevance | `grpo.relevance = 0.0` |" in text
     assert "| with-relevance | all |  |  |  | 35.0%" in text
-    assert "| with-relevance | 1 | groups without signal | 0.50 |" in text
+    assert "| with-relevance | 1 | zero-variance groups | 0.50 |" in text
     assert "| with-relevance | 0 | 5.00 | 40.0% | 50.0% | 4.0% | 10.0% | – |" in text
     widths = {line.count("|") for line in text.splitlines() if line.startswith("| with-relevance | 0 | s")}
     assert widths == {14}

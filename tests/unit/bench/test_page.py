@@ -96,7 +96,7 @@ def test_busy_machine_and_missed_goals_are_stated_on_the_page():
     page = render_page([BenchResult("engine", "abc", busy, (slow,))], "")
     assert "2 cores, load 3.0 before. The machine was shared" in page
     assert "| slow | 9 ms | ≤ 3 | 3 × the goal | 1 |" in page
-    assert "Short of their goals: slow." in page
+    assert "Goals missed: slow." in page
     assert "shared" not in render_page([_result(replace(slow, value=2.0))], "")
 
 

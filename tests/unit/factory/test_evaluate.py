@@ -240,9 +240,9 @@ def test_files_of_one_part_are_combined_on_the_page():
 def test_page_without_an_end_marker_is_rejected():
     with pytest.raises(EvaluationError, match="insert it at the end"):
         with_factory(f"# Benchmarks\n{BEGIN}\ntext\n", [EVALUATION])
-    with pytest.raises(EvaluationError, match="given twice"):
+    with pytest.raises(EvaluationError, match="is in two files"):
         with_factory("", [EVALUATION, EVALUATION])
-    with pytest.raises(EvaluationError, match="there is no part 'x'"):
+    with pytest.raises(EvaluationError, match="unknown part 'x'"):
         with_factory("", [dataclasses.replace(EVALUATION, part="x")])
 
 
@@ -285,7 +285,7 @@ def test_admission_rate_uses_recorded_times_of_variants_and_base_scenes(tmp_path
     assert found.figure("admitted_share").value == 75.0
     pace = found.figure("admitted_per_hour")
     assert (pace.value, pace.n, pace.is_reached) == (2 * 3600 * 2 / 8.0, 2, True)
-    assert found.notes == ("Against drafts: no_plan 1.",)
+    assert found.notes == ("Rejected drafts: no_plan 1.",)
     assert found.conditions["look ahead"] == "yes"
     assert "| admitted_per_hour |" in with_factory("", [found])
 

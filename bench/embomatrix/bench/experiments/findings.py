@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from embomatrix.trainer.logging.outcome import RunOutcome, TaskRate
 
 BINS: Final = 10
-"""Number of equal stretches of a run that a curve has means of."""
+"""Number of equal parts of a run; a curve has one mean per part."""
 MOST_WAIT: Final = 0.05
 MOST_OVERHEAD: Final = 0.10
 SUCCESS_AFTER: Final = 0.70
@@ -96,7 +96,7 @@ def _over_seeds(rates: Sequence[Mapping[str, float]]) -> list[float]:
 
 
 def curve(run: Run, key: str) -> tuple[float, ...]:
-    """Means of a metric over ``BINS`` stretches of a run, fewer if it has fewer steps; NaN if no step has the metric."""
+    """Means of a metric over ``BINS`` equal parts of a run, fewer if the run has fewer steps; NaN if no step has the metric."""
     values = np.array([math.nan if row[key] is None else float(row[key]) for row in run.metrics])
     parts = np.array_split(values, max(1, min(BINS, len(values))))
     return tuple(_mean(list(part[~np.isnan(part)])) for part in parts if part.size)

@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 
 WIDTH: Final = 128
 HEAD: Final = (
-    "# Experiments\n\nEach section was written by `embomatrix experiment` from the files of its runs; remarks below "
-    "its tables are by hand.\nSections are added, none is taken away: what did not work stays.\n"
+    "# Experiments\n\n`embomatrix experiment` writes each section from the files of its runs. Remarks below the tables are "
+    "written by hand.\nSections are never removed, including those of failed experiments.\n"
 )
 NOTHING: Final = "–"
 """Cell without a value: no task was held out, or no step has the metric."""
 CURVES: Final = (
     ("success", "success of training plans"),
-    ("zero_variance_groups", "groups without signal"),
+    ("zero_variance_groups", "zero-variance groups"),
     ("entropy", "entropy of a token, nats"),
     ("plan_steps", "executed steps of a plan"),
 )
@@ -48,22 +48,24 @@ def learning_section(
             "",
             *table(("arm", "settings"), ((arm.name, _settings(arm.settings)) for arm in design.arms)),
             "",
-            "Success on held-out tasks, 95 % bootstrap over tasks; *all* gives each task its mean over the seeds.",
+            "Success on held-out tasks with 95 % bootstrap intervals over tasks. Rows named *all* average each task over the",
+            "seeds.",
             "",
             *table(
                 ("arm", "seed", "steps", "rollouts", "lost", "after imitation", "after GRPO", "gain"),
                 [row for arm in arms for row in _success_rows(arm)],
             ),
             "",
-            f"Means over {BINS} stretches of each run, first to last.",
+            f"Training curves: each run is divided into {BINS} equal parts in order of time, and each column is the mean of",
+            "one part.",
             "",
             *table(
                 ("arm", "seed", "metric", *(str(number) for number in range(1, BINS + 1))),
                 [row for arm in arms for run in arm.runs for row in _curve_rows(run)],
             ),
             "",
-            "Where the time of GRPO's steps went; *overhead* is all but sampling and update. *memory* is the most that the",
-            "trainer's process held.",
+            "Share of a GRPO step's time by phase; *overhead* is everything except sampling and update. *memory* is the peak",
+            "of the trainer's process.",
             "",
             *table(
                 ("arm", "seed", "seconds a step", "sampling", "update", "waiting", "overhead", "memory"),
@@ -85,16 +87,16 @@ def _configuration(design: Design, machine: Mapping[str, Any], commit: str) -> s
     shared = f", all with {_settings(design.shared)}" if design.shared else ""
     return (
         f"Dataset {design.dataset}; model `{design.model}`; seeds {', '.join(map(str, design.seeds))}; at most "
-        f"{design.imitation} of imitation{_stop(design.patience)}; {design.grpo} of GRPO an "
+        f"{design.imitation} of imitation{_stop(design.patience)}; {design.grpo} of GRPO per "
         f"arm{shared}; {design.threads} threads. Commit `{commit}`, "
-        f"{machine['cores']} cores ({machine['cpu']}), load {machine['load_before']} at the start of the command."
+        f"{machine['cores']} cores ({machine['cpu']}), load {machine['load_before']} when the command started."
     )
 
 
 def _stop(patience: int) -> str:
     if not patience:
         return ""
-    return f", stopped after {patience} measurements without a lower loss on tasks set aside"
+    return f", stopped after {patience} measurements without a lower validation loss"
 
 
 def _success_rows(arm: ArmFindings) -> Iterable[tuple[str, ...]]:

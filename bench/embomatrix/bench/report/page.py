@@ -76,7 +76,9 @@ def _provenance(result: BenchResult) -> list[str]:
     machine = result.machine
     known = ("cpu", "memory_gb", "system", "speed", "gpu", "python", "pybullet", "numpy", "platform")
     details = [f"{name.replace('_', ' ')} {machine[name]}" for name in known if machine.get(name)]
-    shared = " The machine was shared: alone it is faster, and ratios suffer less than times."
+    shared = (
+        " The machine was shared: absolute times would be lower on a dedicated machine; ratios change less."
+    )
     return [
         f"Commit `{result.commit}`, {machine['cores']} cores, load {machine['load_before']} before."
         + (shared if is_shared(machine) else ""),
@@ -92,12 +94,12 @@ def _figure_lines(figures: Sequence[Figure]) -> list[str]:
     lines = table(("figure", "value", "goal", "", "n"), rows)
     short = [figure.name for figure in figures if figure.verdict not in ("", "reached")]
     if any(figure.goal is not None for figure in figures):
-        lines += ["", f"Short of their goals: {'; '.join(short)}." if short else "Every goal is reached."]
+        lines += ["", f"Goals missed: {'; '.join(short)}." if short else "Every goal is reached."]
     return lines
 
 
 def ablation_lines(figures: Sequence[Figure]) -> list[str]:
-    """The paper's table beside ours; nothing if the ablation was not measured."""
+    """Return the paper's table beside ours, or no lines if the ablation was not measured."""
     values = {figure.name: figure.value for figure in figures}
     if "ablation_naive_ms" not in values:
         return []
@@ -122,7 +124,7 @@ def ablation_lines(figures: Sequence[Figure]) -> list[str]:
 
 
 def peer_lines(figures: Sequence[Figure]) -> list[str]:
-    """Our cluster and its peers, one row each; nothing if they were not measured."""
+    """Return a table of our cluster and its peers, or no lines if they were not measured."""
     values: dict[str, dict[str, float]] = {}
     for figure in figures:
         if figure.name.startswith(CONTEST):

@@ -26,46 +26,48 @@ _HEADING: Final = "\n### "
 PARTS: Final[Mapping[str, tuple[str, str]]] = {
     "tasks": (
         "Diversity of tasks",
-        "`embomatrix factory evaluate tasks`: instructions as each writer makes them for the same scene variants, not yet "
-        "verified. Self-BLEU, distinct n-grams and near-duplicates are means over scenes; entropies are over all tasks, as "
-        "shares of the largest possible. *plain* is the writer without social simulation. Figures grow or shrink with the "
-        "number of instructions, so compare equal ones only; none is on the scale of the paper's judge.",
+        "`embomatrix factory evaluate tasks` compares the instructions of each writer for the same scene variants, before "
+        "verification. Self-BLEU, distinct n-grams and near-duplicates are means over scenes. Entropies are over all tasks, "
+        "as shares of the largest possible entropy. *plain* is the writer without social simulation. These figures depend on "
+        "the number of instructions, so compare only equal numbers. None is on the scale of the paper's judge.",
     ),
     "admission": (
         "Admission",
-        "`embomatrix factory evaluate admissions DATASET`: by the ledger of a build. *admitted_per_hour* is by processor time, "
-        "on two cores that do nothing else: writing, layout, look-ahead and judging of all drafts, and the base scenes. "
-        "*plain* is the writer without social simulation.",
+        "`embomatrix factory evaluate admissions DATASET` reads the ledger of a build. *admitted_per_hour* is computed from "
+        "CPU time for two dedicated cores. The time covers writing, layout, look-ahead and verification of all drafts, and "
+        "the base scenes. *plain* is the writer without social simulation.",
     ),
     "imports": (
         "Imports",
-        "`embomatrix factory import … --instantiate --json FILE`: a problem counts when a base scene was built with all that "
-        "it names where its start puts it, and its goal can be told true or false; whether the start holds in physics is "
-        "looked at only where a task is verified. *Reached* are goals of which each literal can be made to hold by a skill "
-        "of the profile; *solved*, measured without `--instantiate`, are those of them that the oracle solves in a scene.",
+        "`embomatrix factory import … --instantiate --json FILE`: a problem counts as imported if a base scene was built with "
+        "every object in its initial place, and its goal can be evaluated. Only verification checks the initial state in "
+        "physics. *Reached* are goals for which a skill of the profile can achieve each literal. *Solved* are the reached "
+        "goals that the oracle solves in a scene, measured without `--instantiate`.",
     ),
     "verification": (
         "Tasks verified again",
-        "`embomatrix factory verify DATASET --physical`: admitted tasks, judged anew in two other processes. *oracle_cached* "
-        "are those admitted again, *reverified_bit_equal* those whose plans are the dataset's and whose poses and states are "
-        "the same to the bit after every step; in *oracle_physical* a robot carries the dataset's plan out in stepped physics.",
+        "`embomatrix factory verify DATASET --physical` verifies admitted tasks again in two new processes. *oracle_cached* is "
+        "the share that is admitted again. *reverified_bit_equal* is the share with the dataset's plan and with bit-identical "
+        "poses and states after every step. *oracle_physical* is the share whose plan a robot executes in stepped physics.",
     ),
     "aesthetics": (
         "Aesthetics",
-        "`embomatrix factory evaluate aesthetics`: a geometric score of 0 to 10, its weights fitted so that hand-made rooms "
-        "score high and the same rooms with shifted, swapped or dropped furniture score low. *auc* is the chance that a "
-        "hand-made room which the fit did not see scores above a spoilt one; it is not on the scale of the paper's judge.",
+        "`embomatrix factory evaluate aesthetics` computes a geometric score of 0 to 10. Its weights are fitted to give "
+        "hand-made rooms high scores, and the same rooms with shifted, swapped or dropped furniture low scores. *auc* is the "
+        "probability that a hand-made room outside the fit scores above a spoilt one. The score is not on the scale of the "
+        "paper's judge.",
     ),
     "looks": (
         "Scenes, as a model sees them",
-        "`embomatrix factory evaluate looks`: points of 10 that a language model gives for labelled plans, with the paper's "
-        "prompt. Its scale is the model's own.",
+        "`embomatrix factory evaluate looks`: score of 0 to 10 that a language model gives labelled floor plans, with the "
+        "paper's prompt. The scale is the model's own.",
     ),
     "scenes": (
         "Scenes for tasks",
-        "`embomatrix factory evaluate scenes`: the same tasks laid out by three methods, each scene judged by code that "
-        "no method calls. *aesthetics* is of what a method laid out, *aesthetics_shared* of the tasks that all of them did: "
-        "simple ones fail at crowded rooms, which score low. The score is of whole rooms, most of which no method touches.",
+        "`embomatrix factory evaluate scenes` lays out the same tasks with three methods and checks each scene with code that "
+        "no method uses. *aesthetics* covers the tasks that a method laid out, *aesthetics_shared* the tasks that all methods "
+        "laid out. Simple methods fail in crowded rooms, which score low. The score is of whole rooms, most of which no "
+        "method changes.",
     ),
 }
 """Heading and explanation of each part, in the order of the page."""
@@ -130,14 +132,14 @@ def _by_part(evaluations: Sequence[EvaluationFigures]) -> dict[str, list[Evaluat
     """Group evaluations by part, in the order of the page. Raises EvaluationError."""
     for evaluation in evaluations:
         if evaluation.part not in PARTS:
-            raise EvaluationError(f"there is no part {evaluation.part!r}: expected {', '.join(PARTS)}")
+            raise EvaluationError(f"unknown part {evaluation.part!r}: expected one of {', '.join(PARTS)}")
     found = {part: [each for each in evaluations if each.part == part] for part in PARTS}
     for part, mine in found.items():
         counts = Counter(figure.name for each in mine for figure in each.figures)
         twice = next((name for name, count in counts.items() if count > 1), "")
         if twice:
             raise EvaluationError(
-                f"{twice!r} of part {part!r} is given twice: give one file of each measurement"
+                f"figure {twice!r} of part {part!r} is in two files: pass one file per measurement"
             )
     return {part: mine for part, mine in found.items() if mine}
 

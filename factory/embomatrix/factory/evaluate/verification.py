@@ -155,7 +155,7 @@ def _physical(bundle: Bundle, record: TaskRecord) -> PlanFailure | None:
 def evaluation_of(
     verdicts: Sequence[VerificationOutcome], conditions: Mapping[str, Any]
 ) -> EvaluationFigures:
-    """Return shares in percent of the tasks, and the objections to plans in physics, commonest first."""
+    """Return shares of the tasks in percent, and the reasons why plans failed in physics, most frequent first."""
     physical = [verdict.physical for verdict in verdicts if verdict.in_physics]
     figures = [
         _figure("oracle_cached", [not verdict.cached for verdict in verdicts], GOAL_PERCENT),
@@ -167,7 +167,7 @@ def evaluation_of(
         )
     reasons = Counter(failure.reason for failure in physical if failure is not None)
     counts = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
-    notes = (f"Against plans in physics: {counts}.",) if counts else ()
+    notes = (f"Plans that failed in physics: {counts}.",) if counts else ()
     return EvaluationFigures("verification", conditions, tuple(figures), notes)
 
 
