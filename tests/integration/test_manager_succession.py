@@ -109,7 +109,7 @@ async def test_manager_warns_of_another_data_folder(tmp_path, state, caplog):
         warned[turn] = [line for line in caplog.messages if "differs from that of the last leader" in line]
     assert warned[1] == []
     [line] = warned[2]
-    assert f"the data folder {tmp_path / 'other'} is not" in line
+    assert f"the data folder {tmp_path / 'other'} differs" in line
     assert "--data-dir" in line
 
 

@@ -172,9 +172,9 @@ def test_every_task_has_a_layout_tree_on_its_page(folder: Path, dataset: Dataset
         assert set(tree) <= set(record.rooms)
         known = dataset.bundle(record.bundle_digest).scene.by_name
         assert _things_in(tree.values()) <= set(known)
-    told = next(record for record in dataset.records if "ontop" in record.signature).task
+    chosen = next(record for record in dataset.records if "ontop" in record.signature).task
     page = tmp_path / "task.html"
-    code, _ = run("inspect", told.task_id, "--dataset", str(folder), "--out", str(page), "--no-picture")
+    code, _ = run("inspect", chosen.task_id, "--dataset", str(folder), "--out", str(page), "--no-picture")
     assert code == 0
     assert 'id="layout-tree"' in page.read_text(encoding="utf-8")
 

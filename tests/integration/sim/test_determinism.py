@@ -35,7 +35,7 @@ def bundle():
 
 
 def digests(bundle, order) -> dict[tuple[int, int], str]:
-    """Digest of every plan with every seed, executed in an order, in one simulator."""
+    """Return the digest of every plan with every seed, executed in this order in one simulator."""
     simulator = load_simulator(bundle)
     task = task_over(bundle.scene)
     found = {}
