@@ -280,7 +280,7 @@ def test_interrupted_evaluation_resumes_from_its_answers(kitchen, tmp_path):
             assert_ended(asking.interrupt(), 130, "the same command continues from there")
         server.script = ["move 10"]
         result = run(*arguments, f"--endpoint={url}")
-    assert_ended(result, 0, "2 answers are there already", "12 answers in", "goal_not_met 12 100.0%")
+    assert_ended(result, 0, "2 answers are already stored", "12 answers in", "goal_not_met 12 100.0%")
 
 
 def _lines(out):
@@ -295,9 +295,11 @@ def test_interrupted_build_leaves_no_dataset_and_resumes(tmp_path):
     with background(tmp_path / "log", *arguments) as building:
         building.wait_for((out / "build.jsonl").exists)
         result = building.interrupt()
-    assert_ended(result, 130, "interrupted: finished tasks are kept in", "run the same command again to resume")
+    assert_ended(
+        result, 130, "interrupted: finished tasks are kept in", "run the same command again to resume"
+    )
     assert not (out / "tasks.jsonl").exists()
     other = run(
         "factory", "build", f"--out={out}", "--scene=Rs_int", "--train=9", "--heldout=0", "--no-look-ahead"
     )
-    assert_ended(other, 2, "holds a build of other settings (train 8, now 9): give the same again")
+    assert_ended(other, 2, "holds a build with other settings (train 8, now 9): give the same settings")
