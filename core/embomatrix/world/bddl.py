@@ -347,7 +347,7 @@ class _Reader:
         free = predicate == "inroom" and index == 1
         of_substance = index == 1 and predicate in set(SubstanceRelation) and is_substance(bare)
         if not (free or of_substance or bare in self.objects or is_room_instance(bare)):
-            node.fail(f"object {bare!r} is not declared: add it to :objects, or mend its name")
+            node.fail(f"object {bare!r} is not declared: add it to :objects, or correct its name")
         return bare
 
     def _expect(self, node: _Node, count: int) -> None:
