@@ -123,6 +123,7 @@ _TEXTS = {
     "model.gguf": "hello",
     "brief.json": "{}",
     "cassette.jsonl": "hello\n",
+    "good_brief.json": '{"scene": "Rs_int"}',
     "ca.pem": "hello",
     "file": "this is a file, not a folder",
     "figures.json": "{}",
@@ -411,7 +412,7 @@ COMMANDS = (
     ),
     CommandCase(
         "missing cassette",
-        "factory agent scene-extractor --in=FILES/brief.json --cassette=FILES/nothing.jsonl",
+        "factory agent scene-extractor --in=FILES/good_brief.json --cassette=FILES/nothing.jsonl",
         "FILES/nothing.jsonl",
         "record one first",
     ),
@@ -835,7 +836,7 @@ CALLS = (
         "bundle with another digest",
         lambda: decode_bundle(_kitchen_bundle(), digest=DIGEST),
         "sha256:000000",
-        "fetch the bundle again",
+        "fetch it again",
     ),
     CallCase(
         "bundle that is cut", lambda: decode_bundle(_kitchen_bundle()[:500]), "sha256:", "fetch it again"

@@ -90,7 +90,7 @@ def read_json(text: str, shape: type[T]) -> T:
             first_problem = first_problem or (
                 "its JSON is damaged, or breaks off" if damaged else _problems(error)
             )
-    raise ValueError(first_problem or "it contains no complete JSON value")
+    raise ValueError(first_problem or "it holds no complete JSON value")
 
 
 def _json_values(text: str) -> Iterator[tuple[Any, bool]]:

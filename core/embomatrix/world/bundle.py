@@ -108,7 +108,7 @@ def decode_bundle(data: bytes, *, digest: str = "", limits: BundleLimits = DEFAU
         raise too_large(limits)
     found = bundle_digest(data)
     if digest and found != digest:
-        raise BundleError(f"the bundle's digest is {found}: expected {digest}; fetch the bundle again")
+        raise BundleError(f"the bundle's digest is {found}: expected {digest}; fetch it again")
     try:
         bundle = _from_content(decompress(data, limits))
     except SceneInvalidError as error:
