@@ -81,8 +81,8 @@ def draw(source: str, theme: str, script: Path, browser: str) -> str:
         sheet.write_text(filled, encoding="utf-8")
         alone = ("--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={name}/profile")
         command = (browser, *alone, "--virtual-time-budget=20000", "--dump-dom", sheet.as_uri())
-        told = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=True).stdout
-    drawn = re.search(r'<pre id="drawn">(.*?)</pre>', told, re.DOTALL)
+        rendered = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=True).stdout
+    drawn = re.search(r'<pre id="drawn">(.*?)</pre>', rendered, re.DOTALL)
     if drawn is None or not drawn[1].startswith("&lt;svg") or "Syntax error in text" in drawn[1]:
         raise ValueError(f"Mermaid could not draw this diagram: try it in its live editor\n{source}")
     return html.unescape(drawn[1]) + "\n"

@@ -1,4 +1,4 @@
-// A worker in JavaScript: all of WorkerService. Put your simulator into `execute`.
+// A worker in JavaScript with the whole WorkerService. Put your simulator into `execute`.
 //
 //   npm install @grpc/grpc-js@1 @grpc/proto-loader@0.8
 //   node worker.mjs PROTO_FOLDER HOST:PORT NAME      (EMBOMATRIX_TOKEN, EMBOMATRIX_CA as for other commands)
@@ -44,14 +44,14 @@ const say = (message) => session?.stream.write({ session_id: session.session_id,
 const left = () => draining && leases.size === 0 && outbox.size === 0;
 
 function state(first = false) {
-  const told = {
-    residents: [...residents].map(([bundle_digest, { scene, ...told }]) => ({ bundle_digest, ...told })),
-    running: [...leases.values()].map((lease) => lease.ref), // all that are held, also those that wait
+  const reported = {
+    residents: [...residents].map(([bundle_digest, { scene, ...resident }]) => ({ bundle_digest, ...resident })),
+    running: [...leases.values()].map((lease) => lease.ref), // every held lease, including queued ones
     draining,
   };
-  if (!first) return told;
+  if (!first) return reported;
   const claims = [...leases.values(), ...outbox.values()].map(({ ref, origin }) => ({ ref, origin }));
-  return { ...told, finished: [...outbox.values()].map((kept) => kept.result), claims };
+  return { ...reported, finished: [...outbox.values()].map((kept) => kept.result), claims };
 }
 
 // Scenes: `desired` is the complete set. Drop scenes that are not in it; fetch, check and load new ones.
@@ -71,7 +71,7 @@ async function load(digest) {
     const scene = decode(await fetchBundle(digest), digest);
     if (desired.includes(digest)) note("WARM", { scene });
   } catch (error) {
-    if (asked !== session) residents.delete(digest); // the line broke: the next session is asked again
+    if (asked !== session) residents.delete(digest); // the session ended: the manager requests the scene again in the next one
     else if (desired.includes(digest)) note("FAILED", { error: error.message });
   }
   say({ state: state() });
@@ -91,7 +91,7 @@ function fetchBundle(digest) {
 
 function decode(data, digest) {
   const found = `sha256:${createHash("sha256").update(data).digest("hex")}`;
-  if (data.length > BUNDLE_BYTES) throw new Error(`the bundle has ${data.length} bytes, expected ${BUNDLE_BYTES} at most`);
+  if (data.length > BUNDLE_BYTES) throw new Error(`the bundle has ${data.length} bytes, expected at most ${BUNDLE_BYTES}`);
   if (found !== digest) throw new Error(`the bundle's digest is ${found}, expected ${digest}`);
   const content = inflateSync(data, { maxOutputLength: GROWTH * data.length + (1 << 20) });
   if (content.toString("latin1", 0, 4) !== "EMBX") throw new Error("the bundle does not begin with EMBX");
@@ -129,14 +129,14 @@ async function run(lease) {
   begin();
 }
 
-// Replace with your simulator. This one only goes to rooms. Everything else is an infrastructure failure, without a reward.
+// Replace this placeholder with your simulator. It supports go_to_room only; every other call is an infrastructure failure without a reward.
 async function execute(scene, lease, onStep) {
   const { plan, task_id } = lease.rollout;
   if (!scene.tasks.some((task) => task.task_id === task_id)) throw new Error(`the bundle has no task ${task_id}`);
   const rooms = new Set(scene.scene.rooms.map((room) => room.name));
   const steps = [];
   for (const call of plan) {
-    if (call.skill !== "SKILL_KIND_GO_TO_ROOM") throw new Error(`${call.skill} is beyond this worker`);
+    if (call.skill !== "SKILL_KIND_GO_TO_ROOM") throw new Error(`this worker does not support ${call.skill}`);
     await sleep(5);
     const there = rooms.has(call.room_name);
     const message = there ? `the robot is in ${call.room_name}` : `there is no room ${call.room_name}: the rooms are ${[...rooms].join(", ")}`;
@@ -149,7 +149,7 @@ async function execute(scene, lease, onStep) {
   return { reward: { format, relevance: 0, goal: 0, atoms: [], success: false }, steps, final_state: [], trace_digest };
 }
 
-// Handle a message of the manager. Every field may be absent.
+// Handle a message from the manager. Every field may be absent.
 function take(message) {
   if (message.drain) draining = true;
   if (message.resume) draining = false;
@@ -235,7 +235,7 @@ for (let attempt = 0; !left(); attempt += 1) {
     const { UNAVAILABLE, DEADLINE_EXCEEDED, ABORTED, INTERNAL, CANCELLED } = grpc.status;
     if (![UNAVAILABLE, DEADLINE_EXCEEDED, ABORTED, INTERNAL, CANCELLED].includes(error.code)) throw error;
     console.error(`${error.details ?? error.message}: trying again`);
-    // After another process took over the session, held leases are void; a new manager gets them as claims.
+    // If another process took over the session, held leases are void. A new manager gets them as claims.
     const kind = error.metadata?.get("embomatrix-error")[0];
     if (error.code === ABORTED && kind !== "unknown-session") [...leases.keys(), ...outbox.keys()].forEach(forget);
     await sleep(RETRY_MS[Math.min(attempt, RETRY_MS.length - 1)] * (0.8 + 0.4 * Math.random()));

@@ -1,6 +1,7 @@
-"""Throughput of the manager's state machines in decisions a second: python tests/bench/bench_dispatcher.py [ROLLOUTS WORKERS]
+"""Throughput of the manager's state machines in decisions per second.
 
-Every rollout is submitted, leased and finished; the workers are values, not processes. Prints one JSON object.
+Usage: ``python tests/bench/bench_dispatcher.py [ROLLOUTS WORKERS]``. Every rollout is submitted, leased and finished;
+workers are values, not processes. Prints one JSON object.
 """
 
 import json
@@ -36,7 +37,7 @@ def main(rollouts: int, workers: int) -> None:
     cluster, now_s, given, delivered = ClusterState(boot_id="bench"), 0.0, [], 0
     slowest_s = 0.0
 
-    def tell(event):
+    def apply(event):
         nonlocal now_s, delivered, slowest_s
         now_s += 1e-4
         begin = time.perf_counter()
@@ -50,16 +51,16 @@ def main(rollouts: int, workers: int) -> None:
                     delivered += 1
                 case SetDesired(worker_id, scenes):
                     warm = tuple(Resident(scene, ResidentState.WARM, 1.0, 50.0) for scene in scenes)
-                    tell(WorkerReported(worker_id, warm))
+                    apply(WorkerReported(worker_id, warm))
 
     for index in range(workers):
-        tell(WorkerJoined(f"w{index}", Resources(SLOTS, SLOTS, 2000)))
-        tell(WorkerReported(f"w{index}", (), resync=True))
+        apply(WorkerJoined(f"w{index}", Resources(SLOTS, SLOTS, 2000)))
+        apply(WorkerReported(f"w{index}", (), resync=True))
     plans = tuple(
         Rollout(f"x{i}", f"g{i // 16}", f"s{i // 16 % SCENES}", "t", (), 0) for i in range(rollouts)
     )
     begin = time.perf_counter()
-    tell(BatchSubmitted(Batch("r", "b", 1, plans)))
+    apply(BatchSubmitted(Batch("r", "b", 1, plans)))
     submitted_s, submit_slowest_s, slowest_s = time.perf_counter() - begin, slowest_s, 0.0
     begin = time.perf_counter()
     finished = 0
@@ -67,13 +68,13 @@ def main(rollouts: int, workers: int) -> None:
         if not given:
             # Nothing runs: the next placement comes with the clock.
             now_s += 0.1
-            tell(Tick())
+            apply(Tick())
             continue
         lease = given.pop(0)
-        tell(LeaseFinished(lease.worker_id, lease.ref, DONE))
+        apply(LeaseFinished(lease.worker_id, lease.ref, DONE))
         finished += 1
         if finished % 1000 == 0:
-            tell(Tick())
+            apply(Tick())
     finish_s = time.perf_counter() - begin
     print(
         json.dumps(

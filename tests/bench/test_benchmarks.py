@@ -65,7 +65,7 @@ def _figures(folder, bench):
 
 
 @pytest.mark.parametrize("bench", ["engine", "cluster"])
-def test_every_benchmark_writes_one_format_and_prints_the_same(everything, bench):
+def test_benchmarks_share_one_format_and_print_their_file(everything, bench):
     printed, folder = everything
     written = json.loads((folder / f"{bench}.json").read_text())
     assert set(written) == {"bench", "commit", "machine", "figures"}
@@ -209,7 +209,7 @@ def test_processes_of_the_cluster_end_with_the_benchmark(tmp_path):
     assert not any(psutil.pid_exists(pid) for pid in pids)
 
 
-def test_manager_that_can_not_serve_is_reported_with_the_end_of_its_log(tmp_path):
+def test_failed_manager_is_reported_with_the_end_of_its_log(tmp_path):
     (tmp_path / "manager").write_text("a file where its folder should be")
     with (
         pytest.raises(BenchError, match=r"manager ended with status \d+: "),
@@ -218,7 +218,7 @@ def test_manager_that_can_not_serve_is_reported_with_the_end_of_its_log(tmp_path
         pass
 
 
-def test_page_that_can_not_be_updated_is_refused_before_anything_is_measured(dataset, tmp_path):
+def test_unwritable_page_is_refused_before_the_measurement(dataset, tmp_path):
     page = tmp_path / "notes.md"
     page.write_text("# My notes\n")
     result = _bench("all", f"--dataset={dataset}", f"--out={page}")

@@ -43,7 +43,7 @@ def suite(dataset, tmp_path_factory):
     return folder, run_fidelity(dataset, SMALL, folder, 2, Modes(load_simulator, clumsy), QUIET)
 
 
-def test_a_suite_compares_every_plan_and_writes_the_disagreements(suite):
+def test_suite_compares_every_plan_and_writes_the_disagreements(suite):
     folder, outcome = suite
     plans = (folder / PLANS_FILE).read_text().splitlines()
     assert len(plans) == len(outcome.comparisons) >= SMALL.plans
@@ -51,8 +51,8 @@ def test_a_suite_compares_every_plan_and_writes_the_disagreements(suite):
     differing = [item for item in outcome.comparisons if item.first_difference is not None]
     assert differing
     assert {item.pairs[item.first_difference][0].skill.value for item in differing} == {"toggle_on"}
-    told = [json.loads(line) for line in (folder / DISAGREEMENTS_FILE).read_text().splitlines()]
-    assert {value["trial"] for value in told} >= {item.trial.trial_id for item in differing}
+    disagreements = [json.loads(line) for line in (folder / DISAGREEMENTS_FILE).read_text().splitlines()]
+    assert {value["trial"] for value in disagreements} >= {item.trial.trial_id for item in differing}
 
 
 def test_figures_have_their_documented_names(suite):
@@ -101,13 +101,13 @@ def test_zero_processes_sum_up_the_results_so_far(suite, dataset, tmp_path):
         run_fidelity(dataset, SMALL, tmp_path, 0, modes, QUIET)
     lines = (folder / RESULTS_FILE).read_text().splitlines()
     (tmp_path / RESULTS_FILE).write_text("\n".join(lines[:3]) + "\n" + lines[3][:40])
-    with (tmp_path / RESULTS_FILE).open("a") as running:  # of a suite that goes on meanwhile
+    with (tmp_path / RESULTS_FILE).open("a") as running:  # a suite that is still running
         assert len(run_fidelity(dataset, SMALL, tmp_path, 0, modes, QUIET).comparisons) == 3
         running.write(lines[3][40:] + "\n")
     assert (tmp_path / RESULTS_FILE).read_text().splitlines() == lines[:4]
 
 
-def test_a_folder_of_other_settings_is_refused(suite, dataset):
+def test_folder_with_other_settings_is_refused(suite, dataset):
     with pytest.raises(BenchError, match="other settings"):
         run_fidelity(dataset, FidelitySettings(21, 0, 0), suite[0], 1, Modes(load_simulator, clumsy), QUIET)
 
@@ -196,7 +196,7 @@ def test_wrong_option_is_one_sentence(dataset, options, sentence):
     assert "Traceback" not in answer.output
 
 
-def test_a_damaged_suite_is_refused_with_its_folder(dataset, suite, tmp_path):
+def test_damaged_suite_is_refused_with_its_folder(dataset, suite, tmp_path):
     for name in (PLANS_FILE, "settings.json"):
         (tmp_path / name).write_text((suite[0] / name).read_text())
     (tmp_path / RESULTS_FILE).write_text("not JSON\n{}\n")

@@ -41,7 +41,7 @@ _prefixes = itertools.count()
 
 @pytest.fixture(params=["memory", "sqlite", "redis"])
 async def openings(request, tmp_path):
-    """A function that opens the same state once more, as another process of the manager would."""
+    """Return a function that opens the same state once more, as another manager process would."""
     opened = []
     prefix = f"test-{next(_prefixes)}"
 
@@ -280,15 +280,15 @@ async def test_store_that_cannot_be_used_says_what_to_do(tmp_path):
         open_store(f"sqlite:{tmp_path}/file/state.sqlite")
     with pytest.raises(StateError, match="expected memory:"):
         open_store("postgres://x")
-    nobody = open_store("redis://127.0.0.1:1/0")
+    unreachable = open_store("redis://127.0.0.1:1/0")
     with pytest.raises(StateError, match="can't be reached"):
-        await nobody.claim(FIRST)
-    await nobody.close()
+        await unreachable.claim(FIRST)
+    await unreachable.close()
 
 
 @contextlib.contextmanager
 def no_file_grows(limit=200_000):
-    """A disk that is full, for this process: no file may become larger than ``limit`` bytes."""
+    """Limit file sizes of this process to ``limit`` bytes, like a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
     try:

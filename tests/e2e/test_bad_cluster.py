@@ -25,17 +25,17 @@ REFUSED = "missing or unknown token: pass --token, or set EMBOMATRIX_TOKEN to a 
 SECRET = "the-secret-of-this-test"
 
 
-def assert_told(told, status, *words):
-    assert "Traceback" not in told.text
-    assert "should not have happened" not in told.text
-    assert told.status == status, told.text
+def assert_ended(ended, status, *words):
+    assert "Traceback" not in ended.text
+    assert "should not have happened" not in ended.text
+    assert ended.status == status, ended.text
     for word in words:
-        assert word in told.text
+        assert word in ended.text
 
 
 @contextlib.contextmanager
 def manager(folder, *options):
-    """A manager on free ports; yields the command, its address and its page."""
+    """Yield the command, gRPC address and HTTP address of a manager on free ports."""
     folder.mkdir(exist_ok=True)
     arguments = ("manager", "serve", "--port=0", "--http-port=0", f"--data-dir={folder}", *options)
     with background(folder / "log", *arguments) as command:
@@ -60,7 +60,7 @@ def served(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def checkpoint(kitchen, tmp_path_factory):
-    """A policy that knows nothing yet, saved as training would."""
+    """Save an untrained policy in the format of a training run."""
     settings = read_settings(None, {"tiny.layers": 1, "tiny.width": 16, "tiny.heads": 1, "tiny.inner": 16})
     policy = new_policy(settings, load_tasks(kitchen))
     store = CheckpointStore(tmp_path_factory.mktemp("run") / "checkpoints", keep=1)
@@ -81,7 +81,7 @@ def checkpoint(kitchen, tmp_path_factory):
 def test_unreachable_manager_is_named(kitchen, checkpoint, tmp_path, arguments):
     places = {"DATASET": kitchen, "OUT": tmp_path / "out", "CHECKPOINT": checkpoint}
     filled = [_placed(item, places) for item in arguments]
-    assert_told(run(*filled, f"--manager={NOWHERE}"), 2, UNREACHABLE)
+    assert_ended(run(*filled, f"--manager={NOWHERE}"), 2, UNREACHABLE)
 
 
 def _placed(item, places):
@@ -103,41 +103,41 @@ def _placed(item, places):
 def test_wrong_token_is_refused_and_never_shown(served, kitchen, tmp_path, arguments, token):
     _, address, _ = served
     filled = [_placed(item, {"DATASET": kitchen, "OUT": tmp_path / "out"}) for item in arguments]
-    told = run(*filled, f"--manager={address}", f"--token={token}")
-    assert_told(told, 2, REFUSED)
-    assert SECRET not in told.text
+    ended = run(*filled, f"--manager={address}", f"--token={token}")
+    assert_ended(ended, 2, REFUSED)
+    assert SECRET not in ended.text
 
 
 @pytest.mark.parametrize("option", ["", "http-"])
 def test_used_port_is_named_and_its_process_keeps_running(tmp_path, option):
-    """The second manager shares the data folder of the first: it must not take its state before it knows it can serve."""
+    """The second manager shares the first one's data folder; it must bind its ports before it claims the state."""
     with manager(tmp_path / "data") as (first, address, page):
         taken = address if not option else page.removeprefix("http://").rstrip("/")
         port = taken.rpartition(":")[2]
         ports = {"port": "0", "http-port": "0", f"{option}port": port}
         options = [f"--{name}={value}" for name, value in ports.items()]
-        told = run("manager", "serve", f"--data-dir={tmp_path / 'data'}", *options)
+        ended = run("manager", "serve", f"--data-dir={tmp_path / 'data'}", *options)
         remedy = f"stop the program that uses it, or pass another --{option}port"
-        assert_told(told, 2, f"{taken} can't be bound (Address already in use): {remedy}")
-        assert "add_port.cc" not in told.text
-        assert_told(run("cluster", "runs", f"--manager={address}"), 0, "no open runs")
+        assert_ended(ended, 2, f"{taken} can't be bound (Address already in use): {remedy}")
+        assert "add_port.cc" not in ended.text
+        assert_ended(run("cluster", "runs", f"--manager={address}"), 0, "no open runs")
         assert first.process.poll() is None, first.text
 
 
 def test_unreachable_redis_is_named_without_its_password(tmp_path):
     state = "--state=redis://:hidden@127.0.0.1:1/0"
-    told = run("manager", "serve", "--port=0", "--http-port=0", f"--data-dir={tmp_path}", state)
-    assert_told(
-        told, 2, "Redis at redis://:***@127.0.0.1:1/0 can't be reached", "start it, or pass another --state"
+    ended = run("manager", "serve", "--port=0", "--http-port=0", f"--data-dir={tmp_path}", state)
+    assert_ended(
+        ended, 2, "Redis at redis://:***@127.0.0.1:1/0 can't be reached", "start it, or pass another --state"
     )
-    assert "hidden" not in told.text
+    assert "hidden" not in ended.text
 
 
 @pytest.mark.parametrize("option", ["--host=0.0.0.0", "--http-host=0.0.0.0"])
 def test_non_loopback_address_without_tls_is_refused(tmp_path, option):
-    told = run("manager", "serve", option, "--token=secret", f"--data-dir={tmp_path}")
-    assert_told(
-        told, 2, "refusing to serve on 0.0.0.0 without TLS,", "run `embomatrix manager init --data-dir"
+    ended = run("manager", "serve", option, "--token=secret", f"--data-dir={tmp_path}")
+    assert_ended(
+        ended, 2, "refusing to serve on 0.0.0.0 without TLS,", "run `embomatrix manager init --data-dir"
     )
 
 
@@ -153,7 +153,7 @@ async def test_bundle_with_wrong_digest_is_refused(served):
 
 
 async def _reward(address, record, data, run_name):
-    """Put the bundle, execute the oracle's plan once, and give the reward; None where the rollout was lost."""
+    """Upload the bundle, execute the oracle's plan once and return the reward; None if the rollout was lost."""
     rollout = Rollout(
         "r", "g", record.bundle_digest, record.task.task_id, plan_from_json(list(record.oracle)), 0
     )
@@ -189,12 +189,12 @@ def test_training_reports_interrupts_and_write_errors(kitchen, tmp_path):
             tmp_path / "early.log", *common, f"--out={tmp_path / 'early'}", "--imitate-seconds=60"
         ) as run_:
             run_.wait_for("imitation")
-            assert_told(run_.interrupt(), 130, f"go on with `--resume --out={tmp_path / 'early'}`")
+            assert_ended(run_.interrupt(), 130, f"go on with `--resume --out={tmp_path / 'early'}`")
         [saved] = (tmp_path / "early" / "checkpoints").iterdir()
         assert saved.name.startswith("imitation-")
         with background(tmp_path / "late.log", *common, *short, f"--out={tmp_path / 'late'}") as run_:
             run_.wait_for((tmp_path / "late" / "metrics.jsonl").exists)
-            assert_told(
+            assert_ended(
                 run_.interrupt(), 130, f"interrupted: continue with `--resume --out={tmp_path / 'late'}`"
             )
         newest = max((tmp_path / "late" / "checkpoints").iterdir())
@@ -202,7 +202,7 @@ def test_training_reports_interrupts_and_write_errors(kitchen, tmp_path):
         full = run_anew(
             *common, f"--out={tmp_path / 'full'}", "--imitate-seconds=0.5", largest_file=64 * 1024
         )
-        assert_told(full, 2, "can't be written", "make room there, or give rights")
+        assert_ended(full, 2, "can't be written", "make room there, or give rights")
         assert not list((tmp_path / "full").glob("reference*"))
 
 
@@ -212,8 +212,8 @@ def test_interrupted_demo_ends_its_processes(kitchen, tmp_path):
     with background(tmp_path / "log", *arguments) as demo:
         demo.wait_for((out / "metrics.jsonl").exists)
         address = re.search(r"manager at (\S+),", demo.text)[1]
-        told = demo.interrupt()
-    assert_told(told, 130, "interrupted: continue with `--resume --out=")
+        ended = demo.interrupt()
+    assert_ended(ended, 130, "interrupted: continue with `--resume --out=")
     assert list((out / "checkpoints").glob("step-*"))
     with socket.socket() as probe:
         host, _, port = address.rpartition(":")

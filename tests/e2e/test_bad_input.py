@@ -1,4 +1,4 @@
-"""Invalid input to commands: one sentence with thing and remedy, an exit status, and never a traceback."""
+"""Invalid input to commands: one sentence with object and remedy, an exit status, and no traceback."""
 
 import json
 import shutil
@@ -22,12 +22,12 @@ BDDL = """(define (problem apple-0)
 """
 
 
-def assert_told(told, status, *words):
-    assert "Traceback" not in told.text
-    assert "should not have happened" not in told.text
-    assert told.status == status, told.text
+def assert_ended(result, status, *words):
+    assert "Traceback" not in result.text
+    assert "should not have happened" not in result.text
+    assert result.status == status, result.text
     for word in words:
-        assert word in told.text
+        assert word in result.text
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def assert_told(told, status, *words):
 def test_unknown_name_error_suggests_similar_names(kitchen, tmp_path, arguments, words):
     out = tmp_path / "out"
     filled = [item.replace("DATASET", str(kitchen)).replace("OUT", str(out)) for item in arguments]
-    assert_told(run(*filled, HF_HUB_OFFLINE="1"), 2, words)
+    assert_ended(run(*filled, HF_HUB_OFFLINE="1"), 2, words)
     assert not out.exists()
 
 
@@ -72,8 +72,8 @@ def test_unknown_name_error_suggests_similar_names(kitchen, tmp_path, arguments,
 def test_unparsable_text_earns_minus_one_with_a_reason(kitchen, tmp_path, plan, words):
     file = tmp_path / "plan"
     file.write_bytes(plan if isinstance(plan, bytes) else plan.encode())
-    told = run("play", TASK, f"--plan={file}", f"--dataset={kitchen}")
-    assert_told(told, 1, words, "the text is not a plan and was not executed", "-1.00")
+    result = run("play", TASK, f"--plan={file}", f"--dataset={kitchen}")
+    assert_ended(result, 1, words, "the text is not a plan and was not executed", "-1.00")
 
 
 @pytest.mark.parametrize(
@@ -85,8 +85,8 @@ def test_unparsable_text_earns_minus_one_with_a_reason(kitchen, tmp_path, plan, 
     ],
 )
 def test_failed_step_shows_its_reason_and_ends_the_plan(kitchen, plan, words):
-    told = run("play", TASK, "--plan=-", f"--dataset={kitchen}", text=f"{plan}\nmove 0")
-    assert_told(told, 0, words, "not executed", "the goal is not reached")
+    result = run("play", TASK, "--plan=-", f"--dataset={kitchen}", text=f"{plan}\nmove 0")
+    assert_ended(result, 0, words, "not executed", "the goal is not reached")
 
 
 @pytest.mark.parametrize(
@@ -114,16 +114,16 @@ def test_bddl_error_names_line_and_column(tmp_path, content, words):
     file, out = tmp_path / "problem.bddl", tmp_path / "out"
     if content is not None:
         file.write_bytes(content if isinstance(content, bytes) else content.encode())
-    told = run("factory", "import", f"--bddl={file}", "--scene=Rs_int", f"--out={out}")
-    assert_told(told, 2, words)
+    result = run("factory", "import", f"--bddl={file}", "--scene=Rs_int", f"--out={out}")
+    assert_ended(result, 2, words)
     assert not (out / "tasks.jsonl").exists()
 
 
 def test_import_refuses_to_overwrite_a_dataset(kitchen, tmp_path):
     (tmp_path / "problem.bddl").write_text(BDDL)
     before = (kitchen / "tasks.jsonl").read_bytes()
-    told = run("factory", "import", f"--bddl={tmp_path / 'problem.bddl'}", f"--out={kitchen}")
-    assert_told(told, 2, f"{kitchen} holds a dataset already: name another folder with --out")
+    result = run("factory", "import", f"--bddl={tmp_path / 'problem.bddl'}", f"--out={kitchen}")
+    assert_ended(result, 2, f"{kitchen} holds a dataset already: name another folder with --out")
     assert (kitchen / "tasks.jsonl").read_bytes() == before
 
 
@@ -157,7 +157,7 @@ def test_missing_or_damaged_dataset_error_names_the_remedy(kitchen, tmp_path, da
     shutil.copytree(kitchen, folder)
     change, words = DAMAGES[damage]
     change(folder)
-    assert_told(run("play", TASK, "--oracle", f"--dataset={folder}"), 2, str(folder), words)
+    assert_ended(run("play", TASK, "--oracle", f"--dataset={folder}"), 2, str(folder), words)
 
 
 @pytest.mark.parametrize("damage", ["no folder", "bundle cut"])
@@ -165,8 +165,8 @@ def test_trainer_reports_the_same_dataset_errors(kitchen, tmp_path, damage):
     folder = tmp_path / "dataset"
     shutil.copytree(kitchen, folder)
     DAMAGES[damage][0](folder)
-    told = run("train", f"--dataset={folder}", f"--manager={NOWHERE}", f"--out={tmp_path / 'out'}")
-    assert_told(told, 2, "embomatrix train:", str(folder), "embomatrix factory build")
+    result = run("train", f"--dataset={folder}", f"--manager={NOWHERE}", f"--out={tmp_path / 'out'}")
+    assert_ended(result, 2, "embomatrix train:", str(folder), "embomatrix factory build")
 
 
 @pytest.mark.parametrize(
@@ -184,7 +184,7 @@ def test_trainer_reports_the_same_dataset_errors(kitchen, tmp_path, damage):
 def test_missing_package_error_names_the_extra(kitchen, tmp_path, package, arguments, words):
     out = tmp_path / "out"
     filled = [item.replace("DATASET", str(kitchen)).replace("OUT", str(out)) for item in arguments]
-    assert_told(run_anew(*filled, **without(tmp_path, package)), 2, words)
+    assert_ended(run_anew(*filled, **without(tmp_path, package)), 2, words)
 
 
 @pytest.mark.parametrize(
@@ -207,19 +207,19 @@ def test_missing_package_error_names_the_extra(kitchen, tmp_path, package, argum
         (("worker", "run", "--nice=50"), "--nice 50: input should be less than or equal to 19"),
     ],
 )
-def test_invalid_option_value_error_names_the_expected_one(tmp_path, arguments, words):
-    assert_told(run(*arguments, HOME=str(tmp_path)), 2, words)
+def test_invalid_option_error_names_the_expected_value(tmp_path, arguments, words):
+    assert_ended(run(*arguments, HOME=str(tmp_path)), 2, words)
 
 
 def test_unknown_training_setting_is_named(kitchen, tmp_path):
     (tmp_path / "settings.toml").write_text("speed = 3")
-    told = run(
+    result = run(
         "train",
         f"--settings={tmp_path / 'settings.toml'}",
         f"--dataset={kitchen}",
         f"--out={tmp_path / 'out'}",
     )
-    assert_told(told, 2, "unknown setting 'speed': correct its name or remove it")
+    assert_ended(result, 2, "unknown setting 'speed': correct its name or remove it")
 
 
 @pytest.mark.parametrize(
@@ -246,25 +246,25 @@ def test_unwritable_folder_is_named(kitchen, tmp_path, arguments, words):
     (tmp_path / "file").write_text("no folder")
     out = tmp_path / "file" / "out"
     filled = [item.replace("DATASET", str(kitchen)).replace("OUT", str(out)) for item in arguments]
-    assert_told(run(*filled), 2, str(out), words)
+    assert_ended(run(*filled), 2, str(out), words)
 
 
 def test_full_disk_leaves_no_partial_scene_file(tmp_path):
-    told = run_anew("scene", "build", "Rs_int", f"--out={tmp_path}", largest_file=4096)
-    assert_told(told, 2, "Rs_int.json can't be written (File too large): free disk space")
+    result = run_anew("scene", "build", "Rs_int", f"--out={tmp_path}", largest_file=4096)
+    assert_ended(result, 2, "Rs_int.json can't be written (File too large): free disk space")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_resume_without_checkpoint_is_refused(kitchen, tmp_path):
-    told = run("train", "--resume", f"--dataset={kitchen}", f"--out={tmp_path}")
-    assert_told(told, 2, f"no checkpoint in {tmp_path} to resume from: leave out --resume")
+    result = run("train", "--resume", f"--dataset={kitchen}", f"--out={tmp_path}")
+    assert_ended(result, 2, f"no checkpoint in {tmp_path} to resume from: leave out --resume")
 
 
 def test_folder_of_another_run_stays_unchanged(kitchen, tmp_path):
     (tmp_path / "checkpoints" / "step-000001").mkdir(parents=True)
-    told = run("train", f"--dataset={kitchen}", f"--out={tmp_path}")
-    assert_told(told, 2, f"{tmp_path} holds another run: pass --resume to continue it, or another --out")
-    assert_told(
+    result = run("train", f"--dataset={kitchen}", f"--out={tmp_path}")
+    assert_ended(result, 2, f"{tmp_path} holds another run: pass --resume to continue it, or another --out")
+    assert_ended(
         run("demo", f"--dataset={kitchen}", f"--out={tmp_path}"), 2, "holds another run: pass another --out"
     )
 
@@ -277,10 +277,10 @@ def test_interrupted_evaluation_resumes_from_its_answers(kitchen, tmp_path):
     with server.serving() as url:
         with background(tmp_path / "log", *arguments, f"--endpoint={url}") as asking:
             asking.wait_for(lambda: (out / "answers.jsonl").exists() and len(_lines(out)) == 3)
-            assert_told(asking.interrupt(), 130, "the same command continues from there")
+            assert_ended(asking.interrupt(), 130, "the same command continues from there")
         server.script = ["move 10"]
-        told = run(*arguments, f"--endpoint={url}")
-    assert_told(told, 0, "2 answers are already stored", "12 answers in", "goal_not_met 12 100.0%")
+        result = run(*arguments, f"--endpoint={url}")
+    assert_ended(result, 0, "2 answers are already stored", "12 answers in", "goal_not_met 12 100.0%")
 
 
 def _lines(out):
@@ -294,10 +294,12 @@ def test_interrupted_build_leaves_no_dataset_and_resumes(tmp_path):
     )  # fmt: skip
     with background(tmp_path / "log", *arguments) as building:
         building.wait_for((out / "build.jsonl").exists)
-        told = building.interrupt()
-    assert_told(told, 130, "interrupted: finished tasks are kept in", "run the same command again to resume")
+        result = building.interrupt()
+    assert_ended(
+        result, 130, "interrupted: finished tasks are kept in", "run the same command again to resume"
+    )
     assert not (out / "tasks.jsonl").exists()
     other = run(
         "factory", "build", f"--out={out}", "--scene=Rs_int", "--train=9", "--heldout=0", "--no-look-ahead"
     )
-    assert_told(other, 2, "holds a build with other settings (train 8, now 9): give the same settings again")
+    assert_ended(other, 2, "holds a build with other settings (train 8, now 9): give the same settings again")

@@ -1,4 +1,4 @@
-"""`embomatrix cluster` before a real manager: it shows what the cluster does, and what a person gets wrong in a sentence."""
+"""`embomatrix cluster` with a real manager: tables and files of the cluster, and one sentence for each user error."""
 
 import asyncio
 import itertools
@@ -20,12 +20,12 @@ NOWHERE = "127.0.0.1:1"
 UNREACHABLE = f"no manager answers at {NOWHERE}"
 
 
-async def told(*arguments):
+async def cluster_command(*arguments):
     return await asyncio.to_thread(run, "cluster", *arguments)
 
 
-async def lived_run(kitchen, address):
-    """A run of 40 rollouts on two slots and one more that crashes each time; closed when this ends."""
+async def finished_run(kitchen, address):
+    """Closed run of 41 rollouts on two slots; the last one crashes its slot at every attempt."""
     dataset = Dataset.load(kitchen)
     record = dataset.train[0]
     digest, task, plan = record.bundle_digest, record.task.task_id, plan_from_json(list(record.oracle))
@@ -38,18 +38,18 @@ async def lived_run(kitchen, address):
         await client.announce_lookahead("r1", 1, [LookaheadEntry(7, digest, 40)])
         batch = Batch("r1", "b", 6, tuple(rollouts))
         results = [result async for result in client.execute(batch, deadline_s=60)]
-        (cell,) = json.loads((await told("plan", "r1", there, "--json")).text)
+        (cell,) = json.loads((await cluster_command("plan", "r1", there, "--json")).text)
         assert (cell["step"], cell["count"], cell["worker_ids"]) == (7, 40, ["kitchen-worker"])
-        workers = await told("workers", there)
+        workers = await cluster_command("workers", there)
         assert "kitchen-worker ready 2 0 40 1 " in workers.text
-        open_runs = await told("runs", there, "--json")
+        open_runs = await cluster_command("runs", there, "--json")
         assert [(run["run_id"], run["closed_s"]) for run in json.loads(open_runs.text)] == [("r1", 0.0)]
         await client.close_run("r1")
     return results
 
 
 def assert_a_trace_of(events, rollouts):
-    """No two spans of a slot overlap, and every rollout was executed once, after it was submitted."""
+    """Assert that spans of a slot never overlap and that every rollout ran once, after its submission."""
     tracks, executed = {}, []
     for event in events:
         if event["ph"] == "X":
@@ -68,13 +68,13 @@ def assert_a_trace_of(events, rollouts):
 async def test_report_and_trace_of_a_closed_run_show_its_rollouts(browser, kitchen, tmp_path):
     report, trace = tmp_path / "report.html", tmp_path / "trace.json"
     with cluster(tmp_path / "cluster") as (address, _):
-        results = await lived_run(kitchen, address)
+        results = await finished_run(kitchen, address)
         there = f"--manager={address}"
-        assert "r1 evening closed" in (await told("runs", "--closed", there)).text
-        assert (await told("report", "r1", f"--out={report}", there)).status == 0
-        assert (await told("trace", "r1", f"--out={trace}", there)).status == 0
-        lines = (await told("events", "r1", "--json", there)).text
-        fleet = await told("events", there)
+        assert "r1 evening closed" in (await cluster_command("runs", "--closed", there)).text
+        assert (await cluster_command("report", "r1", f"--out={report}", there)).status == 0
+        assert (await cluster_command("trace", "r1", f"--out={trace}", there)).status == 0
+        lines = (await cluster_command("events", "r1", "--json", there)).text
+        fleet = await cluster_command("events", there)
     page = shown(browser, report.as_uri(), tmp_path)
     assert page.words["about"].startswith("run r1 · opened 20")
     assert "slot_crashed" in page.words["failures"]
@@ -96,15 +96,15 @@ def test_cluster_command_names_an_unreachable_manager(command):
 async def test_unknown_run_or_worker_error_names_the_remedy(tmp_path):
     async with manager(tmp_path) as at:
         there = f"--manager={at.address}"
-        report = await told("report", "r9", there)
+        report = await cluster_command("report", "r9", there)
         assert (report.status, "no run 'r9' is open or kept" in report.text) == (2, True)
-        revoke = await told("revoke", "w9", "--reason=a test", there)
+        revoke = await cluster_command("revoke", "w9", "--reason=a test", there)
         assert (revoke.status, "token" in revoke.text, "Traceback" in revoke.text) == (2, True, False)
-        drain = await told("drain", "w9", there)
+        drain = await cluster_command("drain", "w9", there)
         assert (drain.status, "there is no worker 'w9'" in drain.text) == (2, True)
-        assert (await told("workers", there)).text.startswith("no workers: start one")
+        assert (await cluster_command("workers", there)).text.startswith("no workers: start one")
         async with open_run(at.address):
-            written = await told("report", "r1", f"--out={tmp_path / 'no' / 'r.html'}", there)
+            written = await cluster_command("report", "r1", f"--out={tmp_path / 'no' / 'r.html'}", there)
         assert (written.status, "can't be written" in written.text) == (2, True)
 
 
@@ -115,18 +115,18 @@ async def test_operator_drains_and_resumes_a_worker_and_pauses_dispatch(tmp_path
         FakeWorker(at.address, worker_id="lab-pc"),
     ):
         there = f"--manager={at.address}"
-        assert (await told("drain", "lab-pc", there)).text == "worker lab-pc, state draining"
-        (row,) = json.loads((await told("workers", there, "--json")).text)
+        assert (await cluster_command("drain", "lab-pc", there)).text == "worker lab-pc, state draining"
+        (row,) = json.loads((await cluster_command("workers", there, "--json")).text)
         assert row["state"] == "draining"
-        assert (await told("resume", "lab-pc", there)).text == "worker lab-pc, state ready"
+        assert (await cluster_command("resume", "lab-pc", there)).text == "worker lab-pc, state ready"
         with background(tmp_path / "log", "cluster", "events", "--follow", there) as following:
             await asyncio.to_thread(following.wait_for, "worker_joined worker=lab-pc")
             async with FakeWorker(at.address, worker_id="late-pc"):
                 await asyncio.to_thread(following.wait_for, "worker_joined worker=late-pc")
             assert (await asyncio.to_thread(following.interrupt)).status == 0
-        assert json.loads((await told("pause", there, "--json")).text) == {"dispatch": "paused"}
+        assert json.loads((await cluster_command("pause", there, "--json")).text) == {"dispatch": "paused"}
         waiting = asyncio.create_task(outcomes(client, batch(4)))
         await asyncio.sleep(0.3)
         assert not waiting.done()
-        await told("resume", there)
+        await cluster_command("resume", there)
         assert len(await waiting) == 4

@@ -1,4 +1,4 @@
-"""The real compose file on a real Docker engine: redis, manager and workers come up, and a batch runs through them."""
+"""The compose file on a real Docker engine: redis, manager and workers start, and a batch runs through them."""
 
 import json
 import shutil
@@ -57,7 +57,7 @@ def cluster():
 
 
 class Door:
-    """The published page, opened with what the init service made."""
+    """Client of the published page with the credentials that the init service made."""
 
     def __init__(self):
         def read(name):

@@ -1,4 +1,4 @@
-"""The compose file without Docker: its commands are real ones, and what they open is closed to everyone else."""
+"""The compose file without Docker: its commands exist, and its ports are closed to other machines."""
 
 import contextlib
 import re
@@ -57,7 +57,7 @@ def test_every_service_is_confined_limited_and_restarted():
 
 
 def placed(arguments, folder):
-    """The container's folders as ones of this test; the published ports as free ones."""
+    """Replace the container's folders with temporary ones and the published ports with free ones."""
     moved = [
         re.sub(r"(=|:)/(data|for-worker|for-trainer|cache|tmp/worker)", rf"\1{folder}/\2", each)
         for each in arguments
@@ -67,9 +67,9 @@ def placed(arguments, folder):
 
 @pytest.mark.slow
 def test_worker_joins_the_cluster_of_the_compose_commands_with_its_own_token(tmp_path):
-    told = run("manager", "init", *placed(SERVICES["init"]["command"], tmp_path))
-    assert told.status == 0, told.text
-    assert "manager, localhost" in told.text
+    result = run("manager", "init", *placed(SERVICES["init"]["command"], tmp_path))
+    assert result.status == 0, result.text
+    assert "manager, localhost" in result.text
     again = run("manager", "init", *placed(SERVICES["init"]["command"], tmp_path))
     assert again.status == 0, again.text
     serve = [*placed(SERVICES["manager"]["command"], tmp_path), "--port=0", "--http-port=0"]

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.browser
 
 @contextlib.contextmanager
 def cluster(folder, *options):
-    """A manager and one worker of two slots; yields the manager's address and its page."""
+    """Yield the gRPC address and page address of a manager with one worker of two slots."""
     folder.mkdir(exist_ok=True)
     data = f"--data-dir={folder / 'data'}"
     serve = ("manager", "serve", "--port=0", "--http-port=0", "--state=memory:", data, *options)
@@ -50,7 +50,7 @@ async def test_page_shows_workers_slots_warm_scenes_and_throughput(browser, kitc
             await client.announce_lookahead(run_id, 1, [LookaheadEntry(7, digest, ROLLOUTS)])
             results = [item async for item in client.execute(Batch(run_id, "b", 1, rollouts), deadline_s=60)]
             assert all(isinstance(result.outcome, Completed) for result in results)
-            await asyncio.sleep(1)  # throughput is told of whole seconds
+            await asyncio.sleep(1)  # throughput covers whole seconds
             page = shown(browser, url, tmp_path)
             workers = shown(browser, f"{url}#workers", tmp_path)
             ahead = shown(browser, f"{url}#lookahead", tmp_path)

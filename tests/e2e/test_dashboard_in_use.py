@@ -44,7 +44,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.timeout(300)]
 
 
 class Window:
-    """A page in a browser, and what went wrong in it."""
+    """Page in a browser, with the errors that it logged."""
 
     def __init__(self, page, url):
         self.page = page
@@ -63,7 +63,7 @@ class Window:
         return " ".join((await self.page.locator(selector).inner_text()).split())
 
     async def until(self, selector, pattern):
-        """Its words, once they fit."""
+        """Return the element's text once it satisfies the condition."""
         await self.page.locator(selector).filter(has_text=re.compile(pattern)).wait_for()
         return await self.words(selector)
 
@@ -87,7 +87,7 @@ async def window(browser, url, *, size="desk", theme="light"):
 
 @contextlib.asynccontextmanager
 async def ten_workers(address):
-    """Ten workers: one was killed, one is paused, one logs much; one of two scenes loads nowhere."""
+    """Start ten workers: one killed, one paused, one with many log lines; one of two scenes loads nowhere."""
     names = [LONG, *(f"office-{number}" for number in range(1, 10))]
     async with contextlib.AsyncExitStack() as stack, open_run(address) as client:
         workers = [FakeWorker(address, name, slots=2, broken={BEDROOM}) for name in names]
@@ -157,7 +157,7 @@ async def test_look_ahead_is_read_by_keyboard(browser, tmp_path):
         await opened.page.keyboard.press("ArrowRight")
         await opened.until("#cell", f"^Step 8, {_brief(second)}: 4 rollouts, {places[second]}")
         await opened.page.keyboard.press("ArrowRight")
-        await opened.page.wait_for_timeout(1500)  # a refresh takes nobody's place away
+        await opened.page.wait_for_timeout(1500)  # a refresh keeps the scroll position
         assert (await opened.words("#cell")).startswith("Step 8, ")
         assert await opened.page.evaluate("document.activeElement.dataset.key.includes(' 8 ')")
 
@@ -169,7 +169,7 @@ async def _slots_shown_s(opened, pattern="shown"):
 
 
 async def _point_at_a_rollout(opened):
-    """Return the page position at which the mouse points at a rollout."""
+    """Move the mouse over a rollout of the timeline and return the page position."""
     await opened.page.locator("canvas.gantt").wait_for()
     box = await opened.page.locator("canvas.gantt").bounding_box()
     for left in range(int(box["x"]) + 160, int(box["x"] + box["width"]), 6):
@@ -202,11 +202,11 @@ async def test_timeline_zooms_and_pans_with_the_mouse(browser, tmp_path):
             longer = await _slots_shown_s(opened) > before_s
             assert longer == (times > 0), f"{key} and the wheel by {times}"
         await opened.page.mouse.move(left, top)
-        told = await opened.words("#one")
+        shown = await opened.words("#one")
         await opened.page.mouse.down()
         await opened.page.mouse.move(left + 400, top, steps=8)
         await opened.page.mouse.up()
-        assert (await opened.words("#one")) == told, "what was grabbed stays under the mouse"
+        assert (await opened.words("#one")) == shown, "what was grabbed stays under the mouse"
         await opened.page.wait_for_timeout(1200)
         assert await _slots_shown_s(opened) == pytest.approx(one_s, rel=0.1), "a refresh takes no view away"
         await opened.page.locator("canvas.gantt").focus()

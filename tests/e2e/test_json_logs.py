@@ -1,4 +1,4 @@
-"""The log lines of real daemons as JSON: every line an object, with the ids that it is about, and no secret on any."""
+"""JSON logs of real daemons: every line is an object with the ids that it concerns, and no line holds a secret."""
 
 import json
 import re
@@ -15,10 +15,10 @@ JSON = "--log-format=json"
 
 
 def lines(log):
-    """The objects of a log, and what else stands there."""
-    told = log.read_text().splitlines()
-    return [json.loads(line) for line in told if line.startswith("{")], [
-        line for line in told if not line.startswith("{")
+    """Return the JSON objects of a log and its other lines."""
+    output = log.read_text().splitlines()
+    return [json.loads(line) for line in output if line.startswith("{")], [
+        line for line in output if not line.startswith("{")
     ]
 
 
@@ -69,7 +69,7 @@ async def test_json_log_lines_have_ids_and_no_token(kitchen, tmp_path):
 
 
 def test_unknown_log_format_is_refused():
-    told = run("manager", "serve", "--log-format=xml")
-    assert told.status == 2
-    assert "xml" in told.text
-    assert "Traceback" not in told.text
+    output = run("manager", "serve", "--log-format=xml")
+    assert output.status == 2
+    assert "xml" in output.text
+    assert "Traceback" not in output.text

@@ -1,4 +1,4 @@
-"""Workers that Ray places join a manager, execute, come back when their process is lost, and are gone with Ray."""
+"""Ray actors as workers: they join a manager, execute, restart after a process loss, and end with Ray."""
 
 import contextlib
 import re
@@ -23,7 +23,7 @@ def with_ray():
 
 
 def daemons(name):
-    """Processes of the worker daemon of that name."""
+    """Return the worker daemon's processes with this name."""
     found = []
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):

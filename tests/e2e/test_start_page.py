@@ -1,4 +1,4 @@
-"""The commands of the start page, typed one after the other in a fresh folder by somebody who has read nothing else."""
+"""Commands of the start page, typed one after the other in an empty folder."""
 
 import contextlib
 import os
@@ -24,14 +24,14 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
 
 def lines_below(heading):
-    """The lines of the code blocks of a section, without their comments."""
+    """Return the lines of the code blocks in a section, without comments."""
     section = PAGE.read_text(encoding="utf-8").split(f"\n## {heading}\n")[1].split("\n## ")[0]
     blocks = re.findall(r"^```\n(.*?)^```", section, re.MULTILINE | re.DOTALL)
     return [line.split("  #")[0].strip() for block in blocks for line in block.splitlines()]
 
 
 class Shell:
-    """A person's terminals on one machine: a folder and a home of their own, and ports that nobody else has."""
+    """Terminals of one user on one machine, with a dedicated folder, home and ports."""
 
     def __init__(self, folder):
         self.folder = folder
@@ -64,11 +64,11 @@ class Shell:
         if re.match(r"[A-Z]+=", line):
             self._assigned.append(line)
             return ""
-        told = next((words for part, words in SERVES.items() if part in line), None)
-        return self._ended(line) if told is None else self._serving(line, told)
+        ready_words = next((words for part, words in SERVES.items() if part in line), None)
+        return self._ended(line) if ready_words is None else self._serving(line, ready_words)
 
     def close_terminals(self):
-        """Ctrl-C in all that serve."""
+        """Send Ctrl-C to every command that still serves."""
         self._services.close()
 
     def _ended(self, line):
@@ -77,13 +77,13 @@ class Shell:
         assert result.returncode == 0, f"{line}\n{said.decode()}"
         return said.decode()
 
-    def _serving(self, line, told):
+    def _serving(self, line, ready_words):
         log = self.folder / f"{time.monotonic_ns()}.log"
         with log.open("wb") as file:
             process = self._run(f"exec {line}", stdout=file, stderr=subprocess.STDOUT)
         self._services.callback(_stop, process)
         ends_s = time.monotonic() + LIMIT_S
-        while told not in log.read_text():
+        while ready_words not in log.read_text():
             assert process.poll() is None, f"{line}\n{log.read_text()}"
             assert time.monotonic() < ends_s, f"{line}\n{log.read_text()}"
             time.sleep(0.1)

@@ -1,4 +1,4 @@
-"""The whole path with real processes: factory, cluster, trainer; one worker is killed in the middle."""
+"""Factory, cluster and trainer as real processes; one worker is killed during training."""
 
 import json
 import os
@@ -19,8 +19,8 @@ from embomatrix.cli.supervisor import embomatrix_command
 STEPS = 12
 HOLD_S = 2.8
 """Shorter than the silence after which the manager gives a worker nothing."""
-TOLD_S = 1.5
-"""What the manager tells by then is of a look after the workers were stopped."""
+REPORTED_S = 1.5
+"""Delay after which the manager's report reflects the stopped workers."""
 NOTICED_S = 1.5
 """A worker whose connection broke is given up after a second."""
 pytestmark = pytest.mark.timeout(1200)
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.timeout(1200)
 class Run:
     """Output and files of a training run whose first worker was killed during it."""
 
-    told: str
+    output: str
     out: Path
     metrics: list[dict[str, float]]
     restarts: dict[str, int]
@@ -53,22 +53,22 @@ def run(tmp_path_factory):
         both = [children.pid("worker-1"), children.pid("worker-2")]
         _until(lambda: _stopped_with_work(both, cluster.dashboard), trainer)
         os.kill(both[0], signal.SIGKILL)
-        # Until the manager knows: the other one would take from the dead what waits behind what it ran.
+        # Until the manager notices: otherwise the other worker would steal the dead worker's queued leases.
         time.sleep(NOTICED_S)
         os.kill(both[1], signal.SIGCONT)
-        told, _ = trainer.communicate(timeout=600)
-        assert trainer.returncode == 0, told
+        output, _ = trainer.communicate(timeout=600)
+        assert trainer.returncode == 0, output
         restarts = {name: children.restarts(name) for name in ("manager", *cluster.workers)}
-    return Run(told, out, _metrics(out), restarts)
+    return Run(output, out, _metrics(out), restarts)
 
 
 def test_rollouts_of_a_killed_worker_are_redispatched_and_none_is_lost(run):
     assert run.restarts == {"manager": 0, "worker-1": 1, "worker-2": 0}
     assert [line["step"] for line in run.metrics] == list(range(1, STEPS + 1))
     assert sum(line["lost"] for line in run.metrics) == 0, "a rollout without a result"
-    assert _counted("rollouts, ", run.told) == sum(line["rollouts"] for line in run.metrics)
-    assert _counted("lost and masked", run.told) == 0
-    assert _counted("re-dispatched", run.told) >= 1, "the kill hit no rollout: the test shows nothing"
+    assert _counted("rollouts, ", run.output) == sum(line["rollouts"] for line in run.metrics)
+    assert _counted("lost and masked", run.output) == 0
+    assert _counted("re-dispatched", run.output) >= 1, "the kill hit no rollout: the test shows nothing"
 
 
 def test_equal_plans_have_equal_rewards_on_any_worker(run):
@@ -107,14 +107,14 @@ def _metrics(out):
 
 
 def _stopped_with_work(pids, dashboard):
-    """Stop the workers for a while: whether the manager gave the first one more than it runs. Else they go on.
+    """Stop the workers and return True if the first one holds queued leases; otherwise continue them.
 
-    What it runs may be hedged as a straggler's; what waits behind it nobody else has.
+    A running lease may be hedged; a queued lease has no second copy, so only a re-dispatch can finish it.
     """
     for pid in pids:
         os.kill(pid, signal.SIGSTOP)
     ends_s = time.monotonic() + HOLD_S
-    time.sleep(TOLD_S)
+    time.sleep(REPORTED_S)
     while time.monotonic() < ends_s:
         with urllib.request.urlopen(f"{dashboard}/api/v1/workers", timeout=10) as answer:
             workers = json.load(answer)["items"]
@@ -134,8 +134,8 @@ def _until(condition, process, limit_s=180.0):
         time.sleep(0.02)
 
 
-def _counted(what, told):
-    """The number that stands before the words in the closing summary."""
-    found = re.search(rf"([\d,]+) {what}", " ".join(told.split()))
-    assert found, told
+def _counted(what, output):
+    """Return the number before these words in the closing summary."""
+    found = re.search(rf"([\d,]+) {what}", " ".join(output.split()))
+    assert found, output
     return int(found[1].replace(",", ""))

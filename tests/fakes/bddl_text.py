@@ -1,4 +1,4 @@
-"""BDDL text of whole problems."""
+"""BDDL text of complete problems."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def render_problem(problem: BddlProblem) -> str:
-    """BDDL text that ``parse_problem`` parses to an equal problem."""
+    """Render BDDL text that ``parse_problem`` parses to an equal problem."""
     grouped: dict[str, list[str]] = {}
     for name, type_name in problem.objects.items():
         grouped.setdefault(type_name, []).append(name)

@@ -1,11 +1,11 @@
-"""A page in a real browser, after its scripts ran, and its words by the elements that they stand in."""
+"""Pages rendered by a real browser, with their text by element id."""
 
 import subprocess
 from html.parser import HTMLParser
 
 
 class Page(HTMLParser):
-    """The words of a page by the id of the element that they stand in, and how often each class of element is there."""
+    """Text of a page by element id, and the number of elements of each class."""
 
     VOID = frozenset(("meta", "link", "input", "br", "line", "polygon", "polyline"))
 
@@ -33,7 +33,7 @@ class Page(HTMLParser):
 
 
 def shown(browser, url, folder):
-    """The page after its scripts ran for a few seconds."""
+    """Return the page after its scripts ran for a few seconds."""
     result = subprocess.run(
         [
             browser,

@@ -1,4 +1,4 @@
-"""A real HTTP server that speaks chat completions and answers from a script."""
+"""HTTP server for chat completions that answers from a script."""
 
 import contextlib
 import json
@@ -8,7 +8,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 
 def completion(text, finish="stop"):
-    """A body as endpoints send it."""
+    """Return a response body in the format of chat endpoints."""
     return {
         "model": "scripted-1",
         "choices": [{"message": {"role": "assistant", "content": text}, "finish_reason": finish}],
@@ -17,7 +17,7 @@ def completion(text, finish="stop"):
 
 
 class ChatServer:
-    """Answers come in the order of ``script``, the last one for ever: a text, or (status, headers, body, seconds)."""
+    """Server that answers with the entries of ``script``, a text or (status, headers, body, seconds), and repeats the last."""
 
     def __init__(self, *script):
         self.script = list(script)
@@ -45,7 +45,7 @@ class ChatServer:
 
     @contextlib.contextmanager
     def serving(self):
-        """Base URL of the server for as long as this is held."""
+        """Serve until the block ends; yields the base URL."""
         script = self
 
         class Handler(BaseHTTPRequestHandler):

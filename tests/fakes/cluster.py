@@ -1,4 +1,4 @@
-"""A small manager for the client's tests: keeps one batch's results and breaks its streams when told to."""
+"""Small manager for the client's tests: keeps one batch's results and breaks its streams on request."""
 
 import contextlib
 from dataclasses import dataclass, field
@@ -26,7 +26,7 @@ class FakeCluster(
     scene_service_pb2_grpc.SceneServiceServicer,
     admin_service_pb2_grpc.AdminServiceServicer,
 ):
-    """Every rollout ends as cancelled at once; a stream ends after ``results_per_stream`` results."""
+    """Manager that cancels every rollout at once. A stream ends after ``results_per_stream`` results."""
 
     results_per_stream: int = 1000
     break_streams: bool = False

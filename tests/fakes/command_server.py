@@ -1,7 +1,7 @@
-"""The `embomatrix` command without its start: a process that has imported what commands import, and forks one for each.
+"""Fork server for the `embomatrix` command, which saves the seconds that imports take.
 
-Importing takes seconds, and what a command says does not depend on it. The command is the real one, in a process of its own
-with its own arguments, environment and standard streams. ``python -m tests.fakes.command_server FD`` serves on a socket.
+The server has imported the commands' modules and forks one process for each command. Each command has its own
+arguments, environment and standard streams. ``python -m tests.fakes.command_server FD`` serves on a socket.
 """
 
 import contextlib
@@ -38,7 +38,7 @@ LONGEST = 1 << 20
 
 
 def ask(server, arguments, environment, streams):
-    """Start a command; returns a file that tells its exit status when it has ended. ``streams`` are descriptors 0 to 2."""
+    """Start a command; returns a file that receives its exit status. ``streams`` are descriptors 0 to 2."""
     reading, writing = os.pipe()
     with contextlib.closing(os.fdopen(writing, "wb")):
         message = json.dumps([list(arguments), dict(environment), os.getcwd()]).encode()
@@ -47,8 +47,8 @@ def ask(server, arguments, environment, streams):
 
 
 def serve(server):
-    """Fork for each request; returns in a process that is to become the command, never in this one."""
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # who watched a command has nobody to tell
+    """Fork for each request. Returns only in a forked process, which then becomes the command."""
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for the watching process
     while True:
         message, fds, _, _ = socket.recv_fds(server, LONGEST, 4)
         if not message:
@@ -62,7 +62,7 @@ def serve(server):
 
 
 def watch(fds):
-    """Become the command in a further process, and tell here how that ended."""
+    """Fork once more to become the command, and send its exit status to the caller."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     *streams, writing = fds
     child = os.fork()
@@ -94,7 +94,7 @@ def main():
 
 
 def run_to_its_end():
-    """The command's exit status. Tearing the interpreter down takes longer than most commands: that is left out."""
+    """Run the command and return its exit status. Skips the interpreter's teardown, which is slow."""
     status = 0
     try:
         runpy.run_module("embomatrix.cli", run_name="__main__", alter_sys=True)
@@ -102,7 +102,7 @@ def run_to_its_end():
         if isinstance(leaving.code, str):
             print(leaving.code, file=sys.stderr)
         status = leaving.code if isinstance(leaving.code, int) else int(leaving.code is not None)
-    except BaseException:  # noqa: BLE001  # an interpreter tells and goes
+    except BaseException:  # noqa: BLE001  # an interpreter prints the error and exits
         traceback.print_exc()
         status = 1
     sys.stdout.flush()

@@ -1,4 +1,4 @@
-"""The real `embomatrix` command as a person runs it: to its end, or in the background until it is stopped."""
+"""The real `embomatrix` command, run to its end or in the background."""
 
 import contextlib
 import functools
@@ -35,7 +35,7 @@ sys.meta_path[:] = [Finder if finder is importlib.machinery.PathFinder else find
 
 
 @dataclass(frozen=True)
-class Told:
+class CommandResult:
     """Exit status and text of a finished command, with line breaks removed."""
 
     status: int
@@ -51,18 +51,18 @@ def environment(**changes):
 
 
 def run(*arguments, text="", **changes):
-    """Run the command to its end; ``changes`` are of its environment. What it imports was imported before."""
-    with tempfile.TemporaryFile() as said, tempfile.TemporaryFile() as given:
+    """Run the command to its end in a fork of the command server. ``changes`` apply to its environment."""
+    with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as given:
         given.write(_bytes(text))
         given.seek(0)
-        streams = (given.fileno(), said.fileno(), said.fileno())
+        streams = (given.fileno(), output.fileno(), output.fileno())
         ended = ask(_server(), map(str, arguments), environment(**changes), streams)
         with contextlib.closing(ended):
             if not select.select([ended], [], [], LIMIT_S)[0]:
                 raise TimeoutError(f"embomatrix {' '.join(map(str, arguments))}: no end after {LIMIT_S:g} s")
             (status,) = STATUS.unpack(ended.read(STATUS.size))
-        said.seek(0)
-        return Told(status, _words(said.read()))
+        output.seek(0)
+        return CommandResult(status, _words(output.read()))
 
 
 # What a process does before it becomes the command. Not a ``preexec_fn``: that runs in a fork of this process, where gRPC's
@@ -78,7 +78,7 @@ def _after(before, arguments):
 
 
 def run_anew(*arguments, text="", largest_file=None, **changes):
-    """The same in a process that starts from nothing; no file may grow beyond ``largest_file`` bytes, as on a full disk."""
+    """Run the command in a fresh process. No file may exceed ``largest_file`` bytes, like on a full disk."""
     before = "pass" if largest_file is None else _SMALL_FILES.format(largest_file)
     result = subprocess.run(
         _after(before, arguments),
@@ -89,20 +89,20 @@ def run_anew(*arguments, text="", largest_file=None, **changes):
         timeout=LIMIT_S,
         check=False,
     )
-    return Told(result.returncode, _words(result.stdout))
+    return CommandResult(result.returncode, _words(result.stdout))
 
 
 def _bytes(text):
     return text.encode() if isinstance(text, str) else text
 
 
-def _words(said):
-    return " ".join(said.decode(errors="replace").split())
+def _words(output):
+    return " ".join(output.decode(errors="replace").split())
 
 
 @functools.cache
 def _server():
-    """Started with the first command of this process, and ended by the end of it."""
+    """Start the command server on first use; it ends with this process."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with theirs:
         # The verbosity is read when grpc is imported, and the command sets it only then.
@@ -122,13 +122,13 @@ def without(folder, *packages):
 
 
 class Background:
-    """A command that goes on; what it says is kept in a file."""
+    """Command that runs in the background; a file keeps its output."""
 
     def __init__(self, log, arguments, **changes):
         self._log = Path(log)
         with self._log.open("wb") as file:
             self.process = subprocess.Popen(
-                # A shell has what it runs in the background ignore Ctrl-C, and that is inherited.
+                # A shell makes its background processes ignore Ctrl-C, and children inherit that.
                 _after(_HEARS_INTERRUPTS, arguments),
                 stdin=subprocess.DEVNULL,
                 stdout=file,
@@ -142,7 +142,7 @@ class Background:
         return " ".join(self._log.read_text(errors="replace").split())
 
     def wait_for(self, condition, limit_s=LIMIT_S):
-        """Wait until the condition holds, of the command's words where it is a string."""
+        """Wait until the condition holds; a string is awaited in the command's output."""
         deadline = time.monotonic() + limit_s
         while not (condition in self.text if isinstance(condition, str) else condition()):
             assert self.process.poll() is None, self.text
@@ -150,17 +150,17 @@ class Background:
             time.sleep(0.05)
 
     def interrupt(self):
-        """Ctrl-C in a terminal: the whole process group hears it."""
+        """Send SIGINT to the whole process group, like Ctrl-C in a terminal."""
         os.killpg(self.process.pid, signal.SIGINT)
         return self.end()
 
     def end(self):
-        return Told(self.process.wait(timeout=LIMIT_S), self.text)
+        return CommandResult(self.process.wait(timeout=LIMIT_S), self.text)
 
 
 @contextlib.contextmanager
 def background(log, *arguments, **changes):
-    """A command in the background, ended with the block."""
+    """Run a command in the background and end it with the block."""
     command = Background(log, arguments, **changes)
     try:
         yield command

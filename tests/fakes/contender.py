@@ -1,11 +1,11 @@
-"""Contender without processes that answers at once."""
+"""Fake contender that answers at once, without processes."""
 
 from embomatrix.bench.peers.contenders import Done
 from embomatrix.rpc.wire.values import Completed
 
 
 class FakeContender:
-    """``news`` maps a chunk's number to its outcome, None for no answer; all other chunks are done."""
+    """Contender whose ``news`` maps a chunk's number to its outcome, None for no answer; all other chunks are done."""
 
     def __init__(self, news):
         self._news = news

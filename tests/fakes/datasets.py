@@ -1,4 +1,4 @@
-"""Datasets in the flat, small enough for commands under test."""
+"""Small datasets in the flat, for tests of commands."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ HELD_OUT = "tidy_up"
 
 
 def write_kitchen_dataset(folder):
-    """Three tasks to train on and one held out, each with the oracle's plan; returns the folder."""
+    """Write three training tasks and one held-out task with the oracle's plans; returns the folder."""
     scene = kitchen_scene()
     tasks = {task.task_id: task for task in kitchen_tasks(scene)}
     bundle = Bundle(scene, tasks)
@@ -39,7 +39,7 @@ def write_kitchen_dataset(folder):
 
 
 def write_flats_dataset(folder, count, plans):
-    """The flat ``count`` times, under as many names, with a task for each of ``plans``, text by task id."""
+    """Write ``count`` copies of the flat under different names, with a task for each of ``plans`` (text by task id)."""
     records, bundles = [], {}
     for number in range(count):
         scene = replace(kitchen_scene(), scene_id=f"flat_{number}")

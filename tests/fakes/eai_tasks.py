@@ -1,4 +1,4 @@
-"""EAI's tasks in the scenes that they were written for, in as many layouts as an import tries there."""
+"""EAI's tasks in their own scenes, in as many layouts as an import tries."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from embomatrix.factory.task_import.task import ImportedTask
 
 
 def in_its_scene(source, base, library):
-    """The task as it is laid out, and with its plan, in the first layout that is solved. AssertionError where none is."""
+    """Return the task with its oracle plan in the first solvable layout. Raises AssertionError if there is none."""
     refusals = []
     for imported in imports(source, [base], seed=0, options=ImportOptions(), draws=OWN_SCENE_DRAWS):
         found = verify(imported, library, None) if isinstance(imported, ImportedTask) else imported

@@ -1,10 +1,10 @@
-"""Executor of an evaluation's plans in this process, with the code of the local processes."""
+"""In-process executor for evaluation plans, with the code of the local worker processes."""
 
 from embomatrix.worker.slots.rollout_pool import execute_scene
 
 
 class HereExecutor:
-    """Executes every rollout at once; ``executed`` counts them."""
+    """Executor that runs every rollout at once; ``executed`` counts the rollouts."""
 
     def __init__(self, folder):
         self.folder = folder

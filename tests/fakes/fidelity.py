@@ -1,5 +1,7 @@
-"""Stand-ins for the physical mode that differ from the cached one in ways known beforehand. Functions of a module: processes
-that are spawned find them by name."""
+"""Physical-mode actors with known differences from the cached mode.
+
+They are module functions because spawned processes find them by name.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class ClumsyActor(CachedActor):
-    """Never gets a switch pressed."""
+    """Actor that fails to press every switch."""
 
     def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
         if call.skill is Skill.TOGGLE_ON:
@@ -35,7 +37,7 @@ class ClumsyActor(CachedActor):
 
 
 class SloppyActor(CachedActor):
-    """Places things as it should, after which they lie in the far corner of the kitchen."""
+    """Actor that places objects correctly and then moves them to the far corner of the kitchen."""
 
     def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
         held = world.carried[:1]
@@ -46,7 +48,7 @@ class SloppyActor(CachedActor):
 
 
 class DyingActor(CachedActor):
-    """Takes the process with it when it opens something."""
+    """Actor that kills its process when it opens an object."""
 
     def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
         if call.skill is Skill.OPEN:
@@ -55,7 +57,7 @@ class DyingActor(CachedActor):
 
 
 class HangingActor(CachedActor):
-    """Never comes back from opening something."""
+    """Actor that hangs when it opens an object."""
 
     def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
         if call.skill is Skill.OPEN:
@@ -64,7 +66,7 @@ class HangingActor(CachedActor):
 
 
 class RaisingActor(CachedActor):
-    """Breaks down with an error when it opens something."""
+    """Actor that raises an error when it opens an object."""
 
     def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
         if call.skill is Skill.OPEN:

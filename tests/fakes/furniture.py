@@ -1,4 +1,4 @@
-"""Hand-made assets with round numbers: the geometry that tests can reckon with in their heads."""
+"""Hand-made assets with round dimensions, which keep the expected values of tests simple."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def top_of(size: Vec3, clearance_m: float = 1.0) -> SupportSurface:
 
 
 def block(category: str, synset: str, size: Vec3, abilities: Mapping[str, Mapping[str, float]]) -> Asset:
-    """A solid box with a support on top: counters, stoves."""
+    """Solid box with a support on top: counters, stoves."""
     return asset(
         category,
         synset,
@@ -66,7 +66,7 @@ def block(category: str, synset: str, size: Vec3, abilities: Mapping[str, Mappin
 
 
 def table(category: str, synset: str, size: Vec3) -> Asset:
-    """A board on four legs: things go on it and under it."""
+    """Board on four legs with space above and below."""
     x, y, z = size
     board = box((0, 0, z / 2 - 0.02), (x, y, 0.04))
     leg = z - 0.04
@@ -87,7 +87,7 @@ def cupboard(
     mass_kg: float = 40.0,
     abilities: Mapping[str, Mapping[str, float]],
 ) -> Asset:
-    """A carcass of panels with evenly spaced boards inside and one hinged door; opening it swings it outwards by 90 degrees."""
+    """Carcass of panels with evenly spaced boards inside and one hinged door, which swings outwards by 90 degrees."""
     x, y, z = size
     t = PANEL_M
     depth = x - t  # the door takes the rest
@@ -123,7 +123,7 @@ def cupboard(
 
 
 def open_shelf(category: str, synset: str, size: Vec3, boards: int) -> Asset:
-    """Boards between two sides and a back, open in front: what lies on a board is on top of the shelf, and inside it."""
+    """Boards between two sides and a back, open in front. Objects on a board are on top of the shelf and inside it."""
     x, y, z = size
     t = PANEL_M
     panels = [
@@ -156,7 +156,7 @@ def tub(
     mass_kg: float,
     abilities: Mapping[str, Mapping[str, float]],
 ) -> Asset:
-    """A box without a lid: bowls, and sinks with a thick floor."""
+    """Box without a lid: bowls, and sinks with a thick floor."""
     x, y, z = size
     w = wall_m
     panels = [
@@ -185,7 +185,7 @@ def apple() -> Asset:
 
 
 def chicken_leg() -> Asset:
-    """A hull that is wider in the middle than at its flat bottom and top."""
+    """Hull that is wider in the middle than at its flat bottom and top."""
     size = (0.14, 0.06, 0.05)
     rings = ((-0.025, 0.8), (0.0, 1.0), (0.025, 0.8))
     vertices = tuple((sx * 0.07 * k, sy * 0.03 * k, z) for z, k in rings for sx in (-1, 1) for sy in (-1, 1))
@@ -268,7 +268,7 @@ def bowl() -> Asset:
 
 
 def drawer_cabinet() -> Asset:
-    """A carcass 0.5 m deep, 0.6 m wide and 0.5 m high, open in front, with two drawers that come out by 0.36 m."""
+    """Carcass 0.5 m deep, 0.6 m wide and 0.5 m high, open in front, with two drawers that slide out by 0.36 m."""
     size = (0.5, 0.6, 0.5)
     x, y, z = size
     t, w = PANEL_M, 0.01

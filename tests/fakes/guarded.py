@@ -1,4 +1,4 @@
-"""A manager that asks for tokens and speaks TLS, as `embomatrix manager init` prepares it, in this process."""
+"""In-process manager with tokens and TLS, configured like `embomatrix manager init`."""
 
 import asyncio
 import contextlib
@@ -40,7 +40,7 @@ class Guarded:
 
 @contextlib.asynccontextmanager
 async def guarded(data_dir: Path, **changes):
-    """Prepared once for the folder, and served as often as one likes; other options are those of the manager."""
+    """Prepare the folder once and serve a manager from it; other options are the manager's."""
     prepare(data_dir, sans=("127.0.0.1",), roles=tuple(AccessRole))
     folder = AccessFolder(data_dir)
     options = {
@@ -56,7 +56,7 @@ async def guarded(data_dir: Path, **changes):
 
 
 def packed(content):
-    """A bundle that nothing but its limits says anything about, and its digest."""
+    """Return the digest and the bytes of a bundle with this content."""
     data = zlib.compress(content.encode())
     return bundle_digest(data), data
 
@@ -88,7 +88,7 @@ def worker(at, name, **options):
 
 
 async def joined(at, name, **options):
-    """A worker that joined with a token of its own."""
+    """Return a worker that joined with a dedicated token."""
     return worker(at, name, join_token=await at.issue(AccessRole.JOIN), **options)
 
 

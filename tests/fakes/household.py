@@ -1,4 +1,4 @@
-"""The flat with what is needed to cut, clean and soak: a knife, cloths, dirty things, a dishwasher, soap, fruit with halves."""
+"""The flat with objects for cutting, cleaning and soaking: knife, cloths, dishwasher, soap, halves of fruit."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ COVERED, FILLED = SubstanceRelation.COVERED, SubstanceRelation.FILLED
 def small(
     category: str, synset: str, size: tuple[float, float, float], **abilities: Mapping[str, float]
 ) -> Asset:
-    """A light block."""
+    """Return a light block."""
     return replace(make.block(category, synset, size, abilities), mass_kg=0.3, supports=())
 
 
@@ -84,7 +84,7 @@ def dishwasher() -> Asset:
 
 
 def household_scene() -> Scene:
-    """The kitchen scene with twelve more things, two of them absent: the halves of the melon."""
+    """Return the kitchen scene with twelve more objects, two of them absent: the halves of the melon."""
     kitchen = "kitchen_0"
     board = "breakfast_table_1"
     washer, bottle, half = dishwasher(), soap_bottle(), half_melon()

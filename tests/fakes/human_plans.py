@@ -1,4 +1,4 @@
-"""EAI's human plans in our world's words: for two hands and a graph without places there, for one arm here."""
+"""Conversion of EAI's human plans, which assume two hands and a graph without positions, to our one-armed skills."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ FLOOR = "room_floor"
 STATES = {"OPEN": Skill.OPEN, "TOGGLE_ON": Skill.TOGGLE_ON, "TOGGLE_OFF": Skill.TOGGLE_OFF}
 
 
-class UntoldError(Exception):
-    """A step has no word in our skills; the message is the step's."""
+class InexpressibleError(Exception):
+    """A step has no equivalent among our skills. The message names the step."""
 
 
 class OneArm:
-    """Reads a plan step by step. What two hands take is picked up when it is put down or used, one after the other.
+    """Converter that reads a plan step by step.
 
-    Doors are closed once nothing is left to be picked up from behind them.
+    Objects that two hands take are picked up one after the other, when they are put down or used. Doors are closed once
+    no object behind them is still to be picked up.
     """
 
     def __init__(self, table, ours, homes):
@@ -34,13 +35,13 @@ class OneArm:
         self._shut = []
         self.deeds = []
 
-    def read(self, action, told):
+    def read(self, action, arguments):
         hand, _, deed = action.partition("_")
         if hand not in self._hands:
             hand, deed = "", action
-        if told.startswith(FLOOR) and told not in self._ours:
-            deed = "RELEASE"  # a floor that no goal is about is none of our objects: just somewhere to leave things
-        names = [] if deed == "RELEASE" else [self._name(name) for name in told.split(", ")]
+        if arguments.startswith(FLOOR) and arguments not in self._ours:
+            deed = "RELEASE"  # a floor outside the goals is not in our table: the object is only released
+        names = [] if deed == "RELEASE" else [self._name(name) for name in arguments.split(", ")]
         match deed:
             case "GRASP":
                 self._hands[hand] = names[0]
@@ -55,7 +56,7 @@ class OneArm:
                 self._shut.append(names[0])
             case _ if deed in STATES:
                 self._lay_down()
-                self._send(STATES[deed], names[0])
+                self._append_call(STATES[deed], names[0])
             case "SLICE" | "CLEAN":
                 self._use(Skill.SLICE if deed == "SLICE" else Skill.CLEAN, names[0])
             case "SOAK":
@@ -63,7 +64,7 @@ class OneArm:
             case "UNFREEZE":
                 pass  # none of our skills thaws, and no goal of these tasks asks for it
             case _:
-                raise UntoldError(action)
+                raise InexpressibleError(action)
         self._close_what_is_done()
 
     def end(self):
@@ -73,63 +74,64 @@ class OneArm:
 
     def _name(self, theirs):
         if theirs not in self._ours:
-            raise UntoldError(theirs)
+            raise InexpressibleError(theirs)
         return self._ours[theirs]
 
-    def _say(self, skill, name, source="", relation=None):
+    def _append_call(self, skill, name, source="", relation=None):
         at = self._row[source] if source else None
         self.deeds.append(SkillCall(skill, object_index=self._row[name], source_index=at, relation=relation))
 
     def _take(self, name):
         if self._arm != name:
             self._lay_down()
-            self._send(Skill.PICK_UP, name)
+            self._append_call(Skill.PICK_UP, name)
             self._arm = name
 
     def _lay_down(self):
-        """Put what the arm holds back to where it was last; on the first step that is where it came from."""
+        """Return the held object to its last position; on the first step, to its initial position."""
         if self._arm:
             host, relation = self._home.get(self._arm, ("", None))
             if not host:
-                raise UntoldError("nowhere to lay a tool down")
-            self._send(Skill.PLACE, host, relation=relation)
+                raise InexpressibleError("nowhere to lay a tool down")
+            self._append_call(Skill.PLACE, host, relation=relation)
             self._arm = ""
 
     def _place(self, hand, target, relation):
         name = self._hands[hand]
         if not name:
-            raise UntoldError("an empty hand")
+            raise InexpressibleError("an empty hand")
         self._take(name)
-        self._send(Skill.PLACE, target, relation=relation)
+        self._append_call(Skill.PLACE, target, relation=relation)
         self._home[name] = (target, relation)
         self._hands[hand] = self._arm = ""
 
     def _use(self, skill, name):
         tool = next((held for held in self._hands.values() if held not in ("", name)), "")
         if not tool:
-            raise UntoldError("a tool that lies in a sink")
+            raise InexpressibleError("a tool that lies in a sink")
         self._take(tool)
-        self._send(skill, name, source=tool)
+        self._append_call(skill, name, source=tool)
 
     def _soak(self, name):
         source = self._home.get(name, ("", None))[0]
         if not source:
-            raise UntoldError("SOAK outside of a sink")
+            raise InexpressibleError("SOAK outside of a sink")
         self._take(name)
-        self._send(Skill.SOAK, name, source=source)
+        self._append_call(Skill.SOAK, name, source=source)
 
     def _close_what_is_done(self):
         if not any(self._hands.values()):
             for name in self._shut:
                 self._lay_down()
-                self._send(Skill.CLOSE, name)
+                self._append_call(Skill.CLOSE, name)
             self._shut = []
 
 
 def from_eai(text, table, names, homes):
-    """A human plan's deeds in our skills. ``names``: EAI's names by ours; ``homes``: what things rest on or in at the start.
+    """Convert a human plan's steps to our skills.
 
-    Raises UntoldError for a step that our skills have no word for: to put something next to something, above all.
+    ``names``: EAI's names by ours; ``homes``: initial support or container of each object. Raises InexpressibleError for a
+    step without an equivalent skill, mostly "put next to".
     """
     arm = OneArm(table, {theirs: ours for ours, theirs in names.items()}, homes)
     for step in json.loads(text):

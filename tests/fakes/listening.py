@@ -1,4 +1,4 @@
-"""Waiting for a process that is to serve."""
+"""Wait for a server process to accept connections."""
 
 import contextlib
 import socket
@@ -8,7 +8,7 @@ import pytest
 
 
 def until_listening(address, limit_s=60.0):
-    """Until somebody listens at HOST:PORT."""
+    """Wait until HOST:PORT accepts a connection."""
     host, _, port = address.partition(":")
     deadline = time.monotonic() + limit_s
     while time.monotonic() < deadline:

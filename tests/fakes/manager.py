@@ -1,4 +1,4 @@
-"""A manager for the worker's tests: gives the leases it is told to, keeps what comes back, and breaks on request."""
+"""Manager for the worker's tests: grants scripted leases, records results and breaks connections on request."""
 
 import asyncio
 import contextlib
@@ -24,9 +24,10 @@ from embomatrix.world.inflation import bundle_digest
 
 @dataclass
 class FakeManager(worker_service_pb2_grpc.WorkerServiceServicer):
-    """One worker's manager. ``results`` keeps every result that ever arrived, ``states`` every full state.
+    """Manager of one worker.
 
-    ``deliveries`` counts the messages that brought results.
+    ``results`` keeps every received result, ``states`` every full state. ``deliveries`` counts the messages with
+    results.
     """
 
     acknowledging: bool = True
@@ -59,7 +60,7 @@ class FakeManager(worker_service_pb2_grpc.WorkerServiceServicer):
         return lease.ref
 
     def leases(self, count, digest):
-        """So many in one message."""
+        """Send several leases in one message."""
         rollouts = (Rollout(f"l{number}", "g", digest, "ok", (), 1) for number in range(count))
         leases = (Lease(LeaseRef(one.rollout_id, self.epoch), one, 60.0) for one in rollouts)
         self.outgoing.put_nowait(pb.SessionResponse(leases=list(map(lease_to_proto, leases))))
@@ -105,8 +106,8 @@ class FakeManager(worker_service_pb2_grpc.WorkerServiceServicer):
             if not self.answering_heartbeats:
                 await asyncio.sleep(60)
             self.renewed.append([ref.lease_id for ref in request.running])
-            for told in request.progress:
-                self.steps.setdefault(told.ref.lease_id, []).append(told.steps)
+            for reported in request.progress:
+                self.steps.setdefault(reported.ref.lease_id, []).append(reported.steps)
             return pb.HeartbeatResponse(next_interval_s=0.1)
 
     async def Session(self, request_iterator, context):

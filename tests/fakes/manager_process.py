@@ -1,4 +1,4 @@
-"""A manager as a process of its own, with settings that the command line does not offer: ``python manager_process.py JSON``."""
+"""Manager process with settings that the command line does not offer: ``python manager_process.py JSON``."""
 
 import asyncio
 import logging

@@ -1,4 +1,4 @@
-"""Other libraries, each in a virtual environment of its own: their pins clash with ours, and with one another's."""
+"""Other libraries in dedicated virtual environments: their pins conflict with ours and with one another's."""
 
 import os
 import shutil
@@ -22,7 +22,7 @@ PHYSICS = ("pybullet==3.2.7", "scipy>=1.11")
 
 
 class Peer:
-    """A library's environment below $EMBOMATRIX_PEERS, else the user's cache; made when it is first asked for."""
+    """Virtual environment of a library below $EMBOMATRIX_PEERS or the user's cache; created on first use."""
 
     def __init__(self, name, *packages):
         folder = os.environ.get("EMBOMATRIX_PEERS") or Path.home() / ".cache" / "embomatrix" / "peers"
@@ -38,7 +38,7 @@ class Peer:
             ready.write_text(wanted)
 
     def run(self, *arguments, limit_s=600, **environment):
-        """Run Python there on our sources; returns what it printed. What it says as it fails is the test's message."""
+        """Run Python there with our sources and return its output. A failure raises with that output."""
         paths = os.pathsep.join(map(str, [*ROOTS, ROOT]))
         settings = {**os.environ, "PYTHONPATH": paths, "HF_HUB_OFFLINE": "1", **environment}
         done = subprocess.run(

@@ -1,4 +1,4 @@
-"""Plans in words, tasks over a scene, and the flat with more things in it: what tests of the executor are written with."""
+"""Plans in words, tasks over a scene, and the flat with extra objects, for tests of the executor."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NOTHING = And(())
 
 
 def task_over(scene: Scene, goal: Formula = NOTHING, task_id: str = "test") -> Task:
-    """Task whose table holds every object of the scene, in its order."""
+    """Return a task whose table lists every object of the scene in its order."""
     types = {
         synset: tuple(item.name for item in scene.objects if scene.assets[item.asset_id].synset == synset)
         for synset in sorted({asset.synset for asset in scene.assets.values()})
@@ -39,7 +39,7 @@ def task_over(scene: Scene, goal: Formula = NOTHING, task_id: str = "test") -> T
 
 
 def plan_of(task: Task, text: str) -> Plan:
-    """Calls separated by semicolons, objects by their names: ``move fridge_1; open fridge_1``."""
+    """Parse calls separated by semicolons, with objects by name: ``move fridge_1; open fridge_1``."""
     calls = [
         " ".join(str(task.index_of.get(word, word)) for word in call.split()) for call in text.split(";")
     ]
@@ -47,7 +47,7 @@ def plan_of(task: Task, text: str) -> Plan:
 
 
 def words_of(plan: Plan, task: Task) -> str:
-    """The inverse of ``plan_of`` for calls on objects."""
+    """Format calls on objects as ``plan_of`` parses them."""
     calls = []
     for call in plan:
         words = [call.skill.value]
@@ -58,7 +58,7 @@ def words_of(plan: Plan, task: Task) -> str:
 
 
 def with_objects(scene: Scene, extra: Iterable[tuple[SceneObject, Asset]]) -> Scene:
-    """The scene with more objects at its end."""
+    """Return the scene with more objects appended."""
     items = list(extra)
     return replace(
         scene,
@@ -68,7 +68,7 @@ def with_objects(scene: Scene, extra: Iterable[tuple[SceneObject, Asset]]) -> Sc
 
 
 def awkward_scene() -> Scene:
-    """The flat with one thing for every way in which a call can fail that the plain flat lacks."""
+    """Return the flat with one object for each failure reason that the plain flat can't produce."""
     kitchen, living = "kitchen_0", "living_room_0"
     anvil = replace(make.block("anvil", "anvil.n.01", (0.2, 0.1, 0.1), {}), mass_kg=30.0)
     chest = make.block("chest", "chest.n.01", (0.5, 0.5, 0.5), {})
@@ -98,13 +98,13 @@ def awkward_scene() -> Scene:
 
 
 def executed(simulator: Simulator, text: str, goal: Formula = NOTHING, seed: int = 0) -> Trace:
-    """Trace of a plan in words. The facts of the state reached are the simulator's."""
+    """Return the trace of a plan in words. The simulator then holds the final state."""
     task = task_over(simulator.world.scene, goal)
     return simulator.execute(task, plan_of(task, text), seed)
 
 
 def executed_alone(scene: Scene, text: str) -> Trace:
-    """Trace of a plan in words, in a simulator of its own."""
+    """Return the trace of a plan in words from a dedicated simulator."""
     simulator = load_simulator(Bundle(scene, {}))
     try:
         return executed(simulator, text)

@@ -27,10 +27,10 @@ def build_pose_cache(
     engine: PhysicsEngine | None = None,
     library: PlacementLibrary | None = None,
 ) -> PoseCache:
-    """Verified placements for every movable and every support, and standing poses for all of them.
+    """Return verified placements of every movable object on every support, and standing poses for all of them.
 
-    ``engine`` must hold this scene in its initial state; without one the scene is loaded. Pairs without a stable pose have no
-    entry. Raises EngineError for an invalid scene, KeyError for an unknown name.
+    ``engine`` must hold this scene in its initial state; without an engine the scene is loaded. Pairs without a stable
+    pose have no entry. Raises EngineError for an invalid scene, KeyError for an unknown name.
     """
     with contextlib.ExitStack() as owned:
         if library is None:

@@ -1,4 +1,4 @@
-"""BDDL as other worlds write it, for tests of the import."""
+"""BDDL of other simulators, for tests of the import."""
 
 from typing import Final
 
@@ -36,5 +36,5 @@ PROBLEM: Final = """(define (problem Put_the_apples_in_the_fridge_in_kitchen_0)
 
 
 def source(text: str = PROBLEM) -> SourceText:
-    """The problem as a file named ``apples`` gives it."""
+    """Return the problem as read from a file named ``apples``."""
     return SourceText("apples", text, "file")

@@ -1,6 +1,6 @@
-"""A line between a worker and the manager that can be cut in either direction, and healed, without closing a connection.
+"""Proxy between a worker and the manager that drops either direction without closing connections.
 
-What is sent into a cut line is held back, as TCP does when its packets are lost: it arrives when the line is healed.
+Data for a cut direction is held back until the line is restored, like TCP under packet loss.
 """
 
 import asyncio
@@ -11,7 +11,7 @@ TO_WORKER = "to the worker"
 
 
 class Proxy:
-    """Async context manager; ``address`` is where the worker shall dial."""
+    """Async context manager; the worker connects to ``address``."""
 
     def __init__(self, manager_port):
         self._manager_port = manager_port

@@ -1,4 +1,4 @@
-"""A worker that executes nothing, as a process of its own: ``python quick_worker_process.py MANAGER NAME SLOTS EXECUTE_S``."""
+"""Null worker as a process: ``python quick_worker_process.py MANAGER NAME SLOTS EXECUTE_S``."""
 
 import asyncio
 import os

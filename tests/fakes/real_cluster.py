@@ -1,4 +1,4 @@
-"""A cluster of real processes, started, killed and counted by a test."""
+"""Cluster of real processes that a test starts, kills and counts."""
 
 import asyncio
 import collections
@@ -27,7 +27,7 @@ DIGEST = bundle_digest(SCENE)
 
 
 class RealCluster:
-    """Context manager: whatever still runs at its end is killed. ``settings`` are those of every manager."""
+    """Context manager that kills all remaining processes at its end. ``settings`` apply to every manager."""
 
     def __init__(self, folder, **settings):
         self.folder = folder
@@ -47,7 +47,7 @@ class RealCluster:
 
     @property
     def address(self):
-        """Addresses of all started managers, separated by commas."""
+        """Return the addresses of all started managers, separated by commas."""
         return ",".join(f"127.0.0.1:{port}" for port in self.ports.values())
 
     def start_manager(self, name="manager", **settings):
@@ -63,21 +63,21 @@ class RealCluster:
         self._start(name, str(FAKES / "manager_process.py"), json.dumps(chosen))
 
     def start_worker(self, name, slots=2, manager="", lies=0.0, **wishes):
-        """A daemon with the simulation that needs no physics, which notes each execution as it begins.
+        """Start a daemon with the physics-free simulation, which records the start of each execution.
 
-        It makes a reward up for the share ``lies`` of its rollouts.
+        The daemon fabricates the reward of the share ``lies`` of its rollouts.
         """
         arguments = (manager or self.address, name, str(self.folder / name), str(slots))
         self._start(name, str(FAKES / "worker_process.py"), *arguments, json.dumps(wishes), str(lies))
 
     def type_at(self, name):
-        """The owner of this worker's machine types something, now."""
+        """Simulate input of the owner at this worker's machine, now."""
         terminal = self.folder / name / "devices" / "pts" / "0"
         terminal.parent.mkdir(parents=True, exist_ok=True)
         terminal.touch()
 
     def start_quick_worker(self, name, slots=4, execute_s=0.01):
-        """A worker that only pretends to execute: as many rollouts as the manager can take."""
+        """Start a null worker, which accepts as many rollouts as the manager can dispatch."""
         arguments = (self.address, name, str(slots), str(execute_s))
         self._start(name, str(FAKES / "quick_worker_process.py"), *arguments)
 
@@ -87,16 +87,16 @@ class RealCluster:
         self._start(name, "-m", "embomatrix.cli", "worker", "run", *arguments, cache)
 
     def start_program(self, name, *command):
-        """A worker in another language, at the first manager: the address and its name follow the command."""
+        """Start a worker in another language for the first manager; appends address and name to the command."""
         self._run(name, *map(str, command), self.address, name)
 
     def start_trainer(self, name, batch, task, out):
-        """A trainer that submits or asks for the batch, and notes in the file ``out`` what it read."""
+        """Start a trainer that submits or resumes the batch and writes each result to the file ``out``."""
         arguments = (self.address, batch.run_id, str(len(batch.rollouts)), task, str(out))
         self._start(name, str(FAKES / "trainer_process.py"), *arguments)
 
     def signal(self, name, number=signal.SIGKILL):
-        """Send a signal; a process that is killed is waited for. Returns the wall clock."""
+        """Send a signal and return the wall-clock time. Waits for the end of a killed process."""
         process = self.processes[name]
         process.send_signal(number)
         at_s = time.time()
@@ -109,7 +109,7 @@ class RealCluster:
         return (self.folder / f"{name}.log").read_text()
 
     def logged_s(self, name, pattern, after_s):
-        """Wall clock of the first line of a manager's log after ``after_s`` that has the pattern; None for no such."""
+        """Return the wall-clock time of the manager's first log line after ``after_s`` that matches; None without one."""
         for line in self.log(name).splitlines():
             found = re.match(r"(\d+\.\d+) (.*)", line)
             if found and float(found[1]) >= after_s and re.search(pattern, found[2]):
@@ -117,7 +117,7 @@ class RealCluster:
         return None
 
     def executed(self):
-        """Count how often each rollout was started on a daemon."""
+        """Count the starts of each rollout on the daemons."""
         return collections.Counter(self.executions.read_text().split())
 
     def client(self, **options):
@@ -135,7 +135,7 @@ class RealCluster:
 
 
 async def connected(client, *names, limit_s=60.0):
-    """Wait until these workers are ready; returns how many seconds that took."""
+    """Wait until these workers are ready and return the seconds that it took."""
     began_s = time.monotonic()
     async with asyncio.timeout(limit_s):
         while True:
@@ -148,7 +148,7 @@ async def connected(client, *names, limit_s=60.0):
 
 @contextlib.asynccontextmanager
 async def two_workers(folder, **settings):
-    """A cluster with the workers ``w1`` and ``w2`` ready, and a client of it."""
+    """Start a cluster with the ready workers ``w1`` and ``w2``, and a client."""
     with RealCluster(folder, **settings) as cluster:
         cluster.start_manager()
         for name in ("w1", "w2"):
@@ -159,7 +159,7 @@ async def two_workers(folder, **settings):
 
 
 async def until(condition, limit_s=60.0):
-    """Wait for what other processes and tasks bring about."""
+    """Wait until other processes and tasks make the condition true."""
     async with asyncio.timeout(limit_s):
         while not condition():  # noqa: ASYNC110
             await asyncio.sleep(0.01)
@@ -174,13 +174,13 @@ def batch_of(run_id, count, task="ok", batch_id="b1", group=8):
 
 
 async def opened(client, run_id="run", **options):
-    """A run whose only scene the manager has."""
+    """Open a run and upload its only scene."""
     await client.put_bundles({DIGEST: SCENE})
     return await client.open_run("reliability", run_id, **options)
 
 
 async def outcomes(client, batch, *, then=lambda count: None, deadline_s=120.0):
-    """Every result of the batch, in the order in which they came; ``then`` is told how many there are after each."""
+    """Return every result of the batch in order of arrival. Calls ``then`` with the count after each result."""
     results = []
     async for result in client.execute(batch, deadline_s=deadline_s):
         results.append(result)
@@ -190,7 +190,7 @@ async def outcomes(client, batch, *, then=lambda count: None, deadline_s=120.0):
 
 @dataclass(frozen=True)
 class Tally:
-    """Outcomes of a batch as its trainer received them."""
+    """Outcomes of a batch as received by its trainer."""
 
     submitted: int
     delivered: int
@@ -204,7 +204,7 @@ class Tally:
 
 
 def tally(batch, results, reward=30.7):
-    """``reward`` is what the simulation gives for every rollout, or a function of the rollout's id: any other is fabricated."""
+    """Count the outcomes. ``reward`` is the true reward or a function of the rollout id; other values are fabricated."""
     counts = collections.Counter(result.rollout_id for result in results)
     expected = reward if callable(reward) else lambda _: reward
     assert set(counts) <= {rollout.rollout_id for rollout in batch.rollouts}
@@ -221,7 +221,7 @@ def tally(batch, results, reward=30.7):
     )
 
 
-def tell(name, counted, **figures):
+def print_figures(name, counted, **figures):
     """Print the figures of a test, for the table in docs/reliability.md."""
     parts = {**vars(counted), **figures}
     text = " ".join(

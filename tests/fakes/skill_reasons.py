@@ -1,4 +1,4 @@
-"""Failure reasons that each skill can report, for tests that hold the simulator to them."""
+"""Failure reasons that each skill can report, for comparison with the simulator."""
 
 from embomatrix.skills.check import RULES
 from embomatrix.skills.failure import FailureReason
@@ -20,7 +20,7 @@ MISHAPS = {
 
 
 def reasons_of(skill):
-    """Return every reason with which a call of the skill can fail."""
+    """Return every failure reason that a call of the skill can report."""
     entry = LIBRARY[skill]
     refused = frozenset(reason for item in entry.preconditions for reason in RULES[item].reasons)
     return refused | frozenset(entry.outcomes) | frozenset(MISHAPS[skill])

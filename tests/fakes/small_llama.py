@@ -1,4 +1,4 @@
-"""A Llama of a few thousand random weights and a tokenizer of whole words: what Hugging Face policies are tested with."""
+"""Llama with a few thousand random weights and a whole-word tokenizer, for tests of Hugging Face policies."""
 
 import torch
 
@@ -7,7 +7,7 @@ from embomatrix.trainer.policy.prompts import plan_text
 
 
 def word_tokenizer(tasks):
-    """Word-level, built here: every word of the tasks' prompts and plans."""
+    """Build a word-level tokenizer over the tasks' prompts and plans."""
     import tokenizers
     from transformers import PreTrainedTokenizerFast
 

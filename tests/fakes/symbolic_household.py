@@ -1,6 +1,6 @@
-"""A household of words: tasks, oracle plans and a cluster that executes plans by symbolic rules, without physics.
+"""Symbolic household: tasks, oracle plans and a cluster that executes plans by rules, without physics.
 
-Deterministic, in memory, with the same asynchronous interface as ``rpc.client.ClusterClient``.
+Deterministic, in memory, with the asynchronous interface of ``rpc.client.ClusterClient``.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ ROOMS = ("kitchen_0", "living_room_0", "bedroom_0")
 
 @dataclass
 class House:
-    """State of one rollout. Objects are called by their rows."""
+    """State of one rollout. Objects are identified by their table rows."""
 
     situation: Situation
     parent: dict[int, tuple[int, Relation]] = field(default_factory=dict)
@@ -164,7 +164,7 @@ class House:
 def run_plan(
     task: TrainingTask, plan: tuple[SkillCall, ...], reward: RewardSettings = PAPER
 ) -> tuple[RewardBreakdown, tuple[Step, ...]]:
-    """Execute until the first failure and score it."""
+    """Execute up to the first failure and score the result."""
     house = House(task.situation)
     steps = []
     for call in plan:
@@ -177,7 +177,7 @@ def run_plan(
 
 
 def make_task(task_id: str, rng: np.random.Generator, objects: int = 16) -> TrainingTask:
-    """A random house with one of three kinds of goal and the plan that reaches it."""
+    """Return a random house with one of three kinds of goal and a plan that reaches it."""
     names = _pick(rng, CONTAINERS, max(2, objects // 6)) + _pick(rng, SURFACES, max(2, objects // 6))
     names += _pick(rng, SWITCHES, 1)
     hosts = [name for name in names if name not in SWITCHES]
@@ -221,17 +221,17 @@ def _goal(rng, names, small, host, is_open, index):
     opened = dict(is_open)
     goal, words, plan = [], [], []
 
-    def carry(thing: str, target: str) -> None:
-        plan.append(SkillCall(Skill.MOVE, object_index=index[thing]))
-        _opened(plan, host[thing], opened, index)
-        plan.append(SkillCall(Skill.PICK_UP, object_index=index[thing]))
+    def carry(carried: str, target: str) -> None:
+        plan.append(SkillCall(Skill.MOVE, object_index=index[carried]))
+        _opened(plan, host[carried], opened, index)
+        plan.append(SkillCall(Skill.PICK_UP, object_index=index[carried]))
         plan.append(SkillCall(Skill.MOVE, object_index=index[target]))
         _opened(plan, target, opened, index)
         inside = target in CONTAINERS
         relation = PlaceRelation.INSIDE if inside else PlaceRelation.ONTOP
         plan.append(SkillCall(Skill.PLACE, object_index=index[target], relation=relation))
-        goal.append(Atom(relation.value, (f"{thing}_1", f"{target}_1")))
-        words.append(f"put the {thing.replace('_', ' ')} {'in' if inside else 'on'} the {target}")
+        goal.append(Atom(relation.value, (f"{carried}_1", f"{target}_1")))
+        words.append(f"put the {carried.replace('_', ' ')} {'in' if inside else 'on'} the {target}")
 
     kind = rng.integers(4)
     if kind == 3:
@@ -242,9 +242,9 @@ def _goal(rng, names, small, host, is_open, index):
         plan.append(SkillCall(Skill.TOGGLE_ON, object_index=index[lamp]))
         return (Atom("toggled_on", (f"{lamp}_1",)),), f"switch on the {lamp}", plan
     things = _pick(rng, small, 2 if kind == 2 else 1)
-    for thing in things:
-        targets = [name for name in names if name not in SWITCHES and name != host[thing]]
-        carry(thing, str(rng.choice(targets)))
+    for carried in things:
+        targets = [name for name in names if name not in SWITCHES and name != host[carried]]
+        carry(carried, str(rng.choice(targets)))
     if kind == 1 and plan[-1].relation is PlaceRelation.INSIDE:
         target = goal[0].args[1]
         goal.append(Not(Atom("open", (target,))))
@@ -260,7 +260,7 @@ def _opened(plan: list[SkillCall], name: str, opened: dict[str, bool], index: di
 
 
 def make_tasks(train: int, heldout: int, *, seed: int = 0, objects: int = 16) -> TaskSet:
-    """Training and held-out tasks from disjoint seeds."""
+    """Return training and held-out tasks from disjoint seeds."""
     made = [
         make_task(f"task-{number}", np.random.default_rng((seed, number)), objects)
         for number in range(train + heldout)
@@ -276,9 +276,9 @@ def make_tasks(train: int, heldout: int, *, seed: int = 0, objects: int = 16) ->
 
 @dataclass
 class SymbolicCluster:
-    """The client's interface over the symbolic rules.
+    """Cluster client over the symbolic rules.
 
-    The infrastructure loses rollouts whose id holds a mark of ``lost``, and with ``lose_first`` one of every batch.
+    Rollouts whose id contains an entry of ``lost`` are lost; ``lose_first`` loses one rollout of every batch.
     """
 
     tasks: TaskSet

@@ -1,4 +1,4 @@
-"""systemd's own check of a unit file."""
+"""Check of a unit file by systemd itself."""
 
 import os
 import shutil
@@ -13,7 +13,7 @@ needs_systemd = pytest.mark.skipif(
 
 
 def assert_valid_unit(path, *, system):
-    """The unit in this file, of the system or of a user, has nothing that systemd warns of."""
+    """Assert that systemd reports no warning about this system or user unit."""
     scope = [] if system else ["--user"]
     result = subprocess.run(
         ["systemd-analyze", "verify", "--man=no", *scope, str(path)],

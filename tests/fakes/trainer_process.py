@@ -1,4 +1,4 @@
-"""A trainer to be killed: ``python trainer_process.py MANAGER RUN COUNT TASK FILE`` notes each result that it read."""
+"""Trainer process to be killed: ``python trainer_process.py MANAGER RUN COUNT TASK FILE`` logs results to FILE."""
 
 import asyncio
 import sys

@@ -1,4 +1,4 @@
-"""One plan before two judges: our simulator, and the graph of EAI. Plans of our world are told in EAI's vocabulary."""
+"""One plan before two judges: our simulator and EAI's graph. Plans are translated into EAI's vocabulary."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
 
 GOING = frozenset({Skill.MOVE, Skill.TURN, Skill.MOVE_FORWARD, Skill.GO_TO_ROOM})
-"""The graph has no places, so that nothing stands for these."""
+"""Skills without a counterpart in the graph, which has no locations."""
 PLACES = {
     PlaceRelation.INSIDE: "RIGHT_PLACE_INSIDE",
     PlaceRelation.ONTOP: "RIGHT_PLACE_ONTOP",
@@ -31,16 +31,16 @@ DEEDS = {
 
 
 class ForeignObjectError(Exception):
-    """A plan handles an object that EAI's task does not have."""
+    """A plan uses an object that EAI's task does not have."""
 
 
 def deeds_of(plan):
-    """The calls that do something, without the ways between them."""
+    """Return the calls that change the state, without moves."""
     return tuple(call for call in plan if call.skill not in GOING)
 
 
 def with_ways(deeds):
-    """The deeds as a plan: a move before each, to what the hand does not hold already."""
+    """Return the calls as a plan, with a move before each call on an object that the hand does not hold."""
     plan = []
     for call in deeds:
         goal = call.source_index if call.skill is Skill.SOAK else call.object_index
@@ -49,9 +49,10 @@ def with_ways(deeds):
 
 
 def in_eai(deeds, table, names):
-    """The deeds as EAI's steps, in JSON. ``names``: EAI's simulator names by ours. Raises ForeignObjectError.
+    """Translate the calls into EAI's steps, as JSON.
 
-    What is put where EAI's task has nothing is let go.
+    ``names``: EAI's simulator names by ours. Raises ForeignObjectError. An object that is put on something unknown to
+    EAI's task is released.
     """
     steps, held = [], None
 
@@ -67,7 +68,7 @@ def in_eai(deeds, table, names):
             case Skill.PLACE:
                 say(PLACES[call.relation], call.object_index)
             case Skill.SOAK:
-                # Ours dips what the hand holds; the graph soaks what lies in a running sink.
+                # Our skill dips the held object; the graph soaks an object that is in a running sink.
                 say("RIGHT_PLACE_INSIDE", call.source_index)
                 say("SOAK", call.object_index)
                 say("RIGHT_GRASP", call.object_index)
@@ -79,7 +80,7 @@ def in_eai(deeds, table, names):
 
 
 def names_of(imported, native):
-    """EAI's simulator names by the names of our scene: the prompt lists each type's instances in their order."""
+    """Return EAI's simulator names by our scene's names: the prompt lists each type's instances in their order."""
     listed = {}
     block = native.prompt[native.prompt.index("Your task:") :].split("interactable objects:")[1]
     for name, category in re.findall(r"\{'name': '([^']+)', 'category': '([^']+)'\}", block):
@@ -95,14 +96,14 @@ def names_of(imported, native):
 
 @dataclass(frozen=True)
 class Mutant:
-    """A plan's deeds with one thing wrong."""
+    """Calls of a plan with one error."""
 
     kind: str
     deeds: tuple
 
 
 def mutants(deeds, rows, rng):
-    """One of each kind: a deed left out, two neighbours swapped, another object of ``rows``."""
+    """Return one mutant of each kind: a missing call, two swapped neighbours, another object of ``rows``."""
     at = int(rng.integers(len(deeds)))
     yield Mutant("drop", (*deeds[:at], *deeds[at + 1 :]))
     if len(deeds) > 1:
@@ -150,10 +151,7 @@ WORDS = {"sliced": PIECES, "CLEAN": TOOLS, "not open": START, "open": START}
 
 
 def cause(trace, verdict):
-    """Cause of a disagreement: our step's reason if ours refuses, their message if theirs does.
-
-    Empty for none that is known.
-    """
+    """Return the cause of a disagreement: our step's reason or their message. Empty if the cause is unknown."""
     if trace.failure is not None and verdict.executed:
         return CAUSES.get(trace.failure, "")
     said = " ".join(verdict.errors.values())

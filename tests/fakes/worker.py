@@ -1,4 +1,4 @@
-"""A worker for the manager's tests: speaks the whole protocol, executes nothing, and misbehaves on request."""
+"""Worker for the manager's tests: speaks the whole protocol, executes nothing, and misbehaves on request."""
 
 import asyncio
 import contextlib
@@ -34,7 +34,7 @@ from embomatrix.rpc.wire.values import (
 
 
 def completed(worker_id="w1", reward=PAPER):
-    """A plan that reached half of its goal."""
+    """Return the outcome of a plan that reached half of its goal."""
     scored = RewardBreakdown(reward.format, reward.relevance_per_object, reward.goal / 2, (), success=False)
     return Completed(scored, (), (), "sha256:trace", worker_id, Timings(execute_s=0.001), warm=True)
 
@@ -108,25 +108,25 @@ class FakeWorker:
         await self.kill()
 
     async def kill(self):
-        """Go without a word, as a process that was killed."""
+        """Disconnect without a message, like a killed process."""
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await self._channel.close()
 
     def report(self, ref, outcome, slot=0):
-        """Send a result, whatever became of its lease; of no slot, as of one that never ran."""
+        """Send a result even if its lease has ended; without a slot, as for a rollout that never ran."""
         self._send(results=[LeaseResult(ref, outcome, slot=slot, held_s=self.execute_s if slot else 0.0)])
 
     def finish_all(self):
-        """Send a result of each lease it holds, in one message; returns how many."""
+        """Send the results of all held leases in one message and return their number."""
         held, self.leases = self.leases, {}
         if held:
             self._send(results=[LeaseResult(lease.ref, completed(self.worker_id)) for lease in held.values()])
         return len(held)
 
     def pause(self, reason):
-        """Take nothing new from now on, or again with an empty reason."""
+        """Report a pause with this reason; an empty reason resumes."""
         self.paused = reason
         self._send(state=self._state())
 

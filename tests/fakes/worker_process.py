@@ -1,9 +1,7 @@
-"""A worker daemon with the simulation that needs no physics.
+"""Worker daemon with the physics-free simulation.
 
-``python worker_process.py MANAGER NAME FOLDER SLOTS [WISHES [LIES]]``.
-
-WISHES are preferences as JSON. Its owner sits at the terminals in FOLDER/devices. LIES is the share of
-its rollouts for which it makes a reward up.
+``python worker_process.py MANAGER NAME FOLDER SLOTS [PREFERENCES [LIES]]``. PREFERENCES are JSON. The owner's terminals
+are in FOLDER/devices. LIES is the share of rollouts with a fabricated reward.
 """
 
 import asyncio

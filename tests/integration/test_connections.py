@@ -43,7 +43,7 @@ async def answer(scope, receive, send):
 
 @contextlib.asynccontextmanager
 async def serving(kind, bound=None, **options):
-    """Yields the port of a server with connections of this kind."""
+    """Yield the port of a server with this kind of connections."""
     server = uvicorn.Server(uvicorn.Config(answer, http=kind, lifespan="off", log_config=None, **options))
     server.capture_signals = contextlib.nullcontext
     bound = bound or socket.create_server(("127.0.0.1", 0))
@@ -57,7 +57,7 @@ async def serving(kind, bound=None, **options):
 
 @contextlib.asynccontextmanager
 async def serving_by_tls(kind, folder):
-    """Yields the port of such a server behind this kind of listener, and what trusts it."""
+    """Yield the port of such a server behind this kind of TLS listener, and the client's trust settings."""
     prepare(folder, sans=())
     access = folder / "access"
     files = {"ssl_certfile": access / "server.pem", "ssl_keyfile": access / "server.key"}
@@ -124,7 +124,7 @@ async def test_pending_handshakes_time_out(tmp_path):
 
 
 async def _shaking_hands(port, trusting):
-    """A connection, as soon as there is a place."""
+    """Open a connection as soon as the server has a free place."""
     async with asyncio.timeout(20):
         while True:
             with contextlib.suppress(OSError):

@@ -38,10 +38,10 @@ async def test_plans_are_scored_in_order_and_unparsable_texts_are_not_executed(t
         answer = await http.post(REWARDS, json=asked("move 3", "I can't.", "open 2", mark="<s>"))
         runs = (await http.get("/api/v1/runs")).json()["items"]
     assert answer.status_code == 200, answer.text
-    told = answer.json()
-    assert told["rewards"] == [pytest.approx(15.7), -1.0, pytest.approx(15.7)]
-    assert told["scores"] == [0.0, 0.0, 0.0]
-    assert {name: len(values) for name, values in told["extra_logs"].items()} == {
+    answered = answer.json()
+    assert answered["rewards"] == [pytest.approx(15.7), -1.0, pytest.approx(15.7)]
+    assert answered["scores"] == [0.0, 0.0, 0.0]
+    assert {name: len(values) for name, values in answered["extra_logs"].items()} == {
         "format": 3,
         "relevance": 3,
         "goal": 3,
@@ -110,14 +110,14 @@ async def test_invalid_json_and_oversized_bodies_are_refused(tmp_path):
 
 async def test_rewards_need_a_trainer_token(tmp_path):
     async with guarded(tmp_path) as at, httpx.AsyncClient(base_url=at.page, verify=False) as http:
-        told = {
+        answered = {
             role: (
                 await http.post(REWARDS, json={}, headers={"authorization": f"Bearer {at.token(role)}"})
             ).status_code
             for role in (AccessRole.WORKER, AccessRole.VIEWER, AccessRole.TRAINER, AccessRole.ADMIN)
         }
         anonymous = await http.post(REWARDS, json={})
-    assert told == {
+    assert answered == {
         AccessRole.WORKER: 403,
         AccessRole.VIEWER: 403,
         AccessRole.TRAINER: 422,

@@ -26,16 +26,16 @@ pytestmark = pytest.mark.timeout(120)
 
 
 def test_serving_beyond_loopback_needs_tls_and_tokens(tmp_path):
-    told = run("manager", "serve", "--host=0.0.0.0", "--port=0", "--http-port=0", f"--data-dir={tmp_path}")
-    assert told.status == 2
-    assert "refusing to serve on 0.0.0.0 without TLS and tokens" in told.text
-    assert f"embomatrix manager init --data-dir {tmp_path} --san HOST" in told.text
+    result = run("manager", "serve", "--host=0.0.0.0", "--port=0", "--http-port=0", f"--data-dir={tmp_path}")
+    assert result.status == 2
+    assert "refusing to serve on 0.0.0.0 without TLS and tokens" in result.text
+    assert f"embomatrix manager init --data-dir {tmp_path} --san HOST" in result.text
 
 
 def test_init_files_are_private_and_never_overwritten(tmp_path):
-    told = run("manager", "init", f"--data-dir={tmp_path}", "--san=lab.example", "--san=10.1.2.3")
-    assert told.status == 0, told.text
-    assert "lab.example" in told.text
+    result = run("manager", "init", f"--data-dir={tmp_path}", "--san=lab.example", "--san=10.1.2.3")
+    assert result.status == 0, result.text
+    assert "lab.example" in result.text
     files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in files}
     assert {name for name, mode in modes.items() if mode != 0o600} == {"ca.pem", "server.pem"}
@@ -80,7 +80,7 @@ async def test_daemon_joins_once_and_then_uses_its_credential(tmp_path):
                     await asyncio.sleep(0.05)
             working.stop()
             await serving
-            # It said that it leaves: nobody waits for the minute after which it would be missed.
+            # The worker announced its departure, so the manager does not wait for the one-minute timeout.
             async with asyncio.timeout(20):
                 while [w.state for w in await viewer.list_workers()] != ["left"]:  # noqa: ASYNC110
                     await asyncio.sleep(0.05)
@@ -91,15 +91,15 @@ async def test_daemon_joins_once_and_then_uses_its_credential(tmp_path):
 
 @pytest.mark.slow
 async def test_spare_pc_joins_with_an_invitation(tmp_path):
-    """The commands of an operator and of the PC's owner, each a process of its own."""
+    """The commands of the operator and of the PC's owner each run as a dedicated process."""
     home = tmp_path / "pc"
     async with guarded(tmp_path / "manager") as at:
         ca = at.folder.ca
         options = (f"--manager={at.address}", f"--token=@{at.folder.token(AccessRole.ADMIN)}", f"--ca={ca}")
-        told = await asyncio.to_thread(
+        result = await asyncio.to_thread(
             run, "manager", "token", "issue", "--role=join", "--label=spare PC", *options
         )
-        invitation = next(word for word in told.text.split() if "@" in word)
+        invitation = next(word for word in result.text.split() if "@" in word)
         worker_run = ("worker", "run", f"--join={invitation}", "--slots=1", "--name=spare")
         folders = (f"--cache-dir={home / 'cache'}", f"--state-dir={home / 'state'}")
         for start in ("first", "second"):

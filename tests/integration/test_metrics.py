@@ -25,7 +25,7 @@ async def scraped(http):
 
 
 async def warmed(client, entries):
-    """Announce these until the manager says that all of them are warm: what comes then is a hit."""
+    """Announce these scenes until the manager reports all of them warm, so that later requests are hits."""
     async with asyncio.timeout(10):
         for version in itertools.count(1):
             if set((await client.announce_lookahead("r1", version, entries)).values()) == {Warmth.WARM}:
@@ -105,5 +105,5 @@ async def test_metrics_page_size_is_bounded(tmp_path):
         for number in range(5):
             await outcomes(client, batch(20, batch_id=f"more-{number}"))
         new = set(await scraped(http)) - set(first)
-    # Operations of the store are as many as its protocol has, and told once they happened.
+    # The store's protocol bounds its operations; each appears once it has happened.
     assert {key[0].rpartition("_")[0] for key in new} <= {"embo_store_op_seconds"}

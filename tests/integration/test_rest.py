@@ -43,7 +43,7 @@ async def test_all_lists_come_from_one_snapshot(tmp_path):
 
 
 async def seen_until(http, true):
-    """The first snapshot of which this is true."""
+    """Return the first snapshot for which this is true."""
     for _ in range(300):
         seen = (await http.get(f"{PREFIX}/snapshot")).json()
         if true(seen):
@@ -84,7 +84,7 @@ async def test_full_disk_is_reported_in_the_health_sentence(tmp_path):
 
 
 async def _hear(client, words):
-    """Until the manager says so of itself."""
+    """Wait until the manager reports this about itself."""
     async with asyncio.timeout(30):
         while True:
             if words in (await client.fleet()).health:
@@ -155,12 +155,12 @@ async def test_invalid_page_parameters_are_refused(tmp_path):
 async def test_commands_are_refused_to_viewers_and_foreign_origins(tmp_path):
     async with manager(tmp_path, token="secret") as at, http_at(at) as http:
         foreign = {"authorization": "Bearer secret", "origin": "https://evil.example"}
-        told = [
+        body = [
             (await http.post(f"{PREFIX}/dispatch/pause", headers=headers)).status_code
             for headers in ({}, {"authorization": "Bearer wrong"}, foreign)
         ]
         own = await http.post(f"{PREFIX}/dispatch/pause", headers={"authorization": "Bearer secret"})
-    assert (told, own.status_code) == ([401, 401, 403], 200)
+    assert (body, own.status_code) == ([401, 401, 403], 200)
 
 
 async def test_event_stream_resumes_after_a_sequence_number(tmp_path):
@@ -222,7 +222,7 @@ async def test_unread_event_streams_delay_nobody(tmp_path):
 
 
 def named_in(text):
-    """Files that the page, or a script of it, asks for."""
+    """Return the files that the page, or one of its scripts, requests."""
     own = re.findall(r'"(/static/[^"]+)"', text)
     return [*own, *(f"/static/{name}" for name in re.findall(r'"\./(\w+\.js)"', text))]
 
@@ -247,7 +247,7 @@ async def test_dashboard_loads_only_its_own_files(tmp_path):
     async with manager(tmp_path, token="secret") as at, http_at(at) as http:
         page = await http.get("/")
         texts = {"/": page}
-        while missing := {path for told in texts.values() for path in named_in(told.text)} - texts.keys():
+        while missing := {path for body in texts.values() for path in named_in(body.text)} - texts.keys():
             texts |= {path: await http.get(path) for path in missing}
         outside = [
             (await http.get(path)).status_code
@@ -255,7 +255,7 @@ async def test_dashboard_loads_only_its_own_files(tmp_path):
         ]
     assert "default-src 'none'" in page.headers["content-security-policy"]
     assert "http" not in page.text.replace("http://www.w3.org", "")
-    assert {told.status_code for told in texts.values()} == {200}
+    assert {body.status_code for body in texts.values()} == {200}
     scripts = {path.removeprefix("/static/") for path in texts if path.endswith(".js")}
     shipped = files("embomatrix.manager.web") / "dashboard"
     assert scripts == {item.name for item in shipped.iterdir() if item.name.endswith(".js")} | {
@@ -269,12 +269,12 @@ async def test_dashboard_loads_only_its_own_files(tmp_path):
 
 async def test_openapi_page_describes_every_answer(tmp_path):
     async with manager(tmp_path) as at, http_at(at) as http:
-        told = (await http.get(f"{PREFIX}/openapi.json")).json()
-        for path, methods in told["paths"].items():
+        body = (await http.get(f"{PREFIX}/openapi.json")).json()
+        for path, methods in body["paths"].items():
             assert path.startswith(PREFIX)
             if "get" in methods and "{" not in path and not path.endswith("stream"):
                 assert (await http.get(path)).status_code == 200
-    assert {"SnapshotPage", "WorkerPage", "Timeline", "Changed"} <= set(told["components"]["schemas"])
+    assert {"SnapshotPage", "WorkerPage", "Timeline", "Changed"} <= set(body["components"]["schemas"])
 
 
 async def test_training_reports_are_shown_after_their_run_closed(tmp_path):
@@ -285,16 +285,16 @@ async def test_training_reports_are_shown_after_their_run_closed(tmp_path):
             await client.report_training("r1", TrainingReport("grpo", step, figures, (plan,)))
         with pytest.raises(NotFoundError, match="nobody"):
             await client.report_training("nobody", TrainingReport("grpo", 1))
-        told = (await http.get(f"{PREFIX}/training/r1")).json()
+        body = (await http.get(f"{PREFIX}/training/r1")).json()
         await client.close_run("r1")
         later = (await http.get(f"{PREFIX}/training/r1")).json()
         unknown = await http.get(f"{PREFIX}/training/nobody")
         listed = (await http.get(f"{PREFIX}/training")).json()
         seen = (await http.get(f"{PREFIX}/snapshot")).json()
-    assert told["phases"] == [{"phase": "grpo", "steps": [1, 2], "figures": {"reward": [1.0, 2.0]}}]
-    assert (told["plans"][0]["instruction"], told["plans_step"]) == ("tidy <b>up</b>", 2)
-    assert later == told
-    assert listed == seen["training"] == [told["run"]]
+    assert body["phases"] == [{"phase": "grpo", "steps": [1, 2], "figures": {"reward": [1.0, 2.0]}}]
+    assert (body["plans"][0]["instruction"], body["plans_step"]) == ("tidy <b>up</b>", 2)
+    assert later == body
+    assert listed == seen["training"] == [body["run"]]
     assert (unknown.status_code, "nobody" in unknown.json()["detail"]) == (404, True)
 
 

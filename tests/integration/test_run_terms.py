@@ -48,7 +48,7 @@ async def open_run(address, policy=GroupPolicy.RETRY_THEN_FAIL_GROUP, run_id="r1
 
 
 def batch_of(*tasks, size=2, run_id="r1"):
-    """Rollouts in groups of so many; a rollout of the task "poison" kills its slot."""
+    """Return rollouts in groups of this size; a rollout of the task "poison" kills its slot."""
     rollouts = tuple(Rollout(f"x{i}", f"g{i // size}", KITCHEN, task, (), i) for i, task in enumerate(tasks))
     return Batch(run_id, "b1", 1, rollouts)
 
@@ -109,18 +109,18 @@ async def test_group_end_is_reported_once_from_any_cursor(tmp_path):
     async with manager(tmp_path) as address, open_run(address) as client, FakeWorker(address, slots=2):
         await events(client, batch_of(*"tttt"))
         for cursor in range(5):
-            told = []
+            reported = []
             request = pb.WaitExecutionRequest(run_id="r1", batch_id="b1", after_cursor=cursor)
             results = 0
             async for answer in client._rollouts.WaitExecution(request, timeout=5):
                 results += len(answer.results)
-                told += [group.group_id for group in answer.groups]
+                reported += [group.group_id for group in answer.groups]
             assert results == 4 - cursor
-            assert len(told) == len(set(told))
+            assert len(reported) == len(set(reported))
             if cursor == 0:
-                assert sorted(told) == ["g0", "g1"]
+                assert sorted(reported) == ["g0", "g1"]
             if cursor == 4:
-                assert told == []
+                assert reported == []
 
 
 async def test_run_terms_survive_a_manager_restart(tmp_path):

@@ -43,13 +43,13 @@ MIB = 1024 * 1024
 
 @dataclass
 class Intruder:
-    """Calls with any token, over any channel; the answer is the status it was refused with, and its sentence."""
+    """Caller with any token over any channel; returns the refusal's status and message."""
 
     address: str
     ca: bytes
 
     async def call(self, method, request, token="", stream=False):
-        # Without our own client's limits: it would not send what the manager has to refuse.
+        # Without our client's limits, which would refuse these requests before the manager can.
         trusted = grpc.ssl_channel_credentials(self.ca)
         metadata = (("authorization", f"Bearer {token}"),) if token else ()
         options = (("grpc.max_send_message_length", -1),)
@@ -64,8 +64,8 @@ class Intruder:
                 else:
                     answers = [await made(request, timeout=10, metadata=metadata)]
             except grpc.aio.AioRpcError as error:
-                told = any(key == ERROR_KEY for key, _ in error.trailing_metadata() or ())
-                return error.code().name, error.details(), told
+                named = any(key == ERROR_KEY for key, _ in error.trailing_metadata() or ())
+                return error.code().name, error.details(), named
         return "OK", answers, True
 
 
@@ -93,12 +93,12 @@ def register(name, **fields):
 
 
 def long_plan(size):
-    """One call that is as long as that."""
+    """Return a plan whose one call has this length."""
     return [types_pb2.SkillCall(skill=types_pb2.SKILL_KIND_GO_TO_ROOM, room_name="k" * size)]
 
 
 async def grpc_cases(at, victim, other):
-    """(what is tried, the documented status, what it answered)."""
+    """Return (attempt, documented status, response) for gRPC calls."""
     viewer, trainer_token = at.token(AccessRole.VIEWER), at.token(AccessRole.TRAINER)
     expired = await at.issue(AccessRole.TRAINER, valid_s=0.05)
     late_join = await at.issue(AccessRole.JOIN, valid_s=0.05)
@@ -238,7 +238,7 @@ async def grpc_cases(at, victim, other):
 
 
 async def bundle_cases(at):
-    """The same for bundles, through the client that a trainer uses; limits are met before all of it is sent."""
+    """Return the same for bundles through a trainer's client; limits apply before the whole bundle is sent."""
     bomb = zlib.compress(bytes(64 * MIB), level=9)
     tries = [
         ("a bomb, 1000 to 1", bomb),
@@ -320,7 +320,7 @@ async def test_a18_unauthorized_calls_are_refused_with_the_documented_code(tmp_p
     assert [(what, status) for what, _, (status, _, _) in table] == [
         (what, expected) for what, expected, _ in table
     ]
-    assert all(told for what, _, (_, _, told) in table if "33 MiB" not in what)
+    assert all(named for what, _, (_, _, named) in table if "33 MiB" not in what)
 
 
 async def test_client_without_trust_sends_no_token(tmp_path):

@@ -1,4 +1,4 @@
-"""The worker's slots with the real engine: equal results wherever they are computed, and a fault costs one rollout."""
+"""Slots of a worker with the real engine: results are independent of the slot, and a fault costs one rollout."""
 
 import asyncio
 import contextlib
@@ -46,7 +46,7 @@ pytestmark = pytest.mark.timeout(120)
 
 @pytest.fixture(scope="module")
 def kitchen():
-    """A bundle as the factory makes it: the flat, its tasks, verified poses and what loading would derive."""
+    """Bundle from the factory: the flat, its tasks, verified poses and the prepared arrays."""
     scene = kitchen_scene()
     tasks = {task.task_id: task for task in kitchen_tasks(scene)}
     movable, supports = ("apple_1", "bowl_1", "mug_1"), ("countertop_1", "shelf_1", "coffee_table_1")
@@ -56,7 +56,7 @@ def kitchen():
 
 
 class Harness:
-    """A pool over a folder of bundles."""
+    """Pool over a folder of bundles."""
 
     def __init__(self, folder, bundle, slots):
         self.folder = folder
@@ -98,7 +98,7 @@ class Harness:
                 await asyncio.sleep(0.005)
 
     def slots(self):
-        """The processes that execute rollouts: the scene's children, which are the root's, which is ours."""
+        """Return the slot processes: children of the scene process, grandchildren of the root process."""
         return [
             slot
             for root in psutil.Process().children()

@@ -90,7 +90,7 @@ async def test_trainer_whose_token_is_revoked_reads_no_further(tmp_path):
             with pytest.raises(NotSignedInError, match="revoked"):
                 async for _ in stream:
                     pass
-        # Nothing of the batch is lost: who may read it attaches.
+        # The batch is complete: a trainer with a valid token attaches to it.
         assert len(await collect(client, 40)) == 40
 
 
@@ -116,7 +116,7 @@ async def test_tokens_and_revocations_survive_a_restart(tmp_path):
 
 
 async def test_standby_knows_the_tokens_after_take_over(tmp_path):
-    """Two managers on one Redis: what the first handed out and took back holds at the second, which stood by with TLS too."""
+    """Two managers on one Redis: tokens issued and revoked by the first hold at the second, which stood by with TLS."""
     with RedisServer(tmp_path / "redis", free_port()) as redis:
         options = {"state": redis.url, "leader_ttl_s": 4.0}
         standby = free_port()

@@ -51,7 +51,7 @@ class Cluster:
         )
 
     def start_worker(self, name, slots=2):
-        """A daemon with the simulation that needs no physics."""
+        """Start a daemon with the physics-free simulation."""
         self._start(
             name, str(FAKES / "worker_process.py"), self.address, name, str(self.folder / name), str(slots)
         )
@@ -64,7 +64,7 @@ class Cluster:
         )
 
     def kill(self, name):
-        """``kill -9``: nothing can be said or tidied."""
+        """Send SIGKILL: the process cannot clean up."""
         process = self.processes.pop(name)
         process.send_signal(signal.SIGKILL)
         process.wait()
@@ -84,7 +84,7 @@ class Cluster:
 
 @contextlib.asynccontextmanager
 async def cluster(folder, *workers, real=False):
-    """A manager and these workers, all connected, and a client of it."""
+    """Start a manager and these connected workers, and a client."""
     made = Cluster(folder)
     try:
         made.start_manager()
@@ -235,7 +235,7 @@ async def test_no_simulator_outlives_a_killed_worker(tmp_path):
 
 
 def _kitchen():
-    """The flat with its tasks as a real bundle, and for each task the plan of a robot that tries something sensible."""
+    """Return the flat with its tasks as a real bundle, and a sensible plan for each task."""
     scene = kitchen_scene()
     tasks = {task.task_id: task for task in kitchen_tasks(scene)}
     movable = [item.name for item in scene.objects if not item.fixed]

@@ -1,4 +1,4 @@
-"""Other trainers' own code on a real cluster: a manager, a worker with physics, and the examples in docs/."""
+"""Adapters of other trainers on a real cluster: a manager, a worker with physics, and the examples in docs/."""
 
 import json
 
@@ -45,7 +45,7 @@ async def cluster(tmp_path):
             yield started, client
 
 
-async def test_trl_trains_on_the_cluster_and_announces_what_comes(cluster, dataset, tmp_path):
+async def test_trl_trains_on_the_cluster_and_announces_the_next_scenes(cluster, dataset, tmp_path):
     started, client = cluster
     peer = Peer("trl", TORCH, "trl==1.16.0")
     peer.run("-c", SMALL_MODEL, tmp_path / "model")
@@ -104,10 +104,10 @@ asyncio.run(main())
 async def test_verifiers_scores_replies(cluster, dataset):
     peer = Peer("verifiers", "verifiers==0.4.0")
     printed = peer.run("-c", VERIFIERS, dataset, EXAMPLES, EMBOMATRIX_MANAGER=cluster[0].address)
-    told = [json.loads(line) for line in printed.splitlines()]
-    assert [each["success"] for each in told] == [1, 1, 1, 0, 0, 0]
-    assert all(each["total"] > 30 for each in told[:3])
-    assert [each["total"] for each in told[3:]] == [-1, -1, -1]
+    rows = [json.loads(line) for line in printed.splitlines()]
+    assert [each["success"] for each in rows] == [1, 1, 1, 0, 0, 0]
+    assert all(each["total"] > 30 for each in rows[:3])
+    assert [each["total"] for each in rows[3:]] == [-1, -1, -1]
 
 
 VERL = """
@@ -142,8 +142,8 @@ async def main():
     rows = verl_rows(sys.argv[1])
     texts = [oracles[row["reward_model"]["ground_truth"]] for row in rows]
     samples = [sample(row, text) for row, text in zip(rows * 2, texts + ["hm"] * len(rows), strict=True)]
-    for told in await asyncio.gather(*(manager.run_single(each) for each in samples)):
-        print(json.dumps({"score": told["reward_score"], **told["reward_extra_info"]}))
+    for scored in await asyncio.gather(*(manager.run_single(each) for each in samples)):
+        print(json.dumps({"score": scored["reward_score"], **scored["reward_extra_info"]}))
 
 asyncio.run(main())
 """
@@ -162,7 +162,7 @@ async def test_verl_s_reward_manager_awaits_the_cluster(cluster, dataset):
     )
     peer = Peer("verl", TORCH, *libraries, "verl==0.9.1")
     printed = peer.run("-c", VERL, dataset, EMBOMATRIX_MANAGER=cluster[0].address)
-    told = [json.loads(line) for line in printed.splitlines() if line.startswith("{")]
-    assert [each["success"] for each in told] == [1, 1, 1, 0, 0, 0]
-    assert all(each["score"] == each["format"] + each["relevance"] + each["goal"] for each in told)
-    assert [each["score"] for each in told[3:]] == [-1, -1, -1]
+    rows = [json.loads(line) for line in printed.splitlines() if line.startswith("{")]
+    assert [each["success"] for each in rows] == [1, 1, 1, 0, 0, 0]
+    assert all(each["score"] == each["format"] + each["relevance"] + each["goal"] for each in rows)
+    assert [each["score"] for each in rows[3:]] == [-1, -1, -1]

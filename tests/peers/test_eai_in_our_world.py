@@ -1,4 +1,4 @@
-"""EAI's hundred goals: those that each profile's skills can reach, and the predicates that block the others."""
+"""EAI's hundred goals: the reachable ones by profile, and the predicates that block the others."""
 
 import collections
 import re
@@ -23,11 +23,11 @@ def problems():
 def blocking(problems, profile):
     """Count the goals that each set of predicates blocks."""
     found = {name: unreachable_atoms(problem, profile) for name, problem in problems.items()}
-    told = []
+    blockers = []
     for atoms in filter(None, found.values()):
         literals = WORD.findall(" ".join(atoms))
-        told.append(", ".join(sorted({"not " * bool(negated) + word for negated, word in literals})))
-    return dict(collections.Counter(told))
+        blockers.append(", ".join(sorted({"not " * bool(negated) + word for negated, word in literals})))
+    return dict(collections.Counter(blockers))
 
 
 def test_fifty_nine_goals_are_within_the_paper_s_skills_and_ninety_nine_within_the_household_s(problems):

@@ -1,6 +1,6 @@
-"""EAI's published judge, run without iGibson: what it says of the human plans, and of plans made wrong by hand.
+"""EAI's published judge, run without iGibson on human plans and on hand-made wrong plans.
 
-The first test makes the judge's own virtual environment (27 MB to fetch) unless EMBOMATRIX_EAI names one.
+The first test creates the judge's virtual environment (27 MB download) unless EMBOMATRIX_EAI names one.
 """
 
 import json
@@ -36,7 +36,7 @@ def exam(judge):
 
 
 def marked(exam, texts):
-    """Marks of one answer for each of these tasks."""
+    """Return the marks of one answer for each of these tasks."""
     setup = EvaluationSetup(exam.name, exam.digest, "all", len(texts), "me", "eai", 60, 1, 0.0, 1, 0)
     answers = [Answer(task_id, 0, text) for task_id, text in texts.items()]
     return exam.judge(setup, answers, lambda *_: None)
@@ -95,14 +95,14 @@ def test_broken_plans_get_the_expected_errors(exam, steps, cause):
 
 
 def test_model_text_is_never_executed(exam, tmp_path):
-    """Handed over as it is, the published parser would run it."""
+    """The published parser would execute this text if it received it unsanitised."""
     trap = tmp_path / "trap"
     text = f'[__import__("pathlib").Path({str(trap)!r}).touch()]'
     assert verdict(exam, text=text).cause is Cause.UNPARSABLE
     assert not trap.exists()
 
 
-def test_even_raw_text_can_not_write_or_start_anything_in_the_judges_process(judge, tmp_path):
+def test_raw_text_cannot_write_files_or_start_processes_in_the_judge(judge, tmp_path):
     trap = tmp_path / "trap"
     for code in (
         f'__import__("pathlib").Path({str(trap)!r}).write_text("x")',

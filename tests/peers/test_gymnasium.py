@@ -1,4 +1,4 @@
-"""The environment before Gymnasium's own checker, and the example of the docs."""
+"""Gymnasium's environment checker, and the example of the docs."""
 
 import pytest
 from tests.fakes.datasets import write_kitchen_dataset
@@ -39,7 +39,7 @@ def dataset(tmp_path_factory):
     return write_kitchen_dataset(tmp_path_factory.mktemp("dataset"))
 
 
-def test_gymnasium_s_checker_has_nothing_to_say(peer, dataset):
+def test_environment_passes_gymnasiums_checker(peer, dataset):
     assert "there is no task 'elsewhere'" in peer.run("-c", CHECK, dataset)
 
 

@@ -30,7 +30,7 @@ CASES = list(
 
 
 class Case:
-    """A small model, and a batch whose plans end early, whose old log-probabilities differ, and of which one was lost."""
+    """Small model and a batch whose plans end early, whose old log-probabilities differ, and of which one was lost."""
 
     def __init__(self, folder):
         from transformers import LlamaConfig, LlamaForCausalLM
@@ -131,7 +131,7 @@ def their_loss(case, folder, kind, level, kl_coef):
 
 
 @pytest.mark.parametrize(("kind", "level", "kl_coef"), CASES)
-def test_loss_and_gradient_are_those_of_trl(case, tmp_path, kind, level, kl_coef):
+def test_loss_and_gradient_equal_those_of_trl(case, tmp_path, kind, level, kl_coef):
     theirs = their_loss(case, tmp_path, kind, level, kl_coef)
     their_gradient = case.gradient(theirs)
     terms = LossInputs(case.logprobs(), case.old, case.mask, case.advantages, case.reference)

@@ -1,4 +1,4 @@
-"""The environment behind OpenEnv's own server, asked by OpenEnv's own client."""
+"""The environment behind OpenEnv's server, called by OpenEnv's client."""
 
 import json
 
@@ -38,9 +38,9 @@ served.should_exit = True
 def test_plans_go_through_openenv_s_server_and_come_back_scored(tmp_path):
     dataset = write_kitchen_dataset(tmp_path)
     peer = Peer("openenv", "openenv==0.10.0", "uvicorn", *PHYSICS)
-    told = [json.loads(line) for line in peer.run("-c", TALK, dataset).splitlines() if line.startswith("{")]
-    assert len(told) == 3
-    for each in told:
+    rows = [json.loads(line) for line in peer.run("-c", TALK, dataset).splitlines() if line.startswith("{")]
+    assert len(rows) == 3
+    for each in rows:
         assert "Task: " in each["task"]
         assert (each["none"], each["unchanged"], each["done"], each["success"]) == (-1, True, True, True)
         assert len(each["unknown"]) == 1

@@ -1,4 +1,4 @@
-"""The worker of docs/examples in JavaScript, written from docs/protocol.md, in a cluster of real processes."""
+"""JavaScript worker of docs/examples, written from docs/protocol.md, in a cluster of real processes."""
 
 import asyncio
 import os
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from tests.fakes.peers import EXAMPLES, ROOT
-from tests.fakes.real_cluster import RealCluster, connected, outcomes, tally, tell, until
+from tests.fakes.real_cluster import RealCluster, connected, outcomes, print_figures, tally, until
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
 from embomatrix.rpc.wire.values import Batch, Completed, InfraCode, Rollout
@@ -32,7 +32,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def program():
-    """The worker beside its packages."""
+    """Copy the worker beside its packages."""
     base = os.environ.get("EMBOMATRIX_PEERS") or Path.home() / ".cache" / "embomatrix" / "peers"
     folder = Path(base) / "node"
     folder.mkdir(parents=True, exist_ok=True)
@@ -44,14 +44,14 @@ def program():
 
 @pytest.fixture(scope="module")
 def bundle():
-    """Its bytes and the id of one of its tasks."""
+    """Return the bundle's bytes and the id of one of its tasks."""
     scene = kitchen_scene()
     tasks = {task.task_id: task for task in kitchen_tasks(scene)}
     return encode_bundle(Bundle(scene, tasks)), next(iter(tasks))
 
 
 async def opened(client, data, task_id, plans, run_id="run"):
-    """A run and a batch of these plans in it."""
+    """Open a run with a batch of these plans."""
     digest = bundle_digest(data)
     await client.put_bundles({digest: data})
     await client.open_run("another language", run_id)
@@ -59,9 +59,7 @@ async def opened(client, data, task_id, plans, run_id="run"):
     return Batch(run_id, "b1", 0, tuple(rollouts))
 
 
-async def test_it_executes_through_a_death_of_the_manager_and_leaves_when_it_is_told(
-    tmp_path, program, bundle
-):
+async def test_javascript_worker_survives_a_manager_restart_and_leaves_on_sigterm(tmp_path, program, bundle):
     plans = [[ROOM] * 20] * 150
     with RealCluster(tmp_path) as cluster:
         cluster.start_manager()
@@ -81,15 +79,13 @@ async def test_it_executes_through_a_death_of_the_manager_and_leaves_when_it_is_
             (gone,) = await client.list_workers()
             assert (gone.state, gone.reason) == ("left", "it left")
         counted = tally(batch, results, reward=0.5)
-        tell("a worker in JavaScript", counted, redispatched=run.stats.redispatched)
+        print_figures("a worker in JavaScript", counted, redispatched=run.stats.redispatched)
         assert counted.clean
         assert run.stats.redispatched == 0
         assert [len(result.outcome.steps) for result in results] == [20] * len(plans)
 
 
-async def test_what_it_cannot_do_is_no_reward_and_what_a_plan_may_not_ask_is_a_failed_step(
-    tmp_path, program, bundle
-):
+async def test_unsupported_skill_fails_the_rollout_and_unknown_room_fails_the_step(tmp_path, program, bundle):
     with RealCluster(tmp_path) as cluster:
         cluster.start_manager()
         cluster.start_program("w1", "node", program, ROOT / "proto")
@@ -102,4 +98,4 @@ async def test_what_it_cannot_do_is_no_reward_and_what_a_plan_may_not_ask_is_a_f
     assert [step.failure for step in walked.steps] == [None, FailureReason.UNKNOWN_ROOM]
     assert "the rooms are" in walked.steps[1].message
     assert lost.code is InfraCode.SLOT_CRASHED
-    assert "SKILL_KIND_PICK_UP is beyond this worker" in lost.message
+    assert "this worker does not support SKILL_KIND_PICK_UP" in lost.message

@@ -19,7 +19,7 @@ with trackers_of(read_settings(None, {"track": ["wandb", "trackio"]}), folder) a
 """
 
 
-def test_a_run_that_goes_on_is_one_run_of_wandb_and_trackio_has_every_step(tmp_path):
+def test_resumed_run_is_one_wandb_run_and_trackio_has_every_step(tmp_path):
     peer = Peer("trackers", "torch==2.13.0", "wandb==0.31.0", "trackio==0.43.0")
     run = tmp_path / "run"
     run.mkdir()

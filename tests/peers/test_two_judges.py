@@ -1,6 +1,6 @@
-"""E3: one plan before both judges, our simulator and EAI's graph: oracle plans, and mutants of them.
+"""E3: oracle plans and mutants of them before both judges, our simulator and EAI's graph.
 
-The graph knows no places, so that ways are left out of what is compared. ``pytest -m eai -s`` prints the figures.
+The graph has no locations, so `move` calls are not compared. ``pytest -m eai -s`` prints the figures.
 """
 
 import collections
@@ -68,7 +68,7 @@ def compared(imported, found, native, judge):
             yield plan.kind, ours, verdict.exact, cause(trace, verdict) if differ else "", trace, verdict
 
 
-def test_the_two_judges_agree_and_every_disagreement_has_its_cause(capsys):
+def test_judges_agree_or_the_disagreement_has_a_known_cause(capsys):
     library, rows = PlacementLibrary(), []
     with NativeJudge(install()) as judge:
         natives = {task.task: task for task in judge.tasks()}

@@ -6,7 +6,16 @@ import resource
 import httpx
 import psutil
 import pytest
-from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell, until
+from tests.fakes.real_cluster import (
+    RealCluster,
+    batch_of,
+    connected,
+    opened,
+    outcomes,
+    print_figures,
+    tally,
+    until,
+)
 
 from embomatrix.cli.local_cluster import free_port
 from embomatrix.rpc.status import OverloadedError
@@ -33,13 +42,13 @@ async def test_full_disk_delays_results_and_refuses_new_runs(tmp_path):
                 await client.open_run("another")
             waited_at = len(seen)
             asked = f"http://127.0.0.1:{page_port}/api/v1/snapshot"
-            told = await asyncio.to_thread(httpx.get, asked)
-            assert "make room on its disk" in told.json()["health"]["sentence"]
+            response = await asyncio.to_thread(httpx.get, asked)
+            assert "make room on its disk" in response.json()["health"]["sentence"]
             await asyncio.sleep(2.0)
             assert len(seen) == waited_at, "a result was shown that is not written down"
             manager.rlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
             results = await running
         counted = tally(batch, results)
-        tell("disk full", counted, delivered_before=waited_at)
+        print_figures("disk full", counted, delivered_before=waited_at)
         assert counted.clean
         assert set(cluster.executed().values()) == {1}

@@ -11,8 +11,8 @@ from tests.fakes.real_cluster import (
     connected,
     opened,
     outcomes,
+    print_figures,
     tally,
-    tell,
     two_workers,
     until,
 )
@@ -47,14 +47,14 @@ async def killed_in_the_middle(folder, *, count, task, kill_at, away_s, grace_s)
         )
         recovery_s = min(at_s for at_s in times.values() if at_s > began_s) - began_s
         figures = {"executed_again": again, "start_s": serves_s - wall_s, "rejoin_s": joined_s - serves_s}
-        tell(f"A4 away {away_s:g} s", counted, **figures, first_result_s=recovery_s)
+        print_figures(f"A4 away {away_s:g} s", counted, **figures, first_result_s=recovery_s)
         assert counted.clean
         assert again == 0
         assert stats.delivered == count
 
 
 async def test_killed_manager_resumes_without_repeating_live_rollouts(tmp_path):
-    # As many as the two workers hold: nobody has to wait for the grace to end.
+    # As many rollouts as the two workers hold: none has to wait for the end of the grace time.
     await killed_in_the_middle(tmp_path, count=10, task="slow", kill_at=2, away_s=0.1, grace_s=15.0)
 
 
@@ -82,7 +82,7 @@ async def test_batch_continues_without_its_trainer(tmp_path):
                     await asyncio.sleep(0.05)
             results = await outcomes(client, batch)
         counted = tally(batch, results)
-        tell("A4 without its trainer", counted, executed=sum(cluster.executed().values()))
+        print_figures("A4 without its trainer", counted, executed=sum(cluster.executed().values()))
         assert counted.clean
 
 
@@ -97,9 +97,9 @@ async def test_suspended_manager_loses_no_worker(tmp_path):
         results = await running
         stats = await client.close_run(batch.run_id)
         counted = tally(batch, results)
-        tell("A4 stands still 5 s", counted, redispatched=stats.redispatched)
+        print_figures("A4 stands still 5 s", counted, redispatched=stats.redispatched)
         assert counted.clean
-        # What the manager gave on a connection that was broken by then never came to a worker, and is given again.
+        # Leases sent over a broken connection never reached a worker and are re-dispatched.
         assert set(cluster.executed().values()) == {1}
         assert {result.attempt for result in results} == {1}
         assert "worker lost" not in cluster.log("manager")

@@ -3,7 +3,16 @@
 import asyncio
 
 import pytest
-from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell, until
+from tests.fakes.real_cluster import (
+    RealCluster,
+    batch_of,
+    connected,
+    opened,
+    outcomes,
+    print_figures,
+    tally,
+    until,
+)
 
 from embomatrix.worker.link.status import running_daemons
 
@@ -39,7 +48,7 @@ async def test_worker_pauses_for_its_owner_and_resumes_without_loss(tmp_path):
             results = await running
             stats = await client.close_run(batch.run_id)
         counted = tally(batch, results)
-        tell("owner", counted, redispatched=stats.redispatched, told=status.paused)
+        print_figures("owner", counted, redispatched=stats.redispatched, paused_for=status.paused)
         assert counted.clean
         assert status.paused == "its owner is active"
         assert {result.attempt for result in results} == {1}

@@ -6,7 +6,16 @@ import time
 
 import pytest
 from tests.fakes.proxy import TO_MANAGER, TO_WORKER, Proxy
-from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell, until
+from tests.fakes.real_cluster import (
+    RealCluster,
+    batch_of,
+    connected,
+    opened,
+    outcomes,
+    print_figures,
+    tally,
+    until,
+)
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -16,7 +25,7 @@ DIRECTIONS = pytest.mark.parametrize(
 
 
 async def cut_while_it_runs(cluster, directions, *, count, task, cut_s, other):
-    """One worker's line is cut for ``cut_s`` once it has begun; ``other`` joins directly meanwhile. Returns what came of it."""
+    """Cut one worker's line for ``cut_s`` during its work; ``other`` joins directly meanwhile. Returns the outcome."""
     cluster.start_manager()
     async with Proxy(cluster.ports["manager"]) as proxy, cluster.client() as client:
         cluster.start_worker("w1", manager=proxy.address)
@@ -46,10 +55,10 @@ async def test_short_partition_loses_nothing(tmp_path, directions):
             cluster, directions, count=60, task="slow", cut_s=5.0, other=""
         )
     figures = {"redispatched": stats.redispatched, "stale": stats.stale_results}
-    tell(f"A6 5 s, {' and '.join(directions)}", counted, **figures)
+    print_figures(f"A6 5 s, {' and '.join(directions)}", counted, **figures)
     assert counted.clean
     assert lost_s is None
-    # A lease that was on its way may be given again, and a result be sent twice: nothing that ran runs again.
+    # A lease in transit may be re-dispatched and a result sent twice, but no rollout runs twice.
     assert set(cluster.executed().values()) == {1}
 
 
@@ -58,7 +67,7 @@ async def cut_for_long(folder, directions, *, cut_s, **settings):
         counted, stats, lost_s = await cut_while_it_runs(
             cluster, directions, count=2, task="first slow", cut_s=cut_s, other="w2"
         )
-        tell(
+        print_figures(
             f"A6 {cut_s:g} s, {' and '.join(directions)}",
             counted,
             redispatched=stats.redispatched,
@@ -97,7 +106,7 @@ async def test_worker_stops_leases_that_it_cannot_renew(tmp_path):
         counted, stats, _ = await cut_while_it_runs(
             cluster, (TO_MANAGER, TO_WORKER), count=2, task="first hangs", cut_s=12.0, other="w2"
         )
-        tell("A6 leases that run out", counted, redispatched=stats.redispatched)
+        print_figures("A6 leases that run out", counted, redispatched=stats.redispatched)
         assert counted.clean
         assert stats.stale_results == 0
         assert re.search(r"2 leases given up: no heartbeat was answered", cluster.log("w1"))

@@ -10,8 +10,8 @@ from tests.fakes.real_cluster import (
     connected,
     opened,
     outcomes,
+    print_figures,
     tally,
-    tell,
     two_workers,
     until,
 )
@@ -45,7 +45,7 @@ async def test_dispatch_resumes_after_a_redis_outage_with_equal_outcomes(tmp_pat
             later = await outcomes(client, batch_of(run_id, 20, "graded", "later"))
             counted = tally(batch, results, graded_total)
             recovery_s = min(at_s for at_s in times if at_s > back_s) - back_s
-            tell(f"A5 {end} {away_s:g} s", counted, recovery_s=recovery_s)
+            print_figures(f"A5 {end} {away_s:g} s", counted, recovery_s=recovery_s)
             assert counted.clean
             assert tally(batch_of(run_id, 200, "graded", "quiet"), quiet, graded_total).clean
             assert len(later) == 20
@@ -76,7 +76,7 @@ async def test_results_lost_by_redis_are_redelivered_once(tmp_path):
             results = await running
             again = await outcomes(client, batch)
         counted = tally(batch, results)
-        tell("A5 last second lost", counted, executed=sum(cluster.executed().values()))
+        print_figures("A5 last second lost", counted, executed=sum(cluster.executed().values()))
         assert counted.clean
         assert tally(batch, again).clean
         assert sum(cluster.executed().values()) > 300, "nothing was lost: the test shows nothing"

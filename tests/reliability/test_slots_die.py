@@ -1,13 +1,13 @@
-"""A3: rollouts that crash, hang or devour memory end alone, in a cluster whose other rollouts go on meanwhile.
+"""A3: rollouts that crash, hang or exhaust memory fail alone while the cluster's other rollouts continue.
 
-What a slot with real physics does is in tests/integration/test_slots_with_physics.py.
+Slots with real physics are tested in tests/integration/test_slots_with_physics.py.
 """
 
 import asyncio
 import time
 
 import pytest
-from tests.fakes.real_cluster import DIGEST, RealCluster, connected, opened, outcomes, tally, tell
+from tests.fakes.real_cluster import DIGEST, RealCluster, connected, opened, outcomes, print_figures, tally
 
 from embomatrix.rpc.wire.values import Batch, Completed, InfraCode, Rollout
 
@@ -31,7 +31,7 @@ async def test_failing_slot_fails_only_its_own_rollout(tmp_path):
             took_s = time.monotonic() - began_s
             workers = await client.list_workers()
         counted = tally(batch, results)
-        tell("A3", counted, seconds=took_s)
+        print_figures("A3", counted, seconds=took_s)
         found = {result.rollout_id: result.outcome for result in results}
         assert all(isinstance(found[rollout.rollout_id], Completed) for rollout in good)
         assert {task: found[task].code for task in BAD} == BAD

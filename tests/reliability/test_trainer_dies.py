@@ -8,8 +8,8 @@ from tests.fakes.real_cluster import (
     connected,
     opened,
     outcomes,
+    print_figures,
     tally,
-    tell,
     two_workers,
     until,
 )
@@ -38,7 +38,7 @@ async def test_restarted_trainer_reads_all_results_without_repeats(
             results = await outcomes(client, batch)
             again = await outcomes(client, batch)
         counted = tally(batch, results)
-        tell("A7", counted, read_before=read_before, executed=sum(cluster.executed().values()))
+        print_figures("A7", counted, read_before=read_before, executed=sum(cluster.executed().values()))
         assert counted.clean
         assert {(one.rollout_id, one.cursor) for one in again} == {
             (one.rollout_id, one.cursor) for one in results
@@ -64,7 +64,7 @@ async def test_faults_do_not_change_advantages_of_complete_groups(tmp_path):
         await connected(client, "w1", "w2")
         counted = tally(batch_of("faulty", 800, "graded"), faulty, graded_total)
         expected, found = advantages(quiet), advantages(faulty)
-        tell("A16", counted, groups=len(found))
+        print_figures("A16", counted, groups=len(found))
         assert counted.delivered == 800
         assert counted.fabricated == 0
         assert len(expected) == 100

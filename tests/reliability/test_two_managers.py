@@ -7,7 +7,16 @@ import time
 import grpc
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
-from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell, until
+from tests.fakes.real_cluster import (
+    RealCluster,
+    batch_of,
+    connected,
+    opened,
+    outcomes,
+    print_figures,
+    tally,
+    until,
+)
 from tests.fakes.redis_server import RedisServer
 
 from embomatrix.cli.local_cluster import free_port
@@ -39,12 +48,12 @@ async def leads(cluster, name, status="SERVING"):
 
 
 async def stands_by(cluster, name):
-    """Wait until this manager is up while another one leads."""
+    """Wait until this manager is ready as standby."""
     await leads(cluster, name, "NOT_SERVING")
 
 
 async def both(cluster):
-    """The first manager leads, the second stands by, two workers know both."""
+    """Start a leader and a standby manager, and two workers that know both."""
     cluster.start_manager("first")
     await leads(cluster, "first")
     cluster.start_manager("second")
@@ -76,7 +85,9 @@ async def failed_over(folder, *, count, kill_at, ttl_s, number=signal.SIGKILL):
             results = await running
         counted = tally(batch, results)
         again = sum(times - 1 for times in cluster.executed().values())
-        tell(f"A8 {number.name}", counted, executed_again=again, takeover_s=takeover_s, rejoin_s=joined_s)
+        print_figures(
+            f"A8 {number.name}", counted, executed_again=again, takeover_s=takeover_s, rejoin_s=joined_s
+        )
         assert counted.clean
         assert again == 0
 
@@ -113,7 +124,7 @@ async def test_frozen_leader_is_fenced_and_exits(tmp_path):
             ended = await asyncio.to_thread(cluster.processes["first"].wait, 30)
             results = await running
         counted = tally(batch, results)
-        tell("A8 frozen", counted, takeover_s=takeover_s)
+        print_figures("A8 frozen", counted, takeover_s=takeover_s)
         assert ended != 0
         assert "another manager took over" in cluster.log("first")
         assert (counted.delivered, counted.duplicates, counted.fabricated) == (40, 0, 0)

@@ -12,8 +12,8 @@ from tests.fakes.real_cluster import (
     connected,
     opened,
     outcomes,
+    print_figures,
     tally,
-    tell,
     two_workers,
 )
 from tests.fakes.worker import completed
@@ -36,13 +36,13 @@ async def test_fault_free_runs_repeat_hardly_any_rollout(tmp_path):
             counted = tally(batch, await outcomes(client, batch))
             assert counted.clean
         again = sum(times - 1 for times in cluster.executed().values())
-        tell("A1 short batches", counted, batches=batches, executed_again=again)
+        print_figures("A1 short batches", counted, batches=batches, executed_again=again)
         # A machine that stops a worker for some time makes its leases late.
         assert again <= batches // 4
 
 
 async def kill_again_and_again(cluster, rng, kills):
-    """``kill -9`` a random worker every two seconds, and start it varied."""
+    """Kill a random worker with SIGKILL every two seconds and restart it after varying delays."""
     with contextlib.suppress(asyncio.CancelledError):
         while True:
             await asyncio.sleep(2.0)
@@ -52,7 +52,7 @@ async def kill_again_and_again(cluster, rng, kills):
 
 
 async def soak(folder, *, killing):
-    """20,000 rollouts on ten workers, with or without the killing. Returns the tally, the seconds and the detections."""
+    """Run 20,000 rollouts on ten workers, with or without kills; returns the tally, the seconds and the detections."""
     with RealCluster(folder) as cluster:
         cluster.start_manager()
         names = [f"w{number}" for number in range(WORKERS)]
@@ -85,10 +85,10 @@ async def test_twenty_thousand_rollouts_have_one_outcome_each_while_workers_are_
     (tmp_path / "quiet").mkdir()
     (tmp_path / "killing").mkdir()
     counted, _, quiet_s, _, _ = await soak(tmp_path / "quiet", killing=False)
-    tell("A1", counted, seconds=quiet_s, per_second=ROLLOUTS / quiet_s)
+    print_figures("A1", counted, seconds=quiet_s, per_second=ROLLOUTS / quiet_s)
     assert counted.clean
     counted, stats, took_s, kills, found = await soak(tmp_path / "killing", killing=True)
-    tell(
+    print_figures(
         "A2",
         counted,
         kills=len(kills),
@@ -123,6 +123,6 @@ async def test_repeatedly_killed_daemons_lose_no_rollout(tmp_path):
             results = await outcomes(client, batch, then=kill)
             stats = await client.close_run(batch.run_id)
         counted = tally(batch, results)
-        tell("A2 daemons", counted, kills=len(kills), redispatched=stats.redispatched)
+        print_figures("A2 daemons", counted, kills=len(kills), redispatched=stats.redispatched)
         assert counted.clean
         assert all(isinstance(result.outcome, Completed) for result in results)

@@ -11,8 +11,8 @@ from tests.fakes.real_cluster import (
     connected,
     opened,
     outcomes,
+    print_figures,
     tally,
-    tell,
     two_workers,
     until,
 )
@@ -38,7 +38,7 @@ async def test_older_of_two_workers_with_one_name_stops(tmp_path):
             results = await running
             stats = await client.close_run(batch.run_id)
         counted = tally(batch, results)
-        tell("A9", counted, settled_s=settled_s, stale=stats.stale_results)
+        print_figures("A9", counted, settled_s=settled_s, stale=stats.stale_results)
         assert (counted.delivered, counted.duplicates, counted.fabricated) == (60, 0, 0)
         assert "another session of worker w1 took over" in cluster.log("w1")
         assert "another worker of that name is running" in cluster.log("w1")
@@ -58,7 +58,7 @@ async def test_draining_worker_finishes_its_leases(tmp_path, number):
         results = await running
         stats = await client.close_run(batch.run_id)
         counted = tally(batch, results)
-        tell(f"A11 {number.name}", counted, left_s=left_s, redispatched=stats.redispatched)
+        print_figures(f"A11 {number.name}", counted, left_s=left_s, redispatched=stats.redispatched)
         assert counted.clean
         assert status == 0
         assert stats.redispatched == 0

@@ -2,7 +2,7 @@
 
 import asyncio
 
-from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell
+from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, print_figures, tally
 from tests.fakes.simulation import graded_total
 
 from embomatrix.manager.runtime.intake import TICK_S
@@ -14,7 +14,7 @@ LIAR = "liar"
 
 async def test_lying_worker_is_quarantined_before_any_false_result_is_delivered(tmp_path):
     batch = batch_of("run", 400, "graded")
-    # Nobody is lucky for so long: 0.9^100 is 3 in 100,000.
+    # The probability to escape all audits is 0.9^100, 3 in 100,000.
     with RealCluster(tmp_path, audit_probation=100) as cluster:
         cluster.start_manager()
         for name in HONEST:
@@ -28,7 +28,7 @@ async def test_lying_worker_is_quarantined_before_any_false_result_is_delivered(
             stats = await client.close_run("run")
         counted = tally(batch, results, reward=graded_total)
         liar = workers[LIAR]
-        tell(
+        print_figures(
             "A17",
             counted,
             audited=stats.audited,
@@ -58,7 +58,7 @@ async def test_single_worker_is_not_audited_with_one_warning(tmp_path):
         assert stats.audited == 0
         said = "results are not audited: auditing needs a second worker"
         async with asyncio.timeout(20):
-            while said not in cluster.log("manager"):  # noqa: ASYNC110  # a file tells nobody
+            while said not in cluster.log("manager"):  # noqa: ASYNC110  # a file has no notifications
                 await asyncio.sleep(0.05)
         await asyncio.sleep(4 * TICK_S)
         assert cluster.log("manager").count(said) == 1

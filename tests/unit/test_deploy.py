@@ -1,4 +1,4 @@
-"""Files that place a cluster elsewhere: they are valid, confined, and name commands, options and metrics that there are."""
+"""Deployment files are valid and confined, and name existing commands, options and metrics."""
 
 import json
 import os
@@ -32,7 +32,7 @@ PODS = {
 }
 PROMETHEUS = DEPLOY / "prometheus"
 needs_promtool = pytest.mark.skipif(
-    shutil.which("promtool") is None, reason="needs promtool, which Debian's package prometheus brings"
+    shutil.which("promtool") is None, reason="needs promtool, which Debian's package prometheus provides"
 )
 METRIC = re.compile(r"\bembo_\w+")
 
@@ -80,9 +80,9 @@ def test_slurm_task_runs_a_worker_with_its_cores_and_a_unique_name(tmp_path):
     fake.write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')
     fake.chmod(0o755)
     known = {"PATH": f"{tmp_path}:{os.environ['PATH']}", "SLURM_CPUS_PER_TASK": "4"}
-    told = {"EMBOMATRIX_MANAGER": "m:50070", "SLURM_ARRAY_JOB_ID": "7", "SLURM_ARRAY_TASK_ID": "3"}
+    variables = {"EMBOMATRIX_MANAGER": "m:50070", "SLURM_ARRAY_JOB_ID": "7", "SLURM_ARRAY_TASK_ID": "3"}
     script = ("bash", str(DEPLOY / "slurm" / "workers.sbatch"))
-    ran = subprocess.run(script, env=known | told, capture_output=True, text=True, check=True)
+    ran = subprocess.run(script, env=known | variables, capture_output=True, text=True, check=True)
     words = ran.stdout.splitlines()
     assert words[:3] == ["embomatrix", "worker", "run"]
     assert named(words) <= options(worker_app, "run")

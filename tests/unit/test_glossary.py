@@ -22,7 +22,7 @@ FOLDERS = ("manager/embomatrix/manager/control", "core/embomatrix/sim")
 
 
 def protocol_names() -> set[str]:
-    """Names of the messages, enums and services of the protocol."""
+    """Return the names of the protocol's messages, enums and services."""
     files = [module.DESCRIPTOR for module in PROTOCOL]
     return {
         name
@@ -33,7 +33,7 @@ def protocol_names() -> set[str]:
 
 
 def class_names(folder: str) -> set[str]:
-    """Names of the public top-level classes below a folder."""
+    """Return the public top-level classes below a folder."""
     return {
         node.name
         for path in (ROOT / folder).rglob("*.py")
@@ -53,7 +53,7 @@ def test_glossary_lists_every_public_class(folder: str):
     assert names - set(LISTED) == set()
 
 
-def test_glossary_lists_nothing_that_does_not_exist():
+def test_glossary_lists_only_existing_names():
     known = protocol_names().union(*map(class_names, FOLDERS))
     assert set(LISTED) - known == set()
 

@@ -1,4 +1,4 @@
-"""The layout that imports rely on, and that of the decisions."""
+"""Source layout that imports and decisions rely on."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""The documentation site stands alone: its diagrams are drawn, and nothing on a page is asked of another site."""
+"""The documentation site is self-contained: its diagrams are drawn, and its pages request nothing from other sites."""
 
 import importlib.util
 import re

@@ -50,7 +50,7 @@ class Figure:
         return f"{shown(self.value / self.goal, other_than=1.0)} × the goal" if self.goal else "missed"
 
     @property
-    def told(self) -> str:
+    def formatted(self) -> str:
         """The formatted value. A narrowly missed goal is not rounded up to."""
         return shown(self.value, other_than=None if self.is_reached else self.goal)
 

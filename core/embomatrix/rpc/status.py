@@ -172,11 +172,11 @@ def cluster_error(error: grpc.aio.AioRpcError, address: str) -> ClusterError:
     """Return the ClusterError of a failed call to ``address`` (HOST:PORT)."""
     code = error.code()
     details = error.details() or ""
-    told = {key: str(value) for key, value in error.trailing_metadata() or ()}
-    if LEADER_KEY in told:
-        return StandbyError(details, told[LEADER_KEY])
-    if ERROR_KEY in told:
-        return (_NAMED.get(told[ERROR_KEY]) or _ERRORS.get(code, InternalError))(details)
+    trailers = {key: str(value) for key, value in error.trailing_metadata() or ()}
+    if LEADER_KEY in trailers:
+        return StandbyError(details, trailers[LEADER_KEY])
+    if ERROR_KEY in trailers:
+        return (_NAMED.get(trailers[ERROR_KEY]) or _ERRORS.get(code, InternalError))(details)
     match code:
         case grpc.StatusCode.UNAVAILABLE if trouble := _tls_trouble(details):
             return ManagerUnreachableError(trouble.format(address=address))

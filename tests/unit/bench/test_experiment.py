@@ -46,7 +46,7 @@ MACHINE = {"cores": 2, "cpu": "a processor", "load_before": 0.1}
 
 
 def outcome(before, after):
-    """One of two tasks, whose success rates are these."""
+    """Return an outcome of two tasks with these success rates."""
     spent = {"sampling": 40.0, "update": 50.0, "waiting for simulation": 4.0, "imitation": 60.0}
     tasks = [
         [TaskRate(f"t{at}", "compound", rate) for at, rate in enumerate(rates)] for rates in (before, after)
@@ -71,8 +71,8 @@ ARMS = (
 )
 
 
-def told(*arguments):
-    """Exit status and all that a person reads."""
+def invoke(*arguments):
+    """Return the exit status and all visible output."""
     result = CliRunner().invoke(app, [str(item) for item in arguments])
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     return result.exit_code, " ".join(result.output.split())
@@ -115,11 +115,11 @@ def test_curve_has_ten_parts_or_one_per_step():
 
 
 def test_steps_without_a_metric_are_left_out_of_the_curve():
-    told = run(0, "a", (0.0,), (0.0,))
+    recorded = run(0, "a", (0.0,), (0.0,))
     metrics = [
-        dict(row, entropy=None if step in (1, 18, 19) else 0.3) for step, row in enumerate(told.metrics)
+        dict(row, entropy=None if step in (1, 18, 19) else 0.3) for step, row in enumerate(recorded.metrics)
     ]
-    values = curve(replace(told, metrics=metrics), "entropy")
+    values = curve(replace(recorded, metrics=metrics), "entropy")
     assert values[:9] == pytest.approx([0.3] * 9)
     assert math.isnan(values[9])
 
@@ -137,9 +137,9 @@ def test_section_has_configuration_success_curves_and_times():
     assert widths == {14}
 
 
-def test_section_has_the_memory_of_a_run_that_recorded_it():
-    told = run(0, "a", (), ())
-    found = findings_of("a", [replace(told, outcome=replace(told.outcome, peak_mb=2345.6))])
+def test_section_shows_memory_only_for_runs_that_recorded_it():
+    recorded = run(0, "a", (), ())
+    found = findings_of("a", [replace(recorded, outcome=replace(recorded.outcome, peak_mb=2345.6))])
     assert "| 10.0% | 2,346 MB |" in learning_section(DESIGN, [found], MACHINE, "abc", TODAY)
 
 
@@ -160,7 +160,7 @@ def test_sections_are_appended_and_never_removed(tmp_path):
     assert text.index("## one") < text.index("By hand: it failed.") < text.index("## two")
 
 
-def test_settings_of_arms_are_read_as_the_trainer_reads_its_file(tmp_path):
+def test_arm_settings_are_parsed_like_the_trainers_file(tmp_path):
     arm = parse_arm("fast:grpo.learning_rate=4e-4, grpo.loss=grpo,grpo.relevance_final=0.5")
     path = tmp_path / "settings.toml"
     path.write_text(toml_of(arm.settings))
@@ -170,7 +170,7 @@ def test_settings_of_arms_are_read_as_the_trainer_reads_its_file(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["grpo.group", "=3", "grpo.group="])
-def test_a_setting_without_key_or_value_is_refused(text):
+def test_setting_without_key_or_value_is_refused(text):
     with pytest.raises(TrainerError, match="expected KEY=VALUE"):
         parse_settings([text])
 
@@ -188,7 +188,7 @@ def test_experiment_resumes_only_with_the_same_design(tmp_path):
 
 
 def test_finished_runs_are_not_repeated(tmp_path):
-    """There is no dataset: a command that was run would end in SystemExit."""
+    """Without a dataset, a repeated run would end in SystemExit."""
     conductor = Conductor(DESIGN, tmp_path / "nowhere", tmp_path, lambda heading: None)
     place = Venue(("--manager=127.0.0.1:1",), no_problem)
     (conductor.folder_of(0, IMITATED) / "reference").mkdir(parents=True)
@@ -201,12 +201,12 @@ def test_finished_runs_are_not_repeated(tmp_path):
 def test_so_far_reports_finished_runs_only(dataset, tmp_path):
     out, page = tmp_path / "out", tmp_path / "page.md"
     options = ("--seed=0", "--seed=1", "--so-far", f"--dataset={dataset}", f"--out={out}", f"--page={page}")
-    status, text = told("learning", *options)
+    status, text = invoke("learning", *options)
     assert (status, "no run in" in text) == (2, True)
     done = out / "seed-1" / "with-relevance"
     done.mkdir(parents=True)
     write_outcome(done, outcome((0.2, 0.2), (0.5, 0.9)))
-    status, text = told("learning", *options, f"--json={tmp_path / 'figures.json'}")
+    status, text = invoke("learning", *options, f"--json={tmp_path / 'figures.json'}")
     assert status == 0, text
     assert "| with-relevance | 1 | 20 | 320 | 0 | 20.0% | 70.0% |" in page.read_text()
     figures = {
@@ -238,7 +238,7 @@ def test_outcome_survives_a_round_trip(tmp_path):
 def test_impossible_experiment_is_refused_at_once(dataset, tmp_path, arguments, words):
     filled = [item.replace("DS", str(dataset)) for item in arguments]
     out = () if arguments[0] == "table" else (f"--out={tmp_path / 'out'}",)
-    status, text = told(*filled, *out)
+    status, text = invoke(*filled, *out)
     assert status == 2
     assert words in text
     assert not (tmp_path / "out").exists()

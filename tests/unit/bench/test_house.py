@@ -93,7 +93,7 @@ def test_check_of_openings_exits_with_1_if_it_finds_any(checkout, capsys):
     assert house.main(["--check-openings", "--root", str(root)]) == 0
 
 
-def test_figures_of_a_checkout_are_written_as_every_benchmark_writes_them(checkout, tmp_path):
+def test_code_figures_use_the_common_benchmark_format(checkout, tmp_path):
     code = "class Shared:\n    '''Of two.'''\n"
     root = checkout(core__x__a_py=code, core__x__b_py=code, tests__test_a_py="class Shared: ...\n")
     path = tmp_path / "house.json"

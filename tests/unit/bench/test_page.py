@@ -54,9 +54,9 @@ def test_numbers_are_short_in_tables_and_have_six_digits_in_files():
         "1,234",
         "1,000",
     ]
-    assert Figure("x", 0.98964, "share", Better.HIGHER, 3, 0.99).told == "0.9896"
-    assert Figure("x", 0.99036, "share", Better.HIGHER, 3, 0.99).told == "0.99"
-    assert Figure("x", 1000.3, "ms", Better.LOWER, 3, 1000.0).told == "1,000.3"
+    assert Figure("x", 0.98964, "share", Better.HIGHER, 3, 0.99).formatted == "0.9896"
+    assert Figure("x", 0.99036, "share", Better.HIGHER, 3, 0.99).formatted == "0.99"
+    assert Figure("x", 1000.3, "ms", Better.LOWER, 3, 1000.0).formatted == "1,000.3"
     written = result_to_json(_result(Figure("x", 1.23456789, "ms", Better.LOWER, 3)))
     assert written["figures"] == [
         {"name": "x", "value": 1.23457, "unit": "ms", "goal": None, "better": "lower", "n": 3}
@@ -141,7 +141,7 @@ def test_page_command_renders_figures_that_were_measured_before(tmp_path):
     assert "Commit `def`" in fidelity
 
 
-def test_parts_of_a_benchmark_merge_if_they_are_of_one_commit():
+def test_parts_of_a_benchmark_merge_if_their_commits_match():
     old, new, other = (
         Figure(name, value, "ms", Better.LOWER, 1) for name, value in (("x", 1.0), ("x", 2.0), ("y", 3.0))
     )

@@ -24,9 +24,9 @@ def test_tables_cut_no_figure_and_no_name(capsys):
     show(
         plan_table([PlanCell("run-0123456789ab", 4_321, "sha256:0123456789", 512, Warmth.WARMING, (WORKER,))])
     )
-    told = capsys.readouterr().out
-    assert "…" not in told
-    words = told.split()
+    output = capsys.readouterr().out
+    assert "…" not in output
+    words = output.split()
     for figure in (
         "1234567",
         "65536",

@@ -20,14 +20,14 @@ WORDS = {"COMMAND", "NAME", "--help"}
 
 
 def shown(text: str) -> list[list[str]]:
-    """Commands at the start of a line, in backticks, or behind make's variable, as words."""
+    """Return commands at the start of a line, in backticks, or behind make's variable, as words."""
     lines = re.findall(r"^(?:\t\$\(BIN\)/)?embomatrix +([^#|\n]+)", text.replace("\\\n", " "), re.MULTILINE)
     quoted = re.findall(r"`embomatrix\s+([^`]+)`", text)
     return [found.split() for found in (*lines, *quoted)]
 
 
 def target_of(words: list[str]) -> tuple[Any, list[str]]:
-    """The command that the words name, and what is left of them."""
+    """Return the command that the words name, and the remaining words."""
     points = {point.name: point for point in entry_points(group=GROUP)}
     assert words[0] in points, f"there is no `embomatrix {words[0]}`"
     target = points[words[0]].load()
@@ -53,5 +53,5 @@ def test_every_command_on_the_page_exists_with_its_options(page: Path) -> None:
         assert given - WORDS <= known, f"embomatrix {' '.join(words)}"
 
 
-def test_the_pages_show_commands() -> None:
+def test_pages_show_commands() -> None:
     assert sum(len(shown(page.read_text(encoding="utf-8"))) for page in PAGES) > 40

@@ -11,7 +11,7 @@ def leave_by(monkeypatch, script):
 
 
 @pytest.mark.parametrize(
-    ("number", "told"),
+    ("number", "expected"),
     [
         (
             9,
@@ -20,14 +20,14 @@ def leave_by(monkeypatch, script):
         (15, "signal 15 (Terminated): what it had saved is kept"),
     ],
 )
-def test_command_ended_by_a_signal_is_reported(monkeypatch, capsys, number, told):
+def test_command_ended_by_a_signal_is_reported(monkeypatch, capsys, number, expected):
     leave_by(monkeypatch, f"kill -{number} $$")
     with pytest.raises(SystemExit) as left:
         run_command("experiment", no_problem, "train", "--seed=0")
     assert left.value.code == 2
     said = capsys.readouterr().err
     assert "embomatrix experiment: `embomatrix train` was ended from outside by" in said
-    assert told in said
+    assert expected in said
 
 
 def test_failed_command_passes_its_status_on(monkeypatch, capsys):

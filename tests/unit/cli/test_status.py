@@ -36,7 +36,7 @@ def test_start_of_a_worker_is_suggested_where_none_is_present():
 def test_health_sentence_of_the_manager_comes_first():
     full = "Nothing can be written down, so nothing goes on: no space left on device."
     assert sentences(FleetStatus((worker(),), full), (), ())[0] == full
-    assert sentences(FleetStatus((), full), (), ())[0] == full, "also where nobody is there"
+    assert sentences(FleetStatus((), full), (), ())[0] == full, "also without a worker"
     assert full in "\n".join(drawn(Glance(0.0, FleetStatus((worker(),), full), ()), 24))
 
 
@@ -47,14 +47,14 @@ def test_sentences_cover_runs_warm_scenes_and_idle_workers():
         PlanCell("r1", 7, "sha256:aa", 8, Warmth.WARM),
         PlanCell("r1", 7, "sha256:bb", 8, Warmth.UNPLACEABLE),
     ]
-    told = sentences(
+    shown = sentences(
         FleetStatus(
             (worker(running=1, residents=(warm,)), worker("w2", "paused", reason="somebody uses it"))
         ),
         (RunInfo("r1", "evening", stats, pending=3),),
         plan,
     )
-    assert told[1:] == [
+    assert shown[1:] == [
         "Workers: 1 ready, 1 paused; 1 of 2 slots busy; 1 scene is in memory.",
         "Run evening: 40 rollouts done, 75% of them in warm scenes; 2 lost by the infrastructure, 5 re-dispatched; "
         "3 under way.",
@@ -65,8 +65,8 @@ def test_sentences_cover_runs_warm_scenes_and_idle_workers():
 
 def test_workers_that_left_in_order_are_only_counted():
     ready = "Ready: 1 worker waits for a run."
-    told = sentences(FleetStatus((worker(), worker("w2", "left", reason="it left")), ready), (), ())
-    assert told == [
+    shown = sentences(FleetStatus((worker(), worker("w2", "left", reason="it left")), ready), (), ())
+    assert shown == [
         ready,
         "Workers: 1 ready, 1 left; 0 of 2 slots busy; 0 scenes are in memory.",
     ]
@@ -122,5 +122,5 @@ async def test_status_and_top_show_a_real_manager(tmp_path, capsys):
 
 @pytest.mark.parametrize("name", ["status", "top"])
 def test_unreachable_manager_is_reported_in_a_sentence(name):
-    told = run(name, "--manager=127.0.0.1:1")
-    assert (told.status, told.text.startswith(f"embomatrix {name}: no manager answers")) == (2, True)
+    shown = run(name, "--manager=127.0.0.1:1")
+    assert (shown.status, shown.text.startswith(f"embomatrix {name}: no manager answers")) == (2, True)

@@ -66,11 +66,11 @@ def test_child_that_keeps_dying_is_given_up_and_its_log_kept(tmp_path):
 
 
 def test_child_with_a_user_error_is_given_up_at_once(tmp_path):
-    told = (sys.executable, "-c", "print('no engine: install it', flush=True); raise SystemExit(2)")
-    with Supervisor((_child("told", told), _child("one", SLEEPER)), tmp_path) as children:
-        _until(lambda: children.failed() == ("told",))
-        assert children.restarts("told") == 0
-        assert children.last_words("told") == "no engine: install it"
+    failing = (sys.executable, "-c", "print('no engine: install it', flush=True); raise SystemExit(2)")
+    with Supervisor((_child("failing", failing), _child("one", SLEEPER)), tmp_path) as children:
+        _until(lambda: children.failed() == ("failing",))
+        assert children.restarts("failing") == 0
+        assert children.last_words("failing") == "no engine: install it"
 
 
 def test_interrupt_of_the_terminal_does_not_reach_the_children(tmp_path):

@@ -23,7 +23,7 @@ def task(goal: str) -> Task:
 
 
 class Boxes:
-    """Executor in which only ``open`` works."""
+    """Executor that supports only ``open``."""
 
     def __init__(self, *opened: str) -> None:
         self._start = set(opened)

@@ -39,7 +39,7 @@ CATALOG = Catalog.load()
 
 
 def chosen_models() -> Iterator[tuple[str, str]]:
-    """All models of four scenes, and two models of each small and each openable category."""
+    """Return all models of four scenes, and two models of each small and each openable category."""
     found = {
         (category, model)
         for scene_id in SCENES
@@ -58,7 +58,7 @@ WITH_JOINTS = [asset for asset in ASSETS if asset.joints]
 
 
 def planes_of(part: ConvexPart) -> tuple[FloatArray, FloatArray]:
-    """Half spaces of a part: normals (n, 3) and offsets, in the asset's frame."""
+    """Return half spaces of a part: normals (n, 3) and offsets, in the asset's frame."""
     mesh = mesh_of(part)
     return mesh.face_normals, np.einsum("ij,ij->i", mesh.face_normals, mesh.triangles[:, 0])
 
@@ -81,7 +81,7 @@ def box_corners(box: Aabb) -> FloatArray:
 
 
 def overlap_m(part: ConvexPart, corners: FloatArray, axes: FloatArray) -> float:
-    """Least depth over the separating axes tried: an upper bound of the penetration, negative when apart."""
+    """Return the least depth over the tried separating axes, an upper bound of the penetration; negative when apart."""
     normals, _ = planes_of(part)
     tried = np.vstack((normals, axes))
     own, other = corners_of(part) @ tried.T, corners @ tried.T
@@ -90,7 +90,7 @@ def overlap_m(part: ConvexPart, corners: FloatArray, axes: FloatArray) -> float:
 
 
 def moved(points: FloatArray, joint: Joint, fraction: float) -> FloatArray:
-    """Points of a link, given with its joint at zero, at a share of its travel."""
+    """Transform points of a link from joint position zero to a share of its travel."""
     if joint.kind is JointKind.PRISMATIC:
         return points + np.asarray(joint.axis) * joint.upper * fraction
     half = joint.upper * fraction / 2
@@ -100,7 +100,7 @@ def moved(points: FloatArray, joint: Joint, fraction: float) -> FloatArray:
 
 
 def parts_at(link: Link, fraction: float) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Corners and face axes of the boxes of a door or drawer at a share of its travel."""
+    """Return corners and face axes of a door's or drawer's boxes at a share of its travel."""
     assert link.joint is not None
     axes = moved(np.eye(3), link.joint, fraction) - moved(np.zeros((1, 3)), link.joint, fraction)
     for part in link.parts:
@@ -112,7 +112,7 @@ def corners_at(link: Link, fraction: float) -> FloatArray:
 
 
 def parts_of(asset: Asset, link: str) -> tuple[ConvexPart, ...]:
-    """Parts of a link; of the base for an empty name."""
+    """Return the parts of a link; an empty name is the base."""
     return next(item.parts for item in asset.links if item.name == (link or "base"))
 
 
@@ -139,7 +139,7 @@ def test_box_of_an_asset_is_the_size_of_its_model() -> None:
         assert box.center_m == pytest.approx((0.0, 0.0, 0.0), abs=1e-5), asset.asset_id
 
 
-def test_links_keep_to_what_the_engine_can_hold() -> None:
+def test_links_stay_within_the_engines_limits() -> None:
     for asset in ASSETS:
         names = [link.name for link in asset.links]
         assert len(names) == len(set(names))
@@ -224,12 +224,12 @@ def test_cavities_hold_a_probe_of_three_centimetres_where_their_size_allows() ->
             Family.SOFT,
             Family.PLATE,
         ):
-            continue  # sealed packages and plates: what they are filled with is a substance
+            continue  # sealed packages and plates: their contents are substances
         assert asset.interiors, asset.asset_id
         assert max(min(interior.size_m) for interior in asset.interiors) >= 0.03, asset.asset_id
 
 
-def test_closed_doors_touch_neither_the_frame_nor_what_is_inside() -> None:
+def test_closed_doors_touch_neither_the_frame_nor_the_contents() -> None:
     for asset in WITH_JOINTS:
         assert_clear(asset, (0.0,))
 

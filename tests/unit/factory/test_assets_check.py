@@ -146,9 +146,9 @@ def test_sheet_shows_an_asset_closed_and_open() -> None:
 
 def test_check_prints_the_rules_and_names_an_unknown_category() -> None:
     pytest.importorskip("pybullet", reason="PyBullet has wheels up to Python 3.11 on x86-64")
-    told = CliRunner().invoke(app, ["check", "--category", "bowl", "--category", "fridge", "--glance"])
-    assert told.exit_code == 0, told.output
-    assert "2 models" in told.output
+    result = CliRunner().invoke(app, ["check", "--category", "bowl", "--category", "fridge", "--glance"])
+    assert result.exit_code == 0, result.output
+    assert "2 models" in result.output
     unknown = CliRunner().invoke(app, ["check", "--category", "frigde"])
     assert unknown.exit_code == 2
     assert "did you mean fridge" in unknown.output

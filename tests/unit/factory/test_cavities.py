@@ -1,4 +1,4 @@
-"""Cavities of imported models: every compartment is one; the rest beside a round wall is none."""
+"""Cavities of imported models: one per compartment, none for the space beside a round wall."""
 
 from __future__ import annotations
 

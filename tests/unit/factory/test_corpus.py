@@ -46,7 +46,7 @@ def _written(folder, kitchen, splits, scene, kinds):
 
 @pytest.fixture
 def corpus(tmp_path, kitchen):
-    """Two training tasks and one held-out task in one scene, two in another."""
+    """Corpus with two training tasks and one held-out task in one scene, and two tasks in another."""
     _written(tmp_path / TRAIN, kitchen, ("train", "train", "heldout"), "Rs_int", "abc")
     _written(tmp_path / UNSEEN, kitchen, ("heldout", "heldout"), "Ihlen_1_int", "de")
     return tmp_path

@@ -24,7 +24,7 @@ PAGE = (Path(__file__).parents[3] / "docs" / "tasks.md").read_text(encoding="utf
 
 
 def rows(first_heading: str) -> dict[str, str]:
-    """The table whose first column has this heading: name of each row to the next cell."""
+    """Return the table whose first column has this heading: row names mapped to the next cell."""
     found = re.search(rf"^\| {first_heading} \|.*\n\| ---.*\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
     assert found, f"docs/tasks.md has no table of {first_heading}"
     cells = [line.strip("|").split(" | ") for line in found[1].splitlines()]
@@ -32,7 +32,7 @@ def rows(first_heading: str) -> dict[str, str]:
 
 
 def imported() -> ImportedTask:
-    """The problem of the page, bound to a kitchen."""
+    """Return the page's problem, bound to a kitchen."""
     text = re.search(r"```lisp\n(.*?)```", PAGE, re.DOTALL)
     assert text
     outcome = import_problem(SourceText("apple", text[1], "file"), kitchen_scene())
@@ -40,7 +40,7 @@ def imported() -> ImportedTask:
     return outcome
 
 
-def test_every_refusal_stands_there_in_the_order_in_which_it_is_looked_for():
+def test_every_refusal_is_documented_in_the_order_of_its_check():
     assert list(rows("refusal")) == [*RefusalReason]
 
 
@@ -64,7 +64,7 @@ def test_problem_on_the_page_can_be_bound():
     assert imported().task.instruction == "Put the apple in the fridge."
 
 
-def test_commands_on_the_page_have_the_options_they_are_shown_with():
+def test_commands_on_the_page_exist_with_their_options():
     apps = {"factory": cli.app, "scene": scene_cli.app, "play": typer.Typer()}
     apps["play"].command()(play_cli.play)
     for name, rest in re.findall(r"^embomatrix (\w+) (.*?)(?:#.*)?$", PAGE, re.MULTILINE):

@@ -249,7 +249,9 @@ def test_page_without_an_end_marker_is_rejected():
 def test_ledger_gives_the_admitted_share(tmp_path):
     assert admitted_share(tmp_path) == ()
     ledger = tmp_path / "attempts.jsonl"
-    ledger.write_text("".join(json.dumps({"outcome": told}) + "\n" for told in ("admitted", "no_plan") * 2))
+    ledger.write_text(
+        "".join(json.dumps({"outcome": outcome}) + "\n" for outcome in ("admitted", "no_plan") * 2)
+    )
     (figure,) = admitted_share(tmp_path)
     assert (figure.value, figure.n, figure.is_reached) == (50.0, 4, False)
     ledger.write_text('{"outcome": "admitted"}\n{"outc')

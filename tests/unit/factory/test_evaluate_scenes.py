@@ -134,12 +134,12 @@ def test_resumed_run_makes_only_the_missing_trials(tmp_path: "Path") -> None:
     for outcome in KNOWN:
         log.add(outcome)
     tasks = [SceneTask(SourceText(name, UNICORN, "embomatrix"), "Rs_int") for name in ("known", "new")]
-    told: list[int] = []
-    _, outcomes = evaluate_scenes(tasks, list(LayoutMethod), 0, 1, told.append, OutcomeLog.open(path, 0))
+    counts: list[int] = []
+    _, outcomes = evaluate_scenes(tasks, list(LayoutMethod), 0, 1, counts.append, OutcomeLog.open(path, 0))
     assert outcomes[:3] == KNOWN
     assert [(each.task, each.method) for each in outcomes[3:]] == [("new", method) for method in LayoutMethod]
     assert all("unicorn" in each.detail for each in outcomes[3:])
-    assert told == [3, 4, 5, 6]
+    assert counts == [3, 4, 5, 6]
     assert OutcomeLog.open(path, 0).outcomes == outcomes
 
 

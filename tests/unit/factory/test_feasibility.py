@@ -1,4 +1,4 @@
-"""Wishes are tested for feasibility in the simulator before they are written."""
+"""Requested goal atoms are tested for feasibility in the simulator before they are written."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ from embomatrix.world.task import TaskCategory
 
 @pytest.fixture(scope="module")
 def parted(home: Scene) -> Scene:
-    """The flat with a second fridge in the doorway between its rooms."""
+    """Return the flat with a second fridge in the doorway between its rooms."""
     fridge = home.by_name["fridge_1"]
     (x, y), height = home.doorways[0].center_m, fridge.pose_world_asset.position_m[2]
     other = replace(fridge, name="fridge_2", pose_world_asset=Pose.from_xyz_yaw(x, y, height, 0.0))
@@ -111,7 +111,7 @@ def test_survey_answers_do_not_depend_on_the_order_of_queries(home: Scene) -> No
         ),
     ],
 )
-def test_model_is_told_the_infeasible_wish(home: Scene, wish: RequestedAtom, sentence: str) -> None:
+def test_infeasible_request_is_reported_to_the_model(home: Scene, wish: RequestedAtom, sentence: str) -> None:
     request = TaskRequest(instruction="Please do this for me.", wishes=(wish,))
     with pytest.raises(ValueError, match=f"the robot tried and {sentence}"):
         check_request(request, SceneView(home, Clumsy()), frozenset(home.by_name))

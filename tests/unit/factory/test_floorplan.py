@@ -28,7 +28,7 @@ def plan_of(scene_id: str, seed: int = 0) -> FloorPlan:
 
 
 def reached(plan: FloorPlan) -> set[str]:
-    """Rooms that doorways lead to from the first one."""
+    """Return the rooms that doorways connect to the first one."""
     found = {plan.rooms[0].name}
     for _ in plan.rooms:
         for door in plan.doorways:
@@ -38,7 +38,7 @@ def reached(plan: FloorPlan) -> set[str]:
 
 
 def apart_m(a: object, b: object) -> float:
-    """Gap between two rooms along the axis that separates them best; negative when they overlap."""
+    """Return the gap between two rooms along their best separating axis; negative when they overlap."""
     return max(
         max(a.low_m[i] - b.high_m[i], b.low_m[i] - a.high_m[i])  # type: ignore[attr-defined]
         for i in (0, 1)
@@ -79,7 +79,7 @@ def test_walls_stand_on_no_floor_and_leave_inner_doorways_open(scene_id: str) ->
 
 @pytest.fixture(scope="module")
 def true_rooms() -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Measured corners of the rooms of Beechwood_0_int."""
+    """Return the measured room corners of Beechwood_0_int."""
     path = DATA / "beechwood_0_int_layout.json"
     if not path.exists():
         pytest.skip("the measured layout of Beechwood_0_int lies beside the repository, in ../shared/data")

@@ -21,7 +21,7 @@ CASEMENT = OpeningSpec("casement", 0.8, 0.92)
 
 
 def house(*windows: OpeningSpec, seed: int = 0) -> FloorPlan:
-    """A living room with these windows and a bathroom beside it."""
+    """Return a living room with these windows and a bathroom beside it."""
     rooms = [
         RoomSpec("living_room_0", "living_room", (4.0, 5.0), (OpeningSpec("front", 0.9, 2.0),), windows),
         RoomSpec("bathroom_0", "bathroom", (2.0, 2.0)),
@@ -34,7 +34,7 @@ def boxes(plan: FloorPlan) -> list[Aabb]:
 
 
 def ends(window: Window) -> tuple[float, float]:
-    """The window's interval on the axis of its wall."""
+    """Return the window's interval on the axis of its wall."""
     middle = window.center_m[0 if window.along == "x" else 1]
     return middle - window.width_m / 2, middle + window.width_m / 2
 
@@ -73,8 +73,8 @@ def test_window_wider_than_its_wall_is_narrowed() -> None:
 def test_windows_without_a_wall_are_reported() -> None:
     plan = house(*[OpeningSpec("bay", 3.0, 1.5)] * 40)
     assert 0 < len(plan.windows) < 40
-    told = [sentence for sentence in plan.left_out if "window-bay" in sentence]
-    assert told == [f"{40 - len(plan.windows)} window-bay in living_room_0: no outer wall has room for it"]
+    reasons = [sentence for sentence in plan.left_out if "window-bay" in sentence]
+    assert reasons == [f"{40 - len(plan.windows)} window-bay in living_room_0: no outer wall has room for it"]
 
 
 def test_windows_may_face_a_garden() -> None:

@@ -38,7 +38,7 @@ DOOR = Doorway(("kitchen_0", "hall_0"), (2.0, -0.06), 0.9, 2.0, "x")
 
 
 def block(category: str, size: Vec3, *, door: bool = False) -> Asset:
-    """A solid box with a surface on top, and a hinged front if ``door``."""
+    """Return a solid box with a surface on top, and a hinged front if ``door``."""
     links = [Link("base", (ConvexPart(Shape.BOX, Pose((0.0, 0.0, 0.0)), size),))]
     if door:
         leaf = ConvexPart(Shape.BOX, Pose((size[0] / 2 - 0.01, 0.0, 0.0)), (0.02, size[1], size[2]))
@@ -323,7 +323,7 @@ WALL_TYPES = (
 
 
 def wall_gap_m(scene: Scene, item: SceneObject) -> float:
-    """Gap between the back of an object and the edge of its room."""
+    """Return the gap between the back of an object and the edge of its room."""
     room = next(room for room in scene.rooms if room.name == item.room)
     box, yaw = box_of(scene, item), item.pose_world_asset.yaw
     for axis, direction in enumerate((round(math.cos(yaw)), round(math.sin(yaw)))):

@@ -1,4 +1,4 @@
-"""Furnished rooms look plausible to a person."""
+"""Furnished rooms have no visible absurdities."""
 
 import pytest
 
@@ -17,7 +17,7 @@ def called(scene, *words):
 
 
 def over(one, other):
-    """Horizontal overlap of two boxes in m²."""
+    """Return the horizontal overlap of two boxes in m²."""
     sides = [
         min(one.high_m[axis], other.high_m[axis]) - max(one.low_m[axis], other.low_m[axis]) for axis in (0, 1)
     ]

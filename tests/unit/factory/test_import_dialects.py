@@ -168,8 +168,8 @@ def test_report_counts_refusals_and_lists_unreachable_goals(eai: Path, flat: Sce
     (item,) = read_eai(eai)
     bound = outcome_of(item, bind_first(item, [flat], options=EVALUABLE))
     refused = outcome_of(item, TaskRefusal(RefusalReason.DOES_NOT_FIT, "no room"))
-    told = report_to_json([bound, refused])
-    assert (told["problems"], told["bound"], told["refused"]) == (2, 1, {"does_not_fit": 1})
+    summary = report_to_json([bound, refused])
+    assert (summary["problems"], summary["bound"], summary["refused"]) == (2, 1, {"does_not_fit": 1})
     text = report_to_markdown([bound, refused])
     assert "* `toys` (does_not_fit): no room" in text
     assert "## Goals that the profile `paper` does not reach: 2" in text
@@ -183,10 +183,10 @@ def test_solved_share_counts_reachable_goals_only() -> None:
         for name, reason, atoms in (("a", "", ()), ("b", "no_plan", ()), ("c", "", ("(cut apple)",)))
     )
     evaluation = solved_of([solved, stuck, beyond], 0)
-    told = [(figure.name, figure.value, figure.goal, figure.n) for figure in evaluation.figures]
+    summary = [(figure.name, figure.value, figure.goal, figure.n) for figure in evaluation.figures]
     without = solved_of([solved], 0, solids=True).figures[0].name
     assert without == "oracle_solved_behavior of what paper reaches without liquids"
-    assert told == [
+    assert summary == [
         ("oracle_solved_behavior of what paper reaches", 1 / 2, 0.95, 2),
         ("oracle_solved_behavior of what household reaches", 2 / 3, None, 3),
     ]

@@ -86,7 +86,7 @@ def test_bag_is_scaled_up_for_its_contents() -> None:
     grown = chosen({"bag": "shopping_basket"}, {"bag": Requirement(bears=True, contents=("belt.n.02",))})
     assert grown["bag"][0].share > 1
     assert chosen({"bag": "paper_bag"}, {"bag": demand})["bag"][0] in CATALOG.models_of("paper_bag"), (
-        "what no share brings about changes nothing"
+        "a predicate that no share can satisfy changes nothing"
     )
 
 

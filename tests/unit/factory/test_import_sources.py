@@ -99,15 +99,15 @@ def test_import_in_two_processes_gives_the_same_outcomes(tmp_path: Path) -> None
     )
     problems = {"whole": roomy, "unknown": PROBLEM.replace("apple.n.01", "unicorn.n.01")}
     jsonl.write_text("\n".join(json.dumps({"name": name, "bddl": text}) for name, text in problems.items()))
-    told = []
+    written = []
     for jobs in ("1", "2"):
         outcomes = tmp_path / f"{jobs}.jsonl"
         command = ["import", "--jsonl", str(jsonl), "--scene", "Rs_int", "--bind-only", "--jobs", jobs]
         result = CliRunner().invoke(app, [*command, "--outcomes", str(outcomes)])
         assert result.exit_code == 0, result.output
-        told.append(outcomes.read_text())
-    assert told[0] == told[1]
-    assert [json.loads(line)["reason"] for line in told[0].splitlines()[1:]] == ["", "unknown_type"]
+        written.append(outcomes.read_text())
+    assert written[0] == written[1]
+    assert [json.loads(line)["reason"] for line in written[0].splitlines()[1:]] == ["", "unknown_type"]
 
 
 def test_solids_option_skips_problems_with_liquids(tmp_path: Path) -> None:

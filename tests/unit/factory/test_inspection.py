@@ -128,7 +128,7 @@ def test_scene_pictures_are_rendered_once(dataset, tmp_path):
     done = [CliRunner().invoke(app, ["pictures", str(folder)]) for _ in range(2)]
     bundles = {record.bundle_digest.removeprefix("sha256:") for record in dataset.records}
     assert {file.stem for file in (folder / "pictures").glob("*.jpg")} == bundles
-    assert [told.output.split(" pictures")[0].split()[-1] for told in done] == [f"{len(bundles)}", "0"]
+    assert [result.output.split(" pictures")[0].split()[-1] for result in done] == [f"{len(bundles)}", "0"]
     wrong = CliRunner().invoke(app, ["pictures", str(tmp_path / "nowhere")])
     assert (wrong.exit_code, "there is no dataset" in " ".join(wrong.output.split())) == (2, True)
 

@@ -209,9 +209,9 @@ def test_model_organizes_a_room_after_feedback():
         Branch("breakfast_table_1", ON, "plate_1"),
         Branch("kitchen_0", ON, "plate_1"),
     )
-    told = [request["messages"][-1]["content"] for request in server.requests]
-    assert "no complete JSON value" in told[1]
-    assert "is not connected to the root" in told[2]
+    messages = [request["messages"][-1]["content"] for request in server.requests]
+    assert "no complete JSON value" in messages[1]
+    assert "is not connected to the root" in messages[2]
 
 
 def test_rules_replace_a_model_with_unusable_answers():

@@ -182,7 +182,7 @@ def test_failed_concurrent_draft_does_not_affect_the_others():
 
 def test_build_numbers_concurrent_drafts_in_the_order_kept():
     class Twice(PlainWriter):
-        """Gives the same draft twice, whatever it is asked for: one of the two is kept."""
+        """Writer that returns the same draft twice; only one of them is kept."""
 
         at_once = 3
 
@@ -282,7 +282,7 @@ def a_door():
         (lambda: RequestedAtom(predicate=RequestPredicate.HOT, thing=HOST, holds=False), "not the contrary"),
     ],
 )
-def test_infeasible_wish_is_rejected_with_its_reason(wish, sentence):
+def test_infeasible_request_is_rejected_with_its_reason(wish, sentence):
     request = TaskRequest(instruction="Ann asks for it, please.", wishes=(wish(),))
     with pytest.raises(ValueError, match=sentence):
         check_request(request, VIEW, KNOWN)

@@ -80,7 +80,7 @@ def test_unknown_scene_gets_one_sentence_with_close_names() -> None:
     assert "Traceback" not in result.output
 
 
-def test_render_writes_plan_view_and_what_the_robot_sees(tmp_path: Path) -> None:
+def test_render_writes_plan_view_and_robot_view(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["render", "hotel_suite_small", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
     assert sorted(path.name for path in tmp_path.iterdir()) == [

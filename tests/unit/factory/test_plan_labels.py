@@ -21,7 +21,7 @@ NOTHING = boxes(())
 
 
 def written(image: Image.Image) -> np.ndarray:
-    """Mask of the pixels that are no longer grey, (height, width)."""
+    """Return the mask (height, width) of pixels that are no longer grey."""
     return np.asarray(np.any(np.asarray(image) != 128, axis=2))
 
 
@@ -55,7 +55,7 @@ def test_size_of_a_room_moves_below_its_name_if_one_line_is_too_long() -> None:
     assert Labels(image).inside("storage_room_0  1.6 x 1.2 m", (20, 20, 130, 70), "black", NOTHING)
     rows, columns = np.nonzero(written(image))
     name, size = one_line_of("storage_room_0"), one_line_of("1.6 x 1.2 m")
-    assert abs(np.ptp(columns) + 1 - max(name[1], size[1])) <= 2, "the name is whole on a line of its own"
+    assert abs(np.ptp(columns) + 1 - max(name[1], size[1])) <= 2, "the whole name has a dedicated line"
     assert np.ptp(rows) + 1 > 1.5 * name[0]
 
 

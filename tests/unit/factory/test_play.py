@@ -90,8 +90,8 @@ def test_unparsable_text_is_explained_and_earns_minus_one(run, text, words):
 def test_index_outside_the_table_is_a_failed_step(run):
     result = run("apple_to_counter", "--plan", "-", text="move 9999")
     assert result.exit_code == 0
-    told = " ".join(result.output.split())  # however wide the terminal is
-    assert "unknown_index: there is no object with index 9999: the table has indices 0 to 14" in told
+    printed = " ".join(result.output.split())  # however wide the terminal is
+    assert "unknown_index: there is no object with index 9999: the table has indices 0 to 14" in printed
 
 
 def test_oracle_option_solves_the_task(run):

@@ -1,4 +1,4 @@
-"""Pictures of relations: the simulator's verdicts are those that a person expects."""
+"""Pictures of relations: the simulator's verdicts match human judgement."""
 
 import numpy as np
 import pytest

@@ -18,7 +18,7 @@ CABINET = "top_cabinet_1"
 
 
 def turned_to_the_wall(scene: Scene) -> Scene:
-    """The scene with a cabinet that faces the wall and contains an object of the living room."""
+    """Return the scene with a cabinet that faces the wall and contains an object of the living room."""
     x, y, z = scene.by_name[CABINET].pose_world_asset.position_m
     changed = {
         CABINET: {

@@ -19,7 +19,7 @@ HERE = Pose((0.0, 0.0, 0.0))
 
 
 def moved(scene: Scene, name: str, dx: float = 0.0, dy: float = 0.0, dz: float = 0.0) -> Scene:
-    """The scene with one object shifted."""
+    """Return the scene with one object shifted."""
 
     def shift(item: SceneObject) -> SceneObject:
         x, y, z = item.pose_world_asset.position_m

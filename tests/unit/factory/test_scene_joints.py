@@ -23,7 +23,7 @@ TRAVEL_M = 0.36
 
 
 def cabinet_with_a_bowl_in_its_lower_drawer() -> tuple[dict[str, SceneObject], dict[str, Asset]]:
-    """The objects by name, and their assets: a mug lies in the bowl, a book in the upper drawer, another on top."""
+    """Return the objects by name, and their assets: a mug in the bowl, a book in the upper drawer, another on top."""
     cabinet, bowl, mug = make.drawer_cabinet(), make.mug(), make.mug()
     book = make.block("book", "book.n.02", (0.2, 0.15, 0.04), {})
     rows = [

@@ -28,7 +28,7 @@ SMALL = "hotel_suite_small"
 
 
 def put(scene: Scene, name: str, x: float, y: float, z: float | None = None) -> Scene:
-    """The scene with one object at another place with the same heading."""
+    """Return the scene with one object moved and its heading kept."""
     item = scene.by_name[name]
     pose = item.pose_world_asset
     there = Pose((x, y, pose.position_m[2] if z is None else z), pose.quat_xyzw)
@@ -42,7 +42,7 @@ def problems(scene: Scene, kind: ProblemKind) -> list[tuple[str, ...]]:
 
 
 def standing(scene: Scene) -> str:
-    """An object on the floor that is higher than a window's sill."""
+    """Return an object on the floor that is higher than a window's sill."""
     return next(
         o.name
         for o in scene.objects

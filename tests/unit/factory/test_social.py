@@ -1,4 +1,4 @@
-"""Rule-based social simulation: casts that cover the scene, wishes that change, instructions that name a person."""
+"""Rule-based social simulation: casts that cover the scene, changing requests, instructions that name a user."""
 
 import dataclasses
 import re
@@ -268,7 +268,7 @@ def test_usual_places_are_plausible():
 
 @dataclasses.dataclass(frozen=True)
 class Flat:
-    """View of a scene in which each object is named after its category and stands in the kitchen."""
+    """Scene view in which each object is named after its category and is in the kitchen."""
 
     scene = dataclasses.replace(SCENE, rooms=tuple(room for room in SCENE.rooms if room.type == "kitchen"))
 

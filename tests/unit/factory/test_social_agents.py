@@ -1,4 +1,4 @@
-"""Each social agent runs alone; the answer of one agent is the brief of the next."""
+"""Each social agent runs alone; its answer is the input of the next agent."""
 
 import json
 from pathlib import Path
@@ -30,12 +30,12 @@ def test_agent_names_are_unique() -> None:
 def test_agents_chain_from_scene_to_instruction() -> None:
     people = run("role-player", BRIEF)
     talk = run("social-simulator", people)
-    told = SOCIAL_AGENTS[SocialAgent.SUMMARIZER].read(talk)
-    assert isinstance(told, SummaryBrief)
-    assert told.cast == SOCIAL_AGENTS[SocialAgent.SIMULATOR].read(people).cast
+    summary_brief = SOCIAL_AGENTS[SocialAgent.SUMMARIZER].read(talk)
+    assert isinstance(summary_brief, SummaryBrief)
+    assert summary_brief.cast == SOCIAL_AGENTS[SocialAgent.SIMULATOR].read(people).cast
     summary = json.loads(run("summarizer", talk))
-    assert summary["wishes"] == [*told.conversation.last_wishes]
-    assert any(name in summary["instruction"] for name in told.cast.names)
+    assert summary["wishes"] == [*summary_brief.conversation.last_wishes]
+    assert any(name in summary["instruction"] for name in summary_brief.cast.names)
     assert run("social-simulator", people) == talk
 
 

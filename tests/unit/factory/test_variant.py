@@ -23,7 +23,7 @@ def test_open_doors_obstruct_no_path_and_no_other_door(base: Scene, seed: int) -
     changed = build_variant(base, rooms, "open", np.random.default_rng(seed)).scene
     ajar = [item.name for item in changed.objects if any(item.joints)]
     assert ajar
-    before, after = ({p.names for p in reach_problems(told)} for told in (base, changed))
+    before, after = ({p.names for p in reach_problems(each)} for each in (base, changed))
     assert after <= before
     floor = ReachableFloor(changed)
     for item in changed.objects:

@@ -7,10 +7,10 @@ from embomatrix.world.scene import Scene
 
 def test_unsupported_object_is_on_floor_wall_or_ceiling() -> None:
     view = SceneView(build_base_scene("restaurant_diner"))
-    told = {view.category(name): view.whereabouts(name) for name in view.scene.by_name}
-    assert told["fridge"] == told["booth"] == "on the floor"
-    assert told["mirror"] == "on the wall"
-    assert told["room_light"] == "under the ceiling"
+    places = {view.category(name): view.whereabouts(name) for name in view.scene.by_name}
+    assert places["fridge"] == places["booth"] == "on the floor"
+    assert places["mirror"] == "on the wall"
+    assert places["room_light"] == "under the ceiling"
 
 
 def test_supported_object_is_described_with_its_support(home: Scene) -> None:

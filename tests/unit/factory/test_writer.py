@@ -1,4 +1,4 @@
-"""Tasks of the plain writer are about objects of the scene, readable, and deterministic."""
+"""Tasks of the plain writer name existing objects, are readable, and are deterministic."""
 
 import dataclasses
 

@@ -39,7 +39,7 @@ def test_every_method_has_roles():
     assert {method for method in OPEN if "/embomatrix." in method} <= ours
 
 
-def test_admins_may_call_every_listed_method_and_nobody_others():
+def test_admins_may_call_listed_methods_and_no_role_may_call_others():
     assert all(may_call(AccessRole.ADMIN, method) for method in ROLES)
     assert not any(may_call(role, "/embomatrix.proto.v1.AdminService/DropEverything") for role in AccessRole)
 
@@ -56,7 +56,7 @@ def test_roles_are_kept_apart():
 
 
 def book_of(*credentials):
-    """Secrets and ids that a test can read."""
+    """Return a token book with readable secrets and ids."""
     numbers = itertools.count(1)
     return CredentialBook(
         credentials,
@@ -180,7 +180,7 @@ class Known:
 
 
 class TokenMachine(RuleBasedStateMachine):
-    """Whatever happens in whatever order: a token opens a door if and only if it is one, is not void, and is not late."""
+    """State machine: a token grants access exactly while it is issued, not revoked and not expired."""
 
     def __init__(self):
         super().__init__()

@@ -36,7 +36,7 @@ def test_only_an_opinion_against_two_that_agree_is_wrong():
     assert judge([first, third]).ruling is Ruling.OPEN
     assert judge([first, third, second]).wrong == (1,)
     assert judge([first, third, opinion("w2", trace_digest="too")]).ruling is Ruling.SPLIT
-    # Another platform agrees with both of two that differ in their traces only: nobody can tell who is wrong.
+    # Another platform agrees with two results that differ only in their traces: neither is proved wrong.
     assert judge([first, third, opinion("w2", OTHER)]).wrong == ()
 
 

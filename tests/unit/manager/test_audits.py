@@ -47,7 +47,7 @@ PLAIN = RunTerms(GroupPolicy.PARTIAL)
 
 
 class Bench:
-    """A cluster whose workers have the scene, and do what the test says."""
+    """Cluster whose workers have the scene and act as scripted."""
 
     def __init__(self, workers=("w1", "w2", "w3"), terms=VERIFIED, rules=None, versions=SAME):
         limits = DispatchLimits(audit=rules or AuditRules())
@@ -58,22 +58,22 @@ class Bench:
         self.caught = []
         for name in workers:
             self.join(name, versions)
-        self.tell(RunOpened("r1", terms))
+        self.apply(RunOpened("r1", terms))
 
     def join(self, name, versions=SAME):
-        self.tell(WorkerJoined(name, Resources(1, 1, 1024, versions=versions)))
+        self.apply(WorkerJoined(name, Resources(1, 1, 1024, versions=versions)))
         self.report(name, resync=True)
 
     def report(self, name, *, resync=False):
         held = tuple(lease.ref for lease in self.live.values() if lease.worker_id == name)
         resident = Resident("kitchen", ResidentState.WARM, 0.1, 10.0)
-        self.tell(WorkerReported(name, (resident,), held, resync=resync))
+        self.apply(WorkerReported(name, (resident,), held, resync=resync))
 
     def submit(self, count=1, batch_id="b1"):
         rollouts = tuple(Rollout(f"{batch_id}-{n}", f"g{n}", "kitchen", "t", (), 0) for n in range(count))
-        self.tell(BatchSubmitted(Batch("r1", batch_id, 0, rollouts)))
+        self.apply(BatchSubmitted(Batch("r1", batch_id, 0, rollouts)))
 
-    def tell(self, event, after_s=0.01):
+    def apply(self, event, after_s=0.01):
         self.now_s += after_s
         for command in self.cluster.handle(event, now_s=self.now_s):
             match command:
@@ -92,14 +92,14 @@ class Bench:
 
     def finish(self, lease, outcome=None):
         del self.live[lease.ref]
-        self.tell(LeaseFinished(lease.worker_id, lease.ref, outcome or completed(lease.worker_id)))
+        self.apply(LeaseFinished(lease.worker_id, lease.ref, outcome or completed(lease.worker_id)))
 
     def only_lease(self):
         (lease,) = self.live.values()
         return lease
 
     def answer(self, lies=(), limit=1000):
-        """Finish whatever is leased; workers in ``lies`` make their results up."""
+        """Finish all leases; workers in ``lies`` fabricate their results."""
         while self.live and limit:
             limit -= 1
             lease = next(iter(self.live.values()))
@@ -158,12 +158,12 @@ def test_quarantine_survives_a_new_session_and_ends_by_an_operator():
     bench.submit()
     liar = bench.only_lease().worker_id
     bench.answer(lies={liar})
-    bench.tell(WorkerLost(liar, "it left"))
+    bench.apply(WorkerLost(liar, "it left"))
     bench.join(liar)
     bench.submit(9, "b2")
     assert liar not in {lease.worker_id for lease in bench.live.values()}
-    bench.tell(WorkerResumed(liar))
-    bench.tell(Tick(), after_s=0.2)
+    bench.apply(WorkerResumed(liar))
+    bench.apply(Tick(), after_s=0.2)
     assert liar in {lease.worker_id for lease in bench.live.values()}
 
 
@@ -180,8 +180,8 @@ def test_two_different_results_fail_after_waiting_for_a_third_worker():
     bench.submit()
     bench.answer(lies={"w1"})
     assert not bench.results
-    bench.tell(Tick())
-    bench.tell(Tick(), after_s=AuditRules().timeout_s)
+    bench.apply(Tick())
+    bench.apply(Tick(), after_s=AuditRules().timeout_s)
     assert bench.results["b1-0"].outcome.code is InfraCode.RESULT_MISMATCH
     assert not bench.caught
 
@@ -212,11 +212,11 @@ def test_held_result_is_delivered_after_its_second_worker_left():
     bench.finish(bench.only_lease())
     gone = bench.only_lease().worker_id
     bench.live.clear()
-    bench.tell(WorkerLost(gone, "it left"))
-    bench.tell(Tick())
-    bench.tell(LeasesRenewed("w1", ()))
+    bench.apply(WorkerLost(gone, "it left"))
+    bench.apply(Tick())
+    bench.apply(LeasesRenewed("w1", ()))
     assert not bench.results
-    bench.tell(Tick(), after_s=AuditRules().timeout_s)
+    bench.apply(Tick(), after_s=AuditRules().timeout_s)
     assert isinstance(bench.results["b1-0"].outcome, Completed)
 
 
@@ -227,7 +227,7 @@ def test_failed_check_blames_no_worker():
     for _ in range(3):
         lease = bench.only_lease()
         bench.finish(lease, InfraFailure(InfraCode.SLOT_CRASHED, "signal 11", lease.worker_id))
-        bench.tell(Tick(), after_s=6.0)
+        bench.apply(Tick(), after_s=6.0)
     assert bench.results["b1-0"].outcome.code is InfraCode.SLOT_CRASHED
     assert not bench.caught
 
@@ -238,7 +238,7 @@ def test_audits_end_with_their_rollout_or_run(event):
     bench.submit()
     bench.finish(bench.only_lease())
     assert bench.live
-    bench.tell(event)
+    bench.apply(event)
     assert isinstance(bench.results["b1-0"].outcome, Cancelled)
     assert not bench.live
     assert not bench.cluster.dispatcher.queued
@@ -250,16 +250,16 @@ def test_background_audits_deliver_at_once_and_use_idle_slots():
     leases = list(bench.live.values())
     bench.finish(leases[0])
     assert len(bench.results) == 1
-    bench.tell(Tick())
+    bench.apply(Tick())
     assert list(bench.live.values()) == leases[1:], "both others are at work"
     for lease in leases[1:]:
         bench.finish(lease)
-    bench.tell(Tick())
+    bench.apply(Tick())
     assert bench.live
     assert all(lease.audit for lease in bench.live.values())
     bench.answer(lies={"w1"})
     for _ in range(3):
-        bench.tell(Tick())
+        bench.apply(Tick())
         bench.answer(lies={"w1"})
     assert bench.caught == ["w1"]
     assert bench.stats().audited == 3
@@ -269,7 +269,7 @@ def test_background_audit_waits_for_queued_rollouts():
     bench = Bench(workers=("w1", "w2"), terms=PLAIN, rules=AuditRules(background=True))
     bench.submit(40)
     while len(bench.results) < 40:
-        bench.tell(Tick())
+        bench.apply(Tick())
         assert not any(lease.audit for lease in bench.live.values()) or not bench.cluster.dispatcher.queued
         bench.finish(next(lease for lease in bench.live.values() if not lease.audit))
 
@@ -278,7 +278,7 @@ def test_background_audits_are_off_by_default():
     bench = Bench(terms=PLAIN)
     bench.submit(9)
     bench.answer()
-    bench.tell(Tick())
+    bench.apply(Tick())
     assert not bench.live
     assert bench.stats().audited == 0
 
@@ -299,7 +299,7 @@ def test_honest_workers_stay_and_every_rollout_gets_one_outcome_in_any_order(dic
                 alive.add(name)
                 bench.join(name, dice.choice([SAME, OTHER, {}]))
             case 2:
-                bench.tell(Tick(), after_s=dice.choice([0.1, 2.0]))
+                bench.apply(Tick(), after_s=dice.choice([0.1, 2.0]))
                 for name in sorted(alive):
                     bench.report(name)
             case 3 if bench.live:
@@ -313,7 +313,7 @@ def test_honest_workers_stay_and_every_rollout_gets_one_outcome_in_any_order(dic
         bench.join(name)
     for _ in range(200):
         bench.answer()
-        bench.tell(Tick(), after_s=1.0)
+        bench.apply(Tick(), after_s=1.0)
         for name in ("w1", "w2", "w3"):
             bench.report(name)
     assert not bench.caught
@@ -325,7 +325,7 @@ def test_honest_workers_stay_and_every_rollout_gets_one_outcome_in_any_order(dic
 def lose(bench, alive, name):
     alive.discard(name)
     bench.live = {ref: lease for ref, lease in bench.live.items() if lease.worker_id != name}
-    bench.tell(WorkerLost(name, "killed"))
+    bench.apply(WorkerLost(name, "killed"))
 
 
 LIARS = 20
@@ -350,5 +350,5 @@ def test_workers_falsifying_a_tenth_of_results_are_caught_on_probation():
     assert report.delivered == report.submitted
     assert set(report.caught) <= {f"w{index:05d}" for index in range(LIARS)}, "an honest worker was blamed"
     assert len(report.caught) >= LIARS - 1
-    # Two liars may meet, and the third worker be one as well: a result that nobody confirms is none.
+    # Two liars may meet, and the third worker may lie as well: an unconfirmed result is lost.
     assert report.infra_failures <= 0.01 * report.submitted

@@ -14,7 +14,7 @@ SIZE = 1000
 
 
 class Folder:
-    """A store with room for three bundles, and its clock. Bundles are named by a letter."""
+    """Store with room for three bundles, and its clock. A letter names a bundle."""
 
     def __init__(self, path, keep_s=60.0):
         self.now_s = 1_000_000.0

@@ -43,7 +43,7 @@ CRASH = InfraFailure(InfraCode.SLOT_CRASHED, "signal 11")
 
 
 class Desk:
-    """A dispatcher, its clock, and the leases that its workers hold."""
+    """Dispatcher with its clock and the leases that its workers hold."""
 
     def __init__(self, limits=LIMITS):
         self.dispatcher = Dispatcher(limits, boot_id="boot")
@@ -52,7 +52,7 @@ class Desk:
         self.held = {}
         self.hedges = []
 
-    def tell(self, event, after_s=0.0):
+    def apply(self, event, after_s=0.0):
         self.now_s += after_s
         commands = self.dispatcher.handle(event, now_s=self.now_s)
         for command in commands:
@@ -69,27 +69,27 @@ class Desk:
         return commands
 
     def worker(self, worker_id, slots=1, warm=("kitchen",), render_slots=0):
-        self.tell(WorkerJoined(worker_id, Resources(slots, slots, 1024, render_slots=render_slots)))
+        self.apply(WorkerJoined(worker_id, Resources(slots, slots, 1024, render_slots=render_slots)))
         self.report(worker_id, warm, resync=True)
 
     def report(self, worker_id, warm=("kitchen",), **changes):
         residents = tuple(Resident(scene, ResidentState.WARM) for scene in warm)
-        return self.tell(WorkerReported(worker_id, residents, **changes))
+        return self.apply(WorkerReported(worker_id, residents, **changes))
 
     def submit(self, *groups, run_id="r1", batch_id="b1", scene="kitchen", render=False):
-        """So many rollouts in each group, named "group.index"."""
+        """Submit a batch of groups with these sizes; rollouts are named "batch.group.index"."""
         rollouts = tuple(
             Rollout(f"{batch_id}.{group}.{index}", f"{batch_id}.{group}", scene, "t", (), 0, render)
             for group, size in enumerate(groups)
             for index in range(size)
         )
-        return self.tell(BatchSubmitted(Batch(run_id, batch_id, 1, rollouts)))
+        return self.apply(BatchSubmitted(Batch(run_id, batch_id, 1, rollouts)))
 
     def finish(self, rollout_id, outcome=None, worker_id=None, after_s=0.0):
         leases = self.held[rollout_id]
         worker_id = worker_id or next(iter(leases))
         ref = leases.pop(worker_id)
-        return self.tell(LeaseFinished(worker_id, ref, outcome or completed(worker_id)), after_s)
+        return self.apply(LeaseFinished(worker_id, ref, outcome or completed(worker_id)), after_s)
 
 
 @pytest.fixture
@@ -98,7 +98,7 @@ def desk():
 
 
 def policy(desk, group_policy, **terms):
-    desk.tell(RunOpened("r1", RunTerms(group_policy, **terms)))
+    desk.apply(RunOpened("r1", RunTerms(group_policy, **terms)))
 
 
 # Group policies
@@ -142,7 +142,7 @@ def test_fail_fast_retries_nothing_and_cancels_the_batch(desk):
 def test_slots_freed_by_a_failed_group_are_filled_at_once(desk):
     desk.worker("w1", slots=1)
     desk.submit(2, 2)
-    desk.tell(Tick(), after_s=601.0)
+    desk.apply(Tick(), after_s=601.0)
     desk.submit(1, batch_id="b2")
     assert "b2.0.0" in desk.held
 
@@ -150,7 +150,7 @@ def test_slots_freed_by_a_failed_group_are_filled_at_once(desk):
 def test_deadline_of_a_run_overrides_the_default(desk):
     policy(desk, GroupPolicy.PARTIAL, rollout_deadline_s=5.0)
     desk.submit(1)
-    desk.tell(Tick(), after_s=5.0)
+    desk.apply(Tick(), after_s=5.0)
     assert desk.results["b1.0.0"].code is InfraCode.DEADLINE
     assert "within 5 s" in desk.results["b1.0.0"].message
 
@@ -159,7 +159,7 @@ def test_deadline_of_a_run_overrides_the_default(desk):
 
 
 def known(desk, count=20):
-    """A run of which the manager knows that its rollouts take a second; one is left that runs on w1."""
+    """Teach the manager a rollout duration of one second; one rollout remains, on w1."""
     desk.worker("w1", slots=count)
     desk.submit(count)
     for index in range(count - 1):
@@ -169,16 +169,16 @@ def known(desk, count=20):
 def test_late_rollout_in_a_tail_is_hedged_and_the_first_result_counts(desk):
     known(desk)
     desk.worker("w2")
-    desk.tell(Tick(), after_s=0.5)
+    desk.apply(Tick(), after_s=0.5)
     assert desk.hedges == []
-    desk.tell(Tick(), after_s=2.0)
+    desk.apply(Tick(), after_s=2.0)
     (hedge,) = desk.hedges
     assert (hedge.worker_id, hedge.rollout.rollout_id) == ("w2", "b1.0.19")
     first = desk.held["b1.0.19"]["w1"]
     commands = desk.finish("b1.0.19", worker_id="w2")
     assert CancelLease("w1", first) in commands
     assert desk.results["b1.0.19"].worker_id == "w2"
-    desk.tell(LeaseFinished("w1", first, completed("w1")))
+    desk.apply(LeaseFinished("w1", first, completed("w1")))
     assert desk.results["b1.0.19"].worker_id == "w2"
     counters = desk.dispatcher.counters("r1")
     assert (counters.hedged, counters.stale_results, counters.delivered) == (1, 1, 20)
@@ -188,7 +188,7 @@ def test_late_rollout_in_a_tail_is_hedged_and_the_first_result_counts(desk):
 def test_failed_hedge_leaves_the_first_lease_alone(desk):
     known(desk)
     desk.worker("w2")
-    desk.tell(Tick(), after_s=3.0)
+    desk.apply(Tick(), after_s=3.0)
     desk.finish("b1.0.19", CRASH, worker_id="w2")
     assert desk.dispatcher.counters("r1").redispatched == 0
     desk.finish("b1.0.19", worker_id="w1")
@@ -203,7 +203,7 @@ def test_rollout_is_hedged_once_and_a_run_within_its_budget():
         desk.finish(f"b1.0.{index}", after_s=1.0 if not index else 0.0)
     desk.worker("w2", slots=8)
     for _ in range(20):
-        desk.tell(Tick(), after_s=1.0)
+        desk.apply(Tick(), after_s=1.0)
     assert len(desk.hedges) == 2
 
 
@@ -214,19 +214,19 @@ def test_rollout_that_ran_out_of_memory_is_not_hedged(desk):
     for index in range(19):
         desk.finish(f"b1.0.{index}", after_s=1.0 if not index else 0.0)
     desk.worker("w2")
-    desk.tell(Tick(), after_s=30.0)
+    desk.apply(Tick(), after_s=30.0)
     assert desk.hedges == []
 
 
 def test_scene_of_a_late_rollout_is_loaded_on_another_worker(desk):
     known(desk)
     desk.worker("w2", warm=())
-    desk.tell(Tick(), after_s=3.0)
+    desk.apply(Tick(), after_s=3.0)
     demand = desk.dispatcher.demand()
     assert demand.pending == {"kitchen": 1}
     assert demand.waited_s["kitchen"] >= 3.0
     desk.report("w2")
-    desk.tell(Tick())
+    desk.apply(Tick())
     assert [hedge.worker_id for hedge in desk.hedges] == ["w2"]
 
 
@@ -241,7 +241,7 @@ def test_last_worker_is_no_longer_treated_as_slow_at_the_next_tick(desk):
     for index in range(24, 30):
         desk.finish(f"b1.0.{index}", after_s=2.0)
     desk.submit(20, batch_id="b2")
-    desk.tell(Tick(), after_s=0.05)
+    desk.apply(Tick(), after_s=0.05)
     assert len([name for name in desk.held if name.startswith("b2") and desk.held[name]]) >= 2
 
 
@@ -251,8 +251,8 @@ def test_only_worker_gets_a_failed_rollout_again_after_a_pause(desk):
     desk.submit(1)
     desk.finish("b1.0.0", CRASH)
     assert not desk.held["b1.0.0"]
-    desk.tell(WorkerSuspected("w2"))
-    desk.tell(Tick(), after_s=LIMITS.elsewhere_s + 0.1)
+    desk.apply(WorkerSuspected("w2"))
+    desk.apply(Tick(), after_s=LIMITS.elsewhere_s + 0.1)
     assert list(desk.held["b1.0.0"]) == ["w1"]
 
 
@@ -261,7 +261,7 @@ def test_only_worker_gets_a_failed_rollout_again_after_a_pause(desk):
 
 def beat(desk, worker_id, rollout_id, steps, after_s):
     ref = desk.held[rollout_id][worker_id]
-    return desk.tell(LeasesRenewed(worker_id, (ref,), (LeaseProgress(ref, steps),)), after_s)
+    return desk.apply(LeasesRenewed(worker_id, (ref,), (LeaseProgress(ref, steps),)), after_s)
 
 
 def test_stalled_lease_moves_to_another_worker(desk):
@@ -282,7 +282,7 @@ def test_worker_that_reports_no_progress_never_stalls(desk):
     known(desk)
     ref = desk.held["b1.0.19"]["w1"]
     for _ in range(20):
-        desk.tell(LeasesRenewed("w1", (ref,)), after_s=5.0)
+        desk.apply(LeasesRenewed("w1", (ref,)), after_s=5.0)
     assert desk.held["b1.0.19"] == {"w1": ref}
 
 
@@ -300,12 +300,12 @@ def test_third_stall_fails_a_rollout(desk):
 
 def test_paused_dispatch_grants_no_leases_until_it_is_resumed(desk):
     desk.worker("w1", slots=2)
-    desk.tell(DispatchPaused())
+    desk.apply(DispatchPaused())
     desk.submit(2)
-    desk.tell(Tick(), after_s=100.0)
+    desk.apply(Tick(), after_s=100.0)
     assert desk.held == {}
     assert desk.results == {}
-    desk.tell(DispatchResumed())
+    desk.apply(DispatchResumed())
     assert set(desk.held) == {"b1.0.0", "b1.0.1"}
 
 
@@ -321,11 +321,11 @@ def test_paused_worker_finishes_its_leases_and_gets_no_new_ones(desk):
 
 def test_resumed_worker_gets_work_unless_it_is_leaving(desk):
     desk.worker("w1")
-    desk.tell(WorkerDrained("w1"))
+    desk.apply(WorkerDrained("w1"))
     desk.submit(1)
     assert desk.held == {}
     desk.report("w1", draining=True)
-    desk.tell(WorkerResumed("w1"))
+    desk.apply(WorkerResumed("w1"))
     assert desk.held == {}
     desk.report("w1", draining=False)
     assert "b1.0.0" in desk.held
@@ -362,7 +362,7 @@ def test_new_run_gets_its_share_before_slot_times_are_known(desk, weight, share)
     desk.submit(1, run_id="before", batch_id="before")
     # From here on the worker is given many leases ahead, and each run's are charged as if they took a second.
     desk.finish("before.0.0", after_s=0.001)
-    desk.tell(RunOpened("first", RunTerms(weight=weight)))
+    desk.apply(RunOpened("first", RunTerms(weight=weight)))
     desk.submit(800, run_id="first", batch_id="first")
     desk.submit(800, run_id="second", batch_id="second")
     for _ in range(600):

@@ -55,7 +55,7 @@ def test_rollout_waits_while_its_scene_is_warm_nowhere(table):
 
 
 def test_worker_gets_no_lease_before_its_first_report(table):
-    table.tell(WorkerJoined("w1", Resources(4, 4, 1024)))
+    table.apply(WorkerJoined("w1", Resources(4, 4, 1024)))
     assert leases(table.submit()) == []
 
 
@@ -90,7 +90,7 @@ def test_rollouts_of_a_lost_worker_are_redispatched_at_once(table):
     table.worker("w1", slots=2)
     table.submit(4)
     table.worker("w2", slots=2)
-    given = leases(table.tell(WorkerLost("w1", "killed")))
+    given = leases(table.apply(WorkerLost("w1", "killed")))
     assert {lease.worker_id for lease in given} == {"w2"}
     assert len(given) == 4
 
@@ -100,7 +100,7 @@ def test_only_started_leases_of_a_lost_worker_cost_an_attempt(table):
         table.worker(name)
         if name == "w1":
             table.submit(2)
-        table.tell(WorkerLost(name, "killed"))
+        table.apply(WorkerLost(name, "killed"))
     assert table.results["b1-0"].outcome.code is InfraCode.WORKER_LOST
     assert table.results["b1-0"].attempt == 3
     assert "b1-1" not in table.results
@@ -122,7 +122,7 @@ def test_late_result_is_acknowledged_counted_and_dropped(table):
     table.worker("w1")
     (old,) = leases(table.submit())
     table.worker("w2")
-    (new,) = leases(table.tell(WorkerLost("w1", "silent")))
+    (new,) = leases(table.apply(WorkerLost("w1", "silent")))
     assert table.finish(old) == [AcknowledgeLease("w1", old.ref)]
     assert table.results == {}
     table.finish(new)
@@ -135,7 +135,7 @@ def test_result_under_another_epoch_or_worker_is_stale(table):
     table.worker()
     (lease,) = leases(table.submit())
     for worker_id, ref in (("w1", LeaseRef(lease.ref.lease_id, 99)), ("w2", lease.ref)):
-        table.tell(LeaseFinished(worker_id, ref, completed()))
+        table.apply(LeaseFinished(worker_id, ref, completed()))
     assert table.results == {}
     table.finish(lease)
     assert len(table.results) == 1
@@ -144,9 +144,9 @@ def test_result_under_another_epoch_or_worker_is_stale(table):
 def test_lease_without_renewal_expires(table):
     table.worker()
     (lease,) = leases(table.submit())
-    table.tell(LeasesRenewed("w1", (lease.ref,)), after_s=29)
-    assert table.tell(Tick(), after_s=2) == []
-    commands = table.tell(Tick(), after_s=30)
+    table.apply(LeasesRenewed("w1", (lease.ref,)), after_s=29)
+    assert table.apply(Tick(), after_s=2) == []
+    commands = table.apply(Tick(), after_s=30)
     assert commands[0] == CancelLease("w1", lease.ref)
     assert leases(commands)[0].ref.lease_epoch > lease.ref.lease_epoch
 
@@ -155,23 +155,24 @@ def test_renewed_lease_expires_at_its_limit(table):
     table.worker()
     (lease,) = leases(table.submit())
     for _ in range(9):
-        table.tell(LeasesRenewed("w1", (lease.ref,)), Tick(), after_s=10)
+        table.apply(LeasesRenewed("w1", (lease.ref,)), Tick(), after_s=10)
     assert table.dispatcher.live_leases
-    table.tell(LeasesRenewed("w1", (lease.ref,)), after_s=9)
-    commands = table.tell(Tick(), after_s=2)
+    table.apply(LeasesRenewed("w1", (lease.ref,)), after_s=9)
+    commands = table.apply(Tick(), after_s=2)
     assert CancelLease("w1", lease.ref) in commands
 
 
 def test_leases_that_expire_behind_a_busy_slot_cost_no_attempt_and_are_leased_again():
-    """Counterexample of the lease machine: expiring the running lease "started" the one behind it, and so on.
+    """Counterexample that the lease machine found.
 
-    All of them then counted as failures of their worker, which kept its slots free although rollouts waited.
+    The expiry of the running lease "started" the lease behind it, and so on. All of them then counted as failures of their
+    worker, whose slots stayed free although rollouts waited.
     """
     table = Table()
     table.worker("w1")
     (running, queued) = leases(table.submit(2))
     table.worker("w2", warm=())
-    commands = table.tell(Tick(), after_s=31)
+    commands = table.apply(Tick(), after_s=31)
     assert [command.ref for command in commands if isinstance(command, CancelLease)] == [
         running.ref,
         queued.ref,
@@ -208,22 +209,22 @@ def test_later_report_returns_no_lease(table):
 
 
 def test_unknown_lease_of_a_former_manager_is_cancelled(table):
-    table.tell(WorkerJoined("w1", Resources(1, 1, 1024)))
+    table.apply(WorkerJoined("w1", Resources(1, 1, 1024)))
     ghost = LeaseRef("other-1", 1)
     assert table.report(held=[ghost], resync=True) == [CancelLease("w1", ghost)]
 
 
 def test_suspected_worker_gets_no_lease_until_it_is_heard(table):
     table.worker()
-    table.tell(WorkerSuspected("w1"))
+    table.apply(WorkerSuspected("w1"))
     assert leases(table.submit()) == []
-    assert len(leases(table.tell(WorkerRecovered("w1")))) == 1
+    assert len(leases(table.apply(WorkerRecovered("w1")))) == 1
 
 
 def test_drained_worker_finishes_its_leases_and_gets_no_new_ones(table):
     table.worker()
     first, second = leases(table.submit(5))
-    table.tell(WorkerDrained("w1"))
+    table.apply(WorkerDrained("w1"))
     assert leases(table.finish(first)) == leases(table.finish(second)) == []
     assert len(table.results) == 2
 
@@ -232,7 +233,7 @@ def test_idle_slot_steals_a_lease_queued_behind_a_busy_one(table):
     table.worker("w1", slots=1)
     running, waiting = leases(table.submit(2))
     table.worker("w2", slots=1)
-    commands = table.tell(Tick(), after_s=1.0)
+    commands = table.apply(Tick(), after_s=1.0)
     assert commands[0] == CancelLease("w1", waiting.ref)
     (stolen,) = leases(commands)
     assert (stolen.worker_id, stolen.rollout) == ("w2", waiting.rollout)
@@ -245,7 +246,7 @@ def test_cancelled_batch_finishes_at_once_and_frees_its_slots(table):
     table.worker()
     given = leases(table.submit(3))
     table.submit(1, batch_id="b2")
-    commands = table.tell(BatchCancelled("r1", "b1"))
+    commands = table.apply(BatchCancelled("r1", "b1"))
     assert all(isinstance(table.results[f"b1-{i}"].outcome, Cancelled) for i in range(3))
     assert {c.ref for c in commands if isinstance(c, CancelLease)} == {lease.ref for lease in given}
     assert [lease.rollout.rollout_id for lease in leases(commands)] == ["b2-0"]
@@ -254,8 +255,8 @@ def test_cancelled_batch_finishes_at_once_and_frees_its_slots(table):
 def test_closed_run_cancels_only_its_own_batches(table):
     table.submit(2)
     rollout = Rollout("other", "g", "kitchen", "t", (), 0)
-    table.tell(BatchSubmitted(Batch("r2", "b1", 1, (rollout,))))
-    table.tell(RunClosed("r1"))
+    table.apply(BatchSubmitted(Batch("r2", "b1", 1, (rollout,))))
+    table.apply(RunClosed("r1"))
     assert set(table.results) == {"b1-0", "b1-1"}
     assert table.dispatcher.pending_of("r2") == 1
 
@@ -263,32 +264,32 @@ def test_closed_run_cancels_only_its_own_batches(table):
 def test_rollout_fails_at_its_deadline(table):
     table.worker(warm=[])
     table.submit()
-    table.tell(Tick(), after_s=599)
+    table.apply(Tick(), after_s=599)
     assert table.results == {}
-    table.tell(Tick(), after_s=2)
+    table.apply(Tick(), after_s=2)
     assert table.results["b1-0"].outcome.code is InfraCode.DEADLINE
 
 
 def test_rollouts_without_a_worker_fail_after_the_bounded_wait(table):
     table.submit()
-    table.tell(Tick(), after_s=59)
+    table.apply(Tick(), after_s=59)
     assert table.results == {}
-    table.tell(Tick(), after_s=2)
+    table.apply(Tick(), after_s=2)
     assert table.results["b1-0"].outcome.code is InfraCode.NO_CAPACITY
 
 
 def test_later_rollout_waits_for_the_whole_limit_too(table):
-    table.tell(Tick(), after_s=100)
+    table.apply(Tick(), after_s=100)
     table.submit()
-    table.tell(Tick(), after_s=30)
+    table.apply(Tick(), after_s=30)
     assert table.results == {}
 
 
 def test_unplaceable_scene_fails_its_rollouts_with_the_reason(table):
     table.worker(warm=[])
     table.submit()
-    table.tell(ScenesUnplaceable({"kitchen": "needs 900 MB"}))
-    table.tell(Tick(), after_s=61)
+    table.apply(ScenesUnplaceable({"kitchen": "needs 900 MB"}))
+    table.apply(Tick(), after_s=61)
     assert table.results["b1-0"].outcome == InfraFailure(InfraCode.NO_CAPACITY, "needs 900 MB")
 
 
@@ -315,9 +316,9 @@ def test_only_worker_may_fail_to_load_for_a_while(table):
     table.worker(warm=[])
     table.submit()
     table.report(failed=["kitchen"])
-    table.tell(Tick(), after_s=9)
+    table.apply(Tick(), after_s=9)
     assert table.results == {}
-    table.tell(Tick(), after_s=2)
+    table.apply(Tick(), after_s=2)
     assert table.results["b1-0"].outcome.code is InfraCode.SCENE_LOAD_FAILED
 
 
@@ -340,7 +341,7 @@ def test_newer_session_loses_the_leases_of_the_older_one(table):
 def test_result_contains_the_queue_time(table):
     table.worker()
     first, second = leases(table.submit(2))
-    table.tell(Tick(), after_s=2.0)
+    table.apply(Tick(), after_s=2.0)
     table.submit(1, batch_id="b2")
     table.now_s += 3.0
     (third,) = leases(table.finish(first))
@@ -368,7 +369,7 @@ def test_history_of_a_redispatched_rollout_names_workers_reasons_and_causes(tabl
     table.worker("w2")
     state = table.dispatcher.state
     assert state.where("b1-0").startswith("leased: boot-1 on w1")
-    (again, _) = leases(table.tell(WorkerLost("w1", "killed"), after_s=1.0))
+    (again, _) = leases(table.apply(WorkerLost("w1", "killed"), after_s=1.0))
     table.finish(again)
     steps = state.explain("b1-0")
     assert [(step.kind, step.worker_id, step.cause) for step in steps] == [
@@ -389,4 +390,4 @@ def test_every_command_carries_the_event_that_caused_it(table):
     assert [type(command.caused_by) for command in commands] == [BatchSubmitted, BatchSubmitted]
     lost = WorkerLost("w1", "killed")
     table.worker("w2")
-    assert all(command.caused_by is lost for command in table.tell(lost))
+    assert all(command.caused_by is lost for command in table.apply(lost))

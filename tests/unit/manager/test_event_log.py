@@ -24,11 +24,11 @@ from embomatrix.rpc.wire.values import (
 EPOCH_S = 1_000.0
 
 
-def chronicle(*run_ids):
-    told = RunEventLog(epoch_s=EPOCH_S)
+def log_of(*run_ids):
+    log = RunEventLog(epoch_s=EPOCH_S)
     for run_id in run_ids:
-        told.open_run(run_id, "a run", now_s=1.0, cpu_s=0.0)
-    return told
+        log.open_run(run_id, "a run", now_s=1.0, cpu_s=0.0)
+    return log
 
 
 def lease(number, run_id="r1"):
@@ -39,38 +39,38 @@ def lease(number, run_id="r1"):
 
 
 def test_busy_run_drops_its_own_oldest_events_and_counts_them():
-    told = chronicle("busy", "quiet")
+    log = log_of("busy", "quiet")
     for number in range(EVENTS_KEPT):
-        told.leased(lease(number, "busy"), now_s=2.0)
-    told.leased(lease(1, "quiet"), now_s=3.0)
-    assert told.page("busy", 0).dropped == EVENTS_KEPT + 1 - EVENTS_KEPT // 2
-    assert [event.kind for event in told.page("quiet", 0).events] == [EventKind.RUN_OPENED, EventKind.LEASED]
-    assert told.page("quiet", 0).dropped == 0
+        log.leased(lease(number, "busy"), now_s=2.0)
+    log.leased(lease(1, "quiet"), now_s=3.0)
+    assert log.page("busy", 0).dropped == EVENTS_KEPT + 1 - EVENTS_KEPT // 2
+    assert [event.kind for event in log.page("quiet", 0).events] == [EventKind.RUN_OPENED, EventKind.LEASED]
+    assert log.page("quiet", 0).dropped == 0
 
 
 def test_every_run_keeps_a_minimum_of_events():
-    told = chronicle(*(f"r{number}" for number in range(2 * EVENTS_KEPT // LEAST_KEPT)))
+    log = log_of(*(f"r{number}" for number in range(2 * EVENTS_KEPT // LEAST_KEPT)))
     for number in range(2 * LEAST_KEPT):
-        told.leased(lease(number), now_s=2.0)
-    assert len(told.page("r1", 0).events) == LEAST_KEPT
+        log.leased(lease(number), now_s=2.0)
+    assert len(log.page("r1", 0).events) == LEAST_KEPT
 
 
 def test_pages_of_a_log_come_one_after_the_other():
-    told = chronicle("r1")
+    log = log_of("r1")
     for number in range(10):
-        told.leased(lease(number), now_s=2.0)
-    first = told.page("r1", 0, 4).events
-    second = told.page("r1", first[-1].sequence, 100).events
+        log.leased(lease(number), now_s=2.0)
+    first = log.page("r1", 0, 4).events
+    second = log.page("r1", first[-1].sequence, 100).events
     assert [event.rollout_id for event in (*first, *second)][1:] == [f"x{number}" for number in range(10)]
     assert first[0].at_s == EPOCH_S + 1.0
-    assert told.page("another", 0) is None
+    assert log.page("another", 0) is None
 
 
 def test_leases_of_closed_runs_are_not_logged():
-    told = chronicle("r1")
-    told.close_run("r1", now_s=2.0)
-    told.leased(lease(1), now_s=3.0)
-    assert told.page("r1", 0) is None
+    log = log_of("r1")
+    log.close_run("r1", now_s=2.0)
+    log.leased(lease(1), now_s=3.0)
+    assert log.page("r1", 0) is None
 
 
 def live(command):
@@ -81,47 +81,47 @@ def live(command):
 
 
 def test_hedge_is_won_by_its_own_result():
-    told = chronicle("r1")
+    log = log_of("r1")
     first, second = lease(1), replace(lease(2), hedge=True)
     for command in (first, second):
-        told.leased(command, now_s=2.0)
+        log.leased(command, now_s=2.0)
     crashed = InfraFailure(InfraCode.SLOT_CRASHED, "died")
-    told.reported("w1", [LeaseResult(first.ref, crashed)], live(first), now_s=3.0)
-    assert told.hedges_won == 0
-    told.reported("w1", [LeaseResult(second.ref, completed())], live(second), now_s=3.0)
-    assert told.hedges_won == 1
+    log.reported("w1", [LeaseResult(first.ref, crashed)], live(first), now_s=3.0)
+    assert log.hedges_won == 0
+    log.reported("w1", [LeaseResult(second.ref, completed())], live(second), now_s=3.0)
+    assert log.hedges_won == 1
 
 
 def test_results_of_dead_leases_are_not_logged():
-    told = chronicle("r1")
-    told.reported("w1", [LeaseResult(LeaseRef("l1", 1), completed())], {}, now_s=3.0)
-    told.reported("w2", [LeaseResult(lease(1).ref, completed())], live(lease(1)), now_s=3.0)
-    assert [event.kind for event in told.page("r1", 0).events] == [EventKind.RUN_OPENED]
+    log = log_of("r1")
+    log.reported("w1", [LeaseResult(LeaseRef("l1", 1), completed())], {}, now_s=3.0)
+    log.reported("w2", [LeaseResult(lease(1).ref, completed())], live(lease(1)), now_s=3.0)
+    assert [event.kind for event in log.page("r1", 0).events] == [EventKind.RUN_OPENED]
 
 
 def test_phases_of_a_lease_add_up_to_its_life():
-    told = chronicle("r1")
+    log = log_of("r1")
     done = replace(completed(), timings=Timings(load_s=0.5, execute_s=1.0))
-    told.reported("w1", [LeaseResult(lease(1).ref, done, slot=3, held_s=1.2)], live(lease(1)), now_s=4.0)
-    (event,) = [event for event in told.page("r1", 0).events if event.kind is EventKind.COMPLETED]
+    log.reported("w1", [LeaseResult(lease(1).ref, done, slot=3, held_s=1.2)], live(lease(1)), now_s=4.0)
+    (event,) = [event for event in log.page("r1", 0).events if event.kind is EventKind.COMPLETED]
     assert event.timings == Timings(queued_s=1.0, load_s=0.5, execute_s=1.0, lease_s=0.5)
     assert (event.slot, event.held_s, event.attempt) == (3, 1.2, 1)
 
 
 def test_scene_events_are_logged_on_change_only():
-    told = chronicle()
+    log = log_of()
     loading = Resident("a", ResidentState.LOADING)
     warm = Resident("a", ResidentState.WARM, load_s=0.5)
     broken = Resident("b", ResidentState.FAILED, error="no mesh")
     for now_s, residents in enumerate([[loading], [warm], [warm, broken], [warm, broken], [broken], []]):
-        told.fleet.residents("w1", residents, now_s=now_s)
-    found = [(event.at_s - EPOCH_S, event.kind, event.bundle_digest) for event in told.page("", 0).events]
+        log.fleet.residents("w1", residents, now_s=now_s)
+    found = [(event.at_s - EPOCH_S, event.kind, event.bundle_digest) for event in log.page("", 0).events]
     assert found == [
         (1, EventKind.SCENE_WARM, "a"),
         (2, EventKind.SCENE_FAILED, "b"),
         (4, EventKind.SCENE_EVICTED, "a"),
     ]
-    assert told.fleet.scene_load.sum_s == 0.5
+    assert log.fleet.scene_load.sum_s == 0.5
 
 
 def summary(run_id):
@@ -133,7 +133,7 @@ def summary(run_id):
 async def test_archive_keeps_the_latest_runs_and_skips_damaged_files(tmp_path):
     archive = RunArchive(tmp_path / "runs", kept=3)
     for number in range(5):
-        await archive.keep(summary(f"r{number}"), chronicle("r").page("r", 0).events)
+        await archive.keep(summary(f"r{number}"), log_of("r").page("r", 0).events)
     assert [kept.run.run_id for kept in await archive.summaries()] == ["r4", "r3", "r2"]
     (tmp_path / "runs" / "r3.run.gz").write_bytes(b"no gzip")
     assert [kept.run.run_id for kept in await archive.summaries()] == ["r4", "r2"]

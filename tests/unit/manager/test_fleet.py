@@ -1,4 +1,4 @@
-"""Worker pool of a large cluster: look-up by scene, free slots and backlog without scanning all workers."""
+"""Worker pool of a large cluster: lookups by scene, free slots and backlog scan only some of the workers."""
 
 import pytest
 
@@ -35,7 +35,7 @@ def load(pool, worker_id, leases, given_s=0.0):
         pool.add_lease(worker, LeaseRecord(LeaseRef(name, 1), worker_id, record, given_s, 30.0, 180.0))
 
 
-def test_only_holder_with_a_credit_is_found_among_many():
+def test_only_worker_with_a_credit_is_found_among_many():
     pool = pool_of(MANY)
     for worker_id in list(pool.workers)[:-1]:
         load(pool, worker_id, 2)
@@ -53,7 +53,7 @@ def test_all_of_many_holders_get_leases():
     assert len(set(chosen)) == MANY
 
 
-def test_an_idle_worker_finds_a_lease_behind_a_busy_slot():
+def test_idle_worker_finds_a_lease_behind_a_busy_slot():
     pool = pool_of(2)
     load(pool, "w0000", 2, given_s=1.0)
     thief = pool.workers["w0001"]
@@ -64,7 +64,7 @@ def test_an_idle_worker_finds_a_lease_behind_a_busy_slot():
 
 @pytest.mark.parametrize(
     ("now_s", "left_alone"),
-    # Three rollouts of 0.1 s each, of which the first began at 1 s: the last begins at 1.2 s.
+    # Three rollouts of 0.1 s each; the first began at 1 s, so the last begins at 1.2 s.
     [(1.05, False), (1.15, True), (1.2, True), (1.39, True), (1.41, False)],
 )
 def test_lease_about_to_start_is_not_stolen(now_s, left_alone):

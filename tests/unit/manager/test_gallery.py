@@ -25,7 +25,7 @@ EVERY = {"search": "", "scene": "", "category": "", "offset": 0, "limit": 24}
 
 @pytest.fixture
 def folder(tmp_path):
-    """Tasks by an honest name, by one that has a meaning in paths, and by a script."""
+    """Dataset whose tasks have a plain name, a name with a meaning in paths, and a script as name."""
     names = ("tidy", "..", "<script>alert(1)<b>")
     tasks = [replace(TASK, task_id=name, instruction=f"Please {name} up") for name in names]
     data = encode_bundle(Bundle(SCENE, {task.task_id: task for task in tasks}))
@@ -75,15 +75,15 @@ def test_manager_without_a_dataset_shows_no_tasks():
 async def test_task_page_shows_objects_transcript_and_tree(folder):
     (folder / "transcripts" / "tidy.md").write_text("**Mia** (need): tidy up")
     (folder / "trees" / "tidy.json").write_text(json.dumps({"kitchen_0": ["apple"]}))
-    told = await Gallery(folder).detail("tidy")
-    assert (told.transcript, told.tree) == ("**Mia** (need): tidy up", {"kitchen_0": ["apple"]})
-    assert [row.name for row in told.objects] == list(TASK.table)
-    assert {row.name for row in told.objects if row.goal} == set(TASK.goal_objects) & set(TASK.table)
-    assert len(told.moments) == 3
-    assert "kitchen_0" in told.rooms
+    detail = await Gallery(folder).detail("tidy")
+    assert (detail.transcript, detail.tree) == ("**Mia** (need): tidy up", {"kitchen_0": ["apple"]})
+    assert [row.name for row in detail.objects] == list(TASK.table)
+    assert {row.name for row in detail.objects if row.goal} == set(TASK.goal_objects) & set(TASK.table)
+    assert len(detail.moments) == 3
+    assert "kitchen_0" in detail.rooms
 
 
-async def test_name_that_is_a_path_leads_to_no_file(folder):
+async def test_path_as_name_opens_no_file(folder):
     gallery = Gallery(folder)
     assert (await gallery.detail("..")).transcript == ""
     for name in ("../secret.md", "/etc/passwd", "transcripts/tidy", ""):
@@ -97,8 +97,8 @@ async def test_name_that_is_a_path_leads_to_no_file(folder):
 async def test_link_out_of_the_folder_and_a_file_without_end_are_not_read(folder):
     (folder / "transcripts" / "tidy.md").symlink_to(folder.parent / "secret.md")
     (folder / "trees" / "tidy.json").write_text("[" * 400_000)
-    told = await Gallery(folder).detail("tidy")
-    assert (told.transcript, told.tree) == ("", None)
+    detail = await Gallery(folder).detail("tidy")
+    assert (detail.transcript, detail.tree) == ("", None)
 
 
 async def test_picture_is_a_jpeg_or_none(folder):

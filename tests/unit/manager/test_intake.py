@@ -22,7 +22,7 @@ WARM = (Resident("kitchen", ResidentState.WARM, 0.1, 50.0),)
 
 
 class Manager:
-    """An intake with one worker of one slot, which has the scene and as many leases as it may hold."""
+    """Intake with one worker of one slot, which has the scene and its full number of leases."""
 
     def __init__(self, rollouts):
         self.intake = Intake(ClusterState(boot_id="boot"), Registry(LivenessLimits()))
@@ -41,7 +41,7 @@ def gives(commands):
     return [command for command in commands if isinstance(command, GiveLease)]
 
 
-def test_lease_given_for_first_state_results_is_not_lost():
+def test_lease_granted_for_first_state_results_is_not_lost():
     manager = Manager(rollouts=4)
     first, second = (command.ref for command in manager.given)
     state = WorkerState(WARM, (second,), (LeaseResult(first, completed()),))
@@ -67,7 +67,7 @@ def test_returning_suspect_holds_each_rollout_once():
     assert set(manager.intake.cluster.dispatcher.live_leases) == {again.ref.lease_id}
 
 
-def test_call_under_a_session_that_ended_is_refused():
+def test_call_of_an_ended_session_is_refused():
     manager = Manager(rollouts=0)
     manager.intake.register("w1", "boot-2", Resources(1, 1, 1000), now_s=1.0)
     with pytest.raises(SupersededError):

@@ -74,9 +74,9 @@ def test_group_ends_with_its_last_result_from_any_cursor():
 def test_delivery_time_is_added_to_the_row():
     result = RolloutResult("x1", "g1", 1, 1, completed())
     row = timed_row(result_row(result), 0.25)
-    told = rollout_result_from_proto(RolloutResultMessage.FromString(row.payload))
+    stored = rollout_result_from_proto(RolloutResultMessage.FromString(row.payload))
     timings = dataclasses.replace(result.outcome.timings, deliver_s=0.25)
-    assert told == dataclasses.replace(result, outcome=dataclasses.replace(result.outcome, timings=timings))
+    assert stored == dataclasses.replace(result, outcome=dataclasses.replace(result.outcome, timings=timings))
     assert group_and_kind(row) == ("g1", Completed)
 
 

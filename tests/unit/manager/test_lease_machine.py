@@ -103,7 +103,7 @@ class LeaseMachine(RuleBasedStateMachine):
         for worker in WORKERS:
             self.worker_joins(worker, 2, 1000)
 
-    def tell(self, event, *, lost=False):
+    def apply(self, event, *, lost=False):
         self.now_s += 0.01
         for command in self.cluster.handle(event, now_s=self.now_s):
             match command:
@@ -132,8 +132,8 @@ class LeaseMachine(RuleBasedStateMachine):
         self.live[worker] = {}
         self.desired.pop(worker, None)
         renders = 0 if worker == "w3" else slots
-        self.tell(WorkerJoined(worker, Resources(slots, slots, memory_mb, render_slots=renders)))
-        self.tell(WorkerReported(worker, (), resync=True))
+        self.apply(WorkerJoined(worker, Resources(slots, slots, memory_mb, render_slots=renders)))
+        self.apply(WorkerReported(worker, (), resync=True))
 
     @rule(
         worker=workers,
@@ -148,14 +148,14 @@ class LeaseMachine(RuleBasedStateMachine):
             Resident(scene, ResidentState.FAILED if scene in failing else ResidentState.WARM, 0.1, 60.0)
             for scene in self.desired.get(worker, ())
         )
-        self.tell(
+        self.apply(
             WorkerReported(worker, residents, tuple(self.live[worker]), resync=reconnect, paused=paused)
         )
 
     @rule(worker=workers)
     def worker_is_killed(self, worker):
         self.live.pop(worker, None)
-        self.tell(WorkerLost(worker, "killed"))
+        self.apply(WorkerLost(worker, "killed"))
 
     @rule(worker=workers)
     def stream_breaks_with_leases_under_way(self, worker):
@@ -167,15 +167,15 @@ class LeaseMachine(RuleBasedStateMachine):
         event=st.sampled_from(STANDINGS),
     )
     def standing_of_a_worker_changes(self, worker, event):
-        self.tell(event(worker))
+        self.apply(event(worker))
 
     @rule(paused=st.sampled_from([True, False, False, False]))
     def operator_pauses_or_resumes(self, paused):
-        self.tell(DispatchPaused() if paused else DispatchResumed())
+        self.apply(DispatchPaused() if paused else DispatchResumed())
 
     @rule(run=st.sampled_from(RUNS), terms=TERMS)
     def run_is_opened(self, run, terms):
-        self.tell(RunOpened(run, terms))
+        self.apply(RunOpened(run, terms))
 
     @rule(
         run=st.sampled_from(RUNS),
@@ -192,25 +192,25 @@ class LeaseMachine(RuleBasedStateMachine):
         )
         self.submitted.update({rollout.rollout_id: rollout for rollout in rollouts})
         self.batches[name] = batch = Batch(run, name, len(self.batches) + 1, rollouts)
-        self.tell(BatchSubmitted(batch, piece))
-        self.tell(BatchSubmitted(batch, piece))
+        self.apply(BatchSubmitted(batch, piece))
+        self.apply(BatchSubmitted(batch, piece))
 
     @precondition(lambda self: self.batches)
     @rule(data=st.data(), piece=st.integers(1, 4))
     def batch_is_continued(self, data, piece):
         batch = data.draw(st.sampled_from(list(self.batches.values())))
-        self.tell(BatchContinued(batch.run_id, batch.batch_id, piece))
+        self.apply(BatchContinued(batch.run_id, batch.batch_id, piece))
 
     @rule(scenes=st.lists(st.sampled_from(SCENES), max_size=4))
     def look_ahead_is_announced(self, scenes):
         entries = tuple(LookaheadEntry(len(self.batches) + 1 + i, scene, 4) for i, scene in enumerate(scenes))
-        self.tell(LookaheadAnnounced("r1", len(self.batches) + 1, entries))
+        self.apply(LookaheadAnnounced("r1", len(self.batches) + 1, entries))
 
     @precondition(lambda self: len(self.batches) % 4 == 3)
     @rule(data=st.data())
     def batch_is_cancelled(self, data):
         batch = data.draw(st.sampled_from(list(self.batches.values())))
-        self.tell(BatchCancelled(batch.run_id, batch.batch_id))
+        self.apply(BatchCancelled(batch.run_id, batch.batch_id))
 
     @rule(rounds=st.integers(1, 6))
     def cluster_works(self, rounds):
@@ -230,7 +230,7 @@ class LeaseMachine(RuleBasedStateMachine):
         del self.live[worker][ref]
         outcome = completed(worker) if failing is None else InfraFailure(failing, "broken")
         for _ in range(repeats):
-            self.tell(LeaseFinished(worker, ref, outcome))
+            self.apply(LeaseFinished(worker, ref, outcome))
 
     @precondition(lambda self: self.old)
     @rule(data=st.data(), worker=workers)
@@ -238,7 +238,7 @@ class LeaseMachine(RuleBasedStateMachine):
         lease = data.draw(st.sampled_from(self.old))
         for held in self.live.values():
             held.pop(lease.ref, None)
-        self.tell(LeaseFinished(worker, lease.ref, completed(worker)))
+        self.apply(LeaseFinished(worker, lease.ref, completed(worker)))
 
     @rule(
         seconds=st.sampled_from([0.1, 1.0, 6.0, 20.0]),
@@ -251,9 +251,9 @@ class LeaseMachine(RuleBasedStateMachine):
             for worker, held in list(self.live.items()):
                 for ref in held:
                     self.steps[ref] = self.steps.get(ref, -1) + moving
-                told = tuple(LeaseProgress(ref, self.steps[ref]) for ref in held if self.steps[ref] >= 0)
-                self.tell(LeasesRenewed(worker, tuple(held), told))
-        self.tell(Tick())
+                progress = tuple(LeaseProgress(ref, self.steps[ref]) for ref in held if self.steps[ref] >= 0)
+                self.apply(LeasesRenewed(worker, tuple(held), progress))
+        self.apply(Tick())
         self.no_worker_idles_while_an_acceptable_rollout_waits()
 
     def no_worker_idles_while_an_acceptable_rollout_waits(self):
@@ -310,7 +310,7 @@ class LeaseMachine(RuleBasedStateMachine):
         """Check that every rollout gets its outcome with one healthy worker and enough time."""
         if not hasattr(self, "cluster"):
             return
-        self.tell(DispatchResumed())
+        self.apply(DispatchResumed())
         for worker in WORKERS:
             self.worker_is_killed(worker)
         self.worker_joins("w1", 3, 1000)

@@ -30,9 +30,9 @@ class RestartedMachine(LeaseMachine):
         )
         for batch in self.batches.values():
             known = [one.rollout_id for one in batch.rollouts if one.rollout_id in self.delivered]
-            self.tell(BatchRestored(batch, {name: self.delivered[name].cursor for name in known}))
+            self.apply(BatchRestored(batch, {name: self.delivered[name].cursor for name in known}))
         if roster:
-            self.tell(WorkersExpected(frozenset(self.live)))
+            self.apply(WorkersExpected(frozenset(self.live)))
         for worker in list(self.live):
             if worker in gone or worker not in slots:
                 del self.live[worker]
@@ -44,8 +44,8 @@ class RestartedMachine(LeaseMachine):
         held = dict(self.live[worker])
         claims = tuple(LeaseClaim(ref, command.origin) for ref, command in held.items())
         renders = 0 if worker == "w3" else slots
-        self.tell(WorkerJoined(worker, Resources(slots, slots, 1000, render_slots=renders)))
-        self.tell(WorkerReported(worker, (), tuple(held), resync=True, claims=claims))
+        self.apply(WorkerJoined(worker, Resources(slots, slots, 1000, render_slots=renders)))
+        self.apply(WorkerReported(worker, (), tuple(held), resync=True, claims=claims))
 
     @invariant()
     def workers_hold_no_more_than_their_credits(self):

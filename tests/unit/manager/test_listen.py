@@ -25,7 +25,7 @@ def test_port_in_use_names_the_address_and_the_option():
             pass
 
 
-def test_address_of_another_machine_is_told_to_change_the_host():
+def test_address_of_another_machine_suggests_another_host():
     with (
         pytest.raises(PortInUseError, match="pass an address of this machine as --host"),
         bound_socket("203.0.113.7", 0),

@@ -28,7 +28,7 @@ def settings(data_dir, **changes):
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1", "localhost"])
-def test_on_loopback_nothing_is_needed(tmp_path, host):
+def test_loopback_needs_no_protection(tmp_path, host):
     found = protection_of(settings(tmp_path, host=host))
     assert (found.tls, found.guarded) == (None, False)
 

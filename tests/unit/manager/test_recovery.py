@@ -48,29 +48,29 @@ def claim(rollout_id, epoch=1, attempt=1, batch_id="b1"):
 
 
 class Successor:
-    """A manager that has just taken a batch over, and its clock."""
+    """Manager that has just taken over a batch, and its clock."""
 
     def __init__(self, count=2, delivered=(), failures=0):
         limits = DispatchLimits(restart_grace_s=GRACE_S)
         self.dispatcher = Dispatcher(limits, boot_id="new", first_epoch=FIRST_EPOCH)
         self.now_s = 100.0
         cursors = {name: number + 1 for number, name in enumerate(delivered)}
-        self.first = self.tell(BatchRestored(batch(count), cursors, failures))
+        self.first = self.apply(BatchRestored(batch(count), cursors, failures))
 
-    def tell(self, *events, after_s=0.0):
+    def apply(self, *events, after_s=0.0):
         self.now_s += after_s
         return [command for event in events for command in self.dispatcher.handle(event, now_s=self.now_s)]
 
     def worker(self, worker_id="w1", *claims, slots=1):
-        """A worker comes back and says what it holds."""
+        """Reconnect a worker that reports its held leases."""
         held = tuple(claim.ref for claim in claims)
-        return self.tell(
+        return self.apply(
             WorkerJoined(worker_id, Resources(slots, slots, 1024)),
             WorkerReported(worker_id, WARM, held, resync=True, claims=claims),
         )
 
     def wait_out_the_grace(self):
-        return self.tell(Tick(), after_s=GRACE_S)
+        return self.apply(Tick(), after_s=GRACE_S)
 
 
 def kinds(commands, kind):
@@ -85,7 +85,7 @@ def test_running_lease_of_a_former_manager_is_adopted_and_its_result_counts():
     successor = Successor(1)
     assert successor.worker("w1", claim("x0")) == []
     assert successor.wait_out_the_grace() == []
-    commands = successor.tell(LeaseFinished("w1", claim("x0").ref, completed()))
+    commands = successor.apply(LeaseFinished("w1", claim("x0").ref, completed()))
     assert [command.result.rollout_id for command in kinds(commands, DeliverResult)] == ["x0"]
     assert commands[-1] == FinishBatch("r1", "b1")
 
@@ -93,7 +93,7 @@ def test_running_lease_of_a_former_manager_is_adopted_and_its_result_counts():
 def test_unacknowledged_result_counts_when_its_worker_returns():
     successor = Successor(1)
     successor.worker("w1", claim("x0"))
-    commands = successor.tell(LeaseFinished("w1", claim("x0").ref, completed()))
+    commands = successor.apply(LeaseFinished("w1", claim("x0").ref, completed()))
     assert kinds(commands, AcknowledgeLease) == [AcknowledgeLease("w1", claim("x0").ref)]
     assert len(kinds(commands, DeliverResult)) == 1
 
@@ -101,39 +101,39 @@ def test_unacknowledged_result_counts_when_its_worker_returns():
 def test_unclaimed_rollouts_are_leased_only_after_the_grace_time():
     successor = Successor(2)
     assert given_to(successor.worker("w1", slots=4)) == []
-    assert given_to(successor.tell(Tick(), after_s=GRACE_S - 0.1)) == []
-    assert given_to(successor.tell(Tick(), after_s=0.2)) == [("w1", "x0"), ("w1", "x1")]
+    assert given_to(successor.apply(Tick(), after_s=GRACE_S - 0.1)) == []
+    assert given_to(successor.apply(Tick(), after_s=0.2)) == [("w1", "x0"), ("w1", "x1")]
 
 
 def test_wait_ends_when_all_expected_workers_have_reported():
     successor = Successor(2)
-    successor.tell(WorkersExpected(frozenset({"w1", "w2"})))
+    successor.apply(WorkersExpected(frozenset({"w1", "w2"})))
     successor.worker("w1", claim("x0"), slots=4)
-    assert given_to(successor.tell(Tick(), after_s=0.1)) == []
+    assert given_to(successor.apply(Tick(), after_s=0.1)) == []
     successor.worker("w2")
-    assert [rollout for _, rollout in given_to(successor.tell(Tick(), after_s=0.1))] == ["x1"]
+    assert [rollout for _, rollout in given_to(successor.apply(Tick(), after_s=0.1))] == ["x1"]
 
 
 def test_no_wait_if_no_worker_was_present_before():
     successor = Successor(1)
-    successor.tell(WorkersExpected(frozenset()))
+    successor.apply(WorkersExpected(frozenset()))
     successor.worker("w1")
-    assert given_to(successor.tell(Tick(), after_s=0.1)) == [("w1", "x0")]
+    assert given_to(successor.apply(Tick(), after_s=0.1)) == [("w1", "x0")]
 
 
 def test_wait_for_a_missing_worker_ends_after_the_grace_time():
     successor = Successor(1)
-    successor.tell(WorkersExpected(frozenset({"w1", "gone"})))
+    successor.apply(WorkersExpected(frozenset({"w1", "gone"})))
     successor.worker("w1")
-    assert given_to(successor.tell(Tick(), after_s=GRACE_S - 0.1)) == []
+    assert given_to(successor.apply(Tick(), after_s=GRACE_S - 0.1)) == []
     assert successor.dispatcher.expected == {"gone"}
-    assert given_to(successor.tell(Tick(), after_s=0.2)) == [("w1", "x0")]
+    assert given_to(successor.apply(Tick(), after_s=0.2)) == [("w1", "x0")]
 
 
 def test_batch_submitted_meanwhile_does_not_wait():
     successor = Successor(1)
     successor.worker("w1", slots=4)
-    assert given_to(successor.tell(BatchSubmitted(batch(1, "b2")))) == [("w1", "x0")]
+    assert given_to(successor.apply(BatchSubmitted(batch(1, "b2")))) == [("w1", "x0")]
 
 
 def test_scenes_of_awaited_rollouts_are_in_demand():
@@ -148,10 +148,10 @@ def test_later_of_two_claimed_leases_counts():
         claims = {"w1": claim("x0", epoch=5), "w2": claim("x0", epoch=9)}
         commands = [command for name in order for command in successor.worker(name, claims[name])]
         assert kinds(commands, CancelLease) == [CancelLease("w1", claims["w1"].ref)]
-        late = successor.tell(LeaseFinished("w1", claims["w1"].ref, completed()))
+        late = successor.apply(LeaseFinished("w1", claims["w1"].ref, completed()))
         assert kinds(late, DeliverResult) == []
         assert successor.dispatcher.counters("r1").stale_results == 1
-        good = successor.tell(LeaseFinished("w2", claims["w2"].ref, completed()))
+        good = successor.apply(LeaseFinished("w2", claims["w2"].ref, completed()))
         assert len(kinds(good, DeliverResult)) == 1
 
 
@@ -186,8 +186,8 @@ def test_leases_that_cannot_be_adopted_are_cancelled(stray):
 def test_leases_claimed_without_origin_are_cancelled():
     successor = Successor(1)
     old = claim("x0").ref
-    successor.tell(WorkerJoined("w1", Resources(1, 1, 1024)))
-    commands = successor.tell(WorkerReported("w1", WARM, (old,), resync=True))
+    successor.apply(WorkerJoined("w1", Resources(1, 1, 1024)))
+    commands = successor.apply(WorkerReported("w1", WARM, (old,), resync=True))
     assert kinds(commands, CancelLease) == [CancelLease("w1", old)]
     assert given_to(successor.wait_out_the_grace()) == [("w1", "x0")]
 
@@ -195,7 +195,7 @@ def test_leases_claimed_without_origin_are_cancelled():
 def test_attempts_under_the_former_manager_count():
     successor = Successor(1)
     successor.worker("w1", claim("x0", attempt=3))
-    (delivered,) = kinds(successor.tell(WorkerLost("w1", "killed")), DeliverResult)
+    (delivered,) = kinds(successor.apply(WorkerLost("w1", "killed")), DeliverResult)
     assert "attempt 3 of 3" in delivered.result.outcome.message
 
 
@@ -203,7 +203,7 @@ def test_adopted_lease_expires_like_any_other():
     successor = Successor(1)
     successor.worker("w1", claim("x0"))
     successor.worker("w2")
-    commands = successor.tell(Tick(), after_s=31.0)
+    commands = successor.apply(Tick(), after_s=31.0)
     assert kinds(commands, CancelLease) == [CancelLease("w1", claim("x0").ref)]
     assert len(given_to(commands)) == 1
 
@@ -218,13 +218,13 @@ def test_fully_delivered_batch_finishes_at_once_and_counts():
 def test_cursors_continue_after_those_of_the_former_manager():
     successor = Successor(3, delivered=("x0", "x1"))
     successor.worker("w1", claim("x2"))
-    (delivered,) = kinds(successor.tell(LeaseFinished("w1", claim("x2").ref, completed())), DeliverResult)
+    (delivered,) = kinds(successor.apply(LeaseFinished("w1", claim("x2").ref, completed())), DeliverResult)
     assert delivered.result.cursor == 3
 
 
 def test_batch_cancelled_during_the_wait_is_not_leased():
     successor = Successor(2)
-    assert len(kinds(successor.tell(BatchCancelled("r1", "b1")), DeliverResult)) == 2
+    assert len(kinds(successor.apply(BatchCancelled("r1", "b1")), DeliverResult)) == 2
     successor.worker("w1", slots=4)
     assert given_to(successor.wait_out_the_grace()) == []
 
@@ -250,5 +250,5 @@ def test_every_rollout_gets_one_outcome_whatever_workers_claim(held, back):
     settle(successor.wait_out_the_grace())
     while running:
         name, ref = running.pop()
-        settle(successor.tell(LeaseFinished(name, ref, completed(name))))
+        settle(successor.apply(LeaseFinished(name, ref, completed(name))))
     assert sorted(delivered) == [f"x{number}" for number in range(6)]

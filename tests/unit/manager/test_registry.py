@@ -81,7 +81,7 @@ def test_broken_stream_loses_a_worker_after_a_second(registry):
     assert [type(event) for event in registry.tick(now_s=2.0)] == [WorkerLost]
 
 
-def test_stream_that_comes_back_in_time_costs_nothing(registry):
+def test_stream_restored_within_the_grace_costs_nothing(registry):
     session, _ = join(registry)
     registry.attach(session, now_s=0.0)
     registry.detach(session, now_s=1.0)
@@ -101,7 +101,7 @@ def test_silence_during_a_manager_stall_is_excused(registry):
     assert [event.worker_id for event in registry.tick(now_s=32.0)] == ["w2"]
     assert registry.tick(now_s=34.6) == [WorkerSuspected("w1")]
     registry.excuse_silence(30.0, now_s=35.0)
-    assert session.last_seen_s == 35.0, "nobody was heard in the future"
+    assert session.last_seen_s == 35.0, "no worker was heard in the future"
 
 
 def test_heartbeats_slow_down_in_a_large_cluster(registry):

@@ -32,8 +32,8 @@ NOTE = FailureNote(1000.0, "slot_crashed", "signal 11", "w1", "r1", "x1")
 
 
 def mood(*, paused=False, now_s=1010.0, **changes):
-    told = health(replace(CALM, **changes), paused=paused, now_s=now_s)
-    return told.mood, told.sentence
+    view = health(replace(CALM, **changes), paused=paused, now_s=now_s)
+    return view.mood, view.sentence
 
 
 def test_health_reports_the_most_important_fact():
@@ -119,9 +119,9 @@ def test_timeline_shows_the_last_seconds_of_each_slot():
         )
 
     page = EventPage((done(1, 90.0), done(2, 99.0), done(3, 100.0, EventKind.FAILED, "slot_oom")), 7)
-    told = timeline("r1", page, seconds=5.0)
-    assert (told.from_s, told.until_s, told.dropped) == (95.0, 100.0, 7)
-    (track,) = told.tracks
+    view = timeline("r1", page, seconds=5.0)
+    assert (view.from_s, view.until_s, view.dropped) == (95.0, 100.0, 7)
+    (track,) = view.tracks
     assert [(span.rollout_id, span.outcome) for span in track.spans] == [
         ("x2", "completed"),
         ("x3", "slot_oom"),
@@ -140,7 +140,7 @@ def test_timeline_counts_busy_slots_and_filters_by_worker():
         )
 
     page = EventPage(tuple(map(done, range(TRACKS + 30))), 0)
-    told = timeline("r1", page, seconds=5.0)
-    assert (told.slots, len(told.tracks)) == (TRACKS + 30, TRACKS)
+    view = timeline("r1", page, seconds=5.0)
+    assert (view.slots, len(view.tracks)) == (TRACKS + 30, TRACKS)
     of_one = timeline("r1", page, seconds=5.0, search="Desk-21")
     assert [track.worker_id for track in of_one.tracks] == [f"desk-21{digit}" for digit in range(10)]

@@ -40,7 +40,7 @@ MB = 100.0
 
 
 class Cluster:
-    """A scheduler with workers that load what they are told to hold."""
+    """Scheduler with workers that load every assigned scene."""
 
     def __init__(self):
         self.pool = WorkerPool()
@@ -50,7 +50,7 @@ class Cluster:
         self.now_s = 0.0
         self.desired = {}
 
-    def tell(self, event, after_s=0.0):
+    def apply(self, event, after_s=0.0):
         self.now_s += after_s
         self.change_standing(event)
         urgency = self.scheduler.note(event, now_s=self.now_s)
@@ -61,7 +61,7 @@ class Cluster:
         return commands
 
     def change_standing(self, event):
-        """Apply what the dispatcher would."""
+        """Apply a change of the worker's state, as the dispatcher would."""
         match event:
             case WorkerJoined(worker_id, resources):
                 self.pool.join(worker_id, resources)
@@ -71,23 +71,23 @@ class Cluster:
                 self.pool.workers[event.worker_id].apply(event)
 
     def worker(self, name="w1", slots=1, memory_mb=1000, score=1.0):
-        self.tell(WorkerJoined(name, Resources(slots, slots, memory_mb, score)))
+        self.apply(WorkerJoined(name, Resources(slots, slots, memory_mb, score)))
         return self.report(name, resync=True)
 
     def report(self, name="w1", state=ResidentState.WARM, scenes=None, resync=False, memory_mb=MB):
         scenes = self.desired.get(name, ()) if scenes is None else scenes
         residents = tuple(Resident(scene, state, 1.0, memory_mb, "no mesh") for scene in scenes)
-        return self.tell(WorkerReported(name, residents, resync=resync))
+        return self.apply(WorkerReported(name, residents, resync=resync))
 
     def announce(self, *steps, version=1, run_id="r1", count=4):
         entries = [LookaheadEntry(i + 1, scene, count) for i, scenes in enumerate(steps) for scene in scenes]
-        return self.tell(LookaheadAnnounced(run_id, version, tuple(entries)))
+        return self.apply(LookaheadAnnounced(run_id, version, tuple(entries)))
 
     def demand(self, after_s=0.0, **pending):
-        return self.tell(DemandObserved(pending), after_s)
+        return self.apply(DemandObserved(pending), after_s)
 
     def submit(self, scene, step=1, after_s=0.0):
-        self.tell(
+        self.apply(
             BatchSubmitted(Batch("r1", f"b{step}", step, (Rollout("x", "g", scene, "t", (), 0),))), after_s
         )
 
@@ -135,7 +135,7 @@ def test_desired_set_is_sent_only_when_it_changes(cluster):
     assert cluster.announce(["a", "b"], version=2) == []
     cluster.report(state=ResidentState.LOADING)
     assert cluster.report() == []
-    assert cluster.tell(Tick()) == []
+    assert cluster.apply(Tick()) == []
 
 
 def test_window_of_a_lower_version_is_ignored(cluster):
@@ -183,9 +183,9 @@ def test_idle_workers_load_a_scene_after_its_rollouts_waited_too_long(cluster):
         cluster.report(name)
     (first,) = [name for name, scenes in cluster.desired.items() if "a" in scenes]
     other = {"w1": "w2", "w2": "w1"}[first]
-    cluster.tell(DemandObserved({"a": 1}, {"a": 0.4}, idle=frozenset([other])))
+    cluster.apply(DemandObserved({"a": 1}, {"a": 0.4}, idle=frozenset([other])))
     assert "a" not in cluster.desired[other]
-    cluster.tell(DemandObserved({"a": 1}, {"a": 1.1}, idle=frozenset([other])))
+    cluster.apply(DemandObserved({"a": 1}, {"a": 1.1}, idle=frozenset([other])))
     assert "a" in cluster.desired[other]
 
 
@@ -204,19 +204,19 @@ def test_outdated_report_changes_nothing(cluster):
     cluster.worker("w1", memory_mb=250)
     cluster.worker("w2", memory_mb=250)
     cluster.announce(["a", "b"], ["c", "d"])
-    told = dict(cluster.desired)
+    sent = dict(cluster.desired)
     assert cluster.report("w1", scenes=[]) == []
-    assert cluster.report("w2", state=ResidentState.LOADING, scenes=told["w2"][:1]) == []
-    assert cluster.desired == told
+    assert cluster.report("w2", state=ResidentState.LOADING, scenes=sent["w2"][:1]) == []
+    assert cluster.desired == sent
 
 
 def test_scenes_with_running_rollouts_are_not_evicted(cluster):
     cluster.worker(memory_mb=150)
     cluster.demand(a=2)
     cluster.report()
-    cluster.tell(DemandObserved({"b": 4}, in_use=frozenset([("w1", "a")])))
+    cluster.apply(DemandObserved({"b": 4}, in_use=frozenset([("w1", "a")])))
     assert cluster.desired["w1"] == ("a",)
-    cluster.tell(DemandObserved({"b": 4}))
+    cluster.apply(DemandObserved({"b": 4}))
     assert cluster.desired["w1"] == ("b",)
 
 
@@ -224,7 +224,7 @@ def test_unneeded_scenes_stay_while_there_is_room_and_leave_by_last_use(cluster)
     cluster.worker(memory_mb=250)
     cluster.demand(a=1, b=1)
     cluster.report()
-    cluster.tell(DemandObserved({}, used=frozenset([("w1", "a")])))
+    cluster.apply(DemandObserved({}, used=frozenset([("w1", "a")])))
     assert set(cluster.desired["w1"]) == {"a", "b"}
     cluster.demand(c=1)
     assert cluster.desired["w1"] == ("c", "a")
@@ -234,7 +234,7 @@ def test_measured_memory_replaces_the_estimate(cluster):
     cluster.worker(memory_mb=1000)
     cluster.announce(["a", "b", "c"])
     cluster.report(memory_mb=400.0)
-    cluster.tell(Tick())
+    cluster.apply(Tick())
     assert len(cluster.desired["w1"]) == 2
 
 
@@ -242,7 +242,7 @@ def test_scene_larger_than_every_worker_is_unplaceable_with_the_reason(cluster):
     cluster.worker(memory_mb=300)
     cluster.announce(["a"])
     cluster.report(memory_mb=900.0)
-    cluster.tell(Tick())
+    cluster.apply(Tick())
     assert cluster.scheduler.readiness.warmth("a") is Warmth.WARM
     cluster.report(scenes=[])
     assert cluster.scheduler.readiness.warmth("a") is Warmth.UNPLACEABLE
@@ -260,7 +260,7 @@ def test_failed_load_moves_to_another_worker_and_is_retried_later(cluster):
     assert cluster.desired[other] == ("a",)
     cluster.report(other, state=ResidentState.FAILED, scenes=["a"])
     assert cluster.desired[other] == ()
-    cluster.tell(Tick(), after_s=11)
+    cluster.apply(Tick(), after_s=11)
     assert "a" in cluster.desired[first] + cluster.desired[other]
 
 
@@ -269,7 +269,7 @@ def test_scenes_move_away_from_an_unusable_worker(cluster, event):
     cluster.worker("w1")
     cluster.announce(["a"])
     cluster.worker("w2")
-    cluster.tell(event)
+    cluster.apply(event)
     assert cluster.desired["w2"] == ("a",)
 
 
@@ -304,8 +304,8 @@ def test_used_load_ahead_is_no_waste(cluster):
     cluster.worker()
     cluster.announce(["a", "b"])
     cluster.report()
-    cluster.tell(DemandObserved({}, used=frozenset([("w1", "a")])))
-    cluster.tell(RunClosed("r1"))
+    cluster.apply(DemandObserved({}, used=frozenset([("w1", "a")])))
+    cluster.apply(RunClosed("r1"))
     cluster.scheduler.prewarm.close("r1")
     assert cluster.scheduler.prewarm.counters("r1").wasted == 1
 
@@ -323,7 +323,7 @@ def test_scene_counts_at_its_next_use():
 
 
 class Listed:
-    """Sites in a list, all to be looked at."""
+    """List of sites without an index."""
 
     def __init__(self, sites):
         self._sites = {site.worker_id: site for site in sites}
@@ -382,15 +382,15 @@ def test_scene_is_not_copied_if_loading_takes_longer_than_it_saves(cluster):
     for name in ("w1", "w2", "w3"):
         cluster.report(name)
     done = replace(completed(), timings=Timings(execute_s=0.01))
-    cluster.tell(LeaseFinished("w1", LeaseRef("lease", 1), done))
+    cluster.apply(LeaseFinished("w1", LeaseRef("lease", 1), done))
     cluster.demand(quick=16)
     assert sum("quick" in scenes for scenes in cluster.desired.values()) == 1
-    cluster.tell(LeaseFinished("w1", LeaseRef("lease", 2), replace(done, timings=Timings(execute_s=100.0))))
+    cluster.apply(LeaseFinished("w1", LeaseRef("lease", 2), replace(done, timings=Timings(execute_s=100.0))))
     cluster.demand(long=16)
     assert sum("long" in scenes for scenes in cluster.desired.values()) == 3
 
 
 def test_scenes_of_redispatched_rollouts_are_loaded_before_later_ones(cluster):
     cluster.worker()
-    cluster.tell(DemandObserved({"later": 30, "earlier": 2}, {"earlier": 5.0, "later": 1.0}))
+    cluster.apply(DemandObserved({"later": 30, "earlier": 2}, {"earlier": 5.0, "later": 1.0}))
     assert cluster.desired["w1"] == ("earlier", "later")

@@ -101,7 +101,7 @@ REWARD = RewardBreakdown(0.5, 0.0, 0.0, (), False)
 
 @pytest.fixture
 def auditor():
-    """One rollout was submitted; two workers said that they have its scene."""
+    """Return an invariant checker that saw one submitted rollout and two workers with its scene."""
     auditor = InvariantChecker(EventQueue())
     auditor.submit(Batch("r", "b", 1, (ROLLOUT,)))
     warm = WorkerState((Resident("kitchen", ResidentState.WARM),))

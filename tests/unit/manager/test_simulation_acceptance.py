@@ -23,7 +23,7 @@ MEAN_OVER_MEDIAN = math.exp(0.2**2 / 2)
 
 
 def unlike(trainer, seed=0):
-    """Eight workers with 8, 4, 2 and 1 slots, one of them ten times slower than it says."""
+    """Return eight workers with 8, 4, 2 and 1 slots, one of them ten times slower than it reports."""
     return SimulationScenario(
         seed=seed,
         workers=8,
@@ -37,7 +37,7 @@ def unlike(trainer, seed=0):
 
 
 def looking_ahead(k, **changes):
-    """45 scenes of two seconds on 16 slots, with room for 32 of them at a time."""
+    """Return a scenario of 45 scenes with loads of two seconds on 16 slots, with memory for 32 scenes."""
     trainer = Trainer(steps=45, groups=4, group_size=16, lookahead=k, write_s=1.0, update_s=1.0, **changes)
     return SimulationScenario(
         workers=4,
@@ -70,7 +70,7 @@ def check_unlike(seed):
 
 
 def test_known_slow_worker_delays_no_group():
-    """A12: 8, 4, 2 and 1 slots, one worker ten times slower than it says: hedges ≤ 5 %, nobody waits for it."""
+    """A12: 8, 4, 2 and 1 slots, one worker ten times slower than it reports: hedges ≤ 5 %, no group waits for it."""
     check_unlike(seed=0)
 
 
@@ -116,7 +116,7 @@ def test_look_ahead_makes_starts_warm_if_memory_suffices():
 @pytest.mark.slow
 @pytest.mark.parametrize("surprises", [0.5, 1.0])
 def test_wrong_look_ahead_costs_at_most_five_percent_and_starves_no_run(surprises):
-    """A14: half or all of what was announced turns out to be something else."""
+    """A14: half or all of the announced scenes are wrong."""
     none, wrong = (simulate(looking_ahead(k, surprises=surprises)) for k in (0, 3))
     ratio = wrong.elapsed_s / none.elapsed_s
     longest_s = max(wrong.groups_s["run"])
@@ -127,14 +127,14 @@ def test_wrong_look_ahead_costs_at_most_five_percent_and_starves_no_run(surprise
     assert longest_s <= 2 * max(none.groups_s["run"])
 
 
-def test_scenes_wanted_by_64_runs_at_once_are_loaded_once():
-    """A14: over-creation is 1.0 though the manager hears of a load half a second late."""
+def test_scenes_needed_by_64_runs_are_loaded_once():
+    """A14: over-creation is 1.0 although reports of loads arrive half a second late."""
     first = Trainer(name="first", steps=1, groups=4, group_size=8, start_s=5.0)
     one = Trainer(steps=1, groups=2, group_size=1, write_s=0.01, update_s=0.0, start_s=20.0)
     trainers = (first, *(replace(one, name=f"run{index}") for index in range(64)))
     kinds = (replace(LOCAL, slots=4, latency_s=0.5),)
     scenes = Scenes(count=20, load_s=2.0)
-    # Before anything was executed nobody knows what a copy more is worth: the first run tells.
+    # The value of another copy is unknown until the first run has executed.
     simulation = ClusterSimulation(
         SimulationScenario(workers=8, kinds=kinds, scenes=scenes, execute_s=0.02, trainers=trainers)
     )
@@ -152,7 +152,7 @@ def test_scenes_wanted_by_64_runs_at_once_are_loaded_once():
 
 
 def test_stuck_slot_is_detected_by_its_progress_before_the_execution_limit():
-    """A3 on the simulated clock: flat for 10 s is enough, where the limit of an execution is 60 s."""
+    """A3 on the simulated clock: 10 s without progress suffice; the execution limit is 60 s."""
     alone = RunTerms(GroupPolicy.PARTIAL)
     trainer = Trainer(steps=4, groups=10, group_size=8, write_s=4.0, update_s=1.0, terms=alone)
     scenario = SimulationScenario(
@@ -166,7 +166,7 @@ def test_stuck_slot_is_detected_by_its_progress_before_the_execution_limit():
     # Without second leases: they would save most of these rollouts before their slots are known to be stuck.
     report = simulate(replace(scenario, dispatch=replace(scenario.dispatch, hedge_share=0.0)))
     later_s = report.groups_s["run"][10:]
-    print(f"A3: {report.stats.redispatched} leases given again, longest group {max(later_s):.1f} s")
+    print(f"A3: {report.stats.redispatched} leases re-dispatched, longest group {max(later_s):.1f} s")
     assert report.infra_failures == 0
     assert report.stats.redispatched >= 3
     # Flat for 10 s, then noticed with the next heartbeat, then once more for luck that is bad twice.
@@ -200,7 +200,7 @@ def test_rendering_rollouts_without_a_gpu_fail_with_the_reason():
 @pytest.mark.slow
 @pytest.mark.parametrize(("rollouts", "workers"), [(512, 32), (4_096, 256), (16_000, 1_000)])
 def test_scale_points_start_at_once_and_keep_slots_busy(rollouts, workers):
-    """A15, simulated: 512, 4,096 and 16,000 in flight: first result ≤ 1 s after it could be, overhead ≤ 20 %."""
+    """A15, simulated: 512, 4,096 and 16,000 in flight: first result ≤ 1 s after the earliest possible, overhead ≤ 20 %."""
     report = simulate(in_flight(workers, rollouts))
     print(
         f"A15 {rollouts:,} in flight: first result after {report.first_result_s:.2f} s, slots at work "

@@ -119,7 +119,7 @@ def test_drained_worker_gets_no_leases_and_costs_no_attempt():
 
 @pytest.mark.parametrize("slow", [0.0, 0.125])
 def test_heterogeneous_workers_finish_within_a_quarter_of_the_bound(slow):
-    """One of the eight may be ten times slower than it says."""
+    """One of the eight workers may be ten times slower than it reports."""
     kinds = tuple(
         MachineKind(f"{slots} slots", 1.0, slots, 2048, 1.0, 0.0005, 100.0) for slots in (8, 4, 2, 1)
     )

@@ -77,11 +77,11 @@ reports = st.builds(
 
 
 @given(st.lists(reports, max_size=120))
-def test_columns_are_as_long_as_steps_whatever_is_reported(told):
+def test_columns_are_as_long_as_steps_for_any_reports(sent):
     book = TrainingBook()
-    for report in told:
+    for report in sent:
         book.note("r1", "", report, at_s=0.0)
-    phases = curves_of(book).values() if told else []
+    phases = curves_of(book).values() if sent else []
     assert len(phases) <= PHASES_KEPT
     for curves in phases:
         assert curves.steps == sorted(set(curves.steps))

@@ -119,6 +119,6 @@ async def test_only_missing_bundles_are_sent_and_large_ones_arrive_whole():
     assert cluster.bundles == {"sha256:1": b"kept", "sha256:2": large}
 
 
-def test_every_status_stands_for_one_error():
+def test_every_status_maps_to_one_error():
     assert len(set(STATUS.values())) == len(STATUS)
     assert all(issubclass(error, ClusterError) for error in STATUS)

@@ -29,10 +29,10 @@ def test_training_report_round_trips():
 
 def test_long_or_malformed_model_text_is_cut_before_sending():
     plan = SampledPlan("t1", "tidy up", "\ud83c" + "x" * 9000, None, 0.0)
-    told = training_report_from_proto(
+    decoded = training_report_from_proto(
         training_report_to_proto("r1", TrainingReport("grpo", 1, plans=(plan,)))
     )
-    assert told.plans[0].text == "?" + "x" * (TEXT_CHARS - 1)
+    assert decoded.plans[0].text == "?" + "x" * (TEXT_CHARS - 1)
 
 
 @pytest.mark.parametrize(

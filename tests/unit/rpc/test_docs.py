@@ -26,7 +26,7 @@ CALLS = {
 
 
 def rows(first_heading: str) -> dict[str, str]:
-    """The table whose first column has this heading: name of each row to the next cell."""
+    """Return the table whose first column has this heading: row names mapped to the next cell."""
     found = re.search(rf"^\| {first_heading} \|.*\n\| ---.*\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
     assert found, f"docs/protocol.md has no table of {first_heading}"
     cells = [line.strip("|").split(" | ") for line in found[1].splitlines()]

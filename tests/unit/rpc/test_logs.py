@@ -24,7 +24,7 @@ def as_json(*args, **kwargs):
 
 
 def alone(function):
-    """Bind ids without a trace in other tests, and with none of theirs."""
+    """Run in a fresh context, so that bound ids neither enter nor leave the test."""
     return contextvars.Context().run(function)
 
 
@@ -37,7 +37,7 @@ def test_named_values_of_a_message_are_json_fields():
 
 
 def test_bound_ids_are_on_every_line():
-    def told():
+    def logged():
         bind("worker", "w1")
         bind("session", "abc")
         bind("session", "")
@@ -45,7 +45,7 @@ def test_bound_ids_are_on_every_line():
             record("scene warm scene=%s", "s1")
         )
 
-    line, sentence = alone(told)
+    line, sentence = alone(logged)
     assert (line["worker"], line["scene"], "session" in line) == ("w1", "s1", False)
     assert sentence.endswith("WARNING scene warm scene=s1 worker=w1")
     assert "worker" not in alone(lambda: as_json("nothing is bound here"))
@@ -110,5 +110,7 @@ def test_libraries_log_warnings_and_errors_only():
         "logging.getLogger('asyncio').info('chatter'); logging.getLogger('asyncio').error('trouble')\n"
         "logging.getLogger('embomatrix.x').debug('detail')"
     )
-    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stderr
-    assert [json.loads(line)["message"] for line in told.splitlines()] == ["trouble", "detail"]
+    logged = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    ).stderr
+    assert [json.loads(line)["message"] for line in logged.splitlines()] == ["trouble", "detail"]

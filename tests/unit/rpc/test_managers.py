@@ -1,4 +1,4 @@
-"""Choice of the manager to call."""
+"""Selection of a manager among several addresses."""
 
 import pytest
 

@@ -39,9 +39,9 @@ def commit(folder, proto):
 
 @pytest.fixture
 def repository(tmp_path):
-    """A repository of one commit with a protocol of its own and our rules."""
+    """Repository with one commit, a small protocol and our rules."""
     if not BUF.exists():
-        pytest.fail(f"{BUF} is missing: install the extra dev, whose wheel buf-bin brings it")
+        pytest.fail(f"{BUF} is missing: install the extra dev: its wheel buf-bin provides it")
     folder = tmp_path / "repository"
     (folder / "proto/embomatrix/proto/v1").mkdir(parents=True)
     for name in ("check.sh", "buf.yaml"):
@@ -57,10 +57,10 @@ def checked(folder):
     )
 
 
-def test_first_commit_has_nothing_to_compare_with_and_says_so(repository):
-    told = checked(repository)
-    assert told.returncode == 0, told.stderr
-    assert "skipped, this checkout has one commit only" in told.stdout
+def test_first_commit_reports_a_missing_baseline(repository):
+    result = checked(repository)
+    assert result.returncode == 0, result.stderr
+    assert "skipped, this checkout has one commit only" in result.stdout
 
 
 def test_adding_a_field_passes_and_removing_one_fails(repository):
@@ -68,15 +68,15 @@ def test_adding_a_field_passes_and_removing_one_fails(repository):
     assert "nothing broken since" in checked(repository).stdout
     git(repository, "checkout", "-b", "work")
     commit(repository, PROTO.replace(FIELD, "  string more = 2;\n"))
-    told = checked(repository)
-    assert told.returncode != 0
-    assert 'field "1" with name "release"' in told.stdout
+    result = checked(repository)
+    assert result.returncode != 0
+    assert 'field "1" with name "release"' in result.stdout
 
 
 def test_shallow_clone_is_linted(repository, tmp_path):
     commit(repository, PROTO.replace("NoteService", "Notes"))
     git(tmp_path, "clone", "--depth=1", f"file://{repository}", "shallow")
-    told = checked(tmp_path / "shallow")
-    assert told.returncode != 0
-    assert "Notes" in told.stdout
-    assert "breaking" not in told.stdout
+    result = checked(tmp_path / "shallow")
+    assert result.returncode != 0
+    assert "Notes" in result.stdout
+    assert "breaking" not in result.stdout

@@ -42,7 +42,7 @@ def is_behind(
         (LEFT, (0.1, 0.0, 0.0), 0.0, False),
         (LEFT, (0.1, 0.0, 0.9), 1.0, False),
     ],
-    ids=["from the front", "through the leaf", "through the wall", "a shut door", "over the leaf"],
+    ids=["from the front", "through the panel", "through the wall", "a shut door", "over the panel"],
 )
 def test_only_places_past_an_open_panel_or_its_wall_are_behind(stand, point, fraction, behind) -> None:
     assert is_behind(stand, point, fraction, Pose((0.0, 0.0, 0.8))) is behind

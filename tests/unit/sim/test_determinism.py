@@ -10,7 +10,7 @@ from tests.fakes.plans import plan_of, task_over
 from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.executor import Simulator
+from embomatrix.sim.executor import Simulator, StepRandom
 from embomatrix.sim.placing.pose_cache import analyse_scene
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
@@ -35,7 +35,7 @@ def bundle():
 
 
 def digests(bundle, order) -> dict[tuple[int, int], str]:
-    """Digest of every plan with every seed, executed in an order, in one simulator."""
+    """Return the digest of every plan with every seed, executed in this order in one simulator."""
     simulator = load_simulator(bundle)
     task = task_over(bundle.scene)
     found = {}
@@ -44,6 +44,19 @@ def digests(bundle, order) -> dict[tuple[int, int], str]:
         found[plan, seed] = f"{trace.digest} {trace.final} {trace.failure}"
     simulator.close()
     return found
+
+
+@pytest.mark.parametrize(
+    ("seed", "step", "numbers"),
+    [
+        (0, 1, [3343061319433681400, 854139613077895453]),
+        (7, 3, [4043451057506116768, 3455150974730563071]),
+    ],
+)
+def test_random_numbers_of_a_step_are_pinned(seed: int, step: int, numbers: list[int]) -> None:
+    draws = StepRandom()
+    draws.go_to(seed, step)
+    assert draws.generator.integers(2**62, size=2).tolist() == numbers
 
 
 def test_traces_do_not_depend_on_earlier_executions(bundle) -> None:

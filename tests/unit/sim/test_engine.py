@@ -315,7 +315,7 @@ def test_broken_assets_are_refused_before_bullet_sees_them(scene, words) -> None
         BulletEngine(dataclasses.replace(scene, objects=items))
 
 
-def test_scene_with_one_name_twice_or_an_unknown_asset_is_refused() -> None:
+def test_scene_with_a_duplicate_name_or_unknown_asset_is_refused() -> None:
     scene = kitchen_scene()
     twice = dataclasses.replace(scene, objects=(*scene.objects, scene.objects[0]))
     with pytest.raises(EngineError, match="two bodies are called 'countertop_1'"):

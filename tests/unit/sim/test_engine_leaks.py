@@ -18,7 +18,7 @@ CORNERS = tuple((x, y, z) for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0
 
 
 def scene_of_hulls() -> Scene:
-    """Two things of one hull each, of new assets at every call, as a decoded bundle has them."""
+    """Return a scene with two objects of one hull each. Assets are new at every call, as in a decoded bundle."""
     hull = ConvexPart(
         Shape.HULL, Pose((0.0, 0.0, 0.0)), (0.2, 0.2, 0.2), tuple((*corner,) for corner in CORNERS)
     )

@@ -150,7 +150,7 @@ def test_no_path_leads_into_a_room_without_a_door():
     )
 
 
-def test_a_room_without_a_door_can_not_be_entered():
+def test_room_without_a_door_cannot_be_entered():
     trace = executed_alone(replace(kitchen_scene(), doorways=()), "go_to_room living_room_0")
     assert trace.failure is FailureReason.NO_PATH
 
@@ -183,7 +183,7 @@ def test_blocker_in_the_doorway_is_named(text):
     assert trace.steps[0].message.endswith(": chest_1 blocks the way; clear the way or choose another object")
 
 
-def test_the_arm_does_not_reach_through_a_wall():
+def test_arm_does_not_reach_through_a_wall():
     low, apple = make.coffee_table(), make.apple()
     scene = scene_of(
         "wall",
@@ -196,7 +196,7 @@ def test_the_arm_does_not_reach_through_a_wall():
     assert trace.failure is FailureReason.NO_LINE_OF_APPROACH
 
 
-def test_a_chest_is_too_large_for_the_gripper():
+def test_chest_is_too_large_for_the_gripper():
     chest = replace(make.block("chest", "chest.n.01", (0.5, 0.5, 0.5), {}), mass_kg=3.0)
     scene = scene_of("chest", [(placed("chest_1", chest, "kitchen_0", upright(1.5, 1.5, 0, chest)), chest)])
     trace = executed_alone(scene, "move chest_1; pick_up chest_1")
@@ -245,7 +245,7 @@ def test_blocked_door_stays_in_place():
     simulator.close()
 
 
-def test_a_full_bowl_takes_nothing_more(flat):
+def test_full_bowl_accepts_no_further_object(flat):
     trace = executed(
         flat,
         "move apple_1; pick_up apple_1; move bowl_1; place bowl_1 inside; move mug_1; pick_up mug_1; "

@@ -80,10 +80,10 @@ def test_first_different_step_is_reported_with_both_messages(cached, bundle):
     other.close()
     assert comparison.first_difference == 1
     assert (comparison.equal_steps, len(comparison.pairs), comparison.steps_of_either) == (1, 2, 4)
-    told = disagreement_to_json(comparison)
-    assert (told["step"], told["skill"]) == (2, "toggle_on")
-    assert "switched table_lamp_1 on" in told["cached"]
-    assert "blocks it" in told["physical"]
+    record = disagreement_to_json(comparison)
+    assert (record["step"], record["skill"]) == (2, "toggle_on")
+    assert "switched table_lamp_1 on" in record["cached"]
+    assert "blocks it" in record["physical"]
 
 
 def test_atoms_of_one_mode_only_are_reported(cached, bundle):
@@ -91,10 +91,10 @@ def test_atoms_of_one_mode_only_are_reported(cached, bundle):
     comparison = compared(cached, other, CARRY)
     other.close()
     assert comparison.first_difference is None
-    told = disagreement_to_json(comparison)
-    assert "(ontop apple_1 countertop_1)" in told["only_cached"]
+    record = disagreement_to_json(comparison)
+    assert "(ontop apple_1 countertop_1)" in record["only_cached"]
     assert "(inroom apple_1 kitchen_0)" in comparison.equal_atoms
-    assert "step" not in told
+    assert "step" not in record
 
 
 def test_comparison_covers_objects_of_goal_and_calls(bundle):

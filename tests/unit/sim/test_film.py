@@ -54,7 +54,7 @@ def test_door_opens_gradually(film) -> None:
     assert shares[-1] == 1.0
 
 
-def test_the_film_ends_in_the_state_that_the_plan_reached(film, scene) -> None:
+def test_film_ends_in_the_final_state_of_the_plan(film, scene) -> None:
     simulator = load_simulator(Bundle(scene, {}))
     simulator.execute(film.task, film.plan, 0)
     assert film.frames[-1].poses["apple_1"] == simulator.world.engine.pose("apple_1")

@@ -1,7 +1,7 @@
-"""Inputs that crash, hang or silently corrupt physics are refused early.
+"""Inputs that would crash, hang or silently corrupt physics are refused early.
 
-Each kind is tried at three gates: bundles and scene files, which carry all outside data, and the engine itself, for scenes that
-a program makes. Messages name what was found.
+Each kind is tried at three gates: bundles and scene files, which carry all outside data, and the engine itself, for scenes
+built in code. Messages name what was found.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ CUBE = tuple((x, y, z) for x in (-0.05, 0.05) for y in (-0.05, 0.05) for z in (-
 
 
 def with_object(**changes):
-    """The flat with its last object changed: the apple or another small thing."""
+    """Return the flat with its last object changed: the apple or another small object."""
     scene = kitchen_scene()
     return dataclasses.replace(
         scene, objects=(*scene.objects[:-1], dataclasses.replace(scene.objects[-1], **changes))
@@ -40,7 +40,7 @@ def with_object(**changes):
 
 
 def with_asset(**changes):
-    """The flat with the asset of its last object changed."""
+    """Return the flat with the asset of its last object changed."""
     scene = kitchen_scene()
     asset = dataclasses.replace(scene.assets[scene.objects[-1].asset_id], **changes)
     joints = (0.0,) * len(asset.joints)
@@ -174,12 +174,12 @@ PHYSICAL = {
 """Invalid for physics itself: all three gates refuse it."""
 OUTSIDE = {
     "box with vertices": lambda: with_part(dataclasses.replace(BOX, vertices_m=CUBE)),
-    "things that rest on one another in a circle": in_a_circle,
-    "thing that rests on itself": lambda: with_object(host=kitchen_scene().objects[-1].name),
+    "objects that rest on one another in a circle": in_a_circle,
+    "object that rests on itself": lambda: with_object(host=kitchen_scene().objects[-1].name),
     "unknown host": lambda: with_object(host="ghost_1"),
     "unknown room": lambda: with_object(room="attic_0"),
     "unknown piece": lambda: with_object(pieces=("ghost_1",)),
-    "two things at one point": at_one_point,
+    "two objects at one point": at_one_point,
     "no room": lambda: dataclasses.replace(kitchen_scene(), rooms=()),
     "room inside out": lambda: with_room(high_m=(0.0, 0.0)),
     "room as large as a country": lambda: with_room(high_m=(9e5, 9e5)),
@@ -262,7 +262,7 @@ def test_decompression_bomb_of_a_gigabyte_is_refused():
 
 
 def _respun(change):
-    """Bundle of the flat whose JSON and arrays a function has changed, as an attacker would."""
+    """Return the flat's bundle with JSON and arrays changed by a function, as an attacker would."""
     content = bytearray(zlib.decompress(encode_bundle(Bundle(kitchen_scene(), {}))))
     length = int.from_bytes(content[8:12], "little")
     value, rest = json.loads(content[12 : 12 + length]), bytes(content[12 + length :])

@@ -32,7 +32,7 @@ RECTANGLE = st.builds(
 
 
 def rows_of(rectangles) -> np.ndarray:
-    """Obstacles from the floor to 1 m, shape (n, 6)."""
+    """Return obstacles from the floor to 1 m, shape (n, 6)."""
     return np.array([(*rectangle, 0.0, 1.0) for rectangle in rectangles]).reshape(-1, 6)
 
 
@@ -56,7 +56,7 @@ def navigator(engine):
 
 
 def walled_off(scene):
-    """The same flat with its doorway bricked up."""
+    """Return the flat with its doorway bricked up."""
     return dataclasses.replace(scene, walls=(*scene.walls, box((5.05, 2, 1.2), (0.1, 0.9, 2.4))))
 
 
@@ -263,7 +263,7 @@ def test_main_part_is_the_largest_remaining_component_around_a_point(start, come
 
 
 def _parts_are_equal(grid: FloorGrid, other: FloorGrid) -> bool:
-    """But for the numbers that the parts bear."""
+    """Return True if the connected parts agree up to their numbering."""
     assert all(grid.label(cell) == grid.labels[cell] for cell in np.ndindex(grid.labels.shape))
     pairs = set(zip(grid.labels.flat, other.labels.flat, strict=True))
     numbers = len(set(grid.labels.flat)), len(set(other.labels.flat))

@@ -24,7 +24,7 @@ LOWER_FLOOR_M = 0.25 - 0.22
 
 
 def drawer_scene():
-    """The flat with a cabinet of two drawers, a mug in a bowl in the lower one, and a book-like block in the upper one."""
+    """Return the flat with a cabinet of two drawers: a mug in a bowl in the lower one, a book-like block in the upper."""
     cabinet, mug = make.drawer_cabinet(), make.mug()
     block = dataclasses.replace(make.block("book", "book.n.02", (0.2, 0.15, 0.04), {}), mass_kg=0.5)
     x, y = 4.0, 0.26
@@ -200,7 +200,7 @@ def test_objects_on_carried_objects_are_carried_too(flat):
     assert set(panels.carried) == {"mug_2", "book_1", "apple_1"}
 
 
-# Whatever is done, a reset brings the start back to the bit, and a failed call changes nothing.
+# After any calls, a reset restores the start bit for bit; a failed call changes nothing.
 
 NAMES = (
     "apple_1",

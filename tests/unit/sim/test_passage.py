@@ -20,7 +20,7 @@ OUT = (0.5, 0.0, 1.5, 0.0, -0.2, 0.0, 1.8, 0.785)
 
 @contextlib.contextmanager
 def room_with(*things):
-    """A dynamic world with the robot and things: names, sizes, where the middle of the underside is, and whether fixed."""
+    """Return a dynamic world with the robot and objects: names, sizes, centres of the undersides, and whether fixed."""
     rows = []
     for name, size, place, fixed in things:
         thing = make.block(name, "block.n.01", size, {})
@@ -68,7 +68,7 @@ def test_robot_stays_at_the_end_of_a_passage_when_stepped():
     [(30.0, 0.08, True), (47.0, 0.08, True), (11.0, 0.02, False), (47.0, 0.02, False)],
 )
 def test_thin_obstacle_is_detected(degrees, back_m, stops):
-    """A rod stops the hand. Its fingers give way and pass: but that is for physics to say, and then no end is exact."""
+    """A rod stops the hand. Compliant fingers may pass it, as physics decides; the sweep's end is then inexact."""
     turn = np.eye(body.NUMBERS)[body.YAW] * math.radians(degrees)
     start = np.array([2.0, 1.5, 0.0, *OUT])
     rotation, position = body.tools((start + turn)[None])

@@ -1,4 +1,4 @@
-"""Physical mode: the robot carries out every skill once in the flat, and fails where it must."""
+"""Physical mode: the robot carries out every skill once in the flat and reports failures."""
 
 from dataclasses import replace
 
@@ -94,7 +94,7 @@ def test_equal_plans_give_bit_equal_traces_after_any_history():
         second.close()
 
 
-def test_a_refused_call_moves_nothing(flat):
+def test_refused_call_moves_nothing(flat):
     trace = executed(flat, "pick_up mug_1")
     assert trace.failure is FailureReason.OUT_OF_REACH
     assert flat.world.engine.pose("apple_1") == flat.world.scene.by_name["apple_1"].pose_world_asset

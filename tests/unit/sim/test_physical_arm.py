@@ -63,7 +63,7 @@ def test_tool_moves_with_base_lift_and_heading():
     np.testing.assert_allclose(turned[0], arm.about_z(np.array([np.pi / 2]))[0] @ turn[0], atol=1e-9)
 
 
-def test_the_folded_arm_keeps_within_the_robots_disc_and_off_its_own_trunk():
+def test_folded_arm_stays_within_the_robots_disc_and_clear_of_its_trunk():
     from embomatrix.sim.bullet.robot import TUCKED_ARM
     from embomatrix.skills.limits import ROBOT
 
@@ -124,7 +124,7 @@ def test_touched_boxes_shrink_until_clear_and_others_stay():
 def test_places_that_an_open_panel_cuts_off_come_last(panel_m, order):
     engine = BulletEngine(kitchen_scene())
     try:
-        # From the south wall on: the long one reaches the furniture in the north, and more floor lies east of it.
+        # From the south wall: the long rectangle reaches the furniture in the north, with more floor east of it.
         panel = boxes_of([(Pose((4.0, panel_m / 2, 0.5)), (0.04, panel_m, 1.0), "door")])
         east, west = np.array([[4.5, 0.5, 0.0]]), np.array([[3.3, 2.6, 0.0]])
         found = Floor(Navigator(engine, Relations(engine))).with_cut_off_last([west, east], panel)
@@ -173,7 +173,7 @@ def test_stretched_arm_bears_its_weight_in_coarse_steps():
 
 
 def test_lift_bears_its_load_beside_a_closely_fitting_panel():
-    """Bullet divides by the effect of a contact. A contact that can move nothing once stopped the solver for the robot too."""
+    """Bullet divides by the effect of a contact. An immovable contact once stopped the solver for the robot too."""
     front, tall = ConvexPart(Shape.BOX, Pose((0.31, 0.0, 0.0)), (0.02, 0.6, 1.0)), (0.6, 0.6, 1.0)
     door = Link("door", (front,), Joint(JointKind.REVOLUTE, (0.31, 0.0, -0.5), (0.0, 1.0, 0.0), 1.5))
     oven = make.asset("oven", "oven.n.01", tall, [make.box((0.0, 0.0, 0.0), tall)], links=[door])

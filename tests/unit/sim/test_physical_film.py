@@ -1,4 +1,4 @@
-"""Films of physical mode: the arm moves, and objects move only while something moves them."""
+"""Films of physical mode: the arm moves, and objects move only while they are pushed or carried."""
 
 import itertools
 import math
@@ -24,7 +24,7 @@ def film():
     return film
 
 
-def test_the_arm_reaches_and_the_object_is_lifted(film) -> None:
+def test_arm_reaches_and_lifts_the_object(film) -> None:
     assert [step.ok for step in film.steps] == [True, True]
     start = film.scene.by_name["apple_1"].pose_world_asset.position_m[2]
     assert film.frames[-1].poses["apple_1"].position_m[2] > start + 0.05

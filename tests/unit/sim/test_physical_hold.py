@@ -93,7 +93,7 @@ def test_object_is_dropped_into_a_crate_too_narrow_for_the_hand(play):
 
 @pytest.mark.parametrize(("x", "yaw", "gap"), [(2.35, 0.0, 0.1), (1.7, 0.45, 0.0), (2.35, 0.45, 0.1)])
 def test_regrasp_for_a_narrow_top_puts_the_hand_on_the_near_side(play, x, yaw, gap):
-    # The roll can't lie across the heater, nor the hand come along it, past the lockers.
+    # The roll does not fit across the heater, and the lockers block the hand's approach along the heater.
     roll = replace(make.block("roll", "roll.n.01", (0.2, 0.063, 0.032), {}), mass_kg=0.15)
     heater = make.block("heater", "heater.n.01", (0.084, 0.48, 1.84), {})
     locker = make.block("locker", "locker.n.01", (0.3, 0.3, 2.2), {})
@@ -117,7 +117,7 @@ def test_regrasp_for_a_narrow_top_puts_the_hand_on_the_near_side(play, x, yaw, g
 
 @pytest.mark.parametrize(("wide_m", "yaw"), [(0.4, 0.0), (0.36, np.pi / 2)])
 def test_object_that_fits_a_board_one_way_is_gripped_at_its_outer_side(play, wide_m, yaw):
-    # The book lies across the board, as long as that is wide, and is put down for the while with an end to the robot.
+    # The book is as long as the board is wide. It is put down temporarily with one end towards the robot.
     book = replace(make.block("book", "book.n.01", (0.32, 0.22, 0.02), {}), mass_kg=0.4)
     size = (0.26 + make.PANEL_M, wide_m + 2 * make.PANEL_M, 0.32)
     rack = make.open_shelf("rack", "rack.n.01", size, 2)

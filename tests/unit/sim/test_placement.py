@@ -173,9 +173,7 @@ def test_rim_of_an_open_bowl_must_be_within_reach(rim_m, is_found) -> None:
 
 
 @pytest.mark.parametrize("relation", [Relation.ONTOP, Relation.INSIDE])
-def test_object_on_a_shelf_is_placed_where_it_can_be_picked_up_again(
-    engine, relations, navigator, relation
-) -> None:
+def test_object_on_a_shelf_is_placed_within_reach(engine, relations, navigator, relation) -> None:
     held, target = "apple_1", "shelf_1"
     heedless = Placer(engine, relations, PoseCache())
     heedful = Placer(engine, relations, PoseCache(), navigator)

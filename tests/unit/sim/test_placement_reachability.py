@@ -83,7 +83,7 @@ def test_equal_queries_give_equal_answers(known):
 
 
 def boxed_in():
-    """The flat with a low stand on its table, in a closed box high enough for a slice of bread."""
+    """Return the flat with a low stand on its table, in a closed box high enough for a slice of bread."""
     x, y, top, high, wide = 1.9, 1.3, 0.75, 0.11, 0.2
     stand = make.block("stand", "board.n.01", (0.06, 0.06, 0.04), {})
     slice_of = replace(make.block("slice", "bread.n.01", (0.05, 0.05, 0.03), {}), mass_kg=0.1)
@@ -103,7 +103,7 @@ def boxed_in():
     return with_objects(kitchen_scene(), [*sides, *boxed, (free, slice_of)])
 
 
-def test_nothing_is_placed_where_nothing_could_be_picked_up():
+def test_no_object_is_placed_at_an_unreachable_pose():
     placing = PlacementQuery("slice_1", "stand_1", Relation.ONTOP)
     scene = boxed_in()
     poses = looked_ahead(scene, (placing,))

@@ -1,4 +1,4 @@
-"""Oracle planner: for every kind of goal a minimal working plan, or the reason why there is none."""
+"""Oracle planner: a minimal working plan for every kind of goal, or the reason for its absence."""
 
 from dataclasses import replace
 
@@ -134,7 +134,7 @@ def test_cooked_food_is_served_elsewhere(flat):
     )
 
 
-def test_a_microwave_is_switched_off_before_the_food_is_taken_out(flat):
+def test_microwave_is_switched_off_before_the_food_is_taken_out(flat):
     task = task_over(
         flat.world.scene, And((atom("hot", "apple_1"), atom("ontop", "apple_1", "coffee_table_1")))
     )
@@ -161,7 +161,7 @@ def test_a_microwave_is_switched_off_before_the_food_is_taken_out(flat):
         And((atom("touching", "apple_1", "coffee_table_1"),)),
     ],
 )
-def test_a_plan_is_found_for_the_goal(flat, goal):
+def test_oracle_finds_a_plan_for_the_goal(flat, goal):
     assert oracle(flat, goal).startswith("move")
 
 
@@ -178,16 +178,16 @@ def test_plans_for_the_flat_succeed_with_several_seeds(flat):
 def test_source_named_in_the_instruction_is_preferred(flat):
     task = task_over(flat.world.scene, atom("cooked", "apple_1"))
     by_stove = words_of(find_plan(flat, replace(task, instruction="Cook the apple.")), task)
-    told = replace(task, instruction="Cook the apple in the microwave, please.")
+    instructed = replace(task, instruction="Cook the apple in the microwave, please.")
     assert by_stove.endswith("place stove_1 ontop; toggle_on stove_1")
-    assert words_of(find_plan(flat, told), task).endswith("close microwave_1; toggle_on microwave_1")
+    assert words_of(find_plan(flat, instructed), task).endswith("close microwave_1; toggle_on microwave_1")
 
 
 def test_object_in_the_named_room_is_preferred(flat):
     task = task_over(flat.world.scene, Exists("?a", "apple.n.01", atom("inside", "?a", "bowl_1")))
-    told = replace(task, instruction="Put the apple in the living room into the bowl.")
+    instructed = replace(task, instruction="Put the apple in the living room into the bowl.")
     assert words_of(find_plan(flat, task), task).startswith("move apple_1")
-    assert words_of(find_plan(flat, told), task).startswith("move apple_2")
+    assert words_of(find_plan(flat, instructed), task).startswith("move apple_2")
 
 
 def test_every_call_of_a_plan_is_necessary(flat):
@@ -222,7 +222,7 @@ def test_goal_without_a_plan_is_refused_with_a_reason(flat, goal, reason):
     assert oracle(flat, goal) == reason
 
 
-def test_a_goal_that_needs_an_object_outside_the_table_has_no_plan(flat):
+def test_goal_with_an_object_outside_the_table_has_no_plan(flat):
     task = task_over(flat.world.scene, atom("ontop", "apple_1", "countertop_1"))
     task = replace(task, table=task.table[:5])
     assert find_plan(flat, task) == PlanNotFound("apple_1 is not in the object table: no plan can name it")

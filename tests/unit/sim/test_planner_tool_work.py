@@ -45,7 +45,7 @@ GOALS = {
 
 
 @pytest.mark.parametrize("goal", GOALS)
-def test_a_household_goal_is_reached(home, goal):
+def test_household_goal_is_reached(home, goal):
     task = task_of(home, goal)
     plan = find_plan(home, task)
     assert not isinstance(plan, PlanNotFound), plan.reason

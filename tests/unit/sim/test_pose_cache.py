@@ -13,9 +13,10 @@ from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.mini_world import MiniWorld, StaticObject
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.candidates import beside, candidates, stands_in
-from embomatrix.sim.placing.pose_cache import POSES, PlacementLibrary
+from embomatrix.sim.placing.pose_cache import POSES, Contents, PlacementLibrary
 from embomatrix.sim.state.relations import Relations
-from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.asset import Asset, Credit, Interior, Joint, JointKind, Link, SupportSurface
+from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
 from embomatrix.world.poses import PlacementKey
 from embomatrix.world.state import Relation
 
@@ -112,6 +113,27 @@ def test_library_identifies_assets_by_content(pool) -> None:
     low = dataclasses.replace(make.kitchen_table(), mass_kg=21.0)
     assert library.poses(make.apple(), low, Relation.ONTOP, 0) != first
     library.close()
+
+
+def test_content_digest_of_an_asset_is_pinned() -> None:
+    """Seeds of cached poses come from content digests: another digest changes every generated scene."""
+    hull = ConvexPart(Shape.HULL, Pose((0.1, 0.0, 0.0)), (0.1, 0.2, 0.3), ((0.0, 0.0, 0.0), (0.1, 0.2, 0.3)))
+    fridge = Asset(
+        "fridge-pin",
+        "fridge",
+        "electric_refrigerator.n.01",
+        (0.6, 0.6, 1.8),
+        80.0,
+        (
+            Link("base", (make.box((0.0, 0.0, 0.0), (0.6, 0.6, 1.8)),)),
+            Link("door", (hull,), Joint(JointKind.REVOLUTE, (0.3, 0.2, 0.0), (0.0, 0.0, 1.0), 1.5)),
+        ),
+        (SupportSurface("top", (0.0, 0.0, 0.9), (0.6, 0.6), 0.5),),
+        (Interior("inside", (0.0, 0.0, 0.0), (0.5, 0.5, 1.5)),),
+        {"openable": {}, "coldSource": {"temperature": -100.0}},
+        Credit("author", "CC0", "source"),
+    )
+    assert Contents().of(fridge) == "4971fbcd00afcdf24c6d80f2bb8664f701dd52c9fe8c5cfb84d4e03109b31ca8"
 
 
 def test_too_tall_object_is_not_placed_inside_a_cavity() -> None:

@@ -26,7 +26,7 @@ PLANS = (
 
 @pytest.fixture(scope="module")
 def bundle():
-    """The flat, prepared by a simulator that has been used before, as it comes out of a bundle's bytes."""
+    """Bundle of the flat, prepared by a used simulator and decoded from bytes."""
     scene = kitchen_scene()
     task = task_over(scene)
     bare = Bundle(scene, {task.task_id: task})
@@ -93,6 +93,6 @@ def test_mismatched_arrays_are_derived_instead(bundle, spoil):
         assert simulator.execute(task, plan_of(task, PLANS[0]), 0).failure is None
 
 
-def test_the_grid_covers_the_rooms(bundle):
+def test_grid_covers_the_rooms(bundle):
     rows, columns = grid_shape(bundle.scene)
     assert (rows * 0.05, columns * 0.05) == pytest.approx((9.3, 4.2), abs=0.051)

@@ -38,7 +38,7 @@ def test_work_runs_in_initialised_pool_processes(tmp_path):
 
 
 class Adder:
-    """Adds a number, and tells in which process."""
+    """Pool job that adds a number and returns the sum with its process id."""
 
     def __init__(self, number):
         self.number = number

@@ -1,4 +1,4 @@
-"""A reset restores the state and everything derived from it."""
+"""A reset restores the state and everything derived from it, bit for bit."""
 
 import pytest
 from hypothesis import given, settings

@@ -1,4 +1,4 @@
-"""Effects of temperature follow from the state, whichever call caused it."""
+"""Temperature effects follow from the state, independent of the call that caused it."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from embomatrix.world.state import State
 
 
 def scene_with_pan():
-    """The flat with a pan on the table, and a lukewarm plate."""
+    """Return the flat with a pan on the table, and a lukewarm plate."""
     pan = replace(make.bowl(), asset_id="frying_pan-fakeaa", category="frying_pan", synset="frying_pan.n.01")
     return with_objects(
         kitchen_scene(), [(placed("frying_pan_1", pan, "kitchen_0", upright(2.1, 1.4, 0.75, pan)), pan)]
@@ -42,7 +42,7 @@ def test_object_in_the_closed_fridge_is_frozen_at_the_start(flat):
     assert not after(flat, "turn 0").holds("frozen", ("apple_1",))
 
 
-def test_the_fridge_freezes_only_when_it_is_closed(flat):
+def test_fridge_freezes_only_when_closed(flat):
     stock = (
         "move fridge_1; open fridge_1; move apple_1; pick_up apple_1; move fridge_1; place fridge_1 inside"
     )

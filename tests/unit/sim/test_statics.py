@@ -1,4 +1,4 @@
-"""A settle confirms every rest pose that statics proves; statics leaves the other cases to the settle."""
+"""A settle confirms every rest pose that statics proves; statics skips all other cases."""
 
 import math
 
@@ -27,7 +27,7 @@ def part(shape, size, at=(0.0, 0.0, 0.0)):
 
 
 def over(held, support, x, y, yaw):
-    """Pose half a millimetre over the support's top."""
+    """Return a pose half a millimetre over the support's top."""
     z = bounds_of(support).box(IDENTITY).high_m[2] - bounds_of(held).box(IDENTITY).low_m[2] + LIFT_M
     return Pose.from_xyz_yaw(x, y, z, yaw)
 

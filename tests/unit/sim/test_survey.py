@@ -26,7 +26,7 @@ NAMES = ("apple_1", "chicken_leg_1", "microwave_1", "table_lamp_1")
 
 
 def walled_in():
-    """The flat with ``apple_1`` on its table between four boards and under a fifth."""
+    """Return the flat with ``apple_1`` on its table between four boards and under a fifth."""
     x, y, top = 1.9, 1.6, 0.75
     side, lid = (
         make.block("board", "board.n.01", (0.02, 0.2, TALL_M), {}),

@@ -22,7 +22,7 @@ PLANS = (
 
 @pytest.fixture(scope="module")
 def both():
-    """One simulator that found out ahead, and one that did not."""
+    """Return one simulator with predicted swings and one without."""
     ahead, then = load_simulator(Bundle(drawer_scene(), {})), load_simulator(Bundle(drawer_scene(), {}))
     for _ in ahead.warm_up():
         pass
@@ -32,7 +32,7 @@ def both():
 
 
 def in_the_way(simulator: Simulator, y_m: float) -> None:
-    """Stand the bowl before the drawers, by hand."""
+    """Move the bowl before the drawers."""
     simulator.world.engine.set_pose("bowl_1", upright(4.0, y_m, 0.0, simulator.world.asset("bowl_1")))
 
 
@@ -83,5 +83,5 @@ def test_predicted_swing_is_not_measured_again(both) -> None:
     ahead.reset(task_over(ahead.world.scene), 0)
     assert not ahead.world.swings.open(DRAWERS)
     changed = [name for name, _ in ahead.world.engine.journal.entries]
-    assert sorted(changed) == sorted(set(changed)), "every stop on the way would be a change of its own"
+    assert sorted(changed) == sorted(set(changed)), "every stop on the path would be a separate change"
     assert {DRAWERS, "mug_2", "book_1"} == set(changed)

@@ -196,7 +196,7 @@ def test_running_microwave_is_not_opened_but_running_stove_is_no_obstacle():
     assert reason(WordWorld(on={"microwave"}), Skill.TOGGLE_OFF, "microwave") is None
 
 
-def test_a_microwave_starts_only_when_closed():
+def test_microwave_starts_only_when_closed():
     assert reason(WordWorld(open={"microwave"}), Skill.TOGGLE_ON, "microwave") is FailureReason.MUST_BE_CLOSED
     assert reason(WordWorld(), Skill.TOGGLE_ON, "microwave") is None
 
@@ -325,7 +325,7 @@ def test_rag_that_removes_one_of_two_substances_is_accepted():
     assert home_reason(at_home(carried=("rag",), facts=facts), Skill.CLEAN, "plate", "rag") is None
 
 
-def test_a_clean_plate_may_be_wiped():
+def test_clean_plate_may_be_wiped():
     assert home_reason(at_home(carried=("rag",)), Skill.CLEAN, "plate", "rag") is None
 
 

@@ -69,7 +69,7 @@ def test_system_text_lists_every_skill_and_the_example_of_its_codec(codec):
 
 
 @pytest.mark.parametrize("codec", Codec)
-def test_the_example_of_every_codec_parses_to_the_same_plan(codec):
+def test_example_of_every_codec_parses_to_the_same_plan(codec):
     text = EXAMPLES[codec]
     plan = parse_plan(with_indices(text, SITUATION) if codec is Codec.NAMES else text)
     assert plan == parse_plan(EXAMPLES[Codec.JSON])
@@ -116,13 +116,13 @@ def test_text_without_a_plan_is_unchanged(text):
 
 
 def test_limit_keeps_named_rows_and_their_hosts():
-    told = limited(SITUATION, 3)
-    assert {row.name for row in told.rows} == {"apple_1", "fridge_1", "countertop_1"}
+    reduced = limited(SITUATION, 3)
+    assert {row.name for row in reduced.rows} == {"apple_1", "fridge_1", "countertop_1"}
     assert limited(SITUATION, 7) is SITUATION
 
 
 def test_limit_ignores_names_inside_other_words():
-    told = limited(
+    reduced = limited(
         Situation(
             (),
             "",
@@ -132,12 +132,16 @@ def test_limit_ignores_names_inside_other_words():
         ),
         1,
     )
-    assert [row.name for row in told.rows] == ["apple_1"]
+    assert [row.name for row in reduced.rows] == ["apple_1"]
 
 
 def test_contents_of_an_omitted_row_are_listed_in_the_room():
-    told = subset(SITUATION, {4, 2})
-    assert prompt_for(told, Codec.NAMES).user.splitlines()[:3] == ["room kitchen_0", "fridge closed", "apple"]
+    reduced = subset(SITUATION, {4, 2})
+    assert prompt_for(reduced, Codec.NAMES).user.splitlines()[:3] == [
+        "room kitchen_0",
+        "fridge closed",
+        "apple",
+    ]
 
 
 def test_prompt_never_contains_the_goal():
@@ -151,7 +155,7 @@ def test_prompt_shows_substances_and_absent_objects():
     situation = situation_of(scene, replace(task_over(scene), profile=Profile.HOUSEHOLD))
     states = {row.name: row.states for row in situation.rows}
     assert states["plate_1"] == ("dusty",)
-    assert states["plate_2"] == ("stained",), "a covering that has a word of its own is told by it"
+    assert states["plate_2"] == ("stained",), "a covering with a dedicated word is described by that word"
     assert states["liquid_soap__bottle_1"] == ("filled_with_liquid_soap",)
     assert states["half_melon_1"] == ("absent",)
     assert situation.profile is Profile.HOUSEHOLD

@@ -16,7 +16,7 @@ def one_thread():
 
 @pytest.fixture
 def small_files():
-    """Make the kernel refuse files above a size, as a full disk would."""
+    """Make the kernel refuse files above a size, like a full disk."""
 
     @contextmanager
     def limited(most_bytes):

@@ -52,7 +52,7 @@ async def test_texts_of_several_tasks_are_scored_in_order_with_one_batch_per_tas
     assert (len(cluster.batches), cluster.executed) == (2, 3)
 
 
-async def test_a_scorer_serves_several_event_loops(on_cluster):
+async def test_scorer_serves_several_event_loops(on_cluster):
     def in_a_loop_of_its_own():
         return asyncio.run(on_cluster.score([FIRST.task.task_id], [oracle(FIRST)]))
 
@@ -128,14 +128,14 @@ def test_completion_without_text_counts_as_empty(completion):
 
 
 def test_sampler_announces_each_portion_before_its_first_index():
-    told = []
-    sampler = AnnouncedSampler([4, 4, 1, 1, 0, 0, 2, 2, 3, 3], 4, 1, told.append)
+    windows = []
+    sampler = AnnouncedSampler([4, 4, 1, 1, 0, 0, 2, 2, 3, 3], 4, 1, windows.append)
     drawn = []
     for index in sampler:
-        drawn.append((index, len(told)))
+        drawn.append((index, len(windows)))
     assert [index for index, _ in drawn] == [4, 4, 1, 1, 0, 0, 2, 2, 3, 3]
     assert [count for _, count in drawn] == [1] * 4 + [2] * 4 + [3] * 2
-    assert told == [[[4, 1], [0, 2]], [[0, 2], [3]], [[3]]]
+    assert windows == [[[4, 1], [0, 2]], [[0, 2], [3]], [[3]]]
     assert len(sampler) == 10
 
 
@@ -167,7 +167,7 @@ class LookingAhead(ClusterLookahead, TrainerOfTheirs):
     lookahead_steps = 1
 
 
-def test_the_mixin_announces_each_generation_and_the_next_to_the_cluster(cluster, on_cluster):
+def test_mixin_announces_the_current_and_the_next_generation(cluster, on_cluster):
     sampler = LookingAhead(ClusterReward(on_cluster))._get_train_sampler()
     drawn = iter(sampler)
     next(drawn)
@@ -209,10 +209,10 @@ async def test_openrlhf_gets_tensors_and_lost_plans_are_retried():
     ids = [FIRST.task.task_id, SECOND.task.task_id, FIRST.task.task_id]
     with scorer(SymbolicCluster(TASKS, lost=frozenset({"score-0/"}))) as opened:
         rewards = await openrlhf.rewards_of(opened, ids, [oracle(FIRST), oracle(SECOND), "hm"])
-    told = openrlhf.reward_payload(rewards)
-    assert told["scores"].tolist() == [1.0, 1.0, 0.0]
-    assert told["rewards"].tolist() == pytest.approx([reward.total for reward in rewards])
-    assert sum(values[2].item() for values in told["extra_logs"].values()) == -1
+    windows = openrlhf.reward_payload(rewards)
+    assert windows["scores"].tolist() == [1.0, 1.0, 0.0]
+    assert windows["rewards"].tolist() == pytest.approx([reward.total for reward in rewards])
+    assert sum(values[2].item() for values in windows["extra_logs"].values()) == -1
     with (
         scorer(SymbolicCluster(TASKS, lose_first=True)) as opened,
         pytest.raises(TrainerError, match="lost a plan of the task 'task-0' 3 times"),

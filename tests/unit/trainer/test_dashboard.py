@@ -16,7 +16,7 @@ ORACLE_TASK = TASKS.train[0]
 
 
 class AwayCluster(SymbolicCluster):
-    """Takes no report before it is back."""
+    """Cluster that rejects reports until it is back."""
 
     error = UnavailableError("away")
 
@@ -50,12 +50,12 @@ def test_run_reports_both_phases_time_by_activity_and_plans(tmp_path):
 
 
 def test_report_shows_best_and_worst_plan_and_a_lost_one_last():
-    told = []
+    sent = []
     good, bad = outcomes(SymbolicCluster(TASKS), "toggle_on countertop", "what?")
     lost = good.__class__("move table", None)
     group = GroupLog(ORACLE_TASK, (bad, lost, good), (-1.0, math.nan, 1.0), zero_variance=False)
-    DashboardReporter(told.append).sampled(4, [group])
-    (report,) = told
+    DashboardReporter(sent.append).sampled(4, [group])
+    (report,) = sent
     assert (report.step, report.figures) == (4, {})
     assert [plan.text for plan in report.plans] == [good.text, bad.text, lost.text]
     assert report.plans[1].problem
@@ -63,9 +63,9 @@ def test_report_shows_best_and_worst_plan_and_a_lost_one_last():
 
 
 def test_non_finite_numbers_are_not_reported():
-    told = []
-    DashboardReporter(told.append).log("grpo", 1, {"reward": 1.0, "kl": math.nan})
-    assert told == [TrainingReport("grpo", 1, {"reward": 1.0})]
+    sent = []
+    DashboardReporter(sent.append).log("grpo", 1, {"reward": 1.0, "kl": math.nan})
+    assert sent == [TrainingReport("grpo", 1, {"reward": 1.0})]
 
 
 def test_latest_reports_are_queued_for_an_unreachable_manager():

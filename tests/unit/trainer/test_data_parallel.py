@@ -24,7 +24,7 @@ FAST = {"imitation__steps": 20, "grpo__steps": 4, "checkpoint_every": 2}
 
 @pytest.fixture
 def remotes(monkeypatch):
-    """The processes of every workers that is made."""
+    """Collect the processes of all data-parallel workers."""
     made = []
     real = DataParallelWorkers.__init__
 
@@ -48,11 +48,11 @@ def test_two_processes_are_bit_identical_to_one(tmp_path, remotes, changes):
     two = learnt(tmp_path / "two", processes=2, **changes)
     assert len(remotes) == 1
     assert torch.equal(one, two)
-    told = [
+    results = [
         [{**row, "seconds": 0, "spent_s": {}} for row in read_metrics(tmp_path / name)]
         for name in ("one", "two")
     ]
-    assert told[0] == told[1]
+    assert results[0] == results[1]
 
 
 def test_more_processes_than_microbatches_are_bit_identical(tmp_path, remotes):
@@ -79,7 +79,7 @@ def test_killed_process_ends_the_run_and_a_resume_gives_the_same_result(tmp_path
 
 @pytest.fixture
 def interruptible():
-    """Interrupts are heard, also where the tests were begun in the background: a shell has those ignored there."""
+    """Restore the default SIGINT handler: shells ignore SIGINT in background processes."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -87,7 +87,7 @@ def interruptible():
 
 def test_ctrl_c_waits_for_neither_rewards_nor_processes(tmp_path, remotes, interruptible):
     class Silent(SymbolicCluster):
-        """Gives no reward in the third step of GRPO, and has the trainer interrupted."""
+        """Cluster that withholds the rewards of GRPO's third step and interrupts the trainer."""
 
         async def execute(self, batch):
             if batch.batch_id == "step-3-0-0":

@@ -1,4 +1,4 @@
-"""Drawing of tokens: frequencies follow the scores, and masked tokens are never drawn."""
+"""Token sampling: frequencies follow the scores, and masked tokens are never drawn."""
 
 import pytest
 import torch
@@ -21,13 +21,13 @@ def test_token_frequencies_follow_the_softmax(temperature):
 
 
 @given(
-    barred=st.lists(st.booleans(), min_size=2, max_size=40).filter(lambda marks: not all(marks)),
+    masked=st.lists(st.booleans(), min_size=2, max_size=40).filter(lambda marks: not all(marks)),
     seed=st.integers(0, 2**32),
 )
-def test_masked_token_is_never_drawn(barred, seed):
+def test_masked_token_is_never_drawn(masked, seed):
     generator = torch.Generator().manual_seed(seed)
-    marks = torch.tensor(barred)
-    scores = torch.randn(len(barred), generator=generator).masked_fill(marks, BARRED)
+    marks = torch.tensor(masked)
+    scores = torch.randn(len(masked), generator=generator).masked_fill(marks, BARRED)
     choice, _ = draw(scores.repeat(50, 1), 1.0, generator)
     assert not marks[choice].any()
 

@@ -23,7 +23,7 @@ TABLE = ("fridge_1", "apple_1", "table_1", "microwave_1", "bowl_1")
 
 
 def failed(plan, at, reason, **words):
-    """Steps of a plan whose step ``at``, counted from 1, fails as the simulator would report it."""
+    """Return steps of a plan whose step ``at``, counted from 1, fails as the simulator would report it."""
     steps = [Step(call, None, "") for call in plan[: at - 1]]
     refusal = refuse(reason, **words)
     return (*steps, Step(plan[at - 1], reason, refusal.sentence, refusal.blocker))
@@ -42,7 +42,7 @@ def test_equal_tasks_give_a_wilson_interval():
 
 
 def test_bootstrap_resamples_tasks_not_samples():
-    """Ten samples of each of ten tasks that either always or never succeed are ten observations, not a hundred."""
+    """Ten equal samples of each of ten tasks are ten observations, not a hundred."""
     estimate = mean_over_tasks([0.0, 1.0] * 5)
     assert estimate.method is IntervalMethod.BOOTSTRAP
     assert estimate.interval.high - estimate.interval.low > 0.5

@@ -49,7 +49,7 @@ SCALE = LossTotals(4, 7, LONGEST)
 
 
 def by_hand(kind, ratio, low, high, kl_coef):
-    """Objective in plain Python, plan by plan and token by token."""
+    """Compute the objective in plain Python, plan by plan and token by token."""
     plans = []
     for new, old, reference, mask, advantage in zip(NEW, OLD, REFERENCE, MASK, ADVANTAGES, strict=True):
         own = [at for at, present in enumerate(mask) if present]

@@ -49,29 +49,29 @@ def prompts(policy, count=3):
 
 
 def test_shared_prompt_gives_the_log_probabilities_of_a_plain_forward_pass(policy):
-    told = [prompts(policy)[0][30:], *prompts(policy)[1:]]
-    samples = policy.sample(told, 3, 1.2, 10, torch.Generator().manual_seed(0))
-    shared = policy.logprobs(told, samples.tokens, samples.mask, 3, 1.2)
+    prompt_ids = [prompts(policy)[0][30:], *prompts(policy)[1:]]
+    samples = policy.sample(prompt_ids, 3, 1.2, 10, torch.Generator().manual_seed(0))
+    shared = policy.logprobs(prompt_ids, samples.tokens, samples.mask, 3, 1.2)
     assert torch.allclose(shared.logprobs, samples.logprobs * samples.mask, atol=1e-4)
     for row in range(9):
-        whole = torch.tensor([[*told[row // 3], *samples.tokens[row].tolist()]])
-        scores = policy.module(whole).logits[0, len(told[row // 3]) - 1 : -1].float() / 1.2
+        whole = torch.tensor([[*prompt_ids[row // 3], *samples.tokens[row].tolist()]])
+        scores = policy.module(whole).logits[0, len(prompt_ids[row // 3]) - 1 : -1].float() / 1.2
         plain = torch.log_softmax(scores, -1).gather(-1, samples.tokens[row][:, None])[:, 0]
         assert torch.allclose(shared.logprobs[row], plain * samples.mask[row], atol=1e-4)
 
 
 def test_shared_prompt_gives_the_same_gradient(policy):
-    told = prompts(policy, 1)
-    samples = policy.sample(told, 2, 1.0, 8, torch.Generator().manual_seed(0))
+    prompt_ids = prompts(policy, 1)
+    samples = policy.sample(prompt_ids, 2, 1.0, 8, torch.Generator().manual_seed(0))
 
     def gradient(total):
         policy.module.zero_grad()
         total.backward()
         return torch.cat([parameter.grad.flatten() for parameter in policy.parameters()])
 
-    shared = gradient(policy.logprobs(told, samples.tokens, samples.mask, 2, 1.0).logprobs.sum())
+    shared = gradient(policy.logprobs(prompt_ids, samples.tokens, samples.mask, 2, 1.0).logprobs.sum())
     rows = [
-        policy.logprobs(told, samples.tokens[row, None], samples.mask[row, None], 1, 1.0).logprobs.sum()
+        policy.logprobs(prompt_ids, samples.tokens[row, None], samples.mask[row, None], 1, 1.0).logprobs.sum()
         for row in range(2)
     ]
     assert torch.allclose(shared, gradient(rows[0] + rows[1]), atol=1e-4, rtol=1e-3)
@@ -79,17 +79,19 @@ def test_shared_prompt_gives_the_same_gradient(policy):
 
 @pytest.fixture
 def half(policy, tokenizer):
-    """The same weights, multiplied in half the bits."""
+    """Policy with the same weights in half precision."""
     model = copy.deepcopy(policy.module)
     use_compute_dtype(model, torch.bfloat16, model.get_output_embeddings())
     return HfPolicy(model, tokenizer, Codec.LINES, "random llama")
 
 
 def test_bfloat16_products_are_close_and_keep_float32_weights_and_gradients(policy, half):
-    told = prompts(policy)
-    samples = half.sample(told, 3, 1.2, 10, torch.Generator().manual_seed(0))
-    scored = half.logprobs(told, samples.tokens, samples.mask, 3, 1.2)
-    apart = (scored.logprobs - policy.logprobs(told, samples.tokens, samples.mask, 3, 1.2).logprobs).abs()
+    prompt_ids = prompts(policy)
+    samples = half.sample(prompt_ids, 3, 1.2, 10, torch.Generator().manual_seed(0))
+    scored = half.logprobs(prompt_ids, samples.tokens, samples.mask, 3, 1.2)
+    apart = (
+        scored.logprobs - policy.logprobs(prompt_ids, samples.tokens, samples.mask, 3, 1.2).logprobs
+    ).abs()
     assert 0 < apart.max() < 0.1
     assert torch.allclose(scored.logprobs, samples.logprobs * samples.mask, atol=0.05)
     scored.logprobs.sum().backward()
@@ -98,12 +100,12 @@ def test_bfloat16_products_are_close_and_keep_float32_weights_and_gradients(poli
 
 
 def test_model_with_bfloat16_products_learns_and_is_saved_in_float32(half, tmp_path):
-    told = prompts(half)
-    before = half.sample(told, 2, 0.0, 6, torch.Generator()).texts
+    prompt_ids = prompts(half)
+    before = half.sample(prompt_ids, 2, 0.0, 6, torch.Generator()).texts
     with torch.no_grad():
         for parameter in half.parameters():
             parameter.neg_()
-    after = half.sample(told, 2, 0.0, 6, torch.Generator()).texts
+    after = half.sample(prompt_ids, 2, 0.0, 6, torch.Generator()).texts
     assert after != before
     half.save(tmp_path)
     back = saved_policy(tmp_path, read_settings(None, {"compute_dtype": "float32"}))
@@ -125,9 +127,9 @@ def test_layers_but_not_the_head_use_bfloat16_on_capable_cpus(
 
 def test_adapters_learn_with_bfloat16_products(half, tmp_path):
     half.adapt(LoraSettings(rank=2, alpha=4.0), seed=0)
-    told = prompts(half)
-    samples = half.sample(told, 2, 1.0, 6, torch.Generator().manual_seed(0))
-    half.logprobs(told, samples.tokens, samples.mask, 2, 1.0).logprobs.sum().backward()
+    prompt_ids = prompts(half)
+    samples = half.sample(prompt_ids, 2, 1.0, 6, torch.Generator().manual_seed(0))
+    half.logprobs(prompt_ids, samples.tokens, samples.mask, 2, 1.0).logprobs.sum().backward()
     assert all(parameter.grad is not None for parameter in half.parameters())
     half.save(tmp_path)
     back = saved_policy(tmp_path, read_settings(None, {"compute_dtype": "float32"}))
@@ -137,8 +139,8 @@ def test_adapters_learn_with_bfloat16_products(half, tmp_path):
 def test_saved_model_can_be_loaded(policy, tmp_path):
     policy.save(tmp_path)
     back = saved_policy(tmp_path, read_settings(None, {}))
-    told = prompts(policy)
-    first, again = (each.sample(told, 2, 0.0, 6, torch.Generator()).texts for each in (policy, back))
+    prompt_ids = prompts(policy)
+    first, again = (each.sample(prompt_ids, 2, 0.0, 6, torch.Generator()).texts for each in (policy, back))
     assert first == again
 
 
@@ -210,7 +212,7 @@ def test_random_llama_completes_a_run(policy, tmp_path):
 
 @pytest.fixture(scope="session")
 def smollm2(tmp_path_factory):
-    """Folder of SmolLM2-135M-Instruct: EMBOMATRIX_SMOLLM2, or converted from its wheel and kept beside the build."""
+    """Folder of SmolLM2-135M-Instruct: EMBOMATRIX_SMOLLM2, or converted from its wheel and cached beside the build."""
     given = os.environ.get("EMBOMATRIX_SMOLLM2")
     folder = Path(given) if given else Path("build/models/SmolLM2-135M-Instruct")
     if (folder / "config.json").exists():
@@ -279,8 +281,8 @@ def test_trained_policy_keeps_its_codec_and_other_models_use_json(policy, tokeni
     model.save_pretrained(tmp_path / "other")
     tokenizer.save_pretrained(tmp_path / "other")
 
-    def codec(name, told):
-        return load_model(str(tmp_path / name), told, threads=1, device="cpu").policy.codec
+    def codec(name, prompt_ids):
+        return load_model(str(tmp_path / name), prompt_ids, threads=1, device="cpu").policy.codec
 
     assert codec("taught", None) is Codec.LINES
     assert codec("taught", Codec.JSON) is Codec.JSON

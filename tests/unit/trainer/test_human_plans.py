@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from tests.fakes.human_plans import UntoldError, from_eai
+from tests.fakes.human_plans import InexpressibleError, from_eai
 
 from embomatrix.skills.syntax import PlaceRelation
 
@@ -12,7 +12,7 @@ NAMES = dict(zip(TABLE, ("fridge", "apple", "milk", "table", "rag", "chair", "si
 HOMES = {"rag_1": ("table_1", PlaceRelation.ONTOP), "apple_1": ("fridge_1", PlaceRelation.INSIDE)}
 
 
-def told(*steps):
+def converted(*steps):
     text = json.dumps([{"action": action, "object": names} for action, names in steps])
     words = []
     for call in from_eai(text, TABLE, NAMES, HOMES):
@@ -27,7 +27,7 @@ def test_two_objects_are_carried_in_turn_before_the_door_is_closed():
         *(("OPEN", "fridge"), ("LEFT_GRASP", "apple"), ("RIGHT_GRASP", "milk"), ("CLOSE", "fridge")),
         *(("LEFT_PLACE_ONTOP", "table"), ("RIGHT_PLACE_ONTOP", "table")),
     )
-    assert told(*steps) == [
+    assert converted(*steps) == [
         "open fridge_1",
         "pick_up apple_1",
         "place table_1 ontop",
@@ -39,7 +39,7 @@ def test_two_objects_are_carried_in_turn_before_the_door_is_closed():
 
 def test_tool_is_put_back_before_the_hand_is_needed():
     steps = (("RIGHT_GRASP", "rag"), ("LEFT_GRASP", "chair"), ("CLEAN", "chair"), ("OPEN", "fridge"))
-    assert told(*steps) == [
+    assert converted(*steps) == [
         "pick_up rag_1",
         "clean_object_with_tool chair_1 rag_1",
         "place table_1 ontop",
@@ -49,12 +49,16 @@ def test_tool_is_put_back_before_the_hand_is_needed():
 
 def test_soaked_object_is_held_under_its_sink():
     steps = (("RIGHT_GRASP", "rag"), ("RIGHT_PLACE_INSIDE", "sink"), ("TOGGLE_ON", "sink"), ("SOAK", "rag"))
-    assert told(*steps)[2:] == ["toggle_on sink_1", "pick_up rag_1", "soak_object_in_source rag_1 sink_1"]
+    assert converted(*steps)[2:] == [
+        "toggle_on sink_1",
+        "pick_up rag_1",
+        "soak_object_in_source rag_1 sink_1",
+    ]
 
 
 def test_object_left_on_the_floor_is_put_back():
     steps = (("RIGHT_GRASP", "rag"), ("CLEAN", "chair"), ("RIGHT_PLACE_ONTOP", "room_floor_kitchen_0"))
-    assert told(*steps)[2:] == ["place table_1 ontop"]
+    assert converted(*steps)[2:] == ["place table_1 ontop"]
 
 
 @pytest.mark.parametrize(
@@ -68,5 +72,5 @@ def test_object_left_on_the_floor_is_put_back():
     ],
 )
 def test_step_without_a_matching_skill_is_reported(step, words):
-    with pytest.raises(UntoldError, match=words):
-        told(step)
+    with pytest.raises(InexpressibleError, match=words):
+        converted(step)

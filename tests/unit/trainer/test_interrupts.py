@@ -1,4 +1,4 @@
-"""Deferred interrupts: the first Ctrl-C waits for the end of the block, a second one does not."""
+"""Deferred interrupts: the first Ctrl-C waits for the end of the block, a second one exits at once."""
 
 import signal
 

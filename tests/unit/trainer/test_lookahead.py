@@ -1,4 +1,4 @@
-"""Look-ahead: the same batches in the same order, and the coming ones known."""
+"""Look-ahead keeps the batches and their order, and announces the next ones."""
 
 import pytest
 import torch

@@ -103,10 +103,10 @@ def test_run_writes_report_metrics_samples_and_the_newest_checkpoints(tmp_path):
     assert summary.checkpoint.name == "step-000006"
     assert sum(seconds for _, seconds, _ in time_rows(summary)) == pytest.approx(summary.wall_s)
     assert success_rows(summary)[0][0] == "all tasks"
-    told = read_outcome(tmp_path)
-    assert (told.steps, told.rollouts, len(told.before), len(told.after)) == (6, 96, 4, 4)
-    assert 0 <= told.wait_share <= told.overhead < 1
-    assert told.peak_mb > 50, "torch alone takes more"
+    outcome = read_outcome(tmp_path)
+    assert (outcome.steps, outcome.rollouts, len(outcome.before), len(outcome.after)) == (6, 96, 4, 4)
+    assert 0 <= outcome.wait_share <= outcome.overhead < 1
+    assert outcome.peak_mb > 50, "torch alone takes more"
 
 
 def test_full_disk_ends_the_run_and_keeps_the_previous_checkpoint(tmp_path, small_files):
@@ -125,14 +125,14 @@ def test_full_disk_ends_the_run_and_keeps_the_previous_checkpoint(tmp_path, smal
 
 
 def test_used_share_of_the_budget_is_at_most_one(tmp_path):
-    told = []
+    shares = []
 
     class Listener(LineDisplay):
         def stepped(self, record, share, rollouts_per_s):
-            told.append(share)
+            shares.append(share)
 
     run(tmp_path, display=Listener(Console(quiet=True)), grpo__steps=None, grpo__minutes=1e-6)
-    assert told == [1.0]
+    assert shares == [1.0]
 
 
 def test_every_step_announces_its_window(tmp_path):

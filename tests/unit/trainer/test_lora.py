@@ -70,7 +70,7 @@ def policy_of(tokenizer, *, seed=0, recompute=False):
 
 
 def adapters(module):
-    """Adapted layers by name."""
+    """Return the adapted layers by name."""
     return {name: layer for name, layer in module.named_modules() if hasattr(layer, "lora_B")}
 
 
@@ -84,13 +84,13 @@ def moved(policy):
 
 
 def scored(policy, *, rows=4):
-    """Log-probabilities of the same plans under any policy; prompts differ in length."""
-    told = [policy.encode(prompt_for(task.situation, Codec.LINES)) for task in TASKS.train[:2]]
-    told[0] = told[0][20:]
+    """Return log-probabilities of the same plans under any policy; prompts differ in length."""
+    prompt_ids = [policy.encode(prompt_for(task.situation, Codec.LINES)) for task in TASKS.train[:2]]
+    prompt_ids[0] = prompt_ids[0][20:]
     tokens = torch.arange(rows * 5).view(rows, 5) % 30 + 2
     mask = torch.ones(rows, 5, dtype=torch.bool)
     mask[1, 3:] = False
-    return policy.logprobs(told, tokens, mask, rows // 2, 0.9)
+    return policy.logprobs(prompt_ids, tokens, mask, rows // 2, 0.9)
 
 
 def train(out, changes, *, resume=False):

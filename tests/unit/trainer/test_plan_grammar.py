@@ -1,4 +1,4 @@
-"""A policy that is held to the grammar writes plans, and calls only what its prompt tells."""
+"""A policy constrained by the grammar writes valid plans about objects in its prompt."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ TASKS = make_tasks(12, 3)
 
 
 def twins(situation):
-    """A situation with two more object_tokens of one category, so that names need numbers."""
+    """Return a situation with two more objects of one category, so that names need numbers."""
     first = situation.rows[0]
     more = [PromptRow(100 + at, f"{first.category}_{at}", first.category, first.room) for at in (7, 3)]
     return replace(situation, rows=(*situation.rows[1:], *more), table_size=102)
@@ -45,7 +45,7 @@ def prompt_of(situation):
 
 
 def next_words(situation, written):
-    """Words that may follow what is written, in its prompt."""
+    """Return the words that may follow this text in its prompt."""
     names = GRAMMAR.prompt_names(torch.tensor([prompt_of(situation)]))
     state = GRAMMAR.start(1)
     for token in WORDS.encode(written):
@@ -61,10 +61,10 @@ def test_untrained_policy_writes_valid_plans(task):
     )
     ended = (samples.tokens == END).any(dim=1).tolist()
     assert sum(ended) >= 20
-    told = {row.index for row in task.situation.rows}
+    listed = {row.index for row in task.situation.rows}
     for text in (text for text, whole in zip(samples.texts, ended, strict=True) if whole):
         for call in parse_policy_text(text, replace(task.situation, profile=Profile.HOUSEHOLD), Codec.NAMES):
-            assert {call.object_index, call.source_index} - {None} <= told
+            assert {call.object_index, call.source_index} - {None} <= listed
             assert call.room_name is None or call.room_name in task.situation.rooms
 
 
@@ -119,9 +119,9 @@ def test_objects_only_in_the_instruction_are_masked():
 
 def test_arguments_follow_the_signature_of_the_skill():
     situation = TASKS.train[0].situation
-    thing = situation.rows[0].category
-    assert next_words(situation, f"place {thing}") == {"ontop", "inside", "under"}
-    assert thing in next_words(situation, f"heat_object_with_source {thing}")
+    kind = situation.rows[0].category
+    assert next_words(situation, f"place {kind}") == {"ontop", "inside", "under"}
+    assert kind in next_words(situation, f"heat_object_with_source {kind}")
     assert "1.57" in next_words(situation, "turn")
     assert next_words(situation, "turn 1.57") == {"\n", "<end>"}
     room = next(iter(next_words(situation, "go_to_room")))

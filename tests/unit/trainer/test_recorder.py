@@ -28,8 +28,8 @@ def test_atomic_folder_appears_when_complete(tmp_path):
 def test_failed_atomic_folder_keeps_the_old_one(tmp_path):
     with atomic_folder(tmp_path / "final") as partial:
         (partial / "a").write_text("1")
-    told = pytest.raises(TrainerError, match=r"final can't be written \(no room\)")
-    with told, atomic_folder(tmp_path / "final"):
+    refused = pytest.raises(TrainerError, match=r"final can't be written \(no room\)")
+    with refused, atomic_folder(tmp_path / "final"):
         raise RuntimeError("no room. And then an essay.\nWith a trace.")
     assert (tmp_path / "final" / "a").read_text() == "1"
     assert [path.name for path in tmp_path.iterdir()] == ["final"]

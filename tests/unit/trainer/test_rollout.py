@@ -79,7 +79,7 @@ def test_bundle_is_uploaded_once_before_its_first_rollout():
 
 
 class Away(SymbolicCluster):
-    """Does not answer the first times that it is given a scene."""
+    """Cluster that rejects the first three uploads."""
 
     refused = 0
 

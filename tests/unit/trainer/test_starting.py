@@ -25,7 +25,7 @@ def kitchen(tmp_path_factory):
 
 @pytest.fixture
 def begun(kitchen, tmp_path):
-    """Saves the checkpoint of a run that took one step of imitation, and of GRPO once it is ``grpo_ready``."""
+    """Save the checkpoint of a run after one step of imitation; with ``grpo_ready``, after one step of GRPO too."""
 
     def begin(*, grpo_ready=False):
         start = start_run(kitchen, tmp_path, "tiny", None, SMALL)
@@ -46,7 +46,7 @@ def test_resumed_run_can_be_longer_and_keeps_its_settings(kitchen, tmp_path, beg
 
 
 @pytest.mark.parametrize(
-    ("changes", "model", "written", "told"),
+    ("changes", "model", "written", "expected"),
     [
         (
             {"seed": 7},
@@ -65,11 +65,11 @@ def test_resumed_run_can_be_longer_and_keeps_its_settings(kitchen, tmp_path, beg
         ({}, "tiny", "[grpo]\ngruop = 4\n", r"unknown setting 'grpo\.gruop'"),
     ],
 )
-def test_resume_rejects_changed_settings(kitchen, tmp_path, begun, changes, model, written, told):
+def test_resume_rejects_changed_settings(kitchen, tmp_path, begun, changes, model, written, expected):
     begun(grpo_ready=True)
     file = tmp_path / "settings.toml"
     file.write_text(written)
-    with pytest.raises(TrainerError, match=told):
+    with pytest.raises(TrainerError, match=expected):
         resume_run(kitchen, tmp_path, changes, model=model, settings_file=file)
 
 
@@ -105,8 +105,8 @@ def test_default_threads_and_processes_depend_on_the_model(kitchen, tmp_path, mo
     assert (by_itself.threads, by_itself.processes) == (4, 2)
     written = tmp_path / "settings.toml"
     written.write_text("threads = 1\nprocesses = 3\n")
-    told = start_run(kitchen, tmp_path / "told", "tiny", written, {**shape, "threads": None}).settings
-    assert (told.threads, told.processes) == (1, 3)
+    chosen = start_run(kitchen, tmp_path / "chosen", "tiny", written, {**shape, "threads": None}).settings
+    assert (chosen.threads, chosen.processes) == (1, 3)
 
 
 def test_policy_on_another_device_has_one_process_by_default(kitchen, tmp_path, monkeypatch):
@@ -133,10 +133,10 @@ def test_word_level_policy_uses_bfloat16_on_capable_cpus(kitchen, tmp_path, monk
     assert whole.policy.module.blocks[0].qkv.compute_dtype is torch.float32
 
 
-@pytest.mark.parametrize(("told", "codec"), [({}, Codec.JSON), ({"codec": "lines"}, Codec.LINES)])
-def test_trained_language_model_keeps_its_codec_by_default(kitchen, tmp_path, told, codec):
+@pytest.mark.parametrize(("given", "codec"), [({}, Codec.JSON), ({"codec": "lines"}, Codec.LINES)])
+def test_trained_language_model_keeps_its_codec_by_default(kitchen, tmp_path, given, codec):
     pytest.importorskip("tokenizers")
     tokenizer = word_tokenizer(load_tasks(kitchen).train)
     HfPolicy(random_llama(tokenizer), tokenizer, Codec.JSON, "random llama").save(tmp_path / "taught")
-    start = start_run(kitchen, tmp_path / "run", str(tmp_path / "taught"), None, {**SMALL, **told})
+    start = start_run(kitchen, tmp_path / "run", str(tmp_path / "taught"), None, {**SMALL, **given})
     assert start.settings.codec is start.policy.codec is codec

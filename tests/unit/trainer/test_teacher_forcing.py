@@ -29,7 +29,7 @@ TASKS = make_tasks(20, 0, objects=7)
 
 
 class CutError(Exception):
-    """Ends a run in its midst."""
+    """Error that ends a run before its last step."""
 
 
 def settings_of(**changes):
@@ -147,8 +147,8 @@ def test_early_stopping_restores_the_best_weights(tmp_path):
     ],
 )
 def test_low_outlier_does_not_stop_a_falling_loss(tmp_path, monkeypatch, losses, taken):
-    told = iter(losses)
-    monkeypatch.setattr(Imitation, "_validation_loss", lambda _: next(told))
+    given_losses = iter(losses)
+    monkeypatch.setattr(Imitation, "_validation_loss", lambda _: next(given_losses))
     settings = settings_of(imitation__steps=len(losses), imitation__patience=3, imitation__validate_every=1)
     _, state, steps = imitate(tmp_path, settings)
     assert (len(steps), state.best_loss) == (taken, min(losses[:taken]))

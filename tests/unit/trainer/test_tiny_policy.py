@@ -36,15 +36,15 @@ def prompts(made, count=3):
     return [made.encode(prompt_for(task.situation, Codec.NAMES)) for task in TASKS.train[:count]]
 
 
-def draw(made, told, group=4, temperature=1.3, seed=0):
-    return made.sample(told, group, temperature, 12, torch.Generator().manual_seed(seed))
+def draw(made, prompt_ids, group=4, temperature=1.3, seed=0):
+    return made.sample(prompt_ids, group, temperature, 12, torch.Generator().manual_seed(seed))
 
 
 def test_sampler_and_update_agree_on_log_probabilities():
     made = policy()
-    told = prompts(made)
-    samples = draw(made, told)
-    scored = made.logprobs(told, samples.tokens, samples.mask, 4, 1.3)
+    prompt_ids = prompts(made)
+    samples = draw(made, prompt_ids)
+    scored = made.logprobs(prompt_ids, samples.tokens, samples.mask, 4, 1.3)
     assert torch.allclose(scored.logprobs, samples.logprobs * samples.mask, atol=1e-5)
     assert (scored.entropy[samples.mask] >= 0).all()  # 0 where one word alone may follow
     assert (scored.entropy[samples.mask] > 0).any()
@@ -52,20 +52,20 @@ def test_sampler_and_update_agree_on_log_probabilities():
 
 def test_padding_and_prompt_sharing_do_not_change_values_or_gradients():
     made = policy()
-    told = [prompts(made)[0][:9], *prompts(made)[1:]]
-    samples = draw(made, told)
+    prompt_ids = [prompts(made)[0][:9], *prompts(made)[1:]]
+    samples = draw(made, prompt_ids)
 
     def gradient(scored):
         made.module.zero_grad()
         scored.sum().backward()
         return torch.cat([parameter.grad.flatten() for parameter in made.parameters()])
 
-    together = made.logprobs(told, samples.tokens, samples.mask, 4, 1.0).logprobs
+    together = made.logprobs(prompt_ids, samples.tokens, samples.mask, 4, 1.0).logprobs
     shared = gradient(together)
     alone = torch.cat(
         [
             made.logprobs(
-                [told[row // 4]], samples.tokens[row, None], samples.mask[row, None], 1, 1.0
+                [prompt_ids[row // 4]], samples.tokens[row, None], samples.mask[row, None], 1, 1.0
             ).logprobs
             for row in range(12)
         ]
@@ -76,10 +76,12 @@ def test_padding_and_prompt_sharing_do_not_change_values_or_gradients():
 
 def test_bfloat16_products_are_close_and_keep_float32_weights_and_gradients():
     whole, half = policy(), policy(compute_dtype=torch.bfloat16)
-    told = prompts(whole)
-    samples = draw(half, told)
-    scored = half.logprobs(told, samples.tokens, samples.mask, 4, 1.3)
-    apart = (scored.logprobs - whole.logprobs(told, samples.tokens, samples.mask, 4, 1.3).logprobs).abs()
+    prompt_ids = prompts(whole)
+    samples = draw(half, prompt_ids)
+    scored = half.logprobs(prompt_ids, samples.tokens, samples.mask, 4, 1.3)
+    apart = (
+        scored.logprobs - whole.logprobs(prompt_ids, samples.tokens, samples.mask, 4, 1.3).logprobs
+    ).abs()
     assert 0 < apart.max() < 0.2  # of log-probabilities that differ by ten and more
     assert torch.allclose(scored.logprobs, samples.logprobs * samples.mask, atol=0.1)
     scored.logprobs.sum().backward()
@@ -166,12 +168,12 @@ def test_frozen_copy_does_not_change_with_the_policy():
 
 def test_too_long_prompt_keeps_its_end():
     made = policy()
-    told = made.encode(prompt_for(TASKS.train[0].situation, Codec.NAMES))
+    prompt_ids = made.encode(prompt_for(TASKS.train[0].situation, Codec.NAMES))
     situation = TASKS.train[0].situation
     rows = situation.rows * 40
     long = made.encode(prompt_for(type(situation)((), "", rows, situation.instruction, 16), Codec.NAMES))
     assert len(long) <= SHAPE.longest
-    assert long[-4:] == told[-4:]
+    assert long[-4:] == prompt_ids[-4:]
 
 
 def test_household_tasks_add_words_to_the_vocabulary():

@@ -31,8 +31,8 @@ def test_nested_values_are_named_by_their_path():
 
 @pytest.mark.skipif(importlib.util.find_spec("trackio") is not None, reason="trackio is installed")
 def test_missing_tracker_package_is_reported(tmp_path):
-    told = pytest.raises(TrainerError, match="pip install trackio")
-    with told, trackers_of(read_settings(None, {"track": ["trackio"]}), tmp_path):
+    refused = pytest.raises(TrainerError, match="pip install trackio")
+    with refused, trackers_of(read_settings(None, {"track": ["trackio"]}), tmp_path):
         pass
 
 

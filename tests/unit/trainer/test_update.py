@@ -62,7 +62,7 @@ def test_unused_reserve_changes_nothing(tmp_path, kind):
         "grpo__chunk": 1,
         "grpo__steps": 2,
         "grpo__temperature": 1.5,
-        "grpo__group": 10,  # so many plans of a task hardly ever earn all the same
+        "grpo__group": 10,  # this many plans of a task hardly ever earn equal rewards
         "seed": 7,
     }
     _, plain = trained(tmp_path / "plain", **changes)

@@ -24,25 +24,25 @@ def rng(seed=0):
 def test_oracle_succeeds_in_every_variation(task):
     for seed in range(5):
         situation = drop_bystanders(task.situation, used_rows(task.oracle), 0.5, rng(seed))
-        told = vary(situation, VARIATION, rng(seed))
-        plan = parse_policy_text(plan_in_names(task.oracle, told), told, Codec.NAMES)
+        varied = vary(situation, VARIATION, rng(seed))
+        plan = parse_policy_text(plan_in_names(task.oracle, varied), varied, Codec.NAMES)
         assert plan == task.oracle
         assert run_plan(task, plan)[0].success
 
 
 @pytest.mark.parametrize("task", TASKS.train, ids=lambda task: task.task.task_id)
 def test_unnamed_categories_are_renamed_within_their_kind(task):
-    told = vary(task.situation, VARIATION, rng())
+    varied = vary(task.situation, VARIATION, rng())
     before = {row.index: row for row in task.situation.rows}
-    names = {row.name for row in told.rows}
-    assert len(names) == len(told.rows)
-    for row in told.rows:
+    names = {row.name for row in varied.rows}
+    assert len(names) == len(varied.rows)
+    for row in varied.rows:
         old = before[row.index]
         named = names_it(task.situation.instruction, old)
         assert named or row.category in TASKS.kinds[old.category]
         assert (row.states, row.fixed, row.relation) == (old.states, old.fixed, old.relation)
         assert not row.host or row.host in names
-        assert names_it(told.instruction, row) == named
+        assert names_it(varied.instruction, row) == named
 
 
 def test_named_categories_can_get_any_name():
@@ -67,17 +67,17 @@ def test_variations_differ_and_repeat_with_the_seed():
 
 def test_without_renaming_unique_names_only_change_order():
     situation = TASKS.train[0].situation
-    told = vary(situation, Variation(TASKS.kinds, rename=0.0), rng(3))
-    assert sorted(told.rows, key=lambda row: row.index) == list(situation.rows)
-    assert told.instruction == situation.instruction
+    varied = vary(situation, Variation(TASKS.kinds, rename=0.0), rng(3))
+    assert sorted(varied.rows, key=lambda row: row.index) == list(situation.rows)
+    assert varied.instruction == situation.instruction
 
 
 def test_needed_rows_and_their_hosts_are_kept():
     task = TASKS.train[0]
     needed = used_rows(task.oracle)
     for seed in range(20):
-        told = drop_bystanders(task.situation, needed, 1.0, rng(seed))
-        kept = {row.index for row in told.rows}
+        varied = drop_bystanders(task.situation, needed, 1.0, rng(seed))
+        kept = {row.index for row in varied.rows}
         hosts = {row.host for row in task.situation.rows if row.index in needed and row.host}
         assert needed <= kept
-        assert hosts <= {row.name for row in told.rows}
+        assert hosts <= {row.name for row in varied.rows}

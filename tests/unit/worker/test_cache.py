@@ -17,7 +17,7 @@ from embomatrix.world.inflation import bundle_digest
 
 
 class Source:
-    """Bundles by digest, and a record of what was asked for."""
+    """Bundles by digest, and a record of the requests."""
 
     def __init__(self, *contents, wrong=0):
         self.bundles = {bundle_digest(content): content for content in contents}
@@ -35,7 +35,7 @@ def _cache(folder, source, limit_bytes=10_000):
     return BundleCache(folder / "bundles", limit_bytes=limit_bytes, fetch=source.fetch)
 
 
-async def test_a_bundle_is_fetched_once_and_then_found(tmp_path):
+async def test_bundle_is_fetched_once_and_then_cached(tmp_path):
     source = Source(b"scene")
     cache = _cache(tmp_path, source)
     [digest] = source.bundles
@@ -45,7 +45,7 @@ async def test_a_bundle_is_fetched_once_and_then_found(tmp_path):
     assert source.asked == [digest]
 
 
-async def test_a_bundle_damaged_on_disk_is_fetched_again(tmp_path):
+async def test_bundle_damaged_on_disk_is_fetched_again(tmp_path):
     source = Source(b"scene")
     cache = _cache(tmp_path, source)
     [digest] = source.bundles
@@ -99,12 +99,12 @@ async def test_two_daemons_share_a_cache_folder(tmp_path):
     sources = [Source(*contents), Source(*contents)]
     caches = [_cache(tmp_path, source, limit_bytes=1300) for source in sources]
 
-    async def bring(cache, digests):
+    async def fetch_all(cache, digests):
         for digest in digests:
             assert (await cache.path_of(digest)).suffix == ".bundle"
 
     digests = list(sources[0].bundles)
-    await asyncio.gather(bring(caches[0], digests * 3), bring(caches[1], digests[::-1] * 3))
+    await asyncio.gather(fetch_all(caches[0], digests * 3), fetch_all(caches[1], digests[::-1] * 3))
     left = list((tmp_path / "bundles").iterdir())
     assert all(bundle_digest(path.read_bytes()).endswith(path.stem) for path in left)
     assert sum(path.stat().st_size for path in left) <= 1300
@@ -166,7 +166,7 @@ def test_full_disk_evicts_all_other_bundles(tmp_path):
     assert result.stdout == "False False True 1\n", result.stderr
 
 
-async def test_a_bundle_that_cannot_be_written_leaves_nothing_behind(tmp_path):
+async def test_failed_bundle_write_leaves_no_file(tmp_path):
     # The limit is the system's own, and lifted again.
     source = Source(b"a" * 400, b"b" * 4000)
     cache = _cache(tmp_path, source)

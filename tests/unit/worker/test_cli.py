@@ -1,4 +1,4 @@
-"""Command line of the worker: one sentence and status 2 for every error that a user can mend."""
+"""Command line of the worker: one sentence and status 2 for every user error."""
 
 import subprocess
 import sys
@@ -36,7 +36,7 @@ def test_absent_manager_is_named_with_once(tmp_path):
     assert "Traceback" not in result.stderr
 
 
-def test_a_wrong_option_is_named_with_what_was_expected():
+def test_wrong_option_is_named_with_the_expected_value():
     result = _worker("run", "--slots=-3")
     assert result.returncode == 2
     assert "--slots -3" in result.stderr

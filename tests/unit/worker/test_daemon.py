@@ -23,7 +23,7 @@ def _daemon(address, folder, **options):
 
 @contextlib.asynccontextmanager
 async def joined(manager, folder, **options):
-    """A daemon that has joined the manager and is told to leave at the end."""
+    """Run a daemon that has joined the manager; stop it at the end."""
     async with serving(manager) as address:
         daemon = _daemon(address, folder, **options)
         task = asyncio.create_task(daemon.run())
@@ -54,7 +54,7 @@ async def test_it_registers_with_its_resources_and_reports_its_state_first(tmp_p
         assert manager.states[0].residents == ()
 
 
-async def test_a_desired_scene_becomes_warm_and_a_lease_comes_back_scored(tmp_path):
+async def test_desired_scene_becomes_warm_and_lease_returns_a_score(tmp_path):
     manager = FakeManager()
     digest = manager.bundle(b"ok")
     async with joined(manager, tmp_path):
@@ -87,7 +87,7 @@ async def test_many_leases_are_executed_once_each(tmp_path):
 
 
 async def test_results_share_messages_while_slots_have_enough_leases(tmp_path, monkeypatch):
-    # So long that what is counted does not depend on the machine's speed.
+    # Long enough to make the count independent of the machine's speed.
     monkeypatch.setattr(session, "LINGER_S", 60.0)
     manager = FakeManager()
     digest = manager.bundle(b"ok")
@@ -165,7 +165,7 @@ async def test_worker_registers_again_with_a_manager_that_forgot_its_session(tmp
     assert _done(manager) == ["new"]
 
 
-async def test_worker_joins_a_manager_that_comes_back(tmp_path):
+async def test_worker_joins_a_returning_manager(tmp_path):
     manager = FakeManager()
     async with serving(manager) as address:
         pass
@@ -205,7 +205,7 @@ async def test_repeated_session_conflicts_end_the_daemon(tmp_path):
             await asyncio.wait_for(task, 10)
 
 
-async def test_a_cancelled_lease_gives_no_result(tmp_path):
+async def test_cancelled_lease_gives_no_result(tmp_path):
     manager = FakeManager()
     digest = manager.bundle(b"ok")
     async with joined(manager, tmp_path):
@@ -252,7 +252,7 @@ async def test_drain_finishes_running_leases_and_leaves(tmp_path):
     assert manager.states[-1].draining
 
 
-async def test_a_drain_without_a_manager_and_without_work_leaves_at_once(tmp_path):
+async def test_drained_idle_worker_leaves_at_once_without_a_manager(tmp_path):
     daemon = _daemon("127.0.0.1:1", tmp_path)
     task = asyncio.create_task(daemon.run())
     await asyncio.sleep(1.0)
@@ -260,7 +260,7 @@ async def test_a_drain_without_a_manager_and_without_work_leaves_at_once(tmp_pat
     await asyncio.wait_for(task, 2)
 
 
-async def test_a_drain_delivers_its_last_results_to_a_manager_that_comes_back(tmp_path):
+async def test_drained_worker_delivers_its_last_results_to_a_returning_manager(tmp_path):
     manager = FakeManager(acknowledging=False)
     digest = manager.bundle(b"ok")
     async with joined(manager, tmp_path) as (daemon, task):
@@ -273,14 +273,14 @@ async def test_a_drain_delivers_its_last_results_to_a_manager_that_comes_back(tm
     assert _done(manager) == ["l1", "l1"]
 
 
-async def test_the_manager_may_ask_for_a_drain(tmp_path):
+async def test_manager_can_request_a_drain(tmp_path):
     manager = FakeManager()
     async with joined(manager, tmp_path) as (_, task):
         manager.drain()
         await asyncio.wait_for(task, 10)
 
 
-async def test_a_second_signal_leaves_at_once(tmp_path):
+async def test_second_signal_ends_the_daemon_at_once(tmp_path):
     manager = FakeManager()
     async with joined(manager, tmp_path) as (daemon, task):
         manager.lease("l1", manager.bundle(b"ok"), "hang", deadline_s=600.0)

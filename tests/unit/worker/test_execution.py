@@ -1,4 +1,4 @@
-"""Leases ahead in a slot's stream: they run without the daemon, and a failing process loses none of them."""
+"""Leases ahead in a slot's stream run without the daemon, and a failing process loses none of them."""
 
 import asyncio
 import itertools
@@ -28,7 +28,7 @@ BRIEF_S = AHEAD_S / 12
 
 @pytest.fixture
 def executions(tmp_path, monkeypatch):
-    """Tells how often each rollout was begun, by its id."""
+    """Return a function that counts the starts of each rollout, by id."""
     path = tmp_path / "executions"
     monkeypatch.setenv("FAKE_EXECUTIONS", str(path))
     return lambda: Counter(path.read_text().split())
@@ -43,9 +43,9 @@ def submit(harness, lease_id, task="ok", deadline_s=30.0, digest="scene"):
 
 
 async def learn_pace(harness):
-    """Only where executions were seen to be brief does a slot get leases ahead: tells how many that took.
+    """Execute brief rollouts until the slot gets leases ahead; returns how many that took.
 
-    On a busy machine one that is brief may take long.
+    A busy machine may slow down a brief execution.
     """
     pace_s, count = math.inf, 0
     while count < 4 or pace_s > BRIEF_S:
@@ -142,7 +142,7 @@ async def test_lease_of_another_scene_is_executed_despite_endless_leases_of_a_bu
             await asyncio.sleep(0.002)
 
 
-async def test_lease_given_again_after_a_cancellation_has_one_result(tmp_path):
+async def test_lease_repeated_after_a_cancellation_has_one_result(tmp_path):
     async with running(tmp_path, slots=1) as harness:
         await learn_pace(harness)
         submit(harness, "first", "slow")

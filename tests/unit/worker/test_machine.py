@@ -73,7 +73,7 @@ def test_load_of_others_is_busy_time_without_our_processes():
 def test_descendants_count_as_ours_even_after_their_end():
     before_s = family_cpu_s(os.getpid())
     subprocess.run([sys.executable, "-c", BUSY], check=True)
-    # The kernel tells of whole ticks here, hundredths of a second, of which it may drop one at each end.
+    # The kernel counts whole ticks of 0.01 s here and may drop one at each end.
     assert family_cpu_s(os.getpid()) - before_s >= 0.38
 
 
@@ -84,10 +84,10 @@ def test_ended_process_has_no_cpu_time():
 
 
 def test_only_other_programs_are_load_of_others():
-    ours, nobody = HostMachine(lambda: [os.getpid()]), HostMachine(list)
+    ours, without_processes = HostMachine(lambda: [os.getpid()]), HostMachine(list)
     subprocess.run([sys.executable, "-c", BUSY], check=True)
-    # Whatever else this machine does, both saw it; between them lies what was ours.
-    share, whole = ours.observe().others_load, nobody.observe().others_load
+    # Both observed all other load of this machine; their difference is our load.
+    share, whole = ours.observe().others_load, without_processes.observe().others_load
     assert whole > share
 
 
@@ -101,9 +101,9 @@ def test_this_machine_can_be_observed():
 
 def test_unsupported_preference_is_reported():
     machine = HostMachine(list)
-    wishes = Preferences(idle_s=60, mains_only=True)
-    assert len(machine.unsupported(wishes, Observation(0))) == 2
-    assert machine.unsupported(wishes, Observation(0, owner_idle_s=5.0, on_mains=True)) == []
+    preferences = Preferences(idle_s=60, mains_only=True)
+    assert len(machine.unsupported(preferences, Observation(0))) == 2
+    assert machine.unsupported(preferences, Observation(0, owner_idle_s=5.0, on_mains=True)) == []
     assert machine.unsupported(Preferences(), Observation(0)) == []
 
 

@@ -23,7 +23,7 @@ async def test_credential_takes_precedence_over_its_token(tmp_path):
     assert await membership_of(settings) == KEPT
 
 
-async def test_an_invitation_is_remembered_by_its_token_and_may_name_a_new_address(tmp_path):
+async def test_invitation_is_identified_by_its_token_and_may_change_the_address(tmp_path):
     MembershipFile(tmp_path, "join.secret").keep(KEPT)
     moved = WorkerSettings(join="join.secret@moved.example:50070", state_dir=tmp_path)
     found = await membership_of(moved)
@@ -42,7 +42,7 @@ def test_each_token_has_a_private_file_that_does_not_name_it(tmp_path):
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"manager": 1}', "\x00"])
-def test_a_damaged_file_is_named_with_the_remedy(tmp_path, content):
+def test_damaged_file_is_named_with_the_remedy(tmp_path, content):
     file = MembershipFile(tmp_path, "join.secret")
     file.keep(KEPT)
     [path] = tmp_path.iterdir()

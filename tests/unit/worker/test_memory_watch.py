@@ -27,7 +27,7 @@ class Machine:
 
 @contextlib.asynccontextmanager
 async def watched(folder):
-    """A pool whose scenes are warm, and the machine that it leaves memory to."""
+    """Yield a pool with warm scenes, and the machine that limits its memory."""
     machine = Machine()
     async with running(folder) as harness:
         watch = asyncio.create_task(MemoryWatch(harness.pool, lambda: machine.spare_mb).run(0.02))
@@ -64,7 +64,7 @@ async def test_leases_are_executed_however_little_memory_there_is(tmp_path):
 
 
 async def test_memory_limit_never_exceeds_the_configured_one(tmp_path):
-    # Each takes 40 MB and what it shares with no other process.
+    # Each takes 40 MB plus its private memory.
     async with running(tmp_path, memory_mb=75.0) as harness:
         harness.pool.limit_memory(1e6)
         harness.pool.want(["large-1", "large-2", "large-3"])

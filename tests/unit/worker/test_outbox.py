@@ -22,7 +22,7 @@ def _filled(count):
     return outbox
 
 
-def test_a_result_is_sent_once_on_a_stream_and_kept():
+def test_result_is_sent_once_per_stream_and_kept():
     outbox = _filled(3)
     assert outbox.take_unsent(2) == (_result(0), _result(1))
     assert outbox.take_unsent(2) == (_result(2),)
@@ -38,7 +38,7 @@ def test_new_stream_sends_unacknowledged_results():
     assert outbox.take_unsent(10) == (_result(0), _result(2))
 
 
-def test_an_acknowledgement_of_something_unknown_is_ignored():
+def test_acknowledgement_of_an_unknown_result_is_ignored():
     outbox = _filled(1)
     outbox.acknowledge(LeaseRef("other", 9))
     assert len(outbox) == 1

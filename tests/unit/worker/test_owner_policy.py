@@ -32,12 +32,12 @@ OBSERVATIONS = st.builds(
 HISTORIES = st.lists(st.tuples(st.floats(0.1, 20), OBSERVATIONS), max_size=40)
 
 
-def standings(history, wishes=WISHES):
-    """(time, observation, standing) after each step of a history of pauses between observations."""
+def standings(history, preferences=WISHES):
+    """Return (time, observation, pause state) after each step of a history of pauses between observations."""
     now_s, standing = 100.0, WORKING
     for passed_s, seen in history:
         now_s += passed_s
-        standing = next_pause_state(standing, seen, wishes, now_s)
+        standing = next_pause_state(standing, seen, preferences, now_s)
         yield now_s, seen, standing
 
 

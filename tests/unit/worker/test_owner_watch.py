@@ -19,7 +19,7 @@ SCARCE = Observation(0, owner_idle_s=0.0, free_memory=0.02)
 
 
 class Room:
-    """The probe of a machine whose owner the test plays."""
+    """Probe of a machine whose owner the test plays."""
 
     def __init__(self):
         self.seen = AWAY
@@ -30,12 +30,12 @@ class Room:
 
 @contextlib.asynccontextmanager
 async def lent(manager, folder, *, slots=1, grace_s=30.0):
-    """A daemon that works while its owner is away."""
+    """Run a daemon that works while its owner is away."""
     room = Room()
-    wishes = Preferences(idle_s=60, grace_s=grace_s, calm_s=0.05, check_s=0.02)
+    chosen = Preferences(idle_s=60, grace_s=grace_s, calm_s=0.05, check_s=0.02)
     async with serving(manager) as address:
         settings = WorkerSettings(
-            manager=address, name="w1", cache_dir=folder, state_dir=folder, preferences=wishes
+            manager=address, name="w1", cache_dir=folder, state_dir=folder, preferences=chosen
         )
         rng = np.random.default_rng(0)
         daemon = Daemon(settings, Resources(slots, slots, 500), rng, program=PROGRAM, probe=room)
@@ -89,9 +89,9 @@ async def test_leases_beyond_the_grace_period_are_handed_back(tmp_path):
     async with lent(manager, tmp_path, grace_s=0.2) as room:
         manager.lease("l1", manager.bundle(b"ok"), "hang", deadline_s=600.0)
         await _until(lambda: ["l1"] in manager.renewed)
-        told = len(manager.states)
+        reported = len(manager.states)
         room.seen = THERE
-        await _until(lambda: len(manager.states) >= told + 2 and not _held(manager))
+        await _until(lambda: len(manager.states) >= reported + 2 and not _held(manager))
         await _until(lambda: manager.renewed[-1] == [])
     assert manager.results == []
 

@@ -19,7 +19,7 @@ def _held(*digests, memory_mb=50.0, busy=()):
     }
 
 
-def test_the_most_urgent_missing_scene_is_next():
+def test_most_urgent_missing_scene_is_next():
     assert decide(["a", "b"], _held("a"), budget_mb=500, known_mb={}) == Decision("b")
 
 
@@ -42,11 +42,11 @@ def test_less_urgent_scene_is_evicted_for_a_more_urgent_one_only():
     assert decide(["late", "now"], held, budget_mb=60, known_mb={"now": 50}) == NOTHING
 
 
-def test_a_busy_scene_is_never_evicted():
+def test_busy_scene_is_never_evicted():
     assert decide(["new"], _held("x", busy={"x"}), budget_mb=60, known_mb={"new": 50}) == NOTHING
 
 
-def test_a_scene_larger_than_the_budget_is_loaded_alone():
+def test_scene_larger_than_the_budget_is_loaded_alone():
     assert decide(["huge"], _held("x"), budget_mb=60, known_mb={"huge": 900}) == Decision("huge", ("x",))
 
 

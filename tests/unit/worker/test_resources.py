@@ -23,12 +23,12 @@ def test_settings_take_precedence_over_measurements():
     assert (resources.slots, resources.memory_mb) == (3, 77)
 
 
-def test_the_fingerprint_of_a_platform_does_not_change():
+def test_platform_fingerprint_is_stable():
     assert fingerprint() == fingerprint()
     assert len(fingerprint()) == 16
 
 
-def test_a_gpu_is_found_by_nvidia_smi(tmp_path, monkeypatch):
+def test_gpu_is_found_by_nvidia_smi(tmp_path, monkeypatch):
     program = tmp_path / "nvidia-smi"
     program.write_text("#!/bin/sh\necho 'NVIDIA H200, 143771'\n")
     program.chmod(0o755)
@@ -36,7 +36,7 @@ def test_a_gpu_is_found_by_nvidia_smi(tmp_path, monkeypatch):
     assert find_gpu() == Gpu("NVIDIA H200", 143771)
 
 
-def test_a_gpu_program_that_fails_means_no_gpu(tmp_path, monkeypatch):
+def test_failing_nvidia_smi_means_no_gpu(tmp_path, monkeypatch):
     program = tmp_path / "nvidia-smi"
     program.write_text("#!/bin/sh\necho 'driver mismatch'\nexit 9\n")
     program.chmod(0o755)
@@ -69,10 +69,10 @@ def test_two_workers_of_one_host_get_different_names():
 @pytest.mark.parametrize(
     "wrong", [{"manager": "nowhere"}, {"slots": -1}, {"name": "a b"}, {"nice": 20}, {"slotz": 1}]
 )
-def test_a_wrong_setting_is_refused(wrong):
+def test_invalid_setting_is_refused(wrong):
     with pytest.raises(ValidationError):
         WorkerSettings(**wrong)
 
 
-def test_a_token_is_not_shown():
+def test_token_is_not_shown():
     assert "secret" not in repr(WorkerSettings(token="secret"))

@@ -1,4 +1,4 @@
-"""Slots: every lease ends in one result, whatever happens to simulator processes."""
+"""Slots: every lease ends in one result, even if simulator processes fail."""
 
 import asyncio
 import contextlib
@@ -27,7 +27,7 @@ from embomatrix.worker.slots.residents import LoadError, SlotLimits
 
 
 class Harness:
-    """A pool whose bundles are files that say how their scene behaves."""
+    """Pool whose bundle files script the behaviour of their scenes."""
 
     def __init__(self, folder, *, slots=2, memory_mb=500.0, program=PROGRAM, fork_s=10.0):
         self.folder = folder
@@ -90,7 +90,7 @@ def _living():
 
 def _simulators(parent=None):
     below = psutil.Process(parent or os.getpid()).children(recursive=True)
-    # Other children of this process, such as the resource tracker of a process pool, are not the slots' doing.
+    # Other children of this process, such as a pool's resource tracker, do not belong to the slots.
     return [process for process in below if _is_simulator(process)]
 
 
@@ -101,7 +101,7 @@ def _is_simulator(process):
         return False
 
 
-async def test_a_lease_is_executed_and_scored_in_another_process(tmp_path):
+async def test_lease_is_executed_and_scored_in_another_process(tmp_path):
     async with running(tmp_path) as harness:
         harness.submit("l1")
         outcome = (await harness.outcomes(1))["l1"]
@@ -113,7 +113,7 @@ async def test_a_lease_is_executed_and_scored_in_another_process(tmp_path):
     assert outcome.timings.load_s > 0
 
 
-async def test_a_wanted_scene_is_warm_before_its_first_lease(tmp_path):
+async def test_desired_scene_is_warm_before_its_first_lease(tmp_path):
     async with running(tmp_path) as harness:
         harness.pool.want(["a", "b"])
         await harness.until(lambda: harness.state("a") is harness.state("b") is ResidentState.WARM)
@@ -123,7 +123,7 @@ async def test_a_wanted_scene_is_warm_before_its_first_lease(tmp_path):
     assert outcome.timings.load_s == 0.0
 
 
-async def test_a_slot_is_used_again_for_the_next_lease_of_its_scene(tmp_path):
+async def test_slot_is_reused_for_the_next_lease_of_its_scene(tmp_path):
     async with running(tmp_path, slots=1) as harness:
         for number in range(5):
             harness.submit(f"l{number}")
@@ -157,7 +157,7 @@ async def test_idle_processes_are_bounded_over_all_scenes(tmp_path):
         assert isinstance((await harness.outcomes(9))["again"], Completed)
 
 
-async def test_a_slot_that_has_grown_is_replaced(tmp_path):
+async def test_slot_with_memory_growth_is_replaced(tmp_path):
     async with running(tmp_path, slots=1) as harness:
         for number, task in enumerate(("ok", "grow", "ok")):
             harness.submit(f"l{number}", task)
@@ -177,7 +177,7 @@ async def test_two_slots_execute_one_scene_at_the_same_time(tmp_path):
     assert time.monotonic() - started_s < 0.55
 
 
-async def test_a_lease_that_is_given_twice_is_executed_once(tmp_path):
+async def test_duplicate_lease_is_executed_once(tmp_path):
     async with running(tmp_path) as harness:
         harness.submit("l1", "slow")
         harness.submit("l1", "slow")
@@ -219,7 +219,7 @@ async def test_exception_during_a_rollout_is_an_infrastructure_failure(tmp_path)
     assert len(outcome.message) == 500
 
 
-async def test_a_rollout_that_takes_too_much_memory_fails_alone(tmp_path):
+async def test_out_of_memory_rollout_fails_alone(tmp_path):
     async with running(tmp_path, slots=1) as harness:
         harness.submit("l1", "greedy")
         harness.submit("l2")
@@ -243,7 +243,7 @@ async def test_stopped_scene_process_is_replaced_while_its_rollout_continues(tmp
     async with running(tmp_path, slots=2, fork_s=0.3) as harness:
         harness.submit("other", digest="other")
         await harness.outcomes(1)
-        harness.submit("running", "stop")  # its slot stops the scene's process and goes on for a second
+        harness.submit("running", "stop")  # its slot stops the scene's process and continues for a second
         [root] = [child for child in psutil.Process().children() if _is_simulator(child)]
         await harness.until(lambda: any(scene.status() == psutil.STATUS_STOPPED for scene in root.children()))
         [stopped] = [scene for scene in root.children() if scene.status() == psutil.STATUS_STOPPED]
@@ -278,7 +278,7 @@ async def test_killed_root_is_restarted(tmp_path):
         ("unfetchable", InfraCode.BUNDLE_CORRUPT, "damaged twice"),
     ],
 )
-async def test_a_scene_that_cannot_be_loaded_fails_its_leases_with_the_reason(tmp_path, digest, code, text):
+async def test_unloadable_scene_fails_its_leases_with_the_reason(tmp_path, digest, code, text):
     async with running(tmp_path) as harness:
         harness.submit("l1", digest=digest)
         harness.submit("l2")
@@ -301,7 +301,7 @@ async def test_unwanted_scenes_are_evicted_if_memory_is_short(tmp_path):
         assert harness.pool.memory_used_mb <= 100.0
 
 
-async def test_a_cancelled_lease_gives_no_result_and_frees_its_slot(tmp_path):
+async def test_cancelled_lease_gives_no_result_and_frees_its_slot(tmp_path):
     async with running(tmp_path, slots=1) as harness:
         stuck = harness.submit("stuck", "hang", deadline_s=60.0)
         waiting = harness.submit("waiting", "hang", deadline_s=60.0)

@@ -30,8 +30,8 @@ def test_options_take_precedence_over_the_file_and_the_file_over_defaults(tmp_pa
     settings = settings_of(["--config", str(config), "--slots=2", "--idle-s=60", "--label=owner=ann"])
     assert (settings.name, settings.slots, settings.cache_mb, settings.nice) == ("attic", 2, 77, 10)
     assert settings.labels == {"room": "attic", "owner": "ann"}
-    wishes = settings.preferences
-    assert (wishes.hours, wishes.idle_s, wishes.mains_only, wishes.max_load) == ("18:00-08:00", 60, True, 0)
+    chosen = settings.preferences
+    assert (chosen.hours, chosen.idle_s, chosen.mains_only, chosen.max_load) == ("18:00-08:00", 60, True, 0)
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,7 @@ def test_options_take_precedence_over_the_file_and_the_file_over_defaults(tmp_pa
         (["--cache-mb=0"], "--cache-mb 0: input should be greater than or equal to 1"),
     ],
 )
-def test_a_wrong_preference_is_named_with_what_was_expected(arguments, said):
+def test_wrong_preference_is_named_with_the_expected_value(arguments, said):
     result = CliRunner().invoke(app, ["run", *arguments])
     assert result.exit_code == 2
     assert said in " ".join(result.stderr.split())
@@ -113,7 +113,7 @@ def test_status_files_of_killed_daemons_are_ignored(tmp_path):
     assert running_daemons(tmp_path) == [STATUS]
 
 
-def test_a_status_that_cannot_be_written_is_no_error(tmp_path):
+def test_unwritable_status_file_is_no_error(tmp_path):
     (tmp_path / "running").write_text("a file where a folder should be")
     file = StatusFile(tmp_path, "w1")
     file.write(STATUS)
@@ -189,7 +189,7 @@ def test_unprivileged_unit_gets_root_files_as_credentials():
 
 
 def test_worker_and_manager_of_a_machine_keep_their_files_apart():
-    """Each runs as a user of its own, and systemd gives a folder of state to the one that started last."""
+    """Each service runs as a dedicated user; systemd assigns a shared state folder to the service that started last."""
     manager = (DEPLOY / "systemd" / "embomatrix-manager.service").read_text()
     folders = [
         line
@@ -226,7 +226,7 @@ def test_special_characters_are_quoted_for_systemd():
 
 @needs_systemd
 @pytest.mark.parametrize("system", [False, True])
-def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path, system):
+def test_systemd_accepts_the_unit(tmp_path, system):
     path = tmp_path / "embomatrix-worker.service"
     path.write_text(
         unit_text(

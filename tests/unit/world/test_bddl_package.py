@@ -52,7 +52,7 @@ def text_of(activity: str) -> str:
 
 
 def lists_of(formula: Formula) -> list[Any]:
-    """A formula as the nested lists that the bddl package parses, without question marks."""
+    """Return a formula as the nested lists that the bddl package parses, without question marks."""
     match formula:
         case Atom(predicate, args):
             return [predicate, *(arg.lstrip("?") for arg in args)]
@@ -104,7 +104,7 @@ def test_every_activity_parses_as_in_the_bddl_package() -> None:
 
 @dataclass(frozen=True)
 class Coin:
-    """Facts by hash: every atom is true or false for good, with a chance of ``percent``."""
+    """Facts by hash: every atom has a fixed truth value, true with a probability of ``percent``."""
 
     seed: int
     percent: int
@@ -120,7 +120,7 @@ class Thing:
 
 
 class Package:
-    """The bddl package's evaluator over facts that can be changed: goals are compiled once."""
+    """Evaluator of the bddl package over mutable facts: goals are compiled once."""
 
     def __init__(self, activity: str, text: str) -> None:
         from bddl.activity import Conditions, get_goal_conditions, get_object_scope
@@ -183,7 +183,7 @@ KINDS = ("apple", "box", "lamp")
 
 @st.composite
 def formulas(draw: st.DrawFn, scope: tuple[str, ...] = (), depth: int = 3) -> Formula:
-    """Closed formulas of every operator, whose variables have names of their own."""
+    """Generate closed formulas of every operator, with unique variable names."""
     names = st.sampled_from([*OBJECTS, *scope, *scope])
     operator = draw(st.integers(0, 10)) if depth else draw(st.integers(0, 1))
     variables = (f"?v{len(scope)}", f"?v{len(scope) + 1}")

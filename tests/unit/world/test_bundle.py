@@ -26,13 +26,13 @@ def test_equal_bundles_have_equal_bytes_and_digests(bundle: Bundle) -> None:
     assert bundle_digest(encode_bundle(bundle)).startswith("sha256:")
 
 
-def test_other_content_has_another_digest(bundle: Bundle) -> None:
+def test_different_content_has_a_different_digest(bundle: Bundle) -> None:
     moved = dataclasses.replace(bundle.scene, seed=8)
     other = dataclasses.replace(bundle, scene=moved)
     assert bundle_digest(encode_bundle(other)) != bundle_digest(encode_bundle(bundle))
 
 
-def test_wrong_digest_names_what_was_found_and_what_was_expected(bundle: Bundle) -> None:
+def test_wrong_digest_error_names_both_digests(bundle: Bundle) -> None:
     data = encode_bundle(bundle)
     expected = "sha256:" + "0" * 64
     with pytest.raises(BundleError) as caught:

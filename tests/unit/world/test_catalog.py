@@ -136,7 +136,7 @@ def test_scaled_model_keeps_its_shape_and_scales_its_mass_with_the_cube() -> Non
     assert small.size_m == pytest.approx(tuple(0.8 * extent for extent in whole.size_m))
     assert (small.share, whole.share) == (0.8, 1.0)
     assert small.asset_id == f"{whole.asset_id}@0.8"
-    assert catalog.models_of("chorizo") == (whole,), "no model of its own"
+    assert catalog.models_of("chorizo") == (whole,), "no dedicated model"
 
 
 @pytest.mark.parametrize("share", ["0.1", "3", "nan", "half", "-1"])

@@ -234,7 +234,7 @@ SCENE_JSON: dict[str, Any] = {
 
 
 def test_decoding_survives_garbage_collections() -> None:
-    """msgspec 0.22 crashes in a collection if a record joins a fixed tuple and a bounded integer in one union."""
+    """msgspec 0.22 crashes during a collection if a record joins a fixed tuple and a bounded integer in one union."""
     script = (
         "import gc; gc.set_threshold(1)\n"
         "from tests.fakes.scenes import kitchen_scene\n"

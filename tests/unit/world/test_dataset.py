@@ -43,7 +43,7 @@ def test_unknown_task_suggests_a_close_name(tmp_path: Path, bundle: Bundle, task
         Dataset.load(tmp_path).find("tiny-1-opn")
 
 
-def test_folder_without_a_dataset_tells_how_to_build_one(tmp_path: Path) -> None:
+def test_folder_without_a_dataset_suggests_the_build_command(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="factory build"):
         Dataset.load(tmp_path / "nothing")
 

@@ -25,7 +25,7 @@ TYPES = {"apple": ("apple_1", "apple_2"), "box": ("box_1", "box_2"), "lamp": ("l
 
 @dataclass
 class Table:
-    """Facts that hold; ``asked`` counts the questions."""
+    """Set of true facts; ``asked`` counts the queries."""
 
     true: set[tuple[str, ...]] = field(default_factory=set)
     asked: int = 0

@@ -30,7 +30,7 @@ def near(found, expected) -> bool:
 
 
 def same_frame(a: Pose, b: Pose) -> bool:
-    """Quaternions of opposite sign turn alike, so rotations are compared."""
+    """Compare rotations: quaternions of opposite sign are equal rotations."""
     return near(a.position_m, b.position_m) and near(a.rotation, b.rotation)
 
 

@@ -37,7 +37,7 @@ def hand_in(result: BenchResult, json_file: Path | None) -> None:
         table.add_column(heading, justify="right" if heading in ("value", "goal", "n") else "left")
     for figure in result.figures:
         goal = "" if figure.goal is None else shown(figure.goal)
-        table.add_row(figure.name, f"{figure.told} {figure.unit}", goal, figure.verdict, f"{figure.n:,}")
+        table.add_row(figure.name, f"{figure.formatted} {figure.unit}", goal, figure.verdict, f"{figure.n:,}")
     console.print(table)
     if is_shared(result.machine):
         console.print(

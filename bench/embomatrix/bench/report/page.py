@@ -88,7 +88,7 @@ def _provenance(result: BenchResult) -> list[str]:
 
 def _figure_lines(figures: Sequence[Figure]) -> list[str]:
     rows = (
-        (figure.name, f"{figure.told} {figure.unit}", figure.bound, figure.verdict, f"{figure.n:,}")
+        (figure.name, f"{figure.formatted} {figure.unit}", figure.bound, figure.verdict, f"{figure.n:,}")
         for figure in figures
     )
     lines = table(("figure", "value", "goal", "", "n"), rows)

@@ -78,9 +78,11 @@ def _about(summary: RunSummary) -> str:
 
 def _reward_text(reward: RewardSettings) -> str:
     """Name the coefficients that differ from the paper's."""
-    told = dataclasses.asdict(reward)
+    coefficients = dataclasses.asdict(reward)
     own = [
-        f"{name} {told[name]:g}" for name, usual in dataclasses.asdict(PAPER).items() if told[name] != usual
+        f"{name} {coefficients[name]:g}"
+        for name, usual in dataclasses.asdict(PAPER).items()
+        if coefficients[name] != usual
     ]
     return f"reward: {', '.join(own)}, else the paper's" if own else "reward: the paper's"
 
@@ -190,12 +192,12 @@ def _failures(summary: RunSummary) -> str:
     if not summary.failures:
         return '<p class="none">None: every lease brought a result.</p>'
     codes = Counter(event.code for event in summary.failures)
-    told = ", ".join(f"{count} {code}" for code, count in codes.most_common())
+    counts = ", ".join(f"{count} {code}" for code, count in codes.most_common())
     rows = "".join(map(_failure_row, reversed(summary.failures)))
     names = ("time", "what", "reason", "attempt", "rollout", "worker", "scene")
     head = "".join(f"<th>{name}</th>" for name in names)
     table = f"<table><tr>{head}</tr>{rows}</table>"
-    return f'<p class="note">The latest {len(summary.failures)}: {_text(told)}.</p><div class="scroll">{table}</div>'
+    return f'<p class="note">The latest {len(summary.failures)}: {_text(counts)}.</p><div class="scroll">{table}</div>'
 
 
 def _failure_row(event: RunEvent) -> str:

@@ -130,17 +130,23 @@ def screen(before: Glance, now: Glance, *, lines: int) -> RenderableType:
 
 def sentences(fleet: FleetStatus, runs: Sequence[RunInfo], plan: Sequence[PlanCell]) -> list[str]:
     """Describe the cluster. The first sentence is the manager's own verdict, as the dashboard shows it."""
-    told = [fleet.health]
+    sentences_shown = [fleet.health]
     if all(worker.state == LEFT for worker in fleet.workers):
-        told.append(
+        sentences_shown.append(
             "Start a worker with `embomatrix worker run`, here or on any machine that reaches the manager."
         )
-    return [*told, _slots(fleet.workers), *_runs(runs), *_ahead(plan), *_idle_workers(fleet.workers)]
+    return [
+        *sentences_shown,
+        _slots(fleet.workers),
+        *_runs(runs),
+        *_ahead(plan),
+        *_idle_workers(fleet.workers),
+    ]
 
 
-def counted(number: int, thing: str) -> str:
+def counted(number: int, noun: str) -> str:
     """Return the number with the noun in singular or plural."""
-    return f"{number} {thing}{'' if number == 1 else 's'}"
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 async def _look(client: AdminClient) -> Glance:

@@ -120,8 +120,8 @@ def plan_table(cells: Sequence[PlanCell]) -> Table:
         scene = cell.bundle_digest.removeprefix("sha256:")[:8]
         more = len(cell.worker_ids) - NAMED
         names = (*cell.worker_ids[:NAMED], *([f"{more}_more"] if more > 0 else []))
-        told = f"{scene}·{cell.count}·{cell.warmth.value}" + (f"@{','.join(names)}" if names else "")
-        rows.setdefault((cell.run_id, cell.step), []).append(Text(told, style=WARMTH_STYLES[cell.warmth]))
+        label = f"{scene}·{cell.count}·{cell.warmth.value}" + (f"@{','.join(names)}" if names else "")
+        rows.setdefault((cell.run_id, cell.step), []).append(Text(label, style=WARMTH_STYLES[cell.warmth]))
     for (run_id, step), told_cells in sorted(rows.items()):
         table.add_row(Text(run_id), str(step), Text("  ").join(told_cells))
     return table

@@ -54,9 +54,11 @@ def doctor(
     except ClusterError as error:
         fail("doctor", str(error))
     visits = [Visit(address, secret, trusted, page_port, expected=bool(manager)) for address in addresses]
-    told = asyncio.run(_visit(visits))
-    held = frozenset().union(*(ports_held(visit, found) for visit, found in zip(visits, told, strict=True)))
-    findings = [*machine(held), *itertools.chain.from_iterable(told)]
+    findings_by_visit = asyncio.run(_visit(visits))
+    held = frozenset().union(
+        *(ports_held(visit, found) for visit, found in zip(visits, findings_by_visit, strict=True))
+    )
+    findings = [*machine(held), *itertools.chain.from_iterable(findings_by_visit)]
     if as_json:
         show_json(findings)
     else:
@@ -76,10 +78,12 @@ def _show(findings: Sequence[Finding]) -> None:
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
     for finding in findings:
-        told = Text(finding.found)
+        findings_by_visit = Text(finding.found)
         if finding.remedy:
-            told.append(f"\n{finding.remedy}", style="dim")
-        table.add_row(Text(finding.level.value, style=STYLES[finding.level]), finding.thing, told)
+            findings_by_visit.append(f"\n{finding.remedy}", style="dim")
+        table.add_row(
+            Text(finding.level.value, style=STYLES[finding.level]), finding.thing, findings_by_visit
+        )
     console = Console(highlight=False)
     console.print(table)
     console.print(f"\n{verdict(findings)}", markup=False)

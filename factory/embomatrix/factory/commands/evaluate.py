@@ -116,12 +116,12 @@ def scenes(
     kept = "; outcomes so far are saved: run the same command to resume" if outcomes is not None else ""
     with user_errors(outcomes, kept):
         chosen = fixed_tasks(sample)[::only]
-        told = methods or list(LayoutMethod)
+        used_methods = methods or list(LayoutMethod)
         log = OutcomeLog.open(outcomes, seed) if outcomes is not None else None
         with progress(Console(stderr=True)) as bars:
-            bar = bars.add_task("trials", total=len(chosen) * len(told))
+            bar = bars.add_task("trials", total=len(chosen) * len(used_methods))
             evaluation, _ = evaluate_scenes(
-                chosen, told, seed, jobs, lambda done: bars.update(bar, completed=done), log
+                chosen, used_methods, seed, jobs, lambda done: bars.update(bar, completed=done), log
             )
         if only > 1:
             taken = {"taken": f"one in {only} of the fixed tasks", **evaluation.conditions}
@@ -157,13 +157,13 @@ def looks(
 ) -> None:
     """Score layouts with the paper's judge: a vision-language model sees the plan of each room and its layout tree."""
     with user_errors():
-        chosen, told = fixed_tasks(sample)[::only], methods or list(LayoutMethod)
+        chosen, used_methods = fixed_tasks(sample)[::only], methods or list(LayoutMethod)
 
         async def looked(judge: ChatModel) -> EvaluationFigures:
             with progress(Console(stderr=True)) as bars:
-                bar = bars.add_task("trials", total=len(chosen) * len(told))
+                bar = bars.add_task("trials", total=len(chosen) * len(used_methods))
                 return await evaluate_looks(
-                    judge, chosen, told, seed, lambda done: bars.update(bar, completed=done)
+                    judge, chosen, used_methods, seed, lambda done: bars.update(bar, completed=done)
                 )
 
         evaluation = asyncio.run(_asked(looked, llm, model, key, cassette))

@@ -110,8 +110,8 @@ def _rounded(value: float) -> float:
 
 def _hosts_first(items: Sequence[RequestedObject]) -> Iterator[RequestedObject]:
     by_name = {item.name: item for item in items}
-    for thing in hosts_first([object_brief(item, item.asset(0), {}) for item in items]):
-        yield by_name[thing.name]
+    for brief in hosts_first([object_brief(item, item.asset(0), {}) for item in items]):
+        yield by_name[brief.name]
 
 
 def _requested_place(

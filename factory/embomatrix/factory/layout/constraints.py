@@ -257,45 +257,45 @@ BACKED: Final = frozenset(_BACKED.split())
 def choose_constraints(brief: ConstraintBrief) -> PlacementConstraints:
     """Return the constraints of each object, the most important first. Objects that may stand anywhere have none."""
     return PlacementConstraints(
-        {thing.name: tuple(dict.fromkeys(_constraints_for(thing, brief))) for thing in brief.objects}
+        {item.name: tuple(dict.fromkeys(_constraints_for(item, brief))) for item in brief.objects}
     )
 
 
-def _constraints_for(thing: ObjectBrief, brief: ConstraintBrief) -> Iterator[PlacementConstraint]:
+def _constraints_for(item: ObjectBrief, brief: ConstraintBrief) -> Iterator[PlacementConstraint]:
     others = dict(brief.others)
-    rank = brief.objects.index(thing)
+    rank = brief.objects.index(item)
     before = {**others, **{each.name: each.category for each in brief.objects[:rank]}}
-    for other in thing.beside:
+    for other in item.beside:
         yield PlacementConstraint(ConstraintKind.NEXT_TO, other, required=True)
     if brief.on_floor:
-        yield from _on_floor(thing, before)
+        yield from _on_floor(item, before)
         return
-    alike = next((name for name, category in before.items() if category == thing.category), "")
+    alike = next((name for name, category in before.items() if category == item.category), "")
     if alike:
         yield PlacementConstraint(ConstraintKind.NEXT_TO, alike)
         yield PlacementConstraint(ConstraintKind.CENTER_ALIGNED, alike)
         return
     everyone = {**before, **{each.name: each.category for each in brief.objects[rank + 1 :]}}
-    likes = COMPANIONS.get(thing.category, frozenset())
+    likes = COMPANIONS.get(item.category, frozenset())
     friend = next((name for name, category in everyone.items() if category in likes), "")
     if friend:
         yield PlacementConstraint(ConstraintKind.NEXT_TO, friend)
         yield PlacementConstraint(ConstraintKind.SIDE_OF, friend)
         return
-    if brief.host in BOARDS and thing.category in CENTREPIECES:
+    if brief.host in BOARDS and item.category in CENTREPIECES:
         yield PlacementConstraint(ConstraintKind.MIDDLE)
-    elif thing.category in BACKED or (brief.host in BOARDS and thing.category in SEATED):
+    elif item.category in BACKED or (brief.host in BOARDS and item.category in SEATED):
         yield PlacementConstraint(ConstraintKind.EDGE)
 
 
-def _on_floor(thing: ObjectBrief, before: Mapping[str, str]) -> Iterator[PlacementConstraint]:
+def _on_floor(item: ObjectBrief, before: Mapping[str, str]) -> Iterator[PlacementConstraint]:
     """Yield floor constraints: seats face a table, tables stand in the middle, other furniture at a wall."""
-    role = role_of(thing.category, thing.size_m, 0.0) if thing.kind is PlacementClass.FURNITURE else None
+    role = role_of(item.category, item.size_m, 0.0) if item.kind is PlacementClass.FURNITURE else None
     table = next((name for name, category in before.items() if category in TABLES), "")
     if role is FurnitureRole.SEAT and table:
         yield PlacementConstraint(ConstraintKind.FACE_TO, table)
         yield PlacementConstraint(ConstraintKind.NEXT_TO, table)
-    elif role in (FurnitureRole.LOW_TABLE, FurnitureRole.OPEN) or thing.category in BOARDS:
+    elif role in (FurnitureRole.LOW_TABLE, FurnitureRole.OPEN) or item.category in BOARDS:
         yield PlacementConstraint(ConstraintKind.MIDDLE)
     else:
         yield PlacementConstraint(ConstraintKind.EDGE)

@@ -55,15 +55,15 @@ def distribute(brief: DistributionBrief) -> Distribution:
         }
         room = max(scores, key=lambda name: (scores[name], name))
         given[room] += len(family)
-        for thing in family:
-            found[thing.name] = room
-            reasons[thing.name] = why or _reason_for(thing, rooms[room])
+        for item in family:
+            found[item.name] = room
+            reasons[item.name] = why or _reason_for(item, rooms[room])
     return Distribution(found, reasons)
 
 
 def tied_groups(objects: Sequence[ObjectBrief]) -> list[tuple[ObjectBrief, ...]]:
     """Group the objects that the task's relations tie together, directly or indirectly. Each group shares a room."""
-    leader = {thing.name: thing.name for thing in objects}
+    leader = {item.name: item.name for item in objects}
 
     def head(name: str) -> str:
         while leader[name] != name:
@@ -71,14 +71,14 @@ def tied_groups(objects: Sequence[ObjectBrief]) -> list[tuple[ObjectBrief, ...]]
         return name
 
     anchors: dict[str, str] = {}
-    for thing in objects:
-        for other in filter(None, (thing.host, *thing.beside)):
+    for item in objects:
+        for other in filter(None, (item.host, *item.beside)):
             # An existing object ties together all objects that the task puts at it.
-            tied = other if other in leader else anchors.setdefault(other, thing.name)
-            leader[head(thing.name)] = head(tied)
+            tied = other if other in leader else anchors.setdefault(other, item.name)
+            leader[head(item.name)] = head(tied)
     grouped: dict[str, list[ObjectBrief]] = {}
-    for thing in objects:
-        grouped.setdefault(head(thing.name), []).append(thing)
+    for item in objects:
+        grouped.setdefault(head(item.name), []).append(item)
     return [tuple(group) for group in grouped.values()]
 
 
@@ -86,20 +86,20 @@ def _allowed(
     family: Sequence[ObjectBrief], brief: DistributionBrief, rooms: Mapping[str, LayoutRoomFacts]
 ) -> tuple[list[str], str]:
     """Return the rooms that all objects of the group may be in, and the reason if there is no choice."""
-    names = {thing.name for thing in family}
+    names = {item.name for item in family}
     held = {
         rooms_of
-        for thing in family
-        for other in filter(None, (thing.host, *thing.beside))
+        for item in family
+        for other in filter(None, (item.host, *item.beside))
         if other not in names
         for rooms_of in (other if other in rooms else brief.homes.get(other, ""),)
     }
     allowed = [name for name in rooms if not held or held == {name}]
-    for thing in family:
-        if thing.rooms:
-            allowed = [name for name in allowed if name in thing.rooms]
+    for item in family:
+        if item.rooms:
+            allowed = [name for name in allowed if name in item.rooms]
     if not allowed:
-        wanted = sorted(held | {room for thing in family for room in thing.rooms})
+        wanted = sorted(held | {room for item in family for room in item.rooms})
         raise DistributionError(
             f"{', '.join(sorted(names))} belong together but are demanded in {', '.join(wanted)}: expected one room of "
             f"{', '.join(rooms)}"
@@ -111,27 +111,27 @@ def _allowed(
 
 def _score(family: Sequence[ObjectBrief], room: LayoutRoomFacts, given: int) -> float:
     liking = sum(
-        ROOM_TYPE_SCORE * belongs(thing.category, room.type) + PREFERRED_HOST_SCORE * _host_score(thing, room)
-        for thing in family
+        ROOM_TYPE_SCORE * belongs(item.category, room.type) + PREFERRED_HOST_SCORE * _host_score(item, room)
+        for item in family
     )
     return liking / len(family) + SIZE_SCORE * math.log(max(room.area_m2, 1.0)) - LOAD_PENALTY * given
 
 
-def _host_score(thing: ObjectBrief, room: LayoutRoomFacts) -> float:
+def _host_score(item: ObjectBrief, room: LayoutRoomFacts) -> float:
     """Score from 0 to 1 for the object's preferred hosts in the room; negative if the room has no host for it."""
-    if thing.kind is not PlacementClass.GOODS:
+    if item.kind is not PlacementClass.GOODS:
         return 0.5
     here = set(room.furniture)
-    if not any(is_usual_host(host, thing.category) for host in here):
+    if not any(is_usual_host(host, item.category) for host in here):
         return NO_HOST_SCORE
-    wanted = preferred_hosts(thing.category)
+    wanted = preferred_hosts(item.category)
     return max((1.0 - rank / len(wanted) for rank, host in enumerate(wanted) if host in here), default=0.2)
 
 
-def _reason_for(thing: ObjectBrief, room: LayoutRoomFacts) -> str:
-    liked = next((host for host in preferred_hosts(thing.category) if host in room.furniture), "")
+def _reason_for(item: ObjectBrief, room: LayoutRoomFacts) -> str:
+    liked = next((host for host in preferred_hosts(item.category) if host in room.furniture), "")
     if liked:
         return f"{room.name} has a {liked}"
-    if belongs(thing.category, room.type):
+    if belongs(item.category, room.type):
         return f"such objects belong in a {room.type}"
     return f"{room.name} has space: {room.area_m2:.0f} m2"

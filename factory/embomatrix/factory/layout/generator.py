@@ -116,13 +116,13 @@ def _assign_rooms(
     return answer.rooms
 
 
-def _at_neighbours_host(editor: SceneEditor, thing: ObjectBrief) -> ObjectBrief:
+def _at_neighbours_host(editor: SceneEditor, item: ObjectBrief) -> ObjectBrief:
     """Give an object that must stand beside an existing object the host of that object."""
-    other = next((editor.objects[name] for name in thing.beside if name in editor.objects), None)
-    if other is None or thing.relation is not None:
-        return thing
+    other = next((editor.objects[name] for name in item.beside if name in editor.objects), None)
+    if other is None or item.relation is not None:
+        return item
     inside = other.relation is Relation.INSIDE
-    return replace(thing, relation=LayoutRelation.INSIDE if inside else LayoutRelation.ONTOP, host=other.host)
+    return replace(item, relation=LayoutRelation.INSIDE if inside else LayoutRelation.ONTOP, host=other.host)
 
 
 class _RoomLayout:
@@ -192,7 +192,7 @@ class _RoomLayout:
         objects = tuple(
             _at_neighbours_host(self._editor, self._brief_of(name)) for name in self._pending.waiting
         )
-        named = {thing.host for thing in objects if thing.host in self._editor.objects}
+        named = {item.host for item in objects if item.host in self._editor.objects}
         hosts = tuple(hosts_in(self._editor, self._room.name, named))
         room = next(room for room in rooms_of(self._editor) if room.name == self._room.name)
         return RoomBrief(room, hosts, objects, tuple(self._pending.failures), self._seed * 31 + self._round)

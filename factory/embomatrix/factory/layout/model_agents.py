@@ -111,20 +111,20 @@ class ModelLayoutAgents(OnOneLoop):
         rooms = {room.name for room in brief.rooms}
 
         def check(answer: RoomsAnswer) -> None:
-            _check_complete({thing.name for thing in brief.objects}, answer.rooms, "a room")
-            for thing in brief.objects:
-                room = answer.rooms[thing.name]
+            _check_complete({item.name for item in brief.objects}, answer.rooms, "a room")
+            for item in brief.objects:
+                room = answer.rooms[item.name]
                 if room not in rooms:
                     raise ValueError(f"there is no room {room!r}: the rooms are {', '.join(sorted(rooms))}")
-                if thing.rooms and room not in thing.rooms:
-                    raise ValueError(f"{thing.name} is in {room}: it may only be in {', '.join(thing.rooms)}")
+                if item.rooms and room not in item.rooms:
+                    raise ValueError(f"{item.name} is in {room}: it may only be in {', '.join(item.rooms)}")
                 host = (
                     room
-                    if thing.host in rooms
-                    else brief.homes.get(thing.host, answer.rooms.get(thing.host, room))
+                    if item.host in rooms
+                    else brief.homes.get(item.host, answer.rooms.get(item.host, room))
                 )
-                if host != room or (thing.host in rooms and thing.host != room):
-                    raise ValueError(f"{thing.name} belongs at {thing.host}, which is not in {room}")
+                if host != room or (item.host in rooms and item.host != room):
+                    raise ValueError(f"{item.name} belongs at {item.host}, which is not in {room}")
 
         answer = self._ask(AgentName.DISTRIBUTOR, DISTRIBUTOR, brief, RoomsAnswer, check, brief.seed)
         return distribute(brief) if answer is None else Distribution(answer.rooms, answer.reasons)
@@ -139,15 +139,15 @@ class ModelLayoutAgents(OnOneLoop):
 
         def check(answer: TreeAnswer) -> None:
             hung = {branch.child: branch for branch in tree_of(answer).branches()}
-            _check_complete({thing.name for thing in brief.objects}, hung, "a parent")
-            for thing in brief.objects:
-                allowed = [*choices(brief, thing, hung)]
-                chosen = hung[thing.name]
-                nested = chosen.parent in {other.name for other in brief.objects} and thing.relation is None
+            _check_complete({item.name for item in brief.objects}, hung, "a parent")
+            for item in brief.objects:
+                allowed = [*choices(brief, item, hung)]
+                chosen = hung[item.name]
+                nested = chosen.parent in {other.name for other in brief.objects} and item.relation is None
                 if allowed and chosen not in allowed and not nested:
                     options = "; ".join(f"{branch.relation} {branch.parent}" for branch in allowed[:8])
                     raise ValueError(
-                        f"{thing.name} can't be {chosen.relation} {chosen.parent}: it can be {options}"
+                        f"{item.name} can't be {chosen.relation} {chosen.parent}: it can be {options}"
                     )
 
         answer = self._ask(
@@ -163,22 +163,20 @@ class ModelLayoutAgents(OnOneLoop):
 
     def choose_constraints(self, brief: ConstraintBrief) -> PlacementConstraints:
         """Planar-Level Placement Generator: choice of constraints. Raise EndpointError."""
-        names = {thing.name for thing in brief.objects}
+        names = {item.name for item in brief.objects}
         known = names | {name for name, _ in brief.others}
 
         def check(answer: ConstraintsAnswer) -> None:
-            for thing, constraints in answer.of.items():
-                if thing not in names:
+            for item, constraints in answer.of.items():
+                if item not in names:
                     raise ValueError(
-                        f"there is no object {thing!r} to place: expected {', '.join(sorted(names))}"
+                        f"there is no object {item!r} to place: expected {', '.join(sorted(names))}"
                     )
                 for each in constraints:
-                    if each.kind not in PLANE_CONSTRAINTS and (
-                        each.other not in known or each.other == thing
-                    ):
+                    if each.kind not in PLANE_CONSTRAINTS and (each.other not in known or each.other == item):
                         raise ValueError(
-                            f"{thing}: {each.kind} needs another object of the plane: found {each.other!r}, expected one of "
-                            f"{', '.join(sorted(known - {thing}))}"
+                            f"{item}: {each.kind} needs another object of the plane: found {each.other!r}, expected one of "
+                            f"{', '.join(sorted(known - {item}))}"
                         )
 
         answer = self._ask(AgentName.PLANNER, PLANNER, brief, ConstraintsAnswer, check, brief.seed)
@@ -187,11 +185,11 @@ class ModelLayoutAgents(OnOneLoop):
         demanded = choose_constraints(brief).of
         return PlacementConstraints(
             {
-                thing.name: (
-                    *(each for each in demanded[thing.name] if each.required),
-                    *(PlacementConstraint(each.kind, each.other) for each in answer.of.get(thing.name, ())),
+                item.name: (
+                    *(each for each in demanded[item.name] if each.required),
+                    *(PlacementConstraint(each.kind, each.other) for each in answer.of.get(item.name, ())),
                 )
-                for thing in brief.objects
+                for item in brief.objects
             }
         )
 

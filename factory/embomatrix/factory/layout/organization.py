@@ -197,14 +197,14 @@ def organize(brief: RoomBrief) -> LayoutTree:
     hung: dict[str, Branch] = {
         host.name: Branch(brief.room.name, LayoutRelation.ONTOP, host.name) for host in brief.hosts
     }
-    for thing in hosts_first(brief.objects):
-        options = list(choices(brief, thing, hung))
+    for brief_item in hosts_first(brief.objects):
+        options = list(choices(brief, brief_item, hung))
         if not options:
             continue
-        scores = [_branch_score(brief, thing, branch, contents) for branch in options]
+        scores = [_branch_score(brief, brief_item, branch, contents) for branch in options]
         best = options[int(np.argmax(np.asarray(scores) + RANDOM_SCORE * rng.random(len(options))))]
-        hung[thing.name] = best
-        contents.setdefault(best.parent, Counter())[thing.category] += 1
+        hung[brief_item.name] = best
+        contents.setdefault(best.parent, Counter())[brief_item.category] += 1
     return LayoutTree.of(brief.room.name, hung.values())
 
 
@@ -213,22 +213,27 @@ def hosts_first(objects: Sequence[ObjectBrief]) -> list[ObjectBrief]:
     order: list[ObjectBrief] = []
     waiting = list(objects)
     while waiting:
-        names = {thing.name for thing in waiting}
-        ready = next((thing for thing in waiting if not names & {thing.host, *thing.beside}), waiting[0])
+        names = {brief_item.name for brief_item in waiting}
+        ready = next(
+            (brief_item for brief_item in waiting if not names & {brief_item.host, *brief_item.beside}),
+            waiting[0],
+        )
         waiting.remove(ready)
         order.append(ready)
     return order
 
 
-def choices(brief: RoomBrief, thing: ObjectBrief, hung: Mapping[str, Branch]) -> Iterator[Branch]:
+def choices(brief: RoomBrief, brief_item: ObjectBrief, hung: Mapping[str, Branch]) -> Iterator[Branch]:
     """Yield the branches that an object may take: the task's demand, or every host with room for it.
 
     Failed branches are left out.
 
     ``hung`` holds the branches of the tree so far, by child.
     """
-    failed = Counter((item.host, item.relation) for item in brief.failures if item.object_name == thing.name)
-    for branch in _open_choices(brief, thing, hung):
+    failed = Counter(
+        (item.host, item.relation) for item in brief.failures if item.object_name == brief_item.name
+    )
+    for branch in _open_choices(brief, brief_item, hung):
         here = branch.parent == brief.room.name or branch.parent in hung
         if here and failed[branch.parent, branch.relation] < _max_attempts(branch, brief):
             yield branch
@@ -247,24 +252,24 @@ def _max_attempts(branch: Branch, brief: RoomBrief) -> int:
     return MAX_ATTEMPTS if reasons and reasons <= SPOT_REASONS else 1
 
 
-def _open_choices(brief: RoomBrief, thing: ObjectBrief, hung: Mapping[str, Branch]) -> Iterator[Branch]:
-    floor = Branch(brief.room.name, LayoutRelation.ONTOP, thing.name)
-    if thing.relation is not None:
-        if thing.relation not in CLOTH_RELATIONS:
-            yield Branch(thing.host or brief.room.name, thing.relation, thing.name)
+def _open_choices(brief: RoomBrief, brief_item: ObjectBrief, hung: Mapping[str, Branch]) -> Iterator[Branch]:
+    floor = Branch(brief.room.name, LayoutRelation.ONTOP, brief_item.name)
+    if brief_item.relation is not None:
+        if brief_item.relation not in CLOTH_RELATIONS:
+            yield Branch(brief_item.host or brief.room.name, brief_item.relation, brief_item.name)
         return
-    beside = next((hung[other] for other in thing.beside if other in hung), None)
+    beside = next((hung[other] for other in brief_item.beside if other in hung), None)
     if beside is not None:
-        yield replace(beside, child=thing.name)
+        yield replace(beside, child=brief_item.name)
         return
-    if thing.kind in (PlacementClass.HUNG, PlacementClass.OVERHEAD):
+    if brief_item.kind in (PlacementClass.HUNG, PlacementClass.OVERHEAD):
         yield replace(floor, relation=LayoutRelation.ATTACHED)
         return
-    if thing.kind is PlacementClass.GOODS:
+    if brief_item.kind is PlacementClass.GOODS:
         for host in brief.hosts:
             for offer in host.offers:
-                if offer.relation is not LayoutRelation.UNDER and fits_offer(offer, thing.size_m):
-                    yield Branch(host.name, offer.relation, thing.name)
+                if offer.relation is not LayoutRelation.UNDER and fits_offer(offer, brief_item.size_m):
+                    yield Branch(host.name, offer.relation, brief_item.name)
     yield floor
 
 
@@ -280,19 +285,19 @@ def fits_offer(offer: HostOffer, size_m: Size3) -> bool:
 
 
 def _branch_score(
-    brief: RoomBrief, thing: ObjectBrief, branch: Branch, contents: Mapping[str, Counter[str]]
+    brief: RoomBrief, brief_item: ObjectBrief, branch: Branch, contents: Mapping[str, Counter[str]]
 ) -> float:
     host = next((item for item in brief.hosts if item.name == branch.parent), None)
     if host is None:
         return (
             PREFERRED_SCORE
-            if thing.kind is not PlacementClass.GOODS or thing.category in FLOOR_OBJECTS
+            if brief_item.kind is not PlacementClass.GOODS or brief_item.category in FLOOR_OBJECTS
             else FLOOR_SCORE
         )
     there = contents[host.name]
-    crowd = CROWD_PENALTY * sum(there.values()) - SAME_CATEGORY_BONUS * (there[thing.category] > 0)
+    crowd = CROWD_PENALTY * sum(there.values()) - SAME_CATEGORY_BONUS * (there[brief_item.category] > 0)
     tired = sum(item.host == host.name for item in brief.failures)
-    return host_score(thing.category, host, branch.relation) - crowd - 0.5 * tired
+    return host_score(brief_item.category, host, branch.relation) - crowd - 0.5 * tired
 
 
 def host_score(category: str, host: HostFacts, relation: LayoutRelation) -> float:

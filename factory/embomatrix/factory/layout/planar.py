@@ -80,9 +80,9 @@ class _Beam:
 def arrange(brief: PlaneBrief) -> tuple[PlaneArrangement, ...]:
     """Return joint arrangements of the brief's objects, the best first, at least one. Each lists the objects left out."""
     grown = [_Beam()]
-    for thing in _in_order(brief.objects):
+    for item in _in_order(brief.objects):
         grown = sorted(
-            (child for beam in grown[:BEAMS] for child in _extended(brief, thing, beam)),
+            (child for beam in grown[:BEAMS] for child in _extended(brief, item, beam)),
             key=lambda beam: -beam.score,
         )
     return tuple(PlaneArrangement(beam.spots, beam.score, dict(beam.left_out)) for beam in grown[:RESULTS])
@@ -90,15 +90,15 @@ def arrange(brief: PlaneBrief) -> tuple[PlaneArrangement, ...]:
 
 def _in_order(objects: Sequence[PlaneObject]) -> list[PlaneObject]:
     """Return the largest objects first, but no object before those that its constraints name."""
-    waiting = sorted(objects, key=lambda thing: -thing.size_m[0] * thing.size_m[1])
+    waiting = sorted(objects, key=lambda item: -item.size_m[0] * item.size_m[1])
     order: list[PlaneObject] = []
     while waiting:
-        left = {thing.name for thing in waiting}
+        left = {item.name for item in waiting}
         ready = next(
             (
-                thing
-                for thing in waiting
-                if not any(constraint.other in left - {thing.name} for constraint in thing.constraints)
+                item
+                for item in waiting
+                if not any(constraint.other in left - {item.name} for constraint in item.constraints)
             ),
             waiting[0],
         )
@@ -107,13 +107,13 @@ def _in_order(objects: Sequence[PlaneObject]) -> list[PlaneObject]:
     return order
 
 
-def _extended(brief: PlaneBrief, thing: PlaneObject, beam: _Beam) -> list[_Beam]:
+def _extended(brief: PlaneBrief, item: PlaneObject, beam: _Beam) -> list[_Beam]:
     """Extend the beam by the object at each of its best spots, or without the object if it has none."""
-    search = _Search(brief, thing, beam.footprints)
+    search = _Search(brief, item, beam.footprints)
     found = search.best()
     if isinstance(found, LayoutReason):
         return [
-            replace(beam, score=beam.score - LEFT_OUT_PENALTY, left_out=(*beam.left_out, (thing.name, found)))
+            replace(beam, score=beam.score - LEFT_OUT_PENALTY, left_out=(*beam.left_out, (item.name, found)))
         ]
     return [
         _Beam(
@@ -129,15 +129,15 @@ def _extended(brief: PlaneBrief, thing: PlaneObject, beam: _Beam) -> list[_Beam]
 class _Search:
     """Search for spots of one object, given the positions of the others."""
 
-    def __init__(self, brief: PlaneBrief, thing: PlaneObject, placed: tuple[PlaneFootprint, ...]) -> None:
+    def __init__(self, brief: PlaneBrief, item: PlaneObject, placed: tuple[PlaneFootprint, ...]) -> None:
         self._brief = brief
-        self._thing = thing
+        self._item = item
         self._others = {item.name: item for item in (*brief.obstacles, *placed)}
         self._rng = np.random.default_rng((brief.seed, len(placed), 11))
 
     def footprint(self, spot: PlaneSpot) -> PlaneFootprint:
-        x, y, height = self._thing.size_m
-        return PlaneFootprint(self._thing.name, spot.center_m, spot.yaw, (x, y), 0.0, height)
+        x, y, height = self._item.size_m
+        return PlaneFootprint(self._item.name, spot.center_m, spot.yaw, (x, y), 0.0, height)
 
     def best(self) -> list[tuple[PlaneSpot, float]] | LayoutReason:
         """Return the best spots with their scores, apart from one another, or the reason if there is none."""
@@ -148,9 +148,9 @@ class _Search:
         spots = spots.at(~self._taken(spots))
         if not len(spots):
             return LayoutReason.NO_FREE_SPOT
-        held = [self._holds(number, spots) for number in range(len(self._thing.constraints))]
+        held = [self._holds(number, spots) for number in range(len(self._item.constraints))]
         needed = [
-            row for row, constraint in zip(held, self._thing.constraints, strict=True) if constraint.required
+            row for row, constraint in zip(held, self._item.constraints, strict=True) if constraint.required
         ]
         if needed:
             fits = np.logical_and.reduce(needed)
@@ -168,7 +168,7 @@ class _Search:
         width, depth = brief.size_m
         most = FLOOR_CELLS if brief.on_floor else SURFACE_CELLS
         step = max(STEP_M[brief.on_floor], math.sqrt(width * depth / most))
-        about = [self._others[w.other] for w in self._thing.constraints if w.other in self._others]
+        about = [self._others[w.other] for w in self._item.constraints if w.other in self._others]
         xs, ys = (
             np.unique(np.concatenate([_grid_line(extent, step), [item.center_m[axis] for item in about]]))
             for axis, extent in enumerate((width, depth))
@@ -176,16 +176,16 @@ class _Search:
         points = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2)  # (k, 2)
         gazes = [
             np.arctan2(*(np.asarray(self._others[constraint.other].center_m) - points).T[::-1])
-            for constraint in self._thing.constraints
+            for constraint in self._item.constraints
             if constraint.kind is ConstraintKind.FACE_TO and constraint.other in self._others
         ]
-        turns = YAWS if self._thing.has_front else YAWS[:2]
+        turns = YAWS if self._item.has_front else YAWS[:2]
         yaws = np.concatenate([*(np.full(len(points), turn) for turn in turns), *gazes])
-        return SpotCandidates.of(np.tile(points, (len(turns) + len(gazes), 1)), yaws, self._thing.size_m)
+        return SpotCandidates.of(np.tile(points, (len(turns) + len(gazes), 1)), yaws, self._item.size_m)
 
     def _taken(self, spots: SpotCandidates) -> BoolArray:
         """Mask of spots that collide with an object or lie in a zone that stays free, shape (n,)."""
-        height = self._thing.size_m[2]
+        height = self._item.size_m[2]
         rows = [
             (*item.center_m, *(half_extents(np.asarray(item.yaw), item.size_m) + GAP_M).tolist())
             for item in self._others.values()
@@ -200,17 +200,17 @@ class _Search:
         return np.asarray(meets.any(axis=1))
 
     def _holds(self, number: int, spots: SpotCandidates) -> BoolArray:
-        constraint = self._thing.constraints[number]
+        constraint = self._item.constraints[number]
         other = self._others.get(constraint.other)
-        return holds(constraint, spots, self._brief.size_m, self._thing.size_m, other)
+        return holds(constraint, spots, self._brief.size_m, self._item.size_m, other)
 
     def _scores(self, spots: SpotCandidates, held: Sequence[BoolArray]) -> FloatArray:
-        brief, thing = self._brief, self._thing
+        brief, item = self._brief, self._item
         score = RANDOM_SCORE * self._rng.random(len(spots))
-        kinds = {constraint.kind for constraint in thing.constraints}
-        for constraint, row in zip(thing.constraints, held, strict=True):
+        kinds = {constraint.kind for constraint in item.constraints}
+        for constraint, row in zip(item.constraints, held, strict=True):
             shade = satisfaction(
-                constraint, spots, brief.size_m, thing.size_m, self._others.get(constraint.other)
+                constraint, spots, brief.size_m, item.size_m, self._others.get(constraint.other)
             )
             score += WEIGHTS[constraint.kind] * ((1 - GRADED_SHARE) * row + GRADED_SHARE * shade)
         if ConstraintKind.EDGE not in kinds:
@@ -218,10 +218,10 @@ class _Search:
         nearest = [gaps(spots, item) for item in self._others.values()]
         if nearest:
             score += CLEARANCE_BONUS * np.minimum(np.min(nearest, axis=0) / CLEARANCE_M, 1.0)
-        if thing.has_front and ConstraintKind.FACE_TO not in kinds:
+        if item.has_front and ConstraintKind.FACE_TO not in kinds:
             looks = _inward_facing(spots, brief.size_m) if brief.on_floor else np.cos(spots.yaw)
             score += (WALL_BONUS if brief.on_floor else FRONT_BONUS) * (looks > 0.9)
-        elif not thing.has_front and not brief.on_floor:
+        elif not item.has_front and not brief.on_floor:
             score += FRONT_BONUS / 2 * (spots.half[:, 1] >= spots.half[:, 0])
         return np.asarray(score)
 
@@ -241,9 +241,9 @@ class _Search:
                 x, y = spots.center[row].tolist()
                 if any(math.hypot(x - s.center_m[0], y - s.center_m[1]) < apart for s, _ in chosen):
                     continue
-                kept = tuple(w for w, h in zip(self._thing.constraints, held, strict=True) if h[row])
+                kept = tuple(w for w, h in zip(self._item.constraints, held, strict=True) if h[row])
                 chosen.append(
-                    (PlaneSpot(self._thing.name, (x, y), float(spots.yaw[row]), kept), float(scores[row]))
+                    (PlaneSpot(self._item.name, (x, y), float(spots.yaw[row]), kept), float(scores[row]))
                 )
                 if len(chosen) == BRANCHES:
                     return chosen

@@ -99,8 +99,8 @@ def brief_for(
         plane=plane.name,
         size_m=(width, depth),
         objects=tuple(
-            PlaneObject(thing.name, _extent(asset), constraints.get(thing.name, ()), thing.has_front)
-            for thing, asset in objects
+            PlaneObject(item.name, _extent(asset), constraints.get(item.name, ()), item.has_front)
+            for item, asset in objects
         ),
         obstacles=tuple(_obstacles(editor, plane, max((a.size_m[2] for _, a in objects), default=0.0))),
         zones=tuple(_zones(editor, plane)) if plane.on_floor else (),

@@ -192,8 +192,8 @@ class _Plan:
         for item, box, color in sorted(self._named, key=lambda named: (not named[0].host, _area(named[1]))):
             if not labels.inside(item.name, box, color, marks):
                 numbered.append((item, box, color))
-        told = self._told_by_host()
-        hidden = {name for names in told.values() for name in names}
+        names_by_host = self._names_by_host()
+        hidden = {name for names in names_by_host.values() for name in names}
         for item in self._small:
             if item.name not in hidden:
                 x, y = self._px(*item.pose_world_asset.position_m[:2])
@@ -203,7 +203,7 @@ class _Plan:
             if not labels.inside(str(number), box, color, marks):
                 labels.beside(str(number), _middle(box), color, marks)
             lines.append(f"{number}  {item.name}  {self._where(item)}".rstrip())
-        groups = [f"{where}: {counted(names)}" for where, names in sorted(told.items())]
+        groups = [f"{where}: {counted(names)}" for where, names in sorted(names_by_host.items())]
         return [*lines, *([""] if groups else []), *groups]
 
     def _label_rooms(self, labels: Labels) -> None:
@@ -219,13 +219,13 @@ class _Plan:
         x, y = self._px(self._scene.robot.x_m, self._scene.robot.y_m)
         labels.beside("robot", (x, y + int(ROBOT.radius_m * self._scale)), "#d02020", standing)
 
-    def _told_by_host(self) -> Mapping[str, Sequence[str]]:
+    def _names_by_host(self) -> Mapping[str, Sequence[str]]:
         """Group small objects by place, as ``inside shelf_1``, if there are too many for numbers."""
-        told = defaultdict(list)
+        names_by_host = defaultdict(list)
         for item in self._small:
             if item.relation and item.host:
-                told[self._where(item)].append(item.name)
-        return {where: names for where, names in told.items() if len(names) > _EACH_BY_NUMBER}
+                names_by_host[self._where(item)].append(item.name)
+        return {where: names for where, names in names_by_host.items() if len(names) > _EACH_BY_NUMBER}
 
     def _where(self, item: SceneObject) -> str:
         is_told = (item.relation and item.host) or self._is_small(item)

@@ -56,14 +56,16 @@ class SimulatedRobot:
     def __exit__(self, *_: object) -> None:
         self._simulator.close()
 
-    def can_pick_up(self, thing: str) -> bool:
+    def can_pick_up(self, object_name: str) -> bool:
         """True if the robot can pick the object up."""
-        return self._is_feasible(f"take {thing}", (thing,), None, lambda script: script.take(thing))
+        return self._is_feasible(
+            f"take {object_name}", (object_name,), None, lambda script: script.take(object_name)
+        )
 
-    def can_place(self, thing: str, relation: Relation, host: str) -> bool:
+    def can_place(self, object_name: str, relation: Relation, host: str) -> bool:
         """True if the robot can place the object on or in the host, where it is not yet."""
-        placed = Subgoals(placements=(PlacementGoal(thing, relation, host),))
-        return self._achieves(Atom(relation.value, (thing, host)), placed, thing, host)
+        placed = Subgoals(placements=(PlacementGoal(object_name, relation, host),))
+        return self._achieves(Atom(relation.value, (object_name, host)), placed, object_name, host)
 
     def can_swing(self, name: str, *, shut: bool) -> bool:
         """True if the robot can open, or close, all doors and drawers of the object, and they are not so yet."""
@@ -75,10 +77,12 @@ class SimulatedRobot:
         atom = Atom(State.TOGGLED_ON.value, (name,))
         return self._achieves(atom if on else Not(atom), Subgoals(on={name: on}), name)
 
-    def can_treat(self, thing: str, source: str, state: State) -> bool:
+    def can_treat(self, object_name: str, source: str, state: State) -> bool:
         """True if the object can become hot, cooked or frozen at the source and is not so yet."""
-        exposure = Exposure(thing, source, hot=state is not State.FROZEN)
-        return self._achieves(Atom(state.value, (thing,)), Subgoals(exposures=(exposure,)), thing, source)
+        exposure = Exposure(object_name, source, hot=state is not State.FROZEN)
+        return self._achieves(
+            Atom(state.value, (object_name,)), Subgoals(exposures=(exposure,)), object_name, source
+        )
 
     def _achieves(self, goal: Formula, subgoals: Subgoals, *names: str) -> bool:
         simulator = self._simulator

@@ -145,19 +145,19 @@ def unaccounted(scene: Scene) -> tuple[SceneProblem, ...]:
     A scene without an inventory in the catalog has nothing unaccounted for.
     """
     placed = Counter(item.asset_id for item in scene.objects)
-    told: Counter[str] = Counter()
+    reported: Counter[str] = Counter()
     for sentence in scene.left_out:
         match = _COUNT.match(sentence)
         if match is not None:
-            told[match[2]] += int(match[1])
+            reported[match[2]] += int(match[1])
     return tuple(
         SceneProblem(
             ProblemKind.UNACCOUNTED,
             (asset_id,),
-            f"{count} are listed, {placed[asset_id]} are placed, {told[asset_id]} are reported as left out",
+            f"{count} are listed, {placed[asset_id]} are placed, {reported[asset_id]} are reported as left out",
         )
         for asset_id, count in _listed(scene.base).items()
-        if placed[asset_id] + told[asset_id] < count
+        if placed[asset_id] + reported[asset_id] < count
     )
 
 

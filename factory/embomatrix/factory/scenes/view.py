@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 class RobotFeasibility(Protocol):
     """Feasibility of single actions from the start of a scene. Names are those of scene objects."""
 
-    def can_pick_up(self, thing: str) -> bool:
+    def can_pick_up(self, object_name: str) -> bool:
         """True if the robot can pick the object up."""
         ...
 
-    def can_place(self, thing: str, relation: Relation, host: str) -> bool:
+    def can_place(self, object_name: str, relation: Relation, host: str) -> bool:
         """True if the robot can place the object on or in the host."""
         ...
 
@@ -42,7 +42,7 @@ class RobotFeasibility(Protocol):
         """True if the robot can switch the object on, or off."""
         ...
 
-    def can_treat(self, thing: str, source: str, state: State) -> bool:
+    def can_treat(self, object_name: str, source: str, state: State) -> bool:
         """True if the object can become hot, cooked or frozen at the source and is not so yet."""
         ...
 
@@ -50,10 +50,10 @@ class RobotFeasibility(Protocol):
 class CapableRobot:
     """Feasibility without a check: every action is possible."""
 
-    def can_pick_up(self, thing: str) -> bool:
+    def can_pick_up(self, object_name: str) -> bool:
         return True
 
-    def can_place(self, thing: str, relation: Relation, host: str) -> bool:
+    def can_place(self, object_name: str, relation: Relation, host: str) -> bool:
         return True
 
     def can_swing(self, name: str, *, shut: bool) -> bool:
@@ -62,7 +62,7 @@ class CapableRobot:
     def can_switch(self, name: str, *, on: bool) -> bool:
         return True
 
-    def can_treat(self, thing: str, source: str, state: State) -> bool:
+    def can_treat(self, object_name: str, source: str, state: State) -> bool:
         return True
 
 
@@ -171,9 +171,9 @@ class SceneView:
             for interior in asset.interiors
         )
 
-    def takes(self, host: str, thing: str, *, inside: bool) -> bool:
+    def takes(self, host: str, object_name: str, *, inside: bool) -> bool:
         """True if a cavity or an open surface of the host is larger than the object."""
-        size, asset = sorted(self.asset(thing).size_m), self.asset(host)
+        size, asset = sorted(self.asset(object_name).size_m), self.asset(host)
         if inside:
             return any(
                 all(a < b for a, b in zip(size, sorted(interior.size_m), strict=True))

@@ -218,7 +218,12 @@ def _placed(problem: BddlProblem, notes: list[str]) -> BddlProblem:
     for name, type_name in problem.objects.items():
         if type_name in FLOORS and name not in known:
             above = next(
-                (known[thing] for thing, host in rests.items() if host == name and thing in known), first
+                (
+                    known[object_name]
+                    for object_name, host in rests.items()
+                    if host == name and object_name in known
+                ),
+                first,
             )
             put(name, above)
     return dataclasses.replace(problem, init=(*problem.init, *added)) if added else problem

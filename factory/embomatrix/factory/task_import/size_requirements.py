@@ -69,14 +69,16 @@ def requirements_of(problem: BddlProblem) -> Mapping[str, Requirement]:
         for atom in atoms:
             if atom.predicate not in PLACED:
                 continue
-            thing, host = (name.lstrip("?") for name in atom.args)
+            object_name, host = (name.lstrip("?") for name in atom.args)
             if borne is ended and not _holds_at_start(problem, atom):
                 # of two neighbours, the one that is not in the room yet
-                carried.add(host if atom.predicate == Relation.NEXTTO and thing in fixtures else thing)
+                carried.add(
+                    host if atom.predicate == Relation.NEXTTO and object_name in fixtures else object_name
+                )
             if atom.predicate in (Relation.INSIDE, Relation.ONTOP):
                 bears.add(host)
-                places[thing][Relation(atom.predicate), problem.types.get(host, (host,))[0]] = None
-                borne[atom.predicate, host] += _share(problem, thing, host)
+                places[object_name][Relation(atom.predicate), problem.types.get(host, (host,))[0]] = None
+                borne[atom.predicate, host] += _share(problem, object_name, host)
     found = {}
     for name in (*problem.objects, *problem.types):
         contents, burden = (
@@ -160,9 +162,9 @@ def _holds_at_start(problem: BddlProblem, atom: Atom) -> bool:
     return all(any((one, other) in at_start for other in second) for one in first)
 
 
-def _share(problem: BddlProblem, thing: str, host: str) -> list[str]:
+def _share(problem: BddlProblem, object_name: str, host: str) -> list[str]:
     """Return the types of the objects for one host if the objects are distributed evenly."""
-    things = problem.types.get(thing, (thing,))
+    object_names = problem.types.get(object_name, (object_name,))
     hosts = problem.types.get(host, (host,))
-    type_name = problem.objects.get(thing, thing)
-    return [type_name] * math.ceil(len(things) / max(1, len(hosts)))
+    type_name = problem.objects.get(object_name, object_name)
+    return [type_name] * math.ceil(len(object_names) / max(1, len(hosts)))

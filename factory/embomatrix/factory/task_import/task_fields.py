@@ -81,18 +81,18 @@ def sources_for(
         if atom.predicate not in _THERMAL:
             continue
         effect = State(atom.predicate)
-        things = types.get(atom.args[0].lstrip("?"), (atom.args[0],))
-        for thing in things:
-            if thing not in view.scene.by_name:
+        object_names = types.get(atom.args[0].lstrip("?"), (atom.args[0],))
+        for object_name in object_names:
+            if object_name not in view.scene.by_name:
                 continue
-            if any(effect in view.thermal_effects(thing, name) for name in known):
+            if any(effect in view.thermal_effects(object_name, name) for name in known):
                 continue
             able = (
                 item.name
                 for item in view.scene.objects
                 if item.fixed
                 and view.is_source(item.name)
-                and effect in view.thermal_effects(thing, item.name)
+                and effect in view.thermal_effects(object_name, item.name)
                 and view.opens(item.name)
             )
             yield from itertools.islice(able, 1)

@@ -48,8 +48,8 @@ logger = logging.getLogger(__name__)
 class RunHistory:
     """History of open and closed runs. Reads the process's own clocks."""
 
-    def __init__(self, chronicle: RunEventLog, archive: RunArchive, cluster: ClusterState) -> None:
-        self._event_log = chronicle
+    def __init__(self, event_log: RunEventLog, archive: RunArchive, cluster: ClusterState) -> None:
+        self._event_log = event_log
         self._archive = archive
         self._cluster = cluster
 

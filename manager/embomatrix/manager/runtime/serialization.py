@@ -80,9 +80,9 @@ def timed_row(row: ResultRow, deliver_s: float) -> ResultRow:
     return ResultRow(row.cursor, row.rollout_id, row.payload + _DELIVERED + _DOUBLE.pack(deliver_s))
 
 
-def reputation_row(worker_id: str, repute: Reputation) -> ShelfRow:
+def reputation_row(worker_id: str, worker_reputation: Reputation) -> ShelfRow:
     """Return the row of a reputation. Open disputes are dropped, since their rollouts are executed again."""
-    kept = {name: value for name, value in asdict(repute).items() if name != "disputed"}
+    kept = {name: value for name, value in asdict(worker_reputation).items() if name != "disputed"}
     return ShelfRow(worker_id, json.dumps(kept, separators=(",", ":")).encode())
 
 

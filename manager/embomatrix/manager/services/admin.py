@@ -32,8 +32,8 @@ class AdminServicer(admin_service_pb2_grpc.AdminServiceServicer):
     ) -> pb.ListWorkersResponse:
         async with translate(context):
             workers = [worker_info_to_proto(info) for info in worker_infos(self._runtime)]
-            told = health(overview(self._runtime), paused=self._runtime.paused, now_s=time.time())
-        return pb.ListWorkersResponse(workers=workers, health=told.sentence, mood=told.mood)
+            verdict = health(overview(self._runtime), paused=self._runtime.paused, now_s=time.time())
+        return pb.ListWorkersResponse(workers=workers, health=verdict.sentence, mood=verdict.mood)
 
     async def ListRuns(
         self, request: pb.ListRunsRequest, context: grpc.aio.ServicerContext

@@ -306,14 +306,14 @@ def _worker(runtime: ManagerRuntime, worker_id: str) -> WorkerView:
     scheduler = runtime.cluster.scheduler
     held = len(record.held) if record else 0
     residents = scheduler.residents(worker_id)
-    repute = runtime.cluster.dispatcher.auditor.of(worker_id)
+    reputation = runtime.cluster.dispatcher.auditor.of(worker_id)
     here = {r.bundle_digest for r in residents if r.state is not ResidentState.FAILED}
     return WorkerView(
         worker_id=worker_id,
         state=_standing(runtime, session).value,
-        reason=repute.quarantine or session.reason,
-        audited=repute.audited,
-        audit_mismatches=repute.mismatches,
+        reason=reputation.quarantine or session.reason,
+        audited=reputation.audited,
+        audit_mismatches=reputation.mismatches,
         slots=session.resources.slots,
         busy=min(held, record.slots) if record else 0,
         waiting=max(0, held - record.slots) if record else 0,

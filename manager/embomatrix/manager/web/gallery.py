@@ -227,8 +227,8 @@ class Gallery:
 
 def _row(scene: Scene, name: str, about: frozenset[str]) -> ObjectRow:
     item, asset = scene.by_name[name], scene.asset_of(name)
-    told = sorted(state.value for state in item.states)
-    told += ["open"] if any(share > 0 for share in item.joints) else []
+    state_words = sorted(state.value for state in item.states)
+    state_words += ["open"] if any(share > 0 for share in item.joints) else []
     size = [round(extent, 2) for extent in asset.size_m]
     return ObjectRow(
         name,
@@ -236,7 +236,7 @@ def _row(scene: Scene, name: str, about: frozenset[str]) -> ObjectRow:
         _where(scene, name),
         size,
         float(f"{asset.mass_kg:.3g}"),
-        ", ".join(told),
+        ", ".join(state_words),
         name in about,
     )
 

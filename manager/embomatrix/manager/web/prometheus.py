@@ -73,20 +73,20 @@ class _Cluster(Collector):
         )
 
     def _work(self) -> Iterator[Metric]:
-        runtime, chronicle = self._runtime, self._runtime.event_log
+        runtime, event_log = self._runtime, self._runtime.event_log
         dispatcher, totals = runtime.cluster.dispatcher, runtime.cluster.totals()
         yield _gauge("embo_runs", "Open runs.", len(runtime.runs.open))
         yield _gauge("embo_queue_depth", "Queued rollouts.", dispatcher.queued)
         yield _gauge("embo_leases", "Live leases.", len(dispatcher.live_leases))
         outcomes = {name: runtime.meter.outcomes[name] for name in OUTCOMES}
         yield _counter("embo_rollouts", "Rollouts by outcome.", outcomes, "outcome")
-        phases = {phase.value: histogram for phase, histogram in chronicle.phases().items()}
+        phases = {phase.value: histogram for phase, histogram in event_log.phases().items()}
         yield _histograms("embo_rollout_seconds", "Time of completed rollouts by phase.", "phase", phases)
-        yield _attempts(chronicle.attempts)
+        yield _attempts(event_log.attempts)
         yield _counter("embo_redispatched", "Re-dispatched leases.", totals.redispatched)
         yield _counter("embo_lease_expired", "Expired leases.", dispatcher.expired)
         yield _counter("embo_stale_results", "Late results that were rejected.", totals.stale_results)
-        won = chronicle.hedges_won
+        won = event_log.hedges_won
         hedges = {"true": won, "false": max(0, totals.hedged - won)}
         yield _counter("embo_hedges", "Hedge leases, by whether they delivered first.", hedges, "won")
         yield _counter("embo_groups_failed", "Failed groups.", totals.groups_failed)

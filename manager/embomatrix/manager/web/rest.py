@@ -172,8 +172,8 @@ def _logs(router: APIRouter, runtime: ManagerRuntime) -> None:
         """Totals of an open run, or of one of the last 50 closed runs."""
         with http_errors():
             summary = await history.summary(run_id)
-        told = dataclasses.asdict(dataclasses.replace(summary, failures=()))
-        return JSONResponse({**told, "failures": [_event(event) for event in summary.failures]})
+        values = dataclasses.asdict(dataclasses.replace(summary, failures=()))
+        return JSONResponse({**values, "failures": [_event(event) for event in summary.failures]})
 
     @router.get("/runs/{run_id}/timeline", response_model=Timeline)
     async def tracks(run_id: str, seconds: Seconds = 60.0, search: Search = "") -> Response:
@@ -250,8 +250,8 @@ async def _growing(runtime: ManagerRuntime, run: str, after: int) -> AsyncIterat
 def _event(event: RunEvent) -> dict[str, Any]:
     """Return the event's fields that are set."""
     timings = dataclasses.asdict(event.timings) if event.timings is not None else None
-    told = event._replace(timings=None)._asdict() | {"timings": timings}
-    return {name: value for name, value in told.items() if value}
+    values = event._replace(timings=None)._asdict() | {"timings": timings}
+    return {name: value for name, value in values.items() if value}
 
 
 def _json(value: Any) -> Response:

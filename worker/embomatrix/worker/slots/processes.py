@@ -311,8 +311,8 @@ async def start_root(
             answer = await peer.receive()
     except (ProcessGoneError, TimeoutError, OSError) as error:
         await Root(peer, process, 0.0).end()
-        said = (await asyncio.to_thread(_last_line, log)) or str(error)
-        raise ProcessGoneError(f"the simulator did not start: {said} (its output is in {log})") from error
+        message = (await asyncio.to_thread(_last_line, log)) or str(error)
+        raise ProcessGoneError(f"the simulator did not start: {message} (its output is in {log})") from error
     if "error" in answer.header:
         await Root(peer, process, 0.0).end()
         raise ProcessGoneError(str(answer.header["error"]))
