@@ -55,15 +55,15 @@ def test_unknown_name_error_suggests_similar_names(kitchen, tmp_path, arguments,
             "I would rather not.",
             "no plan was found (the text begins with 'I would rather not.'): expected a JSON array",
         ),
-        ('[{"action": "move", "object_index": 3}', "its JSON is wrong at line 1, column 39"),
+        ('[{"action": "move", "object_index": 3}', "its JSON is invalid at line 1, column 39"),
         (
             '[{"action": "dance", "object_index": 3}]',
-            "step 1: unknown skill 'dance': expected one of move, turn",
+            "step 1: found the unknown skill 'dance': expected one of move, turn",
         ),
         ("open 1\n" * 9_000, "the plan has 9000 steps: expected at most 64"),
-        (json.dumps([{"action": "open", "object_index": 1}] * 10_000), "a plan has at most 65536"),
-        ('[{"action": "turn", "yaw": NaN}]', "yaw must be a finite number, found nan"),
-        ('[{"action": "move"}]', "step 1: move lacks object_index: it takes object_index"),
+        (json.dumps([{"action": "open", "object_index": 1}] * 10_000), "expected at most 65536"),
+        ('[{"action": "turn", "yaw": NaN}]', "yaw is nan: expected a finite number"),
+        ('[{"action": "move"}]', "step 1: move has no object_index: expected `move object_index`"),
         ("", "the text is empty"),
         (bytes(range(256)) * 20, "no plan was found"),
     ],
@@ -73,7 +73,7 @@ def test_unparsable_text_earns_minus_one_with_a_reason(kitchen, tmp_path, plan, 
     file = tmp_path / "plan"
     file.write_bytes(plan if isinstance(plan, bytes) else plan.encode())
     result = run("play", TASK, f"--plan={file}", f"--dataset={kitchen}")
-    assert_ended(result, 1, words, "the text is no plan: it was not executed", "-1.00")
+    assert_ended(result, 1, words, "the text is not a plan and was not executed", "-1.00")
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_failed_step_shows_its_reason_and_ends_the_plan(kitchen, plan, words):
             "object 'pear.n.01_1' is not declared: add it to :objects",
         ),
         ("", "problem: line 1, column 1: the text is empty: expected '(define (problem NAME) ...)'"),
-        (b"\xff\xfe\x00", "problem.bddl is no text in UTF-8: expected BDDL problems"),
+        (b"\xff\xfe\x00", "problem.bddl is not UTF-8 text: expected BDDL problems"),
         (None, "problem.bddl can't be read (No such file or directory)"),
     ],
     ids=["parenthesis", "type", "undeclared", "empty", "binary", "absent"],
@@ -201,7 +201,7 @@ def test_missing_package_error_names_the_extra(kitchen, tmp_path, package, argum
         ),
         (
             ("status", "--manager=nowhere"),
-            "'nowhere' is no manager address: expected HOST:PORT",
+            "'nowhere' is not a manager address: expected HOST:PORT",
         ),
         (("worker", "run", "--manager=host:99999"), "--manager 'host:99999': expected HOST:PORT"),
         (("worker", "run", "--nice=50"), "--nice 50: input should be less than or equal to 19"),
@@ -251,7 +251,7 @@ def test_unwritable_folder_is_named(kitchen, tmp_path, arguments, words):
 
 def test_full_disk_leaves_no_partial_scene_file(tmp_path):
     result = run_anew("scene", "build", "Rs_int", f"--out={tmp_path}", largest_file=4096)
-    assert_ended(result, 2, "Rs_int.json can't be written (File too large): make room")
+    assert_ended(result, 2, "Rs_int.json can't be written (File too large): free disk space")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -277,10 +277,10 @@ def test_interrupted_evaluation_resumes_from_its_answers(kitchen, tmp_path):
     with server.serving() as url:
         with background(tmp_path / "log", *arguments, f"--endpoint={url}") as asking:
             asking.wait_for(lambda: (out / "answers.jsonl").exists() and len(_lines(out)) == 3)
-            assert_ended(asking.interrupt(), 130, "the same command goes on from there")
+            assert_ended(asking.interrupt(), 130, "the same command continues from there")
         server.script = ["move 10"]
         result = run(*arguments, f"--endpoint={url}")
-    assert_ended(result, 0, "2 answers are there already", "12 answers in", "goal_not_met 12 100.0%")
+    assert_ended(result, 0, "2 answers are already stored", "12 answers in", "goal_not_met 12 100.0%")
 
 
 def _lines(out):
@@ -295,9 +295,11 @@ def test_interrupted_build_leaves_no_dataset_and_resumes(tmp_path):
     with background(tmp_path / "log", *arguments) as building:
         building.wait_for((out / "build.jsonl").exists)
         result = building.interrupt()
-    assert_ended(result, 130, "interrupted: what was built is kept in", "the same command goes on from there")
+    assert_ended(
+        result, 130, "interrupted: finished tasks are kept in", "run the same command again to resume"
+    )
     assert not (out / "tasks.jsonl").exists()
     other = run(
         "factory", "build", f"--out={out}", "--scene=Rs_int", "--train=9", "--heldout=0", "--no-look-ahead"
     )
-    assert_ended(other, 2, "holds a build of other settings (train 8, now 9): give the same again")
+    assert_ended(other, 2, "holds a build with other settings (train 8, now 9): give the same settings again")

@@ -98,4 +98,4 @@ async def test_unsupported_skill_fails_the_rollout_and_unknown_room_fails_the_st
     assert [step.failure for step in walked.steps] == [None, FailureReason.UNKNOWN_ROOM]
     assert "the rooms are" in walked.steps[1].message
     assert lost.code is InfraCode.SLOT_CRASHED
-    assert "SKILL_KIND_PICK_UP is beyond this worker" in lost.message
+    assert "this worker does not support SKILL_KIND_PICK_UP" in lost.message

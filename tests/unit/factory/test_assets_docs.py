@@ -32,7 +32,7 @@ def test_table_of_families_counts_every_category_in_use_once() -> None:
         assert sum(counts[family] for family in found) == int(number.strip(" |")), kind
     assert sorted(listed) == sorted(Family)
     assert (
-        f"{len(catalog.category_names):,} categories of solid things {len(catalog.used_categories):,} stand"
+        f"{len(catalog.category_names):,} categories of solid objects {len(catalog.used_categories):,} occur"
         in PAGE
     )
 

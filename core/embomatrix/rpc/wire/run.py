@@ -57,7 +57,7 @@ def run_terms_from_proto(message: rollout_service_pb2.OpenRunRequest) -> RunTerm
     policy = enum_member("group_policy", _POLICY_VALUES, message.group_policy)
     for field in ("weight", "rollout_deadline_s"):
         if finite(field, getattr(message, field)) < 0:
-            raise ConvertError(field, f"is {getattr(message, field)}: it can't be below 0")
+            raise ConvertError(field, f"found {getattr(message, field)}: expected 0 or more")
     # An unset weight reads as 0.
     return RunTerms(
         policy,

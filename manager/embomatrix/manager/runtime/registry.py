@@ -274,7 +274,10 @@ class Registry:
     def _there(self, worker_id: str) -> WorkerSession:
         session = self._sessions.get(worker_id)
         if session is None:
-            raise NotFoundError(f"there is no worker {worker_id!r}: connected are {name_list(self.present)}")
+            raise NotFoundError(
+                f"there is no worker {worker_id!r} (connected: {name_list(self.present)}): check its name with "
+                "`embomatrix cluster workers`"
+            )
         if session.standing.is_gone:
             raise NotFoundError(f"worker {worker_id!r} is gone ({session.reason}): restart it on its machine")
         return session

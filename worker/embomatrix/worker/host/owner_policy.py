@@ -35,7 +35,7 @@ class Hours:
         first_h, first_m, last_h, last_m = map(int, found.groups())
         hours = Hours(first_h * 60 + first_m, last_h * 60 + last_m)
         if hours.begin == hours.end:
-            raise ValueError("begins when it ends: leave it out to work all day")
+            raise ValueError("the interval is empty: leave the option out to work all day")
         return hours
 
     def has(self, minute: int) -> bool:
