@@ -55,15 +55,15 @@ def test_unknown_name_error_suggests_similar_names(kitchen, tmp_path, arguments,
             "I would rather not.",
             "no plan was found (the text begins with 'I would rather not.'): expected a JSON array",
         ),
-        ('[{"action": "move", "object_index": 3}', "its JSON is wrong at line 1, column 39"),
+        ('[{"action": "move", "object_index": 3}', "its JSON is invalid at line 1, column 39"),
         (
             '[{"action": "dance", "object_index": 3}]',
-            "step 1: unknown skill 'dance': expected one of move, turn",
+            "step 1: found the unknown skill 'dance': expected one of move, turn",
         ),
         ("open 1\n" * 9_000, "the plan has 9000 steps: expected at most 64"),
-        (json.dumps([{"action": "open", "object_index": 1}] * 10_000), "a plan has at most 65536"),
-        ('[{"action": "turn", "yaw": NaN}]', "yaw must be a finite number, found nan"),
-        ('[{"action": "move"}]', "step 1: move lacks object_index: it takes object_index"),
+        (json.dumps([{"action": "open", "object_index": 1}] * 10_000), "expected at most 65536"),
+        ('[{"action": "turn", "yaw": NaN}]', "yaw is nan: expected a finite number"),
+        ('[{"action": "move"}]', "step 1: move has no object_index: expected `move object_index`"),
         ("", "the text is empty"),
         (bytes(range(256)) * 20, "no plan was found"),
     ],
@@ -201,7 +201,7 @@ def test_missing_package_error_names_the_extra(kitchen, tmp_path, package, argum
         ),
         (
             ("status", "--manager=nowhere"),
-            "'nowhere' is no manager address: expected HOST:PORT",
+            "'nowhere' is not a manager address: expected HOST:PORT",
         ),
         (("worker", "run", "--manager=host:99999"), "--manager 'host:99999': expected HOST:PORT"),
         (("worker", "run", "--nice=50"), "--nice 50: input should be less than or equal to 19"),
@@ -302,4 +302,4 @@ def test_interrupted_build_leaves_no_dataset_and_resumes(tmp_path):
     other = run(
         "factory", "build", f"--out={out}", "--scene=Rs_int", "--train=9", "--heldout=0", "--no-look-ahead"
     )
-    assert_ended(other, 2, "holds a build with other settings (train 8, now 9): give the same settings")
+    assert_ended(other, 2, "holds a build with other settings (train 8, now 9): give the same settings again")

@@ -124,7 +124,7 @@ async def test_task_pages_show_gallery_and_oracle_plan(browser, kitchen, tmp_pat
     assert one.classes.count("step") == len(record.oracle) + 1
     assert one.classes.count("goal") == len(record.task.goal_objects)
     assert one.classes.count("floor") == 1
-    assert "the dataset holds no task 'nothing'" in none.words["main"]
+    assert "the dataset has no task 'nothing'" in none.words["main"]
 
 
 async def test_task_page_without_dataset_shows_the_option(browser, tmp_path):

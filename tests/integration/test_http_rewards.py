@@ -79,14 +79,14 @@ async def test_infrastructure_failure_returns_503_without_a_reward(tmp_path):
     [
         ({"query": ["a"]}, 422, "prompts"),
         ({"query": [], "prompts": [], "labels": []}, 422, "query"),
-        ({**asked("move 1"), "labels": []}, 422, "send as many of each"),
+        ({**asked("move 1"), "labels": []}, 422, "send the same number of each"),
         (asked("move 1", label="42"), 422, "found the label '42'"),
         (
             asked("move 1", label=LABEL.replace('"seed": 7', '"seed": -1')),
             422,
             "seed: Input should be greater than or equal to 0",
         ),
-        ({**asked("move 1"), "query": ["move 1"]}, 422, "the query 'move 1' does not hold its prompt"),
+        ({**asked("move 1"), "query": ["move 1"]}, 422, "the query 'move 1' does not contain its prompt"),
         (
             asked("move 1", label=RewardLabel("t", f"sha256:{'0' * 64}", Profile.PAPER, 0).text()),
             409,

@@ -317,7 +317,7 @@ async def test_uploaded_bundle_with_wrong_digest_is_refused(tmp_path):
     async with manager(tmp_path) as at, ClusterClient(at.address) as client:
         with pytest.raises(InvalidRequestError, match="damaged"):
             await client.put_bundles({KITCHEN: BEDROOM_DATA})
-        with pytest.raises(InvalidRequestError, match="is no digest"):
+        with pytest.raises(InvalidRequestError, match="is not a digest"):
             await client.put_bundles({"../../etc/passwd": b"x"})
         assert await client.put_bundles({KITCHEN: KITCHEN_DATA}) == (KITCHEN,)
         assert await client.put_bundles({KITCHEN: KITCHEN_DATA}) == ()

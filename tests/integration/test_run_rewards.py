@@ -75,7 +75,7 @@ async def test_invalid_coefficients_are_refused_at_open_run(tmp_path):
         stub = rollout_service_pb2_grpc.RolloutServiceStub(channel)
         bad = types_pb2.RewardSettings(unparsable=-1, format=0.5, goal=-30)
         with (
-            pytest.raises(InvalidRequestError, match=r"reward\.goal: is -30: a tier pays 0 or more"),
+            pytest.raises(InvalidRequestError, match=r"reward\.goal: found -30: expected 0 or more"),
             cluster_errors(at.address),
         ):
             await stub.OpenRun(

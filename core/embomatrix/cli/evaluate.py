@@ -258,9 +258,8 @@ def read_eval_settings(path: Path | None, options: dict[str, Any]) -> EvalSettin
         ) from error
     except ValidationError as error:
         first = error.errors()[0]
-        raise TrainerError(
-            f"setting {first['loc'][0]!r}: {first['msg']} (found {first['input']!r})"
-        ) from error
+        expected = first["msg"][:1].lower() + first["msg"][1:]
+        raise TrainerError(f"setting {first['loc'][0]!r}: {expected} (found {first['input']!r})") from error
     except ValueError as error:
         raise TrainerError(f"the settings {path} are not valid TOML ({error}): fix the file") from error
 

@@ -48,7 +48,8 @@ def shown(command: str) -> Iterator[None]:
         if isinstance(error, OSError) and error.errno in _STORAGE:
             where = f"{error.filename} can't be written" if error.filename else "a file can't be written"
             fail(
-                command, f"{where} ({error.strerror}): make room or give rights there, or name another folder"
+                command,
+                f"{where} ({error.strerror}): free disk space, fix the permissions or name another folder",
             )
         path = _keep(error)
         fail(

@@ -15,7 +15,7 @@ class RewardSettingsError(ValueError):
     """Raised for an invalid coefficient. ``problem`` states the value found and the value expected."""
 
     def __init__(self, field: str, problem: str) -> None:
-        super().__init__(f"{field} {problem}")
+        super().__init__(f"{field}: {problem}")
         self.field = field
         self.problem = problem
 
@@ -38,15 +38,17 @@ class RewardSettings:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if not (math.isfinite(value) and abs(value) <= LARGEST):
-                raise RewardSettingsError(field.name, f"is {value:g}: expected a number between -1e6 and 1e6")
+                raise RewardSettingsError(
+                    field.name, f"found {value:g}: expected a number between -1e6 and 1e6"
+                )
             if value < 0 and field.name != "unparsable":
                 raise RewardSettingsError(
-                    field.name, f"is {value:g}: a tier pays 0 or more, and 0 leaves it out"
+                    field.name, f"found {value:g}: expected 0 or more; 0 disables the tier"
                 )
         if self.unparsable > self.format:
             raise RewardSettingsError(
                 "unparsable",
-                f"is {self.unparsable:g} and format {self.format:g}: "
+                f"found {self.unparsable:g} with format {self.format:g}: "
                 f"expected at most the reward of a plan; lower it",
             )
 

@@ -62,7 +62,7 @@ def open_channel(address: str, token: str = "", ca: bytes = b"") -> grpc.aio.Cha
     """
     if not is_address(address):
         raise InvalidRequestError(
-            f"{address!r} is no manager address: expected HOST:PORT, as in {DEFAULT_ADDRESS}"
+            f"{address!r} is not a manager address: expected HOST:PORT, as in {DEFAULT_ADDRESS}"
         )
     if not re.fullmatch(TOKEN_PATTERN, token):
         raise InvalidRequestError("the token can't be sent: expected visible ASCII characters without spaces")

@@ -37,7 +37,7 @@ class Managers:
         for address in self.addresses:
             if not is_address(address):
                 raise InvalidRequestError(
-                    f"{address!r} is no manager address: expected HOST:PORT, as in {DEFAULT_ADDRESS}, or several with "
+                    f"{address!r} is not a manager address: expected HOST:PORT, as in {DEFAULT_ADDRESS}, or several with "
                     "commas between them"
                 )
         self.current = self.addresses[0]

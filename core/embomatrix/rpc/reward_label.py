@@ -37,8 +37,8 @@ class RewardLabel:
             first = error.errors(include_url=False, include_context=False)[0]
             field = ".".join(map(str, first["loc"])) or "label"
             raise InvalidRequestError(
-                f"found the label {text[:80]!r} ({field}: {first['msg']}): expected one that "
-                "`trainer.adapters.openrlhf.rows` wrote"
+                f"found the label {text[:80]!r} ({field}: {first['msg']}): expected a label that "
+                "`trainer.adapters.openrlhf.rows` writes"
             ) from error
 
 
@@ -50,6 +50,6 @@ def answer_in(query: str, prompt: str) -> str:
     _, found, answer = query.partition(prompt)
     if not found:
         raise InvalidRequestError(
-            f"the query {query[:80]!r} does not hold its prompt {prompt[:80]!r}: send both as they were"
+            f"the query {query[:80]!r} does not contain its prompt {prompt[:80]!r}: send both unchanged"
         )
     return answer

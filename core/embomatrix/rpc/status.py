@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 ERROR_KEY: Final = "embomatrix-error"
-"""Trailing metadata key of every status that our services set. It tells an overloaded manager from a dead one."""
+"""Trailing metadata key of every status that our services set. It distinguishes an overloaded manager from a dead one."""
 LEADER_KEY: Final = "embomatrix-leader"
 """Trailing metadata key with the leader's address, set by a standby manager."""
 
@@ -187,11 +187,11 @@ def cluster_error(error: grpc.aio.AioRpcError, address: str) -> ClusterError:
             )
         case grpc.StatusCode.DEADLINE_EXCEEDED:
             return DeadlineError(
-                f"the manager at {address} did not answer in time: is it overloaded or paused?"
+                f"the manager at {address} did not answer in time: check its load, and that it is not paused"
             )
         case grpc.StatusCode.UNIMPLEMENTED:
             return PreconditionError(
-                f"the server at {address} is no manager of this version ({details}): "
+                f"the server at {address} is not a manager of this version ({details}): "
                 "check --manager and update both"
             )
         case _:

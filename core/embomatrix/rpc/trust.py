@@ -37,8 +37,10 @@ def read_token(text: str) -> str:
     try:
         return Path(text[1:]).expanduser().read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError) as error:
-        problem = error.strerror if isinstance(error, OSError) else "it holds no token"
-        raise InvalidRequestError(f"--token {text}: the file can't be read ({problem})") from error
+        problem = error.strerror if isinstance(error, OSError) else "it contains no token"
+        raise InvalidRequestError(
+            f"--token {text}: the file can't be read ({problem}): name the file that contains the token"
+        ) from error
 
 
 def read_ca(path: Path | None) -> bytes:
@@ -49,10 +51,12 @@ def read_ca(path: Path | None) -> bytes:
         text = path.expanduser().read_text(encoding="ascii")
         fingerprint_of(text)
     except OSError as error:
-        raise InvalidRequestError(f"--ca {path}: the file can't be read ({error.strerror})") from error
+        raise InvalidRequestError(
+            f"--ca {path}: the file can't be read ({error.strerror}): name the manager's ca.pem"
+        ) from error
     except ValueError as error:
         raise InvalidRequestError(
-            f"--ca {path}: it holds no certificate: pass the ca.pem that `embomatrix manager init` wrote"
+            f"--ca {path}: it contains no certificate: pass the ca.pem that `embomatrix manager init` wrote"
         ) from error
     return text.encode("ascii")
 
@@ -146,6 +150,6 @@ def _certificate_at(address: str) -> bytes:
         ) from error
     except OSError as error:
         raise ManagerUnreachableError(
-            f"no manager answers at {address} ({error.strerror or error}): is the address right, and the port open?"
+            f"no manager answers at {address} ({error.strerror or error}): check the address and that the port is open"
         ) from error
     return ssl.DER_cert_to_PEM_cert(shown or b"").encode("ascii")

@@ -70,7 +70,8 @@ def parse_plan(text: str, profile: Profile = Profile.PAPER) -> Plan:
     size = len(text.encode("utf-8", errors="replace"))
     if size > MAX_PLAN_BYTES:
         raise PlanError(
-            PlanReason.TOO_LONG, f"the text has {size} bytes: a plan has at most {MAX_PLAN_BYTES}"
+            PlanReason.TOO_LONG,
+            f"the text has {size} bytes: expected at most {MAX_PLAN_BYTES}; shorten the plan",
         )
     answer = _without_reasoning(text)
     value = _last_json_plan(answer)
@@ -124,7 +125,7 @@ def _check_length(count: int) -> None:
         raise PlanError(PlanReason.NO_PLAN, "the plan is empty: expected at least one skill call")
     if count > MAX_STEPS:
         raise PlanError(
-            PlanReason.TOO_MANY_STEPS, f"the plan has {count} steps: expected at most {MAX_STEPS}"
+            PlanReason.TOO_MANY_STEPS, f"the plan has {count} steps: expected at most {MAX_STEPS}; shorten it"
         )
 
 
@@ -159,12 +160,15 @@ def _last_json_plan(text: str) -> object | None:
 def _call_from_json(value: object, number: int, profile: Profile) -> SkillCall:
     """Read one call. Unknown keys, such as comments, are ignored."""
     if not isinstance(value, dict) or "action" not in value:
-        raise PlanError(PlanReason.MISSING_ARGUMENT, f'step {number} has no "action": name the skill')
+        raise PlanError(
+            PlanReason.MISSING_ARGUMENT,
+            f'step {number} has no "action": add the name of a skill, as in {{"action": "move", "object_index": 0}}',
+        )
     nested = value.get("parameters", {})
     if not isinstance(nested, dict):
         raise PlanError(
             PlanReason.WRONG_ARGUMENT,
-            f'step {number}: "parameters" must be an object, found {_shown(nested)}',
+            f'step {number}: "parameters" is a {_shown(nested)}: expected an object such as {{"object_index": 0}}',
         )
     given = {**nested, **value}
     aliased = {arg.value: given[alias] for alias, arg in ALIASES.items() if alias in given}
@@ -194,10 +198,10 @@ def _found_instead(text: str) -> str:
     try:
         json.loads(content)
     except json.JSONDecodeError as error:
-        return f"its JSON is wrong at line {error.lineno}, column {error.colno}: {error.msg}"
+        return f"its JSON is invalid at line {error.lineno}, column {error.colno}: {error.msg}"
     except (ValueError, RecursionError):
         return "its JSON can't be read"
-    return "its JSON holds no array of calls"
+    return "its JSON contains no array of calls"
 
 
 def _segments(text: str) -> Iterator[list[str]]:
@@ -221,7 +225,7 @@ def _call_from_words(words: list[str], number: int, profile: Profile) -> SkillCa
     if len(words) - 1 > len(expected):
         raise PlanError(
             PlanReason.WRONG_ARGUMENT,
-            f"step {number}: {skill.value} takes {_signature(skill)}, found {len(words) - 1} arguments",
+            f"step {number}: found {_shown(' '.join(words))}: expected `{_signature(skill)}`",
         )
     values = {arg.value: _number_or_word(word) for arg, word in zip(expected, words[1:], strict=False)}
     return _build_call(skill, values, number)
@@ -242,7 +246,7 @@ def _skill(value: object, number: int, profile: Profile) -> Skill:
     if skill is None:
         raise PlanError(
             PlanReason.UNKNOWN_SKILL,
-            f"step {number}: unknown skill {_shown(value)}: expected one of {', '.join(known)}",
+            f"step {number}: found the unknown skill {_shown(value)}: expected one of {', '.join(known)}",
         )
     return skill
 
@@ -253,7 +257,7 @@ def _build_call(skill: Skill, values: Mapping[str, object], number: int) -> Skil
         if values.get(arg.value) is None:
             raise PlanError(
                 PlanReason.MISSING_ARGUMENT,
-                f"step {number}: {skill.value} lacks {arg.value}: it takes {_signature(skill)}",
+                f"step {number}: {skill.value} has no {arg.value}: expected `{_signature(skill)}`",
             )
         arguments[arg.value] = _checked(arg, values[arg.value], number)
     return SkillCall(skill, **cast("dict[str, Any]", arguments))
@@ -280,7 +284,7 @@ def _checked(arg: Arg, value: object, number: int) -> int | float | str:
                 return value.strip()
             expected = "the name of a room"
     raise PlanError(
-        PlanReason.WRONG_ARGUMENT, f"step {number}: {arg.value} must be {expected}, found {_shown(value)}"
+        PlanReason.WRONG_ARGUMENT, f"step {number}: {arg.value} is {_shown(value)}: expected {expected}"
     )
 
 
@@ -295,7 +299,7 @@ def _finite(value: object) -> float | None:
 
 
 def _signature(skill: Skill) -> str:
-    return ", ".join(arg.value for arg in SIGNATURES[skill])
+    return " ".join([skill.value, *(arg.value for arg in SIGNATURES[skill])])
 
 
 def _shown(value: object) -> str:

@@ -142,7 +142,7 @@ def parse_problem(text: str) -> BddlProblem:
     """Read a whole ``(define (problem ...) ...)``. Raises BddlError."""
     root = _read(text)
     if root.head != "define":
-        root.fail(f"expected '(define (problem NAME) ...)', found {root.head or '()'!r}")
+        root.fail(f"found {root.head or '()'!r}: expected '(define (problem NAME) ...)'")
     sections: dict[str, _Node] = {}
     for node in root.items[1:]:
         head = node.head
@@ -156,7 +156,7 @@ def parse_problem(text: str) -> BddlProblem:
         sections[head] = node
     for needed in (":objects", ":init", ":goal"):
         if needed not in sections:
-            root.fail(f"section ({needed} ...) is missing")
+            root.fail(f"section ({needed} ...) is missing: add it to the problem")
     name_node = sections.get("problem", root)
     if name_node is root or len(name_node.items) != 2 or not name_node.items[1].word:
         name_node.fail("expected (problem NAME), one word")
@@ -193,14 +193,14 @@ def _read(text: str) -> _Node:
     root: _Node | None = None
     for token, line, column in _tokens(text):
         if root is not None:
-            raise BddlError(f"unexpected {token!r} after the last closing parenthesis", line, column)
+            raise BddlError(f"found {token!r} after the last closing parenthesis: remove it", line, column)
         if token == "(":
             if len(open_lists) >= MAX_DEPTH:
                 raise BddlError(f"nested deeper than {MAX_DEPTH} parentheses", line, column)
             open_lists.append(([], line, column))
             continue
         if not open_lists:
-            raise BddlError(f"expected '(' first, found {token!r}", line, column)
+            raise BddlError(f"the text begins with {token!r}: expected '('", line, column)
         if token == ")":
             items, start_line, start_column = open_lists.pop()
             node = _Node("", tuple(items), start_line, start_column)
@@ -232,7 +232,7 @@ def _parse_objects(section: _Node) -> dict[str, str]:
     items = iter(section.items[1:])
     for node in items:
         if not node.word:
-            node.fail("expected object names and '- TYPE' in :objects, found a list")
+            node.fail("found a list in :objects: expected object names and '- TYPE'")
         if node.word != "-":
             pending.append(node)
             continue
@@ -322,21 +322,21 @@ class _Reader:
 
     def _atom(self, node: _Node, scope: Mapping[str, str]) -> Atom:
         if node.word or not node.items or not node.items[0].word:
-            node.fail(f"expected (PREDICATE ARGUMENT ...), found {node.word or 'a list'!r}")
+            node.fail(f"found {node.word or 'a list'!r}: expected (PREDICATE ARGUMENT ...)")
         predicate = node.head
         if predicate not in ARITIES:
             node.fail(f"unknown predicate {predicate!r}: expected one of {', '.join(sorted(ARITIES))}")
         args = node.items[1:]
         if len(args) not in ARITIES[predicate]:
             expected = " or ".join(map(str, ARITIES[predicate]))
-            node.fail(f"{predicate!r} takes {expected} arguments, found {len(args)}")
+            node.fail(f"the number of arguments of {predicate!r} is {len(args)}: expected {expected}")
         return Atom(
             predicate, tuple(self._name(arg, scope, predicate, index) for index, arg in enumerate(args))
         )
 
     def _name(self, node: _Node, scope: Mapping[str, str], predicate: str, index: int) -> str:
         if not node.word:
-            node.fail("expected a name, found a list")
+            node.fail("found a list: expected a name")
         word = node.word.lower()
         bare = word.removeprefix("?")
         for name in (word, f"?{bare}"):  # both dialects omit the mark now and then
@@ -347,13 +347,13 @@ class _Reader:
         free = predicate == "inroom" and index == 1
         of_substance = index == 1 and predicate in set(SubstanceRelation) and is_substance(bare)
         if not (free or of_substance or bare in self.objects or is_room_instance(bare)):
-            node.fail(f"object {bare!r} is not declared: add it to :objects, or mend its name")
+            node.fail(f"object {bare!r} is not declared: add it to :objects, or correct its name")
         return bare
 
     def _expect(self, node: _Node, count: int) -> None:
         found = len(node.items) - 1
         if found != count:
-            node.fail(f"{node.head!r} takes {count} parts, found {found}")
+            node.fail(f"the number of parts of {node.head!r} is {found}: expected {count}")
 
 
 def _count(node: _Node) -> int:

@@ -108,7 +108,7 @@ def decode_bundle(data: bytes, *, digest: str = "", limits: BundleLimits = DEFAU
         raise too_large(limits)
     found = bundle_digest(data)
     if digest and found != digest:
-        raise BundleError(f"the bundle's digest is {found}, expected {digest}")
+        raise BundleError(f"the bundle's digest is {found}: expected {digest}; fetch it again")
     try:
         bundle = _from_content(decompress(data, limits))
     except SceneInvalidError as error:
@@ -123,16 +123,18 @@ def _from_content(content: bytes) -> Bundle:
     """Decode decompressed content. Raises ValueError for other data and SceneInvalidError for a broken rule."""
     if len(content) < _HEAD.size or content[:4] != MAGIC:
         raise ValueError(
-            f"it begins with {content[:4]!r}, expected {MAGIC!r}: build the dataset anew with this version"
+            f"it begins with {content[:4]!r}: expected {MAGIC!r}; build the dataset again with this version"
         )
     _, version, text_bytes = _HEAD.unpack_from(content)
     if version != FORMAT:
         raise ValueError(
-            f"it has format {version}, this version reads {FORMAT}: build the dataset anew with it"
+            f"it has format {version}: expected {FORMAT}; build the dataset again with this version"
         )
     end = _HEAD.size + text_bytes
     if end > len(content) or end % _ALIGNMENT:
-        raise ValueError(f"its JSON has {text_bytes} bytes, {len(content)} are there in all")
+        raise ValueError(
+            f"its JSON should have {text_bytes} bytes, but the bundle has {len(content)}: fetch it again"
+        )
     record = decode(content[_HEAD.size : end], BundleJson, "bundle")
     arrays = _arrays(record.arrays, memoryview(content)[end:])
     prepared = {

@@ -257,7 +257,7 @@ def _object(
     asset = assets.get(record.asset_id)
     if asset is None:
         raise SceneInvalidError(
-            "asset_id", f"unknown asset {record.asset_id[:80]!r}: the scene carries {len(assets)} others"
+            "asset_id", f"found {record.asset_id[:80]!r}: expected one of the scene's {len(assets)} assets"
         )
     if len(record.joints) != len(asset.joints):
         raise SceneInvalidError(
@@ -287,7 +287,9 @@ def _object(
 def _check_known(path: str, names: Iterable[str], known: set[str], kind: str) -> None:
     for name in names:
         if name not in known:
-            raise SceneInvalidError(path, f"unknown {kind} {name[:80]!r}")
+            raise SceneInvalidError(
+                path, f"found the unknown {kind} {name[:80]!r}: expected one that the scene defines"
+            )
 
 
 def _check_unique(path: str, names: Sequence[str], kind: str) -> None:
@@ -314,7 +316,9 @@ def _check_references(scene: Scene) -> None:
                 f"{path}.name", f"found {item.name!r}: the engine reserves this name; rename it"
             )
         if item.host == item.name:
-            raise SceneInvalidError(f"{path}.host", f"unknown host {item.host!r}")
+            raise SceneInvalidError(
+                f"{path}.host", f"found {item.host!r}: expected the name of another object in the scene"
+            )
         _check_known(f"{path}.room", (item.room,), known_rooms, "room")
         _check_known(f"{path}.host", (item.host,), known_names, "host")
         if item.pieces:
@@ -330,7 +334,7 @@ def _check_references(scene: Scene) -> None:
 def _check_floor(scene: Scene) -> None:
     """Raise SceneInvalidError unless the navigation grid of the floor exists and fits in memory."""
     if not scene.rooms:
-        raise SceneInvalidError("scene.rooms", "is empty: expected at least one room")
+        raise SceneInvalidError("scene.rooms", "found no room: expected at least one")
     width, depth = (
         max(room.high_m[axis] for room in scene.rooms) - min(room.low_m[axis] for room in scene.rooms)
         for axis in (0, 1)

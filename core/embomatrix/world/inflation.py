@@ -59,7 +59,7 @@ class Inflation:
     def finish(self) -> None:
         """Raise BundleError unless the compressed stream ended with the last byte."""
         if not self._decoder.eof or self._decoder.unused_data:
-            raise BundleError("the bundle is cut short, or bytes follow its end: fetch it again")
+            raise BundleError("it is cut short, or bytes follow its end: fetch it again")
 
     def _inflate(self, piece: bytes) -> bytes:
         self._taken += len(piece)
@@ -69,7 +69,7 @@ class Inflation:
         try:
             content = self._decoder.decompress(piece, bound - self._grown + 1)
         except zlib.error as error:
-            raise BundleError(f"the bundle is no zlib stream: {error}") from error
+            raise BundleError(f"it is not zlib-compressed ({error}): fetch it again") from error
         self._grown += len(content)
         if self._grown > bound or self._decoder.unconsumed_tail:
             raise BundleError(

@@ -202,7 +202,7 @@ def test_figures_are_read_back_equal(tmp_path):
     path.write_text(json.dumps(evaluation_to_json(EVALUATION)))
     assert read_evaluation(path) == EVALUATION
     path.write_text('{"part": "tasks"}')
-    with pytest.raises(EvaluationError, match="holds no figures"):
+    with pytest.raises(EvaluationError, match="contains no figures"):
         read_evaluation(path)
 
 

@@ -193,7 +193,7 @@ def test_solved_share_counts_reachable_goals_only() -> None:
 
 
 def test_folder_without_eai_files_is_rejected_in_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(ProblemSourceError, match=r"can't be read|holds no tasks of EAI"):
+    with pytest.raises(ProblemSourceError, match=r"can't be read|contains no tasks of EAI"):
         read_eai(tmp_path)
 
 

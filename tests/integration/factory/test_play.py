@@ -74,10 +74,10 @@ def test_failed_step_is_marked_and_later_steps_are_not_executed(run):
     [
         ("I would rather not.", "no plan was found"),
         ("dance 3", "unknown skill 'dance'"),
-        ('[{"action": "move"}]', "move lacks object_index"),
-        ("turn nan", "yaw must be a finite number"),
+        ('[{"action": "move"}]', "move has no object_index"),
+        ("turn nan", "yaw is nan: expected a finite number"),
         ("turn 1\n" * 65, "expected at most 64"),
-        ("x" * 70_000, "a plan has at most 65536"),
+        ("x" * 70_000, "expected at most 65536"),
     ],
 )
 def test_unparsable_text_is_explained_and_earns_minus_one(run, text, words):

@@ -99,7 +99,7 @@ def test_missing_file_is_named(tmp_path: Path, name: str) -> None:
     (tmp_path / "folder.json").mkdir()
     result = CliRunner().invoke(app, ["check", str(tmp_path / name)])
     assert result.exit_code == 2
-    assert f"{name} is no file" in result.output
+    assert f"{name} is not a file" in result.output
 
 
 def test_build_accepts_only_names(path: Path) -> None:

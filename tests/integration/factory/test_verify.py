@@ -76,4 +76,4 @@ def test_dataset_without_tasks_is_reported(tmp_path: "Path") -> None:
     write_dataset(tmp_path, [], {})
     result = CliRunner().invoke(app, ["verify", str(tmp_path)])
     assert result.exit_code == 2
-    assert "holds no task" in result.output
+    assert "contains no task" in result.output

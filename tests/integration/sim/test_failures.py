@@ -144,7 +144,10 @@ def test_tests_cover_every_failure_reason():
 def test_no_path_leads_into_a_room_without_a_door():
     trace = executed_alone(replace(kitchen_scene(), doorways=()), "move apple_2")
     assert trace.failure is FailureReason.NO_PATH
-    assert trace.steps[0].message == "the robot can't get to apple_2: a wall blocks the way"
+    assert (
+        trace.steps[0].message
+        == "the robot can't get to apple_2: a wall blocks the way; clear the way or choose another object"
+    )
 
 
 def test_room_without_a_door_cannot_be_entered():
@@ -163,7 +166,9 @@ def test_middle_of_a_huge_table_is_out_of_reach():
     )
     trace = executed_alone(replace(scene, robot=RobotStart(0.5, 0.5, 0.0, "kitchen_0")), "move apple_1")
     assert trace.failure is FailureReason.NO_STANDING_POSE
-    assert trace.steps[0].message.endswith("can be reached: island_1 is in the way")
+    assert trace.steps[0].message.endswith(
+        "within reach of apple_1: island_1 is in the way; clear the way or choose another object"
+    )
 
 
 @pytest.mark.parametrize("text", ["move apple_2", "go_to_room living_room_0"])
@@ -175,7 +180,7 @@ def test_blocker_in_the_doorway_is_named(text):
     )
     trace = executed_alone(scene, text)
     assert trace.failure is FailureReason.NO_PATH
-    assert trace.steps[0].message.endswith(": chest_1 blocks the way")
+    assert trace.steps[0].message.endswith(": chest_1 blocks the way; clear the way or choose another object")
 
 
 def test_arm_does_not_reach_through_a_wall():
@@ -196,7 +201,10 @@ def test_chest_is_too_large_for_the_gripper():
     scene = scene_of("chest", [(placed("chest_1", chest, "kitchen_0", upright(1.5, 1.5, 0, chest)), chest)])
     trace = executed_alone(scene, "move chest_1; pick_up chest_1")
     assert trace.failure is FailureReason.TOO_LARGE
-    assert trace.steps[-1].message == "chest_1 measures 0.50 m and the gripper takes at most 0.30 m"
+    assert (
+        trace.steps[-1].message
+        == "chest_1 measures 0.50 m and the gripper takes at most 0.30 m: choose a smaller object"
+    )
 
 
 def in_front_of_the_microwave():
@@ -227,7 +235,7 @@ def in_front_of_the_microwave():
 def test_mug_in_front_of_the_microwave_blocks_its_door():
     trace = executed_alone(in_front_of_the_microwave(), "move microwave_1; open microwave_1")
     assert trace.failure is FailureReason.DOOR_BLOCKED
-    assert trace.steps[-1].message == "mug_1 is in the way of the door of microwave_1"
+    assert trace.steps[-1].message == "mug_1 is in the way of the door of microwave_1: clear the way first"
 
 
 def test_blocked_door_stays_in_place():

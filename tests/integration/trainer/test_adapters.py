@@ -222,7 +222,7 @@ async def test_openrlhf_gets_tensors_and_lost_plans_are_retried():
 
 def test_openrlhf_errors_name_the_mismatched_query_and_the_missing_setting():
     label = RewardLabel("t", FIRST.bundle_digest, Profile.PAPER, 0).text()
-    with pytest.raises(TrainerError, match="does not hold its prompt 'the prompt'"):
+    with pytest.raises(TrainerError, match="does not contain its prompt 'the prompt'"):
         openrlhf.reward_func(["move 1"], ["the prompt"], [label])
     with pytest.raises(TrainerError, match="EMBOMATRIX_DATASET is not set"):
         openrlhf.reward_func(["the prompt move 1"], ["the prompt"], [label])

@@ -182,7 +182,7 @@ def test_page_escapes_texts_of_models_and_tasks(bench):
     [
         (lambda text: text.replace('"answers": 1', '"answers": 99'), "has another version"),
         (lambda text: text.replace('"sample": 0', '"sample": "x"'), "line 2, is damaged: found sample 'x'"),
-        (lambda text: "", "holds no answers"),
+        (lambda text: "", "contains no answers"),
         (lambda text: "{}\n" + text, "is not an answer file"),
         (lambda text: text.replace('"samples": 2', '"samples": 1000000000'), "found samples 1000000000"),
         (

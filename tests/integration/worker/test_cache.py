@@ -66,7 +66,7 @@ async def test_bundle_damaged_in_transit_twice_is_given_up(tmp_path):
 @pytest.mark.parametrize("digest", ["", "sha256:xyz", "../../etc/passwd", "sha256:" + "0" * 63])
 async def test_invalid_digest_never_becomes_a_path(tmp_path, digest):
     source = Source()
-    with pytest.raises(LoadError, match="is no digest"):
+    with pytest.raises(LoadError, match="is not a digest"):
         await _cache(tmp_path, source).path_of(digest)
     assert source.asked == []
 

@@ -40,7 +40,10 @@ def test_options_take_precedence_over_the_file_and_the_file_over_defaults(tmp_pa
         (["--hours=nights"], "--hours 'nights': expected HH:MM-HH:MM, as in 18:00-08:00"),
         (["--max-load=7"], "--max-load 7.0: input should be less than or equal to 1"),
         (["--label=attic"], "--label 'attic': expected KEY=VALUE, as in room=lab"),
-        (["--config=/nowhere.toml"], "--config /nowhere.toml: No such file or directory"),
+        (
+            ["--config=/nowhere.toml"],
+            "--config /nowhere.toml: the file can't be read (No such file or directory)",
+        ),
         (["--join", ""], "--join is empty, perhaps an unset variable: expected TOKEN@HOST:PORT"),
         (["--cache-mb=0"], "--cache-mb 0: input should be greater than or equal to 1"),
     ],
@@ -54,8 +57,11 @@ def test_wrong_preference_is_named_with_the_expected_value(arguments, said):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("[preferences]\nhous = '18:00-08:00'\n", "preferences.hous is no setting: expected one of calm_s,"),
-        ("cache_mbb = 3\n", "cache_mbb is no setting: expected one of ca, cache_dir, cache_mb,"),
+        (
+            "[preferences]\nhous = '18:00-08:00'\n",
+            "preferences.hous is not a setting: expected one of calm_s,",
+        ),
+        ("cache_mbb = 3\n", "cache_mbb is not a setting: expected one of ca, cache_dir, cache_mb,"),
     ],
 )
 def test_file_with_an_unknown_key_is_refused_with_the_known_ones(tmp_path, text, said):
@@ -147,7 +153,10 @@ def test_relative_paths_of_a_unit_become_absolute(tmp_path, monkeypatch):
     [
         (["--join", "secret@host:1"], "every user can read a token in a unit"),
         (["--token=secret"], "every user can read a token in a unit"),
-        (["--config=/nowhere.toml"], "--config /nowhere.toml: No such file or directory"),
+        (
+            ["--config=/nowhere.toml"],
+            "--config /nowhere.toml: the file can't be read (No such file or directory)",
+        ),
         (["--hours=nights"], "--hours 'nights': expected HH:MM-HH:MM"),
         (["--slotz=3"], "No such option: --slotz"),
     ],

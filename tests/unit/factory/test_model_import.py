@@ -163,7 +163,7 @@ def test_glb_is_read_with_the_poses_of_its_nodes(tmp_path: Path) -> None:
         ("a.obj", b"", "has 0 bytes"),
         ("a.obj", b"v 0 0 0\nv 1 0 zero", "line 2"),
         ("a.obj", b"v 0 0 0\nf 1 2 3", "line 2"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0", "holds no face"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0", "contains no face"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 inf 0\nf 1 2 3", "not a finite number"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3", "expected a solid, not a sheet"),
         ("a.glb", b"glTF but not really", "be read as glb"),
@@ -227,9 +227,9 @@ def test_folder_of_assets_is_read_back_equal_and_damaged_files_are_named(tmp_pat
         file.truncate(1 << 30)
     with pytest.raises(ModelFileError, match="over 4,194,304 bytes"):
         read_assets(shelf)
-    with pytest.raises(ModelFileError, match="holds no file"):
+    with pytest.raises(ModelFileError, match="contains no file"):
         read_assets(tmp_path)
-    with pytest.raises(ModelFileError, match="is no folder"):
+    with pytest.raises(ModelFileError, match="is not a folder"):
         read_assets(tmp_path / "nowhere")
 
 
@@ -333,5 +333,5 @@ def test_folder_without_assets_is_refused_before_anything_is_built(tmp_path: Pat
     said = ["build", "Rs_int", "--out", str(tmp_path / "out"), "--assets", str(tmp_path / "nowhere")]
     refused = CliRunner().invoke(scene_app, said)
     assert refused.exit_code == 2
-    assert "is no folder" in refused.output
+    assert "is not a folder" in refused.output
     assert not (tmp_path / "out").exists()

@@ -53,10 +53,10 @@ def test_urdf_keeps_its_joint_and_merges_fixed_links(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("body", "message"),
     [
-        (link("a") + link("b"), "expected one link without a parent, found 'a', 'b'"),
+        (link("a") + link("b"), "found the links 'a', 'b' without a parent"),
         (link("a") + link("b") + joint("j", "a", "b") + joint("k", "b", "a"), "form a cycle"),
         (link("a") + link("b") + link("c") + joint("j", "b", "c") + joint("k", "c", "b"), "form a cycle without a connection"),
-        (link("a") + joint("j", "a", "ghost"), "the child of the joint 'j' is 'ghost': there is no such link"),
+        (link("a") + joint("j", "a", "ghost"), "the child of the joint 'j' is 'ghost': expected the name of a link"),
         (link("a") + link("b") + link("c") + joint("j", "a", "c") + joint("k", "b", "c"), "has two parents"),
         (link("a") + link("a"), "two links are named 'a'"),
         (link("a", '<inertial><mass value="-2"/></inertial>'), "the mass of the link 'a' is negative"),
@@ -66,7 +66,7 @@ def test_urdf_keeps_its_joint_and_merges_fixed_links(tmp_path: Path) -> None:
         (link("a", size="1 0 1"), "expected metres above 0"),
         (link("a", size="1 1e30 1"), "at most 100"),
         ("".join(link(f"l{number}") for number in range(200)), "it has 200 links"),
-        ("<link", "is no XML"),
+        ("<link", "is not XML"),
         (link("a") + link("b") + joint("j", "a", "b", "planar"), "of type 'planar'"),
         (link("a") + link("b") + joint("j", "a", "b", "revolute"), "has no travel"),
         ('<link name="a"/>', "the link 'a' has no shape"),

@@ -143,7 +143,7 @@ async def counted(data, size, taken):
 @pytest.mark.parametrize(
     ("data", "sentence", "pieces_taken"),
     [
-        (os.urandom(9 * MIB), "no zlib stream", 1),
+        (os.urandom(9 * MIB), "not zlib-compressed", 1),
         (packed(os.urandom(9 * MIB)), "over 8,388,608 bytes", 9),
         (zlib.compress(bytes(40 * MIB)), "expected at most 100 to 1", 1),
         (packed(b"content")[:-3], "cut short", 1),

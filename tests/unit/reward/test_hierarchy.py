@@ -88,10 +88,10 @@ def test_settings_override_every_constant() -> None:
 @pytest.mark.parametrize(
     ("coefficients", "sentence"),
     [
-        ({"goal": -3.0}, r"goal is -3: a tier pays 0 or more, and 0 leaves it out"),
-        ({"relevance_limit": float("nan")}, r"relevance_limit is nan: expected a number between"),
-        ({"format": 1e9}, r"format is 1e\+09: expected a number between -1e6 and 1e6"),
-        ({"unparsable": 1.0}, r"unparsable is 1 and format 0\.5: .* lower it"),
+        ({"goal": -3.0}, r"goal: found -3: expected 0 or more; 0 disables the tier"),
+        ({"relevance_limit": float("nan")}, r"relevance_limit: found nan: expected a number between"),
+        ({"format": 1e9}, r"format: found 1e\+09: expected a number between -1e6 and 1e6"),
+        ({"unparsable": 1.0}, r"unparsable: found 1 with format 0\.5: .* lower it"),
     ],
 )
 def test_invalid_coefficients_are_named(coefficients: dict[str, float], sentence: str) -> None:

@@ -90,7 +90,7 @@ async def test_internal_errors_of_the_manager_stay_in_its_log():
 
 async def test_server_without_the_call_is_reported_as_no_manager():
     async with serving(FakeCluster()) as address, ClusterClient(address, limits=LIMITS) as client:
-        with pytest.raises(PreconditionError, match="no manager of this version"):
+        with pytest.raises(PreconditionError, match="not a manager of this version"):
             await client.list_workers()
 
 

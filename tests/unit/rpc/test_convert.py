@@ -166,7 +166,7 @@ def test_malformed_unparsed_value_raises_on_first_access():
     unread = convert_outcome.unread_completed(
         types_pb2.Completed(trace_digest="t").SerializeToString(), timings=Timings(), warm=True
     )
-    with pytest.raises(ConvertError, match="reward: is missing"):
+    with pytest.raises(ConvertError, match="reward: found no value"):
         _ = unread.steps
     with pytest.raises(AttributeError, match="no attribute 'stops'"):
         _ = unread.stops
@@ -223,7 +223,7 @@ def test_empty_run_terms_are_the_defaults():
 
 
 def test_weight_below_zero_is_refused_with_its_field():
-    with pytest.raises(ConvertError, match=r"weight: is -1\.0"):
+    with pytest.raises(ConvertError, match=r"weight: found -1\.0"):
         convert_run.run_terms_from_proto(rollout_service_pb2.OpenRunRequest(weight=-1.0))
 
 
@@ -288,18 +288,18 @@ def test_malformed_plan_names_the_field(calls, field):
 def test_two_rollouts_of_one_id_are_refused():
     rollout = types_pb2.Rollout(rollout_id="r", group_id="g", bundle_digest="d", task_id="t")
     request = rollout_service_pb2.ExecuteRequest(run_id="run", batch_id="b", rollouts=[rollout, rollout])
-    with pytest.raises(ConvertError, match=r"rollouts\[1\].rollout_id: 'r' occurs twice"):
+    with pytest.raises(ConvertError, match=r"rollouts\[1\].rollout_id: found 'r' a second time"):
         convert.batch_from_proto(request)
 
 
 def test_result_without_an_outcome_is_refused():
-    with pytest.raises(ConvertError, match="outcome: is missing"):
+    with pytest.raises(ConvertError, match="outcome: found no value"):
         convert_outcome.rollout_result_from_proto(types_pb2.RolloutResult(rollout_id="r"))
 
 
 def test_completed_rollout_without_a_reward_is_refused_instead_of_scored_zero():
     message = types_pb2.RolloutResult(rollout_id="r", completed=types_pb2.Completed(trace_digest="x"))
-    with pytest.raises(ConvertError, match=r"completed\.reward: is missing"):
+    with pytest.raises(ConvertError, match=r"completed\.reward: found no value"):
         convert_outcome.rollout_result_from_proto(message)
 
 
@@ -312,20 +312,20 @@ def whole(**changed):
 @pytest.mark.parametrize(
     ("message", "problem"),
     [
-        (whole(reward=None), "reward: is missing"),
-        (whole(reward=types_pb2.Reward(goal=math.nan)), "reward.goal: is nan"),
-        (whole(timings=types_pb2.Timings(load_s=math.inf)), "timings.load_s: is inf"),
+        (whole(reward=None), "reward: found no value"),
+        (whole(reward=types_pb2.Reward(goal=math.nan)), "reward.goal: found nan"),
+        (whole(timings=types_pb2.Timings(load_s=math.inf)), "timings.load_s: found inf"),
         (
             whole(timings=types_pb2.Timings(load_s=-math.inf, lease_s=math.inf)),
-            "timings.load_s: is -inf",
+            "timings.load_s: found -inf",
         ),
         (
             whole(
                 steps=[types_pb2.StepResult(call=MOVE), types_pb2.StepResult(call=MOVE, failure="gave_up")]
             ),
-            r"steps\[1\].failure: 'gave_up' is no known failure reason",
+            r"steps\[1\].failure: found the unknown reason 'gave_up'",
         ),
-        (whole(steps=[types_pb2.StepResult()]), r"steps\[0\].call.skill: 0 is no known skill"),
+        (whole(steps=[types_pb2.StepResult()]), r"steps\[0\].call.skill: found the unknown skill 0"),
     ],
 )
 def test_malformed_result_is_refused_by_reader_and_forwarder(read, message, problem):
@@ -345,5 +345,5 @@ def test_checked_result_equals_the_parsed_one(completed):
 
 
 def test_worker_without_slots_is_refused():
-    with pytest.raises(ConvertError, match="slots: is 0"):
+    with pytest.raises(ConvertError, match="slots: found 0"):
         convert_session.resources_from_proto(types_pb2.Resources(cores=4))

@@ -119,11 +119,11 @@ def test_every_wire_resident_state_has_a_member():
 
 def test_lease_without_a_deadline_is_refused():
     message = worker_service_pb2.Lease(ref=worker_service_pb2.LeaseRef(lease_id="l1", lease_epoch=1))
-    with pytest.raises(ConvertError, match=r"deadline_s: is 0\.0: it must be above 0"):
+    with pytest.raises(ConvertError, match=r"deadline_s: found 0\.0: expected a number above 0"):
         convert.lease_from_proto(message)
 
 
 def test_malformed_result_error_names_the_element():
     message = worker_service_pb2.WorkerState(finished=[worker_service_pb2.LeaseResult()])
-    with pytest.raises(ConvertError, match=r"finished\[0\].lease.lease_id: is empty"):
+    with pytest.raises(ConvertError, match=r"finished\[0\].lease.lease_id: found no value"):
         convert.worker_state_from_proto(message)

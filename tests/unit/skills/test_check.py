@@ -224,8 +224,8 @@ def test_heat_skills_check_food_then_switch_then_door():
 def test_heat_source_defines_whether_food_lies_inside_or_on_top():
     inside = check(WordWorld(), call(Skill.HEAT, "apple", "microwave")).sentence
     ontop = check(WordWorld(), call(Skill.HEAT, "apple", "stove")).sentence
-    assert inside == "apple is not inside microwave"
-    assert ontop == "apple is not on top of stove"
+    assert inside == "apple is not inside microwave: place it there first"
+    assert ontop == "apple is not on top of stove: place it there first"
 
 
 def test_cooking_temperature_depends_on_the_food():
@@ -233,7 +233,7 @@ def test_cooking_temperature_depends_on_the_food():
     tough = replace(apple, abilities={**apple.abilities, "cookable": {"cook_temperature": 120.0}})
     world = WordWorld(assets={**ASSETS, "apple": tough}, on={"microwave"}, at={("apple", "microwave")})
     assert check(world, call(Skill.COOK, "apple", "microwave")).sentence == (
-        "microwave reaches 100 C and apple needs 120 C"
+        "microwave reaches 100 C and apple needs 120 C: choose a hotter source"
     )
 
 

@@ -25,7 +25,7 @@ def test_file_overrides_defaults_and_options_override_the_file(tmp_path):
             r"setting 'grpo\.group': input should be greater than or equal to 2 \(found 1\)",
         ),
         ("[reward]\ngaol = 3", r"unknown setting 'reward\.gaol': correct its name"),
-        ("[reward]\ngoal = -3", r"setting 'reward': .*goal is -3: a tier pays 0 or more"),
+        ("[reward]\ngoal = -3", r"setting 'reward': .*goal: found -3: expected 0 or more"),
         ("[reward]\ngoal = 'much'", r"setting 'reward\.goal': input should be a valid number"),
         ("grpo = 3", r"setting 'grpo': expected a table of settings \(found 3\)"),
         ("[grpo", r"settings\.toml is not valid TOML"),

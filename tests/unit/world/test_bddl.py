@@ -141,7 +141,7 @@ ERRORS: dict[str, tuple[str, str, str, int]] = {
     "wrong number of arguments": (
         "(not (open basket.n.01_1))",
         "(open basket.n.01_1 floor.n.01_1)",
-        "takes 1 arguments, found 2",
+        "the number of arguments of 'open' is 2: expected 1",
         12,
     ),
     "unknown type": (
@@ -162,7 +162,7 @@ ERRORS: dict[str, tuple[str, str, str, int]] = {
     "negation of two": (
         "(not (OnTop",
         "(not (open basket.n.01_1) (OnTop",
-        "'not' takes 1 parts, found 2",
+        "the number of parts of 'not' is 2: expected 1",
         19,
     ),
     "word for a formula": ("(and\n", "(and apple.n.01_1\n", "expected (PREDICATE", 17),

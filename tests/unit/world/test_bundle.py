@@ -75,12 +75,12 @@ def test_compressed_nonsense_is_refused(text: str) -> None:
 def test_bundle_of_another_format_names_both(bundle: Bundle) -> None:
     content = bytearray(zlib.decompress(encode_bundle(bundle)))
     content[4:8] = (9).to_bytes(4, "little")
-    with pytest.raises(BundleError, match="has format 9, this version reads 3: build the dataset anew"):
+    with pytest.raises(BundleError, match="has format 9: expected 3; build the dataset again"):
         decode_bundle(zlib.compress(content))
 
 
 def test_bundle_of_the_first_format_names_the_remedy() -> None:
-    with pytest.raises(BundleError, match="build the dataset anew"):
+    with pytest.raises(BundleError, match="build the dataset again"):
         decode_bundle(zlib.compress(b'{"format":1,"scene":{}}'))
 
 

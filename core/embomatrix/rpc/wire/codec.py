@@ -72,14 +72,14 @@ def inside(field: str, convert: Callable[[WireT], ValueT], message: WireT) -> Va
 def required(field: str, text: str) -> str:
     """Return the text, or raise ConvertError if it is empty."""
     if not text:
-        raise ConvertError(field, "is empty: it must be set")
+        raise ConvertError(field, "found no value: expected one")
     return text
 
 
 def finite(field: str, number: float) -> float:
     """Return the number, or raise ConvertError if it is NaN or infinite."""
     if not math.isfinite(number):
-        raise ConvertError(field, f"is {number}: it must be a finite number")
+        raise ConvertError(field, f"found {number}: expected a finite number")
     return number
 
 
@@ -92,7 +92,9 @@ def enum_member(field: str, members: Mapping[int, EnumT], number: int) -> EnumT:
     """Return the enum member of a wire number. Raise ConvertError for an unknown number."""
     member = members.get(number)
     if member is None:
-        raise ConvertError(field, f"{number} is no known {field}: is the sender newer than this side?")
+        raise ConvertError(
+            field, f"found the unknown value {number}: if the sender is newer, upgrade this side"
+        )
     return member
 
 

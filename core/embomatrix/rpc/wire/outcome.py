@@ -72,7 +72,9 @@ def _failure_reason(text: str) -> FailureReason | None:
     try:
         return FailureReason(text)
     except ValueError:
-        raise ConvertError("failure", f"{text!r} is no known failure reason") from None
+        raise ConvertError(
+            "failure", f"found the unknown reason {text!r}: if the sender is newer, upgrade this side"
+        ) from None
 
 
 def timings_to_proto(timings: Timings) -> types_pb2.Timings:
@@ -152,7 +154,7 @@ def _steps_in(wire: bytes) -> tuple[Step, ...]:
 
 def _reward_in(message: types_pb2.Completed) -> types_pb2.Reward:
     if not message.HasField("reward"):
-        raise ConvertError("reward", "is missing: a completed rollout has one")
+        raise ConvertError("reward", "found no value: a completed rollout has one")
     return message.reward
 
 
@@ -199,4 +201,4 @@ def _outcome(message: types_pb2.RolloutResult) -> Outcome:
         case "cancelled":
             return Cancelled(message.cancelled.reason)
         case None:
-            raise ConvertError("outcome", "is missing: a result has exactly one")
+            raise ConvertError("outcome", "found no value: expected completed, infra_failure or cancelled")

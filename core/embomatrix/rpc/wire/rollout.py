@@ -76,11 +76,15 @@ def _call_of(data: bytes) -> SkillCall:
     message = types_pb2.SkillCall.FromString(data)
     skill = _SKILLS.get(message.skill)
     if skill is None:
-        raise ConvertError("skill", f"{message.skill} is no known skill: is the sender newer than this side?")
+        raise ConvertError(
+            "skill", f"found the unknown skill {message.skill}: if the sender is newer, upgrade this side"
+        )
     taken = SIGNATURES[skill]
     for field, is_taken in _FIELDS[skill]:
         if message.HasField(field) != is_taken:
-            problem = "is missing: {} needs it" if is_taken else "is set: {} does not take it"
+            problem = (
+                "found no value: {} needs one" if is_taken else "found a value: {} takes none; leave it out"
+            )
             raise ConvertError(field, problem.format(skill.value))
     return SkillCall(
         skill,
@@ -95,7 +99,7 @@ def _call_of(data: bytes) -> SkillCall:
 
 def _room_name(text: str) -> str:
     if len(text) > MAX_ROOM_NAME:
-        raise ConvertError("room_name", f"has {len(text)} characters: at most {MAX_ROOM_NAME} name a room")
+        raise ConvertError("room_name", f"found {len(text)} characters: expected at most {MAX_ROOM_NAME}")
     return text
 
 
@@ -103,12 +107,14 @@ def _relation(text: str) -> PlaceRelation:
     try:
         return PlaceRelation(text)
     except ValueError:
-        raise ConvertError("relation", f"{text!r} is none of {', '.join(PlaceRelation)}") from None
+        raise ConvertError(
+            "relation", f"found {text!r}: expected one of {', '.join(PlaceRelation)}"
+        ) from None
 
 
 def _plan_from(calls: Sequence[bytes]) -> Plan:
     if len(calls) > MAX_STEPS:
-        raise ConvertError("plan", f"has {len(calls)} steps: at most {MAX_STEPS} are executed")
+        raise ConvertError("plan", f"found {len(calls)} steps: expected at most {MAX_STEPS}")
     return each_known("plan", _call_of, calls)
 
 
@@ -189,7 +195,8 @@ def batch_with(message: rollout_service_pb2.ExecuteRequest, rollouts: tuple[Roll
     for index, rollout in enumerate(rollouts):
         if rollout.rollout_id in seen:
             raise ConvertError(
-                f"rollouts[{index}].rollout_id", f"{rollout.rollout_id!r} occurs twice in the batch"
+                f"rollouts[{index}].rollout_id",
+                f"found {rollout.rollout_id!r} a second time: expected unique ids",
             )
         seen.add(rollout.rollout_id)
     batch = Batch(

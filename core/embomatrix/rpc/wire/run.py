@@ -57,7 +57,7 @@ def run_terms_from_proto(message: rollout_service_pb2.OpenRunRequest) -> RunTerm
     policy = enum_member("group_policy", _POLICY_VALUES, message.group_policy)
     for field in ("weight", "rollout_deadline_s"):
         if finite(field, getattr(message, field)) < 0:
-            raise ConvertError(field, f"is {getattr(message, field)}: it can't be below 0")
+            raise ConvertError(field, f"found {getattr(message, field)}: expected 0 or more")
     # An unset weight reads as 0.
     return RunTerms(
         policy,
@@ -70,7 +70,7 @@ def run_terms_from_proto(message: rollout_service_pb2.OpenRunRequest) -> RunTerm
 
 
 def reward_settings_to_proto(reward: RewardSettings) -> types_pb2.RewardSettings | None:
-    """Return None for the paper's coefficients: an absent field stands for them."""
+    """Return None for the paper's coefficients: an absent field means the paper's."""
     return (
         None if reward is PAPER or reward == PAPER else types_pb2.RewardSettings(**dataclasses.asdict(reward))
     )

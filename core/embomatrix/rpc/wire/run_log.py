@@ -211,13 +211,11 @@ def run_summary_from_proto(message: pb.GetRunResponse) -> RunSummary:
 
 def _named_phase_from_proto(message: pb.PhaseSummary) -> tuple[RolloutPhase, PhaseSummary]:
     if message.phase not in list(RolloutPhase):
-        raise ConvertError(
-            "phase", f"{message.phase!r} is no known phase: expected one of {', '.join(RolloutPhase)}"
-        )
+        raise ConvertError("phase", f"found {message.phase!r}: expected one of {', '.join(RolloutPhase)}")
     return RolloutPhase(message.phase), _phase_from_proto(message)
 
 
 def _series_from_proto(message: pb.RunSeries) -> RunSeries:
     if finite("step_s", message.step_s) <= 0:
-        raise ConvertError("step_s", f"is {message.step_s}: it must be above 0")
+        raise ConvertError("step_s", f"found {message.step_s}: expected a number above 0")
     return _read_series(message)

@@ -71,9 +71,9 @@ run_info_to_proto, run_info_from_proto = converters(
 
 def resources_from_proto(message: types_pb2.Resources) -> Resources:
     if message.slots == 0:
-        raise ConvertError("slots", "is 0: a worker offers at least one slot")
+        raise ConvertError("slots", "found 0: expected at least one slot")
     if len(message.labels) > MAX_LABELS:
-        raise ConvertError("labels", f"are {len(message.labels)}: a worker has at most {MAX_LABELS}")
+        raise ConvertError("labels", f"found {len(message.labels)}: expected at most {MAX_LABELS}")
     return _resources_from_proto(message)
 
 
@@ -140,7 +140,7 @@ def lease_from_proto(message: worker_service_pb2.Lease) -> Lease:
     """Return the lease with its rollout unparsed: the slot that executes it parses it."""
     ref = inside("ref", lease_ref_from_proto, message.ref)
     if finite("deadline_s", message.deadline_s) <= 0:
-        raise ConvertError("deadline_s", f"is {message.deadline_s}: it must be above 0")
+        raise ConvertError("deadline_s", f"found {message.deadline_s}: expected a number above 0")
     origin = None
     if message.HasField("origin"):
         origin = inside("origin", lease_origin_from_proto, message.origin)
@@ -179,7 +179,7 @@ def lease_result_from_proto(message: worker_service_pb2.LeaseResult) -> LeaseRes
         case "infra_failure":
             outcome = inside("infra_failure", infra_failure_from_proto, message.infra_failure)
         case None:
-            raise ConvertError("outcome", "is missing: a result has exactly one")
+            raise ConvertError("outcome", "found no value: expected completed, infra_failure or cancelled")
     return LeaseResult(ref, outcome, slot=message.slot, held_s=finite("held_s", message.held_s))
 
 

@@ -145,5 +145,5 @@ def _checked_step(message: pb.SampledStep) -> SampledStep:
 def _bounded(field: str, value: T, at_most: int) -> T:
     """Return the value. Raise ConvertError if its length exceeds the limit."""
     if len(value) > at_most:
-        raise ConvertError(field, f"has a length of {len(value)}: at most {at_most} are accepted, send less")
+        raise ConvertError(field, f"found a length of {len(value)}: expected at most {at_most}; send less")
     return value

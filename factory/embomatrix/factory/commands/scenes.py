@@ -240,7 +240,7 @@ def _print_reports(reports: Sequence[SceneReport], path: Path | None) -> None:
 
 def _chosen(names: Sequence[str] | None, every: bool) -> tuple[str, ...]:
     if every and names:
-        raise _refused(f"--all and {names[0]!r} exclude one another: give names, or --all")
+        raise _refused(f"found both --all and {names[0]!r}: give names or --all")
     if not every and not names:
         raise _refused("no scene is named: give a name that `embomatrix scene list` shows, or --all")
     return Catalog.load().scene_ids if every else tuple(dict.fromkeys(names or ()))

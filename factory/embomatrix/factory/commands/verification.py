@@ -43,7 +43,7 @@ def verify(
             check_writable(json_file)
         records = sampled(Dataset.load(folder).records, sample, seed)
         if not records:
-            fail(f"{folder} holds no task: there is nothing to verify")
+            fail(f"{folder} contains no task: name a dataset with tasks")
         with progress(Console(stderr=True)) as bars:
             bar = bars.add_task("looks", total=2 * len(records))
             verdicts = verify_again(

@@ -33,7 +33,7 @@ def named(tasks: Sequence[SceneTask], name: str) -> SceneTask:
         if task.source.name == name:
             return task
     raise EvaluationError(
-        f"{name!r} is none of the {len(tasks)} fixed tasks, such as {tasks[0].source.name!r}"
+        f"{name!r} is not a fixed task: expected one of {len(tasks)}, such as {tasks[0].source.name!r}"
     )
 
 

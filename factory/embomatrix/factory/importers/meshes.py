@@ -54,13 +54,15 @@ def _obj(data: bytes, path: Path) -> Mapping[str, Mesh]:
                 fan = [(corners[0], b, c) for b, c in itertools.pairwise(corners[1:])]
                 groups.setdefault(group, []).extend(fan)
         except ValueError:
-            raise ModelFileError(f"{path}, line {number}: {line[:60]!r} is no vertex and no face") from None
+            raise ModelFileError(
+                f"{path}, line {number}: found {line[:60]!r}: expected a vertex such as `v 0 0 1` or a face such as `f 1 2 3`"
+            ) from None
     points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
     meshes = {
         name: _cut(points, np.array(faces, dtype=np.int64), path) for name, faces in groups.items() if faces
     }
     if not meshes:
-        raise ModelFileError(f"{path} holds no face: expected a triangle mesh")
+        raise ModelFileError(f"{path} contains no face: expected a triangle mesh")
     return meshes
 
 
@@ -89,7 +91,7 @@ def _binary(data: bytes, kind: str, path: Path) -> Mapping[str, Mesh]:
         if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)
     }
     if not meshes:
-        raise ModelFileError(f"{path} holds no face: expected a triangle mesh")
+        raise ModelFileError(f"{path} contains no face: expected a triangle mesh")
     return meshes
 
 

@@ -32,14 +32,16 @@ def save_asset(folder: Path, asset: Asset) -> Path:
 def read_assets(folder: Path) -> Mapping[str, Asset]:
     """Assets of a folder by their id. Raises ModelFileError naming the file that is missing or damaged."""
     if not folder.is_dir():
-        raise ModelFileError(f"{folder} is no folder: expected one with files that end in {SUFFIX}")
+        raise ModelFileError(f"{folder} is not a folder: expected one with files that end in {SUFFIX}")
     found: dict[str, Asset] = {}
     for path in sorted(folder.glob(f"*{SUFFIX}")):
         try:
             asset = asset_from_json(json.loads(read_whole(path, at_most=MAX_BYTES)))
         except (OSError, ValueError, SceneInvalidError) as error:
-            raise ModelFileError(f"{path} is no asset that can be read: {error}") from None
+            raise ModelFileError(
+                f"{path} is not a readable asset ({error}): import the model again"
+            ) from None
         found[asset.asset_id] = asset
     if not found:
-        raise ModelFileError(f"{folder} holds no file that ends in {SUFFIX}: import a model into it first")
+        raise ModelFileError(f"{folder} contains no file that ends in {SUFFIX}: import a model into it first")
     return found

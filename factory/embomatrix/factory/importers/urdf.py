@@ -69,7 +69,7 @@ def read_urdf(path: Path) -> RawModel:
     try:
         root = ET.fromstring(text)
     except ET.ParseError as error:
-        raise ModelFileError(f"{path} is no XML: {error}") from None
+        raise ModelFileError(f"{path} is not XML ({error}): expected a plain URDF") from None
     try:
         return _model(root, path.parent)
     except ModelFileError as error:
@@ -81,7 +81,7 @@ def _model(root: ET.Element, folder: Path) -> RawModel:
     for element in root.findall("link"):
         name = _name(element)
         if name in elements:
-            raise ModelFileError(f"two links are named {name!r}")
+            raise ModelFileError(f"two links are named {name!r}: rename one")
         elements[name] = element
     if not 0 < len(elements) <= MAX_LINKS:
         raise ModelFileError(f"it has {len(elements)} links: expected 1 to {MAX_LINKS}")
@@ -102,7 +102,9 @@ def _tree(links: list[str], joints: list[_Joint]) -> list[str]:
     roots = [name for name in links if name not in parents]
     if len(roots) != 1:
         found = ", ".join(map(repr, roots)) or "none: its joints form a cycle"
-        raise ModelFileError(f"expected one link without a parent, found {found}")
+        raise ModelFileError(
+            f"found the links {found} without a parent: expected one; connect the others with joints"
+        )
     order = roots
     for name in order:  # grows during the iteration
         order.extend(joint.child for joint in joints if joint.parent == name)
@@ -156,7 +158,7 @@ def _joint(element: ET.Element, links: dict[str, ET.Element]) -> _Joint:
         found = element.find(end)
         link = found.get("link", "") if found is not None else ""
         if link not in links:
-            raise ModelFileError(f"the {end} of the joint {name!r} is {link!r}: there is no such link")
+            raise ModelFileError(f"the {end} of the joint {name!r} is {link!r}: expected the name of a link")
         ends.append(link)
     axis = np.array(_numbers(element.find("axis"), "xyz", (1.0, 0.0, 0.0), name))
     length = float(np.linalg.norm(axis))

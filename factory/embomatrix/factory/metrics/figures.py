@@ -55,6 +55,6 @@ def read_evaluation(path: Path) -> EvaluationFigures:
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise EvaluationError(
-            f"{path} holds no figures of an evaluation ({error}): expected a file written by 'embomatrix factory "
+            f"{path} contains no figures of an evaluation ({error}): expected a file written by 'embomatrix factory "
             "evaluate' with --json"
         ) from error

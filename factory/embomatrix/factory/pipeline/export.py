@@ -74,12 +74,12 @@ def encode_rows(rows: Sequence[Mapping[str, Any]], suffix: str) -> bytes:
     if suffix == ".jsonl":
         return "".join(f"{json.dumps(row, ensure_ascii=False)}\n" for row in rows).encode("utf-8")
     if suffix != ".parquet":
-        raise DatasetError(f"found the suffix {suffix!r}: expected {' or '.join(SUFFIXES)}")
+        raise DatasetError(f"the file's suffix is {suffix!r}: expected {' or '.join(SUFFIXES)}")
     try:
         arrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
     except ImportError as error:
         raise DatasetError(
-            "Parquet needs pyarrow: pip install 'embomatrix[export]', or export to .jsonl"
+            "Parquet needs the package pyarrow: install it with `pip install 'embomatrix[export]'`, or export to .jsonl"
         ) from error
     text, texts = arrow.string(), arrow.list_(arrow.string())
     kinds = {"rooms": texts, "table": texts, "oracle_steps": arrow.int32()}

@@ -31,16 +31,18 @@ def write_scene(path: Path, scene: Scene) -> None:
 def read_scene(path: Path) -> Scene:
     """Read and check the scene in a file of at most MAX_BYTES. Raises SceneFileError."""
     if not path.is_file():
-        raise SceneFileError(f"{path} is no file: expected one that `embomatrix scene build` wrote")
+        raise SceneFileError(f"{path} is not a file: expected one that `embomatrix scene build` wrote")
     try:
         return scene_from_json(json.loads(read_whole(path, at_most=MAX_BYTES)))
     except OSError as error:
         raise SceneFileError(
-            f"{path} can't be read ({error.strerror}): expected what `embomatrix scene build` wrote"
+            f"{path} can't be read ({error.strerror}): expected a file that `embomatrix scene build` wrote"
         ) from error
     except SceneInvalidError as error:
-        raise SceneFileError(f"{path}: {error}") from error
+        raise SceneFileError(
+            f"{path} is not a scene ({error}): expected a file that `embomatrix scene build` wrote"
+        ) from error
     except (ValueError, RecursionError) as error:
         raise SceneFileError(
-            f"{path} is not JSON ({error}): expected what `embomatrix scene build` wrote"
+            f"{path} is not JSON ({error}): expected a file that `embomatrix scene build` wrote"
         ) from error

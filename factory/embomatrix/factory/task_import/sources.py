@@ -125,8 +125,8 @@ def read_eai(folder: Path) -> tuple[SourceText, ...]:
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ProblemSourceError(
-            f"{folder} holds no tasks of EAI ({error!r}): unpack the wheel of eai-eval 1.0.5 and name the folder that contains "
-            f"{EAI_FOLDER}"
+            f"{folder} contains no tasks of EAI ({error}): unpack the wheel of eai-eval 1.0.5 and name the folder "
+            f"that contains {EAI_FOLDER}"
         ) from error
 
 
@@ -148,5 +148,7 @@ def _read(path: Path, *, at_most: int = MAX_RECORDS_BYTES) -> str:
 def _definitions() -> Path:
     spec = importlib.util.find_spec("bddl")
     if spec is None or spec.origin is None:
-        raise ProblemSourceError("BEHAVIOR-1K's activities need the bddl package: pip install 'bddl==3.6.0'")
+        raise ProblemSourceError(
+            "BEHAVIOR-1K's activities need the package bddl: install it with `pip install bddl==3.6.0`"
+        )
     return Path(spec.origin).parent / "activity_definitions"

@@ -64,7 +64,7 @@ def make_server_certificate(authority: KeyPair, names: Iterable[str], now: datet
     issuer_key = serialization.load_pem_private_key(authority.key, password=None)
     if not isinstance(issuer_key, ec.EllipticCurvePrivateKey):
         raise ValueError(
-            "the authority's key is no elliptic-curve key: let `embomatrix manager init` make another authority"
+            "the authority's key is not an elliptic-curve key: remove it and run `embomatrix manager init` again"
         )
     key = ec.generate_private_key(ec.SECP256R1())
     alternatives = [general_name(name) for name in names]

@@ -55,7 +55,8 @@ def protection_of(settings: ManagerSettings) -> Protection:
     for host in (settings.host, settings.http_host):
         if lacking and not is_loopback(host) and not settings.insecure_bind:
             raise AccessError(
-                f"refusing to serve on {host} without {' and '.join(lacking)}, where anyone could use the cluster or listen: "
+                f"refusing to serve on {host} without {' and '.join(lacking)}: anyone there could use the cluster or read its "
+                f"traffic; "
                 f"run `embomatrix manager init --data-dir {settings.data_dir} --san HOST` first, or pass --insecure-bind if "
                 "the network is trusted"
             )
@@ -86,7 +87,10 @@ def _tls(settings: ManagerSettings, folder: AccessFolder) -> Tls | None:
             "`embomatrix manager init` for the data folder"
         ) from error
     except ValueError as error:
-        raise AccessError(f"{chain_file} or {ca_file} holds no certificate (PEM): {error}") from error
+        raise AccessError(
+            f"{chain_file} or {ca_file} contains no PEM certificate ({error}): "
+            "pass the files that `embomatrix manager init` wrote"
+        ) from error
     if left < timedelta(0):
         raise AccessError(
             f"the certificate {chain_file} expired {-left.days} days ago: `embomatrix manager init` renews the one of the "

@@ -278,7 +278,7 @@ def issue(
     from embomatrix.rpc.wire.tokens import AccessRole
 
     if role not in list(AccessRole):
-        _refuse(f"--role {role!r}: expected {', '.join(AccessRole)}")
+        _refuse(f"--role {role!r}: expected one of {', '.join(AccessRole)}")
     wanted = AccessRole(role)
     new, token_id = _ask(
         manager, token, ca, lambda client: client.issue_token(wanted, valid_s=hours * 3600.0, label=label)

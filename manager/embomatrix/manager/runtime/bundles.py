@@ -162,7 +162,7 @@ class BundleStore:
     def _path(self, digest: str) -> Path:
         if not _DIGEST.fullmatch(digest):
             raise InvalidRequestError(
-                f"{digest[:100]!r} is no digest: expected sha256: and 64 hexadecimal digits"
+                f"{digest[:100]!r} is not a digest: expected sha256: and 64 hexadecimal digits"
             )
         return self._folder / f"{digest.removeprefix(PREFIX)}.bundle"
 

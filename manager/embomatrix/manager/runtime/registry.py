@@ -89,7 +89,7 @@ class WorkerSession:
     credential_id: str = ""
     """Token that opened the session. No other token may use it."""
     allowed_bundles: set[str] = field(default_factory=set)
-    """Bundles that the worker may fetch, since it was told to hold or execute them."""
+    """Bundles that the worker may fetch: those of its desired scenes and leases."""
 
 
 class Registry:
@@ -274,7 +274,10 @@ class Registry:
     def _there(self, worker_id: str) -> WorkerSession:
         session = self._sessions.get(worker_id)
         if session is None:
-            raise NotFoundError(f"there is no worker {worker_id!r}: connected are {name_list(self.present)}")
+            raise NotFoundError(
+                f"there is no worker {worker_id!r} (connected: {name_list(self.present)}): check its name with "
+                "`embomatrix cluster workers`"
+            )
         if session.standing.is_gone:
             raise NotFoundError(f"worker {worker_id!r} is gone ({session.reason}): restart it on its machine")
         return session

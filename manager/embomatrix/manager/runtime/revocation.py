@@ -27,7 +27,7 @@ class Revocation:
         registry = self._sessions.registry
         if not self._gate.knows_worker(worker_id) and worker_id not in registry.sessions:
             raise NotFoundError(
-                f"there is no worker {worker_id!r}, so none was revoked: connected are {name_list(registry.present)}; "
+                f"there is no worker {worker_id!r}, so none was revoked (connected: {name_list(registry.present)}): "
                 "`embomatrix manager token list` lists all credentials"
             )
         await self._gate.revoke_worker(worker_id, reason)

@@ -118,7 +118,7 @@ class Gallery:
     async def _record(self, task_id: str) -> TaskRecord:
         record = (await self._loaded()).get(task_id)
         if record is None:
-            raise NotFoundError(f"the dataset holds no task {task_id[:100]!r}")
+            raise NotFoundError(f"the dataset has no task {task_id[:100]!r}: the page of tasks lists them")
         return record
 
     async def _loaded(self) -> dict[str, TaskRecord]:

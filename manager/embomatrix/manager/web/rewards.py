@@ -53,7 +53,8 @@ class RewardRequest(BaseModel):
     def _as_many(self) -> RewardRequest:
         if not len(self.query) == len(self.prompts) == len(self.labels):
             raise ValueError(
-                f"{len(self.query)} queries, {len(self.prompts)} prompts and {len(self.labels)} labels: send as many of each"
+                f"found {len(self.query)} queries, {len(self.prompts)} prompts and {len(self.labels)} labels: "
+                "send the same number of each"
             )
         return self
 
@@ -91,7 +92,10 @@ def _request(body: bytes) -> RewardRequest:
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False, include_context=False)[0]
         field = ".".join(map(str, first["loc"])) or "request"
-        raise InvalidRequestError(f"{field}: {first['msg']}") from error
+        message = first["msg"].removeprefix("Value error, ")
+        raise InvalidRequestError(
+            f"{field}: {message}; expected a JSON object with query, prompts and labels"
+        ) from error
 
 
 async def _rewards(runs: Runs, requested: RewardRequest) -> list[RewardBreakdown]:
@@ -126,7 +130,7 @@ async def _executed(runs: Runs, batch: Batch) -> dict[str, Outcome]:
             return await _read(log)
     except TimeoutError as error:
         raise UnavailableError(
-            f"{len(batch.rollouts)} answers took more than {LONGEST_S:g} s: send fewer per request, or add workers"
+            f"{len(batch.rollouts)} answers need more than {LONGEST_S:g} s: send fewer per request, or add workers"
         ) from error
     finally:
         if not log.ended:

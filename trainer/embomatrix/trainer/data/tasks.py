@@ -120,7 +120,7 @@ def training_task(bundle: Bundle, record: TaskRecord) -> TrainingTask:
     task = record.task
     if bundle.tasks.get(task.task_id) != task:
         raise TrainerError(
-            f"the dataset's task {task.task_id!r} is not the one of that name in its bundle {record.bundle_digest}: "
+            f"the dataset's task {task.task_id!r} differs from the task of that name in its bundle {record.bundle_digest}: "
             "build the dataset again"
         )
     try:

@@ -185,7 +185,7 @@ def _read(path: Path) -> tuple[EvaluationSetup, dict[tuple[str, int], Answer], i
     complete_bytes = data.rfind(b"\n") + 1
     lines = data[:complete_bytes].splitlines()
     if not lines:
-        raise TrainerError(f"{path} holds no answers: expected the {FILE} of an evaluation")
+        raise TrainerError(f"{path} contains no answers: expected the {FILE} of an evaluation")
     try:
         header = json.loads(lines[0])
         version = header.pop("answers")

@@ -64,7 +64,9 @@ def read_row(path: Path, bench_digest: str) -> ScoreRow:
             f"the report {path} can't be read ({error.strerror}): expected the report.json of an evaluation"
         ) from error
     except (ValueError, KeyError, TypeError) as error:
-        raise TrainerError(f"{path} is not an evaluation report: expected its report.json") from error
+        raise TrainerError(
+            f"{path} is not an evaluation report: expected the report.json of an evaluation"
+        ) from error
     if digest != bench_digest:
         raise TrainerError(f"{path} reports on other tasks: pass a report on the same benchmark")
     return row

@@ -59,7 +59,7 @@ def parse(values: dict[str, Any]) -> WorkerSettings:
         if first["type"] == "extra_forbidden":
             model = Preferences if first["loc"][0] == "preferences" else WorkerSettings
             key, known = ".".join(map(str, first["loc"])), ", ".join(sorted(model.model_fields))
-            fail(f"--config: {key} is no setting: expected one of {known}")
+            fail(f"--config: {key} is not a setting: expected one of {known}")
         if name in {"token", "join"}:
             # The value is not shown: it may be almost the secret.
             fail(f"--{name}: expected visible ASCII characters without spaces")
@@ -72,8 +72,8 @@ def check_engine() -> None:
     """Exit with a sentence if the engine is not installed, without importing it."""
     if importlib.util.find_spec("pybullet") is None:
         fail(
-            f"a worker needs the physics engine pybullet, and this Python {platform.python_version()} on "
-            f"{platform.machine()} has none: use Python 3.11 on x86-64 Linux and install it with "
+            f"a worker needs the physics engine pybullet, which Python {platform.python_version()} on "
+            f"{platform.machine()} does not have: use Python 3.11 on x86-64 Linux and install it with "
             "`pip install 'embomatrix[worker]'`"
         )
 

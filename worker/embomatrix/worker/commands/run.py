@@ -149,11 +149,11 @@ def read_config(path: Path) -> dict[str, Any]:
     try:
         values = tomllib.loads(path.expanduser().read_text(encoding="utf-8"))
     except OSError as error:
-        fail(f"--config {path}: {error.strerror or error}")
+        fail(f"--config {path}: the file can't be read ({error.strerror or error}): name a TOML file")
     except ValueError as error:
-        fail(f"--config {path}: {error}")
+        fail(f"--config {path}: {error}: expected a TOML file")
     if not isinstance(values.get("preferences", {}), dict):
-        fail(f"--config {path}: preferences is a table, [preferences]")
+        fail(f"--config {path}: expected preferences to be a table, [preferences]")
     return values
 
 

@@ -35,7 +35,7 @@ class Hours:
         first_h, first_m, last_h, last_m = map(int, found.groups())
         hours = Hours(first_h * 60 + first_m, last_h * 60 + last_m)
         if hours.begin == hours.end:
-            raise ValueError("begins when it ends: leave it out to work all day")
+            raise ValueError("the interval is empty: leave the option out to work all day")
         return hours
 
     def has(self, minute: int) -> bool:
@@ -61,7 +61,7 @@ class Preferences(BaseModel):
     calm_s: float = Field(30.0, ge=0, allow_inf_nan=False)
     """Work resumes after this time without a reason to pause."""
     check_s: float = Field(2.0, gt=0, allow_inf_nan=False)
-    """Seconds between two looks at the machine."""
+    """Seconds between two observations of the machine."""
 
     @field_validator("hours")
     @classmethod

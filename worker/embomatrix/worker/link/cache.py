@@ -46,7 +46,8 @@ class BundleCache:
         """Return the bundle's file, fetched if it is missing. Raise LoadError (bundle_corrupt) if it is damaged twice."""
         if not _DIGEST.fullmatch(digest):
             raise LoadError(
-                InfraCode.BUNDLE_CORRUPT, f"{digest!r} is no digest: expected sha256: and 64 digits"
+                InfraCode.BUNDLE_CORRUPT,
+                f"{digest!r} is not a digest: expected sha256: and 64 hexadecimal digits",
             )
         cached = await asyncio.to_thread(self._find, digest)
         if cached is not None:
