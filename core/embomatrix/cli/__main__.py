@@ -1,4 +1,4 @@
-"""`python -m embomatrix.cli` is the `embomatrix` command: child processes are started by it, whatever the PATH."""
+"""`python -m embomatrix.cli` is the `embomatrix` command: child processes start through it, independent of PATH."""
 
 from embomatrix.cli.main import main
 

@@ -163,7 +163,7 @@ class ClusterClient(AdminClient):
     async def events(
         self, batch: Batch, *, deadline_s: float | None = None
     ) -> AsyncGenerator[RolloutResult | GroupDone]:
-        """Execute the batch; yields each rollout's one outcome, and once for each group that all of it have theirs.
+        """Execute the batch; yields each rollout's one outcome, and one event for each complete group.
 
         A broken stream is attached again from the last cursor, also across a restart of the manager, until
         every rollout has its outcome. After ``deadline_s`` seconds (by default the limit for a batch) it

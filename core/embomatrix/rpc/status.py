@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 ERROR_KEY: Final = "embomatrix-error"
-"""Trailing metadata key of every status that our services set. It tells an overloaded manager from a dead one."""
+"""Trailing metadata key of every status that our services set. It distinguishes an overloaded manager from a dead one."""
 LEADER_KEY: Final = "embomatrix-leader"
 """Trailing metadata key with the leader's address, set by a standby manager."""
 

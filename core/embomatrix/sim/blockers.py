@@ -93,7 +93,7 @@ def room_refusal(world: LiveWorld, room: str) -> SkillRefusal:
 def _panel_in_the_way(world: LiveWorld, suffices: Callable[[FloorGrid, int], bool]) -> str:
     """First object whose doors and drawers alone block the robot; "" for none.
 
-    ``suffices`` tells if a component of a grid, given by its number, is good enough.
+    ``suffices`` returns True if a component of a grid, given by its number, is good enough.
     """
     ground = world.navigator.ground
     for owner in dict.fromkeys(ground.open_panels.owners.tolist()):

@@ -167,7 +167,7 @@ def limit_memory(more_mb: int) -> None:
 
 
 def give_back_memory() -> None:
-    """Return free heap pages to the system, so that a peak does not count as the slot's memory for good."""
+    """Return free heap pages to the system, so that a peak does not count as the slot's memory permanently."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # GNU C library only
     if trim is not None:
         trim(0)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 CLOTH: Final = "rag.n.01"
 """Tool whose removal rules apply to a cleaning agent that is poured on directly."""
 _MACHINES: Final = frozenset({"dishwasher.n.01", "washer.n.03"})
-"""Washing machines with detergent of their own."""
+"""Washing machines with built-in detergent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +148,7 @@ def missing_for(
 ) -> tuple[str, ...] | None:
     """Return alternatives that a tool lacks to remove a substance: liquids, or `RUNNING`. One of them is enough.
 
-    Empty: the tool removes the substance as it is. None: the tool never removes it. ``facts`` are those of the tool.
+    Empty: the tool removes the substance without a liquid. None: the tool never removes it. ``facts`` are those of the tool.
     """
     if not is_remover(tool.synset):
         # The paper's rule: detergent in the hand does what a cloth soaked with it does. Water needs the cloth.

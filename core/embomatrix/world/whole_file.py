@@ -31,7 +31,7 @@ def read_whole(path: Path, *, at_most: int) -> bytes:
 
 
 def check_writable(path: Path) -> None:
-    """Check before long work that ``write_whole`` can write here; leaves no file. Raises OSError."""
+    """Check before long work that ``write_whole`` can write here, without leaving a file. Raises OSError."""
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     part = path.with_name(f"{path.name}.part")

@@ -36,7 +36,7 @@ WINDOWS: Final = frozenset({"openable_window", "fixed_window"})
 STRUCTURE: Final = frozenset({"walls", "floors", "ceilings", "lawn", "driveway"})
 """Categories of the building itself. A scene generates its own walls and floors."""
 LEAST_FLOOR_M: Final = 0.4
-"""Narrower floor models are thresholds or strips that nobody can stand on."""
+"""Narrower floor models are thresholds or strips too narrow to stand on."""
 
 _SYNSET: Final = re.compile(r"[a-z][\w'\-]*\.n\.\d\d")
 """Synset in a problem file, such as ``apple.n.01``, without the number of an instance."""

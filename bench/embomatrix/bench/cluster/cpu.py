@@ -99,7 +99,7 @@ def _others_s(cluster: BenchCluster) -> tuple[float, float, float]:
 
 
 def _tree(root: int) -> Iterator[tuple[psutil.Process, int]]:
-    """Yield a process and its descendants with their depth, from one look at the system's processes."""
+    """Yield a process and its descendants with their depth, from one scan of the system's processes."""
     children: dict[int, list[psutil.Process]] = {}
     for process in psutil.process_iter(["ppid"]):
         children.setdefault(process.info["ppid"], []).append(process)

@@ -159,7 +159,7 @@ def kill_tree(pid: int) -> None:
 
 
 def free_port() -> int:
-    """A TCP port of loopback that nobody listens at."""
+    """A free TCP port of loopback."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

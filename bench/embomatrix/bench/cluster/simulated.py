@@ -45,7 +45,7 @@ MOST_CPU_US: Final = 150.0
 
 
 def in_flight(workers: int, rollouts: int) -> SimulationScenario:
-    """Submit so many rollouts at once to servers with 8 slots."""
+    """Submit this number of rollouts at once to servers with 8 slots."""
     trainer = Trainer(
         steps=2, groups=rollouts // GROUP, group_size=GROUP, write_s=0.0, update_s=1.0, start_s=10.0
     )

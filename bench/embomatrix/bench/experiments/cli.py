@@ -1,4 +1,4 @@
-"""`embomatrix experiment`: the paper's experiments. Each is one command that resumes its runs if it is given again."""
+"""`embomatrix experiment`: the paper's experiments. Each is one command; repeating it resumes its runs."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ class PeerSizes:
     kill_at: float = 0.25
     """Share of the results after which a process is killed."""
     limit_s: float = 45.0
-    """Limit for each measurement; rollouts without news by then count as hung."""
+    """Limit for each measurement; rollouts without a result count as hung afterwards."""
     start_s: float = 60.0
     """Limit for processes to start and load their scenes."""
     peer_s: float = 180.0

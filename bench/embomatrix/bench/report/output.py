@@ -29,7 +29,7 @@ errors = Console(stderr=True, soft_wrap=True)
 
 
 def hand_in(result: BenchResult, json_file: Path | None) -> None:
-    """Print the table, and write the JSON file if one is asked for."""
+    """Print the table, and write the JSON file if requested."""
     cores, load = result.machine["cores"], result.machine["load_before"]
     title = f"bench {result.bench} at {result.commit}, {cores} cores, load before {load}"
     table = Table(title=title, title_justify="left")
@@ -55,7 +55,7 @@ def write(path: Path, text: str) -> None:
 
 @contextlib.contextmanager
 def refusals() -> Iterator[None]:
-    """Print one sentence and exit with status 2 for errors that the user can mend."""
+    """Print one sentence and exit with status 2 for errors that the user can fix."""
     try:
         yield
     except (BenchError, BundleError, ClusterError, DatasetError, EngineError, OSError) as error:

@@ -168,7 +168,5 @@ def run_command(*command: str, environment: Mapping[str, str] | None = None) -> 
         ) from error
     if done.returncode:
         words = (done.stderr.strip() or done.stdout.strip()).splitlines()[-1:] or ["no output"]
-        raise BenchError(
-            f"`{' '.join(command[:4])} …` failed ({words[0][:300]}): mend that and measure again"
-        )
+        raise BenchError(f"`{' '.join(command[:4])} …` failed ({words[0][:300]}): fix that and measure again")
     return done.stdout

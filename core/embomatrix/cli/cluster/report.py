@@ -162,7 +162,7 @@ def _prewarm_rows(summary: RunSummary) -> str:
     rows = [
         ("scenes that were warm when their batch came", f"{stats.prewarm_hits:,}"),
         ("scenes that were not", f"{stats.prewarm_misses:,}"),
-        ("loads ahead of demand that nobody used", f"{stats.prewarm_wasted:,}"),
+        ("loads ahead of demand that no rollout used", f"{stats.prewarm_wasted:,}"),
         ("rollouts that began warm", f"{stats.warm_starts:,}"),
         ("rollouts that waited for a scene", f"{stats.cold_starts:,}"),
         ("lead: warm before it was needed", _quantiles(summary.prewarm_lead)),

@@ -70,7 +70,7 @@ def run_terms_from_proto(message: rollout_service_pb2.OpenRunRequest) -> RunTerm
 
 
 def reward_settings_to_proto(reward: RewardSettings) -> types_pb2.RewardSettings | None:
-    """Return None for the paper's coefficients: an absent field stands for them."""
+    """Return None for the paper's coefficients: an absent field means the paper's."""
     return (
         None if reward is PAPER or reward == PAPER else types_pb2.RewardSettings(**dataclasses.asdict(reward))
     )

@@ -103,7 +103,7 @@ class Timings:
 
 @dataclass(frozen=True, slots=True)
 class Completed(_ReadWhenAsked):
-    """Executed and scored plan: evidence about the policy, whatever the reward."""
+    """Executed and scored plan: evidence about the policy, with any reward."""
 
     _left = frozenset({"reward", "steps", "final", "trace_digest"})
 

@@ -93,7 +93,7 @@ class Ground:
 
     @property
     def _layout(self) -> FloorLayout:
-        """Current layout, built on demand: after the last placement of a plan nobody drives."""
+        """Current layout, built on demand: the robot does not drive after a plan's last placement."""
         if self._current is None:
             self._current = self._layout_of(self.floor) if self.floor else self._at_start
         return self._current

@@ -170,7 +170,7 @@ class Navigator:
             yield from self._stands_on(grid, (self._key(name), self.ground.open_joints, label), name)
 
     def stands_past_shut(self, name: str, origin: StandPose) -> tuple[StandPose, ...]:
-        """Evaluate ``stands`` as if all doors and drawers were shut: few panels stand in any of these places."""
+        """Evaluate ``stands`` as if all doors and drawers were shut: few panels block any of these places."""
         start = self.ground.shut.cell(origin.x_m, origin.y_m)
         if start is None or self._engine.is_parked(name):
             return ()

@@ -85,7 +85,7 @@ class PoseBoxes:
         return self._within(stand, ROBOT.reach_m, ROBOT.reach_low_m, ROBOT.reach_high_m)
 
     def handy_from(self, stand: StandPose) -> BoolArray:
-        """Tell for each box, shape (n,), if it is easy to reach: neither far out nor near the floor or overhead."""
+        """Return for each box, shape (n,), True if it is easy to reach: neither far out nor near the floor or overhead."""
         return self._within(stand, HANDY_M, *HANDY_HEIGHTS_M)
 
     def _within(self, stand: StandPose, away_m: float, low_m: float, high_m: float) -> BoolArray:

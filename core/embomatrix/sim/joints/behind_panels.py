@@ -30,7 +30,7 @@ UPRIGHT: Final = 0.9
 def behind_panels(
     boxes: PoseBoxes, asset: Asset, pose: Pose, fractions: Sequence[float], stand: StandPose
 ) -> BoolArray:
-    """Tell for each box, shape (n,), if an open door of an object lies between its middle and a standing pose, in the plan.
+    """Return for each box, shape (n,), True if an open door separates its middle from a standing pose in the plan.
 
     Walls of the object count too: otherwise a robot behind an open door would seem to reach in past the hinge. ``pose`` and
     ``fractions`` are the object's pose and joint positions. A box wholly above or below a panel is not behind it.
@@ -61,7 +61,7 @@ def _open_doors(asset: Asset, pose: Pose, fractions: Sequence[float]) -> Iterato
 def _blocked(
     middles: FloatArray, stand: StandPose, frame: Pose, boxes: Sequence[Aabb], margin_m: float
 ) -> BoolArray:
-    """Tell for each world point, shape (n, 3), if any of k boxes lies between it and the standing pose, in the plan.
+    """Return for each world point, shape (n, 3), True if any of k boxes separates it from the standing pose in the plan.
 
     The boxes are given in ``frame`` and grown by the margin in the plane.
     """

@@ -42,7 +42,7 @@ DRAWS: Final = 100
 """Random postures for folding. A high number pays off: an arm that stays out blocks all later paths."""
 TURN_RAD: Final = 0.01
 FOLDS: Final = 3
-"""Attempts to fold. An obstacle met on one path tells where the next begins."""
+"""Attempts to fold. An obstacle on one path determines the start of the next."""
 CARRY_LIFT_M: Final = 0.6
 """Height of the lift while the robot drives with a load."""
 SURROUNDINGS_M: Final = np.array([0.8, 0.8, 9.0])

@@ -117,7 +117,7 @@ def regrasp(
 ) -> bool:
     """Put the held object down and pick it up so that the hand can bring it to one of some poses. True if it is held again.
 
-    ``is_valid`` tells if the object may stay at its present pose in the planning scene.
+    ``is_valid`` returns True if the object may stay at its present pose in the planning scene.
     """
     grip = stage.grip
     assert grip is not None

@@ -55,7 +55,7 @@ class PutPose:
 class PutRequest:
     """Poses for a held object, the preferred one first, at which ``is_valid`` must hold.
 
-    ``is_valid`` is asked while the object stands at a pose in the planning scene.
+    ``is_valid`` is called while the object is at a pose in the planning scene.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class PutRequest:
                 yield [*options[:MOST_OPTIONS], *roofed[:MOST_OPTIONS]]
 
     def _put_poses(self, pose: Pose) -> tuple[list[PutPose], list[PutPose]]:
-        """Return a pose as it is and half turned, if the hand can come so; and the pose rotated to suit the hand."""
+        """Return a pose unchanged and half turned, if the hand can reach it, and the pose rotated to suit the hand."""
         engine, name = self._stage.world.engine, self._grip.name
         engine.set_pose(name, pose)
         course, depth_m = entry(self._stage, name, engine.aabb(name), self._boxes)
@@ -168,7 +168,7 @@ def put(
 ) -> SkillRefusal | None:
     """Bring the held object to the first reachable pose, let go, and draw the hand back.
 
-    ``is_valid`` tells if the object may stay at its present pose in the planning scene. A refusal names the target if no other
+    ``is_valid`` checks the object's present pose in the planning scene. A refusal names the target if no other
     blocker is known. The object may then still be in the hand.
     """
     assert stage.grip is not None

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import FloatArray
 
 SETTLE_STEPS: Final = 240
-"""Longest settling time, in steps of 1/240 s. The world is then taken as it is."""
+"""Longest settling time, in steps of 1/240 s. The world then counts as settled."""
 AROUND_M: Final = 1.9
 """Objects farther than this from the base are out of the arm's reach."""
 SLIP_M: Final = 0.04

@@ -71,7 +71,7 @@ class PoseTrial:
     def proved(
         self, request: PlacementRequest, options: CandidatePoses, number: int, frames: Mapping[str, Pose]
     ) -> Pose | None:
-        """Rest pose by statics with nothing but the support within 5 mm; None if only a settle can tell."""
+        """Rest pose by statics with nothing but the support within 5 mm; None if only a settle can decide."""
         engine, held, target = self._engine, request.held, request.target
         one, other = self._scene.asset_of(held), self._scene.asset_of(target)
         base = self._options.base(one)

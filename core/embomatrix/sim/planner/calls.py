@@ -28,7 +28,7 @@ OUT_OF_ARM: Final = frozenset(
 
 
 class StuckError(Exception):
-    """Raised when a routine can't go on. The message names the call and the reason."""
+    """Raised when a routine can't continue. The message names the call and the reason."""
 
 
 class TooLongError(StuckError):

@@ -129,7 +129,7 @@ def _placed(link: Link, share: float) -> list[Convex]:
 STEPS: Final = 480
 """Two seconds at 240 Hz."""
 GLANCE_STEPS: Final = 36
-"""Shortest run that tells anything: an asset that is at rest by then counts as standing."""
+"""Shortest meaningful run: an asset that is at rest after it counts as standing."""
 FLOOR_M: Final = 6.0
 """Side of the engine's floor: larger assets would stand over its edge."""
 ROD_M: Final = 0.02

@@ -228,7 +228,7 @@ def lamp(size_m: Vec3) -> Body:
 PEDESTAL_FROM_M: Final = 1.15
 """Width from which a desk has its drawers in a pedestal: a chair still fits beside it."""
 TALL_M: Final = 1.05
-"""Height from which a desk has a hutch: nobody works at such a height."""
+"""Height from which a desk has a hutch: its upper part is too high to work at."""
 _WORK_M: Final = 0.76
 _PANEL_M: Final = 0.018
 _BOARD_M: Final = 0.012

@@ -43,7 +43,7 @@ def evaluate_admissions(folder: Path) -> EvaluationFigures:
     label = WriterKind.PLAIN.value if settings["writer"] == WriterKind.PLAIN else ""
     figures = (*admitted_share(folder, label), *_per_hour(folder, attempts, label))
     reasons = Counter(each["outcome"] for each in attempts if each["outcome"] != ADMITTED)
-    told = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common()) or "nothing"
+    counts = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common()) or "nothing"
     conditions = {
         "dataset": folder.name,
         "scenes": len({each["scene"].split("-")[0] for each in attempts}),
@@ -51,7 +51,7 @@ def evaluate_admissions(folder: Path) -> EvaluationFigures:
         "in physics": "yes" if settings["physical"] else "no",
     }
     return EvaluationFigures(
-        "admission", conditions, figures, (f"Rejected drafts{f' of {label}' if label else ''}: {told}.",)
+        "admission", conditions, figures, (f"Rejected drafts{f' of {label}' if label else ''}: {counts}.",)
     )
 
 

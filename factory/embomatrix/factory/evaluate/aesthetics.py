@@ -241,7 +241,7 @@ def shifted(room: RoomPlan, rng: np.random.Generator) -> RoomPlan:
 
 
 def swapped(room: RoomPlan, rng: np.random.Generator) -> RoomPlan:
-    """Swap the places of small objects, whatever their hosts."""
+    """Swap the places of small objects, independent of their hosts."""
     chosen = [at for at in range(len(room.things)) if rng.random() < SWAPPED]
     things, carried = list(room.things), list(room.carried)
     for at, other in zip(chosen, rng.permutation(chosen) if chosen else (), strict=True):

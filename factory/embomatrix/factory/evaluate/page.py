@@ -1,4 +1,4 @@
-"""Factory section of the benchmark page: tables of evaluations between two markers. The rest of the page stays as it is.
+"""Factory section of the benchmark page: tables of evaluations between two markers. The rest of the page is unchanged.
 
 New figures replace the text under their heading; other headings stay.
 """

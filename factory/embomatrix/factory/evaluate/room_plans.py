@@ -69,9 +69,9 @@ class RoomBox:
 
 @dataclass(frozen=True, slots=True)
 class RoomPlan:
-    """Room with ``pieces`` on the floor and small ``things`` on or in them.
+    """Room with ``pieces`` on the floor and small objects (``things``) on or in them.
 
-    ``carried`` is the index of each thing's piece, -1 for none.
+    ``carried`` is the index of the piece below each small object, -1 for none.
     """
 
     name: str
@@ -162,7 +162,7 @@ def _room_from(value: Mapping[str, Any], number: int) -> RoomPlan:
 
 
 def _bearer(thing: RoomBox, pieces: Sequence[RoomBox]) -> int:
-    """Return the index of the piece of the host's kind below the thing, -1 if there is none."""
+    """Return the index of the piece of the host's kind below the object, -1 if there is none."""
     for index, piece in enumerate(pieces):
         inside = all(
             abs(a - b) <= reach + 0.05

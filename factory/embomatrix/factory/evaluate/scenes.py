@@ -201,8 +201,8 @@ def evaluation_of(outcomes: Sequence[LayoutOutcome], conditions: Mapping[str, An
             figures += _figures(mine, method)
             figures += _shared_aesthetics(outcomes, method)
             reasons = Counter(outcome.reason for outcome in mine if outcome.reason)
-            told = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common(5)) or "none"
-            notes.append(f"Most common reasons for rejection, {method}: {told}.")
+            counts = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common(5)) or "none"
+            notes.append(f"Most common reasons for rejection, {method}: {counts}.")
     return EvaluationFigures("scenes", conditions, tuple(figures), tuple(notes))
 
 
@@ -270,8 +270,8 @@ class OutcomeLog(ResumableLog[LayoutOutcome]):
 
 
 def _outcome(value: dict[str, Any]) -> LayoutOutcome:
-    told = {**value, "method": LayoutMethod(value["method"]), "planar_s": tuple(value["planar_s"])}
-    return LayoutOutcome(**told)
+    fields = {**value, "method": LayoutMethod(value["method"]), "planar_s": tuple(value["planar_s"])}
+    return LayoutOutcome(**fields)
 
 
 def evaluate_scenes(

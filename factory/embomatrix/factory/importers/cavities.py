@@ -26,7 +26,7 @@ LEAST_SHARE: Final = 0.12
 """Least share of the box along x and y for a surface or cavity."""
 MAX_CAVITIES: Final = 12
 REMNANT_SHARE: Final = 0.25
-"""The rest of a hollow beside a cavity counts as a separate cavity from this share of the cavity's volume."""
+"""The remainder beside a cavity counts as a separate cavity from this share of the cavity's volume."""
 FLOOR_SHARE: Final = 0.6
 """Least solid share of a cavity's floor: boards may have slots."""
 
@@ -112,7 +112,7 @@ def _is_roomy(low: Cells, high: Cells) -> bool:
 
 
 def _is_remnant(low: Cells, high: Cells, other_low: Cells, other_high: Cells) -> bool:
-    """True if the box is the rest of a round or bevelled hollow beside a much larger box."""
+    """True if the box is the remainder of a round or bevelled cavity beside a much larger box."""
     is_beside = bool((low <= other_high).all() and (other_low <= high).all())
     return is_beside and bool(np.prod(high - low) < REMNANT_SHARE * np.prod(other_high - other_low))
 

@@ -163,7 +163,7 @@ class PendingObjects:
             self.abandoned.append(pending.failure(self._room))
 
     def replace_host(self, pending: PendingObject) -> bool:
-        """Switch the object's host to its next model, or move the host. Return False if the task doesn't bring the host."""
+        """Switch the object's host to its next model, or move the host. False if the host is not the task's."""
         host = self.placed.get(pending.item.host)
         if host is None:
             return False

@@ -102,7 +102,7 @@ def _best_plan(
 
 
 def room_spec(catalog: Catalog, room: RoomInventory) -> RoomSpec:
-    """Return floor, doors and windows of an inventory's room, each as often as it is listed."""
+    """Return floor, doors and windows of an inventory's room, each repeated as often as it is listed."""
     doors = []
     for category, model, count in room.doors:
         _, width, height = catalog.model(category, model).size_m

@@ -1,7 +1,7 @@
-"""Feasibility of wishes, tested one at a time before they are written: oracle routines run in the simulator.
+"""Feasibility of goal atoms, tested one at a time before they are written: oracle routines run in the simulator.
 
-Many plausible wishes are out of the robot's reach: food behind a microwave, a cabinet behind a table, an oven whose
-open door covers the only position to serve it. A wish that fails alone fails in every task. Combinations of wishes
+Many plausible atoms are out of the robot's reach: food behind a microwave, a cabinet behind a table, an oven whose
+open door covers the only position to serve it. An atom that fails alone fails in every task. Combinations of atoms
 are only checked by admission.
 """
 

@@ -27,7 +27,7 @@ class HouseholdSetting:
 
 @dataclass(frozen=True, slots=True)
 class SocialRole:
-    """Role of a person. ``tie`` is their relation to the first person of the cast, ``back`` the inverse relation.
+    """Role of a cast member. ``tie`` is the relation to the first member, ``back`` the inverse relation.
 
     ``apart`` is the minimum age difference to the first person in years; negative means younger, 0 means any age.
     """
@@ -217,11 +217,11 @@ def milieu_of(base: str) -> Milieu:
 
 
 MIN_SLOTS: Final = 5
-"""Number of activities of a person in their own rooms. Further activities cover the remaining rooms."""
+"""Number of activities of a cast member in their own rooms. Further activities cover the remaining rooms."""
 
 
 def draw_cast(scene: Scene, rng: np.random.Generator) -> Cast:
-    """Return two to five people whose roles suit the place. Every room belongs to somebody or is visited on this day."""
+    """Return two to five people whose roles suit the place. Every room has an owner or a visitor on this day."""
     milieu = milieu_of(scene.base)
     count = int(rng.integers(2, min(5, len(milieu.roles)) + 1))
     others = rng.permutation(len(milieu.roles) - 1)[: count - 1]

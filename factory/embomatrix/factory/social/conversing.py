@@ -1,7 +1,7 @@
 """Rule-based Social Simulation Agent: a conversation in which a request takes shape over several rounds.
 
-The final wishes are conjuncts of a feasible goal. The conversation is derived from them: a vague need with its
-reason, a question, an answer that may change, a request that the robot refuses, and further wishes.
+The final requests are conjuncts of a feasible goal. The conversation is derived from them: a vague need with its
+reason, a question, an answer that may change, a request that the robot refuses, and further requests.
 """
 
 from __future__ import annotations
@@ -75,12 +75,12 @@ REFUSED_SHARE: Final = 0.35
 AMENDED_SHARE: Final = 0.7
 PLACES_TRIED: Final = 5
 INTERJECTED_SHARE: Final = 0.4
-"""Share of the changes that another person in the same room brings up."""
+"""Share of the changes that another cast member in the same room proposes."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConversationScenario:
-    """Person, time, place and reason of a need. ``conjuncts`` are the wishes that the conversation ends with."""
+    """Person, time, place and reason of a need. ``conjuncts`` are the final requests of the conversation."""
 
     cast: Cast
     slot: DaySlot
@@ -99,7 +99,7 @@ class GrammarConversation:
         self._turns: list[DialogueTurn] = []
 
     def run(self) -> Conversation:
-        """Return the conversation: need, question, answer, changes, refusal with a proposal, further wishes, confirmation."""
+        """Return the conversation: need, question, answer, changes, refusal with a proposal, further requests, confirmation."""
         slot, conjuncts = self._scenario.slot, self._scenario.conjuncts
         first, further = conjuncts[0], list(conjuncts[1:])
         self._open(first)
@@ -135,7 +135,7 @@ class GrammarConversation:
         return None
 
     def _refuse(self, further: list[GoalConjunct]) -> None:
-        """Add a request that the robot refuses. It proposes the next wish instead, which leaves ``further``."""
+        """Add a request that the robot refuses. It then proposes the next request, which leaves ``further``."""
         slot = self._scenario.slot
         chore, reason = impossible_request(self._shop.view, slot.room, self._rng)
         self._say(slot.person, Act.ADD, clause=chore)
@@ -147,7 +147,7 @@ class GrammarConversation:
             )
 
     def _settle(self, first: GoalConjunct, earlier: GoalConjunct | None) -> str:
-        """Agree on the first wish, directly or after a change, and return the initial wish."""
+        """Agree on the first request, directly or after a change, and return the initial one."""
         person = self._scenario.slot.person
         if earlier is None:
             self._say(person, Act.ANSWER, clause=first.clause)

@@ -1,4 +1,4 @@
-"""Plausibility of wishes: a wish must suit a person's activity and household conventions."""
+"""Plausibility of requests: a request must suit an activity of the cast and household conventions."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ GROUP_THEMES: Final[Mapping[ItemKind, frozenset[Theme]]] = {
     ItemKind.TOILETRIES: _themes("washing"),
     ItemKind.DECORATION: _themes("guests tidying leaving"),
 }
-"""Themes of a wish to move an object of the group."""
+"""Themes of a request to move an object of the group."""
 
 _KITCHEN: Final = frozenset(
     {"kitchen", "bar", "break_room", "pantry_room", "dining_room", "garden", "grocery_store"}
@@ -176,7 +176,7 @@ SWITCHES: Final[Mapping[str, frozenset[Theme]]] = {
     "checkout_counter": _themes("stock"),
     "grandfather_clock": _themes("guests"),
 }
-"""Themes of a wish to open or switch an object of the category."""
+"""Themes of a request to open or switch an object of the category."""
 NEVER_REQUESTED: Final = frozenset(
     {
         "fire_extinguisher",
@@ -195,7 +195,7 @@ NEVER_REQUESTED: Final = frozenset(
     }
 )
 _NEVER_REQUESTED_ENDINGS: Final = ("_shaker", "_atomizer", "_bottle", "_grinder", "_dispenser", "_can")
-"""Categories, and endings of categories, that nobody asks to open or switch. In the catalog, a salt shaker has a switch."""
+"""Categories, and endings of categories, that no request opens or switches. In the catalog, a salt shaker has a switch."""
 STORAGE_THEMES: Final[Mapping[str, frozenset[Theme]]] = {
     **dict.fromkeys(_KITCHEN, _themes("cooking meals tidying stock guests")),
     **dict.fromkeys(
@@ -208,13 +208,13 @@ _GENERAL: Final = _themes("tidying leaving")
 
 
 def fits(conjunct: GoalConjunct, view: SceneView, slot: DaySlot) -> bool:
-    """True if the activity of a rule-based slot suits the wish."""
+    """True if the activity of a rule-based slot suits the request."""
     occasion = occasion_of(slot.activity)
     return occasion is not None and bool(themes_of(conjunct, view) & occasion.themes)
 
 
 def themes_of(conjunct: GoalConjunct, view: SceneView) -> frozenset[Theme]:
-    """Return the themes of a wish; empty if the wish is implausible."""
+    """Return the themes of a request; empty if the request is implausible."""
     thing = view.category(conjunct.objects[0])
     if thing in PLURAL_NOUNS:
         return frozenset()
@@ -242,7 +242,7 @@ def themes_of(conjunct: GoalConjunct, view: SceneView) -> frozenset[Theme]:
 
 
 def _is_served_well(conjunct: GoalConjunct, view: SceneView, *, warmed: bool) -> bool:
-    """True if heated, cooked or frozen food ends up in a plausible place, or if the wish names no place."""
+    """True if heated, cooked or frozen food ends up in a plausible place, or if the request names no place."""
     for sign in conjunct.signs:
         relation, _, names = sign.rstrip(")").partition("(")
         food, _, host = names.partition(",")
@@ -286,7 +286,7 @@ def is_plausible(thing: str, host: str, room_type: str, *, inside: bool) -> bool
 def best_slot(
     cast: Cast, conjuncts: Sequence[GoalConjunct], view: SceneView, request_counts: Mapping[str, int]
 ) -> tuple[float, DaySlot] | None:
-    """Return the slot that suits all wishes best, with its score; None if none does.
+    """Return the slot that suits all requests best, with its score; None without a suitable slot.
 
     Slots in the rooms of the objects score higher. People and activities with earlier requests score lower.
     """

@@ -1,4 +1,4 @@
-"""Activities by room type: hour, people, reasons for needing help, and themes of suitable wishes.
+"""Activities by room type: hour, people, reasons for needing help, and themes of suitable requests.
 
 The table is ``occasions.toml`` beside this module.
 """
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Theme(StrEnum):
-    """Theme of an activity and of a wish."""
+    """Theme of an activity and of a request."""
 
     COOKING = "cooking"
     MEALS = "meals"

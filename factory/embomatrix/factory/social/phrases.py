@@ -225,7 +225,7 @@ NEEDS: Final[Mapping[str, tuple[str, ...]]] = {
     "open drawers": ("{thing} is shut, and I have no hand free", "I need something out of {thing}"),
     "not open drawers": ("everybody bumps into the drawers of {thing}", "a drawer of {thing} sticks out"),
 }
-"""Statements of a need, by the wish and its manner."""
+"""Statements of a need, by the kind and manner of the request."""
 
 QUESTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "place": (
@@ -263,7 +263,7 @@ INSTRUCTIONS: Final = (
     "Could you spare {who} the walk and {what}?",
     "{Who} can't leave {room} just now. {What}, please.",
 )
-"""Final instructions. Each names a person."""
+"""Final instructions. Each names a cast member."""
 
 CONJUNCTIONS: Final = (
     ", then ",

@@ -43,7 +43,7 @@ class RequestedAtom(BaseModel):
 
 
 class TaskRequest(BaseModel):
-    """Instruction with its wishes."""
+    """Instruction with its requested atoms."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -52,59 +52,64 @@ class TaskRequest(BaseModel):
 
 
 def check_request(request: TaskRequest, view: SceneView, known: frozenset[str]) -> None:
-    """Raise ValueError with a sentence for the model if a wish is not feasible in the scene."""
-    for number, wish in enumerate(request.wishes, start=1):
-        problem = _problem(wish, view, known)
+    """Raise ValueError with a sentence for the model if a requested atom is infeasible in the scene."""
+    for number, requested in enumerate(request.wishes, start=1):
+        problem = _problem(requested, view, known)
         if problem:
-            raise ValueError(f"wish {number}, {wish.predicate.value}: {problem}")
+            raise ValueError(f"wish {number}, {requested.predicate.value}: {problem}")
     if len(set(request.wishes)) < len(request.wishes):
         raise ValueError("two wishes are equal: leave one out")
 
 
-def _problem(wish: RequestedAtom, view: SceneView, known: frozenset[str]) -> str:
-    for name in (wish.thing, *([wish.place] if wish.place else [])):
+def _problem(requested: RequestedAtom, view: SceneView, known: frozenset[str]) -> str:
+    for name in (requested.thing, *([requested.place] if requested.place else [])):
         if name not in known:
             return f"there is no {name!r}: use a name from the list, such as {min(known)!r}"
-    if wish.predicate in PLACED:
-        return _placing_problem(wish, view)
-    if wish.place:
-        return f"it takes no place, found {wish.place!r}"
-    if wish.predicate in THERMAL:
-        if not wish.holds:
+    if requested.predicate in PLACED:
+        return _placing_problem(requested, view)
+    if requested.place:
+        return f"it takes no place, found {requested.place!r}"
+    if requested.predicate in THERMAL:
+        if not requested.holds:
             return "cooked, hot and frozen can only be requested, not the contrary"
-        if not view.asset(wish.thing).can("cookable"):
-            return f"{wish.thing} can't be cooked, heated or frozen"
-        return "" if view.robot.can_pick_up(wish.thing) else _out_of_reach(wish.thing)
-    if wish.predicate is RequestPredicate.OPEN:
-        if not view.is_openable(wish.thing):
-            return f"{wish.thing} has no door or drawer"
-        done, works = view.is_open(wish.thing), view.robot.can_swing(wish.thing, shut=not wish.holds)
+        if not view.asset(requested.thing).can("cookable"):
+            return f"{requested.thing} can't be cooked, heated or frozen"
+        return "" if view.robot.can_pick_up(requested.thing) else _out_of_reach(requested.thing)
+    if requested.predicate is RequestPredicate.OPEN:
+        if not view.is_openable(requested.thing):
+            return f"{requested.thing} has no door or drawer"
+        done, works = (
+            view.is_open(requested.thing),
+            view.robot.can_swing(requested.thing, shut=not requested.holds),
+        )
     else:
-        if not view.is_toggleable(wish.thing):
-            return f"{wish.thing} can't be switched"
-        done, works = view.is_on(wish.thing), view.robot.can_switch(wish.thing, on=wish.holds)
-    if done is wish.holds:
-        return f"{wish.thing} is already in this state"
-    return "" if works else _out_of_reach(wish.thing)
+        if not view.is_toggleable(requested.thing):
+            return f"{requested.thing} can't be switched"
+        done, works = view.is_on(requested.thing), view.robot.can_switch(requested.thing, on=requested.holds)
+    if done is requested.holds:
+        return f"{requested.thing} is already in this state"
+    return "" if works else _out_of_reach(requested.thing)
 
 
-def _placing_problem(wish: RequestedAtom, view: SceneView) -> str:
-    if not wish.holds:
+def _placing_problem(requested: RequestedAtom, view: SceneView) -> str:
+    if not requested.holds:
         return "name the place where the object must be, not one where it must not be"
-    if not wish.place:
+    if not requested.place:
         return "it takes a place"
-    inside = wish.predicate is RequestPredicate.INSIDE
+    inside = requested.predicate is RequestPredicate.INSIDE
     hosts = (
-        view.is_container(wish.place) or view.is_basket(wish.place) if inside else view.is_surface(wish.place)
+        view.is_container(requested.place) or view.is_basket(requested.place)
+        if inside
+        else view.is_surface(requested.place)
     )
-    if not view.is_portable(wish.thing):
-        return f"{wish.thing} can't be carried"
-    if not hosts or not view.takes(wish.place, wish.thing, inside=inside):
-        return f"{wish.thing} does not fit {'into' if inside else 'onto'} {wish.place}"
-    if view.item(wish.thing).host == wish.place:
-        return f"{wish.thing} is there already"
-    if not view.robot.can_place(wish.thing, Relation(wish.predicate.value), wish.place):
-        return f"the robot tried and can't place {wish.thing} there: request another object or place"
+    if not view.is_portable(requested.thing):
+        return f"{requested.thing} can't be carried"
+    if not hosts or not view.takes(requested.place, requested.thing, inside=inside):
+        return f"{requested.thing} does not fit {'into' if inside else 'onto'} {requested.place}"
+    if view.item(requested.thing).host == requested.place:
+        return f"{requested.thing} is there already"
+    if not view.robot.can_place(requested.thing, Relation(requested.predicate.value), requested.place):
+        return f"the robot tried and can't place {requested.thing} there: request another object or place"
     return ""
 
 
@@ -112,11 +117,17 @@ def _out_of_reach(name: str) -> str:
     return f"the robot tried and can't reach {name}: request something else"
 
 
-def conjunct_of(wish: RequestedAtom, view: SceneView) -> GoalConjunct:
-    """Return the wish as a conjunct of a goal. The request's instruction holds its words."""
-    names = (wish.thing, wish.place) if wish.place else (wish.thing,)
-    atom: Formula = Atom(wish.predicate.value, names)
+def conjunct_of(requested: RequestedAtom, view: SceneView) -> GoalConjunct:
+    """Return the atom as a conjunct of a goal. Its words are in the request's instruction."""
+    names = (requested.thing, requested.place) if requested.place else (requested.thing,)
+    atom: Formula = Atom(requested.predicate.value, names)
     categories = ",".join(view.category(name) for name in names)
-    kind = "place" if wish.predicate in PLACED else "thermal" if wish.predicate in THERMAL else "switch"
-    sign = f"{'' if wish.holds else 'not '}{wish.predicate.value}({categories})"
-    return GoalConjunct(atom if wish.holds else Not(atom), "", names, (sign,), kind, wish.thing)
+    kind = (
+        "place"
+        if requested.predicate in PLACED
+        else "thermal"
+        if requested.predicate in THERMAL
+        else "switch"
+    )
+    sign = f"{'' if requested.holds else 'not '}{requested.predicate.value}({categories})"
+    return GoalConjunct(atom if requested.holds else Not(atom), "", names, (sign,), kind, requested.thing)

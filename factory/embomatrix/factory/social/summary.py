@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def instruction_of(conversation: Conversation, cast: Cast, view: SceneView, voice: Voice, why: str) -> str:
-    """Return one or two sentences with the final wishes in their order. ``why`` is a clause with the reason."""
+    """Return one or two sentences with the final requests in their order. ``why`` is a clause with the reason."""
     slot = conversation.slot
     who = cast.of(slot.person)
     others = [person.name for person in cast.people if person.name != who.name]

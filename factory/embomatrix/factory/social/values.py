@@ -31,7 +31,7 @@ class Person(_Value):
 
 
 class DaySlot(_Value):
-    """Activity of a person at a time and place."""
+    """Activity of a cast member at a time and place."""
 
     time: str = Field(pattern=r"^([01]\d|2[0-3]):[0-5]\d$")
     person: str
@@ -73,7 +73,7 @@ class Cast(_Value):
         return tuple(person.name for person in self.people)
 
     def rooms_without_anyone(self, rooms: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the rooms that nobody owns or visits."""
+        """Return the rooms without an owner or visitor."""
         lived_in = {room for person in self.people for room in person.rooms} | {
             slot.room for slot in self.day
         }
@@ -83,13 +83,13 @@ class Cast(_Value):
 class Act(StrEnum):
     """Speech act of a turn."""
 
-    NEED = "need"  # a person states a need
+    NEED = "need"  # a cast member states a need
     CLARIFY = "clarify"  # the robot asks for the object or place
-    ANSWER = "answer"  # the person answers
+    ANSWER = "answer"  # the cast member answers
     REFUSE = "refuse"  # the robot refuses and says why
     PROPOSE = "propose"  # the robot proposes something that it can do
-    AMEND = "amend"  # a person changes the request
-    ADD = "add"  # a person adds a wish
+    AMEND = "amend"  # a cast member changes the request
+    ADD = "add"  # a cast member adds a request
     CONFIRM = "confirm"  # the robot confirms the request
 
 
@@ -109,7 +109,7 @@ class Conversation(_Value):
 
     @property
     def rounds(self) -> int:
-        """Number of times that a person takes the floor."""
+        """Number of turns spoken by cast members."""
         return sum(
             turn.speaker != ROBOT and (number == 0 or self.turns[number - 1].speaker == ROBOT)
             for number, turn in enumerate(self.turns)
@@ -117,7 +117,7 @@ class Conversation(_Value):
 
     @property
     def changed(self) -> bool:
-        """True if the final request differs from the first wish."""
+        """True if the final request differs from the initial one."""
         return self.last_wishes != (self.first_wish,)
 
 
@@ -147,7 +147,7 @@ class SummaryBrief(_Value):
 
 
 class RequestSummary(_Value):
-    """Instruction with its wishes, as clauses of the conversation or as JSON of a model."""
+    """Instruction with its requested atoms, as clauses of the conversation or as JSON of a model."""
 
     instruction: str
     wishes: tuple[str, ...]

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from embomatrix.world.task import TaskCategory
 
 MAX_EQUAL_WISHES: Final = 2
-"""Maximum number of equal wishes in one variant."""
+"""Maximum number of equal requests in one variant."""
 GOALS_TRIED: Final = 10
 """Number of goals considered for one task. Each must suit one of the people."""
 
@@ -94,7 +94,7 @@ class SocialWriter:
     def talk(
         self, variant: Variant, view: SceneView, category: TaskCategory, rng: np.random.Generator
     ) -> Talk | None:
-        """Return a conversation that leads to a wish of this category; None if no goal suits the people."""
+        """Return a conversation that leads to a request of this category; None if no goal suits the cast."""
         cast = self.cast_of(variant.scene)
         said = self._said_in(variant)
         voice = FreshVoice(rng, said)
@@ -128,7 +128,7 @@ def _signature_of(conjuncts: Sequence[GoalConjunct]) -> str:
 def _scenario(
     cast: Cast, context: GoalContext, category: TaskCategory, said: Counter[str]
 ) -> ConversationScenario | None:
-    """Return the scenario of the goal that suits somebody's schedule best; None if none does.
+    """Return the scenario of the goal that suits a cast member's schedule best; None without a suitable goal.
 
     Clauses of rejected goals count as used, which keeps the wording varied.
     """

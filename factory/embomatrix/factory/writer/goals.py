@@ -200,7 +200,7 @@ def switch_goal(context: GoalContext) -> GoalConjunct | None:
     if len(view.alike(name)) > 1 and any(
         _holds(view, predicate, other) != holds for other in view.alike(name)
     ):
-        return None  # "open a cabinet" asks for nothing if one is already open
+        return None  # "open a cabinet" is trivial if one is already open
     if not (
         view.robot.can_swing(name, shut=holds)
         if predicate == "open"

@@ -126,7 +126,7 @@ class Reputation:
 
 
 class Auditor:
-    """Reputations of all workers. ``key`` is secret: it tells which leases are audited."""
+    """Reputations of all workers. ``key`` is secret: it determines the audited leases."""
 
     def __init__(self, rules: AuditRules, key: bytes) -> None:
         self.rules = rules

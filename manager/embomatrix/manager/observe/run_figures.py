@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 FAILURES_KEPT: Final = 200
 WORKERS_KEPT: Final = 4096
 OTHERS: Final = "(others)"
-"""Name that stands for all workers beyond ``WORKERS_KEPT``."""
+"""Common name of all workers beyond ``WORKERS_KEPT``."""
 STEPS: Final = 600
 FIRST_STEP_S: Final = 0.25
 

@@ -227,7 +227,7 @@ class ManagerRuntime:
     async def pause_dispatch(self) -> None:
         """Stop giving leases, also under later managers. Live leases continue.
 
-        Raises UnavailableError if later managers could not be told.
+        Raises UnavailableError if the pause can't be stored for later managers.
         """
         self._paused = True
         self._update_dispatch()

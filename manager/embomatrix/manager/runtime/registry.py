@@ -89,7 +89,7 @@ class WorkerSession:
     credential_id: str = ""
     """Token that opened the session. No other token may use it."""
     allowed_bundles: set[str] = field(default_factory=set)
-    """Bundles that the worker may fetch, since it was told to hold or execute them."""
+    """Bundles that the worker may fetch: those of its desired scenes and leases."""
 
 
 class Registry:

@@ -58,7 +58,7 @@ class StateJournal:
         except StateError as error:
             done = "paused" if paused else "resumed"
             raise UnavailableError(
-                f"dispatch is {done}, but other managers were not told ({error}): repeat the command when the store is back"
+                f"dispatch is {done}, but not stored for other managers ({error}): repeat the command when the store is back"
             ) from error
 
     def flush(self) -> None:

@@ -98,7 +98,7 @@ class Overview:
 
 @dataclass(frozen=True, slots=True)
 class WorkerView:
-    """One worker. ``loads`` are scenes that it was told to load and has not reported."""
+    """One worker. ``loads`` are desired scenes that it has not reported."""
 
     worker_id: str
     state: str

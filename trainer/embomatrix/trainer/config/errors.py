@@ -6,7 +6,7 @@ import pickle
 from typing import Final
 
 DAMAGE: Final = (OSError, ValueError, LookupError, TypeError, RuntimeError, EOFError, pickle.UnpicklingError)
-"""Exceptions that reading a damaged file may raise. ``torch.load`` passes on the errors of its own readers."""
+"""Exceptions that reading a damaged file may raise. ``torch.load`` raises the errors of its internal readers."""
 
 
 class TrainerError(Exception):

@@ -31,7 +31,7 @@ MAX_SEED: Final = 2**31
 
 
 class AnswerSource(Protocol):
-    """Fills an answer sheet. Stored answers are not asked for again.
+    """Fills an answer sheet. Stored answers are not requested again.
 
     ``on_progress`` gets the number of stored answers and the total.
     """
@@ -95,7 +95,7 @@ class EndpointSource:
         self._ledger_file = ledger_file
 
     def ask(self, questions: Sequence[Question], sheet: AnswerSheet, on_progress: OnProgress) -> None:
-        """Raises TrainerError that tells how many answers are stored."""
+        """Raises TrainerError with the number of stored answers."""
         total = len(questions) * sheet.setup.samples
         try:
             asyncio.run(self._ask_all(questions, sheet, lambda: on_progress(len(sheet), total)))

@@ -145,7 +145,7 @@ class _Requests:
         self.reference_logprobs = self._learner.reference_logprobs
 
     def learn(self, microbatch: Microbatch) -> tuple[LossMetrics, list[bool]]:
-        """Write the microbatch's gradient to shared memory. The list tells which parameters have a gradient."""
+        """Write the microbatch's gradient to shared memory. The list marks the parameters with a gradient."""
         for parameter in self._weights:
             parameter.grad = None
         metrics = self._learner.learn(microbatch)
@@ -193,7 +193,7 @@ class DataParallelWorkers:
     def start(cls, local: Learner, policy: Policy, settings: TrainSettings, reference: Path) -> Self:
         """Start ``settings.processes - 1`` remote learners. ``reference`` is the reference policy's folder.
 
-        Raises TrainerError if several processes are asked for and the policy is not on the CPU.
+        Raises TrainerError if several processes are requested and the policy is not on the CPU.
         """
         if settings.processes == 1:
             return cls(local)

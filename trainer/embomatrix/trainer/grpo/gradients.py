@@ -1,4 +1,4 @@
-"""Sum of the microbatches' gradients in a fixed order, whatever order they finish in."""
+"""Sum of the microbatches' gradients in a fixed order, independent of the order in which they finish."""
 
 from __future__ import annotations
 

@@ -160,7 +160,7 @@ class Updater:
         logs: dict[int, list[GroupLog]] = {}
         waiting = list(chunks)
         while waiting:
-            # With enough gradients stored, only the next chunk in the sum may go on.
+            # With enough gradients stored, only the next chunk in the sum may proceed.
             candidates = waiting[:1] if state.gradients.stored >= MAX_STORED_GRADIENTS else waiting
             with self._stopwatch.track(Activity.WAITING):
                 chunk = wait_for_next(candidates)

@@ -40,7 +40,7 @@ class MixedLinear(nn.Linear):
 
 
 class CastingLinear(MixedLinear):
-    """Mixed linear layer whose output has the dtype of its input, for models that know nothing of ``compute_dtype``."""
+    """Mixed linear layer whose output has the dtype of its input, for models without support for ``compute_dtype``."""
 
     def forward(self, x: Tensor) -> Tensor:
         """(…, in_features) to (…, out_features)."""

@@ -156,7 +156,7 @@ class PlanGrammar:
         return ~allowed
 
     def token_masks(self, tokens: Tensor, names: PromptNames) -> Tensor:
-        """Return the words (R, T, V) that must not stand at each position of plans (R, T).
+        """Return the masked words (R, T, V) at each position of plans (R, T).
 
         The plans' own tokens are never masked, so a plan that breaks the grammar still has a likelihood.
         """

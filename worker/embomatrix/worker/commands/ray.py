@@ -23,7 +23,7 @@ from embomatrix.worker.commands.options import fail
 DRAIN_S: Final = 90.0
 """Longer than the time that running rollouts have to end."""
 FINAL: Final = frozenset({0, 2})
-"""Exit statuses without a restart: the daemon left, or a user must mend something."""
+"""Exit statuses without a restart: the daemon left, or a user must fix an error."""
 
 
 class PlacedWorker:
@@ -90,7 +90,7 @@ def ray_workers(
 
 
 def _watch(ray: Any, placed: dict[str, Any], console: Console) -> None:
-    """Report every daemon that has ended for good, until all have."""
+    """Report every daemon that has ended permanently; return when all have."""
     waiting = {each.ended.remote(): name for name, each in placed.items()}
     console.print(f"{len(placed)} workers run on Ray; Ctrl-C drains them", highlight=False)
     while waiting:

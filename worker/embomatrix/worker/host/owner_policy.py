@@ -61,7 +61,7 @@ class Preferences(BaseModel):
     calm_s: float = Field(30.0, ge=0, allow_inf_nan=False)
     """Work resumes after this time without a reason to pause."""
     check_s: float = Field(2.0, gt=0, allow_inf_nan=False)
-    """Seconds between two looks at the machine."""
+    """Seconds between two observations of the machine."""
 
     @field_validator("hours")
     @classmethod

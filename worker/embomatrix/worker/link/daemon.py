@@ -65,7 +65,7 @@ _PASSING: Final = (UnavailableError, DeadlineError, OverloadedError, InternalErr
 
 
 class Daemon:
-    """One worker. ``run`` returns after it has left, and raises ClusterError for errors that no retry can mend."""
+    """One worker. ``run`` returns after it has left, and raises ClusterError for errors that a retry can't fix."""
 
     def __init__(
         self,

@@ -1,7 +1,7 @@
 """Execution of leases in one slot, from the permit to the results.
 
 A slot's process has its next plans in its stream before it has answered the last one, so it never waits for the daemon.
-Meanwhile the daemon reads the answers of some milliseconds at once.
+Meanwhile the daemon reads answers in batches of some milliseconds.
 """
 
 from __future__ import annotations

@@ -120,7 +120,7 @@ class ProcessChannel:
         self._connection.close()
 
     def _listen(self) -> None:
-        """Register the reader for good: doing so for each answer costs more than the answer."""
+        """Register the reader once: registering it for each answer costs more than reading the answer."""
         if not self._listening and not self._gone:
             asyncio.get_running_loop().add_reader(self._connection, self._readable)
             self._listening = True

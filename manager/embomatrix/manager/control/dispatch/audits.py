@@ -1,6 +1,6 @@
 """Audits: an audited result is compared with a second execution on another worker, and with a third on a mismatch.
 
-A check is a rollout record of its own, in no batch; its worker cannot tell it from any other rollout. In a run that asks
+A check is a rollout record of its own, in no batch; its worker cannot distinguish it from any other rollout. In a run that asks
 for verified results, the check is queued and the result is held back. In other runs, the check gets a slot that is idle.
 """
 
@@ -105,7 +105,7 @@ def tick_audits(state: DispatchState) -> None:
         if len(case.opinions) > 1:
             _give_up(state, case, _mismatch(case))
         else:
-            # Nobody can compare: the one result is taken as it is.
+            # No worker can compare: the single result is accepted.
             state.auditor.lone = True
             _close_and_deliver(state, case, case.results[0] if case.results else None)
 
@@ -151,7 +151,7 @@ def _rule(state: DispatchState, case: AuditCase) -> None:
 
 
 def _convict(state: DispatchState, worker_id: str, case: AuditCase) -> None:
-    """Quarantine a worker, and execute again what it did and nobody has confirmed yet."""
+    """Quarantine a worker, and re-dispatch its rollouts without a confirmed result."""
     others = " and ".join(o.worker_id for o in case.opinions if o.worker_id != worker_id)
     reason = f"its result of rollout {case.key.rollout_id} of run {case.key.run_id} contradicts {others}"
     known = state.auditor.quarantined(worker_id)

@@ -1,4 +1,4 @@
-"""Time limits: expired and stalled leases, overdue batches, and rollouts that wait for a worker in vain."""
+"""Time limits: expired and stalled leases, overdue batches, and rollouts that wait too long for a worker."""
 
 from __future__ import annotations
 

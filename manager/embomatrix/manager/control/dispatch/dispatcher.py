@@ -5,7 +5,7 @@ A pure state machine: ``handle`` is the only way to change it, the clock is an a
 * A lease goes only to a worker that *reported* the scene as warm. Waiting rollouts appear in ``demand``; the
   Resource-Scheduler then has their scenes loaded.
 * A worker with a free credit and a warm scene never idles while a rollout of that scene waits that it may take.
-* Every lease has an epoch of its own. A result under any other epoch is acknowledged, counted as stale and dropped.
+* Every lease has a unique epoch. A result under any other epoch is acknowledged, counted as stale and dropped.
 * Only leases that started cost an attempt. After ``max_attempts`` the rollout ends as an infrastructure failure, and the
   run's group policy decides about the rest of the group.
 * A rollout has one live lease, or two on different workers if the first is late; the first good result counts.
@@ -72,7 +72,7 @@ if TYPE_CHECKING:
 class Dispatcher:
     """Batches in, leases and results out. ``boot_id`` keeps lease ids of different manager processes apart.
 
-    ``first_epoch`` is above the epoch of every lease that a former manager granted. ``audit_key`` is secret: it tells
+    ``first_epoch`` is above the epoch of every lease that a former manager granted. ``audit_key`` is secret: it determines
     which results will be audited.
     """
 

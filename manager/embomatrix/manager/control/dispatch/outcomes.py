@@ -73,7 +73,7 @@ def deliver(state: DispatchState, record: RolloutRecord, outcome: Outcome) -> No
 
 
 def return_lease(state: DispatchState, lease: LeaseRecord, why: str) -> None:
-    """End a lease without a result; queue the rollout again unless another lease of it goes on."""
+    """End a lease without a result; queue the rollout again unless another lease of it is live."""
     record = lease.record
     state.log(RolloutStepKind.RETURNED, record.key, lease.worker_id, why)
     state.end_lease(lease)

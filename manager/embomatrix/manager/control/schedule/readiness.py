@@ -88,7 +88,7 @@ class ReadinessForecast:
         ]
 
     def _loading(self, scene: str) -> list[WorkerResidency]:
-        """Return the workers that were told to load the scene."""
+        """Return the workers that were ordered to load the scene."""
         residencies = (self._residencies.by_id[name] for name in self._residencies.assigned_on(scene))
         return [residency for residency in residencies if scene in (residency.desired or ())]
 

@@ -1,4 +1,4 @@
-"""Residency of scenes on workers: what each worker holds and was told to hold, indexed by scene."""
+"""Residency of scenes on workers: the held and the desired scenes of each worker, indexed by scene."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class WorkerResidency:
         return now_s - self.loading_since_s.get(scene, now_s) <= overdue_s
 
     def assigned(self) -> tuple[str, ...]:
-        """Return the scenes that it has or was told to have, by last use. Reports lag behind orders, so both count."""
+        """Return the held and the desired scenes, by last use. Reports lag behind orders, so both count."""
         scenes = [
             scene for scene, resident in self.residents.items() if resident.state is not ResidentState.FAILED
         ]
@@ -177,7 +177,7 @@ class Residencies:
                 self.changed(residency)
 
     def assigned_on(self, scene: str) -> AbstractSet[str]:
-        """Return the workers, usable or not, that have the scene or were told to have it."""
+        """Return the workers, usable or not, that have the scene or were ordered to load it."""
         return self._assigned_on.get(scene, frozenset())
 
     def warm_on(self, scene: str) -> AbstractSet[str]:
@@ -185,7 +185,7 @@ class Residencies:
         return self._warm_on.get(scene, frozenset())
 
     def having(self, scene: str) -> Sequence[WorkerResidency]:
-        """Return the usable workers that have the scene or were told to have it."""
+        """Return the usable workers that have the scene or were ordered to load it."""
         residencies = (self.by_id[worker_id] for worker_id in self._assigned_on.get(scene, ()))
         return [residency for residency in residencies if residency.worker.usable]
 

@@ -55,7 +55,7 @@ class Urgency(IntEnum):
     LATER = 1
     """A scene may be better on another worker."""
     NOW = 2
-    """A scene is needed that no worker was told to load."""
+    """A needed scene is in no worker's desired set."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ const PAGES = {
 const REFRESH_MS = 1000;
 /** Rows of workers in the snapshot, by page; other pages need none. */
 const ROWS = {workers: 50};
-let page = null, told_s = 0;
+let page = null, shown_s = 0;
 let waiting = 0;
 let opened = 0;
 
@@ -25,7 +25,7 @@ async function open() {
     code = await PAGES[name]();
   } catch {
     at("dot").className = "dot lost";
-    tell("a part of the dashboard failed to load: reload the page");
+    showStatus("a part of the dashboard failed to load: reload the page");
     return;
   }
   if (turn !== opened) return;
@@ -47,17 +47,17 @@ async function refresh(first = null) {
   clearTimeout(waiting);
   if (!page) return;
   try {
-    const asked = page, told = await (first ?? ask(`snapshot?${new URLSearchParams(asked.query?.() ?? {limit: 1})}`));
+    const asked = page, snapshot = await (first ?? ask(`snapshot?${new URLSearchParams(asked.query?.() ?? {limit: 1})}`));
     if (asked === page) {
-      say(told);
-      await page.show(told);
+      showOverview(snapshot);
+      await page.show(snapshot);
       at("dot").className = "dot ready";
       at("main").classList.remove("old");
       learn(); // scene names must not delay the first view
     }
   } catch (error) {
     at("dot").className = "dot lost";
-    tell(error.name === "TimeoutError" || error instanceof TypeError ? "the manager does not answer; retrying" : error.message);
+    showStatus(error.name === "TimeoutError" || error instanceof TypeError ? "the manager does not answer; retrying" : error.message);
     age();
   }
   clearTimeout(waiting);
@@ -66,27 +66,27 @@ async function refresh(first = null) {
 }
 
 /** Screen readers announce changed text. The uptime changes every second and is kept out of it. */
-function tell(words, up = "") {
+function showStatus(words, up = "") {
   at("up").textContent = up;
   if (at("states").textContent !== words) at("states").textContent = words;
 }
 
 /** Mark the page as outdated, with the time of its data. */
 function age() {
-  if (!told_s) return;
+  if (!shown_s) return;
   at("main").classList.add("old");
   at("health").className = "health bad";
-  const words = `This page shows the state of ${clock(told_s)}: the manager has not answered since.`;
+  const words = `This page shows the state of ${clock(shown_s)}: the manager has not answered since.`;
   if (at("health").textContent !== words) at("health").textContent = words;
 }
 
-function say(told) {
-  told_s = told.at_s;
-  const states = Object.entries(told.overview.workers).map(([state, n]) => `${n} ${state}`).join(", ") || "no workers";
-  tell(states, `up ${seconds(told.overview.uptime_s)} · `);
+function showOverview(snapshot) {
+  shown_s = snapshot.at_s;
+  const states = Object.entries(snapshot.overview.workers).map(([state, n]) => `${n} ${state}`).join(", ") || "no workers";
+  showStatus(states, `up ${seconds(snapshot.overview.uptime_s)} · `);
   at("health").hidden = false;
-  at("health").className = `health ${told.health.mood}`;
-  const words = told.overview.notice ? `${told.health.sentence} Note: ${told.overview.notice}.` : told.health.sentence;
+  at("health").className = `health ${snapshot.health.mood}`;
+  const words = snapshot.overview.notice ? `${snapshot.health.sentence} Note: ${snapshot.overview.notice}.` : snapshot.health.sentence;
   if (at("health").textContent !== words) at("health").textContent = words;
 }
 

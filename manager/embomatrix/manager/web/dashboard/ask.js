@@ -18,19 +18,19 @@ export async function picture(path) {
 async function answer(path, options = {}) {
   const token = sessionStorage.getItem("token");
   const headers = {...(token ? {authorization: `Bearer ${token}`} : {}), ...(options.body ? {"content-type": "application/json"} : {})};
-  const told = await fetch(`/api/v1/${path}`, {cache: "no-store", headers, signal: AbortSignal.timeout(5000), ...options});
-  if (told.status === 401) {
+  const response = await fetch(`/api/v1/${path}`, {cache: "no-store", headers, signal: AbortSignal.timeout(5000), ...options});
+  if (response.status === 401) {
     document.getElementById("ask").hidden = false;
     throw new Refused("the token is missing or wrong");
   }
-  if (!told.ok) {
-    const text = await told.text();
+  if (!response.ok) {
+    const text = await response.text();
     let why = text;
     try { why = JSON.parse(text).detail ?? text; } catch { /* plain text */ }
-    throw new Refused(typeof why === "string" && why ? why : `the manager answered with status ${told.status}`);
+    throw new Refused(typeof why === "string" && why ? why : `the manager answered with status ${response.status}`);
   }
   document.getElementById("ask").hidden = true;
-  return told;
+  return response;
 }
 
 export const change = (path, body) => ask(path, {method: "POST", body: body ? JSON.stringify(body) : undefined});

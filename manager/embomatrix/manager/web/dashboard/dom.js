@@ -26,7 +26,7 @@ export const count = number => Number(number).toLocaleString("en");
 /** Number and unit with a no-break space. */
 const unit = (number, of) => `${number}\u00a0${of}`;
 export const share = (part, all) => all ? unit(Math.round(100 * part / all), "%") : "–";
-export const counted = (number, thing) => `${count(number)} ${thing}${number === 1 ? "" : "s"}`;
+export const counted = (number, noun) => `${count(number)} ${noun}${number === 1 ? "" : "s"}`;
 /** Time of day; with the date unless it is today. */
 export function clock(seconds) {
   const moment = new Date(seconds * 1000), today = moment.toDateString() === new Date().toDateString();
@@ -80,10 +80,10 @@ function held(place) {
 
 /** Replace the content of an element if it differs. Selections survive a refresh, and the focus also a change. */
 export function put(place, ...children) {
-  const fresh = h("div", {}, ...children), told = fresh.innerHTML;
+  const fresh = h("div", {}, ...children), html = fresh.innerHTML;
   const before = last.get(place);
-  if (before?.told === told && before.first === place.firstChild) return;
-  last.set(place, {told, first: fresh.firstChild});
+  if (before?.html === html && before.first === place.firstChild) return;
+  last.set(place, {html, first: fresh.firstChild});
   const giveBack = held(place);
   place.replaceChildren(...fresh.childNodes);
   giveBack();

@@ -35,7 +35,7 @@ export async function show({overview, runs}) {
 
 /** The latest events of the cluster and of the latest runs, newest first. */
 async function look(runs) {
-  const pages = [await ask(`events?after=${after}`), ...await Promise.all(runs.slice(-3).map(run => ask(`runs/${encodeURIComponent(run.run_id)}`).then(told => ({events: told.failures.filter(event => event.kind === "failed")}))))];
+  const pages = [await ask(`events?after=${after}`), ...await Promise.all(runs.slice(-3).map(run => ask(`runs/${encodeURIComponent(run.run_id)}`).then(summary => ({events: summary.failures.filter(event => event.kind === "failed")}))))];
   const fleet = pages[0].events;
   if (fleet.length) after = fleet.at(-1).sequence;
   log = [...log, ...fleet.filter(event => BAD.includes(event.kind))].slice(-KEPT);

@@ -10,7 +10,7 @@ const SWATCH = {warm: "warm", warming: "warming", queued: "queued", unplaceable:
 
 const HINT = "Each cell shows the number of rollouts, and ×2 if two workers hold the scene. Point at a cell, or move there with Tab and the arrow keys, for details.";
 const MOVES = {ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowUp: [-1, 0], ArrowDown: [1, 0]};
-let chosen = "", told = {};
+let chosen = "", labels = {};
 
 export function open(main) {
   chosen = "";
@@ -26,7 +26,7 @@ export function show({lookahead, runs}) {
   at("sum").textContent = cells.length ? `${warm} of ${counted(cells.length, "cell")} warm` : "";
   const names = Object.fromEntries(runs.map(run => [run.run_id, run.name || run.run_id]));
   const byRun = Map.groupBy ? Map.groupBy(lookahead, step => step.run_id) : new Map([["", lookahead]]);
-  told = {};
+  labels = {};
   const parts = [...byRun].map(([run, steps]) => [h("h3", {}, names[run] ?? run), grid(run, steps), problems(steps)]);
   put(at("ahead"), parts.length && lookahead.length ? parts : none("No scenes announced. A trainer announces the scenes of its coming steps."));
   say(lookahead.length > 0);
@@ -40,7 +40,7 @@ function choose(event) {
 }
 
 function say(any) {
-  const words = any ? told[chosen] ?? HINT : "";
+  const words = any ? labels[chosen] ?? HINT : "";
   if (at("cell").textContent !== words) at("cell").textContent = words;
 }
 
@@ -56,13 +56,13 @@ function walk(event) {
 }
 
 function problems(steps) {
-  const told = new Map(steps.flatMap(step => step.cells.filter(cell => cell.problem).map(cell => [cell.bundle_digest, cell.problem])));
-  return [...told].map(([scene, problem]) => h("p", {class: "bad message"}, h("code", {}, named(scene)), ` ${worded(problem.replace(`scene ${scene} `, ""))}`));
+  const found = new Map(steps.flatMap(step => step.cells.filter(cell => cell.problem).map(cell => [cell.bundle_digest, cell.problem])));
+  return [...found].map(([scene, problem]) => h("p", {class: "bad message"}, h("code", {}, named(scene)), ` ${worded(problem.replace(`scene ${scene} `, ""))}`));
 }
 
 function grid(run, steps) {
   const every = [...new Set(steps.flatMap(step => step.cells.map(cell => cell.bundle_digest)))], scenes = every.slice(0, COLUMNS);
-  const left = [[steps.length - STEPS, "later step"], [every.length - COLUMNS, "more scene"]].filter(([n]) => n > 0).map(([n, thing]) => counted(n, thing));
+  const left = [[steps.length - STEPS, "later step"], [every.length - COLUMNS, "more scene"]].filter(([n]) => n > 0).map(([n, noun]) => counted(n, noun));
   let entry = 0;
   const rows = steps.slice(0, STEPS).map(step => {
     const of = Object.fromEntries(step.cells.map(cell => [cell.bundle_digest, cell]));
@@ -76,7 +76,7 @@ function grid(run, steps) {
 
 function box(key, cell, step, inner) {
   const held = cell.worker_ids.length ? `on ${cell.worker_ids.join(", ")}` : "on no worker";
-  told[key] = `Step ${step}, ${named(cell.bundle_digest)}: ${counted(cell.count, "rollout")}, ${WORDS[cell.warmth]}, ${held}`;
-  return h("button", {type: "button", class: `cell ${cell.warmth}`, "data-key": key, "aria-label": told[key], title: told[key], tabindex: inner && "-1"},
+  labels[key] = `Step ${step}, ${named(cell.bundle_digest)}: ${counted(cell.count, "rollout")}, ${WORDS[cell.warmth]}, ${held}`;
+  return h("button", {type: "button", class: `cell ${cell.warmth}`, "data-key": key, "aria-label": labels[key], title: labels[key], tabindex: inner && "-1"},
     `${cell.count}${cell.worker_ids.length > 1 ? `\u00a0×${cell.worker_ids.length}` : ""}`);
 }

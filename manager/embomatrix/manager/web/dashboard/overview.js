@@ -28,7 +28,7 @@ export function close() {
 export function show({overview: o, runs}) {
   const recent = o.throughput.slice(-10), mean = recent.reduce((a, b) => a + b, 0) / recent.length;
   const failed = Object.entries(o.outcomes).filter(([name]) => name !== "completed" && name !== "cancelled").reduce((sum, [, n]) => sum + n, 0);
-  const told = {
+  const texts = {
     rate: mean >= 100 ? count(Math.round(mean)) : mean.toFixed(1), p50: seconds(o.latency_p50_s), p50note: o.latency_p95_s ? `median; 95th percentile ${seconds(o.latency_p95_s)}` : "from submission to result",
     overhead: o.overhead ? `${(100 * o.overhead).toFixed(o.overhead < 0.1 ? 1 : 0)}\u00a0%` : "–",
     hits: share(o.prewarm_hits, o.prewarm_hits + o.prewarm_misses), hitsnote: o.prewarm_hits ? `lead ${seconds(o.prewarm_lead_s)}, ${count(o.prewarm_wasted)} wasted` : "of announced scenes",
@@ -36,7 +36,7 @@ export function show({overview: o, runs}) {
     bad: count(failed), badnote: `${count(o.redispatched)} re-dispatched, ${count(o.stale_results)} late`,
     peak: `peak ${count(Math.max(...o.throughput))}, ${count(o.outcomes.completed || 0)} in total`,
   };
-  for (const [id, text] of Object.entries(told)) at(id).textContent = text;
+  for (const [id, text] of Object.entries(texts)) at(id).textContent = text;
   at("bad").className = failed ? "bad" : "";
   const ago = o.throughput.map((_, i) => i - o.throughput.length + 1);
   drawn.draw(ago, [o.throughput.map((done, i) => -ago[i] > o.uptime_s ? null : done)]);
@@ -46,10 +46,10 @@ export function show({overview: o, runs}) {
   put(at("outcomes"), rows.length ? table(["outcome", ["rollouts", "n"]], rows, "outcomes") : none("No rollout has been executed yet."));
 }
 
-function phases(told) {
-  const all = Object.values(told).reduce((sum, one) => sum + one.sum_s, 0);
+function phases(durations) {
+  const all = Object.values(durations).reduce((sum, one) => sum + one.sum_s, 0);
   if (!all) return none("No rollout has been executed yet.");
-  const rows = Object.entries(told).map(([name, one]) => h("tr", {}, h("td", {class: "fit"}, name, h("span", {class: "muted wideonly"}, ` ${PHASES[name] ?? ""}`)),
+  const rows = Object.entries(durations).map(([name, one]) => h("tr", {}, h("td", {class: "fit"}, name, h("span", {class: "muted wideonly"}, ` ${PHASES[name] ?? ""}`)),
     h("td", {}, h("span", {class: "share", style: `width:${(100 * one.sum_s / all).toFixed(1)}%`})), h("td", {class: "n fit"}, share(one.sum_s, all)),
     [one.p50_s, one.p95_s, one.p99_s].map(s => h("td", {class: "n fit"}, s ? seconds(s) : "0\u00a0ms"))));
   return table(["phase", "", ["share", "n"], ["median", "n"], ["95 %", "n"], ["99 %", "n"]], rows, "latency by phase");

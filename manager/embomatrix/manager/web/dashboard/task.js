@@ -13,10 +13,10 @@ export function close() {
 
 /** Show the task in a place; throws Refused. */
 export async function open(place, task_id) {
-  const told = await ask(`tasks/${encodeURIComponent(task_id)}`), {card} = told, about = new Set(told.objects.filter(row => row.goal).map(row => row.name));
-  ({moments} = told);
-  view = drawn(told.floor, {rooms: told.rooms, about, things: told.things, label: `floor plan of ${card.scene_id}`});
-  const facts = [["scene", card.scene_id], ["category", card.category.replaceAll("_", " ")], ["split", splitWords(card.split)], ["source", told.source], ["profile", told.profile], ["goal type", told.signature]];
+  const detail = await ask(`tasks/${encodeURIComponent(task_id)}`), {card} = detail, about = new Set(detail.objects.filter(row => row.goal).map(row => row.name));
+  ({moments} = detail);
+  view = drawn(detail.floor, {rooms: detail.rooms, about, things: detail.things, label: `floor plan of ${card.scene_id}`});
+  const facts = [["scene", card.scene_id], ["category", card.category.replaceAll("_", " ")], ["split", splitWords(card.split)], ["source", detail.source], ["profile", detail.profile], ["goal type", detail.signature]];
   const steps = moments.map((moment, i) => h("li", {}, h("button", {type: "button", class: "step", onclick: () => { close(); go(i); }}, moment.call || "start")));
   const button = (id, words, act) => h("button", {type: "button", id, onclick: act}, words);
   place.replaceChildren(
@@ -25,12 +25,12 @@ export async function open(place, task_id) {
     h("section", {class: "most"}, h("h2", {}, "The oracle's plan ", h("small", {}, "moved objects are drawn at their targets, not at their verified poses")), view.picture, view.key,
       h("div", {class: "bar"}, button("first", "Start", () => { close(); go(0); }), button("back", "Back", () => { close(); go(number - 1); }), button("play", "Play", play), button("next", "Next", () => { close(); go(number + 1); }),
         h("span", {id: "said", role: "status"}))),
-    h("section", {class: "third"}, h("h2", {}, "Steps ", h("small", {}, told.problem)), h("ol", {class: "calls", start: "0", onkeydown: key}, steps)),
+    h("section", {class: "third"}, h("h2", {}, "Steps ", h("small", {}, detail.problem)), h("ol", {class: "calls", start: "0", onkeydown: key}, steps)),
     card.picture ? h("section", {class: "half"}, h("h2", {}, "Picture"), h("div", {id: "picture"})) : "",
-    h("section", {class: card.picture ? "half" : ""}, h("h2", {}, "Goal"), h("pre", {class: "told", tabindex: "0"}, told.goal)),
-    h("section", {}, h("h2", {}, "Objects ", h("small", {}, "object table of the plans; goal objects in bold")), objects(told.objects)),
-    told.transcript ? h("section", {class: told.tree ? "half" : ""}, h("h2", {}, "Transcript"), transcript(told.transcript)) : "",
-    told.tree ? h("section", {class: told.transcript ? "half" : ""}, h("h2", {}, "Layout tree"), tree(told.tree)) : "");
+    h("section", {class: card.picture ? "half" : ""}, h("h2", {}, "Goal"), h("pre", {class: "goaltext", tabindex: "0"}, detail.goal)),
+    h("section", {}, h("h2", {}, "Objects ", h("small", {}, "object table of the plans; goal objects in bold")), objects(detail.objects)),
+    detail.transcript ? h("section", {class: detail.tree ? "half" : ""}, h("h2", {}, "Transcript"), transcript(detail.transcript)) : "",
+    detail.tree ? h("section", {class: detail.transcript ? "half" : ""}, h("h2", {}, "Layout tree"), tree(detail.tree)) : "");
   go(0);
   if (card.picture) put(at("picture"), h("img", {alt: `rendered picture of ${card.scene_id}`, src: await picture(`scenes/${card.bundle_digest}/picture`)}));
 }

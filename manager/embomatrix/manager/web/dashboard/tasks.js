@@ -5,7 +5,7 @@ import {drawn} from "./plan.js";
 import * as task from "./task.js";
 
 const CARDS = 24, TYPING_MS = 250;
-const wish = {search: "", scene: "", category: "", offset: 0};
+const filters = {search: "", scene: "", category: "", offset: 0};
 let pictures = new Map(), watcher = null, typed = 0, total = 0;
 
 export function open(main) {
@@ -18,13 +18,13 @@ export function open(main) {
   watcher = new IntersectionObserver(seen => seen.filter(one => one.isIntersecting).forEach(({target}) => { watcher.unobserve(target); look(target); }), {rootMargin: "200px"});
   main.replaceChildren(h("section", {}, h("h2", {}, "Scenes and tasks ", h("small", {id: "total"})),
     h("div", {class: "bar"},
-      h("input", {type: "search", placeholder: "words of the instruction", "aria-label": "search", value: wish.search, oninput: event => { clearTimeout(typed); typed = setTimeout(() => turn({search: event.target.value}), TYPING_MS); }}),
+      h("input", {type: "search", placeholder: "words of the instruction", "aria-label": "search", value: filters.search, oninput: event => { clearTimeout(typed); typed = setTimeout(() => turn({search: event.target.value}), TYPING_MS); }}),
       h("select", {id: "scene", "aria-label": "scene", onchange: event => turn({scene: event.target.value})}),
       h("select", {id: "category", "aria-label": "category", onchange: event => turn({category: event.target.value})}),
-      h("button", {id: "before", type: "button", onclick: () => turn({offset: Math.max(0, wish.offset - CARDS)})}, "Previous"),
-      h("button", {id: "after", type: "button", onclick: () => turn({offset: wish.offset + CARDS})}, "Next")),
+      h("button", {id: "before", type: "button", onclick: () => turn({offset: Math.max(0, filters.offset - CARDS)})}, "Previous"),
+      h("button", {id: "after", type: "button", onclick: () => turn({offset: filters.offset + CARDS})}, "Next")),
     h("div", {id: "cards", class: "cards"}, none("Loading the dataset…"))));
-  turn({offset: wish.offset});
+  turn({offset: filters.offset});
 }
 
 export function close() {
@@ -38,9 +38,9 @@ export function close() {
 export function show() {}
 
 async function turn(changes) {
-  Object.assign(wish, {offset: 0}, changes);
+  Object.assign(filters, {offset: 0}, changes);
   try {
-    const page = await ask(`tasks?${new URLSearchParams({...wish, limit: CARDS})}`);
+    const page = await ask(`tasks?${new URLSearchParams({...filters, limit: CARDS})}`);
     if (watcher) list(page);
   } catch (error) {
     if (watcher) put(at("cards"), refused(error));
@@ -60,7 +60,7 @@ function list(page) {
 }
 
 function choices(id, every, pairs) {
-  put(at(id), h("option", {value: ""}, every), pairs.map(([value, words]) => h("option", {value, selected: value === wish[id]}, words)));
+  put(at(id), h("option", {value: ""}, every), pairs.map(([value, words]) => h("option", {value, selected: value === filters[id]}, words)));
 }
 
 function card(one) {

@@ -6,16 +6,16 @@ import {named} from "./names.js";
 const ROW = 20, NAMES = 150, NAMES_SHARE = 0.28, TYPING_MS = 250, HEAD = 22, GRIP = 5, LEAST_PX = 1, LEAST_S = 0.1, LEAST_VIEW_S = 0.001, TICK = 80;
 const SPANS = [10, 60, 300, 1800];
 const KINDS = [["execute", "warm"], ["load", "warming"], ["deliver", "queued"], ["failed", "bad"], ["idle", "chip"]];
-let run = "", told = null, view = null, live = true, span = 60, painted = [], grabbed = null, edge = NAMES, search = "", typed = 0;
+let run = "", timeline = null, view = null, live = true, span = 60, painted = [], grabbed = null, edge = NAMES, search = "", typed = 0;
 
 export function open(main) {
   run = decodeURIComponent(location.hash.split("?")[1] ?? "");
-  told = view = null; live = true;
+  timeline = view = null; live = true;
   const legend = KINDS.map(([word, tint]) => [h("i", {style: `background:var(--${tint})`}), word]);
   main.replaceChildren(h("section", {},
     h("h2", {}, "Slots ", h("small", {id: "range"}), h("span", {class: "legend"}, legend)),
     h("div", {class: "bar"},
-      h("select", {id: "run", "aria-label": "run", onchange: event => { run = event.target.value; told = view = null; live = true; dispatchEvent(new Event("embomatrix-changed")); }}),
+      h("select", {id: "run", "aria-label": "run", onchange: event => { run = event.target.value; timeline = view = null; live = true; dispatchEvent(new Event("embomatrix-changed")); }}),
       h("input", {type: "search", placeholder: "worker", "aria-label": "search by worker", value: search, oninput: event => { clearTimeout(typed); typed = setTimeout(() => { search = event.target.value; follow(); }, TYPING_MS); }}),
       h("select", {"aria-label": "time range", onchange: event => { span = Number(event.target.value); live = true; view = null; dispatchEvent(new Event("embomatrix-changed")); }}, SPANS.map(s => h("option", {value: s, selected: s === span}, `last ${seconds(s)}`))),
       h("button", {type: "button", onclick: () => zoom(0.5, live ? 1 : 0.5)}, "Zoom in"), h("button", {type: "button", onclick: () => zoom(2, live ? 1 : 0.5)}, "Zoom out"),
@@ -30,19 +30,19 @@ export async function show({runs}) {
   if (!run) run = (runs.findLast(r => r.pending || r.stats.delivered) ?? runs.at(-1))?.run_id ?? "";
   put(at("run"), (known.includes(run) || !run ? known : [run, ...known]).map(id => h("option", {value: id, selected: id === run}, runs.find(r => r.run_id === id)?.name || id)));
   if (!run) { put(at("tracks"), none("No open run. For a closed run: embomatrix cluster report RUN")); return; }
-  if (!live && told) { draw(); return; } // the window or the theme may be another by now
-  told = await ask(`runs/${encodeURIComponent(run)}/timeline?${new URLSearchParams({seconds: span, search})}`);
+  if (!live && timeline) { draw(); return; } // the window or the theme may be another by now
+  timeline = await ask(`runs/${encodeURIComponent(run)}/timeline?${new URLSearchParams({seconds: span, search})}`);
   if (live) {
-    const first = Math.min(...told.tracks.flatMap(track => track.spans.map(one => one.begin_s - one.load_s)));
-    view = {from: Math.min(told.until_s - LEAST_S, Math.max(told.until_s - span, first)), until: told.until_s};
+    const first = Math.min(...timeline.tracks.flatMap(track => track.spans.map(one => one.begin_s - one.load_s)));
+    view = {from: Math.min(timeline.until_s - LEAST_S, Math.max(timeline.until_s - span, first)), until: timeline.until_s};
   }
   draw();
 }
 
 function draw() {
   const place = at("tracks");
-  if (!place || !told) return;
-  if (!told.tracks.length) { put(place, none(search ? "No matching worker executed a rollout in this time." : "No rollout was executed in this time.")); at("one").textContent = ""; return; }
+  if (!place || !timeline) return;
+  if (!timeline.tracks.length) { put(place, none(search ? "No matching worker executed a rollout in this time." : "No rollout was executed in this time.")); at("one").textContent = ""; return; }
   if (!at("one").textContent) at("one").textContent = matchMedia("(pointer: coarse)").matches ? "Tap a span for details; drag to move along the time axis." :
     "Point at a span for details. Zoom: Ctrl and the wheel, double click on a rollout, plus and minus. Move: drag, arrow keys. Escape follows the latest events.";
   let canvas = place.querySelector("canvas");
@@ -52,16 +52,16 @@ function draw() {
   }
   const wide = place.clientWidth;
   edge = Math.min(NAMES, Math.round(wide * NAMES_SHARE));
-  const high = HEAD + told.tracks.length * ROW, dense = devicePixelRatio || 1;
+  const high = HEAD + timeline.tracks.length * ROW, dense = devicePixelRatio || 1;
   canvas.width = wide * dense; canvas.height = high * dense; canvas.style.height = `${high}px`;
-  canvas.setAttribute("aria-label", `${told.tracks.length} slots, ${told.tracks.reduce((sum, track) => sum + track.spans.length, 0)} rollouts`);
+  canvas.setAttribute("aria-label", `${timeline.tracks.length} slots, ${timeline.tracks.reduce((sum, track) => sum + track.spans.length, 0)} rollouts`);
   const pen = canvas.getContext("2d");
   pen.scale(dense, dense);
   const tint = Object.fromEntries(["ink", "soft", "line", "chip", "warm", "warming", "queued", "bad"].map(name => [name, colour(name)]));
   const x = at_s => edge + (at_s - view.from) / (view.until - view.from) * (wide - edge);
   scale(pen, tint, x, wide, high);
   painted = [];
-  told.tracks.forEach((track, number) => {
+  timeline.tracks.forEach((track, number) => {
     const top = HEAD + number * ROW;
     pen.fillStyle = tint.chip; pen.fillRect(edge, top + 2, wide - edge, ROW - 4);
     for (const one of track.spans) {
@@ -74,8 +74,8 @@ function draw() {
     }
     pen.fillStyle = tint.soft; pen.fillText(`${short(pen, track.worker_id, edge - 28)} ${track.slot}`, 0, top + ROW / 2 + 4, edge - 8);
   });
-  const more = told.slots > told.tracks.length ? `; the first ${count(told.tracks.length)} of ${count(told.slots)} slots` : "";
-  at("range").textContent = `${seconds(view.until - view.from)} shown${more}${told.dropped ? `; ${told.dropped} older events were discarded` : ""}`;
+  const more = timeline.slots > timeline.tracks.length ? `; the first ${count(timeline.tracks.length)} of ${count(timeline.slots)} slots` : "";
+  at("range").textContent = `${seconds(view.until - view.from)} shown${more}${timeline.dropped ? `; ${timeline.dropped} older events were discarded` : ""}`;
 }
 
 function bar(pen, x, begin, end, top, fill, always) {
@@ -90,8 +90,8 @@ function scale(pen, tint, x, wide, high) {
   const rough = (view.until - view.from) / Math.max(2, (wide - edge) / TICK), power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].map(n => n * power).find(n => n >= rough);
   pen.font = "11px system-ui"; pen.strokeStyle = tint.line;
-  for (let tick = Math.ceil((view.from - told.until_s) / step) * step; tick <= view.until - told.until_s + 1e-9; tick += step) {
-    const left = x(told.until_s + tick);
+  for (let tick = Math.ceil((view.from - timeline.until_s) / step) * step; tick <= view.until - timeline.until_s + 1e-9; tick += step) {
+    const left = x(timeline.until_s + tick);
     const words = Math.abs(tick) < step / 2 ? "latest" : signed(`${Number(tick.toPrecision(6))} s`), space = pen.measureText(words).width + 3;
     pen.fillStyle = tint.soft; pen.fillText(words, left + space > wide ? left - space : left + 3, 13);
     pen.beginPath(); pen.moveTo(left, 0); pen.lineTo(left, high); pen.stroke();
@@ -115,7 +115,7 @@ function short(pen, name, room) {
 
 /** Show this interval, limited to the loaded data. */
 function look(from, until) {
-  const long = Math.min(span, Math.max(LEAST_VIEW_S, until - from)), begin = Math.max(told.until_s - span, Math.min(from, told.until_s - long));
+  const long = Math.min(span, Math.max(LEAST_VIEW_S, until - from)), begin = Math.max(timeline.until_s - span, Math.min(from, timeline.until_s - long));
   live = false;
   view = {from: begin, until: begin + long};
   draw();

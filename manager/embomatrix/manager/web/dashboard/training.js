@@ -13,11 +13,11 @@ const CHARTS = [
 ];
 const TILES = [["step", "Step"], ["reward", "Reward"], ["solved", "Success"], ["flat", "Zero-variance groups"], ["entropy", "Entropy"], ["long", "Plan length"]];
 const LATEST = 10;
-let run = "", seen = "", drawn = {}, told = null;
+let run = "", seen = "", drawn = {}, report = null;
 
 export function open(main) {
   run = decodeURIComponent(location.hash.split("?")[1] ?? "");
-  seen = ""; drawn = {}; told = null;
+  seen = ""; drawn = {}; report = null;
   main.replaceChildren(
     h("section", {}, h("h2", {}, "Training ", h("small", {id: "when"})),
       h("div", {class: "bar"}, h("select", {id: "run", "aria-label": "run", onchange: event => { run = event.target.value; dispatchEvent(new Event("embomatrix-changed")); }}))),
@@ -36,7 +36,7 @@ export function close() {
 
 export async function show({training}) {
   if (!training.some(one => one.run_id === run)) run = training[0]?.run_id ?? "";
-  if (!run && told) {  // another manager leads, and no trainer has reported to it yet
+  if (!run && report) {  // another manager leads, and no trainer has reported to it yet
     close();
     open(at("main"));
   }
@@ -47,8 +47,8 @@ export async function show({training}) {
   if (!view || seen === `${run} ${view.revision}`) return;
   const fresh = await ask(`training/${encodeURIComponent(run)}`);
   if (!at("sampled")) return;
-  if (told?.run.run_id !== run) close();
-  told = fresh;
+  if (report?.run.run_id !== run) close();
+  report = fresh;
   seen = `${run} ${fresh.run.revision}`;
   draw(fresh);
 }
@@ -76,8 +76,8 @@ function tiles({steps, figures}) {
   };
   const fixed = (name, digits) => mean(name) === null ? "–" : mean(name).toFixed(digits);
   const part = name => mean(name) === null ? "–" : share(mean(name), 1);
-  const told = {step: steps.length ? count(steps.at(-1)) : "–", reward: fixed("reward", 2), solved: part("success"), flat: part("zero_variance_groups"), entropy: fixed("entropy", 3), long: fixed("plan_steps", 1)};
-  for (const [id, text] of Object.entries(told)) at(id).textContent = text;
+  const texts = {step: steps.length ? count(steps.at(-1)) : "–", reward: fixed("reward", 2), solved: part("success"), flat: part("zero_variance_groups"), entropy: fixed("entropy", 3), long: fixed("plan_steps", 1)};
+  for (const [id, text] of Object.entries(texts)) at(id).textContent = text;
   for (const [id] of TILES.slice(1)) at(`${id}note`).textContent = `mean of ${Math.min(LATEST, steps.length)} steps`;
   at("stepnote").textContent = mean("seconds") === null ? "" : `${seconds(mean("seconds"))} each`;
 }
@@ -106,10 +106,10 @@ function spent(figures) {
 }
 
 function heldout(named) {
-  const times = ["before GRPO", "after GRPO"], told = times.map(when => named[`success ${when}`]?.figures);
-  const groups = [...new Set(told.flatMap(figures => Object.keys(figures ?? {})))].sort((a, b) => (b === "all") - (a === "all") || a.localeCompare(b));
+  const times = ["before GRPO", "after GRPO"], successes = times.map(when => named[`success ${when}`]?.figures);
+  const groups = [...new Set(successes.flatMap(figures => Object.keys(figures ?? {})))].sort((a, b) => (b === "all") - (a === "all") || a.localeCompare(b));
   const cell = (figures, group) => figures?.[group]?.at(-1) === undefined ? "–" : share(figures[group].at(-1), 1);
-  const rows = groups.map(group => h("tr", {}, h("td", {}, group === "all" ? "all tasks" : group.replaceAll("_", " ")), told.map(figures => h("td", {class: "n"}, cell(figures, group)))));
+  const rows = groups.map(group => h("tr", {}, h("td", {}, group === "all" ? "all tasks" : group.replaceAll("_", " ")), successes.map(figures => h("td", {class: "n"}, cell(figures, group)))));
   put(at("heldout"), rows.length ? table(["tasks", ...times.map(when => [when, "n"])], rows, "held-out success") : none("Not evaluated. Datasets with held-out tasks are evaluated before the first and after the last step."));
 }
 

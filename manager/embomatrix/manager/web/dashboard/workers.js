@@ -6,23 +6,23 @@ import {named, worded} from "./names.js";
 const ROWS = 50, CHIPS = 6;
 const STATES = ["", "ready", "paused", "draining", "suspect", "lost", "quarantined", "left"];
 const GONE = ["lost", "left"];
-const wish = {state: "", search: "", offset: 0, limit: ROWS};
+const filters = {state: "", search: "", offset: 0, limit: ROWS};
 
-export const query = () => wish;
+export const query = () => filters;
 /** True if a filter or a later page is selected. */
-export const asksMore = () => Boolean(wish.state || wish.search || wish.offset);
+export const asksMore = () => Boolean(filters.state || filters.search || filters.offset);
 
 export function open(main) {
-  const options = STATES.map(state => h("option", {value: state, selected: state === wish.state}, state || "all states"));
+  const options = STATES.map(state => h("option", {value: state, selected: state === filters.state}, state || "all states"));
   main.replaceChildren(h("section", {},
     h("h2", {}, "Workers ", h("small", {id: "total"})),
     h("div", {class: "bar"},
-      h("input", {type: "search", placeholder: "name or label", "aria-label": "search by name or label", value: wish.search, oninput: event => ask({search: event.target.value})}),
+      h("input", {type: "search", placeholder: "name or label", "aria-label": "search by name or label", value: filters.search, oninput: event => ask({search: event.target.value})}),
       h("select", {"aria-label": "state", onchange: event => ask({state: event.target.value})}, options),
-      h("button", {id: "before", type: "button", onclick: () => ask({offset: Math.max(0, wish.offset - ROWS)})}, "Previous"),
-      h("button", {id: "after", type: "button", onclick: () => ask({offset: wish.offset + ROWS})}, "Next"),
+      h("button", {id: "before", type: "button", onclick: () => ask({offset: Math.max(0, filters.offset - ROWS)})}, "Previous"),
+      h("button", {id: "after", type: "button", onclick: () => ask({offset: filters.offset + ROWS})}, "Next"),
       h("button", {id: "dispatch", type: "button"}, "Pause dispatch"),
-      h("span", {id: "told", class: "bad", role: "alert"})),
+      h("span", {id: "answer", class: "bad", role: "alert"})),
     h("div", {id: "workers"})));
 }
 
@@ -34,8 +34,8 @@ export function show({workers, paused}) {
   at("dispatch").textContent = paused ? "Resume dispatch" : "Pause dispatch";
   at("dispatch").onclick = () => steer(`dispatch/${paused ? "resume" : "pause"}`);
   const headings = ["worker", "state", "slots", "scenes", ["scene memory", "wideonly"], ["completed", "n"], ["cores", "n wideonly"], ["last heard", "n wideonly"], ""];
-  const nobody = wish.state || wish.search ? "No worker matches." : "No workers yet. Start one with: embomatrix worker run";
-  put(at("workers"), workers.items.length ? table(headings, workers.items.map(row), "workers", "loose") : none(nobody));
+  const emptyText = filters.state || filters.search ? "No worker matches." : "No workers yet. Start one with: embomatrix worker run";
+  put(at("workers"), workers.items.length ? table(headings, workers.items.map(row), "workers", "loose") : none(emptyText));
   for (const button of at("workers").querySelectorAll("button")) button.onclick = () => steer(button.dataset.path);
 }
 
@@ -68,22 +68,22 @@ function scenes(w) {
     ...w.loads.map(digest => h("span", {class: "chip", title: digest}, named(digest))),
   ];
   if (!chips.length) return h("span", {class: "muted"}, "none");
-  const told = Object.entries(states).map(([state, n]) => `${n} ${state}`).join(", ");
+  const counts = Object.entries(states).map(([state, n]) => `${n} ${state}`).join(", ");
   const broken = w.residents.find(r => r.error);
-  return [`${told} `, chips.slice(0, CHIPS), chips.length > CHIPS && h("span", {class: "muted wideonly"}, `and ${count(chips.length - CHIPS)} more`), broken && h("div", {class: "bad message"}, worded(broken.error))];
+  return [`${counts} `, chips.slice(0, CHIPS), chips.length > CHIPS && h("span", {class: "muted wideonly"}, `and ${count(chips.length - CHIPS)} more`), broken && h("div", {class: "bad message"}, worded(broken.error))];
 }
 
 function ask(changes) {
-  Object.assign(wish, {offset: 0}, changes);
+  Object.assign(filters, {offset: 0}, changes);
   dispatchEvent(new Event("embomatrix-changed"));
 }
 
 async function steer(path) {
-  at("told").textContent = "";
+  at("answer").textContent = "";
   try {
     await change(path);
   } catch (error) {
-    at("told").textContent = error instanceof Refused ? error.message : "the manager does not answer";
+    at("answer").textContent = error instanceof Refused ? error.message : "the manager does not answer";
   }
   dispatchEvent(new Event("embomatrix-changed"));
 }

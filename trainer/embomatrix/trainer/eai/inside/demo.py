@@ -258,7 +258,7 @@ def backend() -> Any:
         return _truths[-1](self.STATE_NAME, self.input)
 
     def unasked(self: Any, *args: Any) -> bool:
-        """bddl wants both methods of an atom. ``evaluate`` above never comes to the one, and a judge samples no state."""
+        """bddl wants both methods of an atom. ``evaluate`` above bypasses the one; a judge never samples states."""
         raise NotImplementedError(f"{self.STATE_NAME} is only judged here: no state is sampled")
 
     class Backend(BDDLBackend):  # type: ignore[misc]
