@@ -169,8 +169,8 @@ def test_check_writes_a_report_and_names_missing_objects(tmp_path: Path) -> None
     ("arguments", "words"),
     [
         (["check"], "no scene is named"),
-        (["check", SMALL, "--all"], "exclude one another"),
-        (["build", "--all", "Rs_itn"], "exclude one another"),
+        (["check", SMALL, "--all"], "give names or --all"),
+        (["build", "--all", "Rs_itn"], "give names or --all"),
         (["sheet", "Rs_itn"], "Rs_int"),
     ],
 )
