@@ -189,7 +189,7 @@ def test_training_reports_interrupts_and_write_errors(kitchen, tmp_path):
             tmp_path / "early.log", *common, f"--out={tmp_path / 'early'}", "--imitate-seconds=60"
         ) as run_:
             run_.wait_for("imitation")
-            assert_ended(run_.interrupt(), 130, f"go on with `--resume --out={tmp_path / 'early'}`")
+            assert_ended(run_.interrupt(), 130, f"continue with `--resume --out={tmp_path / 'early'}`")
         [saved] = (tmp_path / "early" / "checkpoints").iterdir()
         assert saved.name.startswith("imitation-")
         with background(tmp_path / "late.log", *common, *short, f"--out={tmp_path / 'late'}") as run_:
@@ -202,7 +202,7 @@ def test_training_reports_interrupts_and_write_errors(kitchen, tmp_path):
         full = run_anew(
             *common, f"--out={tmp_path / 'full'}", "--imitate-seconds=0.5", largest_file=64 * 1024
         )
-        assert_ended(full, 2, "can't be written", "make room there, or give rights")
+        assert_ended(full, 2, "can't be written", "free space or fix the")
         assert not list((tmp_path / "full").glob("reference*"))
 
 

@@ -176,7 +176,7 @@ def test_trainer_reports_the_same_dataset_errors(kitchen, tmp_path, damage):
         ("uvicorn", ("manager", "serve"), "pip install 'embomatrix[manager]'"),
         ("psutil", ("worker", "run"), "pip install 'embomatrix[worker]'"),
         ("trimesh", ("factory", "build", "--out=no"), "pip install 'embomatrix[factory]'"),
-        ("pybullet", ("worker", "run"), "needs the physics engine pybullet, and this Python"),
+        ("pybullet", ("worker", "run"), "needs the physics engine pybullet, which Python"),
         ("pybullet", ("play", TASK, "--oracle", "--dataset=DATASET"), "the physics engine is missing: expected the package"),
         ("pybullet", ("demo", "--dataset=DATASET", "--out=OUT"), "the cluster can't work, worker-"),
     ],

@@ -106,12 +106,10 @@ async def test_manager_warns_of_another_data_folder(tmp_path, state, caplog):
         caplog.clear()
         async with manager(tmp_path / folder, state=state):
             pass
-        warned[turn] = [
-            line for line in caplog.messages if "is not that of the manager that led last" in line
-        ]
+        warned[turn] = [line for line in caplog.messages if "differs from that of the last leader" in line]
     assert warned[1] == []
     [line] = warned[2]
-    assert f"the data folder {tmp_path / 'other'} is not" in line
+    assert f"the data folder {tmp_path / 'other'} differs" in line
     assert "--data-dir" in line
 
 
@@ -122,6 +120,6 @@ async def test_pause_without_the_store_holds_and_reports_it(tmp_path):
             await client.open_run("test", "r1")
             server.kill()
             with pytest.raises(
-                UnavailableError, match=r"dispatch is paused, but another manager would not know"
+                UnavailableError, match=r"dispatch is paused, but other managers were not told"
             ):
                 await admin.pause_dispatch()

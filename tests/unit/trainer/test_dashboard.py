@@ -3,7 +3,7 @@
 import math
 
 from tests.fakes.symbolic_household import SymbolicCluster
-from tests.unit.trainer.test_loop import TASKS, run
+from tests.integration.trainer.test_loop import TASKS, run
 from tests.unit.trainer.test_rollout import outcomes
 
 from embomatrix.rpc.status import PreconditionError, UnavailableError

@@ -3,7 +3,7 @@
 import pytest
 from tests.fakes.plans import plan_of, task_over
 from tests.fakes.scenes import upright
-from tests.unit.sim.test_panels import drawer_scene
+from tests.integration.sim.test_panels import drawer_scene
 
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.simulation import load_simulator

@@ -343,7 +343,7 @@ async def test_no_process_outlives_the_pool(tmp_path):
 def test_no_process_outlives_a_daemon_that_was_killed(tmp_path):
     program = (
         "import asyncio, pathlib, sys\n"
-        "from tests.unit.worker.test_slots import running\n"
+        "from tests.integration.worker.test_slots import running\n"
         "async def main():\n"
         "    async with running(pathlib.Path(sys.argv[1])) as harness:\n"
         "        harness.submit('l1', 'hang', deadline_s=600)\n"

@@ -8,7 +8,7 @@ import psutil
 from tests.fakes.manager import FakeManager, serving
 from tests.fakes.real_cluster import until
 from tests.fakes.simulation import PROGRAM
-from tests.unit.worker.test_slots import running
+from tests.integration.worker.test_slots import running
 
 from embomatrix.host.limits import MIB
 from embomatrix.rpc.wire.values import Completed, ResidentState, Resources

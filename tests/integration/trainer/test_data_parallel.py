@@ -8,7 +8,7 @@ import pytest
 import torch
 from rich.console import Console
 from tests.fakes.symbolic_household import SymbolicCluster
-from tests.unit.trainer.test_loop import TASKS, run, weights
+from tests.integration.trainer.test_loop import TASKS, run, weights
 
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import read_settings

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
-from tests.unit.trainer.test_loop import run, weights
+from tests.integration.trainer.test_loop import run, weights
 
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import Overlap

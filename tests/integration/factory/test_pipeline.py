@@ -360,7 +360,7 @@ def test_conversation_tasks_are_proved_in_physics_and_keep_transcripts(tmp_path)
         assert transcript.startswith(f"# {record.task.instruction}\n")
         plan = plan_from_json(list(record.oracle), record.task.profile)
         with contextlib.closing(physical_simulator(dataset.read_bundle(record.bundle_digest))) as robot:
-            assert plan_failure(robot, record.task, plan) == ""
+            assert plan_failure(robot, record.task, plan) is None
 
 
 def test_dataset_does_not_depend_on_the_number_of_processes(folder, dataset, tmp_path):

@@ -9,7 +9,7 @@ from collections import Counter
 
 import pytest
 from tests.fakes.leases import lease_to_proto
-from tests.unit.worker.test_slots import running
+from tests.integration.worker.test_slots import running
 
 from embomatrix.rpc.wire.leases import Lease, LeaseRef
 from embomatrix.rpc.wire.session import lease_from_proto

@@ -90,7 +90,7 @@ def test_traces_do_not_depend_on_the_process(bundle, tmp_path) -> None:
     script = (
         "import sys; sys.path[:0] = sys.argv[2:]\n"
         "from pathlib import Path\n"
-        "from tests.unit.sim.test_determinism import PLANS, SEEDS, digests\n"
+        "from tests.integration.sim.test_determinism import PLANS, SEEDS, digests\n"
         "from embomatrix.world.bundle import decode_bundle\n"
         "bundle = decode_bundle(Path(sys.argv[1]).read_bytes())\n"
         "order = [(plan, seed) for seed in SEEDS for plan in range(len(PLANS))]\n"
