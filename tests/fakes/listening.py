@@ -15,4 +15,4 @@ def until_listening(address, limit_s=60.0):
         with contextlib.suppress(OSError), socket.create_connection((host, int(port)), timeout=1):
             return
         time.sleep(0.1)
-    pytest.fail(f"nobody listens at {address}")
+    pytest.fail(f"no server listens at {address}")

@@ -120,11 +120,11 @@ WEIGHT = "the graph lifts whatever is smaller than 1.5 m3"
 LOAD = "the graph lifts a thing from under what rests on it"
 AGAIN = "the graph lets a step pass that asks for what is so already"
 HANDS = "the graph has two hands"
-PIECES = "the graph goes on with parts of what was sliced, ours with pieces of other names"
+PIECES = "the graph continues with parts of the sliced object, ours with pieces of other names"
 TOOLS = "our sink soaks what lies in it when it is switched on; the graph asks for the step that soaks the cleaner"
 LIDS = "the graph's cartons stand open from the start"
 RUNNING = "ours cleans with a machine only while it runs; the graph takes any"
-START = "the graph's start differs: what nobody mentions is shut, and stands where the problem says"
+START = "the graph's start differs: unmentioned objects are shut, and positions follow the problem"
 CAUSES = {
     FailureReason.NO_FREE_POSE: GEOMETRY,
     FailureReason.NO_CAVITY: GEOMETRY,

@@ -201,7 +201,7 @@ async def grpc_cases(at, victim, other):
             True,
         ),
         (
-            "a bundle nobody asked for",
+            "an unrequested bundle",
             "PERMISSION_DENIED",
             "WorkerService.FetchBundle",
             fetch(session_id=other.session[0], bundle_digest=BEDROOM),

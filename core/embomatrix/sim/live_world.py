@@ -193,7 +193,6 @@ class LiveWorld:
 
     @property
     def robot_room(self) -> str:
-        """Room of the robot."""
         return self.scene.room_at((self.robot.x_m, self.robot.y_m))
 
     def state_bytes(self) -> bytes:

@@ -78,7 +78,6 @@ def heats(source: ThermalSource) -> bool:
 
 
 def cooks(source: ThermalSource, food: Asset) -> bool:
-    """True if the source cooks the food."""
     return food.can("cookable") and source.temperature_c >= cook_temperature_c(food)
 
 

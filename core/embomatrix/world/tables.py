@@ -117,11 +117,9 @@ class Tables:
         return Placements(names, self._sets, self._spots)
 
     def pose(self, row: object) -> Pose:
-        """Pose in a row."""
         return _at(self._poses, row, "pose")
 
     def part(self, row: object) -> ConvexPart:
-        """Part in a row."""
         return _at(self._parts, row, "")
 
     def stands(self, spans: Mapping[str, tuple[int, int]]) -> dict[str, tuple[StandPose, ...]]:

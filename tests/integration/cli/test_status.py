@@ -29,8 +29,8 @@ def worker(name="w1", state="ready", *, running=0, completed=0, reason="", resid
 
 
 def test_start_of_a_worker_is_suggested_where_none_is_present():
-    nobody = sentences(FleetStatus((), "No worker has joined yet."), (), ())
-    assert nobody[1].startswith("Start a worker with `embomatrix worker run`")
+    empty = sentences(FleetStatus((), "No worker has joined yet."), (), ())
+    assert empty[1].startswith("Start a worker with `embomatrix worker run`")
 
 
 def test_health_sentence_of_the_manager_comes_first():

@@ -79,9 +79,9 @@ def test_blocked_aisle_is_reported(flat: Scene) -> None:
     middle = room.center_m[1]
     x0, x1 = room.low_m[0] - 0.1, room.high_m[0] + 0.1
     bar = ConvexPart(Shape.BOX, Pose(((x0 + x1) / 2, middle, 0.5)), (x1 - x0, 0.1, 1.0))
-    barred = replace(flat, walls=(*flat.walls, bar), objects=(), doorways=flat.doorways[-1:])
+    blocked = replace(flat, walls=(*flat.walls, bar), objects=(), doorways=flat.doorways[-1:])
     start = replace(flat.robot, x_m=room.center_m[0], y_m=middle + 0.6, room=room.name)
-    assert (room.name,) in problems(replace(barred, robot=start), ProblemKind.AISLE)
+    assert (room.name,) in problems(replace(blocked, robot=start), ProblemKind.AISLE)
 
 
 def test_narrow_doorway_is_reported(flat: Scene) -> None:
@@ -169,8 +169,8 @@ def test_check_writes_a_report_and_names_missing_objects(tmp_path: Path) -> None
     ("arguments", "words"),
     [
         (["check"], "no scene is named"),
-        (["check", SMALL, "--all"], "exclude one another"),
-        (["build", "--all", "Rs_itn"], "exclude one another"),
+        (["check", SMALL, "--all"], "give names or --all"),
+        (["build", "--all", "Rs_itn"], "give names or --all"),
         (["sheet", "Rs_itn"], "Rs_int"),
     ],
 )

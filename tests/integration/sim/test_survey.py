@@ -86,16 +86,16 @@ def test_walled_in_object_is_refused_in_cached_mode_with_its_blocker():
 def test_object_is_reachable_after_its_blocker_is_removed():
     poses = PoseCache(arm_blockers={Handling.TAKE: {"apple_1": "bowl_1"}})
     scene = kitchen_scene()
-    barred = executed_with(scene, poses, "move apple_1; pick_up apple_1")
-    assert barred.failure is FailureReason.ARM_BLOCKED
+    blocked = executed_with(scene, poses, "move apple_1; pick_up apple_1")
+    assert blocked.failure is FailureReason.ARM_BLOCKED
     taken = "move bowl_1; pick_up bowl_1; move countertop_1; place countertop_1 ontop; move apple_1; pick_up apple_1"
     assert executed_with(scene, poses, taken).failure is None
 
 
 def test_moved_object_is_not_blocked_at_its_new_place():
     poses = PoseCache(arm_blockers={Handling.PRESS: {"table_lamp_1": "wall"}})
-    barred = executed_with(kitchen_scene(), poses, "move table_lamp_1; toggle_on table_lamp_1")
-    assert barred.failure is FailureReason.ARM_BLOCKED
+    blocked = executed_with(kitchen_scene(), poses, "move table_lamp_1; toggle_on table_lamp_1")
+    assert blocked.failure is FailureReason.ARM_BLOCKED
     moved = "move table_lamp_1; pick_up table_lamp_1; move coffee_table_1; place coffee_table_1 ontop; toggle_on table_lamp_1"
     assert executed_with(kitchen_scene(), poses, moved).failure is None
 
@@ -110,8 +110,8 @@ def test_object_in_an_opened_drawer_stays_blocked():
     )
     text = "move bottom_cabinet_1; open bottom_cabinet_1; pick_up apple_9"
     assert executed_with(scene, PoseCache(), text).failure is None
-    barred = PoseCache(arm_blockers={Handling.TAKE: {"apple_9": "bottom_cabinet_1"}})
-    assert executed_with(scene, barred, text).failure is FailureReason.ARM_BLOCKED
+    blocked = PoseCache(arm_blockers={Handling.TAKE: {"apple_9": "bottom_cabinet_1"}})
+    assert executed_with(scene, blocked, text).failure is FailureReason.ARM_BLOCKED
 
 
 def test_lid_of_a_portable_object_is_blocked():

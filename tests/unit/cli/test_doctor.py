@@ -156,12 +156,12 @@ async def test_guarded_manager_reports_each_missing_credential(tmp_path):
     access = tmp_path / "access"
     ca, viewer = (access / "ca.pem").read_bytes(), (access / "tokens" / "viewer").read_text().strip()
     async with a_manager(tmp_path) as endpoints:
-        nobody = await manager(Visit(endpoints.address))
+        unreachable = await manager(Visit(endpoints.address))
         trusting = await manager(Visit(endpoints.address, ca=ca, page_port=1))
         signed_in = await manager(Visit(endpoints.address, viewer, ca, page_port=1))
         elsewhere = await manager(Visit(endpoints.address.replace("127.0.0.1", "127.0.0.2"), ca=ca))
-    assert levels(nobody)["TLS"] is Level.WRONG
-    assert "--ca" in nobody[-1].remedy
+    assert levels(unreachable)["TLS"] is Level.WRONG
+    assert "--ca" in unreachable[-1].remedy
     assert levels(trusting) == {
         "manager": Level.FINE,
         "TLS": Level.FINE,

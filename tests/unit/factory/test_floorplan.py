@@ -72,8 +72,8 @@ def test_walls_stand_on_no_floor_and_leave_inner_doorways_open(scene_id: str) ->
             covered = [min(box.high_m[i], room.high_m[i]) - max(box.low_m[i], room.low_m[i]) for i in (0, 1)]
             assert min(covered) < 1e-6
     for door in plan.doorways:
-        barred = any(box.contains((*door.center_m, 1.0)) for box in boxes)
-        assert barred == (door.rooms[1] == "")
+        blocked = any(box.contains((*door.center_m, 1.0)) for box in boxes)
+        assert blocked == (door.rooms[1] == "")
         assert any(box.contains((*door.center_m, WALL_HEIGHT_M - 0.05)) for box in boxes)
 
 

@@ -189,7 +189,7 @@ class DynamicWorld:
 
     def hook(self, name: str, joint: int) -> None:
         """Attach the hand's point to the panel that a joint of the object moves."""
-        link = self.bodies.leaf(name, joint)
+        link = self.bodies.panel_link(name, joint)
         tool = self.robot.hand_pose()
         point = tool.apply((0.0, 0.0, TIP_M))
         state = self._bullet.getLinkState(

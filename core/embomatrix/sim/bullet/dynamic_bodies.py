@@ -74,7 +74,7 @@ class DynamicBodies:
         """Link numbers of a body, its base first."""
         return range(-1, int(self._bullet.getNumJoints(self._bodies[name], physicsClientId=self._client)))
 
-    def leaf(self, name: str, joint: int) -> int:
+    def panel_link(self, name: str, joint: int) -> int:
         """Link that a joint of an object moves."""
         return self._joints[name][joint]
 

@@ -198,7 +198,6 @@ def preferred_hosts(category: str) -> tuple[str, ...]:
 
 
 def is_usual_host(host: str, category: str) -> bool:
-    """True if the host is usual for the category."""
     nothing = HOST_GROUPS.get(host) == frozenset() or host in _APPLIANCES
     return (
         not nothing and suits(category, host) and (host in preferred_hosts(category) or host not in NO_HOSTS)

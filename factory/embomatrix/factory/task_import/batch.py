@@ -82,7 +82,7 @@ def bind_first(
 def imports(
     source: SourceText, bases: Sequence[Scene], *, seed: int, options: ImportOptions, draws: int = 1
 ) -> Iterator[ImportedTask | TaskRefusal]:
-    """Yield imports of the problem into each scene as it is, and with missing furniture added if the options allow it.
+    """Yield imports of the problem into each unchanged scene, and with missing furniture added if the options allow it.
 
     The problem's own scene is tried ``draws`` times before all others. The last round renumbers rooms. Refusals that
     do not depend on the scene end the search.

@@ -60,7 +60,7 @@ life of a lease."""
 STORE_AWAY: Final = (
     "the manager cannot reach its store, and another one may lead: try again, or try the other managers"
 )
-_SUSPENSION: Final = {True: ("suspended", "is away"), False: ("goes on", "is back")}
+_SUSPENSION: Final = {True: ("suspended", "is away"), False: ("resumes", "is back")}
 
 
 class ManagerRuntime:

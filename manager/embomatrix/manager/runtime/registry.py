@@ -224,7 +224,6 @@ class Registry:
         return [WorkerRecovered(session.worker_id)]
 
     def drain(self, worker_id: str) -> list[Event]:
-        """Drain a worker."""
         session = self._there(worker_id)
         session.drained, session.standing = True, WorkerStanding.DRAINING
         return [WorkerDrained(worker_id)]

@@ -1,7 +1,7 @@
 """Scorer for plan texts: the common base of all adapters to other trainers.
 
-A scorer is one run of a cluster, opened on the first text. It serves threads and event loops, as its client has an event
-loop of its own. Pickling a scorer drops its connection.
+A scorer is one run of a cluster, opened on the first text. It serves threads and event loops, as its client has a
+dedicated event loop. Pickling a scorer drops its connection.
 """
 
 from __future__ import annotations

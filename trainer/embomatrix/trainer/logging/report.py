@@ -97,7 +97,6 @@ def prewarm_share(stats: RunStats) -> float:
 
 
 def write_report(summary: TrainingSummary, metrics: Sequence[Mapping[str, Any]], machine: str) -> Path:
-    """Write the report to ``summary.report``."""
     parts = [
         f"<h1>Training of {html.escape(summary.model)}</h1>",
         f"<p>{summary.imitation_steps} imitation steps, {summary.steps} GRPO steps, {summary.rollouts} rollouts; "

@@ -1,7 +1,8 @@
 """Audits: an audited result is compared with a second execution on another worker, and with a third on a mismatch.
 
-A check is a rollout record of its own, in no batch; its worker cannot distinguish it from any other rollout. In a run that asks
-for verified results, the check is queued and the result is held back. In other runs, the check gets a slot that is idle.
+A check is a separate rollout record outside all batches. Its worker cannot distinguish it from any other rollout. In a
+run that requests verified results, the check is queued and the result is held back. In other runs, the check gets an
+idle slot.
 """
 
 from __future__ import annotations
