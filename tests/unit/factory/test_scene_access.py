@@ -46,8 +46,8 @@ def test_cabinet_facing_the_wall_is_removed_with_its_contents(flat: Scene) -> No
         "laptop_1",
     }
     assert [note.split(": ")[1] for note in left.left_out[len(flat.left_out) :]] == [
-        "the robot can't stand before its front",
-        "it was in a cabinet that the robot can't stand before",
+        "nobody could stand before its front",
+        "it lay in a cabinet that nobody could stand before",
     ]
     assert unaccounted(left) == ()
     assert {item.asset_id for item in left.objects} == set(left.assets)

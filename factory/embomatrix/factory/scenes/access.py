@@ -15,8 +15,9 @@ if TYPE_CHECKING:
 
     from embomatrix.world.scene import Scene, SceneObject
 
-_NO_FRONT: Final = "the robot can't stand before its front"
-_NO_HOST: Final = "it was in a cabinet that the robot can't stand before"
+# These reasons are content of a scene, so its digest depends on their wording.
+_NO_FRONT: Final = "nobody could stand before its front"
+_NO_HOST: Final = "it lay in a cabinet that nobody could stand before"
 _AT_TABLE_M: Final = 1.0
 """Distance within which a seat can block the floor beside a table."""
 
