@@ -1,4 +1,4 @@
-"""In-process executor for evaluation plans, with the code of the local worker processes."""
+"""Local executor for evaluation plans, with the code of the local worker processes."""
 
 from embomatrix.worker.slots.rollout_pool import execute_scene
 

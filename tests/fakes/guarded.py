@@ -1,4 +1,4 @@
-"""In-process manager with tokens and TLS, configured like `embomatrix manager init`."""
+"""Manager inside the test process, with tokens and TLS as `embomatrix manager init` sets them up."""
 
 import asyncio
 import contextlib
