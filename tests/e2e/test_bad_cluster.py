@@ -137,7 +137,7 @@ def test_unreachable_redis_is_named_without_its_password(tmp_path):
 def test_non_loopback_address_without_tls_is_refused(tmp_path, option):
     ended = run("manager", "serve", option, "--token=secret", f"--data-dir={tmp_path}")
     assert_ended(
-        ended, 2, "refusing to serve on 0.0.0.0 without TLS,", "run `embomatrix manager init --data-dir"
+        ended, 2, "refusing to serve on 0.0.0.0 without TLS:", "run `embomatrix manager init --data-dir"
     )
 
 

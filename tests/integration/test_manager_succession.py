@@ -120,6 +120,6 @@ async def test_pause_without_the_store_holds_and_reports_it(tmp_path):
             await client.open_run("test", "r1")
             server.kill()
             with pytest.raises(
-                UnavailableError, match=r"dispatch is paused, but other managers were not told"
+                UnavailableError, match=r"dispatch is paused, but not stored for other managers"
             ):
                 await admin.pause_dispatch()

@@ -103,7 +103,7 @@ def test_picture_has_a_panel_for_each_method_or_the_reason_of_its_failure() -> N
     assert none.width == LEAST_PX * len(LayoutMethod)
     assert one.width > none.width
     assert len(none.getcolors(1 << 16)) > 1
-    with pytest.raises(EvaluationError, match="none of the 1 fixed tasks"):
+    with pytest.raises(EvaluationError, match="is not a fixed task"):
         named([SceneTask(SourceText("apple", APPLE, "embomatrix"), "Rs_int")], "pear")
 
 

@@ -41,7 +41,7 @@ def test_shares_count_tested_modes_and_objections_name_the_task() -> None:
     evaluation = evaluation_of(verdicts, {})
     assert evaluation.figure("oracle_cached").value == 100
     assert (evaluation.figure("oracle_physical").value, evaluation.figure("oracle_physical").n) == (50, 2)
-    assert evaluation.notes == ("Against plans in physics: grasp_slipped 1.",)
+    assert evaluation.notes == ("Plans that failed in physics: grasp_slipped 1.",)
     assert list(objections(verdicts)) == ["fetch, in physics: grasp_slipped: step 2, pick_up: it fell"]
     without = evaluation_of([compared(FINE, FINE)], {})
     assert [figure.name for figure in without.figures] == ["oracle_cached", "reverified_bit_equal"]

@@ -172,7 +172,7 @@ def test_protruding_object_keeps_a_drawer_from_closing(flat):
     (close,) = plan_of(task, "close bottom_cabinet_1")
     step = flat.run_step(close)
     assert step.failure is FailureReason.DOOR_BLOCKED
-    assert step.message == "table_lamp_1 is in the way of the door of bottom_cabinet_1"
+    assert step.message == "table_lamp_1 is in the way of the door of bottom_cabinet_1: clear the way first"
     assert engine.state_bytes() == before
 
 

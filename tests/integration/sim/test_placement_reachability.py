@@ -111,7 +111,10 @@ def test_no_object_is_placed_at_an_unreachable_pose():
     assert other.startswith(("side", "lid", "stand"))
     trace = execute(scene, poses, "move slice_1; pick_up slice_1; move stand_1; place stand_1 ontop")
     assert trace.failure is FailureReason.ARM_BLOCKED
-    assert trace.steps[-1].message == f"the arm finds no free path to a place for slice_1: {other} blocks it"
+    assert (
+        trace.steps[-1].message
+        == f"the arm finds no free path to a place for slice_1: {other} blocks it; clear the way first"
+    )
 
 
 def test_place_is_reachable_after_its_blocker_is_removed():

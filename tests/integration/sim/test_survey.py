@@ -80,7 +80,10 @@ def test_walled_in_object_is_refused_in_cached_mode_with_its_blocker():
     assert other.startswith(("board", "lid"))
     trace = executed_with(scene, poses, "move apple_1; pick_up apple_1")
     assert trace.failure is FailureReason.ARM_BLOCKED
-    assert trace.steps[-1].message == f"the arm finds no free path to apple_1: {other} blocks it"
+    assert (
+        trace.steps[-1].message
+        == f"the arm finds no free path to apple_1: {other} blocks it; clear the way first"
+    )
 
 
 def test_object_is_reachable_after_its_blocker_is_removed():
