@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from embomatrix.pages.figures import Figure
 
 ROOTS: Final = ("core", "manager", "worker", "trainer", "factory", "bench")
-DOCUMENTED: Final = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 BANNED: Final = re.compile(
     r"(what|who|whose|whom|where|how|which|when|whether|why|that|of|as|to|from|in|on|at|by|for|with|into|over|between)\b",
     re.IGNORECASE,
@@ -42,17 +41,20 @@ def read_sources(root: Path) -> dict[str, str]:
 def count_code_lines(source: str) -> int:
     """Count lines that are neither blank, nor a comment, nor part of a docstring or another bare string."""
     prose: set[int] = set()
-    for node in ast.walk(ast.parse(source)):
-        if (
-            isinstance(node, ast.Expr)
-            and isinstance(node.value, ast.Constant)
-            and isinstance(node.value.value, str)
-        ):
-            prose.update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    for node, _ in _bare_strings(source):
+        prose.update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
     lines = enumerate(source.splitlines(), start=1)
     return sum(
         bool(text := line.strip()) and text[0] != "#" and number not in prose for number, line in lines
     )
+
+
+def _bare_strings(source: str) -> Iterator[tuple[ast.Expr, str]]:
+    """Statements that are only a string: docstrings of modules, classes, functions, attributes and constants."""
+    for node in ast.walk(ast.parse(source)):
+        match node:
+            case ast.Expr(value=ast.Constant(value=str(text))):
+                yield node, text
 
 
 def import_cycles(sources: Mapping[str, str]) -> list[list[str]]:
@@ -89,15 +91,13 @@ def name_clashes(sources: Mapping[str, str]) -> dict[str, list[str]]:
 
 
 def banned_openings(sources: Mapping[str, str]) -> list[str]:
-    """Docstrings that open with a banned word, as ``path:line: message``."""
-    found = []
-    for path, text in sources.items():
-        for node in ast.walk(ast.parse(text)):
-            if isinstance(node, DOCUMENTED) and (words := BANNED.match(ast.get_docstring(node) or "")):
-                line = node.body[0].lineno
-                message = f"the docstring opens with {words[0]!r}: expected a noun or a verb"
-                found.append(f"{path}:{line}: {message}")
-    return found
+    """Docstrings, those of attributes included, that open with a banned word, as ``path:line: message``."""
+    return [
+        f"{path}:{node.lineno}: the docstring opens with {words[0]!r}: expected a noun or a verb"
+        for path, source in sources.items()
+        for node, text in _bare_strings(source)
+        if (words := BANNED.match(text.strip()))
+    ]
 
 
 def house_figures(sources: Mapping[str, str], unit_test_s: float | None) -> tuple[Figure, ...]:

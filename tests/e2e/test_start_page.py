@@ -19,7 +19,7 @@ LIMIT_S = 600.0
 SERVES = {"manager serve": "status page", "worker run": "registered with the manager"}
 """Commands that go on, and what they say once they are of use."""
 SHORT = {"embomatrix train": " --imitate-seconds 1 --steps 1", "worker run": " --slots 1"}
-"""What the test adds, to be done soon."""
+"""Options that the test adds to finish soon."""
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
 

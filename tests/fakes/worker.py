@@ -63,7 +63,7 @@ class FakeWorker:
     desired: tuple = ()
     leases: dict = field(default_factory=dict)
     portions: list = field(default_factory=list)
-    """How many leases came in each message that brought some."""
+    """Number of leases in each message that brought some."""
     acknowledged: list = field(default_factory=list)
     cancelled: list = field(default_factory=list)
     residents: dict = field(default_factory=dict)

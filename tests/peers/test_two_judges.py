@@ -43,7 +43,7 @@ TASKS = {
     "Ihlen_1_int": ("collecting_aluminum_cans", "laying_tile_floors", "putting_leftovers_away"),
 }
 ROUNDS = 3
-"""Of mutants: each has one of every kind."""
+"""Rounds of mutants; each has one of every kind."""
 
 
 def compared(imported, found, native, judge):

@@ -78,6 +78,14 @@ def test_openings_with_a_banned_word_are_reported_with_path_and_line(text):
     assert found.startswith(f"core/a.py:5: the docstring opens with '{text.split()[0]}'")
 
 
+def test_openings_of_constants_and_attributes_are_checked_too():
+    source = 'A = 1\n"""Of those."""\n\n\nclass B:\n    x: int = 0\n    """By scene: how many."""\n'
+    assert [line.split(": ")[0] for line in house.banned_openings({"core/a.py": source})] == [
+        "core/a.py:2",
+        "core/a.py:7",
+    ]
+
+
 @pytest.mark.parametrize(
     "text", ["Whatever is left.", "Internal error.", "Tokens of a plan.", "True if empty."]
 )

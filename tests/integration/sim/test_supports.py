@@ -22,7 +22,7 @@ SPOTS = (
     (1.0, 1.0, 0.0),
     (2.1, 1.0, 0.82),
 )
-"""On the table, in the bowl, in the fridge, on the counter, on the floor, on the bowl."""
+"""Points on the table, in the bowl, in the fridge, on the counter, on the floor and on the bowl."""
 
 CHANGE = st.one_of(
     st.tuples(st.just("move"), st.sampled_from(MOVABLE), st.integers(0, 2**31)),

@@ -23,7 +23,7 @@ from embomatrix.worker.slots.execution import AHEAD_S, RECENT
 
 pytestmark = pytest.mark.timeout(60)
 BRIEF_S = AHEAD_S / 12
-"""Of executions as brief as this a dozen lie ahead."""
+"""Execution so brief that a dozen of them lie ahead."""
 
 
 @pytest.fixture

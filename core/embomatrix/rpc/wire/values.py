@@ -90,7 +90,7 @@ class Timings:
     """Durations of a rollout. Clocks of two machines are never compared."""
 
     queued_s: float = 0.0
-    """From submission to the lease that delivered, on the manager's clock."""
+    """Time between submission and the lease that delivered, on the manager's clock."""
     load_s: float = 0.0
     """Wait for the scene, on the worker's clock; 0 if it was warm."""
     execute_s: float = 0.0
@@ -98,7 +98,7 @@ class Timings:
     lease_s: float = 0.0
     """Life of the lease minus loading and executing: network and wait for a slot, on the manager's clock."""
     deliver_s: float = 0.0
-    """From the result's arrival to its row in the result log, on the manager's clock."""
+    """Time between the result's arrival and its row in the result log, on the manager's clock."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,7 +41,7 @@ RANK: Final = 0.2
 FOLLOWED: Final = 40
 """Solutions whose paths are computed at once: one path costs nearly as much as many."""
 CHECK_LOTS: Final = (0, 4, FOLLOWED)
-"""Of those, the first few are checked before the others, because they are often free."""
+"""Bounds of the two lots in which paths are checked against obstacles. The first lot is often enough."""
 PATHS_RETURNED: Final = 3
 """Paths of one batch to return."""
 BATCH: Final = 12

@@ -72,7 +72,7 @@ class RunAccounts:
         self._known_after = known_after
         self._runs: dict[str, RunAccount] = {}
         self._paid_s: dict[int, float] = {}
-        """By priority: the largest paid turn of a run at the time it was given a lease."""
+        """Largest paid turn of a run at the time it was given a lease, by priority."""
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._runs)

@@ -130,7 +130,7 @@ class Choice:
             if heap:
                 by_run.setdefault(key.run_id, []).append((heap[0][0], number, heap))
         self._runs = list(by_run.values())
-        """For each run a heap of its queues, by a lower bound of the sequence that the worker may take."""
+        """One heap per run with its queues, by a lower bound of the sequence that the worker may take."""
         for run in self._runs:
             heapq.heapify(run)
 

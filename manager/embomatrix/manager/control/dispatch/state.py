@@ -172,9 +172,9 @@ class DispatchState:
         """Workers of the former manager that have not reported yet; None while unknown."""
 
         self.hedge_wanted: Mapping[str, tuple[int, float]] = {}
-        """By scene: late rollouts that no idle worker can take, and the age of the oldest lease in seconds."""
+        """Late rollouts that no idle worker can take, and the age of the oldest lease in seconds, by scene."""
         self.unplaceable: dict[str, tuple[float, str]] = {}
-        """By scene: time since which no worker can hold it, and the reason."""
+        """Time since which no worker can hold a scene, and the reason, by scene."""
         self.no_worker_since_s = 0.0
 
         self.freed: dict[str, Event | None] = {}

@@ -258,10 +258,16 @@ def backend() -> Any:
         return _truths[-1](self.STATE_NAME, self.input)
 
     def unasked(self: Any, *args: Any) -> bool:
-        """bddl wants both methods of an atom. ``evaluate`` above bypasses the one; a judge never samples states."""
-        raise NotImplementedError(f"{self.STATE_NAME} is only judged here: no state is sampled")
+        """Stand in for two methods that bddl declares abstract and that judging a demonstration never calls.
 
-    class Backend(BDDLBackend):  # type: ignore[misc]
+        ``_evaluate`` is only called by the ``evaluate`` that the functions above replace, ``_sample`` only to make
+        scenes. Raises NotImplementedError.
+        """
+        raise NotImplementedError(
+            f"{self.STATE_NAME} is judged from the graph of a demonstration, not sampled"
+        )
+
+    class Backend(BDDLBackend):  # type: ignore[misc]  # bddl is untyped
         def get_predicate_class(self, predicate_name: str) -> type:
             base, evaluate = (
                 (BinaryAtomicFormula, binary) if predicate_name in RELATIONS else (UnaryAtomicFormula, unary)
