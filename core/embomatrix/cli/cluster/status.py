@@ -130,18 +130,12 @@ def screen(before: Glance, now: Glance, *, lines: int) -> RenderableType:
 
 def sentences(fleet: FleetStatus, runs: Sequence[RunInfo], plan: Sequence[PlanCell]) -> list[str]:
     """Describe the cluster. The first sentence is the manager's own verdict, as the dashboard shows it."""
-    sentences_shown = [fleet.health]
+    lines = [fleet.health]
     if all(worker.state == LEFT for worker in fleet.workers):
-        sentences_shown.append(
+        lines.append(
             "Start a worker with `embomatrix worker run`, here or on any machine that reaches the manager."
         )
-    return [
-        *sentences_shown,
-        _slots(fleet.workers),
-        *_runs(runs),
-        *_ahead(plan),
-        *_idle_workers(fleet.workers),
-    ]
+    return [*lines, _slots(fleet.workers), *_runs(runs), *_ahead(plan), *_idle_workers(fleet.workers)]
 
 
 def counted(number: int, noun: str) -> str:

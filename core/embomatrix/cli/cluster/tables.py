@@ -122,8 +122,8 @@ def plan_table(cells: Sequence[PlanCell]) -> Table:
         names = (*cell.worker_ids[:NAMED], *([f"{more}_more"] if more > 0 else []))
         label = f"{scene}·{cell.count}·{cell.warmth.value}" + (f"@{','.join(names)}" if names else "")
         rows.setdefault((cell.run_id, cell.step), []).append(Text(label, style=WARMTH_STYLES[cell.warmth]))
-    for (run_id, step), told_cells in sorted(rows.items()):
-        table.add_row(Text(run_id), str(step), Text("  ").join(told_cells))
+    for (run_id, step), labels in sorted(rows.items()):
+        table.add_row(Text(run_id), str(step), Text("  ").join(labels))
     return table
 
 

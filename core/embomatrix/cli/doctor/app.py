@@ -78,12 +78,10 @@ def _show(findings: Sequence[Finding]) -> None:
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
     for finding in findings:
-        findings_by_visit = Text(finding.found)
+        found = Text(finding.found)
         if finding.remedy:
-            findings_by_visit.append(f"\n{finding.remedy}", style="dim")
-        table.add_row(
-            Text(finding.level.value, style=STYLES[finding.level]), finding.thing, findings_by_visit
-        )
+            found.append(f"\n{finding.remedy}", style="dim")
+        table.add_row(Text(finding.level.value, style=STYLES[finding.level]), finding.thing, found)
     console = Console(highlight=False)
     console.print(table)
     console.print(f"\n{verdict(findings)}", markup=False)

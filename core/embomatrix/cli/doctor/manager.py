@@ -116,15 +116,12 @@ def versions(found: Capabilities) -> Finding:
         )
     except PreconditionError as error:
         return Finding("versions", Level.WRONG, f"protocol {found.protocol} there, {SPOKEN} here", str(error))
-    spoken_versions = f"protocol {spoken}, release {found.release or 'unknown'}"
+    theirs = f"protocol {spoken}, release {found.release or 'unknown'}"
     if found.release and software_version() and found.release != software_version():
         return Finding(
-            "versions",
-            Level.NOTE,
-            f"{spoken_versions} there, {software_version()} here",
-            "they work together",
+            "versions", Level.NOTE, f"{theirs} there, {software_version()} here", "they work together"
         )
-    return Finding("versions", Level.FINE, spoken_versions)
+    return Finding("versions", Level.FINE, theirs)
 
 
 def clock(offset_s: float) -> Finding:
