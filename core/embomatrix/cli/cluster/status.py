@@ -106,11 +106,10 @@ def rate(before: Glance, now: Glance) -> float:
 
 def screen(before: Glance, now: Glance, *, lines: int) -> RenderableType:
     """Draw runs and workers within ``lines`` lines; workers that do not work come first, then the busiest."""
-    present = [worker for worker in now.workers if worker.state in WORKING]
-    slots, busy = sum(worker.resources.slots for worker in present), sum(worker.running for worker in present)
+    present, busy = _at_work(now.workers)
     head = Text(f"{rate(before, now):,.0f} rollouts/s", style="bold")
     head.append(
-        f"   {busy} of {counted(slots, 'slot')} busy   {len(present)} of {counted(len(now.workers), 'worker')} at work"
+        f"   {busy}   {len(present)} of {counted(len(now.workers), 'worker')} at work"
         f"   {counted(len(now.runs), 'run')}",
         style="default",
     )
@@ -148,14 +147,20 @@ async def _look(client: AdminClient) -> Glance:
     return Glance(time.monotonic(), fleet, runs)
 
 
+def _at_work(workers: Sequence[WorkerInfo]) -> tuple[list[WorkerInfo], str]:
+    """Return the workers at work, and the number of their busy slots in words."""
+    present = [worker for worker in workers if worker.state in WORKING]
+    slots, busy = sum(worker.resources.slots for worker in present), sum(worker.running for worker in present)
+    return present, f"{busy} of {counted(slots, 'slot')} busy"
+
+
 def _slots(workers: Sequence[WorkerInfo]) -> str:
     states = Counter(worker.state for worker in workers)
     counts = ", ".join(f"{count} {state}" for state, count in states.most_common()) or "none"
-    present = [worker for worker in workers if worker.state in WORKING]
-    slots, busy = sum(worker.resources.slots for worker in present), sum(worker.running for worker in present)
+    present, busy = _at_work(workers)
     scenes = {resident.bundle_digest for worker in present for resident in worker.residents}
     memory = f"{counted(len(scenes), 'scene')} {'is' if len(scenes) == 1 else 'are'} in memory"
-    return f"Workers: {counts}; {busy} of {counted(slots, 'slot')} busy; {memory}."
+    return f"Workers: {counts}; {busy}; {memory}."
 
 
 def _runs(runs: Sequence[RunInfo]) -> list[str]:
