@@ -25,7 +25,6 @@ class SimulatedMachine:
     """Hardware of a worker and its path to the manager. ``speed`` is the true one, ``resources`` has the claimed one."""
 
     worker_id: str
-    kind: str
     resources: Resources
     speed: float
     latency_s: float
@@ -38,7 +37,6 @@ class SimulatedMachine:
 class SceneSize:
     """Memory and load time of a scene on a machine of speed 1."""
 
-    digest: str
     memory_mb: float
     load_s: float
     bundle_mb: float
@@ -77,7 +75,7 @@ def setting_of(scenario: SimulationScenario) -> Setting:
     load = sizes.load_s * np.exp(rng.normal(0.0, sizes.load_spread, sizes.count))
     digests = [f"scene-{index:05d}" for index in range(sizes.count)]
     scenes = {
-        digest: SceneSize(digest, float(memory[at]), float(load[at]), sizes.bundle_mb)
+        digest: SceneSize(float(memory[at]), float(load[at]), sizes.bundle_mb)
         for at, digest in enumerate(digests)
     }
     spread = np.exp(rng.normal(0.0, scenario.execute_spread, DURATIONS))
@@ -102,7 +100,6 @@ def _machines(scenario: SimulationScenario, rng: np.random.Generator) -> tuple[S
         machines.append(
             SimulatedMachine(
                 worker_id=f"w{index:05d}",
-                kind=kind.name,
                 resources=Resources(
                     kind.slots,
                     kind.slots,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from embomatrix.manager.control.commands import (
     AcknowledgeLease,
@@ -36,8 +36,6 @@ if TYPE_CHECKING:
         RolloutResult,
         RunTerms,
     )
-
-REPORTS: Final = {True: "first report", False: "report"}
 
 
 @dataclass(slots=True)
@@ -97,7 +95,7 @@ class SimulatedManager:
 
     def tick_forever(self) -> None:
         """Tick now and at every interval from now on."""
-        with self._measured.deciding("tick"):
+        with self._measured.deciding():
             lost, commands = self._intake.tick(now_s=self._queue.now_s)
         names = [event.worker_id for event in lost]
         for name in names:
@@ -108,7 +106,7 @@ class SimulatedManager:
         self._queue.after(TICK_S, self.tick_forever)
 
     def register(self, worker_id: str, boot_id: str, resources: Resources) -> WorkerSession:
-        with self._measured.deciding("register"):
+        with self._measured.deciding():
             session, commands = self._intake.register(worker_id, boot_id, resources, now_s=self._queue.now_s)
         self._measured.lost(worker_id, self._queue.now_s)
         self._end_stream(worker_id)
@@ -144,7 +142,7 @@ class SimulatedManager:
         """Raise SupersededError if the session is over."""
         if state is not None:
             self._checker.report(session.worker_id, state, resync=resync)
-        with self._measured.deciding("result" if state is None else REPORTS[resync]):
+        with self._measured.deciding():
             commands = self._intake.report(session, state, results, resync=resync, now_s=self._queue.now_s)
         self._carry_out(commands)
 
@@ -152,7 +150,7 @@ class SimulatedManager:
         self, session: WorkerSession, held: tuple[LeaseRef, ...], progress: tuple[LeaseProgress, ...]
     ) -> float:
         """Raise SupersededError if the session is over."""
-        with self._measured.deciding("heartbeat"):
+        with self._measured.deciding():
             interval_s, commands = self._intake.heartbeat(
                 session.session_id,
                 session.epoch,
@@ -169,14 +167,14 @@ class SimulatedManager:
         self._carry_out(self._intake.feed(RunOpened(run_id, terms), now_s=self._queue.now_s))
 
     def announce(self, run_id: str, version: int, entries: tuple[LookaheadEntry, ...]) -> None:
-        with self._measured.deciding("look-ahead"):
+        with self._measured.deciding():
             event = LookaheadAnnounced(run_id, version, entries)
             commands = self._intake.feed(event, now_s=self._queue.now_s)
         self._carry_out(commands)
 
     def submit(self, batch: Batch) -> None:
         self._checker.submit(batch)
-        with self._measured.deciding("batch"):
+        with self._measured.deciding():
             commands = self._intake.feed(BatchSubmitted(batch), now_s=self._queue.now_s)
         self._carry_out(commands)
 

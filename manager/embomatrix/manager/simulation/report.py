@@ -15,28 +15,16 @@ if TYPE_CHECKING:
     from embomatrix.rpc.wire.values import RunStats
 
 
-@dataclass(slots=True)
-class MessageCost:
-    """CPU seconds of the manager's decisions on one kind of message."""
-
-    count: int = 0
-    total_s: float = 0.0
-    longest_s: float = 0.0
-
-
 class Measurements:
     """Counters of one simulation, read at its end."""
 
     def __init__(self) -> None:
-        self.costs: dict[str, MessageCost] = {}
-        self.busy_s = 0.0
-        """Slot-seconds of executions, including unused ones."""
+        self.cpu_s = 0.0
+        """CPU time of the manager's decisions."""
         self.waits_s: list[float] = []
         """Time from the last submission of each step to its last result: the trainer stands still."""
-        self.queued_s: list[float] = []
-        """Time from the submission of each completed rollout to the start of its execution."""
         self.first_queued_s: list[float] = []
-        """The same for the first rollout of each group, which waits for its scene."""
+        """Time from the submission of each group to the start of its first execution, which waits for the scene."""
         self.foretold = self.warm = 0
         """Groups after a run's first step, whose scenes could be announced in time, and those with a warm scene."""
         self.loads = 0
@@ -55,27 +43,19 @@ class Measurements:
         self.caught: dict[str, int] = {}
         """Executions compared by then, for each worker put in quarantine."""
 
-    @property
-    def cpu_s(self) -> float:
-        return sum(cost.total_s for cost in self.costs.values())
-
     def lost(self, worker_id: str, now_s: float) -> None:
         """Note that the manager gave up a worker, or saw it register again."""
         if worker_id in self.died_s:
             self.detected_s.append(now_s - self.died_s.pop(worker_id))
 
     @contextmanager
-    def deciding(self, kind: str) -> Iterator[None]:
-        """Charge the thread's CPU time inside the block to this kind of message."""
-        cost = self.costs.setdefault(kind, MessageCost())
+    def deciding(self) -> Iterator[None]:
+        """Charge the thread's CPU time inside the block to the manager."""
         begin_s = time.thread_time()
         try:
             yield
         finally:
-            spent_s = time.thread_time() - begin_s
-            cost.count += 1
-            cost.total_s += spent_s
-            cost.longest_s = max(cost.longest_s, spent_s)
+            self.cpu_s += time.thread_time() - begin_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +96,6 @@ class Report:
     """Share of the busy slots of each run, while every run wanted all of them; empty if that never happened."""
     lag_p99_s: float
     """99th percentile of the time that messages waited for the manager; 0 for one that answers at once."""
-    costs: Mapping[str, MessageCost]
     counts: Mapping[str, int]
     caught: Mapping[str, int]
     """Executions compared by then, for each worker put in quarantine."""

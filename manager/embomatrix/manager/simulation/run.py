@@ -141,7 +141,6 @@ class ClusterSimulation:
             groups_s={trainer.plan.name: tuple(trainer.groups_s) for trainer in self._trainers},
             shares={run: count / measured.shared.total() for run, count in sorted(measured.shared.items())},
             lag_p99_s=quantile(sorted(measured.lags_s), 0.99),
-            costs=measured.costs,
             counts=measured.counts,
             caught=measured.caught,
         )

@@ -135,8 +135,8 @@ class SimulatedSlots:
     def cancel(self, refs: set[LeaseRef]) -> None:
         """Drop these leases; slots that run them are killed and respawn."""
         for ref in [ref for ref in self._running if ref in refs]:
-            lease, began_s = self._running.pop(ref)
-            self._leave(lease, began_s)
+            lease, _ = self._running.pop(ref)
+            self._leave(lease)
             self._around.queue.after(RESPAWN_S, self._free_slot)
         self._waiting = deque(lease for lease in self._waiting if lease.ref not in refs)
 
@@ -259,10 +259,9 @@ class SimulatedSlots:
         return Completed(REWARD, (), (), rollout_id, worker_id, timings, warm=True)
 
     def _finished(self, lease: Lease, outcome: Completed | InfraFailure) -> None:
-        entry = self._running.pop(lease.ref, None)
-        if self._stopped or entry is None:
+        if self._running.pop(lease.ref, None) is None or self._stopped:
             return
-        self._leave(*entry)
+        self._leave(lease)
         if isinstance(outcome, Completed):
             self._free += 1
         else:
@@ -270,9 +269,8 @@ class SimulatedSlots:
         self._around.on_result(LeaseResult(lease.ref, outcome))
         self._start()
 
-    def _leave(self, lease: Lease, began_s: float) -> None:
+    def _leave(self, lease: Lease) -> None:
         self._stuck_s.pop(lease.ref, None)
-        self._around.measured.busy_s += self._around.queue.now_s - began_s
         scene = self._scenes.get(lease.rollout.bundle_digest)
         if scene is not None:
             scene.running -= 1

@@ -101,7 +101,6 @@ class SimulatedTrainer:
             if left == 1:
                 self.groups_s.append(self._queue.now_s - sent_s)
             if isinstance(result.outcome, Completed):
-                self._measured.queued_s.append(result.outcome.timings.queued_s)
                 self._starts_s.setdefault(result.group_id, []).append(result.outcome.timings.queued_s)
                 self._warm[result.group_id] = result.outcome.warm
         self._queue.after(self.plan.latency_s, lambda: self._count(len(results)))
