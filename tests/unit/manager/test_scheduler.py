@@ -68,7 +68,9 @@ class Cluster:
             case WorkerLost(worker_id):
                 self.pool.leave(worker_id)
             case WorkerReported() | WorkerDrained() | WorkerSuspected():
-                self.pool.workers[event.worker_id].apply(event)
+                worker = self.pool.workers[event.worker_id]
+                worker.apply(event)
+                self.pool.update_standing(worker)
 
     def worker(self, name="w1", slots=1, memory_mb=1000, score=1.0):
         self.apply(WorkerJoined(name, Resources(slots, slots, memory_mb, score)))

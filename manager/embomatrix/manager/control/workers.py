@@ -95,7 +95,7 @@ class WorkerRecord:
         self.render_slots = min(self.resources.render_slots, self.slots)
 
     def apply(self, event: Standing) -> None:
-        """Take over what the event says about the worker's standing."""
+        """Take over what the event says about the worker's standing. `WorkerPool.update_standing` must follow."""
         match event:
             case WorkerReported():
                 self.reported, self.leaving, self.paused = True, event.draining, event.paused
@@ -103,7 +103,6 @@ class WorkerRecord:
                 self.drained = isinstance(event, WorkerDrained)
             case WorkerSuspected() | WorkerRecovered():
                 self.suspect = isinstance(event, WorkerSuspected)
-        self.refresh()
 
     @property
     def draining(self) -> bool:
@@ -112,11 +111,7 @@ class WorkerRecord:
     @property
     def withdrawn(self) -> bool:
         """True if it may take nothing new, even once it has reported."""
-        return bool(self.drained or self.leaving or self.suspect or self.paused or self.quarantined)
-
-    def refresh(self) -> None:
-        """Bring ``usable`` up to date after a change of the standing."""
-        self.usable = self.reported and not self.withdrawn
+        return bool(self.draining or self.suspect or self.paused or self.quarantined)
 
     @property
     def open_credits(self) -> int:
@@ -206,8 +201,8 @@ class WorkerPool:
             self.lags.pop(worker_id, None)
 
     def update_standing(self, worker: WorkerRecord) -> None:
-        """Bring the worker and the indices up to date with a changed standing."""
-        worker.refresh()
+        """Bring ``usable`` and the indices up to date with a changed standing."""
+        worker.usable = worker.reported and not worker.withdrawn
         if worker.withdrawn:
             self._live.discard(worker.worker_id)
         else:
