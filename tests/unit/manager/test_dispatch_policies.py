@@ -22,7 +22,7 @@ from embomatrix.manager.control.events import (
     WorkerResumed,
     WorkerSuspected,
 )
-from embomatrix.manager.control.schedule.placement import RunShare, in_turns, quotas
+from embomatrix.manager.control.schedule.placement import Need, RunShare, in_turns, quotas
 from embomatrix.rpc.wire.leases import LeaseProgress
 from embomatrix.rpc.wire.values import (
     Batch,
@@ -375,24 +375,24 @@ def test_new_run_gets_its_share_before_slot_times_are_known(desk, weight, share)
     st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 2), st.floats(1.0, 9.0)), max_size=30),
     st.fixed_dictionaries({run: st.sampled_from([0.5, 1.0, 4.0]) for run in "abc"}),
 )
-def test_claims_keep_their_order_and_runs_their_weights(entries, weights):
-    class Claim:
-        def __init__(self, run, rank, cost):
-            self.rank, self.cost, self.share = rank, cost, RunShare(run, weights[run])
-
-    claims = [Claim(*entry) for entry in sorted(entries, key=lambda entry: entry[1])]
-    ordered = in_turns(claims, lambda claim: claim.cost)
-    assert sorted(map(id, ordered)) == sorted(map(id, claims))
-    assert [claim.rank for claim in ordered] == sorted(claim.rank for claim in claims)
+def test_needs_keep_their_order_and_runs_their_weights(entries, weights):
+    by_rank = sorted(entries, key=lambda entry: entry[1])
+    needs = [
+        Need(f"scene-{index}", rank, 1, work_s=cost, share=RunShare(run, weights[run]))
+        for index, (run, rank, cost) in enumerate(by_rank)
+    ]
+    ordered = in_turns(needs, lambda need: need.work_s)
+    assert sorted(map(id, ordered)) == sorted(map(id, needs))
+    assert [need.rank for need in ordered] == sorted(need.rank for need in needs)
     for run in "abc":
-        mine = [claim for claim in claims if claim.share.run_id == run]
-        assert [claim for claim in ordered if claim.share.run_id == run] == mine
-    if {claim.rank for claim in claims} <= {0}:
+        mine = [need for need in needs if need.share.run_id == run]
+        assert [need for need in ordered if need.share.run_id == run] == mine
+    if {need.rank for need in needs} <= {0}:
         spent = dict.fromkeys("abc", 0.0)
-        for index, claim in enumerate(ordered):
-            spent[claim.share.run_id] += claim.cost / claim.share.weight
-            behind = {later.share.run_id for later in ordered[index + 1 :]} - {claim.share.run_id}
-            assert all(spent[claim.share.run_id] <= spent[run] + 9.0 / weights[run] + 1e-9 for run in behind)
+        for index, need in enumerate(ordered):
+            spent[need.share.run_id] += need.work_s / need.share.weight
+            behind = {later.share.run_id for later in ordered[index + 1 :]} - {need.share.run_id}
+            assert all(spent[need.share.run_id] <= spent[run] + 9.0 / weights[run] + 1e-9 for run in behind)
 
 
 @given(

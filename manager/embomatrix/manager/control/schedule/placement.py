@@ -15,7 +15,7 @@ import itertools
 import math
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol, TypeVar
+from typing import TYPE_CHECKING, Final, Protocol
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
@@ -32,31 +32,18 @@ class RunShare:
     priority: int = 0
 
 
-class Claim(Protocol):
-    """A need of a run at its ``rank``-th step from now."""
+def in_turns(needs: Iterable[Need], cost: Callable[[Need], float]) -> list[Need]:
+    """Sort needs by rank, then priority, then the cost over weight that their run has by then.
 
-    @property
-    def rank(self) -> int: ...
-
-    @property
-    def share(self) -> RunShare: ...
-
-
-ClaimT = TypeVar("ClaimT", bound=Claim)
-
-
-def in_turns(claims: Iterable[ClaimT], cost: Callable[[ClaimT], float]) -> list[ClaimT]:
-    """Sort claims by rank, then priority, then the cost over weight that their run has by then.
-
-    Claims of one run keep their order, and claims of equal runs alternate, however many each run has.
+    Needs of one run keep their order, and needs of equal runs alternate, however many each run has.
     """
     spent: dict[str, float] = {}
-    keyed: list[tuple[int, int, float, int, ClaimT]] = []
-    for index, claim in enumerate(claims):
-        share = claim.share
-        spent[share.run_id] = spent.get(share.run_id, 0.0) + cost(claim) / share.weight
-        keyed.append((claim.rank, -share.priority, spent[share.run_id], index, claim))
-    return [claim for *_, claim in sorted(keyed, key=lambda entry: entry[:4])]
+    keyed: list[tuple[int, int, float, int, Need]] = []
+    for index, need in enumerate(needs):
+        share = need.share
+        spent[share.run_id] = spent.get(share.run_id, 0.0) + cost(need) / share.weight
+        keyed.append((need.rank, -share.priority, spent[share.run_id], index, need))
+    return [need for *_, need in sorted(keyed, key=lambda entry: entry[:4])]
 
 
 def quotas(wanted: Mapping[RunShare, int], slots: int) -> dict[RunShare, float]:

@@ -238,7 +238,7 @@ class ResidencySites:
         in_use: frozenset[tuple[str, str]],
         retry_s: float,
         *,
-        needs: Iterable[Need],
+        needs: Sequence[Need],
         measured_mb: Mapping[str, float],
     ) -> None:
         self._residencies = residencies
