@@ -2,12 +2,12 @@
 
 import pytest
 
-from embomatrix.cli import local_cluster as foreground
+from embomatrix.cli import local_cluster
 from embomatrix.cli.local_cluster import no_problem, run_command
 
 
 def leave_by(monkeypatch, script):
-    monkeypatch.setattr(foreground, "embomatrix_command", lambda *_: ["sh", "-c", script])
+    monkeypatch.setattr(local_cluster, "embomatrix_command", lambda *_: ["sh", "-c", script])
 
 
 @pytest.mark.parametrize(

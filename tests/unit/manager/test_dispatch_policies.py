@@ -42,7 +42,7 @@ LIMITS = DispatchLimits(known_after=4, hedge_share=0.1)
 CRASH = InfraFailure(InfraCode.SLOT_CRASHED, "signal 11")
 
 
-class Desk:
+class Bench:
     """Dispatcher with its clock and the leases that its workers hold."""
 
     def __init__(self, limits=LIMITS):
@@ -93,281 +93,281 @@ class Desk:
 
 
 @pytest.fixture
-def desk():
-    return Desk()
+def bench():
+    return Bench()
 
 
-def policy(desk, group_policy, **terms):
-    desk.apply(RunOpened("r1", RunTerms(group_policy, **terms)))
+def policy(bench, group_policy, **terms):
+    bench.apply(RunOpened("r1", RunTerms(group_policy, **terms)))
 
 
 # Group policies
 
 
-def test_default_policy_cancels_the_rest_of_a_failed_group_only(desk):
-    desk.worker("w1", slots=8)
-    desk.submit(3, 2)
-    desk.finish("b1.0.0")
+def test_default_policy_cancels_the_rest_of_a_failed_group_only(bench):
+    bench.worker("w1", slots=8)
+    bench.submit(3, 2)
+    bench.finish("b1.0.0")
     for _ in range(3):
-        commands = desk.finish("b1.0.1", CRASH)
-    assert isinstance(desk.results["b1.0.0"], Completed)
-    assert isinstance(desk.results["b1.0.1"], InfraFailure)
-    assert desk.results["b1.0.2"] == Cancelled("rollout b1.0.1 was lost: slot_crashed")
+        commands = bench.finish("b1.0.1", CRASH)
+    assert isinstance(bench.results["b1.0.0"], Completed)
+    assert isinstance(bench.results["b1.0.1"], InfraFailure)
+    assert bench.results["b1.0.2"] == Cancelled("rollout b1.0.1 was lost: slot_crashed")
     assert [command for command in commands if isinstance(command, CancelLease)]
-    assert not {"b1.1.0", "b1.1.1"} & set(desk.results)
-    assert desk.dispatcher.counters("r1").groups_failed == 1
+    assert not {"b1.1.0", "b1.1.1"} & set(bench.results)
+    assert bench.dispatcher.counters("r1").groups_failed == 1
 
 
-def test_partial_policy_keeps_the_other_members(desk):
-    policy(desk, GroupPolicy.PARTIAL)
-    desk.worker("w1", slots=8)
-    desk.submit(2)
+def test_partial_policy_keeps_the_other_members(bench):
+    policy(bench, GroupPolicy.PARTIAL)
+    bench.worker("w1", slots=8)
+    bench.submit(2)
     for _ in range(3):
-        desk.finish("b1.0.0", CRASH)
-    desk.finish("b1.0.1")
-    assert isinstance(desk.results["b1.0.1"], Completed)
+        bench.finish("b1.0.0", CRASH)
+    bench.finish("b1.0.1")
+    assert isinstance(bench.results["b1.0.1"], Completed)
 
 
-def test_fail_fast_retries_nothing_and_cancels_the_batch(desk):
-    policy(desk, GroupPolicy.FAIL_FAST)
-    desk.worker("w1", slots=8)
-    desk.submit(2, 2, 2)
-    commands = desk.finish("b1.1.0", CRASH)
+def test_fail_fast_retries_nothing_and_cancels_the_batch(bench):
+    policy(bench, GroupPolicy.FAIL_FAST)
+    bench.worker("w1", slots=8)
+    bench.submit(2, 2, 2)
+    commands = bench.finish("b1.1.0", CRASH)
     assert commands.count(FinishBatch("r1", "b1")) == 1
-    assert isinstance(desk.results["b1.1.0"], InfraFailure)
-    assert sum(isinstance(outcome, Cancelled) for outcome in desk.results.values()) == 5
-    assert desk.dispatcher.counters("r1").groups_failed == 3
+    assert isinstance(bench.results["b1.1.0"], InfraFailure)
+    assert sum(isinstance(outcome, Cancelled) for outcome in bench.results.values()) == 5
+    assert bench.dispatcher.counters("r1").groups_failed == 3
 
 
-def test_slots_freed_by_a_failed_group_are_filled_at_once(desk):
-    desk.worker("w1", slots=1)
-    desk.submit(2, 2)
-    desk.apply(Tick(), after_s=601.0)
-    desk.submit(1, batch_id="b2")
-    assert "b2.0.0" in desk.held
+def test_slots_freed_by_a_failed_group_are_filled_at_once(bench):
+    bench.worker("w1", slots=1)
+    bench.submit(2, 2)
+    bench.apply(Tick(), after_s=601.0)
+    bench.submit(1, batch_id="b2")
+    assert "b2.0.0" in bench.held
 
 
-def test_deadline_of_a_run_overrides_the_default(desk):
-    policy(desk, GroupPolicy.PARTIAL, rollout_deadline_s=5.0)
-    desk.submit(1)
-    desk.apply(Tick(), after_s=5.0)
-    assert desk.results["b1.0.0"].code is InfraCode.DEADLINE
-    assert "within 5 s" in desk.results["b1.0.0"].message
+def test_deadline_of_a_run_overrides_the_default(bench):
+    policy(bench, GroupPolicy.PARTIAL, rollout_deadline_s=5.0)
+    bench.submit(1)
+    bench.apply(Tick(), after_s=5.0)
+    assert bench.results["b1.0.0"].code is InfraCode.DEADLINE
+    assert "within 5 s" in bench.results["b1.0.0"].message
 
 
 # Hedging
 
 
-def known(desk, count=20):
+def known(bench, count=20):
     """Teach the manager a rollout duration of one second; one rollout remains, on w1."""
-    desk.worker("w1", slots=count)
-    desk.submit(count)
+    bench.worker("w1", slots=count)
+    bench.submit(count)
     for index in range(count - 1):
-        desk.finish(f"b1.0.{index}", after_s=1.0 if not index else 0.0)
+        bench.finish(f"b1.0.{index}", after_s=1.0 if not index else 0.0)
 
 
-def test_late_rollout_in_a_tail_is_hedged_and_the_first_result_counts(desk):
-    known(desk)
-    desk.worker("w2")
-    desk.apply(Tick(), after_s=0.5)
-    assert desk.hedges == []
-    desk.apply(Tick(), after_s=2.0)
-    (hedge,) = desk.hedges
+def test_late_rollout_in_a_tail_is_hedged_and_the_first_result_counts(bench):
+    known(bench)
+    bench.worker("w2")
+    bench.apply(Tick(), after_s=0.5)
+    assert bench.hedges == []
+    bench.apply(Tick(), after_s=2.0)
+    (hedge,) = bench.hedges
     assert (hedge.worker_id, hedge.rollout.rollout_id) == ("w2", "b1.0.19")
-    first = desk.held["b1.0.19"]["w1"]
-    commands = desk.finish("b1.0.19", worker_id="w2")
+    first = bench.held["b1.0.19"]["w1"]
+    commands = bench.finish("b1.0.19", worker_id="w2")
     assert CancelLease("w1", first) in commands
-    assert desk.results["b1.0.19"].worker_id == "w2"
-    desk.apply(LeaseFinished("w1", first, completed("w1")))
-    assert desk.results["b1.0.19"].worker_id == "w2"
-    counters = desk.dispatcher.counters("r1")
+    assert bench.results["b1.0.19"].worker_id == "w2"
+    bench.apply(LeaseFinished("w1", first, completed("w1")))
+    assert bench.results["b1.0.19"].worker_id == "w2"
+    counters = bench.dispatcher.counters("r1")
     assert (counters.hedged, counters.stale_results, counters.delivered) == (1, 1, 20)
-    assert not desk.dispatcher.live_leases
+    assert not bench.dispatcher.live_leases
 
 
-def test_failed_hedge_leaves_the_first_lease_alone(desk):
-    known(desk)
-    desk.worker("w2")
-    desk.apply(Tick(), after_s=3.0)
-    desk.finish("b1.0.19", CRASH, worker_id="w2")
-    assert desk.dispatcher.counters("r1").redispatched == 0
-    desk.finish("b1.0.19", worker_id="w1")
-    assert isinstance(desk.results["b1.0.19"], Completed)
+def test_failed_hedge_leaves_the_first_lease_alone(bench):
+    known(bench)
+    bench.worker("w2")
+    bench.apply(Tick(), after_s=3.0)
+    bench.finish("b1.0.19", CRASH, worker_id="w2")
+    assert bench.dispatcher.counters("r1").redispatched == 0
+    bench.finish("b1.0.19", worker_id="w1")
+    assert isinstance(bench.results["b1.0.19"], Completed)
 
 
 def test_rollout_is_hedged_once_and_a_run_within_its_budget():
-    desk = Desk(DispatchLimits(known_after=4, hedge_share=0.05))
-    desk.worker("w1", slots=40)
-    desk.submit(40)
+    bench = Bench(DispatchLimits(known_after=4, hedge_share=0.05))
+    bench.worker("w1", slots=40)
+    bench.submit(40)
     for index in range(36):
-        desk.finish(f"b1.0.{index}", after_s=1.0 if not index else 0.0)
-    desk.worker("w2", slots=8)
+        bench.finish(f"b1.0.{index}", after_s=1.0 if not index else 0.0)
+    bench.worker("w2", slots=8)
     for _ in range(20):
-        desk.apply(Tick(), after_s=1.0)
-    assert len(desk.hedges) == 2
+        bench.apply(Tick(), after_s=1.0)
+    assert len(bench.hedges) == 2
 
 
-def test_rollout_that_ran_out_of_memory_is_not_hedged(desk):
-    desk.worker("w1", slots=20)
-    desk.submit(20)
-    desk.finish("b1.0.19", InfraFailure(InfraCode.SLOT_OOM, "MemoryError"))
+def test_rollout_that_ran_out_of_memory_is_not_hedged(bench):
+    bench.worker("w1", slots=20)
+    bench.submit(20)
+    bench.finish("b1.0.19", InfraFailure(InfraCode.SLOT_OOM, "MemoryError"))
     for index in range(19):
-        desk.finish(f"b1.0.{index}", after_s=1.0 if not index else 0.0)
-    desk.worker("w2")
-    desk.apply(Tick(), after_s=30.0)
-    assert desk.hedges == []
+        bench.finish(f"b1.0.{index}", after_s=1.0 if not index else 0.0)
+    bench.worker("w2")
+    bench.apply(Tick(), after_s=30.0)
+    assert bench.hedges == []
 
 
-def test_scene_of_a_late_rollout_is_loaded_on_another_worker(desk):
-    known(desk)
-    desk.worker("w2", warm=())
-    desk.apply(Tick(), after_s=3.0)
-    demand = desk.dispatcher.demand()
+def test_scene_of_a_late_rollout_is_loaded_on_another_worker(bench):
+    known(bench)
+    bench.worker("w2", warm=())
+    bench.apply(Tick(), after_s=3.0)
+    demand = bench.dispatcher.demand()
     assert demand.pending == {"kitchen": 1}
     assert demand.waited_s["kitchen"] >= 3.0
-    desk.report("w2")
-    desk.apply(Tick())
-    assert [hedge.worker_id for hedge in desk.hedges] == ["w2"]
+    bench.report("w2")
+    bench.apply(Tick())
+    assert [hedge.worker_id for hedge in bench.hedges] == ["w2"]
 
 
 # Slow workers
 
 
-def test_last_worker_is_no_longer_treated_as_slow_at_the_next_tick(desk):
-    desk.worker("w1", slots=2)
-    desk.submit(30)
+def test_last_worker_is_no_longer_treated_as_slow_at_the_next_tick(bench):
+    bench.worker("w1", slots=2)
+    bench.submit(30)
     for index in range(24):
-        desk.finish(f"b1.0.{index}", after_s=0.01)
+        bench.finish(f"b1.0.{index}", after_s=0.01)
     for index in range(24, 30):
-        desk.finish(f"b1.0.{index}", after_s=2.0)
-    desk.submit(20, batch_id="b2")
-    desk.apply(Tick(), after_s=0.05)
-    assert len([name for name in desk.held if name.startswith("b2") and desk.held[name]]) >= 2
+        bench.finish(f"b1.0.{index}", after_s=2.0)
+    bench.submit(20, batch_id="b2")
+    bench.apply(Tick(), after_s=0.05)
+    assert len([name for name in bench.held if name.startswith("b2") and bench.held[name]]) >= 2
 
 
-def test_only_worker_gets_a_failed_rollout_again_after_a_pause(desk):
-    desk.worker("w1", slots=2)
-    desk.worker("w2", warm=())
-    desk.submit(1)
-    desk.finish("b1.0.0", CRASH)
-    assert not desk.held["b1.0.0"]
-    desk.apply(WorkerSuspected("w2"))
-    desk.apply(Tick(), after_s=LIMITS.elsewhere_s + 0.1)
-    assert list(desk.held["b1.0.0"]) == ["w1"]
+def test_only_worker_gets_a_failed_rollout_again_after_a_pause(bench):
+    bench.worker("w1", slots=2)
+    bench.worker("w2", warm=())
+    bench.submit(1)
+    bench.finish("b1.0.0", CRASH)
+    assert not bench.held["b1.0.0"]
+    bench.apply(WorkerSuspected("w2"))
+    bench.apply(Tick(), after_s=LIMITS.elsewhere_s + 0.1)
+    assert list(bench.held["b1.0.0"]) == ["w1"]
 
 
 # Progress
 
 
-def beat(desk, worker_id, rollout_id, steps, after_s):
-    ref = desk.held[rollout_id][worker_id]
-    return desk.apply(LeasesRenewed(worker_id, (ref,), (LeaseProgress(ref, steps),)), after_s)
+def beat(bench, worker_id, rollout_id, steps, after_s):
+    ref = bench.held[rollout_id][worker_id]
+    return bench.apply(LeasesRenewed(worker_id, (ref,), (LeaseProgress(ref, steps),)), after_s)
 
 
-def test_stalled_lease_moves_to_another_worker(desk):
-    known(desk)
-    desk.submit(1, batch_id="b2")
-    (worker_id,) = desk.held["b2.0.0"]
-    desk.worker("w2")
+def test_stalled_lease_moves_to_another_worker(bench):
+    known(bench)
+    bench.submit(1, batch_id="b2")
+    (worker_id,) = bench.held["b2.0.0"]
+    bench.worker("w2")
     for steps in range(8):
-        beat(desk, worker_id, "b2.0.0", steps, after_s=3.0)
-    beat(desk, worker_id, "b2.0.0", 7, after_s=9.0)
-    assert list(desk.held["b2.0.0"]) == [worker_id]
-    beat(desk, worker_id, "b2.0.0", 7, after_s=1.0)
-    assert list(desk.held["b2.0.0"]) == ["w2"]
-    assert desk.dispatcher.counters("r1").redispatched == 1
+        beat(bench, worker_id, "b2.0.0", steps, after_s=3.0)
+    beat(bench, worker_id, "b2.0.0", 7, after_s=9.0)
+    assert list(bench.held["b2.0.0"]) == [worker_id]
+    beat(bench, worker_id, "b2.0.0", 7, after_s=1.0)
+    assert list(bench.held["b2.0.0"]) == ["w2"]
+    assert bench.dispatcher.counters("r1").redispatched == 1
 
 
-def test_worker_that_reports_no_progress_never_stalls(desk):
-    known(desk)
-    ref = desk.held["b1.0.19"]["w1"]
+def test_worker_that_reports_no_progress_never_stalls(bench):
+    known(bench)
+    ref = bench.held["b1.0.19"]["w1"]
     for _ in range(20):
-        desk.apply(LeasesRenewed("w1", (ref,)), after_s=5.0)
-    assert desk.held["b1.0.19"] == {"w1": ref}
+        bench.apply(LeasesRenewed("w1", (ref,)), after_s=5.0)
+    assert bench.held["b1.0.19"] == {"w1": ref}
 
 
-def test_third_stall_fails_a_rollout(desk):
-    known(desk)
+def test_third_stall_fails_a_rollout(bench):
+    known(bench)
     for _ in range(3):
-        beat(desk, "w1", "b1.0.19", 3, after_s=1.0)
-        beat(desk, "w1", "b1.0.19", 3, after_s=20.0)
-    assert desk.results["b1.0.19"].code is InfraCode.STALLED
-    assert "did no step for 20 s, after 3" in desk.results["b1.0.19"].message
+        beat(bench, "w1", "b1.0.19", 3, after_s=1.0)
+        beat(bench, "w1", "b1.0.19", 3, after_s=20.0)
+    assert bench.results["b1.0.19"].code is InfraCode.STALLED
+    assert "did no step for 20 s, after 3" in bench.results["b1.0.19"].message
 
 
 # Pauses
 
 
-def test_paused_dispatch_grants_no_leases_until_it_is_resumed(desk):
-    desk.worker("w1", slots=2)
-    desk.apply(DispatchPaused())
-    desk.submit(2)
-    desk.apply(Tick(), after_s=100.0)
-    assert desk.held == {}
-    assert desk.results == {}
-    desk.apply(DispatchResumed())
-    assert set(desk.held) == {"b1.0.0", "b1.0.1"}
+def test_paused_dispatch_grants_no_leases_until_it_is_resumed(bench):
+    bench.worker("w1", slots=2)
+    bench.apply(DispatchPaused())
+    bench.submit(2)
+    bench.apply(Tick(), after_s=100.0)
+    assert bench.held == {}
+    assert bench.results == {}
+    bench.apply(DispatchResumed())
+    assert set(bench.held) == {"b1.0.0", "b1.0.1"}
 
 
-def test_paused_worker_finishes_its_leases_and_gets_no_new_ones(desk):
-    desk.worker("w1")
-    desk.submit(3)
-    desk.report("w1", paused="the owner is back")
-    desk.finish("b1.0.0")
-    assert "b1.0.2" not in desk.held
-    desk.report("w1")
-    assert "b1.0.2" in desk.held
+def test_paused_worker_finishes_its_leases_and_gets_no_new_ones(bench):
+    bench.worker("w1")
+    bench.submit(3)
+    bench.report("w1", paused="the owner is back")
+    bench.finish("b1.0.0")
+    assert "b1.0.2" not in bench.held
+    bench.report("w1")
+    assert "b1.0.2" in bench.held
 
 
-def test_resumed_worker_gets_work_unless_it_is_leaving(desk):
-    desk.worker("w1")
-    desk.apply(WorkerDrained("w1"))
-    desk.submit(1)
-    assert desk.held == {}
-    desk.report("w1", draining=True)
-    desk.apply(WorkerResumed("w1"))
-    assert desk.held == {}
-    desk.report("w1", draining=False)
-    assert "b1.0.0" in desk.held
+def test_resumed_worker_gets_work_unless_it_is_leaving(bench):
+    bench.worker("w1")
+    bench.apply(WorkerDrained("w1"))
+    bench.submit(1)
+    assert bench.held == {}
+    bench.report("w1", draining=True)
+    bench.apply(WorkerResumed("w1"))
+    assert bench.held == {}
+    bench.report("w1", draining=False)
+    assert "b1.0.0" in bench.held
 
 
 # Rendering
 
 
-def test_rendering_rollouts_are_limited_to_rendering_slots(desk):
-    desk.worker("w1", slots=4)
-    desk.worker("w2", slots=4, render_slots=1)
-    desk.submit(3, render=True)
-    assert [list(leases) for leases in desk.held.values()] == [["w2"]]
-    desk.submit(2, batch_id="b2")
-    assert "b2.0.1" in desk.held
-    desk.finish("b1.0.0")
-    assert list(desk.held["b1.0.1"]) == ["w2"]
+def test_rendering_rollouts_are_limited_to_rendering_slots(bench):
+    bench.worker("w1", slots=4)
+    bench.worker("w2", slots=4, render_slots=1)
+    bench.submit(3, render=True)
+    assert [list(leases) for leases in bench.held.values()] == [["w2"]]
+    bench.submit(2, batch_id="b2")
+    assert "b2.0.1" in bench.held
+    bench.finish("b1.0.0")
+    assert list(bench.held["b1.0.1"]) == ["w2"]
 
 
 # Runs beside one another
 
 
-def test_later_run_gets_the_next_free_slot_beside_a_large_batch(desk):
-    desk.worker("w1", slots=2)
-    desk.submit(200, run_id="large", batch_id="large")
-    desk.submit(1, run_id="small", batch_id="small")
-    desk.finish("large.0.0", after_s=1.0)
-    assert "small.0.0" in desk.held
+def test_later_run_gets_the_next_free_slot_beside_a_large_batch(bench):
+    bench.worker("w1", slots=2)
+    bench.submit(200, run_id="large", batch_id="large")
+    bench.submit(1, run_id="small", batch_id="small")
+    bench.finish("large.0.0", after_s=1.0)
+    assert "small.0.0" in bench.held
 
 
 @pytest.mark.parametrize(("weight", "share"), [(1.0, 0.5), (3.0, 0.25)])
-def test_new_run_gets_its_share_before_slot_times_are_known(desk, weight, share):
-    desk.worker("w1")
-    desk.submit(1, run_id="before", batch_id="before")
+def test_new_run_gets_its_share_before_slot_times_are_known(bench, weight, share):
+    bench.worker("w1")
+    bench.submit(1, run_id="before", batch_id="before")
     # From here on the worker is given many leases ahead, and each run's are charged as if they took a second.
-    desk.finish("before.0.0", after_s=0.001)
-    desk.apply(RunOpened("first", RunTerms(weight=weight)))
-    desk.submit(800, run_id="first", batch_id="first")
-    desk.submit(800, run_id="second", batch_id="second")
+    bench.finish("before.0.0", after_s=0.001)
+    bench.apply(RunOpened("first", RunTerms(weight=weight)))
+    bench.submit(800, run_id="first", batch_id="first")
+    bench.submit(800, run_id="second", batch_id="second")
     for _ in range(600):
-        desk.finish(next(name for name, leases in desk.held.items() if leases), after_s=0.001)
-    done = [name.partition(".")[0] for name in desk.results]
+        bench.finish(next(name for name, leases in bench.held.items() if leases), after_s=0.001)
+    done = [name.partition(".")[0] for name in bench.results]
     assert done.count("second") / len(done) == pytest.approx(share, abs=0.05)
 
 

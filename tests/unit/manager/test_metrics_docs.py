@@ -46,14 +46,14 @@ async def test_every_state_and_outcome_has_an_initial_sample(page):
 
 
 def test_overhead_covers_the_last_minute():
-    effort = ManagerLoad()
-    effort.sample(0.0, 0.0, 0.0)
-    assert effort.overhead() == 0.0
-    effort.sample(10.0, 9.0, 1.0)
-    assert effort.overhead() == 0.9
+    load = ManagerLoad()
+    load.sample(0.0, 0.0, 0.0)
+    assert load.overhead() == 0.0
+    load.sample(10.0, 9.0, 1.0)
+    assert load.overhead() == 0.9
     for second in range(20, 200, 10):
-        effort.sample(second, 9.0 + second / 10, 1.0 + second * 0.9)
-    assert effort.overhead() == pytest.approx(0.1)
+        load.sample(second, 9.0 + second / 10, 1.0 + second * 0.9)
+    assert load.overhead() == pytest.approx(0.1)
 
 
 async def test_store_operations_are_timed():

@@ -100,14 +100,14 @@ REWARD = RewardBreakdown(0.5, 0.0, 0.0, (), False)
 
 
 @pytest.fixture
-def auditor():
+def checker():
     """Return an invariant checker that saw one submitted rollout and two workers with its scene."""
-    auditor = InvariantChecker(EventQueue())
-    auditor.submit(Batch("r", "b", 1, (ROLLOUT,)))
+    checker = InvariantChecker(EventQueue())
+    checker.submit(Batch("r", "b", 1, (ROLLOUT,)))
     warm = WorkerState((Resident("kitchen", ResidentState.WARM),))
     for worker in ("w1", "w2"):
-        auditor.report(worker, warm, resync=True)
-    return auditor
+        checker.report(worker, warm, resync=True)
+    return checker
 
 
 def outcome(result, cursor=1):
@@ -118,64 +118,64 @@ def completed(trace="x1"):
     return Completed(REWARD, (), (), trace, "w1", Timings(), warm=True)
 
 
-def test_checker_detects_a_second_outcome(auditor):
+def test_checker_detects_a_second_outcome(checker):
     lost = InfraFailure(InfraCode.WORKER_LOST, "gone")
-    auditor.watch([outcome(lost)])
+    checker.watch([outcome(lost)])
     with pytest.raises(BrokenInvariantError, match="x1 was delivered twice"):
-        auditor.watch([outcome(lost, cursor=2)])
+        checker.watch([outcome(lost, cursor=2)])
 
 
-def test_checker_detects_a_reward_without_execution(auditor):
+def test_checker_detects_a_reward_without_execution(checker):
     with pytest.raises(BrokenInvariantError, match="x1 has a reward that w1 never computed"):
-        auditor.watch([outcome(completed())])
-    auditor.executed("x1", "w1")
+        checker.watch([outcome(completed())])
+    checker.executed("x1", "w1")
 
 
-def test_checker_detects_the_reward_of_another_rollout(auditor):
-    auditor.executed("x1", "w1")
+def test_checker_detects_the_reward_of_another_rollout(checker):
+    checker.executed("x1", "w1")
     with pytest.raises(BrokenInvariantError, match="x1 has the reward of x2"):
-        auditor.watch([outcome(completed(trace="x2"))])
+        checker.watch([outcome(completed(trace="x2"))])
 
 
-def test_checker_detects_two_valid_leases_but_allows_a_successor(auditor):
-    auditor.watch([GiveLease("w1", REF, ROLLOUT, 1.0, ORIGIN), AcknowledgeLease("w1", REF)])
-    auditor.watch([GiveLease("w1", LeaseRef("lease", 2), ROLLOUT, 1.0, ORIGIN)])
+def test_checker_detects_two_valid_leases_but_allows_a_successor(checker):
+    checker.watch([GiveLease("w1", REF, ROLLOUT, 1.0, ORIGIN), AcknowledgeLease("w1", REF)])
+    checker.watch([GiveLease("w1", LeaseRef("lease", 2), ROLLOUT, 1.0, ORIGIN)])
     with pytest.raises(BrokenInvariantError, match="x1 has two leases at once"):
-        auditor.watch([GiveLease("w2", LeaseRef("lease", 3), ROLLOUT, 1.0, ORIGIN)])
+        checker.watch([GiveLease("w2", LeaseRef("lease", 3), ROLLOUT, 1.0, ORIGIN)])
 
 
-def test_checker_detects_a_reused_epoch(auditor):
-    auditor.watch([GiveLease("w1", REF, ROLLOUT, 1.0, ORIGIN), AcknowledgeLease("w1", REF)])
+def test_checker_detects_a_reused_epoch(checker):
+    checker.watch([GiveLease("w1", REF, ROLLOUT, 1.0, ORIGIN), AcknowledgeLease("w1", REF)])
     with pytest.raises(BrokenInvariantError, match="epoch 1 was given twice"):
-        auditor.watch([GiveLease("w2", REF, ROLLOUT, 1.0, ORIGIN)])
+        checker.watch([GiveLease("w2", REF, ROLLOUT, 1.0, ORIGIN)])
 
 
-def test_checker_detects_a_lease_to_a_worker_without_the_scene(auditor):
+def test_checker_detects_a_lease_to_a_worker_without_the_scene(checker):
     with pytest.raises(BrokenInvariantError, match="w3, which never reported"):
-        auditor.watch([GiveLease("w3", REF, ROLLOUT, 1.0, ORIGIN)])
+        checker.watch([GiveLease("w3", REF, ROLLOUT, 1.0, ORIGIN)])
 
 
-def test_checker_detects_a_batch_that_ends_too_early(auditor):
+def test_checker_detects_a_batch_that_ends_too_early(checker):
     with pytest.raises(BrokenInvariantError, match="batch b ended with 1 rollouts open"):
-        auditor.watch([FinishBatch("r", "b")])
+        checker.watch([FinishBatch("r", "b")])
 
 
 def test_messages_arrive_in_order_and_after_a_cut():
     queue, heard = EventQueue(), []
-    line = NetworkPath(queue, 0.1)
-    line.up(lambda: heard.append(("first", queue.now_s)))
-    line.cut(5.0, up=True, down=False)
-    line.up(lambda: heard.append(("second", queue.now_s)))
-    line.down(lambda: heard.append(("down", queue.now_s)))
+    path = NetworkPath(queue, 0.1)
+    path.up(lambda: heard.append(("first", queue.now_s)))
+    path.cut(5.0, up=True, down=False)
+    path.up(lambda: heard.append(("second", queue.now_s)))
+    path.down(lambda: heard.append(("down", queue.now_s)))
     queue.run(until=lambda: len(heard) == 3, limit_s=60.0)
     assert heard == [("first", 0.1), ("down", 0.1), ("second", 5.1)]
 
 
 def test_messages_under_way_on_an_ended_connection_are_lost():
     queue, heard = EventQueue(), []
-    line = NetworkPath(queue, 0.1)
-    line.up(lambda: heard.append("old"))
-    line.hang_up()
-    line.up(lambda: heard.append("new"))
+    path = NetworkPath(queue, 0.1)
+    path.up(lambda: heard.append("old"))
+    path.hang_up()
+    path.up(lambda: heard.append("new"))
     assert not queue.run(until=lambda: len(heard) == 2, limit_s=60.0)
     assert heard == ["new"]
