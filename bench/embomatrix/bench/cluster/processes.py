@@ -8,7 +8,6 @@ import importlib.util
 import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
 import time
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, Final
 import psutil
 
 from embomatrix.bench.report.figures import BenchError
+from embomatrix.cli.local_cluster import free_port
 from embomatrix.host.parent import with_this_process
 
 if TYPE_CHECKING:
@@ -156,13 +156,6 @@ def kill_tree(pid: int) -> None:
         for each in (*process.children(recursive=True), process):
             with contextlib.suppress(psutil.NoSuchProcess):
                 each.kill()
-
-
-def free_port() -> int:
-    """A free TCP port of loopback."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @dataclass(frozen=True, slots=True)

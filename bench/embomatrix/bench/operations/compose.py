@@ -11,8 +11,8 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.bench.cluster.processes import free_port
 from embomatrix.bench.report.figures import BenchError
+from embomatrix.cli.local_cluster import free_port
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.rpc.client import ClientLimits, ClusterClient
 from embomatrix.rpc.status import ClusterError
