@@ -185,11 +185,13 @@ class SimulatedWorker:
         waiting = [True]
 
         def take(answer: _T) -> None:
-            if waiting.pop() if waiting else False:
+            if waiting:
+                waiting.clear()
                 answered(answer)
 
         def give_up() -> None:
-            if waiting.pop() if waiting else False:
+            if waiting:
+                waiting.clear()
                 late()
 
         def arrive() -> None:
