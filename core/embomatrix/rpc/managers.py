@@ -54,8 +54,8 @@ class Managers:
         if isinstance(error, StandbyError) and error.leader in self.addresses:
             self.current = error.leader
             return
-        turn = self.addresses.index(self.current) + 1
-        self.current = self.addresses[turn % len(self.addresses)]
+        following = self.addresses.index(self.current) + 1
+        self.current = self.addresses[following % self.count]
 
 
 class LeaderClient:

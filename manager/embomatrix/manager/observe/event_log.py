@@ -168,7 +168,7 @@ class RunEventLog:
             case Cancelled():
                 self._end(command, now_s, "cancelled", "", "")
 
-    def in_log(self, run_id: str, durations_s: Sequence[float]) -> None:
+    def count_deliveries(self, run_id: str, durations_s: Sequence[float]) -> None:
         """Count the delivery times, in seconds, of results that reached the run's result log."""
         run = self._runs.get(run_id)
         if run is not None:

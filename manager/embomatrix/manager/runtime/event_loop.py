@@ -99,7 +99,7 @@ class ManagerRuntime:
         self.runs = Runs(cluster, store, bundles, logs, self._carry_out, limits or RunLimits(), self.history)
         self._intake = Intake(cluster, registry)
         self._journal = StateJournal(store, registry, cluster)
-        self._delivery = ResultDelivery(store, logs, self._send, self.event_log.in_log)
+        self._delivery = ResultDelivery(store, logs, self._send, self.event_log.count_deliveries)
         self._links: dict[str, WorkerLink] = {}
         self._lapsed_s = lapsed_s
         self._unrenewed = unrenewed

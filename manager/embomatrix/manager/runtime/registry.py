@@ -224,13 +224,13 @@ class Registry:
         return [WorkerRecovered(session.worker_id)]
 
     def drain(self, worker_id: str) -> list[Event]:
-        session = self._there(worker_id)
+        session = self._session_of(worker_id)
         session.drained, session.standing = True, WorkerStanding.DRAINING
         return [WorkerDrained(worker_id)]
 
     def resume(self, worker_id: str) -> list[Event]:
         """Cancel a drain. The worker reports itself whether it still leaves."""
-        session = self._there(worker_id)
+        session = self._session_of(worker_id)
         session.drained, session.standing = False, WorkerStanding.READY
         return [WorkerResumed(worker_id)]
 
@@ -270,7 +270,7 @@ class Registry:
                     events.append(self._lose(session, "its connection broke and it did not reconnect"))
         return events
 
-    def _there(self, worker_id: str) -> WorkerSession:
+    def _session_of(self, worker_id: str) -> WorkerSession:
         session = self._sessions.get(worker_id)
         if session is None:
             raise NotFoundError(

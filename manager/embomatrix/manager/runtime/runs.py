@@ -176,8 +176,8 @@ class Runs:
             )
         self._feed(LookaheadAnnounced(run_id, version, entries))
         scenes = dict.fromkeys(entry.bundle_digest for entry in entries)
-        outlook = self._cluster.scheduler.readiness
-        return [outlook.answer(scene) for scene in scenes]
+        readiness = self._cluster.scheduler.readiness
+        return [readiness.answer(scene) for scene in scenes]
 
     async def submit(self, batch: Batch) -> BatchLog:
         """Queue the batch, or attach to an earlier submission. Return its result log."""

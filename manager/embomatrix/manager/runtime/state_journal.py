@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-ROSTER_S: Final = 0.5
+WRITE_S: Final = 0.5
+"""Interval between two writes, unless one is urgent."""
 NOTED_S: Final = 2.0
 """Limit of a joining worker's wait for its journal entry; workers also join while the store is away."""
 _DISPATCH: Final = "dispatch"
@@ -82,7 +83,7 @@ class StateJournal:
         try:
             while True:
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(ROSTER_S):
+                    async with asyncio.timeout(WRITE_S):
                         await self._urgent.wait()
                 self._urgent.clear()
                 await self._note_present()

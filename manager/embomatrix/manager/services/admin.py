@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 
 class AdminServicer(admin_service_pb2_grpc.AdminServiceServicer):
-    def __init__(self, runtime: ManagerRuntime, gate: Gate, expulsion: Revocation) -> None:
+    def __init__(self, runtime: ManagerRuntime, gate: Gate, revocation: Revocation) -> None:
         self._runtime = runtime
         self._gate = gate
-        self._expulsion = expulsion
+        self._revocation = revocation
 
     async def ListWorkers(
         self, request: pb.ListWorkersRequest, context: grpc.aio.ServicerContext
@@ -116,12 +116,12 @@ class AdminServicer(admin_service_pb2_grpc.AdminServiceServicer):
         self, request: pb.RevokeTokenRequest, context: grpc.aio.ServicerContext
     ) -> pb.RevokeTokenResponse:
         async with translate(context):
-            await self._expulsion.revoke_token(request.token_id)
+            await self._revocation.revoke_token(request.token_id)
         return pb.RevokeTokenResponse()
 
     async def RevokeWorker(
         self, request: pb.RevokeWorkerRequest, context: grpc.aio.ServicerContext
     ) -> pb.RevokeWorkerResponse:
         async with translate(context):
-            await self._expulsion.revoke_worker(request.worker_id, request.reason[:200] or "by the operator")
+            await self._revocation.revoke_worker(request.worker_id, request.reason[:200] or "by the operator")
         return pb.RevokeWorkerResponse()

@@ -88,7 +88,7 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
             async for rows in _results(log, 0):
                 self._gate.caller_of(context)  # A revoked token reads no further results.
                 message = pb.ExecuteResponse()
-                _tell(log, rows, message)
+                _fill(log, rows, message)
                 yield message
 
     async def WaitExecution(
@@ -101,7 +101,7 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
             async for rows in _results(log, request.after_cursor):
                 self._gate.caller_of(context)
                 message = pb.WaitExecutionResponse()
-                _tell(log, rows, message)
+                _fill(log, rows, message)
                 yield message
 
     async def CancelBatch(
@@ -154,7 +154,7 @@ async def _results(log: BatchLog, cursor: int) -> AsyncIterator[list[ResultRow]]
         raise NotFoundError(f"batch {log.batch_id!r} was discarded: its run was closed")
 
 
-def _tell(
+def _fill(
     log: BatchLog, rows: Sequence[ResultRow], message: pb.ExecuteResponse | pb.WaitExecutionResponse
 ) -> None:
     """Fill an empty message with stored results and the groups that end with them."""
