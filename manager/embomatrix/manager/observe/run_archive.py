@@ -81,10 +81,7 @@ class RunHistory:
         record = self._event_log.runs.get(run_id)
         if record is not None:
             return self._summed(record, self.info(record), self.leads(run_id))
-        kept = await self._archive.load(run_id)
-        if kept is None:
-            raise _unknown(run_id)
-        return kept[0]
+        return (await self._archived(run_id))[0]
 
     def info(self, record: RunRecord) -> RunInfo:
         """Return the listing of an open run."""
@@ -101,10 +98,7 @@ class RunHistory:
         page = self._event_log.page(run_id, after, limit)
         if page is not None:
             return page
-        kept = await self._archive.load(run_id)
-        if kept is None:
-            raise _unknown(run_id)
-        summary, events = kept
+        summary, events = await self._archived(run_id)
         beyond = [event for event in events if event.sequence > after]
         return EventPage(tuple(beyond[:limit]), summary.events_dropped)
 
@@ -126,13 +120,19 @@ class RunHistory:
             events: Sequence[RunEvent] = record.ring.events
             dropped = record.ring.dropped
         else:
-            kept = await self._archive.load(run_id)
-            if kept is None:
-                raise _unknown(run_id)
-            dropped, events = kept[0].events_dropped, kept[1]
+            summary, events = await self._archived(run_id)
+            dropped = summary.events_dropped
         since_s = events[-1].at_s - seconds if events else 0.0
         late = itertools.takewhile(lambda event: event.at_s >= since_s, reversed(events))
         return EventPage(tuple(late)[::-1], dropped)
+
+    async def _archived(self, run_id: str) -> tuple[RunSummary, tuple[RunEvent, ...]]:
+        kept = await self._archive.load(run_id)
+        if kept is None:
+            raise NotFoundError(
+                f"no run {run_id!r} is open or kept: `embomatrix cluster runs --closed` lists those that are kept"
+            )
+        return kept
 
     def _summed(self, record: RunRecord, info: RunInfo, leads: PhaseSummary) -> RunSummary:
         figures = record.figures
@@ -169,12 +169,6 @@ def manager_version() -> str:
         return version("embomatrix")
     except PackageNotFoundError:
         return "unknown"
-
-
-def _unknown(run_id: str) -> NotFoundError:
-    return NotFoundError(
-        f"no run {run_id!r} is open or kept: `embomatrix cluster runs --closed` lists those that are kept"
-    )
 
 
 RUNS_KEPT: Final = 50
