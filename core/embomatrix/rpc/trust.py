@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Self
 
-from embomatrix.proto.v1 import rollout_service_pb2, rollout_service_pb2_grpc
+from embomatrix.proto.v1 import rollout_service_pb2_grpc
 from embomatrix.rpc.channel import is_address, open_channel
 from embomatrix.rpc.status import (
     InvalidRequestError,
@@ -21,6 +21,7 @@ from embomatrix.rpc.status import (
     UnavailableError,
     cluster_errors,
 )
+from embomatrix.rpc.versions import capabilities_of
 
 FIRST_CONTACT_S: Final = 10.0
 """Time limit for the handshake and the first answer of a manager with an unknown certificate."""
@@ -120,11 +121,10 @@ async def _fetch_from(address: str, fingerprint: str) -> bytes:
     async with open_channel(address, ca=met) as channel:
         stub = rollout_service_pb2_grpc.RolloutServiceStub(channel)
         with cluster_errors(address):
-            request = rollout_service_pb2.GetCapabilitiesRequest()
-            answer = await stub.GetCapabilities(request, timeout=FIRST_CONTACT_S)
+            found = await capabilities_of(stub, timeout_s=FIRST_CONTACT_S)
     with contextlib.suppress(ValueError):
-        if fingerprint_of(answer.ca_certificate) == fingerprint:
-            return str(answer.ca_certificate).encode("ascii")
+        if fingerprint_of(found.ca_certificate) == fingerprint:
+            return found.ca_certificate.encode("ascii")
     raise NotAllowedError(
         f"the server at {address} is not the manager of this invitation: its authority has another "
         "fingerprint. Ask the operator for a new invitation, and why another machine answers at this address"

@@ -10,7 +10,6 @@ import os
 import re
 import time
 import zlib
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Final
 
 from google.protobuf.message import DecodeError
@@ -19,6 +18,7 @@ from embomatrix.manager.observe.event_log import PAGE
 from embomatrix.manager.observe.run_figures import summary_of
 from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.rpc.status import NotFoundError
+from embomatrix.rpc.versions import software_version
 from embomatrix.rpc.wire.codec import ConvertError, each
 from embomatrix.rpc.wire.run_log import (
     EventPage,
@@ -164,11 +164,8 @@ class RunHistory:
 
 
 def manager_version() -> str:
-    """Return the version of the installed package."""
-    try:
-        return version("embomatrix")
-    except PackageNotFoundError:
-        return "unknown"
+    """Return the version of the installed package; "unknown" in a source tree that is not installed."""
+    return software_version() or "unknown"
 
 
 RUNS_KEPT: Final = 50
