@@ -170,7 +170,8 @@ def manager_version() -> str:
 
 RUNS_KEPT: Final = 50
 SUFFIX: Final = ".run.gz"
-_RUN_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+RUN_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+"""Valid run ids. Each is also a safe file name."""
 
 
 class RunArchive:
@@ -194,7 +195,7 @@ class RunArchive:
     async def load(self, run_id: str) -> tuple[RunSummary, tuple[RunEvent, ...]] | None:
         """Return an archived run; None if there is none of that id."""
         # The id becomes a file name, so only valid run ids are accepted.
-        if not _RUN_ID.fullmatch(run_id):
+        if not RUN_ID.fullmatch(run_id):
             return None
         return await asyncio.to_thread(self._read, self._path(run_id))
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import re
 import secrets
 import time
 from collections import deque
@@ -22,6 +21,7 @@ from embomatrix.manager.control.events import (
     RunOpened,
     WorkersExpected,
 )
+from embomatrix.manager.observe.run_archive import RUN_ID
 from embomatrix.manager.runtime.results import BatchLog
 from embomatrix.manager.runtime.serialization import (
     announced_in,
@@ -60,7 +60,6 @@ logger = logging.getLogger(__name__)
 
 DEFAULT_TERMS: Final = RunTerms()
 PAGE: Final = 4096
-_RUN_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +143,7 @@ class Runs:
         Raises ConflictError for other reward coefficients than those of the open run.
         """
         run_id = run_id or f"run-{secrets.token_hex(6)}"
-        if not _RUN_ID.fullmatch(run_id):
+        if not RUN_ID.fullmatch(run_id):
             raise InvalidRequestError(
                 f"run id {run_id[:140]!r}: use up to 128 letters, digits, '.', '_' and '-'"
             )
