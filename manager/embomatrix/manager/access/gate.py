@@ -135,13 +135,14 @@ class Gate:
         self, context: grpc.aio.ServicerContext, join_token: str, worker_id: str, boot_id: str
     ) -> Admission:
         """Admit a worker under this name, by the token of its call or the join token of its request."""
-        caller = self.caller(token_of(_header(context)) or join_token)
+        token = token_of(_header(context)) or join_token
+        caller = self.caller(token)
         if not may_call(caller.role, _REGISTER):
             raise NotAllowedError(
                 f"a token of the role {caller.role} may not register workers: it needs {who_may(_REGISTER)}"
             )
         if caller.role is AccessRole.JOIN:
-            return await self._join(token_of(_header(context)) or join_token, worker_id, boot_id)
+            return await self._join(token, worker_id, boot_id)
         if self._guarded:
             self._book.check_name(caller.token_id, caller.worker_id, worker_id)
         return Admission(caller.token_id)
