@@ -56,9 +56,8 @@ def protection_of(settings: ManagerSettings) -> Protection:
         if lacking and not is_loopback(host) and not settings.insecure_bind:
             raise AccessError(
                 f"refusing to serve on {host} without {' and '.join(lacking)}: anyone there could use the cluster or read its "
-                f"traffic; "
-                f"run `embomatrix manager init --data-dir {settings.data_dir} --san HOST` first, or pass --insecure-bind if "
-                "the network is trusted"
+                f"traffic; run `embomatrix manager init --data-dir {settings.data_dir} --san HOST` first, or pass "
+                "--insecure-bind if the network is trusted"
             )
     return Protection(tls, first, guarded)
 
