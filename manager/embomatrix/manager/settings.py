@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 import socket
 from pathlib import Path
-from typing import Self
+from typing import Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -13,6 +13,7 @@ from embomatrix.rpc.channel import TOKEN_PATTERN, is_address
 
 DEFAULT_PORT = 50070
 DEFAULT_HTTP_PORT = 8070
+LOOPBACK_NAMES: Final = ("localhost", "127.0.0.1", "::1")
 
 
 class ManagerSettings(BaseModel):

@@ -18,6 +18,7 @@ from embomatrix.manager.access.certificates import (
     names_in,
 )
 from embomatrix.manager.access.credentials import LONGEST_JOIN_S, Credential, CredentialBook
+from embomatrix.manager.settings import LOOPBACK_NAMES
 from embomatrix.manager.store.protocol import ShelfRow
 from embomatrix.rpc.trust import fingerprint_of
 from embomatrix.rpc.wire.tokens import AccessRole
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 FIRST_ROLES: Final = (AccessRole.ADMIN, AccessRole.TRAINER, AccessRole.VIEWER, AccessRole.JOIN)
-LOCAL_NAMES: Final = ("localhost", "127.0.0.1", "::1")
 _PRIVATE: Final = 0o600
 
 
@@ -174,7 +174,7 @@ def _certify(
         raise AccessError(
             f"{folder.ca_key} is missing, so no certificate can be signed: restore the file for this command"
         )
-    names = tuple(dict.fromkeys((*before, *sans, *LOCAL_NAMES, *_own_names())))
+    names = tuple(dict.fromkeys((*before, *sans, *LOOPBACK_NAMES, *_own_names())))
     try:
         pair = make_server_certificate(authority, names, now)
     except ValueError as error:

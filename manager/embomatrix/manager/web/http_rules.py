@@ -9,13 +9,15 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse
 
-from embomatrix.manager.settings import is_loopback
+from embomatrix.manager.settings import LOOPBACK_NAMES, is_loopback
 from embomatrix.manager.web.rewards import REWARDS
 from embomatrix.rpc.channel import token_of
 from embomatrix.rpc.status import NotSignedInError
 from embomatrix.rpc.wire.tokens import AccessRole
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from starlette.types import ASGIApp, Receive, Scope, Send
 
     from embomatrix.manager.access.gate import Gate
@@ -26,10 +28,12 @@ STATIC: Final = "/static/"
 OPEN_PATHS: Final = frozenset({"/", "/healthz"})
 """Page and health check, which need no token."""
 READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
-VIEWERS: Final = frozenset({AccessRole.VIEWER, AccessRole.TRAINER, AccessRole.ADMIN})
-TRAINERS: Final = frozenset({AccessRole.TRAINER, AccessRole.ADMIN})
-ADMINS: Final = frozenset({AccessRole.ADMIN})
-LOOPBACK_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
+SUFFICIENT_ROLES: Final[Mapping[AccessRole, frozenset[AccessRole]]] = {
+    AccessRole.VIEWER: frozenset({AccessRole.VIEWER, AccessRole.TRAINER, AccessRole.ADMIN}),
+    AccessRole.TRAINER: frozenset({AccessRole.TRAINER, AccessRole.ADMIN}),
+    AccessRole.ADMIN: frozenset({AccessRole.ADMIN}),
+}
+"""Roles that may send a request, by the lowest role that it needs."""
 
 
 class HttpRefusal(NamedTuple):
@@ -65,10 +69,8 @@ class HttpRules:
             role = self.gate.caller(token_of(headers.get("authorization"))).role
         except NotSignedInError as error:
             return HttpRefusal(401, f"{error}; HTTP requests send it as `Authorization: Bearer TOKEN`")
-        if role not in _allowed(path, changes=changes):
-            needed = (
-                AccessRole.TRAINER if path == REWARDS else AccessRole.ADMIN if changes else AccessRole.VIEWER
-            )
+        needed = _needed_role(path, changes=changes)
+        if role not in SUFFICIENT_ROLES[needed]:
             return HttpRefusal(403, f"a token of the role {role} may not do this: it needs {needed}")
         return None
 
@@ -95,14 +97,14 @@ class Guard:
 def allowed_hosts(bound: str, tls: Tls | None) -> frozenset[str]:
     """Return the names to answer to: those of the certificate and of loopback; any name if neither applies."""
     if tls is not None:
-        return LOOPBACK_NAMES | {name.lower() for name in tls.names}
-    return LOOPBACK_NAMES if is_loopback(bound) else frozenset()
+        return frozenset({*LOOPBACK_NAMES, *(name.lower() for name in tls.names)})
+    return frozenset(LOOPBACK_NAMES) if is_loopback(bound) else frozenset()
 
 
-def _allowed(path: str, *, changes: bool) -> frozenset[AccessRole]:
+def _needed_role(path: str, *, changes: bool) -> AccessRole:
     if path == REWARDS:
-        return TRAINERS
-    return ADMINS if changes else VIEWERS
+        return AccessRole.TRAINER
+    return AccessRole.ADMIN if changes else AccessRole.VIEWER
 
 
 def _is_foreign(headers: Headers, host: str) -> bool:
