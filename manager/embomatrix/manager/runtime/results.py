@@ -267,9 +267,8 @@ class _Page:
 
 
 def _page(log: BatchLog, ended: Sequence[_Waiting]) -> _Page:
-    delivered = [(entry.command, entry.arrived_s) for entry in ended]
     results = [
-        (command.result, arrived_s) for command, arrived_s in delivered if isinstance(command, DeliverResult)
+        (command.result, arrived_s) for command, arrived_s in ended if isinstance(command, DeliverResult)
     ]
-    last = any(isinstance(command, FinishBatch) for command, _ in delivered)
+    last = any(isinstance(command, FinishBatch) for command, _ in ended)
     return _Page(log, results, [result_row(result) for result, _ in results], last)
