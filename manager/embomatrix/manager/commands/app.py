@@ -157,11 +157,11 @@ def init(
     from embomatrix.manager.access.folder import FIRST_ROLES, AccessError, hand_out_to, prepare
 
     folder = _settings({} if data_dir is None else {"data_dir": data_dir}).data_dir
-    parcels = [_parcel(text) for text in hand_out or ()]
-    roles = tuple(dict.fromkeys((*FIRST_ROLES, *(role for role, _ in parcels))))
+    recipients = [_recipient(text) for text in hand_out or ()]
+    roles = tuple(dict.fromkeys((*FIRST_ROLES, *(role for role, _ in recipients))))
     try:
         done = prepare(folder, sans=san or (), roles=roles)
-        for role, target in parcels:
+        for role, target in recipients:
             hand_out_to(folder, role, target)
     except AccessError as error:
         _refuse(str(error))
@@ -171,10 +171,8 @@ def init(
         print(f"there  {sentence}")
 
 
-def _parcel(text: str) -> tuple[AccessRole, Path]:
+def _recipient(text: str) -> tuple[AccessRole, Path]:
     """Parse ``ROLE:FOLDER``."""
-    from pathlib import Path
-
     from embomatrix.rpc.wire.tokens import AccessRole
 
     name, _, target = text.partition(":")
