@@ -40,9 +40,9 @@ MOST_AHEAD: Final = 24
 LARGEST_AHEAD: Final = 4096
 """Largest plan in bytes that may wait in a stream: the buffer holds all of them, so no write blocks."""
 GATHER_S: Final = 0.025
-"""Answers of all slots are read at multiples of this interval, because each reading takes a core from a slot …"""
+"""Answers of all slots are read at multiples of this interval, because each reading takes a core from a slot."""
 GATHER_SHARE: Final = 0.5
-"""… or after this share of the time that the leases ahead will last, if that is less."""
+"""Answers of a slot are read after this share of the time that its leases ahead will last, if that is less."""
 LEAST_GATHER_S: Final = 0.002
 RECENT: Final = 0.1
 """Weight of the last execution in the moving average of execution times."""

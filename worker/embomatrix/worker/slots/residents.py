@@ -219,7 +219,7 @@ class Residents:
         return self._scenes.get(scene.digest) is scene
 
     def keep_slot(self, scene: ResidentScene, slot: Slot) -> None:
-        """Keep a slot for its scene's next rollout, unless the scene was dropped meanwhile.
+        """Keep a slot for its scene's next rollout, unless the scene was evicted or lost meanwhile.
 
         If too many slots are idle, the least recently used scene gives one up.
         """
@@ -314,11 +314,9 @@ class Residents:
             return self._root
 
     def _evict(self, digest: str) -> None:
-        logger.info("scene evicted scene=%s", digest)
-        self._drop(self._scenes[digest])
-
-    def _drop(self, scene: ResidentScene) -> None:
         """Forget a scene and end its process with its slots."""
+        logger.info("scene evicted scene=%s", digest)
+        scene = self._scenes[digest]
         self._forget(scene)
         self._end(scene)
 
