@@ -130,7 +130,7 @@ def _hold_scene(simulation: SimulationBackend, connection: socket.socket, board:
         return
     # A scene is a hundred thousand objects without garbage: collections would take half of the loading time.
     gc.disable()
-    started_s, core_s = time.perf_counter(), time.thread_time()
+    core_s = time.thread_time()
     try:
         scene = simulation.load(Path(request.header["path"]), request.header["digest"])
     except BundleCorruptError as error:
@@ -139,8 +139,8 @@ def _hold_scene(simulation: SimulationBackend, connection: socket.socket, board:
     except Exception as error:  # noqa: BLE001  # a failure to load is a result
         send(connection, PipeMessage(_failure(InfraCode.SCENE_LOAD_FAILED, error)))
         return
-    load_s, cpu_s = time.perf_counter() - started_s, time.thread_time() - core_s
-    send(connection, PipeMessage({"load_s": load_s, "cpu_s": cpu_s, "memory_mb": private_mb()}))
+    cpu_s = time.thread_time() - core_s
+    send(connection, PipeMessage({"cpu_s": cpu_s, "memory_mb": private_mb()}))
     memory_mb = int(request.header["slot_memory_mb"])
     gc.enable()
     serve_forks(connection, lambda slot: _run_slot(scene, slot, memory_mb, board), scene.complete())
