@@ -179,7 +179,7 @@ def lease_result_from_proto(message: worker_service_pb2.LeaseResult) -> LeaseRes
         case "infra_failure":
             outcome = inside("infra_failure", infra_failure_from_proto, message.infra_failure)
         case None:
-            raise ConvertError("outcome", "found no value: expected completed, infra_failure or cancelled")
+            raise ConvertError("outcome", "found no value: expected completed or infra_failure")
     return LeaseResult(ref, outcome, slot=message.slot, held_s=finite("held_s", message.held_s))
 
 
