@@ -316,7 +316,7 @@ async def test_automatic_rollback_keeps_its_own_error(tmp_path):
     store = SqliteStore(tmp_path / "state.sqlite")
     await store.claim(FIRST)
     other = sqlite3.connect(tmp_path / "state.sqlite", isolation_level=None)
-    # As SQLite does on a full disk.
+    # SQLite rolls back like this on a full disk.
     other.execute("CREATE TRIGGER full BEFORE INSERT ON run BEGIN SELECT RAISE(ROLLBACK, 'no room'); END")
     with pytest.raises(StateError, match="no room"):
         await store.open_run(RunRow("r1", ""))

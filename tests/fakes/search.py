@@ -43,11 +43,11 @@ SEED = 0
 AIMED = (Relation.ONTOP, Relation.INSIDE, Relation.UNDER)
 ASKED_STATES = (State.OPEN, State.TOGGLED_ON, State.HOT, State.COOKED, State.FROZEN)
 MOVABLES = 3
-"""Small things of a small scene."""
+"""Number of small objects in a scene."""
 FURNITURE = 4
 WALKS = 4
 STIRRED = 6
-"""Random deeds that a small scene has behind it before it is frozen: doors stand open, things lie in others."""
+"""Random deeds before a scene is saved: doors are open and objects lie in others."""
 
 
 def deeds(task: Task) -> tuple[SkillCall, ...]:

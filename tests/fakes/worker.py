@@ -63,13 +63,13 @@ class FakeWorker:
     desired: tuple = ()
     leases: dict = field(default_factory=dict)
     portions: list = field(default_factory=list)
-    """Number of leases in each message that brought some."""
+    """Number of leases in each message with leases."""
     acknowledged: list = field(default_factory=list)
     cancelled: list = field(default_factory=list)
     residents: dict = field(default_factory=dict)
     paused: str = ""
     lies: bool = False
-    """It says that plans reached nothing of their goal."""
+    """True if it reports that plans reached nothing of their goal."""
     resumed: bool = False
     labels: dict = field(default_factory=dict)
 

@@ -113,7 +113,7 @@ async def test_large_result_message_does_not_delay_leases(tmp_path):
         worker.portions.clear()
         finished = worker.finish_all()
         await until(lambda: sum(worker.portions) >= finished)
-        # What the first of the results freed is given away before the last of them is heard.
+        # Slots freed by the first results are leased again before the last results are processed.
         assert worker.portions[0] < finished / 2
         while not execution.done():
             worker.finish_all()
@@ -298,7 +298,7 @@ async def test_deposed_manager_stops(tmp_path):
             running_batch = asyncio.create_task(outcomes(client, batch(1)))
             await until(lambda: worker.executed)
             other = SqliteStore(tmp_path / "state.sqlite")
-            # As another process on the same address would, which takes this one for dead.
+            # Another process on the same address may claim the leader lease at once.
             assert (await other.claim(Candidate(f"{socket.gethostname()}/{at.address}", "x:1", 60.0))).mine
             await other.close()
             (lease,) = worker.leases.values()

@@ -61,7 +61,7 @@ async def test_revoking_an_unknown_worker_names_the_connected_ones(tmp_path):
         with pytest.raises(NotFoundError, match=r"no worker 'offcie'.*connected: office\)"):
             await operator.revoke_worker("offcie", "its results were wrong")
         await spare.kill()
-        # One that is away and has a credential can be kept from coming back.
+        # The credential of a worker that has left can still be revoked.
         await operator.revoke_worker("office", "sold")
         with pytest.raises(grpc.aio.AioRpcError) as caught:
             await worker(at, "office", token=spare.token).__aenter__()

@@ -79,7 +79,7 @@ async def cut_for_long(folder, directions, *, cut_s, **settings):
             assert stats.redispatched == 2
             assert set(cluster.executed().values()) == {2}
         else:
-            # The results arrive; the worker does not hear that they did, and sends them again.
+            # The results arrive, but their acknowledgements are lost, so the worker sends them again.
             assert stats.redispatched == 0
             assert set(cluster.executed().values()) == {1}
         return stats
@@ -95,7 +95,7 @@ async def test_rollout_on_partitioned_worker_is_redispatched_once(tmp_path):
 @pytest.mark.slow
 async def test_rollout_on_worker_partitioned_for_a_minute_is_redispatched_once(tmp_path, directions):
     stats = await cut_for_long(tmp_path, directions, cut_s=60.0)
-    # Where the worker hears that it was given up it stops; else its results come late and are fenced.
+    # A worker that hears of its lost session stops; otherwise its results arrive late and are rejected.
     assert stats.stale_results in (0, 2)
 
 

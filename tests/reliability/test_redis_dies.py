@@ -69,7 +69,7 @@ async def test_results_lost_by_redis_are_redelivered_once(tmp_path):
             await asyncio.to_thread(redis.forget, 8_000)
             await asyncio.to_thread(redis.start)
             await until(lambda: len(seen) >= 160)
-            # The manager knows still what Redis has forgotten; the next one does not.
+            # The present manager still knows the results that Redis lost; the next one does not.
             cluster.signal("manager")
             cluster.start_manager()
             await connected(client, "w1")

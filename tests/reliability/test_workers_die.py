@@ -31,7 +31,7 @@ async def test_fault_free_runs_repeat_hardly_any_rollout(tmp_path):
     async with two_workers(tmp_path) as (cluster, client):
         run_id = await opened(client)
         for number in range(batches):
-            # At the end of each, slots of one worker are free while leases wait behind those of the other.
+            # At the end of each batch, one worker has free slots while leases still wait at the other.
             batch = batch_of(run_id, size, "short", batch_id=f"b{number}")
             counted = tally(batch, await outcomes(client, batch))
             assert counted.clean

@@ -167,7 +167,7 @@ def test_full_disk_evicts_all_other_bundles(tmp_path):
 
 
 async def test_failed_bundle_write_leaves_no_file(tmp_path):
-    # The limit is the system's own, and lifted again.
+    # The process's own file size limit, lifted again below.
     source = Source(b"a" * 400, b"b" * 4000)
     cache = _cache(tmp_path, source)
     small, large = source.bundles

@@ -93,7 +93,7 @@ async def test_results_share_messages_while_slots_have_enough_leases(tmp_path, m
     digest = manager.bundle(b"ok")
     async with joined(manager, tmp_path):
         manager.want(digest)
-        # In one message: those that come one by one may be done before enough of them wait.
+        # Sent in one message: single leases might finish before enough of them wait.
         manager.leases(200, digest)
         await _until(lambda: len(manager.results) >= 200)
     assert manager.deliveries < 100

@@ -23,7 +23,7 @@ from embomatrix.worker.slots.execution import AHEAD_S, RECENT
 
 pytestmark = pytest.mark.timeout(60)
 BRIEF_S = AHEAD_S / 12
-"""Execution so brief that a dozen of them lie ahead."""
+"""Execution time at which a slot's stream may hold twelve leases ahead."""
 
 
 @pytest.fixture

@@ -37,7 +37,7 @@ from embomatrix.skills.syntax import MAX_STEPS, SIGNATURES, Arg, PlaceRelation, 
 from embomatrix.skills.trace import Step
 
 NEWER = bytes.fromhex("f80705")
-"""Field 127, a varint: what a later version of the protocol may add to a message."""
+"""Field 127, a varint, as a later version of the protocol may add it to a message."""
 UINT32 = st.integers(0, 2**32 - 1)
 UINT64 = st.integers(0, 2**64 - 1)
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
