@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
 SEED = 0
 AIMED = (Relation.ONTOP, Relation.INSIDE, Relation.UNDER)
-ASKED_STATES = (State.OPEN, State.TOGGLED_ON, State.HOT, State.COOKED, State.FROZEN)
 MOVABLES = 3
 """Number of small objects in a scene."""
 FURNITURE = 4
