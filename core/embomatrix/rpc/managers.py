@@ -64,14 +64,7 @@ class LeaderClient:
     ``address`` is HOST:PORT, or several with commas between them. ``ca`` (PEM) turns TLS on. Every failure is a ClusterError.
     """
 
-    def __init__(
-        self,
-        address: str = DEFAULT_ADDRESS,
-        token: str = "",
-        *,
-        ca: bytes = b"",
-        failover_s: float = FAILOVER_S,
-    ) -> None:
+    def __init__(self, address: str, token: str, *, ca: bytes, failover_s: float) -> None:
         self.managers = Managers(address)
         self.failover_s = failover_s
         self._token = token

@@ -29,7 +29,7 @@ from embomatrix.rpc.status import (
 from embomatrix.rpc.wire.tokens import AccessRole
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Iterable
 
     import grpc
 
@@ -69,18 +69,10 @@ class Gate:
     caller.
     """
 
-    def __init__(
-        self,
-        store: StateStore,
-        *,
-        guarded: bool,
-        shared_token: str = "",
-        clock: Callable[[], float] = time.time,
-    ) -> None:
+    def __init__(self, store: StateStore, *, guarded: bool, shared_token: str = "") -> None:
         self._store = store
         self._guarded = guarded
         self._shared = shared_token
-        self._clock = clock
         self._book = CredentialBook()
         self._lock = asyncio.Lock()
 
@@ -89,7 +81,7 @@ class Gate:
 
         Raises AccessError for a shared token that was issued for a role, since it would become an admin's.
         """
-        now_s = self._clock()
+        now_s = time.time()
         known = [Credential.from_row(row) for row in await self._store.rows(Shelf.CREDENTIALS)]
         self._book.keep(*(credential for credential in known if is_remembered(credential, now_s=now_s)))
         fresh = [credential for credential in first if credential.token_id not in self._book]
@@ -110,7 +102,7 @@ class Gate:
             return Caller(AccessRole.ADMIN, SHARED_ID)
         if not token:
             raise NotSignedInError(NO_TOKEN)
-        found = self._book.find(token, now_s=self._clock())
+        found = self._book.find(token, now_s=time.time())
         return Caller(found.role, found.token_id, found.worker_id if found.role is AccessRole.WORKER else "")
 
     def refusal(self, method: str, header: str | None) -> ClusterError | None:
@@ -158,7 +150,7 @@ class Gate:
         """Return a new token and its id."""
         self._need_guard()
         async with self._lock:
-            credential, token = self._book.issue(role, valid_s=valid_s, label=label, now_s=self._clock())
+            credential, token = self._book.issue(role, valid_s=valid_s, label=label, now_s=time.time())
             await self._keep(credential)
         logger.info("token issued token=%s role=%s label=%s", credential.token_id, role, credential.label)
         return token, credential.token_id
@@ -185,11 +177,11 @@ class Gate:
         logger.info("worker revoked worker=%s: %s", worker_id, reason)
 
     def infos(self) -> tuple[TokenInfo, ...]:
-        return self._book.infos(now_s=self._clock())
+        return self._book.infos(now_s=time.time())
 
     async def _join(self, token: str, worker_id: str, boot_id: str) -> Admission:
         async with self._lock:
-            now_s = self._clock()
+            now_s = time.time()
             # Looked up again: another process may have used the token during the wait for the lock.
             changed, own = self._book.redeem(
                 self._book.find(token, now_s=now_s), worker_id, boot_id, now_s=now_s

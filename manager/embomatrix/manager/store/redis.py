@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+TIMEOUT_S: Final = 5.0
 _FENCED: Final = "FENCED"
 _NO_MEMORY: Final = "OOM command not allowed"
 _GUARD: Final = f"""
@@ -147,9 +148,9 @@ return 1
 
 
 class RedisStore:
-    """``url`` is ``redis://HOST:PORT/DB``. Every call is limited to ``timeout_s``; failures are StateError."""
+    """``url`` is ``redis://HOST:PORT/DB``. Every call is limited to ``TIMEOUT_S``; failures are StateError."""
 
-    def __init__(self, url: str, *, prefix: str = "embomatrix", timeout_s: float = 5.0) -> None:
+    def __init__(self, url: str, *, prefix: str = "embomatrix") -> None:
         self._shown = without_secrets(url)
         self._prefix = prefix
         self._epoch = 0
@@ -157,7 +158,7 @@ class RedisStore:
         self._checked = False
         try:
             self._redis = redis.asyncio.Redis.from_url(
-                url, socket_timeout=timeout_s, socket_connect_timeout=timeout_s
+                url, socket_timeout=TIMEOUT_S, socket_connect_timeout=TIMEOUT_S
             )
         except (ValueError, RedisError) as error:
             raise StateError(

@@ -70,13 +70,13 @@ CREATE INDEX IF NOT EXISTS result_order ON result (run_id, batch_id, cursor);
 class SqliteStore:
     """Store in a file, or in memory for a SQLite URI. Raises StateError if it cannot be opened.
 
-    One connection, used by one thread at a time. ``clock`` returns seconds that all processes of this machine agree on.
+    One connection, used by one thread at a time. Leader leases use wall-clock time, which all processes of this
+    machine share.
     """
 
-    def __init__(self, path: Path | str, *, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, path: Path | str) -> None:
         self._path = path
         self._journal = None if isinstance(path, str) else path.with_name(path.name + "-wal")
-        self._clock = clock
         self._epoch = 0
         self._candidate: Candidate | None = None
         self._lock = asyncio.Lock()
@@ -97,7 +97,7 @@ class SqliteStore:
     async def claim(self, candidate: Candidate) -> Lead:
         def claim() -> Lead:
             leader = self._db.execute("SELECT holder, address, until_s FROM leader").fetchone()
-            if leader and leader[0] != candidate.holder and self._clock() < leader[2]:
+            if leader and leader[0] != candidate.holder and time.time() < leader[2]:
                 return Lead(self._known_epoch(), leader[1], mine=False)
             self._db.execute("UPDATE manager SET epoch = epoch + 1")
             self._lead(candidate)
@@ -197,7 +197,7 @@ class SqliteStore:
             self._db.close()
 
     def _lead(self, candidate: Candidate) -> None:
-        row = (candidate.holder, candidate.address, self._clock() + candidate.ttl_s)
+        row = (candidate.holder, candidate.address, time.time() + candidate.ttl_s)
         self._db.execute("INSERT OR REPLACE INTO leader VALUES (1, ?, ?, ?)", row)
 
     def _known_epoch(self) -> int:
