@@ -29,7 +29,7 @@ from embomatrix.manager.observe.training_reports import TrainingBook
 from embomatrix.manager.runtime.intake import TICK_S, Heartbeat, Intake
 from embomatrix.manager.runtime.registry import WorkerStanding
 from embomatrix.manager.runtime.results import ResultDelivery, ResultLogs
-from embomatrix.manager.runtime.runs import RunLimits, Runs
+from embomatrix.manager.runtime.runs import Runs
 from embomatrix.manager.runtime.state_journal import StateJournal
 from embomatrix.manager.runtime.worker_link import WorkerLink
 from embomatrix.manager.store.opening import timed_store
@@ -51,6 +51,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 UNAUDITED: Final = "results are not audited: auditing needs a second worker"
+RESULTS_KEPT: Final = 500_000
 CLEANUP_S: Final = 5.0
 STALLED_S: Final = 1.0
 """A tick that is this late means that no worker was heard meanwhile."""
@@ -66,7 +67,7 @@ _SUSPENSION: Final = {True: ("suspended", "is away"), False: ("resumes", "is bac
 class ManagerRuntime:
     """Entry point of the services. Call ``start`` first, then run ``serve``.
 
-    Results are kept for ``results_ttl_s`` after their batch ended, ``results_kept`` of them at most. ``lapsed_s``
+    Results are kept for ``results_ttl_s`` after their batch ended, ``RESULTS_KEPT`` of them at most. ``lapsed_s``
     returns how long another manager may have led, and ``unrenewed`` why; nothing is dispatched meanwhile.
     """
 
@@ -78,13 +79,11 @@ class ManagerRuntime:
         bundles: BundleStore,
         archive: RunArchive,
         *,
-        limits: RunLimits | None = None,
         results_ttl_s: float = 3600.0,
-        results_kept: int = 500_000,
         lapsed_s: Callable[[], float] = lambda: 0.0,
         unrenewed: Callable[[], str] = str,
     ) -> None:
-        logs = ResultLogs(ttl_s=results_ttl_s, limit=results_kept)
+        logs = ResultLogs(ttl_s=results_ttl_s, limit=RESULTS_KEPT)
         self.cluster = cluster
         self.registry = registry
         self.bundles = bundles
@@ -96,7 +95,7 @@ class ManagerRuntime:
         self.started_s = time.monotonic()
         self.event_log = RunEventLog(epoch_s=time.time() - self.started_s)
         self.history = RunHistory(self.event_log, archive, cluster)
-        self.runs = Runs(cluster, store, bundles, logs, self._carry_out, limits or RunLimits(), self.history)
+        self.runs = Runs(cluster, store, bundles, logs, self._carry_out, self.history)
         self._intake = Intake(cluster, registry)
         self._journal = StateJournal(store, registry, cluster)
         self._delivery = ResultDelivery(store, logs, self._send, self.event_log.count_deliveries)

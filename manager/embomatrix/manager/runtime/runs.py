@@ -8,7 +8,6 @@ import logging
 import secrets
 import time
 from collections import deque
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.control.dispatch.batches import group_sizes
@@ -59,21 +58,15 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 DEFAULT_TERMS: Final = RunTerms()
+BATCH_ROLLOUTS: Final = 65_536
+"""Rollouts of one batch at most."""
+QUEUED_ROLLOUTS: Final = 262_144
+"""Rollouts of all batches together at most."""
+RUNS: Final = 1024
+LOOKAHEAD_ENTRIES: Final = 65_536
+IDLE_S: Final = 6 * 3600.0
+"""A run without pending rollouts is closed after this time without a call."""
 PAGE: Final = 4096
-
-
-@dataclass(frozen=True, slots=True)
-class RunLimits:
-    """Limits of runs, batches and look-ahead windows."""
-
-    batch_rollouts: int = 65_536
-    """Rollouts of one batch at most."""
-    queued_rollouts: int = 262_144
-    """Rollouts of all batches together at most."""
-    runs: int = 1024
-    lookahead_entries: int = 65_536
-    idle_s: float = 6 * 3600.0
-    """A run without pending rollouts is closed after this time without a call."""
 
 
 class Runs:
@@ -86,7 +79,6 @@ class Runs:
         bundles: BundleStore,
         logs: ResultLogs,
         carry_out: Callable[[Sequence[Command]], None],
-        limits: RunLimits,
         history: RunHistory,
     ) -> None:
         self._cluster = cluster
@@ -94,7 +86,6 @@ class Runs:
         self._bundles = bundles
         self._logs = logs
         self._carry_out = carry_out
-        self.limits = limits
         self._history = history
         self._runs: dict[str, RunRow] = {}
         self._heard_s: dict[str, float] = {}
@@ -148,7 +139,7 @@ class Runs:
                 f"run id {run_id[:140]!r}: use up to 128 letters, digits, '.', '_' and '-'"
             )
         if run_id not in self._runs:
-            if len(self._runs) >= self.limits.runs:
+            if len(self._runs) >= RUNS:
                 raise OverloadedError(f"{len(self._runs)} runs are open: close some with CloseRun")
             run = RunRow(run_id, name[:200], terms_payload(terms))
             with _store_errors():
@@ -169,9 +160,9 @@ class Runs:
     ) -> list[LookaheadAnswer]:
         """Replace the run's look-ahead window. Return the loading state of each scene."""
         self._check_run(run_id)
-        if len(entries) > self.limits.lookahead_entries:
+        if len(entries) > LOOKAHEAD_ENTRIES:
             raise InvalidRequestError(
-                f"{len(entries)} look-ahead entries: at most {self.limits.lookahead_entries}, announce fewer steps"
+                f"{len(entries)} look-ahead entries: at most {LOOKAHEAD_ENTRIES}, announce fewer steps"
             )
         self._feed(LookaheadAnnounced(run_id, version, entries))
         scenes = dict.fromkeys(entry.bundle_digest for entry in entries)
@@ -237,7 +228,7 @@ class Runs:
     async def close_idle(self, now_s: float) -> None:
         """Close runs whose trainers disappeared."""
         for run_id, heard_s in list(self._heard_s.items()):
-            if now_s - heard_s > self.limits.idle_s and not self._cluster.dispatcher.pending_of(run_id):
+            if now_s - heard_s > IDLE_S and not self._cluster.dispatcher.pending_of(run_id):
                 logger.info("closing idle run run=%s", run_id)
                 with contextlib.suppress(UnavailableError):
                     await self.close_run(run_id)
@@ -253,15 +244,17 @@ class Runs:
         self._heard_s[run_id] = time.monotonic()
 
     def _check_batch(self, batch: Batch) -> None:
-        count, limit = len(batch.rollouts), self.limits.batch_rollouts
-        if not 0 < count <= limit:
-            raise InvalidRequestError(f"batch {batch.batch_id!r} has {count} rollouts: expected 1 to {limit}")
+        count = len(batch.rollouts)
+        if not 0 < count <= BATCH_ROLLOUTS:
+            raise InvalidRequestError(
+                f"batch {batch.batch_id!r} has {count} rollouts: expected 1 to {BATCH_ROLLOUTS}"
+            )
         if len({rollout.rollout_id for rollout in batch.rollouts}) < count:
             raise InvalidRequestError(
                 f"batch {batch.batch_id!r} has a rollout id twice: every id must be unique"
             )
         queued = self._cluster.dispatcher.queued
-        if queued + count > self.limits.queued_rollouts:
+        if queued + count > QUEUED_ROLLOUTS:
             raise OverloadedError(
                 f"{queued} rollouts are queued already: submit again after some have finished"
             )

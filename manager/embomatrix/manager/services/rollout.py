@@ -6,6 +6,7 @@ import asyncio
 import time
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.manager.runtime.runs import BATCH_ROLLOUTS
 from embomatrix.proto.v1 import rollout_service_pb2 as pb
 from embomatrix.proto.v1 import rollout_service_pb2_grpc
 from embomatrix.rpc.logs import bind
@@ -55,7 +56,7 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
             protocol_low=SPOKEN.oldest,
             protocol_high=SPOKEN.newest,
             version=software_version(),
-            batch_rollouts=self._runs.limits.batch_rollouts,
+            batch_rollouts=BATCH_ROLLOUTS,
             bundle_bytes=DEFAULT_LIMITS.compressed_bytes,
             ca_certificate=self._authority,
         )
