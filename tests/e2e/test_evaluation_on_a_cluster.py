@@ -2,7 +2,7 @@
 
 import pytest
 from tests.fakes.commands import run
-from tests.fakes.listening import until_listening
+from tests.fakes.waiting import until_listening
 
 from embomatrix.cli.local_cluster import local_cluster
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from tests.fakes.listening import until_listening
+from tests.fakes.waiting import until_listening
 
 from embomatrix.cli.local_cluster import local_cluster
 from embomatrix.cli.supervisor import embomatrix_command

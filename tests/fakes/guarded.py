@@ -1,11 +1,12 @@
 """Manager inside the test process, with tokens and TLS as `embomatrix manager init` sets them up."""
 
-import asyncio
 import contextlib
+import functools
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.fakes import waiting
 from tests.fakes.worker import FakeWorker
 
 from embomatrix.manager.access.folder import AccessFolder, prepare
@@ -69,10 +70,7 @@ def rollouts(count, *, task="t", scene=KITCHEN):
     return tuple(Rollout(f"x{i}", "g", scene, task, (), 0) for i in range(count))
 
 
-async def until(condition, within_s=10.0):
-    async with asyncio.timeout(within_s):
-        while not condition():  # noqa: ASYNC110  # the fake's lists have no event to wait for
-            await asyncio.sleep(0.01)
+until = functools.partial(waiting.until, limit_s=10.0)
 
 
 @contextlib.asynccontextmanager

@@ -3,6 +3,7 @@
 import asyncio
 import collections
 import contextlib
+import functools
 import json
 import os
 import re
@@ -13,6 +14,8 @@ import time
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+
+from tests.fakes import waiting
 
 from embomatrix.cli.local_cluster import free_port
 from embomatrix.rpc.client import ClientLimits, ClusterClient
@@ -158,11 +161,7 @@ async def two_workers(folder, **settings):
             yield cluster, client
 
 
-async def until(condition, limit_s=60.0):
-    """Wait until other processes and tasks make the condition true."""
-    async with asyncio.timeout(limit_s):
-        while not condition():  # noqa: ASYNC110
-            await asyncio.sleep(0.01)
+until = functools.partial(waiting.until, limit_s=60.0)
 
 
 def batch_of(run_id, count, task="ok", batch_id="b1", group=8):

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import functools
 import hashlib
 import socket
 import time
@@ -10,6 +11,7 @@ import zlib
 import grpc
 import httpx
 import pytest
+from tests.fakes import waiting
 from tests.fakes.worker import FakeWorker, completed
 
 from embomatrix.manager.services.app import running
@@ -79,10 +81,7 @@ async def outcomes(client, submitted):
     return {result.rollout_id: result async for result in client.execute(submitted, deadline_s=20)}
 
 
-async def until(condition, within_s=5.0):
-    async with asyncio.timeout(within_s):
-        while not condition():  # noqa: ASYNC110  # the fake's lists have no event to wait for
-            await asyncio.sleep(0.01)
+until = functools.partial(waiting.until, limit_s=5.0)
 
 
 async def test_every_rollout_of_a_batch_comes_back_with_its_reward(tmp_path):

@@ -2,8 +2,10 @@
 
 import asyncio
 import contextlib
+import functools
 
 import pytest
+from tests.fakes import waiting
 from tests.fakes.guarded import packed
 from tests.fakes.worker import FakeWorker
 
@@ -59,10 +61,7 @@ async def events(client, batch):
     return results, [event for event in found if isinstance(event, GroupDone)]
 
 
-async def until(condition, within_s=5.0):
-    async with asyncio.timeout(within_s):
-        while not condition():  # noqa: ASYNC110  # the fake's lists have no event to wait for
-            await asyncio.sleep(0.01)
+until = functools.partial(waiting.until, limit_s=5.0)
 
 
 async def test_lost_rollout_cancels_its_own_group_only(tmp_path):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from tests.fakes import waiting
 from tests.fakes.plans import plan_of
 from tests.fakes.pose_caches import build_pose_cache
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
@@ -93,9 +94,7 @@ class Harness:
         return self.results[lease_id]
 
     async def until(self, condition, limit_s=60.0):
-        async with asyncio.timeout(limit_s):
-            while not condition():  # noqa: ASYNC110  # what is watched belongs to the pool
-                await asyncio.sleep(0.005)
+        await waiting.until(condition, limit_s)
 
     def slots(self):
         """Return the slot processes: children of the scene process, grandchildren of the root process."""

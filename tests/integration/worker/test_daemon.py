@@ -2,10 +2,12 @@
 
 import asyncio
 import contextlib
+import functools
 import re
 
 import numpy as np
 import pytest
+from tests.fakes import waiting
 from tests.fakes.manager import FakeManager, serving
 from tests.fakes.simulation import PROGRAM
 
@@ -36,10 +38,7 @@ async def joined(manager, folder, **options):
                 await task
 
 
-async def _until(condition, limit_s=15.0):
-    async with asyncio.timeout(limit_s):
-        while not condition():  # noqa: ASYNC110  # what is watched belongs to another task
-            await asyncio.sleep(0.005)
+_until = functools.partial(waiting.until, limit_s=15.0)
 
 
 def _done(manager):

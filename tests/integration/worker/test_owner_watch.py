@@ -2,8 +2,10 @@
 
 import asyncio
 import contextlib
+import functools
 
 import numpy as np
+from tests.fakes import waiting
 from tests.fakes.manager import FakeManager, serving
 from tests.fakes.simulation import PROGRAM
 
@@ -49,10 +51,7 @@ async def lent(manager, folder, *, slots=1, grace_s=30.0):
                 await task
 
 
-async def _until(condition, limit_s=15.0):
-    async with asyncio.timeout(limit_s):
-        while not condition():  # noqa: ASYNC110  # what is watched belongs to another task
-            await asyncio.sleep(0.005)
+_until = functools.partial(waiting.until, limit_s=15.0)
 
 
 def _done(manager):

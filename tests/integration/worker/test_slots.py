@@ -11,6 +11,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from tests.fakes import waiting
 from tests.fakes.simulation import PROGRAM
 
 from embomatrix.rpc.wire.leases import Lease, LeaseRef
@@ -57,9 +58,7 @@ class Harness:
         return lease
 
     async def until(self, condition, limit_s=15.0):
-        async with asyncio.timeout(limit_s):
-            while not condition():  # noqa: ASYNC110  # what is watched belongs to the pool
-                await asyncio.sleep(0.005)
+        await waiting.until(condition, limit_s)
 
     async def outcomes(self, count):
         await self.until(lambda: len(self.results) >= count)
