@@ -205,7 +205,7 @@ class ManagerRuntime:
             self._links[worker_id].drain()
 
     def resume_worker(self, worker_id: str) -> None:
-        """Cancel the drain of a worker that has not left."""
+        """Cancel the drain, or lift the quarantine, of a worker that has not left."""
         self._carry_out(self._intake.feed(*self.registry.resume(worker_id), now_s=time.monotonic()))
         if worker_id in self._links:
             self._links[worker_id].resume()

@@ -229,7 +229,7 @@ class Registry:
         return [WorkerDrained(worker_id)]
 
     def resume(self, worker_id: str) -> list[Event]:
-        """Cancel a drain. The worker reports itself whether it still leaves."""
+        """Cancel an operator's drain. The worker's next state says whether it drains on its own."""
         session = self._session_of(worker_id)
         session.drained, session.standing = False, WorkerStanding.READY
         return [WorkerResumed(worker_id)]

@@ -11,10 +11,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.control.schedule.lookahead import LookaheadWindow
-from embomatrix.manager.observe.metrics import (
-    FAILURES_KEPT,
-    FailureNote,
-)
+from embomatrix.manager.observe.metrics import FAILURES_KEPT, FailureNote
 from embomatrix.manager.observe.run_figures import summary_of
 from embomatrix.manager.observe.training_reports import TrainingView  # noqa: TC001  # OpenAPI reads annotations
 from embomatrix.manager.runtime.event_loop import UNAUDITED

@@ -123,7 +123,7 @@ def command_routes(runtime: ManagerRuntime, snapshots: Snapshots, revocation: Re
 
     @router.post("/workers/{worker_id}/resume", response_model=Changed)
     async def resume(worker_id: str) -> Changed:
-        """Cancel the drain of a worker that has not left."""
+        """Cancel the drain, or lift the quarantine, of a worker that has not left."""
         with _changing(snapshots):
             runtime.resume_worker(worker_id)
         return Changed(worker_id, "ready")

@@ -11,12 +11,7 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.rpc.wire.leases import LeaseClaim, LeaseProgress, LeaseResult
-from embomatrix.rpc.wire.values import (
-    Completed,
-    InfraCode,
-    InfraFailure,
-    ResidentState,
-)
+from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, ResidentState
 from embomatrix.worker.slots.execution import HeldLease, SlotRun
 from embomatrix.worker.slots.processes import SIMULATOR_PROGRAM, ProcessGoneError
 from embomatrix.worker.slots.residents import Residents
