@@ -179,11 +179,11 @@ class Simulator:
         """State in words of the goal's objects and of those that a call succeeded on, in the table's order."""
         described = task.goal_objects | self._touched
         names = [name for name in task.table if name in described]
-        return final_lines([self._sight(name) for name in names])
+        return final_lines([self._description(name) for name in names])
 
     def survey(self, task: Task) -> tuple[str, ...]:
         """State in words of every object in the task's table, in its order; it reveals nothing about the goal."""
-        return final_lines([self._sight(name) for name in task.table])
+        return final_lines([self._description(name) for name in task.table])
 
     def warm_up(self) -> Iterator[None]:
         """Compute cached values ahead of their first use, a little per step. Changes no answer.
@@ -213,7 +213,7 @@ class Simulator:
             by_object.setdefault(change.name, []).append(change.words)
         return f"{sentence}; {gained(by_object)}"
 
-    def _sight(self, name: str) -> ObjectDescription:
+    def _description(self, name: str) -> ObjectDescription:
         world = self._world
         host = world.relations.host_of(name)
         asset = world.asset(name)

@@ -82,23 +82,23 @@ def gained(changes: Mapping[str, Sequence[str]]) -> str:
     return "; ".join(f"{name} is now {listed(states)}" for name, states in changes.items())
 
 
-def line(sight: ObjectDescription) -> str:
+def line(item: ObjectDescription) -> str:
     """Describe one object on one line: ``apple_1: on table_1 in kitchen_0, hot``."""
-    if sight.gone:
-        return f"{sight.name}: not there"
-    if sight.held:
+    if item.gone:
+        return f"{item.name}: not there"
+    if item.held:
         place = "in the robot's hand"
-    elif sight.host and sight.relation is not None:
-        place = f"{WORDS[sight.relation]} {sight.host} in {sight.room or 'no room'}"
+    elif item.host and item.relation is not None:
+        place = f"{WORDS[item.relation]} {item.host} in {item.room or 'no room'}"
     else:
-        place = f"in {sight.room or 'no room'}"
-    return f"{sight.name}: {', '.join([place, *sight.states])}"
+        place = f"in {item.room or 'no room'}"
+    return f"{item.name}: {', '.join([place, *item.states])}"
 
 
-def final_lines(sights: Sequence[ObjectDescription]) -> tuple[str, ...]:
+def final_lines(described: Sequence[ObjectDescription]) -> tuple[str, ...]:
     """Describe the first objects, one a line, and add the number of those left out."""
-    lines = tuple(line(sight) for sight in sights[:MAX_FINAL_LINES])
-    left = len(sights) - len(lines)
+    lines = tuple(line(item) for item in described[:MAX_FINAL_LINES])
+    left = len(described) - len(lines)
     return (*lines, f"and {left} more objects") if left > 0 else lines
 
 

@@ -231,11 +231,11 @@ def test_changed_grid_equals_a_fresh_one(start, come, data) -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(RECTANGLE, max_size=6), st.lists(RECTANGLE, max_size=3), st.lists(RECTANGLE, max_size=4))
-def test_narrowed_grid_equals_a_fresh_one(start, come, leaves) -> None:
+def test_narrowed_grid_equals_a_fresh_one(start, come, panels) -> None:
     scene = kitchen_scene()
     grid = FloorGrid(scene, rows_of(start)).changed(rows_of([]), rows_of(come))
-    narrowed = grid.narrowed(rows_of(leaves))
-    fresh = FloorGrid(scene, rows_of(start + come + leaves))
+    narrowed = grid.narrowed(rows_of(panels))
+    fresh = FloorGrid(scene, rows_of(start + come + panels))
     assert (narrowed.free == fresh.free).all()
     assert _parts_are_equal(narrowed, fresh)
 
@@ -248,9 +248,9 @@ def test_narrowed_grid_equals_a_fresh_one(start, come, leaves) -> None:
     COORDINATE,
     COORDINATE,
 )
-def test_main_part_is_the_largest_remaining_component_around_a_point(start, come, leaves, x, y) -> None:
+def test_main_part_is_the_largest_remaining_component_around_a_point(start, come, panels, x, y) -> None:
     wide = FloorGrid(kitchen_scene(), rows_of(start)).changed(rows_of([]), rows_of(come))
-    narrowed = wide.narrowed(rows_of(leaves))
+    narrowed = wide.narrowed(rows_of(panels))
     cell = wide.cell(x, y)
     if cell is None:
         assert narrowed.main_part_of(wide, x, y) == 0

@@ -14,7 +14,7 @@ HOSTS = st.sampled_from(["breakfast_table_1", "countertop_1", "shelf_1", "bowl_1
 DOORS = st.sampled_from(["fridge_1", "microwave_1", "cabinet_1"])
 SWITCHES = st.sampled_from(["table_lamp_1", "stove_1", "microwave_1"])
 RELATIONS = st.sampled_from(["ontop", "inside", "under"])
-ERRANDS = st.one_of(
+CALL_SEQUENCES = st.one_of(
     st.builds("move {0}; pick_up {0}".format, THINGS),
     st.builds("move {0}; place {0} {1}".format, HOSTS, RELATIONS),
     st.builds("move {0}; {1} {0}".format, DOORS, st.sampled_from(["open", "close"])),
@@ -47,12 +47,12 @@ def probed():
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.lists(ERRANDS, min_size=1, max_size=8))
-def test_reset_undoes_any_sequence_of_skills_to_the_bit(flat, probed, errands) -> None:
+@given(st.lists(CALL_SEQUENCES, min_size=1, max_size=8))
+def test_reset_undoes_any_sequence_of_skills_to_the_bit(flat, probed, sequences) -> None:
     task = task_over(flat.world.scene)
     flat.reset(task, 0)
     before = flat.world.state_bytes()
-    for call in plan_of(task, "; ".join(errands)):
+    for call in plan_of(task, "; ".join(sequences)):
         flat.run_step(call)  # those that fail change nothing, and the next one is tried
     flat.reset(task, 0)
     assert flat.world.state_bytes() == before

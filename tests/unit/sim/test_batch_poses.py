@@ -41,7 +41,7 @@ BOX = st.builds(
 )
 
 
-def lineup_of(boxes: list[Aabb]) -> PoseBoxes:
+def pose_boxes_of(boxes: list[Aabb]) -> PoseBoxes:
     return PoseBoxes(np.array([box.low_m for box in boxes]), np.array([box.high_m for box in boxes]))
 
 
@@ -101,7 +101,7 @@ def test_moved_boxes_keep_their_links_and_sizes() -> None:
 @given(st.lists(BOX, min_size=1, max_size=6), COORDINATE, COORDINATE)
 def test_batch_reach_equals_single_reach(boxes, x, y) -> None:
     stand = StandPose(x, y, 0.0)
-    assert lineup_of(boxes).reached_from(stand).tolist() == [in_reach(box, stand) for box in boxes]
+    assert pose_boxes_of(boxes).reached_from(stand).tolist() == [in_reach(box, stand) for box in boxes]
 
 
 @pytest.mark.parametrize(
@@ -110,13 +110,13 @@ def test_batch_reach_equals_single_reach(boxes, x, y) -> None:
 )
 def test_near_place_at_medium_height_is_handy(away_m, height_m, handy) -> None:
     cube = Aabb((away_m, -0.05, height_m - 0.05), (away_m + 0.1, 0.05, height_m + 0.05))
-    assert lineup_of([cube]).handy_from(StandPose(0.0, 0.0, 0.0)).tolist() == [handy]
+    assert pose_boxes_of([cube]).handy_from(StandPose(0.0, 0.0, 0.0)).tolist() == [handy]
 
 
 def test_pose_inside_a_solid_object_is_taken_and_beside_it_is_free() -> None:
     boxes = [Aabb((0.0, 0.0, 0.0), (0.1, 0.1, 0.1)), Aabb((0.19, 0.0, 0.0), (0.29, 0.1, 0.1))]
     near = [Aabb((9.0, 9.0, 9.0), (9.1, 9.1, 9.1)), Aabb((0.0, 0.0, 0.0), (0.2, 0.2, 0.2))]
-    taken, most = lineup_of(boxes).overlaps(Neighbours.of(near, [True, True], [False, False]))
+    taken, most = pose_boxes_of(boxes).overlaps(Neighbours.of(near, [True, True], [False, False]))
     assert taken.tolist() == [True, False]
     assert most.tolist() == [1, 1]
 
@@ -124,7 +124,7 @@ def test_pose_inside_a_solid_object_is_taken_and_beside_it_is_free() -> None:
 def test_object_with_a_cavity_is_taken_only_on_its_own_level() -> None:
     boxes = [Aabb((0.05, 0.05, z), (0.15, 0.15, z + 0.1)) for z in (0.0, 0.05)]
     bowl = Neighbours.of([Aabb((0.0, 0.0, 0.0), (0.2, 0.2, 0.2))], [False], [True])
-    assert lineup_of(boxes).overlaps(bowl)[0].tolist() == [True, False]
+    assert pose_boxes_of(boxes).overlaps(bowl)[0].tolist() == [True, False]
 
 
 def test_pose_on_a_link_without_a_frame_is_out_of_reach() -> None:
@@ -165,7 +165,7 @@ def test_box_is_not_turned_by_other_angles(quat) -> None:
 
 @given(st.lists(BOX, min_size=1, max_size=5), COORDINATE)
 def test_raised_boxes_begin_exactly_over_the_height(boxes, height) -> None:
-    raised = lineup_of(boxes).raised_over(height)
+    raised = pose_boxes_of(boxes).raised_over(height)
     for box, low, high in zip(boxes, raised.lows_m, raised.highs_m, strict=True):
         assert low[2] == pytest.approx(max(box.low_m[2], height))
         assert (high - low).tolist() == pytest.approx(box.size_m)

@@ -14,8 +14,8 @@ from embomatrix.world.state import Relation
 
 
 def test_description_contains_host_room_and_states():
-    sight = ObjectDescription("apple_1", "kitchen_0", "bowl_1", Relation.INSIDE, states=("cooked", "hot"))
-    assert line(sight) == "apple_1: inside bowl_1 in kitchen_0, cooked, hot"
+    item = ObjectDescription("apple_1", "kitchen_0", "bowl_1", Relation.INSIDE, states=("cooked", "hot"))
+    assert line(item) == "apple_1: inside bowl_1 in kitchen_0, cooked, hot"
 
 
 def test_object_on_the_floor_is_described_with_its_room():
@@ -46,8 +46,8 @@ def test_new_temperature_states_are_listed_by_object():
 
 
 def test_long_final_description_is_cut_with_a_remark():
-    sights = [ObjectDescription(f"apple_{n}", "kitchen_0") for n in range(MAX_FINAL_LINES + 3)]
-    lines = final_lines(sights)
+    described = [ObjectDescription(f"apple_{n}", "kitchen_0") for n in range(MAX_FINAL_LINES + 3)]
+    lines = final_lines(described)
     assert len(lines) == MAX_FINAL_LINES + 1
     assert lines[-1] == "and 3 more objects"
-    assert final_lines(sights[:2]) == ("apple_0: in kitchen_0", "apple_1: in kitchen_0")
+    assert final_lines(described[:2]) == ("apple_0: in kitchen_0", "apple_1: in kitchen_0")

@@ -28,7 +28,7 @@ PART_LIMIT = 16
 ROLLING_FRICTION: Final = 2e-3
 """Slight rolling resistance, with which round food comes to rest."""
 NO_SHAPE = -1
-LEAST_LEAF_KG = 0.2
+LEAST_PANEL_KG = 0.2
 """Least mass of a door panel: the solver needs masses of one order of magnitude."""
 
 
@@ -113,9 +113,9 @@ class BodyFactory:
         """
         pieces = self._pieces_of(asset)
         volumes = [sum(math.prod(part.size_m) for part in link.parts) for link in asset.links]
-        leaves = [max(LEAST_LEAF_KG, asset.mass_kg * volume / sum(volumes)) for volume in volumes]
+        panels_kg = [max(LEAST_PANEL_KG, asset.mass_kg * volume / sum(volumes)) for volume in volumes]
         owners = [sum(other.joint is not None for other in pieces[: i + 1]) for i in range(len(pieces))]
-        masses = [leaves[owner] / owners.count(owner) if owner else 0.0 for owner in owners]
+        masses = [panels_kg[owner] / owners.count(owner) if owner else 0.0 for owner in owners]
         return self._create(masses, pieces, pose)
 
     def walls(self, parts: Sequence[ConvexPart]) -> tuple[int, ...]:

@@ -97,7 +97,7 @@ class DynamicBodies:
             for index, (_, joint) in zip(self._joints[name], asset.joints, strict=True)
         )
 
-    def has_leaves(self, name: str) -> bool:
+    def has_panels(self, name: str) -> bool:
         """Return True if an object's joints move. A portable object, such as a laptop, is one rigid body."""
         return name in self._joints
 

@@ -75,7 +75,7 @@ class BulletEngine:
         for number, box in enumerate(self._boxes):
             if self._present[number]:
                 self._around.put(number, box)
-        self._walls_around = _neighbourhood(
+        self._walls_around = _spatial_hash(
             prepared.wall_boxes if prepared else [wall.aabb(IDENTITY) for wall in scene.walls]
         )
         self._journal = Journal()
@@ -296,7 +296,7 @@ class BulletEngine:
         return min([contact[8] for contact in contacts]) if contacts else math.inf
 
 
-def _neighbourhood(boxes: Iterable[Aabb]) -> SpatialHash:
+def _spatial_hash(boxes: Iterable[Aabb]) -> SpatialHash:
     around = SpatialHash()
     for number, box in enumerate(boxes):
         around.put(number, box)

@@ -57,7 +57,7 @@ _PLANTS: Final = frozenset(
     {"tree", "low_resolution_tree", "bush", "pot_plant", "hanging_plant", "greenery", "vine"}
 )
 _CLOTH: Final = frozenset({"bed", "sofa", "armchair", "ottoman", "carpet", "booth", "bench", "pillow"})
-_LEAF_M: Final = 0.1
+_PANEL_M: Final = 0.1
 _PANE_M: Final = 0.03
 """Thinner walls are door panels (first) and window panes (second)."""
 
@@ -234,7 +234,7 @@ def _material(wall: ConvexPart) -> Rgba:
     thickness = min(wall.size_m[:2])
     if thickness < _PANE_M:
         return _GLASS
-    return _DOOR if thickness < _LEAF_M else _WALL
+    return _DOOR if thickness < _PANEL_M else _WALL
 
 
 def color_of(asset: Asset) -> Rgba:

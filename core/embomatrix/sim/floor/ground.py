@@ -23,7 +23,7 @@ ON_FLOOR_M: Final = 0.05
 """A movable object with a lower underside stands on the floor."""
 GRIDS_KEPT: Final = 2
 """Floor layouts in memory besides the first: a plan returns to few; each takes 1 MB in a house with a garden."""
-LEAVES_KEPT: Final = 12
+NARROWED_KEPT: Final = 12
 """Grids with open doors and drawers in memory per layout; most of their data is shared."""
 
 Floor = tuple[tuple[int, Pose | None], ...]
@@ -138,7 +138,7 @@ class Ground:
         kept = self._layout.narrowed
         if self.open_joints not in kept:
             kept[self.open_joints] = self.shut.narrowed(self.open_panels.blocking)
-            if len(kept) > LEAVES_KEPT:
+            if len(kept) > NARROWED_KEPT:
                 kept.popitem(last=False)
         kept.move_to_end(self.open_joints)
         return kept[self.open_joints]

@@ -157,7 +157,7 @@ def close_all(stage: PhysicalStage, name: str) -> SkillRefusal | None:
 
 
 def _move_all(stage: PhysicalStage, name: str, goal: float) -> SkillRefusal | None:
-    if not stage.dynamic.bodies.has_leaves(name):
+    if not stage.dynamic.bodies.has_panels(name):
         return refuse(FailureReason.ARM_BLOCKED, target=name, other=name)
     home = stage.commanded
     refusal = None

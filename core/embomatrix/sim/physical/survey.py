@@ -223,7 +223,7 @@ class _Surveyor:
 
     def _panels_blocker(self, name: str, goal: float) -> str:
         """Return the blocker of moving every panel of an object in turn; "" for none."""
-        if not self._stage.dynamic.bodies.has_leaves(name):
+        if not self._stage.dynamic.bodies.has_panels(name):
             return name
         for panel in panels_in_order(self._stage, name, goal):
             start = self._world.engine.joints(name)[panel.number]

@@ -112,12 +112,14 @@ class PlacementOptions:
         one, other = self._scene.asset_of(held), self._scene.asset_of(target)
         key = PlacementKey(one.asset_id, other.asset_id, relation)
         if key not in self._exact:
-            self._exact[key] = _spots(rows_of(self._cache.placements, key), IDENTITY, one, other, relation)
+            self._exact[key] = _verified_candidates(
+                rows_of(self._cache.placements, key), IDENTITY, one, other, relation
+            )
         yield self._exact[key]
         if key not in self._by_class:
             name, pose_box_held = self.footprint(one)
             boxes = rows_of(self._cache.placements, PlacementKey(name, other.asset_id, relation))
-            self._by_class[key] = _spots(boxes, pose_box_held, one, other, relation)
+            self._by_class[key] = _verified_candidates(boxes, pose_box_held, one, other, relation)
         yield self._by_class[key]
 
     def fresh(self, held: str, target: str, relation: Relation, shift: Vec2, tries: int) -> CandidatePoses:
@@ -158,7 +160,9 @@ NO_CANDIDATES: Final = CandidatePoses(
 )
 
 
-def _spots(rows: FloatArray, then: Pose, held: Asset, support: Asset, relation: Relation) -> CandidatePoses:
+def _verified_candidates(
+    rows: FloatArray, then: Pose, held: Asset, support: Asset, relation: Relation
+) -> CandidatePoses:
     """Candidates at poses in the frame of a support with its joints shut.
 
     ``rows``, shape (n, 7), are positions and quaternions; ``then`` is the object's pose in each of their frames.

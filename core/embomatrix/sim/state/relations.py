@@ -151,9 +151,9 @@ class Relations:
 
     def resting_on(self, name: str) -> tuple[str, ...]:
         """Objects with this host, in scene order: on its surfaces and in its cavities."""
-        return self._answer("guests", name, self._find_guests)
+        return self._answer("resting", name, self._find_resting)
 
-    def _find_guests(self, name: str) -> tuple[str, ...]:
+    def _find_resting(self, name: str) -> tuple[str, ...]:
         if self._engine.is_parked(name):
             return ()
         around = self._engine.near(self._engine.aabb(name).grown(REST_M), frozenset((name,)))
