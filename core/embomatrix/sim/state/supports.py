@@ -98,14 +98,18 @@ class SupportTracker:
 
     def of(self, name: str) -> SupportState:
         """Support of an object."""
-        journal = self._engine.journal
-        if len(journal.entries) != self._read or journal.rounds != self._round:
-            self._read_journal()
-        known = self._now if name in self._stale else self._at_start
+        known = self._cache_of(name)
         state = known.get(name)
         if state is None:
             state = known[name] = self._find(name)
         return state
+
+    def _cache_of(self, name: str) -> dict[str, SupportState]:
+        """Cache for the object's state, after the journal is read."""
+        journal = self._engine.journal
+        if len(journal.entries) != self._read or journal.rounds != self._round:
+            self._read_journal()
+        return self._now if name in self._stale else self._at_start
 
     def warm_up(self) -> Iterator[None]:
         """Compute the support of every object, one per step. Changes no answer."""
@@ -189,12 +193,12 @@ class SupportTracker:
 
     def is_on(self, name: str, other: str) -> bool:
         """Return True if the object rests on a surface of another one outside closable cavities."""
-        known = self._known(name)
+        known = self._cache_of(name).get(name)
         return other in known.on if known is not None else self.would_be_on(name, other)
 
     def is_in(self, name: str, other: str) -> bool:
         """Return True if the object lies in a cavity of another one."""
-        known = self._known(name)
+        known = self._cache_of(name).get(name)
         if known is not None:
             return any(item.name == other for item in known.enclosures)
         return self.would_be_in(name, other)
@@ -214,12 +218,6 @@ class SupportTracker:
         if not asset.interiors or not engine.aabb(name).overlaps(engine.aabb(other), REST_M):
             return False
         return self._interior(name, asset, engine.pose(other), engine.joints(other)) is not None
-
-    def _known(self, name: str) -> SupportState | None:
-        journal = self._engine.journal
-        if len(journal.entries) != self._read or journal.rounds != self._round:
-            self._read_journal()
-        return (self._now if name in self._stale else self._at_start).get(name)
 
     def _interior(self, name: str, asset: Asset, pose: Pose, fractions: tuple[float, ...]) -> Interior | None:
         """Smallest cavity of an asset at a pose that contains the object."""
