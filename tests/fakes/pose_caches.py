@@ -7,7 +7,8 @@ import itertools
 from typing import TYPE_CHECKING
 
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.placing.pose_cache import PLACE_RELATIONS, PlacementLibrary, standing_poses
+from embomatrix.sim.geometry.candidates import PLACE_RELATIONS
+from embomatrix.sim.placing.pose_cache import PlacementLibrary, standing_poses
 from embomatrix.world.poses import PlacementKey, PoseCache
 
 if TYPE_CHECKING:

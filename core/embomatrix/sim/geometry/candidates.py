@@ -32,6 +32,8 @@ SUPPORTED_SHARE: Final = 0.6
 """An object wider than its surface needs at least this share of its width on it."""
 BESIDE_M: Final = 0.02
 """Gap beside a neighbour: less than half of what ``nextto`` allows the smallest object, more than contact."""
+PLACE_RELATIONS: Final = (Relation.ONTOP, Relation.INSIDE, Relation.UNDER)
+"""Relations that placing creates."""
 YAWS: Final = (0.0, math.pi / 2, math.pi, -math.pi / 2)
 """Objects stand square to their support."""
 

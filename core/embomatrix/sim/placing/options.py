@@ -11,7 +11,7 @@ import numpy as np
 
 from embomatrix.sim.geometry.batch_poses import LinkBoxes, PoseSet
 from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of
-from embomatrix.sim.geometry.candidates import patches, proposed_places
+from embomatrix.sim.geometry.candidates import PLACE_RELATIONS, patches, proposed_places
 from embomatrix.sim.geometry.footprints import LEVEL_FLOOR, footprint_of, pose_box_asset
 from embomatrix.sim.geometry.statics import base_of
 from embomatrix.sim.geometry.surfaces import link_under, links_with_surfaces
@@ -31,9 +31,6 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import FloatArray, Vec2
     from embomatrix.world.poses import PoseCache
     from embomatrix.world.scene import Scene
-
-PLACED: Final = (Relation.ONTOP, Relation.INSIDE, Relation.UNDER)
-"""Relations that placing creates."""
 
 
 class CandidatePoses:
@@ -102,7 +99,7 @@ class PlacementOptions:
             movable = [name for name in table if not scene.by_name[name].fixed]
             hosts = [name for name in table if links_with_surfaces(scene.asset_of(name))]
             for held, target in itertools.product(movable, hosts):
-                for relation in PLACED:
+                for relation in PLACE_RELATIONS:
                     for _ in self.verified(held, target, relation):
                         pass
                 yield

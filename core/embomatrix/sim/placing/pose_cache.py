@@ -14,7 +14,14 @@ from embomatrix.sim.bullet.mini_world import MiniWorld, StaticObject
 from embomatrix.sim.engine import TOLERANCE_M
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of
-from embomatrix.sim.geometry.candidates import LIFT_M, beside, candidates, stands_in, surfaces_for
+from embomatrix.sim.geometry.candidates import (
+    LIFT_M,
+    PLACE_RELATIONS,
+    beside,
+    candidates,
+    stands_in,
+    surfaces_for,
+)
 from embomatrix.sim.geometry.footprints import LEVEL_FLOOR, Footprint, box_of, footprint_of
 from embomatrix.sim.state.relations import Relations
 from embomatrix.world.geometry import Pose
@@ -29,7 +36,6 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import Aabb
     from embomatrix.world.scene import Scene
 
-PLACE_RELATIONS: Final = (Relation.ONTOP, Relation.INSIDE, Relation.UNDER)
 POSES: Final = 16
 """Verified poses kept per pair."""
 TRIES: Final = 40

@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Self
 from embomatrix.factory.assets.solids import Solids, placed_parts
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.geometry.bounds import bounds_of
+from embomatrix.sim.geometry.candidates import PLACE_RELATIONS
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical.placement_reachability import PlacementQuery
 from embomatrix.sim.physical.survey import placement_reachability
-from embomatrix.sim.placing.pose_cache import PLACE_RELATIONS, footprint_placements, standing_poses
+from embomatrix.sim.placing.pose_cache import footprint_placements, standing_poses
 from embomatrix.skills.appliances import cold_source, heat_source
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.poses import Handling, PlacementKey, PoseCache
