@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.sim.caches import RecentCache
 from embomatrix.sim.floor.grid import FloorGrid
 from embomatrix.sim.floor.obstacles import WALLS, Obstacles
 from embomatrix.sim.floor.open_panels import OpenPanels
@@ -36,7 +36,7 @@ class FloorLayout:
 
     obstacles: Obstacles
     grid: FloorGrid
-    narrowed: OrderedDict[OpenJoints, FloorGrid]
+    narrowed: RecentCache[OpenJoints, FloorGrid]
 
 
 class Ground:
@@ -59,8 +59,8 @@ class Ground:
                 [self._walls(), *(self._parts_of(item.name, engine.pose(item.name)) for item in blocking)]
             )
             grid = FloorGrid(self._scene, obstacles.blocking)
-        self._at_start = FloorLayout(obstacles, grid, OrderedDict())
-        self._kept: OrderedDict[Floor, FloorLayout] = OrderedDict()
+        self._at_start = FloorLayout(obstacles, grid, RecentCache(NARROWED_KEPT))
+        self._layouts: RecentCache[Floor, FloorLayout] = RecentCache(GRIDS_KEPT)
         self._moved: dict[int, Pose | None] = {}
         """Unsorted entries of ``floor``."""
         self._open_panels = OpenPanels(engine)
@@ -95,7 +95,7 @@ class Ground:
     def _layout(self) -> FloorLayout:
         """Current layout, built on demand: the robot does not drive after a plan's last placement."""
         if self._current is None:
-            self._current = self._layout_of(self.floor) if self.floor else self._at_start
+            self._current = self._layouts.get(self.floor, self._make_layout) if self.floor else self._at_start
         return self._current
 
     @property
@@ -135,13 +135,9 @@ class Ground:
 
     def _narrowed(self) -> FloorGrid:
         """Grid with the panels that are open now."""
-        kept = self._layout.narrowed
-        if self.open_joints not in kept:
-            kept[self.open_joints] = self.shut.narrowed(self.open_panels.blocking)
-            if len(kept) > NARROWED_KEPT:
-                kept.popitem(last=False)
-        kept.move_to_end(self.open_joints)
-        return kept[self.open_joints]
+        return self._layout.narrowed.get(
+            self.open_joints, lambda: self.shut.narrowed(self.open_panels.blocking)
+        )
 
     @property
     def at_start(self) -> tuple[Obstacles, FloorGrid]:
@@ -162,25 +158,19 @@ class Ground:
         else:
             self._moved[number] = pose
 
-    def _layout_of(self, floor: Floor) -> FloorLayout:
-        if floor not in self._kept:
-            self._kept[floor] = self._make_layout(floor)
-            if len(self._kept) > GRIDS_KEPT:
-                self._kept.popitem(last=False)
-        self._kept.move_to_end(floor)
-        return self._kept[floor]
-
-    def _make_layout(self, floor: Floor) -> FloorLayout:
-        moved = [number for number, _ in floor]
+    def _make_layout(self) -> FloorLayout:
+        moved = [number for number, _ in self.floor]
         parts = [
             self._parts_of(self._scene.objects[number].name, pose)
-            for number, pose in floor
+            for number, pose in self.floor
             if pose is not None
         ]
         come = Obstacles.joined([Obstacles.of([], WALLS, []), *parts])
         obstacles, grid = self.at_start
         now = Obstacles.joined([obstacles.without(moved), come])
-        return FloorLayout(now, grid.changed(obstacles.only(moved).blocking, come.blocking), OrderedDict())
+        return FloorLayout(
+            now, grid.changed(obstacles.only(moved).blocking, come.blocking), RecentCache(NARROWED_KEPT)
+        )
 
     def _on_floor(self, name: str) -> bool:
         return not self._engine.is_parked(name) and self._engine.aabb(name).low_m[2] < ON_FLOOR_M

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from embomatrix.sim.caches import BoundedCache
 from embomatrix.sim.floor.grid import CELL_M, FloorGrid
 from embomatrix.sim.floor.ground import Ground
 from embomatrix.sim.floor.obstacles import WALLS, crosses
@@ -57,9 +58,9 @@ class Navigator:
         self._scene = engine.scene
         self.ground = Ground(engine, prepared)
         """Current obstacles. Read-only."""
-        self._stands: dict[tuple[object, ...], tuple[StandPose, ...]] = {}
-        self._asides: dict[tuple[object, ...], StandPose] = {}
-        self._blockers: dict[tuple[object, ...], FloatArray] = {}
+        self._stands: BoundedCache[tuple[object, ...], tuple[StandPose, ...]] = BoundedCache(ANSWERS_KEPT)
+        self._asides: BoundedCache[tuple[object, ...], StandPose] = BoundedCache(ANSWERS_KEPT)
+        self._blockers: BoundedCache[tuple[object, ...], FloatArray] = BoundedCache(ANSWERS_KEPT)
         self._found_before = stands if stands is not None else {}
 
     def refresh(self) -> None:
@@ -200,8 +201,6 @@ class Navigator:
     ) -> tuple[StandPose, ...]:
         """Standing poses on the component at the end of the key, cached by key."""
         if key not in self._stands:
-            if len(self._stands) == ANSWERS_KEPT:
-                self._stands.clear()
             area = self.standing_area(name)
             self._stands[key] = area.stands(grid.free_centers(*area.window, key[2]))
         return self._stands[key]
@@ -215,8 +214,6 @@ class Navigator:
             return origin
         key = self.ground.floor, name, self._engine.pose(name), self.ground.open_joints, origin
         if key not in self._asides:
-            if len(self._asides) == ANSWERS_KEPT:
-                self._asides.clear()
             self._asides[key] = self._find_aside(self.standing_area(name), origin)
         return self._asides[key]
 
@@ -270,8 +267,6 @@ class Navigator:
         """Rectangles within reach of the object that block the arm on its way to it, shape (4, n)."""
         key = self._key(name)
         if key not in self._blockers:
-            if len(self._blockers) == ANSWERS_KEPT:
-                self._blockers.clear()
             self._blockers[key] = _within_reach(self._all_blockers_of(name), self._relations.body(name))
         return self._blockers[key]
 

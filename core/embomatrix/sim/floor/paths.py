@@ -5,12 +5,13 @@ from __future__ import annotations
 import functools
 import heapq
 import math
-from collections import OrderedDict
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
+
+from embomatrix.sim.caches import RecentCache
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -96,16 +97,11 @@ class RecentDistances:
 
     def __init__(self, cell_m: float) -> None:
         self._cell_m = cell_m
-        self._kept: OrderedDict[object, Distances] = OrderedDict()
+        self._kept: RecentCache[object, Distances] = RecentCache(FLOORS_KEPT)
 
     def over(self, floor: object, free: Callable[[], BoolArray]) -> Distances:
         """Distances over a floor; ``free`` returns its free cells if they are needed."""
-        if floor not in self._kept:
-            if len(self._kept) == FLOORS_KEPT:
-                self._kept.popitem(last=False)
-            self._kept[floor] = Distances(free(), self._cell_m)
-        self._kept.move_to_end(floor)
-        return self._kept[floor]
+        return self._kept.get(floor, lambda: Distances(free(), self._cell_m))
 
 
 def cheapest_path(free: BoolArray, floor: BoolArray, start: Cell, goal: Window) -> list[Cell]:

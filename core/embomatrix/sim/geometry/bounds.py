@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from embomatrix.sim.caches import BoundedCache
 from embomatrix.world.asset import JointKind
 from embomatrix.world.geometry import IDENTITY_QUAT, Aabb, ConvexPart, Pose, Shape
 
@@ -24,6 +25,10 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import FloatArray, Quat, Vec3
 
     IntArray = NDArray[np.int64]
+    Turned = tuple[Quat, tuple[float, ...]]
+    """Quaternion of an asset's frame and its joint positions: objects stand at few angles."""
+    Corners = tuple[Vec3, Vec3]
+    """Low and high corner of a box, relative to the asset's origin."""
 
 RIM_POINTS: Final = 24
 """Points on each rim of a cylinder: a box is at most 0.9 % of the radius too small."""
@@ -83,8 +88,10 @@ class AssetBounds:
 
     def __init__(self, asset: Asset) -> None:
         self._links = [(link.parts, link.joint) for link in asset.links if link.parts]
-        self._extents: dict[tuple[Quat, tuple[float, ...]], tuple[Vec3, Vec3]] = {}
-        self._clouds_at: dict[tuple[float, ...], tuple[FloatArray, FloatArray | None]] = {}
+        self._extents: BoundedCache[Turned, Corners] = BoundedCache(EXTENTS_KEPT)
+        self._clouds_at: BoundedCache[tuple[float, ...], tuple[FloatArray, FloatArray | None]] = BoundedCache(
+            EXTENTS_KEPT
+        )
 
     def box(self, pose: Pose, fractions: Sequence[float] = ()) -> Aabb:
         """Bounding box in the target of ``pose``, with the joints at these shares of their travel."""
@@ -106,8 +113,6 @@ class AssetBounds:
         """Points of all links in the asset's frame, shape (3, m), and the radii of balls around them; None for no balls."""
         known = self._clouds_at.get(fractions)
         if known is None:
-            if len(self._clouds_at) >= EXTENTS_KEPT:
-                self._clouds_at.clear()
             moving = iter(fractions)
             points: list[FloatArray] = []
             for (cloud, _), joint in self._clouds:
@@ -122,17 +127,15 @@ class AssetBounds:
     def _clouds(self) -> list[tuple[tuple[FloatArray, FloatArray], Joint | None]]:
         return [(_cloud(parts), joint) for parts, joint in self._links]
 
-    def _extents_at(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> tuple[Vec3, Vec3]:
-        """Corners relative to the origin, cached: objects stand at few angles."""
+    def _extents_at(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> Corners:
+        """Cached corners of the box."""
         key = (quat_xyzw, fractions)
         known = self._extents.get(key)
         if known is None:
-            if len(self._extents) >= EXTENTS_KEPT:
-                self._extents.clear()
             known = self._extents[key] = self._reckon(Pose((0.0, 0.0, 0.0), quat_xyzw), fractions)
         return known
 
-    def _reckon(self, pose: Pose, fractions: tuple[float, ...]) -> tuple[Vec3, Vec3]:
+    def _reckon(self, pose: Pose, fractions: tuple[float, ...]) -> Corners:
         points, radii = self._placed(fractions)
         turned = pose.rotation @ points  # (3, m)
         lows, highs = (turned, turned) if radii is None else (turned - radii, turned + radii)
@@ -148,8 +151,8 @@ class AssetParts:
     def __init__(self, asset: Asset) -> None:
         self._links = [(link.joint, link.parts) for link in asset.links if link.parts]
         self._of_base = len(asset.links[0].parts)
-        self._extents: dict[tuple[Quat, tuple[float, ...]], list[tuple[Vec3, Vec3]]] = {}
-        self._panels: dict[tuple[Quat, tuple[float, ...]], list[tuple[Vec3, Vec3]]] = {}
+        self._extents: BoundedCache[Turned, list[Corners]] = BoundedCache(EXTENTS_KEPT)
+        self._panels: BoundedCache[Turned, list[Corners]] = BoundedCache(EXTENTS_KEPT)
 
     def boxes(self, pose: Pose, fractions: Sequence[float]) -> list[Aabb]:
         """World box of every part, in the order of the links; equal to ``ConvexPart.aabb``."""
@@ -169,8 +172,6 @@ class AssetParts:
         key = (pose.quat_xyzw, tuple(fractions))
         known = self._panels.get(key)
         if known is None:
-            if len(self._panels) >= EXTENTS_KEPT:
-                self._panels.clear()
             known = self._panels[key] = self._reckon_panels(*key)
         return [Aabb((x + a, y + b, z + c), (x + d, y + e, z + f)) for (a, b, c), (d, e, f) in known]
 
@@ -193,19 +194,17 @@ class AssetParts:
                     found.append(ConvexPart(part.shape, frame @ part.pose, part.size_m, part.vertices_m))
         return found
 
-    def _extents_at(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> list[tuple[Vec3, Vec3]]:
-        """Corners of each part's box relative to the asset's origin, cached: objects stand at few angles."""
+    def _extents_at(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> list[Corners]:
+        """Cached corners of each part's box."""
         key = (quat_xyzw, fractions)
         known = self._extents.get(key)
         if known is None:
-            if len(self._extents) >= EXTENTS_KEPT:
-                self._extents.clear()
             known = self._extents[key] = self._reckon(Pose((0.0, 0.0, 0.0), quat_xyzw), fractions)
         return known
 
-    def _reckon_panels(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> list[tuple[Vec3, Vec3]]:
+    def _reckon_panels(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> list[Corners]:
         extents = iter(self._extents_at(quat_xyzw, fractions))
-        found: list[tuple[Vec3, Vec3]] = []
+        found: list[Corners] = []
         for joint, parts in self._links:
             boxes = [Aabb(low, high) for low, high in itertools.islice(extents, len(parts))]
             if joint is not None:
@@ -219,7 +218,7 @@ class AssetParts:
         corners = [part.pose.apply_all(_enclosing_points(part)) for _, parts in self._links for part in parts]
         return np.concatenate(corners), np.cumsum([0, *map(len, corners)])[:-1]
 
-    def _reckon(self, pose: Pose, fractions: tuple[float, ...]) -> list[tuple[Vec3, Vec3]]:
+    def _reckon(self, pose: Pose, fractions: tuple[float, ...]) -> list[Corners]:
         points, starts = self._points
         chunks, first = [], 0
         for frame, parts in self._frames(pose, fractions):
@@ -258,15 +257,13 @@ def forget(assets: Iterable[Asset]) -> None:
         _KNOWN.pop(id(asset), None)
 
 
-_KNOWN: dict[int, tuple[Asset, AssetBounds, AssetParts]] = {}
+_KNOWN: Final[BoundedCache[int, tuple[Asset, AssetBounds, AssetParts]]] = BoundedCache(ASSETS_KEPT)
 """Caches by the asset's id. Holding the asset keeps its id from being reused."""
 
 
 def _known(asset: Asset) -> tuple[AssetBounds, AssetParts]:
     known = _KNOWN.get(id(asset))
     if known is None:
-        if len(_KNOWN) >= ASSETS_KEPT:
-            _KNOWN.clear()
         known = _KNOWN[id(asset)] = (asset, AssetBounds(asset), AssetParts(asset))
     return known[1], known[2]
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.sim.caches import BoundedCache
+
 if TYPE_CHECKING:
     from embomatrix.world.geometry import Aabb
 
@@ -29,7 +31,7 @@ class SpatialHash:
         self._cells: dict[Cell, dict[int, Extent]] = {}
         """Boxes over each cell; wide ones are kept separately."""
         self._wide: dict[int, Extent] = {}
-        self._seen: dict[Span, list[dict[int, Extent]]] = {}
+        self._seen: BoundedCache[Span, list[dict[int, Extent]]] = BoundedCache(SPANS_KEPT)
         """Buckets by queried span, valid until a new cell appears."""
         self._homes: dict[int, list[dict[int, Extent]]] = {}
         self._spans: dict[int, Span] = {}
@@ -77,8 +79,6 @@ class SpatialHash:
 
     def _find_places(self, span: Span) -> list[dict[int, Extent]]:
         """Buckets of a span; a box may be in several."""
-        if len(self._seen) >= SPANS_KEPT:
-            self._seen.clear()
         self._seen[span] = [self._wide, *self._cells_of(span)]
         return self._seen[span]
 
