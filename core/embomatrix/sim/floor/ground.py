@@ -9,7 +9,7 @@ from embomatrix.sim.caches import RecentCache
 from embomatrix.sim.floor.grid import FloorGrid
 from embomatrix.sim.floor.obstacles import WALLS, Obstacles
 from embomatrix.sim.floor.open_panels import OpenPanels
-from embomatrix.sim.geometry.bounds import AssetParts
+from embomatrix.sim.geometry.bounds import IDENTITY, parts_of
 from embomatrix.world.geometry import Pose
 
 if TYPE_CHECKING:
@@ -48,7 +48,6 @@ class Ground:
         self._scene = engine.scene
         self.numbers = {item.name: number for number, item in enumerate(self._scene.objects)}
         """Numbers of the scene's objects by name."""
-        self._parts: dict[str, AssetParts] = {}
         blocking = [item for item in self._scene.objects if item.fixed or self._on_floor(item.name)]
         self._on_floor_at_start = {self.numbers[item.name] for item in blocking if not item.fixed}
         if prepared is not None:
@@ -176,16 +175,12 @@ class Ground:
         return not self._engine.is_parked(name) and self._engine.aabb(name).low_m[2] < ON_FLOOR_M
 
     def _walls(self) -> Obstacles:
-        world = Pose((0.0, 0.0, 0.0))
-        boxes = [wall.aabb(world) for wall in self._scene.walls]
+        boxes = [wall.aabb(IDENTITY) for wall in self._scene.walls]
         return Obstacles.of(boxes, WALLS, [False] * len(boxes))
 
     def _parts_of(self, name: str, pose: Pose) -> Obstacles:
         """Boxes of the object's parts at a pose with its joints shut."""
         asset = self._scene.asset_of(name)
-        if asset.asset_id not in self._parts:
-            self._parts[asset.asset_id] = AssetParts(asset)
-        shut = (0.0,) * len(asset.joints)
-        boxes = self._parts[asset.asset_id].boxes(pose, shut)
+        boxes = parts_of(asset).boxes(pose, (0.0,) * len(asset.joints))
         panels = [link.joint is not None for link in asset.links for _ in link.parts]
         return Obstacles.of(boxes, self.numbers[name], panels)
