@@ -218,14 +218,14 @@ class ConvexPart:
     size_m: Vec3
     vertices_m: tuple[Vec3, ...] = ()
 
+    def corners(self) -> FloatArray:
+        """Vertices of a hull, or corners of the box around another shape, in the part's frame; shape (n, 3)."""
+        if self.vertices_m:
+            return np.asarray(self.vertices_m, dtype=np.float64)
+        x, y, z = (extent / 2 for extent in self.size_m)
+        return np.array([(sx * x, sy * y, sz * z) for sx in (-1, 1) for sy in (-1, 1) for sz in (-1, 1)])
+
     def aabb(self, pose_world_asset: Pose) -> Aabb:
         """World bounding box: exact for boxes and hulls; that of the enclosing box for round shapes."""
-        placed = pose_world_asset @ self.pose
-        corners = np.asarray(self.vertices_m) if self.vertices_m else _corners(self.size_m)
-        world = placed.apply_all(corners)  # (n, 3)
+        world = (pose_world_asset @ self.pose).apply_all(self.corners())  # (n, 3)
         return Aabb(_vec3(world.min(axis=0)), _vec3(world.max(axis=0)))
-
-
-def _corners(size_m: Vec3) -> FloatArray:
-    x, y, z = (s / 2 for s in size_m)
-    return np.array([(sx * x, sy * y, sz * z) for sx in (-1, 1) for sy in (-1, 1) for sz in (-1, 1)])

@@ -215,7 +215,7 @@ class AssetParts:
     @functools.cached_property
     def _points(self) -> tuple[FloatArray, IntArray]:
         """Points whose hull encloses each part, shape (n, 3), and the index of each part's first point."""
-        corners = [part.pose.apply_all(_enclosing_points(part)) for _, parts in self._links for part in parts]
+        corners = [part.pose.apply_all(part.corners()) for _, parts in self._links for part in parts]
         return np.concatenate(corners), np.cumsum([0, *map(len, corners)])[:-1]
 
     def _reckon(self, pose: Pose, fractions: tuple[float, ...]) -> list[Corners]:
@@ -278,28 +278,14 @@ def _cloud(parts: Sequence[ConvexPart]) -> tuple[FloatArray, FloatArray]:
     return np.concatenate(points), np.concatenate(radii)
 
 
-def _enclosing_points(part: ConvexPart) -> FloatArray:
-    """Vertices of a hull, or box corners of other shapes, in the part's frame."""
-    if part.vertices_m:
-        return np.asarray(part.vertices_m, dtype=np.float64)
-    return np.asarray(_signs(part.size_m), dtype=np.float64)
-
-
-def _signs(size_m: Vec3) -> list[Vec3]:
-    x, y, z = (extent / 2 for extent in size_m)
-    return [(sx * x, sy * y, sz * z) for sx in (-1.0, 1.0) for sy in (-1.0, 1.0) for sz in (-1.0, 1.0)]
-
-
 def _points(part: ConvexPart) -> FloatArray:
     x, y, z = (extent / 2 for extent in part.size_m)
     match part.shape:
         case Shape.SPHERE:
             return np.zeros((1, 3))
-        case Shape.HULL:
-            return np.asarray(part.vertices_m, dtype=np.float64)
         case Shape.CYLINDER:
             angles = np.arange(RIM_POINTS) * (2 * math.pi / RIM_POINTS)
             rim = np.stack([x * np.cos(angles), y * np.sin(angles), np.full(RIM_POINTS, z)], axis=1)
             return np.concatenate([rim, rim * (1.0, 1.0, -1.0)])
-        case Shape.BOX:
-            return np.array(_signs(part.size_m))
+        case Shape.HULL | Shape.BOX:
+            return part.corners()
