@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -161,9 +160,7 @@ class LiveWorld:
         box = self.relations.body(name)
         if name in self.carried:
             return ObjectReach(0.0, box.center_m[2])
-        dx = max(box.low_m[0] - self.robot.x_m, self.robot.x_m - box.high_m[0], 0.0)
-        dy = max(box.low_m[1] - self.robot.y_m, self.robot.y_m - box.high_m[1], 0.0)
-        return ObjectReach(math.hypot(dx, dy), box.center_m[2])
+        return ObjectReach(box.level_distance_m(self.robot.x_m, self.robot.y_m), box.center_m[2])
 
     def is_approachable(self, name: str) -> bool:
         """Return True if no wall and nothing much taller than the object stands between it and the robot."""

@@ -159,6 +159,12 @@ class Aabb:
             for lo, p, hi in zip(self.low_m, point, self.high_m, strict=True)
         )
 
+    def level_distance_m(self, x: float, y: float) -> float:
+        """Horizontal distance from a point of the plane to the box; 0 over or under it."""
+        dx = max(self.low_m[0] - x, x - self.high_m[0], 0.0)
+        dy = max(self.low_m[1] - y, y - self.high_m[1], 0.0)
+        return math.hypot(dx, dy)
+
     def grown(self, margin_m: float) -> Aabb:
         """Box with ``margin_m`` added on every side."""
         (a, b, c), (d, e, f) = self.low_m, self.high_m

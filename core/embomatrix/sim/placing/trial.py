@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -125,7 +124,5 @@ class PoseTrial:
 
 def in_reach(box: Aabb, robot: StandPose) -> bool:
     """Return True if the arm reaches the nearest point of a box in the plane, and the height of its middle."""
-    dx = max(box.low_m[0] - robot.x_m, robot.x_m - box.high_m[0], 0.0)
-    dy = max(box.low_m[1] - robot.y_m, robot.y_m - box.high_m[1], 0.0)
-    height = box.center_m[2]
-    return math.hypot(dx, dy) <= ROBOT.reach_m and ROBOT.reach_low_m <= height <= ROBOT.reach_high_m
+    near = box.level_distance_m(robot.x_m, robot.y_m) <= ROBOT.reach_m
+    return near and ROBOT.reach_low_m <= box.center_m[2] <= ROBOT.reach_high_m
