@@ -136,9 +136,9 @@ def limited(situation: Situation, rows: int) -> Situation:
     """
     if len(situation.rows) <= rows:
         return situation
-    text = f" {' '.join(_words(situation.instruction))} "
+    text = f" {plain_words(situation.instruction)} "
     by_name = {row.name: row for row in situation.rows}
-    named = [row for row in situation.rows if f" {' '.join(_words(row.category))} " in text]
+    named = [row for row in situation.rows if f" {plain_words(row.category)} " in text]
     hosts = [by_name[row.host] for row in named if row.host in by_name]
     ranked = dict.fromkeys([*named, *hosts, *situation.rows])
     return subset(situation, {row.index for row in list(ranked)[:rows]})
@@ -156,8 +156,9 @@ def subset(situation: Situation, kept: Iterable[int]) -> Situation:
     return replace(situation, rows=rows)
 
 
-def _words(text: str) -> list[str]:
-    return re.findall(r"[a-z0-9]+", text.lower())
+def plain_words(text: str) -> str:
+    """Words of a text in lower case with single spaces, without punctuation."""
+    return " ".join(re.findall(r"[a-z0-9]+", text.lower()))
 
 
 def labels(situation: Situation) -> dict[int, str]:

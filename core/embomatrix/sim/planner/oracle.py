@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-import re
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -19,6 +18,7 @@ from embomatrix.sim.planner.feasibility import needs_heat, portables, sources_fo
 from embomatrix.sim.planner.script import PlanScript
 from embomatrix.sim.planner.subgoals import Exposure, PlacementGoal, Subgoals
 from embomatrix.sim.planner.tool_work import chosen_methods, needs_tools, subgoals_for
+from embomatrix.skills.prompt import plain_words
 from embomatrix.world.evaluate import evaluate, render
 from embomatrix.world.goal import Not
 from embomatrix.world.state import Relation, State
@@ -290,14 +290,9 @@ def naming_rank(task: Task, scene: Scene, name: str) -> int:
     item = scene.by_name.get(name)
     if item is None:
         return 0
-    text = f" {_plain(task.instruction)} "
-    category = _plain(scene.assets[item.asset_id].category)
-    room = _plain(next((room.type for room in scene.rooms if room.name == item.room), ""))
+    text = f" {plain_words(task.instruction)} "
+    category = plain_words(scene.assets[item.asset_id].category)
+    room = plain_words(next((room.type for room in scene.rooms if room.name == item.room), ""))
     if room and f" {category} in the {room} " in text:
         return NAMED_IN_ROOM
     return NAMED if f" {category} " in text else 0
-
-
-def _plain(text: str) -> str:
-    """Return lower-case words with single spaces."""
-    return " ".join(re.findall(r"[a-z0-9]+", text.lower()))

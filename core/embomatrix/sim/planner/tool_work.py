@@ -11,6 +11,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING
 
 from embomatrix.sim.planner.calls import StuckError
+from embomatrix.sim.state.facts import REAL
 from embomatrix.skills.appliances import (
     gives_liquid,
     liquids_given,
@@ -29,9 +30,6 @@ if TYPE_CHECKING:
     from embomatrix.sim.live_world import LiveWorld
     from embomatrix.sim.planner.choices import GroundLiteral
     from embomatrix.sim.planner.script import PlanScript
-
-REAL = "real"
-"""Predicate of BDDL: the object exists."""
 
 
 class ToolWork(StrEnum):

@@ -19,6 +19,7 @@ RELATIONS = {relation.value: relation for relation in Relation}
 STATES = {state.value: state for state in State}
 SUBSTANCES = {relation.value: relation for relation in SubstanceRelation}
 REAL, FUTURE = "real", "future"
+"""Predicates of BDDL: the object is in the world; the object was absent at the start and still is."""
 
 
 class TrackedSets(dict[str, set[T]]):
