@@ -42,6 +42,10 @@ class GroundLiteral:
     atom: Atom
     positive: bool
 
+    def holds(self, facts: Facts) -> bool:
+        """True if the literal holds now."""
+        return facts.holds(self.atom.predicate, self.atom.args) == self.positive
+
 
 Choice = tuple[GroundLiteral, ...]
 """Conjunction of literals that is sufficient for a goal."""
@@ -180,8 +184,7 @@ class _Alternatives:
     def _judge(self, item: GroundLiteral) -> tuple[bool, bool]:
         """Return two flags: the literal does not hold yet; the literal is impossible."""
         if item not in self.judged:
-            missing = self.facts.holds(item.atom.predicate, item.atom.args) != item.positive
-            self.judged[item] = (missing, self.impossible(item))
+            self.judged[item] = (not item.holds(self.facts), self.impossible(item))
         return self.judged[item]
 
     def _best(self, found: Iterable[Choice | None]) -> list[Choice]:

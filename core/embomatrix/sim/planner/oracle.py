@@ -92,8 +92,7 @@ def find_plan(simulator: Simulator, task: Task) -> Plan | PlanNotFound:
 
 def _obstacle(simulator: Simulator, task: Task, item: GroundLiteral) -> str:
     """Return why a literal that does not hold yet is impossible, else ""."""
-    missing = simulator.facts.holds(item.atom.predicate, item.atom.args) != item.positive
-    return why_impossible(simulator.world, task, item) if missing else ""
+    return "" if item.holds(simulator.facts) else why_impossible(simulator.world, task, item)
 
 
 def _first_proven(simulator: Simulator, task: Task, options: Sequence[Choice]) -> Plan | PlanNotFound:
@@ -177,9 +176,7 @@ def _write(simulator: Simulator, task: Task, choice: Choice, strategy: Strategy)
 
 
 def _missing(simulator: Simulator, choice: Choice) -> list[GroundLiteral]:
-    return [
-        item for item in choice if simulator.facts.holds(item.atom.predicate, item.atom.args) != item.positive
-    ]
+    return [item for item in choice if not item.holds(simulator.facts)]
 
 
 def _subgoals(
