@@ -13,6 +13,7 @@ import numpy as np
 
 from embomatrix.sim.actions import other_stands
 from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion
+from embomatrix.sim.joints.swings import LEAST_OPEN
 from embomatrix.sim.physical import body
 from embomatrix.sim.physical.fold import PATHS_TRIED, approach, fold, unfold
 from embomatrix.sim.physical.grasp import cross, facing
@@ -56,8 +57,6 @@ OVER: Final = 0.5
 """Share of a waypoint step by which the hand overshoots, because panel and arm yield a little."""
 AJAR: Final = 0.2
 """A panel that is open by more than this share can be gripped from within."""
-ENOUGH: Final = 0.5
-"""A door that stops before this share of its travel is not open, as in cached mode."""
 SHUT: Final = OPEN_FRACTION
 STRETCHES: Final = (1, 2, 4)
 """Numbers of pulls into which a motion is divided. The robot repositions itself between pulls."""
@@ -164,10 +163,10 @@ def _move_all(stage: PhysicalStage, name: str, goal: float) -> SkillRefusal | No
     row = panels_in_order(stage, name, goal)
     # Moving one panel may push another that is done: such panels get a second turn.
     for panel in (*row, *row):
-        if _is_done(stage.dynamic.bodies.joints(name)[panel.number], goal):
+        if _is_done(_fraction(stage, panel), goal):
             continue
         refusal = _move_from_anywhere(stage, panel, goal)
-        if _is_done(stage.dynamic.bodies.joints(name)[panel.number], goal):
+        if _is_done(_fraction(stage, panel), goal):
             refusal = None
         elif refusal is None:
             refusal = refuse(FailureReason.DOOR_BLOCKED, target=name, other=SOMETHING)
@@ -183,9 +182,14 @@ def panels_in_order(stage: PhysicalStage, name: str, goal: float) -> list[DoorPa
     return sorted(panels_of(stage, name), key=lambda panel: panel.height_m, reverse=not goal)
 
 
+def _fraction(stage: PhysicalStage, panel: DoorPanel) -> float:
+    """Share of its travel that a panel is open in the dynamic world."""
+    return stage.dynamic.bodies.joints(panel.name)[panel.number]
+
+
 def _is_done(reached: float, goal: float) -> bool:
     """True if a panel is open, or shut, by the standard of cached mode."""
-    return reached >= ENOUGH if goal else reached <= SHUT
+    return reached >= LEAST_OPEN if goal else reached <= SHUT
 
 
 def _move_from_anywhere(stage: PhysicalStage, panel: DoorPanel, goal: float) -> SkillRefusal | None:
@@ -206,14 +210,14 @@ def _move_panel(stage: PhysicalStage, panel: DoorPanel, goal: float) -> SkillRef
     """
     refusal: SkillRefusal | None = None
     for stretches in STRETCHES:
-        start = stage.dynamic.bodies.joints(panel.name)[panel.number]
+        start = _fraction(stage, panel)
         for number in range(stretches):
-            now = stage.dynamic.bodies.joints(panel.name)[panel.number]
+            now = _fraction(stage, panel)
             aim = start + (number + 1) / stretches * (goal - start)
             refusal = _stretch(stage, panel, now, aim) if abs(aim - now) > SHUT else None
             if refusal is not None:
                 break
-        if refusal is None or _is_done(stage.dynamic.bodies.joints(panel.name)[panel.number], goal):
+        if refusal is None or _is_done(_fraction(stage, panel), goal):
             return None
     return refusal
 
@@ -270,7 +274,7 @@ def _draw_in(stage: PhysicalStage, path: ArmPath) -> None:
 def _pull(stage: PhysicalStage, path: ArmPath, panel: DoorPanel, goal: float) -> SkillRefusal | None:
     """Touch the panel, move it along the path, let go and step back."""
     # Contents stay asleep until something touches them: awake bottles in a fridge cost much time.
-    stage.wake_around(panel.at(stage.dynamic.bodies.joints(panel.name)[panel.number]))
+    stage.wake_around(panel.at(_fraction(stage, panel)))
     touch = path.postures[1:3]
     stage.mover.follow(touch, GENTLE_PACE, lambda: stage.dynamic.gap(panel.name) < TOUCH_M)
     if stage.dynamic.gap(panel.name) > 3 * TOUCH_M:
@@ -287,7 +291,7 @@ def _pull(stage: PhysicalStage, path: ArmPath, panel: DoorPanel, goal: float) ->
     stage.mover.wait(4)
     if stage.dynamic.hindrance() == panel.name and not _pushes(path.postures[-2], path.postures[-3]):
         _lean_off(stage, path, panel)
-    reached = stage.dynamic.bodies.joints(panel.name)[panel.number]
+    reached = _fraction(stage, panel)
     stage.settle()
     if abs(reached - goal) > 0.12 and hit is not None:
         return refuse(FailureReason.DOOR_BLOCKED, target=panel.name, other=hit or SOMETHING)
@@ -312,10 +316,10 @@ def _pushes(start: FloatArray, end: FloatArray) -> bool:
 
 def _lean_off(stage: PhysicalStage, path: ArmPath, panel: DoorPanel) -> None:
     """Draw the arm back along its path until it no longer leans on the panel, unless it takes the panel along."""
-    let_go = stage.dynamic.bodies.joints(panel.name)[panel.number]
+    let_go = _fraction(stage, panel)
 
     def is_off() -> bool:
-        moved = abs(stage.dynamic.bodies.joints(panel.name)[panel.number] - let_go)
+        moved = abs(_fraction(stage, panel) - let_go)
         return moved > SHUT or stage.dynamic.hindrance() != panel.name
 
     stage.mover.follow(path.postures[-3:0:-1], 0.6, is_off)
