@@ -64,12 +64,12 @@ def _move(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillR
 
 
 def _turn(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-    world.robot = StandPose(world.robot.x_m, world.robot.y_m, _heading(world, call))
+    world.robot = StandPose(world.robot.x_m, world.robot.y_m, heading_after(world.robot.yaw, call))
     return None
 
 
 def _move_forward(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-    heading, distance_m = _heading(world, call), call.distance or 0.0
+    heading, distance_m = heading_after(world.robot.yaw, call), call.distance or 0.0
     course = heading if distance_m >= 0 else heading + math.pi
     free_m = world.navigator.forward(world.robot, course, abs(distance_m))
     if free_m < abs(distance_m):
@@ -80,9 +80,9 @@ def _move_forward(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -
     return None
 
 
-def _heading(world: LiveWorld, call: SkillCall) -> float:
-    """Heading after the call's turn, in [-pi, pi]."""
-    return math.remainder(world.robot.yaw + math.remainder(call.yaw or 0.0, math.tau), math.tau)
+def heading_after(yaw: float, call: SkillCall) -> float:
+    """Heading after the call's turn from a heading, in [-pi, pi]."""
+    return math.remainder(yaw + math.remainder(call.yaw or 0.0, math.tau), math.tau)
 
 
 def _go_to_room(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:

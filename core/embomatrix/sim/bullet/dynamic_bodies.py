@@ -219,7 +219,7 @@ class DynamicBodies:
                 body, index, jointLowerLimit=low, jointUpperLimit=high, physicsClientId=client
             )
             bullet.resetJointState(body, index, fraction * joint.upper, physicsClientId=client)
-            force = HINGE_NM if joint.kind == "revolute" else RUNNER_N
+            force = HINGE_NM if joint.kind is JointKind.REVOLUTE else RUNNER_N
             bullet.setJointMotorControl2(
                 body, index, bullet.VELOCITY_CONTROL, targetVelocity=0, force=force, physicsClientId=client
             )

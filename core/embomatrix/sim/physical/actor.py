@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.actions import ACTIONS
+from embomatrix.sim.actions import ACTIONS, heading_after
 from embomatrix.sim.blockers import path_refusal, room_refusal
 from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.physical.doors import close_all, open_all
@@ -94,26 +94,23 @@ def _move(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> Sk
 
 
 def _turn(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-    heading, here = _heading(stage, call), stage.commanded
+    here = stage.commanded
+    heading = heading_after(here.yaw, call)
     refusal = drive(stage, stage.mover.posture[None, :2], heading)
     stage.commanded = StandPose(here.x_m, here.y_m, heading)
     return refusal
 
 
 def _move_forward(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
-    heading, distance_m = _heading(stage, call), call.distance or 0.0
-    course = heading if distance_m >= 0 else heading + math.pi
     start = stage.commanded
+    heading, distance_m = heading_after(start.yaw, call), call.distance or 0.0
+    course = heading if distance_m >= 0 else heading + math.pi
     free_m = stage.world.navigator.forward(start, course, abs(distance_m))
     if free_m < abs(distance_m):
         return refuse(FailureReason.BLOCKED, distance=metres(free_m))
     here = stage.mover.posture[:2]
     x, y = start.x_m + abs(distance_m) * math.cos(course), start.y_m + abs(distance_m) * math.sin(course)
     return drive(stage, here[None], heading) or drive(stage, np.array([here, (x, y)]), heading)
-
-
-def _heading(stage: PhysicalStage, call: SkillCall) -> float:
-    return math.remainder(stage.commanded.yaw + math.remainder(call.yaw or 0.0, math.tau), math.tau)
 
 
 def _go_to_room(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
@@ -152,7 +149,7 @@ MOTIONS: Final[Mapping[Skill, Motion]] = {
     Skill.MOVE: _move,
     Skill.TURN: _turn,
     Skill.PICK_UP: lambda stage, call, rng: pick_up(stage, target_of(stage.world, call)),
-    Skill.PLACE: lambda stage, call, rng: place(stage, call, rng),
+    Skill.PLACE: place,
     Skill.MOVE_FORWARD: _move_forward,
     Skill.OPEN: lambda stage, call, rng: open_all(stage, target_of(stage.world, call)),
     Skill.CLOSE: lambda stage, call, rng: close_all(stage, target_of(stage.world, call)),

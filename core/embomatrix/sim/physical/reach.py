@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from embomatrix.sim.engine import FLOOR
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.rrt import path_between
 from embomatrix.sim.physical.space import BallCollision, Boxes, collides
@@ -139,7 +140,7 @@ class ArmReach:
         """
         self._also = also
         self._boxes = boxes
-        self._standing = boxes.without(("floor",))
+        self._standing = boxes.without((FLOOR,))
         self._at_work = at_work
         self._held = held
         self._collision: BallCollision | None = None
