@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from embomatrix.world.asset import Asset
+    from embomatrix.world.geometry import Quat, Vec3
 
 GRAVITY_M_S2: Final = -9.81
 CHUNK_STEPS: Final = 12
@@ -163,11 +164,7 @@ class MiniWorld:
             if done >= least and linear < SLOW_M_S and angular < SLOW_RAD_S:
                 break
         position, quat = bullet.getBasePositionAndOrientation(self._body, physicsClientId=client)
-        if not all(map(math.isfinite, (*position, *quat, linear, angular))):
-            return Settled(pose, math.inf, math.pi, False)
-        settled = Pose(tuple(position), tuple(quat))
-        at_rest = linear < REST_M_S and angular < REST_RAD_S
-        return Settled(settled, math.dist(position, pose.position_m), tilt_between(pose, settled), at_rest)
+        return settled_from(pose, position, quat, linear, angular)
 
     def close(self) -> None:
         """Return the client and end the world's use."""
@@ -185,7 +182,16 @@ class MiniWorld:
         return math.hypot(*linear), math.hypot(*angular)
 
 
-def tilt_between(before: Pose, after: Pose) -> float:
+def settled_from(start: Pose, position: Vec3, quat: Quat, speed_m_s: float, speed_rad_s: float) -> Settled:
+    """Outcome of a fall from its end; not at rest, and infinitely far, if physics lost the object."""
+    if not all(map(math.isfinite, (*position, *quat, speed_m_s, speed_rad_s))):
+        return Settled(start, math.inf, math.pi, False)
+    pose = Pose(position, quat)
+    at_rest = speed_m_s < REST_M_S and speed_rad_s < REST_RAD_S
+    return Settled(pose, math.dist(position, start.position_m), _tilt_between(start, pose), at_rest)
+
+
+def _tilt_between(before: Pose, after: Pose) -> float:
     """Angle in radians between the upward axes of two poses; rotation about the vertical does not count."""
     cosine = float(before.rotation[:, 2] @ after.rotation[:, 2])
     return math.acos(max(-1.0, min(1.0, cosine)))

@@ -13,19 +13,18 @@ from embomatrix.sim.bullet.client import ClientPool, pybullet
 from embomatrix.sim.bullet.mini_world import (
     CHUNK_STEPS,
     GRAVITY_M_S2,
-    REST_M_S,
-    REST_RAD_S,
     SLOW_M_S,
     SLOW_RAD_S,
-    tilt_between,
+    settled_from,
 )
-from embomatrix.sim.engine import FLOOR, TOLERANCE_M, WALL, Settled
+from embomatrix.sim.engine import FLOOR, TOLERANCE_M, WALL
 from embomatrix.sim.validation import check_scene
-from embomatrix.world.geometry import Pose
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from embomatrix.sim.engine import Settled
+    from embomatrix.world.geometry import Pose
     from embomatrix.world.scene import Scene
 
 LEAST_STEPS: Final = 120
@@ -106,11 +105,7 @@ class _Fall:
     def _settled(self, body: int, start: Pose) -> Settled:
         position, quat = self._bullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
         linear, angular = self._bullet.getBaseVelocity(body, physicsClientId=self._client)
-        if not all(map(math.isfinite, (*position, *quat, *linear, *angular))):
-            return Settled(start, math.inf, math.pi, False)
-        pose = Pose(tuple(position), tuple(quat))
-        at_rest = math.hypot(*linear) < REST_M_S and math.hypot(*angular) < REST_RAD_S
-        return Settled(pose, math.dist(position, start.position_m), tilt_between(start, pose), at_rest)
+        return settled_from(start, position, quat, math.hypot(*linear), math.hypot(*angular))
 
     def _overlaps(self) -> dict[tuple[str, str], float]:
         """Pairs in contact deeper than the tolerance; pairs of immovable bodies are left out."""
