@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.bullet.client import pybullet
 from embomatrix.sim.bullet.robot_model import (
-    ARM_JOINTS,
-    BASE_JOINTS,
+    DRIVEN_JOINTS,
     FINGER_JOINTS,
     HAND,
-    LIFT_JOINTS,
     SHOULDER_EFFORT_NM,
     WRIST_EFFORT_NM,
     robot_urdf,
@@ -67,6 +65,14 @@ def tucked(at: StandPose) -> Posture:
     return Posture(at.x_m, at.y_m, at.yaw, TUCKED_LIFT_M, TUCKED_ARM)
 
 
+def load_robot(client: int, *, visuals: bool = False) -> int:
+    """Load the robot into a client and return its body. Raises EngineMissingError if its description is not installed."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "robot.urdf"
+        path.write_text(robot_urdf(visuals=visuals))
+        return int(pybullet().loadURDF(str(path), useFixedBase=True, physicsClientId=client))
+
+
 class RobotBody:
     """Robot loaded into a client, until the client is reset."""
 
@@ -74,10 +80,7 @@ class RobotBody:
         """Load the robot with its joints at a posture."""
         self._bullet = bullet = pybullet()
         self._client = client
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "robot.urdf"
-            path.write_text(robot_urdf())
-            self.body = int(bullet.loadURDF(str(path), useFixedBase=True, physicsClientId=client))
+        self.body = load_robot(client)
         infos = [
             bullet.getJointInfo(self.body, joint, physicsClientId=client)
             for joint in range(bullet.getNumJoints(self.body, physicsClientId=client))
@@ -87,7 +90,7 @@ class RobotBody:
         self.hand = links[HAND]
         self.tips = frozenset((self.hand, *(joints[name] for name in FINGER_JOINTS)))
         self.base = links["base"]
-        self._driven = [joints[name] for name in (*BASE_JOINTS, *LIFT_JOINTS, *ARM_JOINTS, *FINGER_JOINTS)]
+        self._driven = [joints[name] for name in DRIVEN_JOINTS]
         self._limits = [infos[joint][8:10] for joint in self._driven]
         self._forces = [BASE_N] * 2 + [BASE_NM] + [LIFT_N] * 2
         self._forces += [SHOULDER_EFFORT_NM] * 4 + [WRIST_EFFORT_NM] * 3 + [FINGER_N] * 2

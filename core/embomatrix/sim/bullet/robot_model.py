@@ -35,6 +35,8 @@ BASE_JOINTS: Final = ("base_x", "base_y", "base_yaw")
 LIFT_JOINTS: Final = ("mast", "lift")
 ARM_JOINTS: Final = tuple(f"panda_joint{number}" for number in range(1, 8))
 FINGER_JOINTS: Final = ("panda_finger_joint1", "panda_finger_joint2")
+DRIVEN_JOINTS: Final = (*BASE_JOINTS, *LIFT_JOINTS, *ARM_JOINTS, *FINGER_JOINTS)
+"""Joints with motors, in the order of a posture's values."""
 HAND: Final = "panda_hand"
 SHOULDER_EFFORT_NM: Final = 87.0
 WRIST_EFFORT_NM: Final = 40.0

@@ -6,17 +6,15 @@ Every solid is a body without a collision shape. Shapes are shared; objects can 
 from __future__ import annotations
 
 import math
-import tempfile
 import zlib
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from scipy.spatial import ConvexHull
 
 from embomatrix.sim.bullet.client import pybullet
-from embomatrix.sim.bullet.robot import spread
-from embomatrix.sim.bullet.robot_model import ARM_JOINTS, BASE_JOINTS, FINGER_JOINTS, LIFT_JOINTS, robot_urdf
+from embomatrix.sim.bullet.robot import load_robot, spread
+from embomatrix.sim.bullet.robot_model import DRIVEN_JOINTS
 from embomatrix.sim.engine import EngineError
 from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion
 from embomatrix.skills.limits import ROBOT
@@ -267,17 +265,14 @@ class RobotFigure:
         """Load the robot, out of sight. Raises EngineMissingError if its description is not installed."""
         self._bullet = bullet = pybullet()
         self._client = client
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "robot.urdf"
-            path.write_text(robot_urdf(visuals=True))
-            self._body = int(bullet.loadURDF(str(path), useFixedBase=True, physicsClientId=client))
+        self._body = load_robot(client, visuals=True)
         joints: dict[str, int] = {}
         for number in range(bullet.getNumJoints(self._body, physicsClientId=client)):
             info = bullet.getJointInfo(self._body, number, physicsClientId=client)
             joints[info[1].decode()] = number
             if info[12].decode() in _OWN_LINKS:
                 bullet.changeVisualShape(self._body, number, rgbaColor=_CHASSIS, physicsClientId=client)
-        self._driven = [joints[name] for name in (*BASE_JOINTS, *LIFT_JOINTS, *ARM_JOINTS, *FINGER_JOINTS)]
+        self._driven = [joints[name] for name in DRIVEN_JOINTS]
         self.leave()
 
     def stand(self, posture: Posture) -> None:
