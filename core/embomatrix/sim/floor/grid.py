@@ -210,16 +210,17 @@ class FloorGrid:
     def free_centers(self, low_m: Vec2, high_m: Vec2, label: int) -> FloatArray:
         """World coordinates of the component's cells in a rectangle, shape (n, 2)."""
         window = self._window(low_m, high_m)
-        inside = np.argwhere((self.parts.within(window) == label) & (label > 0))
-        corner = np.array([window[0].start, window[1].start])
-        return np.asarray(self._origin + (inside + corner + 0.5) * CELL_M, dtype=np.float64)
+        return self._centers(window, (self.parts.within(window) == label) & (label > 0))
 
     def all_free_centers(self, low_m: Vec2, high_m: Vec2) -> FloatArray:
         """World coordinates of all free cells in a rectangle, shape (n, 2)."""
         window = self._window(low_m, high_m)
+        return self._centers(window, self.parts.within(window) > 0)
+
+    def _centers(self, window: Window, chosen: BoolArray) -> FloatArray:
+        """World coordinates of the chosen cells of a window, shape (n, 2)."""
         corner = np.array([window[0].start, window[1].start])
-        inside = np.argwhere(self.parts.within(window) > 0)
-        return np.asarray(self._origin + (inside + corner + 0.5) * CELL_M, dtype=np.float64)
+        return np.asarray(self._origin + (np.argwhere(chosen) + corner + 0.5) * CELL_M, dtype=np.float64)
 
     def distance(self, start: Cell, end: Cell) -> float | None:
         """Length in metres of the shortest path over free cells; None for no path."""
