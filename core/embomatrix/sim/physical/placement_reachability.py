@@ -22,6 +22,7 @@ from embomatrix.world.state import Relation
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
+    from embomatrix.sim.physical.reach import ArmPath
     from embomatrix.sim.physical.stage import Grip, PhysicalStage
     from embomatrix.world.geometry import Pose
     from embomatrix.world.poses import PoseCache, StandPose
@@ -127,11 +128,15 @@ class PlacementReachability:
         stage, engine = self._stage, self._world.engine
         grip, stage.grip = stage.grip, None
         engine.set_pose(name, pose)
-        tool_paths, _, bases = pick_paths(stage, name)
-        found = next(stage.reach(stage.boxes(), name).paths(tool_paths, bases), None)
+        found = self._pick_path(name)
         engine.park(name)
         stage.grip = grip
         return found is not None
+
+    def _pick_path(self, name: str) -> ArmPath | None:
+        """Return the first free path that picks the object up at its present pose, None for none."""
+        tool_paths, _, bases = pick_paths(self._stage, name)
+        return next(self._stage.reach(self._stage.boxes(), name).paths(tool_paths, bases), None)
 
     def _grip(self, name: str) -> Grip | None:
         """Return the grip after the object was picked up at its initial place, None if the hand finds no path."""
@@ -148,8 +153,7 @@ class PlacementReachability:
         stage.open_around(name)
         world.navigator.refresh()
         stage.stand_at(stands[0])
-        tool_paths, _, bases = pick_paths(stage, name)
-        path = next(stage.reach(stage.boxes(), name).paths(tool_paths, bases), None)
+        path = self._pick_path(name)
         if path is None:
             return None
         return stage.grip_with(path.tool_path.key_pose, world.engine.pose(name), name)
