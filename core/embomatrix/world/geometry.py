@@ -108,6 +108,8 @@ def _writer(owner: type, field: str) -> Callable[[object, object], None]:
 _set_position: Final = _writer(Pose, "position_m")
 _set_quat: Final = _writer(Pose, "quat_xyzw")
 
+IDENTITY: Final = Pose((0.0, 0.0, 0.0))
+
 
 def _quat_product(a: Quat, b: Quat) -> Quat:
     ax, ay, az, aw = a

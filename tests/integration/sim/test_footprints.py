@@ -8,7 +8,7 @@ from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of
+from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.footprints import (
     HEIGHTS_M,
     LEVEL_FLOOR,
@@ -20,7 +20,7 @@ from embomatrix.sim.geometry.footprints import (
 from embomatrix.sim.placing.placement import Placer
 from embomatrix.sim.placing.pose_cache import PlacementLibrary, analyse_scene
 from embomatrix.sim.state.relations import Relations
-from embomatrix.world.geometry import Pose
+from embomatrix.world.geometry import IDENTITY, Pose
 from embomatrix.world.poses import PlacementKey, StandPose
 from embomatrix.world.state import Relation
 

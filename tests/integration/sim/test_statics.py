@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.mini_world import MiniWorld, StaticObject
-from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of
+from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.statics import base_of, is_level, rest_pose
 from embomatrix.world.asset import Asset, Link
-from embomatrix.world.geometry import ConvexPart, Pose, Shape
+from embomatrix.world.geometry import IDENTITY, ConvexPart, Pose, Shape
 
 LIFT_M = 0.0005
 EXTENT = st.floats(0.03, 0.3)

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.sim.bullet.client import pybullet
-from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion
+from embomatrix.sim.geometry.bounds import joint_motion
 from embomatrix.world.asset import JointKind
-from embomatrix.world.geometry import Pose, Shape, Vec3
+from embomatrix.world.geometry import IDENTITY, Pose, Shape, Vec3
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

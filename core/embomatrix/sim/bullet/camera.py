@@ -10,8 +10,7 @@ import numpy as np
 
 from embomatrix.sim.bullet.robot import tucked
 from embomatrix.sim.bullet.visual_scene import VisualScene
-from embomatrix.sim.geometry.bounds import IDENTITY
-from embomatrix.world.geometry import Pose
+from embomatrix.world.geometry import IDENTITY, Pose
 from embomatrix.world.poses import StandPose
 
 if TYPE_CHECKING:

@@ -24,9 +24,10 @@ from embomatrix.sim.engine import (
     Journal,
     Settled,
 )
-from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of, forget
+from embomatrix.sim.geometry.bounds import bounds_of, forget
 from embomatrix.sim.geometry.spatial_hash import SpatialHash
 from embomatrix.sim.validation import check_fractions, check_pose, check_scene
+from embomatrix.world.geometry import IDENTITY
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence

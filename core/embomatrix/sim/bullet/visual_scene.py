@@ -16,9 +16,9 @@ from embomatrix.sim.bullet.client import pybullet
 from embomatrix.sim.bullet.robot import load_robot, spread
 from embomatrix.sim.bullet.robot_model import DRIVEN_JOINTS
 from embomatrix.sim.engine import EngineError
-from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion
+from embomatrix.sim.geometry.bounds import joint_motion
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.geometry import Pose, Shape
+from embomatrix.world.geometry import IDENTITY, Pose, Shape
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -9,8 +9,8 @@ from embomatrix.sim.caches import RecentCache
 from embomatrix.sim.floor.grid import FloorGrid
 from embomatrix.sim.floor.obstacles import WALLS, Obstacles
 from embomatrix.sim.floor.open_panels import OpenPanels
-from embomatrix.sim.geometry.bounds import IDENTITY, parts_of
-from embomatrix.world.geometry import Pose
+from embomatrix.sim.geometry.bounds import parts_of
+from embomatrix.world.geometry import IDENTITY, Pose
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

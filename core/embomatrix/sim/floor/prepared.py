@@ -13,8 +13,7 @@ import numpy as np
 
 from embomatrix.sim.floor.grid import grid_shape
 from embomatrix.sim.floor.obstacles import WALLS, Obstacles
-from embomatrix.sim.geometry.bounds import IDENTITY
-from embomatrix.world.geometry import Aabb
+from embomatrix.world.geometry import IDENTITY, Aabb
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.geometry.bounds import IDENTITY, quarter_turns
+from embomatrix.sim.geometry.bounds import quarter_turns
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.geometry import Aabb
+from embomatrix.world.geometry import IDENTITY, Aabb
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

@@ -14,7 +14,7 @@ import numpy as np
 
 from embomatrix.sim.caches import BoundedCache
 from embomatrix.world.asset import JointKind
-from embomatrix.world.geometry import IDENTITY_QUAT, Aabb, ConvexPart, Pose, Shape
+from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -39,7 +39,6 @@ SQUARE: Final = 5e-7
 """Half the angle, in radians, up to which frames count as square to one another."""
 ASSETS_KEPT: Final = 512
 """Assets with cached points: more than a scene has, and few enough for a process that loads many scenes."""
-IDENTITY: Final = Pose((0.0, 0.0, 0.0), IDENTITY_QUAT)
 
 
 def joint_motion(joint: Joint, fraction: float) -> Pose:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of
+from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.surfaces import interior_around, is_under, surface_under
 from embomatrix.world.asset import SupportSurface
-from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.geometry import IDENTITY, Aabb, Pose
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from typing import Final
 
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.world.asset import Asset, Link, SupportSurface
-from embomatrix.world.geometry import ConvexPart, Pose, Shape
+from embomatrix.world.geometry import IDENTITY, ConvexPart, Pose, Shape
 
 SIDES_M: Final = (0.06, 0.09, 0.13, 0.19, 0.27, 0.38, 0.54)
 """Sides of footprints round up to these; each is about 40 % larger than the one before."""
@@ -54,7 +54,7 @@ def _rounded_up(value: float, steps: tuple[float, ...]) -> float | None:
 def box_of(footprint: Footprint) -> Asset:
     """Box of a class: its long side along x, its origin in the middle."""
     size = (footprint.long_m, footprint.short_m, footprint.height_m)
-    box = ConvexPart(Shape.BOX, Pose((0.0, 0.0, 0.0)), size)
+    box = ConvexPart(Shape.BOX, IDENTITY, size)
     mass_kg = DENSITY_KG_M3 * math.prod(size)
     return Asset(footprint.name, "footprint", "", size, mass_kg, (Link("base", (box,)),))
 
@@ -71,7 +71,7 @@ def pose_box_asset(footprint: Footprint, asset: Asset, pose_floor_asset: Pose) -
 def level_floor() -> Asset:
     """Slab whose name in a pose cache marks the poses in which objects stand by themselves."""
     size = FLOOR_SIZE_M
-    slab = ConvexPart(Shape.BOX, Pose((0.0, 0.0, 0.0)), size)
+    slab = ConvexPart(Shape.BOX, IDENTITY, size)
     top = SupportSurface("top", (0.0, 0.0, size[2] / 2), (size[0], size[1]), math.inf)
     return Asset("level-floor", "floor", "", size, 100.0, (Link("base", (slab,)),), (top,))
 

@@ -11,9 +11,9 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of, parts_of
+from embomatrix.sim.geometry.bounds import bounds_of, parts_of
 from embomatrix.world.asset import JointKind
-from embomatrix.world.geometry import Aabb, Pose, Shape
+from embomatrix.world.geometry import IDENTITY, Aabb, Pose, Shape
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion, parts_of
+from embomatrix.sim.geometry.bounds import joint_motion, parts_of
+from embomatrix.world.geometry import IDENTITY
 from embomatrix.world.state import OPEN_FRACTION, Relation
 
 if TYPE_CHECKING:

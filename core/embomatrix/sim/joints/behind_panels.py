@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion, parts_of
+from embomatrix.sim.geometry.bounds import joint_motion, parts_of
 from embomatrix.world.asset import JointKind
+from embomatrix.world.geometry import IDENTITY
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim.actions import other_stands
-from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion
+from embomatrix.sim.geometry.bounds import joint_motion
 from embomatrix.sim.joints.swings import LEAST_OPEN
 from embomatrix.sim.physical import body
 from embomatrix.sim.physical.fold import PATHS_TRIED, approach, fold, unfold
@@ -26,7 +26,7 @@ from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.view import refuse
 from embomatrix.world.asset import JointKind
-from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.geometry import IDENTITY, Aabb, Pose
 from embomatrix.world.poses import StandPose
 from embomatrix.world.state import OPEN_FRACTION
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim.engine import FLOOR, WALL
-from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion
-from embomatrix.world.geometry import Aabb, Pose, Shape
+from embomatrix.sim.geometry.bounds import joint_motion
+from embomatrix.world.geometry import IDENTITY, Aabb, Pose, Shape
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim.bullet.dynamic import DynamicWorld
-from embomatrix.sim.geometry.bounds import IDENTITY
 from embomatrix.sim.joints.panels import DoorPanels, swing_panels
 from embomatrix.sim.joints.swings import SWING
 from embomatrix.sim.physical.doors import STRETCHES, close_all, open_all, panel_paths, panels_in_order
@@ -27,6 +26,7 @@ from embomatrix.sim.physical.stage import AROUND_M, PhysicalStage
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.sim.placing.pose_cache import Contents
 from embomatrix.skills.limits import ROBOT
+from embomatrix.world.geometry import IDENTITY
 from embomatrix.world.poses import Handling, PoseCache
 
 if TYPE_CHECKING:

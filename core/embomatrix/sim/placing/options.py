@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim.geometry.batch_poses import LinkBoxes, PoseSet
-from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of
+from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.candidates import PLACE_RELATIONS, patches, proposed_places
 from embomatrix.sim.geometry.footprints import LEVEL_FLOOR, footprint_of, pose_box_asset
 from embomatrix.sim.geometry.statics import base_of
 from embomatrix.sim.geometry.surfaces import link_under, links_with_surfaces
-from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.geometry import IDENTITY, Aabb, Pose
 from embomatrix.world.placements import pose_rows, rows_of
 from embomatrix.world.poses import PlacementKey
 from embomatrix.world.state import Relation

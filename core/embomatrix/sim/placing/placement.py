@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.floor.navigation import has_front
 from embomatrix.sim.geometry.batch_poses import Neighbours
-from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of, parts_of
+from embomatrix.sim.geometry.bounds import bounds_of, parts_of
 from embomatrix.sim.geometry.candidates import candidates
 from embomatrix.sim.geometry.surfaces import is_shut, is_upright, link_frame, links_with_surfaces
 from embomatrix.sim.joints.behind_panels import behind_panels
@@ -15,6 +15,7 @@ from embomatrix.sim.placing.options import PlacementOptions
 from embomatrix.sim.placing.trial import NEAR_M, PlacementRequest, PoseTrial
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.limits import ROBOT
+from embomatrix.world.geometry import IDENTITY
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.mini_world import MiniWorld, StaticObject
 from embomatrix.sim.engine import TOLERANCE_M
 from embomatrix.sim.floor.navigation import Navigator
-from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of
+from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.candidates import (
     LIFT_M,
     PLACE_RELATIONS,
@@ -24,7 +24,7 @@ from embomatrix.sim.geometry.candidates import (
 )
 from embomatrix.sim.geometry.footprints import LEVEL_FLOOR, Footprint, box_of, footprint_of
 from embomatrix.sim.state.relations import Relations
-from embomatrix.world.geometry import Pose
+from embomatrix.world.geometry import IDENTITY, Pose
 from embomatrix.world.poses import PlacementKey, PoseCache, StandPose
 from embomatrix.world.state import Relation
 

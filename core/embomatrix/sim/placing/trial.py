@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.engine import FLOOR, TOLERANCE_M
-from embomatrix.sim.geometry.bounds import IDENTITY
 from embomatrix.sim.geometry.statics import is_level, rest_pose
 from embomatrix.sim.geometry.surfaces import link_frame
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.geometry import Pose
+from embomatrix.world.geometry import IDENTITY, Pose
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:

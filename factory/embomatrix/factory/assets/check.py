@@ -15,8 +15,8 @@ from embomatrix.factory.assets.library import FLAT_ON_WALL, HUNG, family_of, fam
 from embomatrix.factory.assets.solids import Convex, Solids, convex_of
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.mini_world import MiniWorld
-from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion
-from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.sim.geometry.bounds import joint_motion
+from embomatrix.world.geometry import IDENTITY, Aabb, Pose
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping

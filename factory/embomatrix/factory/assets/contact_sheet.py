@@ -9,7 +9,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from embomatrix.factory.assets.shapes import mesh_of
-from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion
+from embomatrix.sim.geometry.bounds import joint_motion
+from embomatrix.world.geometry import IDENTITY
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from embomatrix.sim.geometry.bounds import joint_motion
-from embomatrix.world.geometry import Pose, Shape
+from embomatrix.world.geometry import IDENTITY, Pose, Shape
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -28,7 +28,6 @@ TOLERANCE_M: Final = 0.001
 """Shallower overlaps are contact, not penetration."""
 WALL: Final = "wall"
 _SIDES: Final = 32
-_ORIGIN: Final = Pose((0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +106,7 @@ class Solids:
     def of_scene(scene: Scene) -> Solids:
         """Return the walls and all objects of a scene with their joints shut."""
         solids = Solids()
-        solids.add(WALL, [convex_of(wall, _ORIGIN) for wall in scene.walls])
+        solids.add(WALL, [convex_of(wall, IDENTITY) for wall in scene.walls])
         for item in scene.objects:
             solids.add(item.name, placed_parts(scene.assets[item.asset_id], item.pose_world_asset))
         return solids

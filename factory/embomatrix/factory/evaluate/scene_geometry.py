@@ -16,7 +16,7 @@ from scipy import ndimage
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.engine import FLOOR
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.geometry import Pose
+from embomatrix.world.geometry import IDENTITY
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -37,7 +37,6 @@ DOOR_M: Final = 0.6
 RUG_M: Final = 0.03
 HUNG_M: Final = 2.0
 """Objects that hang higher need not be reached."""
-_HERE: Final = Pose((0.0, 0.0, 0.0))
 
 
 class Flaw(StrEnum):
@@ -105,7 +104,7 @@ def _is_borne(scene: Scene, name: str, boxes: dict[str, FloatArray]) -> bool:
         # A round bottom may rest in a hollow: the box of its host then reaches above its underside.
         host = boxes.get(item.host)
         return host is not None and bool(np.any((host[:, 2] <= low) & (host[:, 5] >= low - REST_M)))
-    walls = np.array([(*box.low_m, *box.high_m) for wall in scene.walls for box in (wall.aabb(_HERE),)])
+    walls = np.array([(*box.low_m, *box.high_m) for wall in scene.walls for box in (wall.aabb(IDENTITY),)])
     near = np.all(
         (walls[:, :3] <= mine[:, 3:].max(axis=0) + WALL_M)
         & (walls[:, 3:] >= mine[:, :3].min(axis=0) - WALL_M),
@@ -155,7 +154,7 @@ def _reached(scene: Scene, boxes: dict[str, FloatArray]) -> FloatArray:
         if door.rooms[1]:
             half = np.array((door.width_m / 2, 0.3) if door.along == "x" else (0.3, door.width_m / 2))
             floor[window(np.array(door.center_m) - half, np.array(door.center_m) + half)] = True
-    walls = np.array([(*box.low_m, *box.high_m) for wall in scene.walls for box in (wall.aabb(_HERE),)])
+    walls = np.array([(*box.low_m, *box.high_m) for wall in scene.walls for box in (wall.aabb(IDENTITY),)])
     solid = np.concatenate([walls.reshape(-1, 6), *boxes.values()])
     for row in solid[(solid[:, 2] < ROBOT.height_m) & (solid[:, 5] > RUG_M)]:
         floor[window(row[:2], row[3:5])] = False

@@ -6,7 +6,7 @@ from html import escape
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.pictures.scene import is_overhead
-from embomatrix.world.geometry import Pose
+from embomatrix.world.geometry import IDENTITY
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from embomatrix.pages.plan_view import PlanView
     from embomatrix.world.scene import Scene
 
-_ORIGIN: Final = Pose((0.0, 0.0, 0.0))
 UNIT: Final = 100
 """SVG units per metre."""
 ROBOT_M: Final = 0.25
@@ -26,7 +25,7 @@ def inspection_view(scene: Scene, view: PlanView, about: Collection[str], things
     names = {room.name for room in view.rooms}
     parts = [view.box(room.low_m, room.high_m, "room") for room in view.rooms]
     for wall in scene.walls:
-        box = wall.aabb(_ORIGIN)
+        box = wall.aabb(IDENTITY)
         if box.low_m[2] < 0.1 and view.is_visible(box.low_m, box.high_m):
             parts.append(view.box(box.low_m, box.high_m, "wall"))
     for item in scene.objects:

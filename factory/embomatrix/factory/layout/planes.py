@@ -14,7 +14,7 @@ from embomatrix.factory.layout.values import PlacementConstraint, PlaneBrief, Pl
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.candidates import surfaces_for
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.geometry import Pose
+from embomatrix.world.geometry import IDENTITY, Pose
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
@@ -33,7 +33,6 @@ HIGHEST_M: Final = 1.75
 RIM_M: Final = 0.01
 FLOOR_RIM_M: Final = 0.02
 """Free strip at the edge of a surface, and at walls."""
-_IDENTITY: Final = Pose((0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +117,7 @@ def pose_at(
 
     ``shift_m`` and ``turn`` move and rotate it slightly.
     """
-    box = bounds_of(asset).box(_IDENTITY)
+    box = bounds_of(asset).box(IDENTITY)
     yaw = spot.yaw + turn
     cosine, sine = math.cos(yaw), math.sin(yaw)
     x, y, _ = box.center_m
@@ -141,7 +140,7 @@ def objects_on(editor: SceneEditor, plane: Plane) -> tuple[tuple[str, str], ...]
 
 
 def _extent(asset: Asset) -> tuple[float, float, float]:
-    return bounds_of(asset).box(_IDENTITY).size_m
+    return bounds_of(asset).box(IDENTITY).size_m
 
 
 def _obstacles(editor: SceneEditor, plane: Plane, height_m: float) -> Iterator[PlaneFootprint]:
@@ -162,10 +161,10 @@ def _obstacles(editor: SceneEditor, plane: Plane, height_m: float) -> Iterator[P
         asset = editor.asset_of(name)
         pose = inverse @ item.pose_world_asset
         if name != plane.host:
-            yield _footprint(name, pose, bounds_of(asset).box(_IDENTITY))
+            yield _footprint(name, pose, bounds_of(asset).box(IDENTITY))
             continue
         for number, part in enumerate(part for link in asset.links for part in link.parts):
-            part_box = part.aabb(_IDENTITY)
+            part_box = part.aabb(IDENTITY)
             if pose.position_m[2] + part_box.high_m[2] > 0.001:
                 yield _footprint(f"{name}#{number}", pose, part_box)
 

@@ -13,7 +13,7 @@ from embomatrix.factory.pictures.labels import GAP, Labels, boxes
 from embomatrix.factory.pictures.legend import counted, draw_legend, in_order
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.geometry import IDENTITY, Aabb
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from embomatrix.factory.pictures.labels import Box
     from embomatrix.world.scene import Scene, SceneObject
 
-_ORIGIN: Final = Pose((0.0, 0.0, 0.0))
 _MARGIN_PX: Final = 15
 _FINEST_PX_PER_M: Final = 110.0
 _LONG_SIDE_PX: Final = 1500
@@ -87,7 +86,7 @@ def draw_building(
     for number, room in enumerate(scene.rooms):
         draw.rectangle(box(*room.low_m, *room.high_m), fill=PALE[number % len(PALE)])
     for wall in scene.walls:
-        around = wall.aabb(_ORIGIN)
+        around = wall.aabb(IDENTITY)
         if around.low_m[2] <= 0.1:
             panel = min(wall.size_m[:2]) < 0.1
             draw.rectangle(box(*around.low_m[:2], *around.high_m[:2]), fill="#b5522b" if panel else "#3a3a3a")

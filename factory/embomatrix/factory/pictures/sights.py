@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.pictures.scene import draw_plan
 from embomatrix.factory.pictures.sheet import draw_eyes
-from embomatrix.world.geometry import Pose
+from embomatrix.world.geometry import IDENTITY
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 WALL_M: Final = 0.3
 """Walls and openings within this distance of a room belong to it."""
-_ORIGIN: Final = Pose((0.0, 0.0, 0.0))
 
 
 def sights_of(scene: Scene) -> tuple[bytes, bytes]:
@@ -37,7 +36,7 @@ def alone(scene: Scene, name: str) -> Scene:
     return replace(
         scene,
         rooms=(room,),
-        walls=tuple(wall for wall in scene.walls if _is_at(room, wall.aabb(_ORIGIN))),
+        walls=tuple(wall for wall in scene.walls if _is_at(room, wall.aabb(IDENTITY))),
         doorways=tuple(door for door in scene.doorways if name in door.rooms),
         windows=tuple(window for window in scene.windows if name in window.rooms),
         objects=tuple(item for item in scene.objects if item.room == name),

@@ -10,7 +10,7 @@ import numpy as np
 from embomatrix.sim.floor.grid import CELL_M, FloorGrid
 from embomatrix.sim.geometry.bounds import joint_motion
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.geometry import IDENTITY, Aabb, Pose
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     BoolArray = NDArray[np.bool_]
 
-_ORIGIN: Final = Pose((0.0, 0.0, 0.0))
 _FLAT_M: Final = 0.03
 _REACH_SLACK_M: Final = 0.05
 _FRONT_COSINE: Final = math.cos(math.radians(65.0))
@@ -33,7 +32,7 @@ class ReachableFloor:
 
     def __init__(self, scene: Scene) -> None:
         self._rooms = scene.rooms
-        walls = [wall.aabb(_ORIGIN) for wall in scene.walls]
+        walls = [wall.aabb(IDENTITY) for wall in scene.walls]
         self._standing = _barring(box for item in scene.objects for box in _part_boxes(scene, item))
         boxes = [box_of(scene, item) for item in scene.objects]
         self._footprints = _barring(boxes)[:, :4]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.manager.web.gallery_values import FloorPlanView, MomentView
 from embomatrix.skills.describe import call_in_words
 from embomatrix.skills.syntax import Skill
-from embomatrix.world.geometry import Pose
+from embomatrix.world.geometry import IDENTITY
 
 if TYPE_CHECKING:
     from embomatrix.manager.web.gallery_values import Box
@@ -27,12 +27,11 @@ SMALL_M: Final = 0.2
 SKIRTING_M: Final = 0.1
 """Walls whose lower edge is above this height are lintels or panes: the plan shows an opening."""
 PIECES: Final = 1500
-_ORIGIN: Final = Pose((0.0, 0.0, 0.0))
 
 
 def floor_plan(scene: Scene) -> FloorPlanView:
     """Return the plan of the whole scene."""
-    walls = [wall.aabb(_ORIGIN) for wall in scene.walls]
+    walls = [wall.aabb(IDENTITY) for wall in scene.walls]
     boxes = [(item, scene.box_of(item.name)) for item in scene.objects if not item.absent]
     pieces = [
         _box(item.name, box.low_m, box.high_m)
