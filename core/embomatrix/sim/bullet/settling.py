@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim.bullet.bodies import BodyFactory
-from embomatrix.sim.bullet.client import ClientPool, pybullet
+from embomatrix.sim.bullet.client import connect, pybullet
 from embomatrix.sim.bullet.mini_world import (
     CHUNK_STEPS,
     GRAVITY_M_S2,
@@ -51,12 +51,11 @@ def settle_scene(scene: Scene) -> SettledScene:
     Raises EngineError if the engine is missing or refuses the scene.
     """
     check_scene(scene)
-    pool = ClientPool()
-    client = pool.take()
+    client = connect()
     try:
         return _Fall(scene, client).run()
     finally:
-        pool.give_back(client)
+        pybullet().disconnect(physicsClientId=client)
 
 
 class _Fall:
