@@ -95,11 +95,11 @@ def encode_bundle(bundle: Bundle) -> bytes:
     return zlib.compress(b"".join(parts), level=6)
 
 
-def read_bundle(path: Path, *, digest: str = "", limits: BundleLimits = DEFAULT_LIMITS) -> Bundle:
+def read_bundle(path: Path, *, digest: str = "") -> Bundle:
     """Read a bundle file whose size is checked first. Raises BundleError or OSError."""
     with path.open("rb") as file:
-        data = file.read(limits.compressed_bytes + 1)
-    return decode_bundle(data, digest=digest, limits=limits)
+        data = file.read(DEFAULT_LIMITS.compressed_bytes + 1)
+    return decode_bundle(data, digest=digest)
 
 
 def decode_bundle(data: bytes, *, digest: str = "", limits: BundleLimits = DEFAULT_LIMITS) -> Bundle:

@@ -103,12 +103,11 @@ class RoomInventory:
 
 @dataclass(frozen=True, slots=True)
 class SceneInventory:
-    """Rooms of one of the 51 scenes, by name, and the extents of its wall panels."""
+    """Rooms of one of the 51 scenes, by name."""
 
     scene_id: str
     description: str
     rooms: tuple[RoomInventory, ...]
-    wall_panels_m: tuple[Vec3, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,8 +178,7 @@ class Catalog:
         """Rooms and models of a scene. Raises CatalogError for an unknown scene."""
         entry = _look_up(self._scenes, scene_id, "scene")
         rooms = tuple(_room(name, room) for name, room in sorted(entry["rooms"].items()))
-        panels = tuple((x, y, z) for x, y, z in entry["walls"])
-        return SceneInventory(scene_id, _description(scene_id, rooms), rooms, panels)
+        return SceneInventory(scene_id, _description(scene_id, rooms), rooms)
 
     @functools.cache  # noqa: B019 - the one instance lives as long as the process
     def category(self, name: str) -> Category:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.bullet.client import ClientPool, near_contacts, pybullet
+from embomatrix.sim.bullet.client import connect, near_contacts, pybullet
 from embomatrix.sim.bullet.dynamic_bodies import DynamicBodies, differ
 from embomatrix.sim.bullet.mini_world import GRAVITY_M_S2
 from embomatrix.sim.bullet.passage import Passage
@@ -36,12 +36,10 @@ ROLL: Final = 4
 class DynamicWorld:
     """Scene and robot in one stepped client. Objects are addressed by name."""
 
-    def __init__(self, scene: Scene, pool: ClientPool | None = None) -> None:
-        """Take a client from the pool; ``build`` fills it."""
+    def __init__(self, scene: Scene) -> None:
+        """Connect a client; ``build`` fills it."""
         self._bullet = pybullet()
-        self._owns_pool = pool is None
-        self._pool = pool or ClientPool()
-        self._client = self._pool.take()
+        self._client = connect()
         self.bodies = DynamicBodies(scene, self._client)
         self._known: dict[str, BodyState] = {}
         self._held = ""
@@ -140,14 +138,14 @@ class DynamicWorld:
                 return other
         return ""
 
-    def hindrance(self, ignore: frozenset[str] = frozenset()) -> str:
+    def hindrance(self) -> str:
         """Body that the robot or its held object presses against most in this step; "" for none."""
         bodies = [self.robot.body] + ([self.bodies.body(self._held)] if self._held else [])
         pressed: dict[str, float] = {}
         for body in bodies:
             for contact in self._bullet.getContactPoints(bodyA=body, physicsClientId=self._client):
                 other = self.bodies.name(contact[2])
-                if other and other != self._held and other not in ignore:
+                if other and other != self._held:
                     pressed[other] = pressed.get(other, 0.0) + contact[9]
         return max(pressed, key=lambda name: (pressed[name], name)) if pressed else ""
 
@@ -211,7 +209,5 @@ class DynamicWorld:
         self.robot.brush(self.bodies.body(name), link, on=True)
 
     def close(self) -> None:
-        """Return the client and end the world's use."""
-        self._pool.give_back(self._client)
-        if self._owns_pool:
-            self._pool.close()
+        """Free the client and end the world's use."""
+        self._bullet.disconnect(physicsClientId=self._client)

@@ -141,8 +141,8 @@ class RobotBody:
             physicsClientId=self._client,
         )
 
-    def hold(self, body: int, link: int, pose_hand_body: Pose, force_n: float = GRIP_N) -> None:
-        """Attach a body's link to the hand at its current pose, up to a force."""
+    def hold(self, body: int, link: int, pose_hand_body: Pose) -> None:
+        """Attach a body's link to the hand at its current pose, up to the force of the grip."""
         centre = self._inertial.inverse() @ pose_hand_body
         self._hold = self._bullet.createConstraint(
             self.body,
@@ -157,7 +157,7 @@ class RobotBody:
             (0, 0, 0, 1),
             physicsClientId=self._client,
         )
-        self._bullet.changeConstraint(self._hold, maxForce=force_n, physicsClientId=self._client)
+        self._bullet.changeConstraint(self._hold, maxForce=GRIP_N, physicsClientId=self._client)
 
     def hook(self, body: int, link: int, in_hand: Sequence[float], in_link: Sequence[float]) -> None:
         """Attach one point of a body's link to a point of the hand; the link may turn about it."""

@@ -48,9 +48,9 @@ class PhysicalActor:
 
     drawing = frozenset(Skill)
 
-    def __init__(self, bundle: Bundle, dynamic: DynamicWorld | None = None) -> None:
-        """Use the given dynamic world, or create one. It is built at the first reset and closed with the actor."""
-        self._dynamic = dynamic if dynamic is not None else DynamicWorld(bundle.scene)
+    def __init__(self, bundle: Bundle) -> None:
+        """Create a dynamic world. It is built at the first reset and closed with the actor."""
+        self._dynamic = DynamicWorld(bundle.scene)
         self._stage: PhysicalStage | None = None
         self._watch: Callable[[], None] | None = None
 

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 TOGETHER: Final = 6
 """Neighbouring balls that are first checked as one enclosing ball."""
+LEAST_BALL_M: Final = 0.012
+"""Least radius of the balls that fill a held object."""
 CHUNK: Final = 40_000
 """Pairs of balls and boxes to compare at once, sized for a processor cache."""
 
@@ -161,14 +163,12 @@ def part_boxes(
     return found
 
 
-def object_balls(
-    asset: Asset, fractions: Sequence[float], *, least_m: float = 0.012
-) -> tuple[FloatArray, FloatArray]:
+def object_balls(asset: Asset, fractions: Sequence[float]) -> tuple[FloatArray, FloatArray]:
     """Return balls that fill the parts of an asset, in its frame: centres (k, 3) and radii (k,). Large flat parts get many."""
     centres, radii = [], []
     for pose, size in part_boxes(asset, IDENTITY, fractions):
         half = np.array(size) / 2
-        radius = max(least_m, float(half.min()))
+        radius = max(LEAST_BALL_M, float(half.min()))
         spans = [np.linspace(-1, 1, _count(extent, radius)) * max(extent - radius, 0.0) for extent in half]
         grid = np.stack(np.meshgrid(*spans, indexing="ij"), axis=-1).reshape(-1, 3)
         centres.append(pose.apply_all(grid))

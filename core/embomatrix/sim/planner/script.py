@@ -55,26 +55,24 @@ class PlanScript:
         """Object table of the task."""
         return self._task.table
 
-    def transfer(
-        self, name: str, target: str, relation: PlaceRelation, depth: int = 0, *, near: str = ""
-    ) -> None:
+    def transfer(self, name: str, target: str, relation: PlaceRelation, *, near: str = "") -> None:
         """Carry an object to its place, from beside ``near`` if possible. Containers are opened while the hand is empty.
 
         If there is no room, other portable objects at that place are put away first.
         """
         while True:
             self._prepare(target, relation)
-            self._take(name, depth)
+            self._take(name, 0)
             step = self._calls.place(target, relation, near)
             if step.ok or (
                 step.failure is FailureReason.NO_FREE_POSE and self._place_on_contents(name, target, relation)
             ):
                 return
             burden = self._removable_at(target, relation, name)
-            if step.failure is not FailureReason.NO_FREE_POSE or not burden or depth == DEPTH:
+            if step.failure is not FailureReason.NO_FREE_POSE or not burden:
                 raise StuckError(_sentence(step))
             self._set_down(name, frozenset((name, target)))
-            self.put_away(burden, frozenset((burden, name, target)), depth + 1)
+            self.put_away(burden, frozenset((burden, name, target)), 1)
 
     def _place_on_contents(self, name: str, target: str, relation: PlaceRelation) -> bool:
         """Place the held object on an object inside the target. True if it is then inside the target too."""
@@ -97,11 +95,11 @@ class PlanScript:
             self.switch_off(name)
         self._swing(Skill.OPEN, name, depth)
 
-    def close(self, name: str, depth: int = 0) -> None:
+    def close(self, name: str) -> None:
         """Close an object unless it is closed."""
         if self._world.is_open(name):
             self.open_containers_of(name)
-            self._swing(Skill.CLOSE, name, depth)
+            self._swing(Skill.CLOSE, name, 0)
 
     def switch_on(self, name: str) -> None:
         """Switch an object on unless it is on. Close it first if it runs only when closed."""
