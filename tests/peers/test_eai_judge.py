@@ -109,14 +109,14 @@ def test_raw_text_cannot_write_files_or_start_processes_in_the_judge(judge, tmp_
         f'__import__("os").system("touch {trap}")',
         '__import__("socket").socket()',
     ):
-        found = judge._asked({"op": "judge", "id": FRUIT, "demo": FRUIT, "text": f"[{code}]"})
+        found = judge._request({"op": "judge", "id": FRUIT, "demo": FRUIT, "text": f"[{code}]"})
         assert found["errors"]["parsing"]
     assert not trap.exists()
 
 
 def test_crashed_judge_is_restarted(judge):
     assert (
-        judge._asked({"op": "judge", "id": FRUIT, "demo": FRUIT, "text": '[__import__("os")._exit(1)]'})
+        judge._request({"op": "judge", "id": FRUIT, "demo": FRUIT, "text": '[__import__("os")._exit(1)]'})
         is None
     )
     assert judge.judge(FRUIT, '[{"action": "OPEN", "object": "fridge_97"}]').executed
