@@ -1,8 +1,7 @@
-"""Adapter for ``verifiers`` (its v1 interface), and so for prime-rl: a taskset with a dataset's prompts and a cluster's "
-"rewards.
+"""Adapter for ``verifiers`` (its v1 interface), and so for prime-rl: a taskset that scores plans on a cluster.
 
-Its commands load a taskset from a single-word module such as `docs/examples/embomatrix_household.py`. The environment
-configures the cluster.
+Commands of verifiers load a taskset from a single-word module such as `docs/examples/embomatrix_household.py`. The
+environment configures the cluster.
 """
 
 from __future__ import annotations

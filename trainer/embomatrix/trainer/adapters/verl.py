@@ -1,7 +1,7 @@
-"""Adapter for verl: its custom reward function. Set ``custom_reward_function.path`` to this file, ``.name`` to "
-"``compute_score``.
+"""Adapter for verl: its custom reward function.
 
-verl scores each sample as soon as it is generated, so simulation and generation overlap.
+Set ``custom_reward_function.path`` to this file and ``custom_reward_function.name`` to ``compute_score``. verl scores each
+sample as soon as it is generated, so simulation and generation overlap.
 """
 
 from __future__ import annotations

@@ -166,10 +166,10 @@ class Decoder(nn.Module):
     def scores(
         self, states: Tensor, prompt: PromptCache, plan: PlanCache | None, token_mask: Tensor
     ) -> Tensor:
-        """Log scores (Q * G, T, V) of the next words for hidden states (Q * G, T, C). ``token_mask`` (Q * G, T, V): words "
-        "to exclude.
+        """Log scores (Q * G, T, V) of the next words for hidden states (Q * G, T, C).
 
-        The hidden states are the last T of those after the prompt and after each word of ``plan``.
+        The hidden states are the last T of those after the prompt and after each word of ``plan``. ``token_mask``
+        (Q * G, T, V) is true on words to exclude.
         """
         x = self.norm(states)
         generated = torch.softmax((x @ self.embedding.weight.t()).masked_fill(token_mask, _MASKED), dim=-1)
@@ -182,10 +182,9 @@ class Decoder(nn.Module):
     def _point(
         self, x: Tensor, prompt: PromptCache, plan: PlanCache | None, token_mask: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Pointer attention of normalised states: probabilities of positions, prompt first, and their words; both (Q * G, "
-        "T, P + S).
+        """Pointer attention of normalised states: probabilities of positions, prompt first, and their words.
 
-        All probabilities are 0 if every word is masked.
+        Both have shape (Q * G, T, P + S). All probabilities are 0 if every word is masked.
         """
         rows, length, width = x.shape
         prompts, prompt_length = prompt.tokens.shape
