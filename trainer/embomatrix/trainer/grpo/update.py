@@ -200,7 +200,10 @@ class Updater:
         if state.signal_plans:
             kind = self._settings.loss
             final = LossTotals(
-                state.signal_plans, state.signal_tokens, self._settings.max_new, state.signal_microbatches
+                plans=state.signal_plans,
+                tokens=sum(metrics.weight for metrics in state.metrics),
+                longest=self._settings.max_new,
+                microbatches=len(state.metrics),
             )
             if kind is LossKind.BNPO:
                 state.gradients.scale(state.totals.microbatches / final.microbatches)
@@ -315,7 +318,7 @@ class _RemoteChunk:
 
 
 class _StepState:
-    """Accumulated groups, metrics and gradients of a step. ``signal_*`` count microbatches with a learning signal."""
+    """Accumulated groups and gradients of a step, and the metrics and plans of its microbatches with a learning signal."""
 
     def __init__(self, plan: StepPlan, totals: LossTotals, gradients: GradientSum) -> None:
         self.plan = plan
@@ -324,12 +327,8 @@ class _StepState:
         self.logs: list[GroupLog] = []
         self.metrics: list[LossMetrics] = []
         self.signal_plans = 0
-        self.signal_tokens = 0
-        self.signal_microbatches = 0
 
     def count(self, metrics: LossMetrics, plans: int) -> None:
         """Count one more microbatch with a learning signal."""
         self.metrics.append(metrics)
         self.signal_plans += plans
-        self.signal_tokens += metrics.weight
-        self.signal_microbatches += 1
