@@ -71,10 +71,12 @@ class Answer:
 
 
 class AnswerSheet:
-    """Context manager over an answer file: stored answers, and a place for new ones."""
+    """Context manager over an answer file: stored answers, and a place for new ones.
+
+    Entering raises TrainerError if the file answers other questions, or can't be read or written.
+    """
 
     def __init__(self, path: Path, setup: EvaluationSetup) -> None:
-        """Raises TrainerError if the file answers other questions, or can't be read or written."""
         self.path = path
         self.setup = setup
         self._answers: dict[tuple[str, int], Answer] = {}
