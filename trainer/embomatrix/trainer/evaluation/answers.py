@@ -129,8 +129,7 @@ class AnswerSheet:
         if differing:
             raise TrainerError(
                 f"{self.path} holds answers to other questions ({'; '.join(differing)}): pass the same options again, or "
-                "another "
-                "--out"
+                "another --out"
             )
         # A kill or a full disk may truncate the last line: drop it, so its question is asked again.
         os.truncate(self.path, complete_bytes)
@@ -144,8 +143,7 @@ class AnswerSheet:
         except OSError as error:
             raise TrainerError(
                 f"the answers {self.path} can't be written ({error.strerror}): free disk space; earlier answers are kept, "
-                "and the "
-                "same command continues from there"
+                "and the same command continues from there"
             ) from error
 
 
@@ -198,8 +196,7 @@ def _read(path: Path) -> tuple[EvaluationSetup, dict[tuple[str, int], Answer], i
     if version != VERSION:
         raise TrainerError(
             f"{path} has another version (found {version!r}, expected {VERSION}): ask the model again, or judge the answers "
-            "with "
-            "the version of embomatrix that wrote them"
+            "with the version of embomatrix that wrote them"
         )
     setup = _validate(EvaluationSetup, json.dumps(header).encode(), path, 1, "ask the model again")
     answers = [

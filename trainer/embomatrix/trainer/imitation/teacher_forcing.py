@@ -188,8 +188,7 @@ def _split_tasks(
     if held_back >= len(with_plan):
         raise TrainerError(
             f"imitation.patience holds back {held_back} of {len(with_plan)} training tasks with an oracle plan for "
-            "validation, which "
-            "leaves none to train on: build a larger dataset, or leave patience out"
+            "validation, which leaves none to train on: build a larger dataset, or leave patience out"
         )
     order = np.random.default_rng(np.random.SeedSequence((seed, 3))).permutation(len(with_plan))
     return [with_plan[at] for at in sorted(order[held_back:])], [

@@ -125,8 +125,7 @@ def atomic_folder(final: Path) -> Iterator[Path]:
         full = shutil.disk_usage(final.parent if final.parent.is_dir() else ".").free < DISK_FULL_BYTES
         raise TrainerError(
             f"{final} can't be written ({'the disk is full' if full else reason_of(error)}): free space or fix the "
-            "permissions; "
-            "earlier checkpoints are intact, and --resume continues from the newest"
+            "permissions; earlier checkpoints are intact, and --resume continues from the newest"
         ) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)

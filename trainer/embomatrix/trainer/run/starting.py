@@ -132,8 +132,7 @@ def _check_unchanged(out: Path, original: TrainSettings, now: TrainSettings, *, 
         if value != before[key] and not changeable:
             raise TrainerError(
                 f"the run in {out} was started with {key} = {before[key]!r}, and can't be resumed with {value!r}: leave "
-                "that out, or "
-                "start a new run with another --out"
+                "that out, or start a new run with another --out"
             )
 
 
