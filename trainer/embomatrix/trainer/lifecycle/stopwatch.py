@@ -10,7 +10,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
 
 
 class Activity(StrEnum):
@@ -46,8 +46,7 @@ class TimeShares:
 class Stopwatch:
     """Sum of the seconds in ``track`` blocks, by activity. The blocks must not nest."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
+    def __init__(self) -> None:
         self.spent_s: dict[str, float] = {}
 
     @contextlib.contextmanager
@@ -62,9 +61,9 @@ class Stopwatch:
 
     @contextlib.contextmanager
     def track(self, activity: Activity) -> Iterator[None]:
-        began_s = self._clock()
+        began_s = time.monotonic()
         try:
             yield
         finally:
-            spent_s = self._clock() - began_s
+            spent_s = time.monotonic() - began_s
             self.spent_s[activity.value] = self.spent_s.get(activity.value, 0.0) + spent_s

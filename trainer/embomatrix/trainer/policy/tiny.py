@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Self
 
 import torch
@@ -213,7 +213,7 @@ class TinyPolicy:
         folder.mkdir(parents=True, exist_ok=True)
         torch.save(self.network.state_dict(), folder / _WEIGHTS)
         description = {
-            "shape": self.network.shape.as_dict(),
+            "shape": asdict(self.network.shape),
             "words": self.vocabulary.words,
             "objects": self.vocabulary.object_words,
             "rooms": self.vocabulary.room_words,

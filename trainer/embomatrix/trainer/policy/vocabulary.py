@@ -31,6 +31,8 @@ _WORD: Final = re.compile(r"\n|-?\d+\.\d+|[a-z0-9_]+(?:-[a-z][a-z0-9_]*)*|-\d+")
 _NUMBER: Final = re.compile(r"_\d+")
 _QUANTITY: Final = re.compile(r"-?\d+(?:\.\d+)?")
 _LONGEST_PHRASE: Final = 4
+_MIN_COUNT: Final = 2
+"""Occurrences of a word in the instructions that make it part of the vocabulary."""
 _FIXED_WORDS: Final = (
     BREAK,
     *(skill.value for skill in PROFILES[Profile.PAPER]),
@@ -41,9 +43,7 @@ _FIXED_WORDS: Final = (
 )
 
 
-def build_vocabulary(
-    situations: Iterable[Situation], instructions: Iterable[str], *, min_count: int = 2
-) -> Vocabulary:
+def build_vocabulary(situations: Iterable[Situation], instructions: Iterable[str]) -> Vocabulary:
     """Build the vocabulary of tasks from the object tables in ``situations`` and the training ``instructions``."""
     words: dict[str, None] = dict.fromkeys(_FIXED_WORDS)
     object_stems: dict[str, None] = {}
@@ -62,7 +62,7 @@ def build_vocabulary(
                 stems.setdefault(stem)
                 numbers |= {int(number[1:])} if number else set()
     counts = Counter(word for text in instructions for word in _WORD.findall(text.lower()))
-    frequent = sorted(word for word, count in counts.items() if count >= min_count)
+    frequent = sorted(word for word, count in counts.items() if count >= _MIN_COUNT)
     named = object_stems | room_stems
     # living_room_0 in an instruction must get the same tokens as in the table: a stem and a number.
     words |= dict.fromkeys(word for word in frequent if _split_number(word)[0] not in named)

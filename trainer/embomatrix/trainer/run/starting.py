@@ -47,7 +47,10 @@ class RunStart:
 
     @property
     def prompt_builder(self) -> PromptBuilder:
-        return prompt_builder_for(self.policy, self.tasks, self.settings)
+        """Builder of the run's prompts."""
+        prompt = self.settings.prompt
+        variation = Variation(self.tasks.kinds, prompt.rename_share, prompt.drop_share)
+        return PromptBuilder(self.policy, prompt.rows, variation, prompt.practice_rename_share)
 
 
 def start_run(
@@ -153,10 +156,3 @@ def digest_of(tasks: TaskSet) -> str:
 def has_checkpoint(out: Path) -> bool:
     """True if the folder holds a run that can be resumed."""
     return CheckpointStore(out / CHECKPOINTS, keep=1).latest() is not None
-
-
-def prompt_builder_for(policy: Policy, tasks: TaskSet, settings: TrainSettings) -> PromptBuilder:
-    """Prompt builder for this policy and these tasks."""
-    prompt = settings.prompt
-    variation = Variation(tasks.kinds, prompt.rename_share, prompt.drop_share)
-    return PromptBuilder(policy, prompt.rows, variation, prompt.practice_rename_share)
