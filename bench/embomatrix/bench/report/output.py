@@ -6,11 +6,11 @@ import contextlib
 import json
 from typing import TYPE_CHECKING
 
-import typer
 from rich.console import Console
 from rich.table import Table
 
 from embomatrix.bench.report.figures import BenchError, is_shared, result_to_json
+from embomatrix.cli.failure import fail
 from embomatrix.pages.figures import shown
 from embomatrix.rpc.status import ClusterError
 from embomatrix.sim.engine import EngineError
@@ -59,5 +59,4 @@ def refusals() -> Iterator[None]:
     try:
         yield
     except (BenchError, BundleError, ClusterError, DatasetError, EngineError, OSError) as error:
-        errors.print(f"embomatrix bench: {error}", highlight=False, markup=False)
-        raise typer.Exit(2) from None
+        fail("bench", str(error))
