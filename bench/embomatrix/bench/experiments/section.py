@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.bench.experiments.findings import BINS, by_task, curve
 from embomatrix.bench.report.page import table
 from embomatrix.trainer.evaluation.intervals import bootstrap
+from embomatrix.trainer.lifecycle.stopwatch import Activity
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ HEAD: Final = (
     "written by hand.\nSections are never removed, including those of failed experiments.\n"
 )
 NOTHING: Final = "–"
-"""Cell without a value: no task was held out, or no step has the metric."""
+"""Cell without a value: no task was held out, no step has the metric, or an older run did not record its memory."""
 CURVES: Final = (
     ("success", "success of training plans"),
     ("zero_variance_groups", "zero-variance groups"),
@@ -133,16 +134,15 @@ def _curve_rows(run: Run) -> Iterable[tuple[str, ...]]:
 def _time_row(run: Run) -> tuple[str, ...]:
     outcome = run.outcome
     total = outcome.grpo_s or 1.0
-    shares = [
-        outcome.spent_s.get(name, 0.0) / total for name in ("sampling", "update", "waiting for simulation")
-    ]
+    activities = (Activity.SAMPLING, Activity.UPDATE, Activity.WAITING)
+    shares = [outcome.spent_s.get(activity, 0.0) / total for activity in activities]
     return (
         run.arm,
         str(run.seed),
         f"{total / max(1, outcome.steps):.2f}",
         *(f"{share:.1%}" for share in shares),
         f"{outcome.overhead:.1%}",
-        f"{outcome.peak_mb:,.0f} MB" if outcome.peak_mb else "–",
+        f"{outcome.peak_mb:,.0f} MB" if outcome.peak_mb else NOTHING,
     )
 
 
