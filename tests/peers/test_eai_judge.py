@@ -35,8 +35,8 @@ def exam(judge):
     return NativeExam(judge)
 
 
-def marked(exam, texts):
-    """Return the marks of one answer for each of these tasks."""
+def judged(exam, texts):
+    """Return the result of an exam with one answer for each of these tasks."""
     setup = EvaluationSetup(exam.name, exam.digest, "all", len(texts), "me", "eai", 60, 1, 0.0, 1, 0)
     answers = [Answer(task_id, 0, text) for task_id, text in texts.items()]
     return exam.judge(setup, answers, lambda *_: None)
@@ -45,12 +45,12 @@ def marked(exam, texts):
 def verdict(exam, *steps, text=None):
     """Return the judge's verdict on one plan for the fruit task."""
     plan = text if text is not None else json.dumps([{"action": a, "object": o} for a, o in steps])
-    board = marked(exam, {FRUIT: plan}).board
+    board = judged(exam, {FRUIT: plan}).board
     return next(task for task in board.tasks if task.task_id == FRUIT).verdicts[0]
 
 
 def test_human_plans_get_the_published_judges_figures(exam):
-    result = marked(exam, {task_id: exam.human(task_id) for task_id in exam.task_ids})
+    result = judged(exam, {task_id: exam.human(task_id) for task_id in exam.task_ids})
     assert len(exam.task_ids) == 100
     assert result.board.success().interval.value == pytest.approx(0.88)
     assert result.others["goal exactly true and executed"].interval.value == pytest.approx(0.90)

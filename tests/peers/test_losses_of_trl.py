@@ -134,9 +134,9 @@ def their_loss(case, folder, kind, level, kl_coef):
 def test_loss_and_gradient_equal_those_of_trl(case, tmp_path, kind, level, kl_coef):
     theirs = their_loss(case, tmp_path, kind, level, kl_coef)
     their_gradient = case.gradient(theirs)
-    terms = LossInputs(case.logprobs(), case.old, case.mask, case.advantages, case.reference)
+    inputs = LossInputs(case.logprobs(), case.old, case.mask, case.advantages, case.reference)
     settings = GrpoSettings(loss=kind, ratio=level, clip_low=0.2, clip_high=0.28, kl_coef=kl_coef)
-    scale = LossTotals(TASKS * GROUP, int(case.mask.sum()), LENGTH)
-    ours, _ = surrogate_loss(terms, settings, scale)
+    totals = LossTotals(TASKS * GROUP, int(case.mask.sum()), LENGTH)
+    ours, _ = surrogate_loss(inputs, settings, totals)
     assert ours.item() == pytest.approx(theirs.item(), rel=1e-5, abs=1e-7)
     assert float((case.gradient(ours) - their_gradient).norm() / their_gradient.norm()) < 1e-5

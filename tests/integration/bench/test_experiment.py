@@ -190,12 +190,12 @@ def test_experiment_resumes_only_with_the_same_design(tmp_path):
 def test_finished_runs_are_not_repeated(tmp_path):
     """Without a dataset, a repeated run would end in SystemExit."""
     conductor = Conductor(DESIGN, tmp_path / "nowhere", tmp_path, lambda heading: None)
-    place = Venue(("--manager=127.0.0.1:1",), no_problem)
+    venue = Venue(("--manager=127.0.0.1:1",), no_problem)
     (conductor.folder_of(0, IMITATED) / "reference").mkdir(parents=True)
     conductor.folder_of(0, "with-relevance").mkdir()
     write_outcome(conductor.folder_of(0, "with-relevance"), outcome((0.2,), (0.5,)))
     conductor.imitate(0)
-    conductor.train(0, RELEVANCE_ARMS[0], place)
+    conductor.train(0, RELEVANCE_ARMS[0], venue)
 
 
 def test_so_far_reports_finished_runs_only(dataset, tmp_path):

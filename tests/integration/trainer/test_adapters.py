@@ -209,10 +209,10 @@ async def test_openrlhf_gets_tensors_and_lost_plans_are_retried():
     ids = [FIRST.task.task_id, SECOND.task.task_id, FIRST.task.task_id]
     with scorer(SymbolicCluster(TASKS, lost=frozenset({"score-0/"}))) as opened:
         rewards = await openrlhf.rewards_of(opened, ids, [oracle(FIRST), oracle(SECOND), "hm"])
-    windows = openrlhf.reward_payload(rewards)
-    assert windows["scores"].tolist() == [1.0, 1.0, 0.0]
-    assert windows["rewards"].tolist() == pytest.approx([reward.total for reward in rewards])
-    assert sum(values[2].item() for values in windows["extra_logs"].values()) == -1
+    payload = openrlhf.reward_payload(rewards)
+    assert payload["scores"].tolist() == [1.0, 1.0, 0.0]
+    assert payload["rewards"].tolist() == pytest.approx([reward.total for reward in rewards])
+    assert sum(values[2].item() for values in payload["extra_logs"].values()) == -1
     with (
         scorer(SymbolicCluster(TASKS, lose_first=True)) as opened,
         pytest.raises(TrainerError, match="lost a plan of the task 'task-0' 3 times"),

@@ -49,9 +49,9 @@ def judged(bench, answers, setup=None):
 
 def report(bench, answers, setup=None):
     setup = setup or setup_of(bench)
-    marked = WorldExam(bench, HereExecutor(bench.folder)).judge(setup, answers, lambda *_: None)
-    value = report_of(setup, marked)
-    return value, evaluation_page(value, marked.pictures)
+    result = WorldExam(bench, HereExecutor(bench.folder)).judge(setup, answers, lambda *_: None)
+    value = report_of(setup, result)
+    return value, evaluation_page(value, result.pictures)
 
 
 def questions(bench, codec=Codec.LINES, rows=60):

@@ -179,9 +179,9 @@ def test_interrupted_step_is_rolled_back_and_repeated_after_a_resume(tmp_path):
 def test_ctrl_c_during_an_update_waits_for_the_end_of_the_step(tmp_path, monkeypatch):
     apply = Updater._apply
 
-    def interrupted(updater, work):
-        moved = apply(updater, work)
-        if work.plan.step == 4:
+    def interrupted(updater, state):
+        moved = apply(updater, state)
+        if state.plan.step == 4:
             signal.raise_signal(signal.SIGINT)
         return moved
 

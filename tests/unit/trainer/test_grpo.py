@@ -29,7 +29,7 @@ MASK = [[True, True], [True, False], [True, True], [True, True]]
 ADVANTAGES = [1.0, -1.0, 0.5, -0.5]
 
 
-def terms(new=NEW, **changes):
+def inputs(new=NEW, **changes):
     values = {
         "logprobs": torch.tensor(new, dtype=torch.float64, requires_grad=True),
         "old_logprobs": torch.tensor(OLD, dtype=torch.float64),
@@ -40,12 +40,12 @@ def terms(new=NEW, **changes):
     return LossInputs(**{**values, **changes})
 
 
-def objective(**changes):
+def settings_of(**changes):
     return GrpoSettings(**{"kl_coef": 0.0, **changes})
 
 
 LONGEST = 5
-SCALE = LossTotals(4, 7, LONGEST)
+TOTALS = LossTotals(4, 7, LONGEST)
 
 
 def by_hand(kind, ratio, low, high, kl_coef):
@@ -79,27 +79,27 @@ def by_hand(kind, ratio, low, high, kl_coef):
 
 @pytest.mark.parametrize(("kind", "ratio"), list(itertools.product(LossKind, RatioLevel)))
 def test_loss_equals_the_formula(kind, ratio):
-    settings = objective(loss=kind, ratio=ratio, kl_coef=0.1)
-    loss, _ = surrogate_loss(terms(), settings, SCALE)
+    settings = settings_of(loss=kind, ratio=ratio, kl_coef=0.1)
+    loss, _ = surrogate_loss(inputs(), settings, TOTALS)
     assert loss.item() == pytest.approx(by_hand(kind, ratio, 0.2, 0.28, 0.1), abs=1e-12)
 
 
 def test_paper_objective_equals_its_golden_value():
-    settings = objective(loss=LossKind.PAPER, ratio=RatioLevel.SEQUENCE, clip_high=0.2, kl_coef=0.1)
+    settings = settings_of(loss=LossKind.PAPER, ratio=RatioLevel.SEQUENCE, clip_high=0.2, kl_coef=0.1)
     # ratios exp(0.5), exp(-0.5), exp(-0.5), exp(0.5); clipped at 1.2 and 0.8 where that lowers the gain
     gain = (1.2 - 0.8 + 0.5 * math.exp(-0.5) - 0.5 * math.exp(0.5)) / 4
-    loss, _ = surrogate_loss(terms(reference=None), settings, SCALE)
+    loss, _ = surrogate_loss(inputs(reference=None), settings, TOTALS)
     assert loss.item() == pytest.approx(-gain, abs=1e-12)
 
 
 @pytest.mark.parametrize(("kind", "ratio"), list(itertools.product(LossKind, RatioLevel)))
 def test_microbatches_add_up_to_the_step(kind, ratio):
-    settings = objective(loss=kind, ratio=ratio, kl_coef=0.05, entropy_coef=0.01)
+    settings = settings_of(loss=kind, ratio=ratio, kl_coef=0.05, entropy_coef=0.01)
     entropy = torch.full((4, 2), 0.3, dtype=torch.float64)
-    whole = terms(entropy=entropy)
-    loss, _ = surrogate_loss(whole, settings, SCALE)
+    whole = inputs(entropy=entropy)
+    loss, _ = surrogate_loss(whole, settings, TOTALS)
     loss.backward()
-    pieces = terms(entropy=entropy)
+    pieces = inputs(entropy=entropy)
     for rows in (slice(0, 2), slice(2, 4)):
         part = LossInputs(
             pieces.logprobs[rows],
@@ -109,14 +109,14 @@ def test_microbatches_add_up_to_the_step(kind, ratio):
             pieces.reference[rows],
             entropy[rows],
         )
-        surrogate_loss(part, settings, SCALE)[0].backward()
+        surrogate_loss(part, settings, TOTALS)[0].backward()
     assert torch.allclose(whole.logprobs.grad, pieces.logprobs.grad)
 
 
 @pytest.mark.parametrize(("kind", "ratio"), list(itertools.product(LossKind, RatioLevel)))
 def test_gradient_raises_good_plans_and_lowers_bad_ones(kind, ratio):
-    start = terms(new=OLD, reference=None)
-    loss, metrics = surrogate_loss(start, objective(loss=kind, ratio=ratio), SCALE)
+    start = inputs(new=OLD, reference=None)
+    loss, metrics = surrogate_loss(start, settings_of(loss=kind, ratio=ratio), TOTALS)
     loss.backward()
     for row, advantage in enumerate(ADVANTAGES):
         for at, own in enumerate(MASK[row]):
@@ -127,8 +127,8 @@ def test_gradient_raises_good_plans_and_lowers_bad_ones(kind, ratio):
 
 
 def test_clipped_ratio_has_no_gradient():
-    far = terms(new=[[0.9, 0.9]] * 4, reference=None, advantages=torch.ones(4, dtype=torch.float64))
-    loss, metrics = surrogate_loss(far, objective(), SCALE)
+    far = inputs(new=[[0.9, 0.9]] * 4, reference=None, advantages=torch.ones(4, dtype=torch.float64))
+    loss, metrics = surrogate_loss(far, settings_of(), TOTALS)
     loss.backward()
     assert far.logprobs.grad.abs().max() == 0
     assert metrics.clip_fraction == 1
@@ -137,17 +137,17 @@ def test_clipped_ratio_has_no_gradient():
 def test_lost_rows_have_no_influence():
     mask = torch.tensor(MASK)
     mask[2] = False
-    part = terms(mask=mask)
+    part = inputs(mask=mask)
     loss, _ = surrogate_loss(
-        part, objective(loss=LossKind.PAPER, ratio=RatioLevel.SEQUENCE, kl_coef=0.1), SCALE
+        part, settings_of(loss=LossKind.PAPER, ratio=RatioLevel.SEQUENCE, kl_coef=0.1), TOTALS
     )
     loss.backward()
     assert part.logprobs.grad[2].abs().max() == 0
 
 
 def test_kl_term_pulls_towards_the_reference():
-    part = terms(new=OLD, advantages=torch.zeros(4, dtype=torch.float64))
-    loss, metrics = surrogate_loss(part, objective(kl_coef=1.0), SCALE)
+    part = inputs(new=OLD, advantages=torch.zeros(4, dtype=torch.float64))
+    loss, metrics = surrogate_loss(part, settings_of(kl_coef=1.0), TOTALS)
     loss.backward()
     own = torch.tensor(MASK)
     wanted = torch.sign(torch.tensor(REFERENCE) - torch.tensor(OLD))[own]

@@ -281,8 +281,8 @@ def test_trained_policy_keeps_its_codec_and_other_models_use_json(policy, tokeni
     model.save_pretrained(tmp_path / "other")
     tokenizer.save_pretrained(tmp_path / "other")
 
-    def codec(name, prompt_ids):
-        return load_model(str(tmp_path / name), prompt_ids, threads=1, device="cpu").policy.codec
+    def codec(name, requested):
+        return load_model(str(tmp_path / name), requested, threads=1, device="cpu").policy.codec
 
     assert codec("taught", None) is Codec.LINES
     assert codec("taught", Codec.JSON) is Codec.JSON

@@ -49,13 +49,13 @@ def test_named_categories_can_get_any_name():
     kinds = {
         (old.category, row.category)
         for task in TASKS.train
-        for old, row in zip(task.situation.rows, told_in_order(task), strict=True)
+        for old, row in zip(task.situation.rows, varied_in_table_order(task), strict=True)
         if names_it(task.situation.instruction, old)
     }
     assert any(new not in TASKS.kinds[old] for old, new in kinds)
 
 
-def told_in_order(task):
+def varied_in_table_order(task):
     return sorted(vary(task.situation, VARIATION, rng()).rows, key=lambda row: row.index)
 
 

@@ -81,11 +81,11 @@ async def _execute(child: Child, scene: SceneWork, sample: SlotSample) -> None:
     await asyncio.sleep(WAIT_S)
     slot = await child.fork()
     for rollout in scene.rollouts:
-        answer = await _ask(slot, _frame(rollout))
+        answer = await _ask(slot, _request(rollout))
         sample.execute_s.append(float(answer.header["cpu_s"]))
     await asyncio.sleep(WAIT_S)
     sample.private_mb.append(private_mb(slot.pid))
-    empty = _frame(Rollout("empty", "empty", scene.bundle_digest, scene.executions[0].task_id, (), 0))
+    empty = _request(Rollout("empty", "empty", scene.bundle_digest, scene.executions[0].task_id, (), 0))
     for _ in range(RESPAWNS):
         killed = slot
         started_s = time.perf_counter()
@@ -97,13 +97,13 @@ async def _execute(child: Child, scene: SceneWork, sample: SlotSample) -> None:
     await slot.end()
 
 
-def _frame(rollout: Rollout) -> PipeMessage:
+def _request(rollout: Rollout) -> PipeMessage:
     return PipeMessage({"op": "execute"}, rollout_to_proto(rollout).SerializeToString())
 
 
-async def _ask(child: Child, frame: PipeMessage) -> PipeMessage:
+async def _ask(child: Child, request: PipeMessage) -> PipeMessage:
     async with asyncio.timeout(ANSWER_S):
-        answer = await child.peer.ask(frame)
+        answer = await child.peer.ask(request)
     if "error" in answer.header:
         raise BenchError(f"the simulator failed: {answer.header['error']}")
     return answer

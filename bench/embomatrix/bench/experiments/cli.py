@@ -242,11 +242,11 @@ def _conduct(
     design: Design,
     dataset: Path,
     out: Path,
-    place: AbstractContextManager[Venue] | None,
+    venue: AbstractContextManager[Venue] | None,
     json_file: Path | None,
     page: Path | None,
 ) -> None:
-    """Run everything that is not finished, unless there is no ``place``; then report the finished runs."""
+    """Run everything that is not finished, unless there is no ``venue``; then report the finished runs."""
     for arm in design.arms:
         # A wrong setting is refused before anything is computed.
         checked_settings(tomllib.loads(toml_of({**design.shared, **arm.settings})))
@@ -255,8 +255,8 @@ def _conduct(
     machine, commit = describe_machine(), commit_here()
     keep_design(out, design)
     conductor = Conductor(design, dataset, out, console.rule)
-    if place is not None:
-        conductor.conduct(place)
+    if venue is not None:
+        conductor.conduct(venue)
     runs = read_runs(design, conductor.folder_of)
     arms = [findings_of(name, of_arm) for name, of_arm in runs.items() if of_arm]
     if not arms:

@@ -48,14 +48,14 @@ class Conductor:
     folder: Path
     announce: Callable[[str], None]
 
-    def conduct(self, place: AbstractContextManager[Venue]) -> None:
-        """Run all imitations, then all arms."""
+    def conduct(self, venue: AbstractContextManager[Venue]) -> None:
+        """Run all imitations, then all arms. The venue is entered for the arms only."""
         for seed in self.design.seeds:
             self.imitate(seed)
-        with place as venue:
+        with venue as entered:
             for seed in self.design.seeds:
                 for arm in self.design.arms:
-                    self.train(seed, arm, venue)
+                    self.train(seed, arm, entered)
 
     def imitate(self, seed: int) -> None:
         """Train the policy that this seed's arms start from."""
@@ -75,7 +75,7 @@ class Conductor:
             f"--seed={seed}",
         )
 
-    def train(self, seed: int, arm: Arm, place: Venue) -> None:
+    def train(self, seed: int, arm: Arm, venue: Venue) -> None:
         """Train one arm of one seed."""
         out = self.folder_of(seed, arm.name)
         if (out / OUTCOME).is_file():
@@ -84,13 +84,13 @@ class Conductor:
         self._run(
             out,
             {**self.design.shared, **arm.settings},
-            place.problem,
+            venue.problem,
             "train",
             f"--model={self.folder_of(seed, IMITATED) / 'reference'}",
             "--imitate-seconds=0",
             _budget("minutes", self.design.grpo.seconds / 60, self.design.grpo),
             f"--seed={seed}",
-            *place.arguments,
+            *venue.arguments,
         )
         if not (out / OUTCOME).is_file():
             raise TrainerError(

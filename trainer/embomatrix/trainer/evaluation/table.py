@@ -41,10 +41,10 @@ class ScoreRow:
     figures: Mapping[str, Any]
 
 
-def report_of(setup: EvaluationSetup, marked: ExamResult) -> dict[str, Any]:
+def report_of(setup: EvaluationSetup, result: ExamResult) -> dict[str, Any]:
     """JSON report of an evaluation. Equal answers give equal bytes, wherever the plans are executed."""
-    others = {name: estimate_to_json(found) for name, found in marked.others.items()}
-    return {"report": VERSION, "setup": asdict(setup), **marked.board.as_json(), "others": others}
+    others = {name: estimate_to_json(found) for name, found in result.others.items()}
+    return {"report": VERSION, "setup": asdict(setup), **result.board.as_json(), "others": others}
 
 
 def read_row(path: Path, bench_digest: str) -> ScoreRow:
