@@ -4,7 +4,7 @@ import math
 
 from tests.fakes.symbolic_household import SymbolicCluster
 from tests.integration.trainer.test_loop import TASKS, run
-from tests.unit.trainer.test_rollout import outcomes
+from tests.unit.trainer.test_gateway import outcomes
 
 from embomatrix.rpc.status import PreconditionError, UnavailableError
 from embomatrix.rpc.wire.training import TrainingReport

@@ -9,6 +9,7 @@ from tests.fakes.symbolic_household import make_tasks
 from embomatrix.trainer.data.tasks import Curriculum, Schedule
 
 TASKS = make_tasks(12, 0, objects=10).train
+SIX = make_tasks(6, 2).train
 
 
 def ids(tasks):
@@ -40,3 +41,23 @@ def test_curriculum_starts_with_the_shortest_plans_and_ends_with_all():
     first, last = set(ids(schedule.peek(40))), set(ids(schedule.peek(200, skip=300)))
     assert first <= set(ids(by_length[:4]))
     assert last == set(ids(TASKS))
+
+
+def test_peek_equals_the_next_take():
+    schedule = Schedule(SIX, seed=3)
+    schedule.take(4)
+    ahead = schedule.peek(5, skip=2)
+    assert schedule.take(7)[2:] == ahead
+
+
+def test_every_epoch_is_a_new_permutation():
+    schedule = Schedule(SIX, seed=3)
+    first, second = schedule.take(6), schedule.take(6)
+    assert {task.task.task_id for task in first} == {task.task.task_id for task in second}
+    assert first != second
+
+
+def test_schedule_continues_from_its_cursor():
+    whole = Schedule(SIX, seed=3)
+    whole.take(4)
+    assert Schedule(SIX, seed=3, cursor=4).take(9) == whole.take(9)

@@ -12,7 +12,7 @@ from embomatrix.rpc.wire.values import RunTerms
 from embomatrix.skills.prompt import Codec, plan_in_names
 from embomatrix.trainer.cluster.gateway import Gateway, result_of
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.data.tasks import Schedule, group_seed
+from embomatrix.trainer.data.tasks import group_seed
 
 TASKS = make_tasks(6, 2)
 TASK = TASKS.train[0]
@@ -128,23 +128,3 @@ def test_rollouts_share_a_seed_per_task_and_run():
     assert group_seed(0, "a") == group_seed(0, "a")
     assert len({group_seed(0, "a"), group_seed(0, "b"), group_seed(1, "a")}) == 3
     assert 0 <= group_seed(0, "a") < 2**31
-
-
-def test_peek_equals_the_next_take():
-    schedule = Schedule(TASKS.train, seed=3)
-    schedule.take(4)
-    ahead = schedule.peek(5, skip=2)
-    assert schedule.take(7)[2:] == ahead
-
-
-def test_every_epoch_is_a_new_permutation():
-    schedule = Schedule(TASKS.train, seed=3)
-    first, second = schedule.take(6), schedule.take(6)
-    assert {task.task.task_id for task in first} == {task.task.task_id for task in second}
-    assert first != second
-
-
-def test_schedule_continues_from_its_cursor():
-    whole = Schedule(TASKS.train, seed=3)
-    whole.take(4)
-    assert Schedule(TASKS.train, seed=3, cursor=4).take(9) == whole.take(9)
