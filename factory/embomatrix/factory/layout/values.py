@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final, TypeVar, dataclass_transform
 
+from pydantic import ConfigDict, with_config
+
 from embomatrix.factory.scenes.editor import LayoutReason  # noqa: TC001  pydantic reads the annotation
 
 T = TypeVar("T")
@@ -17,9 +19,7 @@ T = TypeVar("T")
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
 def _value(cls: type[T]) -> type[T]:
     """Make a class a frozen dataclass whose JSON form rejects unknown fields."""
-    made = dataclass(frozen=True, slots=True)(cls)
-    made.__pydantic_config__ = {"extra": "forbid"}  # type: ignore[attr-defined]
-    return made
+    return with_config(ConfigDict(extra="forbid"))(dataclass(frozen=True, slots=True)(cls))
 
 
 Size2 = tuple[float, float]
