@@ -21,8 +21,8 @@ from embomatrix.factory.commands.language_model import (
     Llm,
     Model,
     Tape,
+    layout_agents,
     model_backed_agents,
-    model_layout_agents,
     model_task_writer,
 )
 from embomatrix.factory.commands.layout import lay
@@ -41,7 +41,6 @@ from embomatrix.world.task import TaskCategory
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from embomatrix.factory.layout.agent_interfaces import AgentName
     from embomatrix.factory.layout.request import LayoutAgents
     from embomatrix.factory.writer.tasks import TaskWriter
     from embomatrix.llm.ledger import Ledger
@@ -97,7 +96,7 @@ def build(
     cassette: Tape = None,
 ) -> None:
     """Write tasks over base scenes, keep those that the oracle solves, and save them with their scenes."""
-    model_backed = model_backed_agents(forms or [])
+    model_backed = model_backed_agents(forms)
     if (llm or cassette) and not model_backed:
         fail(
             "--llm and --cassette apply to layout agents here: select some, as in --agent room-organizer=llm"
@@ -111,9 +110,7 @@ def build(
         physical=look_ahead if physical is None else physical,
         modelled=tuple(sorted(model_backed)),
     )
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(user_errors(out))
-        layout = _layout(stack, model_backed, llm, model, key, cassette)
+    with user_errors(out), layout_agents(model_backed, llm, model, key, cassette, FailureLimit()) as layout:
         _make(out, settings, jobs=jobs, layout=layout)
 
 
@@ -146,7 +143,7 @@ def generate(
         fail("--llm needs the name of a model at the endpoint: give --model")
     if look and kind is WriterKind.SOCIAL:
         fail("--look needs a language model: give --llm URL and --model NAME, or --cassette FILE")
-    model_backed = model_backed_agents(forms or [])
+    model_backed = model_backed_agents(forms)
     settings = BuildSettings(
         tasks,
         heldout,
@@ -163,7 +160,7 @@ def generate(
         if manager:
             trusted = ca.read_bytes() if ca is not None else b""
             check = stack.enter_context(cluster_check(manager, token, trusted))
-        layout = _layout(stack, model_backed, llm, model, key, cassette)
+        layout = stack.enter_context(layout_agents(model_backed, llm, model, key, cassette, FailureLimit()))
         if kind is WriterKind.SOCIAL:
             _make(out, settings, jobs=jobs, check=check, layout=layout)
             return
@@ -174,20 +171,6 @@ def generate(
         )
         _make(out, settings, writer, check=check, layout=layout)
         _print_account(ledger)
-
-
-def _layout(
-    stack: contextlib.ExitStack,
-    names: frozenset[AgentName],
-    url: str,
-    model: str,
-    key: str,
-    cassette: Path | None,
-) -> LayoutAgents | None:
-    """Return layout agents with the named ones on a language model; None if all follow rules."""
-    if not names:
-        return None
-    return stack.enter_context(model_layout_agents(url, model, key, cassette, FailureLimit())).agents(names)
 
 
 def _print_account(ledger: Ledger) -> None:

@@ -22,6 +22,7 @@ from embomatrix.llm.values import EndpointError
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
+    from embomatrix.factory.layout.request import LayoutAgents
     from embomatrix.llm.batch import FailureLimit
     from embomatrix.llm.values import ChatModel
 
@@ -77,6 +78,23 @@ def model_layout_agents(
 
 
 @contextlib.contextmanager
+def layout_agents(
+    names: frozenset[AgentName],
+    url: str,
+    model: str,
+    key: str,
+    cassette: Path | None,
+    failure_limit: FailureLimit | None = None,
+) -> Iterator[LayoutAgents | None]:
+    """Yield layout agents with the named ones on a language model; None if all follow rules. Raise LlmError."""
+    if not names:
+        yield None
+        return
+    with model_layout_agents(url, model, key, cassette, failure_limit) as agents:
+        yield agents.agents(names)
+
+
+@contextlib.contextmanager
 def model_task_writer(
     url: str, model: str, key: str, cassette: Path | None, *, price: Price, accounts: Path, look: bool
 ) -> Iterator[tuple[ModelWriter, Ledger]]:
@@ -98,10 +116,10 @@ def model_task_writer(
         yield writer, ledger
 
 
-def model_backed_agents(forms: list[str]) -> frozenset[AgentName]:
+def model_backed_agents(forms: list[str] | None) -> frozenset[AgentName]:
     """Return the agents that ``--agent NAME=llm`` options select."""
     found = set()
-    for form in forms:
+    for form in forms or ():
         name, _, kind = form.partition("=")
         if name not in set(AgentName) or kind not in ("llm", "rules"):
             fail(f"--agent {form!r}: expected NAME=llm or NAME=rules with NAME one of {', '.join(AgentName)}")

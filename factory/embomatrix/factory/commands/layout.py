@@ -16,14 +16,13 @@ from embomatrix.factory.commands.language_model import (
     Llm,
     Model,
     Tape,
+    layout_agents,
     model_backed_agents,
-    model_layout_agents,
 )
 from embomatrix.factory.commands.terminal import fail, user_errors
 from embomatrix.factory.layout.agent_interfaces import LAYOUT_AGENTS, AgentName
 from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.generator import lay as lay_by_tree
-from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pictures.scene import draw_plan
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.sources import read_activity, read_file
@@ -59,16 +58,14 @@ def lay(
     cassette: Tape = None,
 ) -> None:
     """Lay the objects of one task out in a base scene and print the layout trees. Nothing is executed."""
-    names = model_backed_agents(forms or [])
+    names = model_backed_agents(forms)
     if method not in METHODS:
         fail(f"there is no method {method!r}: expected one of {', '.join(METHODS)}")
     if (bddl is None) is (not activity):
         fail("expected exactly one of --bddl FILE and --activity NAME")
     with user_errors(), contextlib.ExitStack() as stack:
         source = read_file(bddl) if bddl is not None else read_activity(activity)
-        agents = LayoutAgents()
-        if names:
-            agents = stack.enter_context(model_layout_agents(llm, model, key, cassette)).agents(names)
+        agents = stack.enter_context(layout_agents(names, llm, model, key, cassette))
         layouts: list[Layout] = []
 
         def lay_and_keep(editor: SceneEditor, items: Sequence[RequestedObject], seed: int) -> Layout:
