@@ -26,7 +26,7 @@ from embomatrix.factory.commands.language_model import (
     model_task_writer,
 )
 from embomatrix.factory.commands.layout import lay
-from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Scenes, Seed, processes
+from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Scenes, Seed, in_physics, processes
 from embomatrix.factory.commands.task_import import app as import_app
 from embomatrix.factory.commands.terminal import fail, progress, user_errors
 from embomatrix.factory.commands.verification import app as verify_app
@@ -107,7 +107,7 @@ def build(
         seed,
         scene_ids(scenes),
         look_ahead=look_ahead,
-        physical=look_ahead if physical is None else physical,
+        physical=in_physics(physical, look_ahead=look_ahead),
         modelled=tuple(sorted(model_backed)),
     )
     with user_errors(out), layout_agents(model_backed, llm, model, key, cassette, FailureLimit()) as layout:
@@ -150,9 +150,9 @@ def generate(
         seed,
         scene_ids(scenes),
         kind,
-        look_ahead,
-        look_ahead if physical is None else physical,
-        tuple(sorted([*model_backed, *[SCENE_EXTRACTOR] * look])),
+        look_ahead=look_ahead,
+        physical=in_physics(physical, look_ahead=look_ahead),
+        modelled=tuple(sorted([*model_backed, *[SCENE_EXTRACTOR] * look])),
     )
     with contextlib.ExitStack() as stack:
         stack.enter_context(user_errors(out))

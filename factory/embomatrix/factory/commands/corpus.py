@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Seed, processes
+from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Seed, in_physics, processes
 from embomatrix.factory.commands.terminal import fail, progress, user_errors
 from embomatrix.factory.pipeline.build import build_dataset
 from embomatrix.factory.pipeline.corpus import HELDOUT_SCENES, CorpusSettings, check_frozen, freeze
@@ -54,7 +54,7 @@ def corpus(
                 tuple(scenes or ()),
                 tuple(unseen or HELDOUT_SCENES),
                 look_ahead,
-                look_ahead if physical is None else physical,
+                in_physics(physical, look_ahead=look_ahead),
             )
             for name, build in settings.builds().items():
                 _build(console, out / name, build, processes(jobs))

@@ -26,6 +26,7 @@ Physical = Annotated[
         help="Admit a task only if a robot carries its plan out in stepped physics. Default: same as --look-ahead.",
     ),
 ]
+
 MOST_JOBS: Final = 8
 """Upper limit of the default: each process holds some hundred MB of scenes."""
 Jobs = Annotated[
@@ -35,6 +36,11 @@ Jobs = Annotated[
         help="Number of processes. The result does not depend on it. Default: one for each core, at most 8.",
     ),
 ]
+
+
+def in_physics(physical: bool | None, *, look_ahead: bool) -> bool:
+    """Return whether plans are checked in stepped physics: ``--physical``, or ``--look-ahead`` if it is not given."""
+    return look_ahead if physical is None else physical
 
 
 def processes(jobs: int | None) -> int:
