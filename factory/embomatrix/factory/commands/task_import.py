@@ -14,7 +14,7 @@ from rich.table import Table
 from embomatrix.factory.admission import TaskRefusal
 from embomatrix.factory.commands.options import Jobs, LookAhead, Scenes, Seed, processes
 from embomatrix.factory.commands.terminal import fail, progress, user_errors
-from embomatrix.factory.metrics.figures import EvaluationError, evaluation_to_json
+from embomatrix.factory.metrics.figures import EvaluationError, write_evaluation
 from embomatrix.factory.pipeline.settings import scene_ids
 from embomatrix.factory.pipeline.store import ResumableLog
 from embomatrix.factory.task_import.batch import Verified
@@ -191,7 +191,7 @@ def _write(
         write_whole(report, (json.dumps(report_to_json(outcomes), indent=1) + "\n").encode("ascii"))
         write_whole(report.with_suffix(".md"), report_to_markdown(outcomes).encode("utf-8"))
     if json_file is not None:
-        write_whole(json_file, (json.dumps(evaluation_to_json(evaluation), indent=1) + "\n").encode("ascii"))
+        write_evaluation(json_file, evaluation)
 
 
 def _check_free(out: Path, depth: Depth, outcomes: Path | None) -> None:

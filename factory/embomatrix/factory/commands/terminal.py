@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from typing import TYPE_CHECKING, NoReturn
 
 import typer
@@ -20,7 +19,7 @@ from rich.table import Table
 
 from embomatrix.factory.layout.agent_interfaces import BriefError
 from embomatrix.factory.layout.distribution import DistributionError
-from embomatrix.factory.metrics.figures import EvaluationError, evaluation_to_json
+from embomatrix.factory.metrics.figures import EvaluationError, verdict_on, write_evaluation
 from embomatrix.factory.task_import.sources import ProblemSourceError
 from embomatrix.llm.values import LlmError
 from embomatrix.rpc.status import ClusterError
@@ -28,7 +27,6 @@ from embomatrix.sim.engine import EngineMissingError
 from embomatrix.world.bddl import BddlError
 from embomatrix.world.catalog import CatalogError
 from embomatrix.world.dataset import DatasetError
-from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -93,15 +91,11 @@ def report_evaluation(evaluation: EvaluationFigures, json_file: Path | None) -> 
     """Print a table of the figures and their notes, and write them to ``json_file`` if one is given."""
     table = Table("figure", "value", "goal", "", "n")
     for figure in evaluation.figures:
-        verdict = "" if figure.goal is None else "reached" if figure.is_reached else "short"
-        table.add_row(
-            figure.name, f"{figure.value:.3g} {figure.unit}".strip(), figure.bound, verdict, str(figure.n)
-        )
+        value = f"{figure.value:.3g} {figure.unit}".strip()
+        table.add_row(figure.name, value, figure.bound, verdict_on(figure), str(figure.n))
     Console().print(table)
     for note in evaluation.notes:
         Console().print(note, highlight=False, markup=False)
     if json_file is not None:
         with user_errors(json_file):
-            write_whole(
-                json_file, (json.dumps(evaluation_to_json(evaluation), indent=1) + "\n").encode("ascii")
-            )
+            write_evaluation(json_file, evaluation)

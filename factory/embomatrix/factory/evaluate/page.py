@@ -9,7 +9,7 @@ import textwrap
 from collections import Counter
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.metrics.figures import EvaluationError
+from embomatrix.factory.metrics.figures import EvaluationError, verdict_on
 from embomatrix.pages.figures import shown
 
 if TYPE_CHECKING:
@@ -147,9 +147,8 @@ def _by_part(evaluations: Sequence[EvaluationFigures]) -> dict[str, list[Evaluat
 def _table(figures: Sequence[Figure]) -> list[str]:
     lines = ["| figure | value | goal | | n |", "| --- | ---: | ---: | --- | ---: |"]
     for figure in figures:
-        verdict = "" if figure.goal is None else "reached" if figure.is_reached else "short"
         value = f"{shown(figure.value)} {figure.unit}".strip()
-        lines.append(f"| {figure.name} | {value} | {figure.bound} | {verdict} | {figure.n:,} |")
+        lines.append(f"| {figure.name} | {value} | {figure.bound} | {verdict_on(figure)} | {figure.n:,} |")
     return lines
 
 

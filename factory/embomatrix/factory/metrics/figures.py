@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from embomatrix.pages.figures import figure_from_json, figure_to_json
+from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -29,8 +30,15 @@ class EvaluationFigures:
     notes: tuple[str, ...] = ()
 
     def figure(self, name: str) -> Figure:
-        """Return the figure of this name. Raises KeyError."""
+        """Return the figure of this name. Raise KeyError."""
         return {figure.name: figure for figure in self.figures}[name]
+
+
+def verdict_on(figure: Figure) -> str:
+    """Return ``reached`` or ``short``; empty without a goal."""
+    if figure.goal is None:
+        return ""
+    return "reached" if figure.is_reached else "short"
 
 
 def evaluation_to_json(evaluation: EvaluationFigures) -> dict[str, Any]:
@@ -43,8 +51,13 @@ def evaluation_to_json(evaluation: EvaluationFigures) -> dict[str, Any]:
     }
 
 
+def write_evaluation(path: Path, evaluation: EvaluationFigures) -> None:
+    """Write an evaluation as JSON. Raise OSError."""
+    write_whole(path, (json.dumps(evaluation_to_json(evaluation), indent=1) + "\n").encode("ascii"))
+
+
 def read_evaluation(path: Path) -> EvaluationFigures:
-    """Read a file written with `evaluation_to_json`. Raises EvaluationError for any other content."""
+    """Read a file that `write_evaluation` wrote. Raise EvaluationError for any other content."""
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
         return EvaluationFigures(
