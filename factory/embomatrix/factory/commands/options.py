@@ -26,7 +26,6 @@ Physical = Annotated[
         help="Admit a task only if a robot carries its plan out in stepped physics. Default: same as --look-ahead.",
     ),
 ]
-
 MOST_JOBS: Final = 8
 """Upper limit of the default: each process holds some hundred MB of scenes."""
 Jobs = Annotated[

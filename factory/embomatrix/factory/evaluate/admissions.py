@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures
 from embomatrix.factory.pipeline.settings import WriterKind
 from embomatrix.factory.pipeline.store import ATTEMPTS_FILE, BUILD_FILE, TIMES_FILE
+from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.pages.figures import Better, Figure
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ def evaluate_admissions(folder: Path) -> EvaluationFigures:
     counts = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common()) or "nothing"
     conditions = {
         "dataset": folder.name,
-        "scenes": len({each["scene"].split("-")[0] for each in attempts}),
+        "scenes": len({base_scene_of(each["scene"]) for each in attempts}),
         "look ahead": "yes" if settings["look_ahead"] else "no",
         "in physics": "yes" if settings["physical"] else "no",
     }

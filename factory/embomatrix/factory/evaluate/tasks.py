@@ -12,7 +12,7 @@ import numpy as np
 
 from embomatrix.factory.metrics.diversity import diversity, normalised_entropy
 from embomatrix.factory.metrics.figures import EvaluationFigures
-from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.build import base_scene_of, build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.casting import NAMES
 from embomatrix.factory.social.writer import SocialWriter
@@ -151,7 +151,7 @@ def asked_of(records: Sequence[TaskRecord], count: int) -> dict[str, list[DraftF
     """Return the first ``count`` tasks of each base scene in a dataset; scenes with fewer tasks are left out."""
     groups: dict[str, list[DraftFeatures]] = {}
     for record in records:
-        base = record.task.scene_id.split("-")[0]
+        base = base_scene_of(record.task.scene_id)
         asked = DraftFeatures(
             record.task.instruction, record.signature, record.rooms, bool(record.task.types)
         )

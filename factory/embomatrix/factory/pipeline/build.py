@@ -22,7 +22,7 @@ from embomatrix.factory.pipeline.variants import (
     VariantYield,
     uniqueness_key,
 )
-from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.build import base_scene_of, build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.sim.process_pool import shared_work
 from embomatrix.world.catalog import Catalog
@@ -297,7 +297,7 @@ def _summary(store: BuildStore, rooms: Mapping[str, Mapping[str, tuple[str, ...]
     rejections: Iterable[Rejection] = (item for result in store.results for item in result.rejections)
     return BuildSummary(
         admitted=Counter((record.split, record.task.category.value) for record in records),
-        scenes=Counter((record.split, record.task.scene_id.split("-")[0]) for record in records),
+        scenes=Counter((record.split, base_scene_of(record.task.scene_id)) for record in records),
         rejected=Counter(item.reason.value for item in rejections),
         variants=len(store.results),
         rooms=rooms,

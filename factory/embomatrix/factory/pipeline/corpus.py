@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
+from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, write_dataset
 from embomatrix.world.whole_file import write_whole
@@ -94,7 +95,7 @@ def freeze(folder: Path) -> Frozen:
     }
     target = folder / VERIFIED
     write_dataset(target, records, bundles)
-    frozen = _frozen(target, {_base(record) for record in train})
+    frozen = _frozen(target, {base_scene_of(record.task.scene_id) for record in train})
     write_whole(target / FROZEN_FILE, (json.dumps(asdict(frozen), indent=1) + "\n").encode("ascii"))
     return frozen
 
@@ -111,7 +112,7 @@ def check_frozen(folder: Path) -> Frozen:
         ) from error
     train = Dataset.load(folder / TRAIN).train
     verified = Dataset.load(folder / VERIFIED)
-    found = _frozen(folder / VERIFIED, {_base(record) for record in train})
+    found = _frozen(folder / VERIFIED, {base_scene_of(record.task.scene_id) for record in train})
     if found != recorded:
         raise DatasetError(
             f"{folder / VERIFIED} differs from the frozen corpus: found {found.tasks} tasks with digest "
@@ -127,8 +128,8 @@ def check_frozen(folder: Path) -> Frozen:
 def _frozen(folder: Path, trained_in: set[str]) -> Frozen:
     data = (folder / TASKS_FILE).read_bytes()
     records = Dataset.load(folder).records
-    bases = tuple(sorted({_base(record) for record in records}))
-    unseen = sum(_base(record) not in trained_in for record in records)
+    bases = tuple(sorted({base_scene_of(record.task.scene_id) for record in records}))
+    unseen = sum(base_scene_of(record.task.scene_id) not in trained_in for record in records)
     return Frozen(len(records), unseen, bases, f"sha256:{hashlib.sha256(data).hexdigest()}")
 
 
@@ -139,14 +140,10 @@ def _check_apart(train: Sequence[TaskRecord], heldout: Sequence[TaskRecord]) -> 
         raise DatasetError(
             f"goals with the signature {min(shared)!r} are trained on and held out: use one seed for both builds"
         )
-    trained_in = {_base(record) for record in train}
-    seen = sum(_base(record) in trained_in for record in heldout)
+    trained_in = {base_scene_of(record.task.scene_id) for record in train}
+    seen = sum(base_scene_of(record.task.scene_id) in trained_in for record in heldout)
     if 2 * seen > len(heldout):
         raise DatasetError(
             f"{seen} of {len(heldout)} held-out tasks lie in scenes of training: expected at most half; the unseen "
             "scenes yielded too few"
         )
-
-
-def _base(record: TaskRecord) -> str:
-    return record.task.scene_id.split("-")[0]

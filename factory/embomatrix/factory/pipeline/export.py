@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.factory.pipeline.store import BUILD_FILE, TRANSCRIPTS_FOLDER
+from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.world.dataset import DatasetError
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def _row(dataset: Dataset, record: TaskRecord) -> dict[str, Any]:
         "task_id": task.task_id,
         "split": record.split,
         "scene_id": task.scene_id,
-        "base_scene": task.scene_id.split("-")[0],
+        "base_scene": base_scene_of(task.scene_id),
         "rooms": list(record.rooms),
         "category": task.category.value,
         "instruction": task.instruction,
@@ -92,7 +93,7 @@ def encode_rows(rows: Sequence[Mapping[str, Any]], suffix: str) -> bytes:
 def dataset_card(dataset: Dataset, file_name: str, data: bytes) -> str:
     """Return the dataset card in Markdown, with the header that dataset hubs read."""
     records = dataset.records
-    scenes = {record.task.scene_id.split("-")[0] for record in records}
+    scenes = {base_scene_of(record.task.scene_id) for record in records}
     kinds = {record.signature for record in records}
     lines = [
         "---",

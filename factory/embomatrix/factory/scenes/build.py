@@ -83,6 +83,11 @@ def build_base_scene(
     return scene
 
 
+def base_scene_of(scene_id: str) -> str:
+    """Return the base scene of a variant or of a task's scene: ``Rs_int`` for ``Rs_int-train-003``."""
+    return scene_id.split("-")[0]
+
+
 def _best_plan(
     specs: Sequence[RoomSpec], pieces: dict[str, list[FurniturePiece]], rng: np.random.Generator
 ) -> tuple[FloorPlan, Furnishing]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.factory.admission import TaskRefusal
 from embomatrix.factory.metrics.figures import EvaluationFigures
+from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.factory.task_import.batch import Verified
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.reach import unreachable_atoms
@@ -69,7 +70,7 @@ def outcome_of(source: SourceText, imported: ImportedTask | Verified | TaskRefus
             source.name, source.source, "", imported.reason.value, imported.sentence, unreachable, notes
         )
     if isinstance(imported, Verified):
-        scene = imported.record.task.scene_id.split("-")[0]
+        scene = base_scene_of(imported.record.task.scene_id)
         return ProblemOutcome(source.name, source.source, scene, "", "", unreachable, imported.notes)
     return ProblemOutcome(
         source.name, source.source, imported.scene.base, "", "", unreachable, imported.notes
