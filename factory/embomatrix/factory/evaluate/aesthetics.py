@@ -23,13 +23,11 @@ from embomatrix.pages.figures import Better, Figure
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
     FloatArray = NDArray[np.float64]
-    from pathlib import Path
-
-    from embomatrix.factory.evaluate.room_plans import RoomBox, RoomPlan
 
 CELL_M: Final = 0.1
 ROBOT_M: Final = 0.2

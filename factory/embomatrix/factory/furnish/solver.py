@@ -307,9 +307,7 @@ def _fill(
     return left
 
 
-def _all_free(
-    solver: RoomSolver, rows: Rows, nodes: GroupCandidates
-) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+def _all_free(solver: RoomSolver, rows: Rows, nodes: GroupCandidates) -> BoolArray:
     """Mark the nodes where the largest group is free: every other group fits there too."""
     largest = max(rows.groups, key=lambda g: len(g.members))
     return solver.free(replace(largest, clear_m=rows.clear_m), nodes)

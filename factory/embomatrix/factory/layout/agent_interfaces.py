@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from embomatrix.factory.layout.constraints import choose_constraints
@@ -34,8 +35,6 @@ from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-
-import numpy as np
 
 
 class AgentName(StrEnum):

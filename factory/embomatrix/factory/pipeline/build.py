@@ -30,19 +30,17 @@ from embomatrix.world.dataset import DatasetError, write_dataset
 from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from pathlib import Path
 
     from embomatrix.factory.layout.request import LayoutAgents
     from embomatrix.factory.pipeline.settings import BuildSettings
     from embomatrix.factory.writer.tasks import TaskWriter
+    from embomatrix.world.dataset import TaskRecord
+    from embomatrix.world.scene import Scene
 
     MakeVariants = Callable[[Sequence[VariantOrder]], Iterator[VariantYield]]
     """Function that makes variants and yields the results in the order of the orders."""
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    from embomatrix.world.dataset import TaskRecord
-    from embomatrix.world.scene import Scene
 
 
 VariantCheck = Callable[[VariantYield], VariantYield]

@@ -27,20 +27,17 @@ from embomatrix.world.poses import Handling, PlacementKey, PoseCache
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from embomatrix.factory.scenes.view import SceneView
+    from embomatrix.sim.physical.survey import ReachabilitySurvey
     from embomatrix.sim.placing.pose_cache import PlacementLibrary
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Aabb, Pose
     from embomatrix.world.poses import StandPose
+    from embomatrix.world.scene import Scene
 
     Poses = dict[PlacementKey, tuple[Pose, ...]]
-    from collections.abc import Sequence
-
-    from embomatrix.sim.physical.survey import ReachabilitySurvey
-    from embomatrix.world.geometry import Pose
-    from embomatrix.world.scene import Scene
 
 
 @dataclass(frozen=True, slots=True)

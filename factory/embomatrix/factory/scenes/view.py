@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     from embomatrix.world.asset import Asset
     from embomatrix.world.scene import Scene, SceneObject
-    from embomatrix.world.state import Relation
 
 
 class RobotFeasibility(Protocol):
