@@ -15,7 +15,6 @@ from embomatrix.world.dataset import Dataset
 from embomatrix.world.whole_file import check_writable
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-"""Each process holds a scene."""
 
 Physical = Annotated[
     bool,
@@ -45,7 +44,7 @@ def verify(
         if not records:
             fail(f"{folder} contains no task: name a dataset with tasks")
         with progress(Console(stderr=True)) as bars:
-            bar = bars.add_task("looks", total=2 * len(records))
+            bar = bars.add_task("judgements", total=2 * len(records))
             verdicts = verify_again(
                 folder,
                 records,

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 SEED: Final = 0
 
 
-def out_of_hand(stage: Simulator, task: Task, view: SceneView, names: Sequence[str]) -> tuple[str, ...]:
+def out_of_hand(simulator: Simulator, task: Task, view: SceneView, names: Sequence[str]) -> tuple[str, ...]:
     """Return the objects that the robot can't reach, or can't pick up although they are portable, each with the reason.
 
     Objects that are absent at the start, or hang higher than the arm reaches, are skipped.
@@ -37,7 +37,7 @@ def out_of_hand(stage: Simulator, task: Task, view: SceneView, names: Sequence[s
             continue
         why = ""
         for plan in _plans(task, view, name):
-            trace = stage.execute(task, plan, SEED)
+            trace = simulator.execute(task, plan, SEED)
             why = trace.steps[-1].message if trace.failure is not None else ""
             if not why:
                 break
@@ -50,8 +50,8 @@ def _plans(task: Task, view: SceneView, name: str) -> Iterator[Plan]:
     """Yield plans to reach an object: after opening what encloses it, with and without moving to the object itself."""
     shut = [
         host
-        for guest, host in itertools.pairwise((name, *view.hosts(name)))
-        if view.rests(guest, Relation.INSIDE, host) and view.is_openable(host) and not view.is_open(host)
+        for inner, host in itertools.pairwise((name, *view.hosts(name)))
+        if view.rests(inner, Relation.INSIDE, host) and view.is_openable(host) and not view.is_open(host)
     ]
     bears = any(item.host == name for item in view.scene.objects)
     go = _call(task, Skill.MOVE, name)

@@ -97,7 +97,7 @@ class LayoutOutcome:
 
 
 def fixed_tasks(sample: Path) -> list[SceneTask]:
-    """Return 70 tasks of the paper's sample file and 70 tasks of BEHAVIOR-1K. Raises EvaluationError, SourceError."""
+    """Return 70 tasks of the paper's sample file and 70 tasks of BEHAVIOR-1K. Raise EvaluationError or ProblemSourceError."""
     text = (resources.files("embomatrix.factory.evaluate") / LIST).read_text(encoding="utf-8")
     names = json.loads(text)
     known = _sample(sample)
@@ -179,9 +179,9 @@ def _executed(
     """Execute the oracle's plan; return the refusal, None if the task is solved, and the objects out of reach."""
     view = SceneView(imported.scene)
     poses = poses_for(imported, view, library, None, seed)
-    with contextlib.closing(load_simulator(Bundle(imported.scene, {}, poses))) as stage:
-        verdict = admit(stage, imported.task, find_plan, imported.init)
-        lost = out_of_hand(stage, imported.task, view, imported.about)
+    with contextlib.closing(load_simulator(Bundle(imported.scene, {}, poses))) as simulator:
+        verdict = admit(simulator, imported.task, find_plan, imported.init)
+        lost = out_of_hand(simulator, imported.task, view, imported.about)
     return (None if isinstance(verdict, Admitted) else verdict), lost
 
 

@@ -121,12 +121,12 @@ def compared(first: Judgement, second: Judgement) -> VerificationOutcome:
 
 
 def _judge_bundle(folder: Path, tasks: tuple[str, list[str]], *, physical: bool) -> list[Judgement]:
-    """Judge tasks of one bundle. tasks: (digest of the bundle, task ids)."""
+    """Judge tasks of one bundle. ``tasks`` holds the bundle's digest and the ids of its tasks."""
     dataset = Dataset.load(folder)
     bundle = dataset.read_bundle(tasks[0])
     records = [dataset.find(task) for task in tasks[1]]
-    with contextlib.closing(load_simulator(bundle)) as stage:
-        judgements = [_cached(stage, record) for record in records]
+    with contextlib.closing(load_simulator(bundle)) as simulator:
+        judgements = [_cached(simulator, record) for record in records]
     if not physical:
         return judgements
     return [
@@ -135,12 +135,12 @@ def _judge_bundle(folder: Path, tasks: tuple[str, list[str]], *, physical: bool)
     ]
 
 
-def _cached(stage: Simulator, record: TaskRecord) -> Judgement:
+def _cached(simulator: Simulator, record: TaskRecord) -> Judgement:
     """Judge a task as admission does and execute the plan found."""
-    verdict = admit(stage, record.task, find_plan, most_held=max_held_share(record.task))
+    verdict = admit(simulator, record.task, find_plan, most_held=max_held_share(record.task))
     if not isinstance(verdict, Admitted):
         return Judgement(record.task.task_id, f"{verdict.reason}: {verdict.sentence}", "", same_plan=False)
-    trace = stage.execute(record.task, verdict.plan, SEED)
+    trace = simulator.execute(record.task, verdict.plan, SEED)
     same = plan_to_json(verdict.plan) == [dict(call) for call in record.oracle]
     return Judgement(record.task.task_id, SUCCESS, trace.digest, same)
 
@@ -148,8 +148,8 @@ def _cached(stage: Simulator, record: TaskRecord) -> Judgement:
 def _physical(bundle: Bundle, record: TaskRecord) -> PlanFailure | None:
     """Execute the dataset's plan with a robot in physics; return the failure, None if it reaches the goal."""
     plan = plan_from_json(list(record.oracle), record.task.profile)
-    with contextlib.closing(physical_simulator(bundle)) as stage:
-        return plan_failure(stage, record.task, plan)
+    with contextlib.closing(physical_simulator(bundle)) as simulator:
+        return plan_failure(simulator, record.task, plan)
 
 
 def evaluation_of(

@@ -135,9 +135,9 @@ class PendingObjects:
 
     def withdraw(self, name: str, reason: LayoutReason, detail: str) -> None:
         """Remove a placed object with all objects on it, and record the reason."""
-        item, seat = self._editor.known(self.names[name]), self.placed[name].support
-        if seat is not None and seat.relation is Relation.UNDER:
-            relation, host = LayoutRelation.UNDER, seat.host
+        item, support = self._editor.known(self.names[name]), self.placed[name].support
+        if support is not None and support.relation is Relation.UNDER:
+            relation, host = LayoutRelation.UNDER, support.host
         else:
             relation = LayoutRelation(item.relation.value) if item.relation else LayoutRelation.ONTOP
             host = item.host or self._room

@@ -60,11 +60,11 @@ def settle(
     rested: dict[str, Pose] = {}
     unstable: dict[str, str] = {}
     with contextlib.closing(BulletEngine(editor.freeze(editor.base.scene_id))) as engine:
-        hands = _ReachProbe(engine)
+        probe = _ReachProbe(engine)
         unreached: dict[str, str] = {}
         for name in [name for name in names if editor.box_of(name).low_m[2] < HIGH_M]:
-            if not hands.reach(name):
-                if hands.place(name, alternatives(name)):
+            if not probe.reach(name):
+                if probe.place(name, alternatives(name)):
                     loose.add(name)
                 else:
                     unreached[name] = NO_STAND

@@ -58,8 +58,8 @@ def draw_film(
 ) -> list[Image.Image]:
     """Pictures of all frames, RGB, 896 x 480 pixels: the room on the left, the robot's view and ``captions`` on the right.
 
-    There is a caption for each call of the plan. Frames are drawn by processes that share nothing with this one;
-    ``on_frame`` hears how many of how many are done.
+    There is a caption for each call of the plan. Frames are drawn by processes that share nothing with this one.
+    ``on_frame`` is called with the number of drawn frames and of all frames.
     """
     rooms = _rooms_seen(film)
     chunks = [film.frames[start : start + CHUNK] for start in range(0, len(film.frames), CHUNK)]

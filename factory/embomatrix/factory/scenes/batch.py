@@ -38,12 +38,12 @@ def run_batch(jobs: Sequence[SceneBuildJob], *, processes: int) -> Iterator[Scen
     can't be written. If a worker process dies, the reports of its unfinished jobs say so.
     """
     catalog = Catalog.load()
-    things = {job: _things(catalog, job) for job in jobs}
+    counts = {job: _object_count(catalog, job) for job in jobs}
     if len(jobs) == 1:
         yield _run(jobs[0])
         return
     with process_pool(min(processes, len(jobs))) as pool:
-        largest_first = sorted(jobs, key=lambda job: -things[job])
+        largest_first = sorted(jobs, key=lambda job: -counts[job])
         waiting = {pool.submit(_run, job): job for job in largest_first}
         for done in as_completed(waiting):
             job = waiting[done]
@@ -67,7 +67,7 @@ def _run(job: SceneBuildJob) -> SceneReport:
     return report
 
 
-def _things(catalog: Catalog, job: SceneBuildJob) -> int:
+def _object_count(catalog: Catalog, job: SceneBuildJob) -> int:
     """Return the number of objects to place, which predicts the time that the job takes."""
     if job.source is not None:
         return 0

@@ -118,8 +118,8 @@ class SceneEditor:
 
     def is_spare(self, name: str) -> bool:
         """True if an object of the base scene may be removed with all objects on it."""
-        guests = {item.name for item in self._objects.values() if item.host == name}
-        return name in self.base.by_name and not self._kept & {name, *guests}
+        carried = {item.name for item in self._objects.values() if item.host == name}
+        return name in self.base.by_name and not self._kept & {name, *carried}
 
     def is_free(self, asset: Asset, pose: Pose) -> bool:
         """True if an asset overlaps nothing at a pose."""

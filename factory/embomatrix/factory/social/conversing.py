@@ -93,7 +93,7 @@ class GrammarConversation:
 
     def __init__(self, scenario: ConversationScenario, context: GoalContext, voice: Voice) -> None:
         self._scenario = scenario
-        self._shop = context
+        self._context = context
         self._rng = context.rng
         self._voice = voice
         self._turns: list[DialogueTurn] = []
@@ -129,17 +129,17 @@ class GrammarConversation:
     def _alternative_place(self, first: GoalConjunct) -> GoalConjunct | None:
         """Return another plausible place for the same object, or None."""
         for _ in range(PLACES_TRIED):
-            other = placed_elsewhere(self._shop, first)
-            if other is not None and themes_of(other, self._shop.view):
+            other = placed_elsewhere(self._context, first)
+            if other is not None and themes_of(other, self._context.view):
                 return other
         return None
 
     def _refuse(self, further: list[GoalConjunct]) -> None:
         """Add a request that the robot refuses. It then proposes the next request, which leaves ``further``."""
         slot = self._scenario.slot
-        chore, reason = impossible_request(self._shop.view, slot.room, self._rng)
-        self._say(slot.person, Act.ADD, clause=chore)
-        self._say(ROBOT, Act.REFUSE, chore=chore, reason=reason)
+        request, reason = impossible_request(self._context.view, slot.room, self._rng)
+        self._say(slot.person, Act.ADD, clause=request)
+        self._say(ROBOT, Act.REFUSE, chore=request, reason=reason)
         if further:
             self._say(ROBOT, Act.PROPOSE, clause=further.pop(0).clause)
             self._turns.append(
@@ -173,7 +173,7 @@ class GrammarConversation:
         return text
 
     def _say(self, speaker: str, act: Act, **words: str) -> None:
-        text = shorten_repeated_rooms(fill(self._voice.choose(TURNS[act]), **words), self._shop.view)
+        text = shorten_repeated_rooms(fill(self._voice.choose(TURNS[act]), **words), self._context.view)
         self._turns.append(DialogueTurn(speaker=speaker, act=act, text=text))
 
 

@@ -63,7 +63,7 @@ GROUP_ROOMS: Final[Mapping[ItemKind, frozenset[str]]] = {
     ItemKind.TABLEWARE: _EATING | _WORKING | {"storage_room"},
     ItemKind.TOILETRIES: _WASHING,
 }
-"""Room types that people bring objects of a group to. Groups without an entry go to any room not in `NOT_IN`."""
+"""Room types that people bring objects of a group to. Groups without an entry go to any room not in `EXCLUDED_ROOMS`."""
 _WET: Final = frozenset({"bathroom", "spa", "hammam", "sauna", "locker_room"})
 EXCLUDED_ROOMS: Final[Mapping[ItemKind, frozenset[str]]] = {
     **dict.fromkeys((ItemKind.DEVICES, ItemKind.OFFICE, ItemKind.TOYS), _WET),
