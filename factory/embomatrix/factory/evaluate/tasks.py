@@ -12,6 +12,7 @@ import numpy as np
 
 from embomatrix.factory.metrics.diversity import diversity, normalised_entropy
 from embomatrix.factory.metrics.figures import EvaluationFigures
+from embomatrix.factory.pipeline.variants import uniqueness_key
 from embomatrix.factory.scenes.build import base_scene_of, build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.casting import NAMES
@@ -119,7 +120,7 @@ def asked_in(base: Scene, writer: TaskWriter, count: int, seed: int) -> list[Dra
     found: dict[str, DraftFeatures] = {}
     for number in range(MOST_VARIANTS):
         for draft in _drafts(base, writer, number, seed):
-            found.setdefault(f"{draft.signature}|{draft.task.instruction}", _asked(draft))
+            found.setdefault(uniqueness_key(draft.signature, draft.task.instruction), _asked(draft))
             if len(found) == count:
                 return list(found.values())
     return list(found.values())
