@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from embomatrix.factory.scenes.view import SceneView
+    from embomatrix.factory.task_import.size_requirements import Requirement
     from embomatrix.world.asset import Asset
     from embomatrix.world.bddl import BddlProblem
     from embomatrix.world.scene import Scene
@@ -61,12 +62,12 @@ def search(
     words = sorted(set(inroom.values()))
     find = _renumbered if renumbering else _rooms_for
     options = {word: find(view.scene, word, rng) for word in words}
-    needs = abilities_needed(problem)
+    needs, requirements = abilities_needed(problem), requirements_of(problem)
     best: tuple[int, dict[str, str], dict[str, str]] | None = None
     lacking = ""
     for rooms in itertools.islice(_room_choices(words, options), MAX_CHOICES):
         wanted = {name: rooms[inroom[name]] for name in fixtures}
-        found, missing = _assign(*_domains(problem, view, wanted, needs, rng, excluded))
+        found, missing = _assign(*_domains(problem, view, wanted, needs, requirements, rng, excluded))
         if not missing:
             return rooms, found
         first = missing[0]
@@ -125,6 +126,7 @@ def _domains(
     view: SceneView,
     wanted: Mapping[str, str],
     needs: Mapping[str, frozenset[str]],
+    requirements: Mapping[str, Requirement],
     rng: np.random.Generator,
     excluded: Container[str],
 ) -> tuple[dict[str, list[str]], list[str]]:
@@ -135,7 +137,6 @@ def _domains(
         for item in problem.init
         if item.positive and item.atom.predicate in {Relation.ONTOP, Relation.INSIDE}
     }
-    requirements = requirements_of(problem)
     domains: dict[str, list[str]] = {}
     missing: list[str] = []
     for name, room in wanted.items():
