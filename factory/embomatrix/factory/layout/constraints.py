@@ -149,7 +149,6 @@ def satisfaction(
     constraint: PlacementConstraint,
     spots: SpotCandidates,
     plane_m: Size2,
-    size_m: Size3,
     other: PlaneFootprint | None,
 ) -> FloatArray:
     """Satisfaction of a constraint at each spot, from 0 to 1, shape (n,). It decreases smoothly with the violation."""

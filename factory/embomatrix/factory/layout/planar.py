@@ -209,9 +209,7 @@ class _Search:
         score = RANDOM_SCORE * self._rng.random(len(spots))
         kinds = {constraint.kind for constraint in item.constraints}
         for constraint, row in zip(item.constraints, held, strict=True):
-            shade = satisfaction(
-                constraint, spots, brief.size_m, item.size_m, self._others.get(constraint.other)
-            )
+            shade = satisfaction(constraint, spots, brief.size_m, self._others.get(constraint.other))
             score += WEIGHTS[constraint.kind] * ((1 - GRADED_SHARE) * row + GRADED_SHARE * shade)
         if ConstraintKind.EDGE not in kinds:
             score += CLEARANCE_BONUS * np.minimum(margins(spots, brief.size_m) / CLEARANCE_M, 1.0)

@@ -58,9 +58,7 @@ class ObjectSampler:
         self._editor = editor
         self._rng = rng
 
-    def add(
-        self, category: str, model: str | None, relation: Relation | None, host: str, *, room: str = ""
-    ) -> str:
+    def add(self, category: str, model: str | None, relation: Relation | None, host: str) -> str:
         """Place a new object and return its name, ``category_N``.
 
         ``host`` is an object, or a room if ``relation`` is None or INROOM; then the object stands on the room's
@@ -73,7 +71,7 @@ class ObjectSampler:
             except PlacementError as error:
                 errors.append(error)
                 continue
-            return self._editor.insert(asset, pose, *self.rests(relation, host), room)
+            return self._editor.insert(asset, pose, *self.rests(relation, host))
         raise errors[-1]
 
     def find(self, asset: Asset, relation: Relation | None, host: str) -> Pose:

@@ -122,7 +122,6 @@ def verify_first(
     foresight: ReachabilitySurvey | None,
     *,
     seed: int = 0,
-    options: ImportOptions | None = None,
 ) -> Verified | TaskRefusal:
     """Import the problem into the first scene in which it is admitted. Otherwise return the refusal that came furthest.
 
@@ -130,10 +129,11 @@ def verify_first(
     """
 
     def outcomes() -> Iterator[Verified | TaskRefusal]:
-        given = options or ImportOptions()
-        for tried in (given, replace(given, compact=True)) if has_shared_host(source) else (given,):
+        for compact in (False, True) if has_shared_host(source) else (False,):
             laid_out, misfits, sentences = 0, 0, list[str]()
-            for imported in imports(source, bases, seed=seed, options=tried, draws=OWN_SCENE_DRAWS):
+            for imported in imports(
+                source, bases, seed=seed, options=ImportOptions(compact=compact), draws=OWN_SCENE_DRAWS
+            ):
                 if isinstance(imported, TaskRefusal):
                     misfits += imported.reason is RefusalReason.DOES_NOT_FIT
                     yield imported
