@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.floorplan.walls import WALL_HEIGHT_M
 from embomatrix.factory.furnish.roles import HUNG_BOTTOM_M, FurnitureRole, role_of, wall_height_m
-from embomatrix.factory.scenes.editor import LayoutReason, PlacementError, box_at
+from embomatrix.factory.scenes.editor import LayoutReason, PlacementError
+from embomatrix.factory.scenes.floor import box_at
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Pose

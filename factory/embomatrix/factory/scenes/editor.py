@@ -14,7 +14,7 @@ from embomatrix.factory.assets.solids import Solids, placed_parts
 from embomatrix.factory.furnish.roles import is_portable
 from embomatrix.factory.scenes.check import reach_problems
 from embomatrix.factory.scenes.clearance import Clearance
-from embomatrix.factory.scenes.floor import ReachableFloor
+from embomatrix.factory.scenes.floor import ReachableFloor, box_at
 from embomatrix.factory.scenes.joints import with_joints
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.skills.limits import ROBOT
@@ -261,11 +261,6 @@ class SceneEditor:
         trial = replace(self.base, objects=(*self._objects.values(), item), assets=assets)
         known = self._unreached | {(name,) for name in self.given_up}
         return {problem.names for problem in reach_problems(trial)} <= known
-
-
-def box_at(asset: Asset, pose: Pose) -> Aabb:
-    """Return the box in the world of an asset at a pose, with closed joints."""
-    return Aabb.around(part.aabb(pose) for link in asset.links for part in link.parts)
 
 
 def add_floor(editor: SceneEditor, room: str) -> str:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import FloatArray
     from embomatrix.world.scene import Room, Scene, SceneObject
 
@@ -104,8 +105,12 @@ def _within(spots: FloatArray, boxes: FloatArray) -> BoolArray:
 
 def box_of(scene: Scene, item: SceneObject) -> Aabb:
     """Return the bounding box of an object in the world with its joints shut."""
-    asset = scene.assets[item.asset_id]
-    return Aabb.around(part.aabb(item.pose_world_asset) for link in asset.links for part in link.parts)
+    return box_at(scene.assets[item.asset_id], item.pose_world_asset)
+
+
+def box_at(asset: Asset, pose: Pose) -> Aabb:
+    """Return the bounding box in the world of an asset at a pose, with its joints shut."""
+    return Aabb.around(part.aabb(pose) for link in asset.links for part in link.parts)
 
 
 def _part_boxes(scene: Scene, item: SceneObject) -> Iterator[Aabb]:
