@@ -11,7 +11,7 @@ from embomatrix.factory.scenes.editor import LayoutReason, PlacementError
 from embomatrix.factory.scenes.floor import box_at
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.geometry import Pose
+from embomatrix.world.geometry import IDENTITY, Pose
 from embomatrix.world.scene import Doorway
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class Hanger:
     def under_ceiling(self, asset: Asset) -> Pose:
         """Return a pose under the ceiling, near the room's centre first. Reach is not required. Raise PlacementError."""
         (cx, cy), (sx, sy) = self._room.center_m, self._room.size_m
-        z = WALL_HEIGHT_M - GAP_M - bounds_of(asset).box(Pose((0.0, 0.0, 0.0))).high_m[2]
+        z = WALL_HEIGHT_M - GAP_M - bounds_of(asset).box(IDENTITY).high_m[2]
         for number in range(TRIES):
             spread = 0.4 * number / TRIES
             x, y = self._rng.uniform(-spread, spread, 2)

@@ -14,7 +14,7 @@ from embomatrix.sim.bullet.visual_scene import VisualScene
 from embomatrix.sim.geometry.bounds import AssetBounds
 from embomatrix.sim.state.relations import Relations
 from embomatrix.world.catalog import Catalog
-from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.geometry import IDENTITY, Aabb, Pose
 from embomatrix.world.scene import RobotStart, Room, Scene, SceneObject
 from embomatrix.world.state import Relation, State
 
@@ -164,7 +164,7 @@ def _at(panel: RelationPicture, assets: Mapping[str, Asset]) -> Vec3:
 
 def _standing(asset: Asset, at_m: Vec3) -> Pose:
     x, y, z = at_m
-    return Pose((x, y, z - AssetBounds(asset).box(Pose((0.0, 0.0, 0.0))).low_m[2]))
+    return Pose((x, y, z - AssetBounds(asset).box(IDENTITY).low_m[2]))
 
 
 def _drawn(panel: RelationPicture) -> Image.Image:

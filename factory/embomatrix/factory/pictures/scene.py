@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from embomatrix.factory.pictures.labels import Box
+    from embomatrix.world.geometry import Aabb
     from embomatrix.world.scene import Scene, SceneObject
 
 _MARGIN_PX: Final = 15
