@@ -13,7 +13,15 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.importers.model import AxisConvention, Mesh, ModelFileError, Motion, RawLink, RawModel
+from embomatrix.factory.importers.model import (
+    AxisConvention,
+    Mesh,
+    ModelFileError,
+    Motion,
+    RawLink,
+    RawModel,
+    triple,
+)
 from embomatrix.world.asset import JointKind
 
 if TYPE_CHECKING:
@@ -67,7 +75,7 @@ def _turn(rod: Mesh, meshes: Iterable[Mesh], frame: AxisConvention) -> Motion:
     arm = (low + high) / 2 - origin
     swung = np.cross(axis, arm)  # initial direction of a positive turn
     sign = 1.0 if swung[FORWARD[frame]] >= 0 else -1.0
-    return Motion(JointKind.REVOLUTE, _triple(origin), _triple(sign * axis), math.pi / 2)
+    return Motion(JointKind.REVOLUTE, triple(origin), triple(sign * axis), math.pi / 2)
 
 
 def _slide(rod: Mesh, meshes: Iterable[Mesh], frame: AxisConvention) -> Motion:
@@ -77,7 +85,7 @@ def _slide(rod: Mesh, meshes: Iterable[Mesh], frame: AxisConvention) -> Motion:
     along = int(np.argmax(np.abs(axis)))
     sign = 1.0 if along == FORWARD[frame] or origin[along] >= (low + high)[along] / 2 else -1.0
     travel = TRAVEL_SHARE * float(high[along] - low[along])
-    return Motion(JointKind.PRISMATIC, _triple((low + high) / 2), _triple(sign * axis), travel)
+    return Motion(JointKind.PRISMATIC, triple((low + high) / 2), triple(sign * axis), travel)
 
 
 def _line(rod: Mesh) -> tuple[FloatArray, FloatArray]:
@@ -91,8 +99,3 @@ def _line(rod: Mesh) -> tuple[FloatArray, FloatArray]:
 def _box(meshes: Iterable[Mesh]) -> tuple[FloatArray, FloatArray]:
     points = np.vstack([mesh.vertices for mesh in meshes])
     return points.min(axis=0), points.max(axis=0)
-
-
-def _triple(values: FloatArray) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return (x, y, z)

@@ -83,6 +83,12 @@ class RawModel:
     frame: AxisConvention
 
 
+def triple(values: FloatArray) -> tuple[float, float, float]:
+    """Return an array of shape (3,) as a tuple."""
+    x, y, z = (float(value) for value in values)
+    return (x, y, z)
+
+
 def read_bytes(path: Path) -> bytes:
     """Return the file's content. Raises ModelFileError if it is missing, unreadable, empty or larger than 64 MiB."""
     try:

@@ -24,6 +24,7 @@ from embomatrix.factory.importers.model import (
     RawLink,
     RawModel,
     read_bytes,
+    triple,
 )
 from embomatrix.world.asset import JointKind
 
@@ -138,7 +139,7 @@ def _gathered(
                     )
                 meshes[name] = []
                 axis = frames[name][:3, :3] @ joint.axis
-                motions[name] = Motion(joint.kind, _triple(frames[name][:3, 3]), _triple(axis), joint.upper)
+                motions[name] = Motion(joint.kind, triple(frames[name][:3, 3]), triple(axis), joint.upper)
         meshes[owner[name]].extend(_shapes(elements[name], frames[name], folder))
     empty = [name for name, found in meshes.items() if not found]
     if empty:
@@ -273,8 +274,3 @@ def _extents(shape: ET.Element, key: str, name: str, *, count: int = 1) -> tuple
             f"{name!r}: {key} is {shape.get(key, '')[:40]!r}, expected metres above 0, at most {MAX_EXTENT_M:g}"
         )
     return values
-
-
-def _triple(values: FloatArray) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return (x, y, z)
