@@ -1,3 +1,3 @@
-"""Fixtures of the unit tests of this package."""
+"""Scenes of the factory's unit tests, for the integration tests of this folder."""
 
 from tests.unit.factory.conftest import flat, home  # noqa: F401

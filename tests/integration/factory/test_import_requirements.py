@@ -35,8 +35,8 @@ BOXES = """(define (problem p) (:domain igibson)
 CARTON = Addition("carton", "carton.n.02", None, "", "kitchen_0")
 
 
-def model_of(demand: Requirement, addition: Addition = CARTON):
-    return models_for(addition, np.random.default_rng(0), demand)[0]
+def model_of(requirement: Requirement, addition: Addition = CARTON):
+    return models_for(addition, np.random.default_rng(0), requirement)[0]
 
 
 def asset_of(model):
@@ -44,15 +44,15 @@ def asset_of(model):
 
 
 def test_contents_are_shared_among_containers_and_static_objects_are_not_carried() -> None:
-    demands = requirements_of(parse_problem(BOXES))
+    requirements = requirements_of(parse_problem(BOXES))
     on_floor = (Relation.ONTOP, "floor.n.01_1")
-    assert requirement_on(demands, "carton.n.02_1", "carton.n.02") == Requirement(
+    assert requirement_on(requirements, "carton.n.02_1", "carton.n.02") == Requirement(
         bears=True, contents=("book.n.02",) * 2, places=(on_floor,)
     )
-    assert requirement_on(demands, "book.n.02_1", "book.n.02") == Requirement(
+    assert requirement_on(requirements, "book.n.02_1", "book.n.02") == Requirement(
         carried=True, places=((Relation.ONTOP, "table.n.02_1"), (Relation.INSIDE, "carton.n.02_1"))
     )
-    assert requirement_on(demands, "table.n.02_1", "table.n.02") == Requirement(
+    assert requirement_on(requirements, "table.n.02_1", "table.n.02") == Requirement(
         bears=True, burden=("book.n.02",) * 3
     )
 
@@ -62,9 +62,11 @@ def test_negated_places_require_carrying_but_no_space() -> None:
         (:objects book.n.02_1 - book.n.02 carton.n.02_1 - carton.n.02 table.n.02_1 - table.n.02)
         (:init (ontop book.n.02_1 table.n.02_1) (inroom table.n.02_1 kitchen))
         (:goal (and (not (ontop book.n.02_1 table.n.02_1)) (not (inside book.n.02_1 carton.n.02_1)))))"""
-    demands = requirements_of(parse_problem(text))
-    assert demands["book.n.02_1"] == Requirement(carried=True, places=((Relation.ONTOP, "table.n.02_1"),))
-    assert demands["carton.n.02_1"] == Requirement()
+    requirements = requirements_of(parse_problem(text))
+    assert requirements["book.n.02_1"] == Requirement(
+        carried=True, places=((Relation.ONTOP, "table.n.02_1"),)
+    )
+    assert requirements["carton.n.02_1"] == Requirement()
 
 
 def test_container_has_floor_for_all_contents() -> None:

@@ -25,12 +25,12 @@ CATALOG = Catalog.load()
 
 
 def chosen(
-    categories: dict[str, str], demands: dict[str, Requirement], *, compact: bool = False
+    categories: dict[str, str], requirements: dict[str, Requirement], *, compact: bool = False
 ) -> dict[str, list[Model]]:
     """Return models for objects of some categories, all of them additions."""
     orders = {name: CATALOG.models_of(category) for name, category in categories.items()}
     additions = [Addition(name, "", None, "", "") for name in categories]
-    wanted = {name: demands.get(name, Requirement()) for name in categories}
+    wanted = {name: requirements.get(name, Requirement()) for name in categories}
     return with_sizes(orders, additions, wanted, {}, compact=compact)
 
 
@@ -56,8 +56,8 @@ def test_graspable_object_keeps_its_size_and_others_are_scaled_down() -> None:
 
 
 def test_carried_container_is_portable_even_without_space_for_all_contents() -> None:
-    demand = Requirement(bears=True, carried=True, contents=("hardback.n.01",) * 40)
-    assert is_portable(asset_of(chosen({"backpack": "backpack"}, {"backpack": demand})["backpack"][0]))
+    requirement = Requirement(bears=True, carried=True, contents=("hardback.n.01",) * 40)
+    assert is_portable(asset_of(chosen({"backpack": "backpack"}, {"backpack": requirement})["backpack"][0]))
 
 
 def test_uncarried_object_keeps_its_size() -> None:
@@ -80,12 +80,12 @@ def test_sausage_fits_into_its_box() -> None:
 
 
 def test_bag_is_scaled_up_for_its_contents() -> None:
-    demand = Requirement(bears=True, contents=("bag__of__brown_rice.n.01",))
+    requirement = Requirement(bears=True, contents=("bag__of__brown_rice.n.01",))
     found = chosen({"bag": "paper_bag"}, {"bag": Requirement(bears=True)})
     assert found["bag"][0].share == 1
     grown = chosen({"bag": "shopping_basket"}, {"bag": Requirement(bears=True, contents=("belt.n.02",))})
     assert grown["bag"][0].share > 1
-    assert chosen({"bag": "paper_bag"}, {"bag": demand})["bag"][0] in CATALOG.models_of("paper_bag"), (
+    assert chosen({"bag": "paper_bag"}, {"bag": requirement})["bag"][0] in CATALOG.models_of("paper_bag"), (
         "a predicate that no share can satisfy changes nothing"
     )
 
@@ -94,8 +94,8 @@ def test_bag_is_scaled_up_for_its_contents() -> None:
 def test_objects_sharing_a_host_have_more_space_in_a_compact_layout(relation: Relation) -> None:
     names = [f"book_{number}" for number in range(24)]
     types = ("hardback.n.01",) * len(names)
-    demands = {name: Requirement(carried=True, places=((relation, "host"),)) for name in names}
-    demands["host"] = (
+    requirements = {name: Requirement(carried=True, places=((relation, "host"),)) for name in names}
+    requirements["host"] = (
         Requirement(bears=True, contents=types)
         if relation is Relation.INSIDE
         else Requirement(bears=True, burden=types)
@@ -107,4 +107,4 @@ def test_objects_sharing_a_host_have_more_space_in_a_compact_layout(relation: Re
         floor_m2 = sum(math.prod(each.size_m) for each in surfaces_for(asset_of(found["host"][0]), relation))
         return sum(math.prod(found[name][0].size_m[:2]) for name in names) / floor_m2
 
-    assert filled(chosen(categories, demands, compact=True)) < filled(chosen(categories, demands))
+    assert filled(chosen(categories, requirements, compact=True)) < filled(chosen(categories, requirements))

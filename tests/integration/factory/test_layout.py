@@ -183,10 +183,10 @@ def test_wall_object_hangs_within_the_robots_reach(home):
 
 
 def test_brief_round_trips_through_its_interface():
-    door = LAYOUT_AGENTS[AgentName.ORGANIZER]
+    interface = LAYOUT_AGENTS[AgentName.ORGANIZER]
     brief = RoomBrief(KITCHEN, (TABLE, FRIDGE), (PLATE,))
-    assert door.read(door.brief.dump_json(brief).decode()) == brief
-    assert json.loads(door.to_json(door.rules(brief)))[-1]["child"] == "plate_1"
+    assert interface.read(interface.brief.dump_json(brief).decode()) == brief
+    assert json.loads(interface.to_json(interface.rules(brief)))[-1]["child"] == "plate_1"
 
 
 def organized(*script: object, failure_limit: FailureLimit | None = None) -> tuple[LayoutTree, ChatServer]:
