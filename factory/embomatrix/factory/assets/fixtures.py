@@ -204,11 +204,11 @@ def sliding_door(size_m: Vec3) -> Body:
 def garage_door(size_m: Vec3) -> Body:
     """A frame with a panel in front of it that slides up."""
     outer = centred(size_m)
-    leaf_m = min(0.06, 0.4 * size_m[0])
+    panel_m = min(0.06, 0.4 * size_m[0])
     x1 = outer.high_m[0]
-    body, gap = _frame(Aabb(outer.low_m, (x1 - leaf_m, *outer.high_m[1:])))
-    leaf = Aabb((x1 - leaf_m + FIT_M, outer.low_m[1], outer.low_m[2] + FIT_M), outer.high_m)
-    body.moving.append(sliding("leaf", leaf, (0.0, 0.0, 1.0), 0.9 * gap.size_m[2]))
+    body, gap = _frame(Aabb(outer.low_m, (x1 - panel_m, *outer.high_m[1:])))
+    panel = Aabb((x1 - panel_m + FIT_M, outer.low_m[1], outer.low_m[2] + FIT_M), outer.high_m)
+    body.moving.append(sliding("leaf", panel, (0.0, 0.0, 1.0), 0.9 * gap.size_m[2]))
     return body
 
 
