@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Final
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from embomatrix.factory.social.prompts import (
     CAST_SYSTEM,
@@ -24,7 +24,7 @@ from embomatrix.factory.social.prompts import (
     answer_schema,
 )
 from embomatrix.factory.social.requests import TaskRequest, check_request
-from embomatrix.factory.social.values import ROBOT, Act, Cast, Conversation, DialogueTurn
+from embomatrix.factory.social.values import ROBOT, Act, Cast, Conversation, DialogueTurn, StrictModel
 from embomatrix.llm.structured import ask
 from embomatrix.llm.values import ChatRequest, Message, Speaker
 
@@ -42,18 +42,14 @@ SUMMARY: Final = "summarization agent"
 """Purposes of the requests, for ledgers and errors."""
 
 
-class RoomSighting(BaseModel):
+class RoomSighting(StrictModel):
     """Description of each room by a vision model."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     rooms: dict[str, Annotated[str, Field(min_length=10, max_length=300, pattern=r"^[^\n<>]*$")]]
 
 
-class ConversationAnswer(BaseModel):
+class ConversationAnswer(StrictModel):
     """Conversation as written by the model."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     turns: tuple[DialogueTurn, ...] = Field(min_length=4, max_length=14)
     first_wish: str = Field(min_length=3, max_length=200)

@@ -11,7 +11,9 @@ from enum import StrEnum
 from importlib import resources
 from typing import TYPE_CHECKING, Final
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import Field, TypeAdapter
+
+from embomatrix.factory.social.values import StrictModel
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -45,13 +47,11 @@ SERVED: Final = frozenset({"guest", "regular guest", "customer", "visitor", "spe
 """Jobs of people who are guests of a place. They do no staff activities."""
 
 
-class Occasion(BaseModel):
+class Occasion(StrictModel):
     """Activity, as a phrase that follows "is". ``why`` lists clauses with a reason for needing help.
 
     ``ages`` limits the people; ``staff`` excludes guests.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     hour: int = Field(ge=0, le=23)
     doing: str = Field(min_length=3)

@@ -5,8 +5,9 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from embomatrix.factory.social.values import StrictModel
 from embomatrix.factory.writer.goals import GoalConjunct
 from embomatrix.world.goal import Atom, Formula, Not
 from embomatrix.world.state import Relation
@@ -31,10 +32,8 @@ PLACED: Final = frozenset({RequestPredicate.ONTOP, RequestPredicate.INSIDE})
 THERMAL: Final = frozenset({RequestPredicate.COOKED, RequestPredicate.HOT, RequestPredicate.FROZEN})
 
 
-class RequestedAtom(BaseModel):
+class RequestedAtom(StrictModel):
     """Requested atom. ``place`` is the host of a relation. ``holds`` is false for closed or switched off."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     predicate: RequestPredicate
     thing: str
@@ -42,10 +41,8 @@ class RequestedAtom(BaseModel):
     holds: bool = True
 
 
-class TaskRequest(BaseModel):
+class TaskRequest(StrictModel):
     """Instruction with its requested atoms."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     instruction: str = Field(min_length=10, max_length=400)
     wishes: tuple[RequestedAtom, ...] = Field(min_length=1, max_length=6)

@@ -12,11 +12,13 @@ ROBOT = "robot"
 """Speaker name of the robot."""
 
 
-class _Value(BaseModel):
+class StrictModel(BaseModel):
+    """Frozen value that rejects unknown fields."""
+
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class Person(_Value):
+class Person(StrictModel):
     """Member of a cast.
 
     ``ties`` maps other people to this person's relation to them: {"Mia": "mother"}. ``rooms`` are their own rooms.
@@ -30,7 +32,7 @@ class Person(_Value):
     ties: dict[str, str] = Field(default_factory=dict)
 
 
-class DaySlot(_Value):
+class DaySlot(StrictModel):
     """Activity of a cast member at a time and place."""
 
     time: str = Field(pattern=r"^([01]\d|2[0-3]):[0-5]\d$")
@@ -39,7 +41,7 @@ class DaySlot(_Value):
     activity: str = Field(min_length=3, max_length=120)
 
 
-class Cast(_Value):
+class Cast(StrictModel):
     """People of a scene, and their schedule."""
 
     setting: str = Field(min_length=1, max_length=120)
@@ -93,13 +95,13 @@ class Act(StrEnum):
     CONFIRM = "confirm"  # the robot confirms the request
 
 
-class DialogueTurn(_Value):
+class DialogueTurn(StrictModel):
     speaker: str
     act: Act
     text: str
 
 
-class Conversation(_Value):
+class Conversation(StrictModel):
     """Dialogue about one request. ``first_wish`` and ``last_wishes`` show its change, clause by clause."""
 
     slot: DaySlot
@@ -121,14 +123,14 @@ class Conversation(_Value):
         return self.last_wishes != (self.first_wish,)
 
 
-class SceneBrief(_Value):
+class SceneBrief(StrictModel):
     """Brief with the name of a base scene."""
 
     scene: str
     seed: int = 0
 
 
-class TalkBrief(_Value):
+class TalkBrief(StrictModel):
     """Brief of a conversation: cast, and category of the request."""
 
     scene: str
@@ -137,7 +139,7 @@ class TalkBrief(_Value):
     seed: int = 0
 
 
-class SummaryBrief(_Value):
+class SummaryBrief(StrictModel):
     """Brief of a summary: cast and conversation."""
 
     scene: str
@@ -146,7 +148,7 @@ class SummaryBrief(_Value):
     seed: int = 0
 
 
-class RequestSummary(_Value):
+class RequestSummary(StrictModel):
     """Instruction with its requested atoms, as clauses of the conversation or as JSON of a model."""
 
     instruction: str
