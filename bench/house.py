@@ -4,8 +4,6 @@
 `python bench/house.py --check-openings` is the check of CI: it lists docstrings that open with a banned word.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import re
@@ -13,13 +11,11 @@ import subprocess
 import sys
 import time
 from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-
-    from embomatrix.pages.figures import Figure
+from embomatrix.pages.figures import Figure
 
 ROOTS: Final = ("core", "manager", "worker", "trainer", "factory", "bench")
 BANNED: Final = re.compile(

@@ -1,11 +1,10 @@
 """`embomatrix bench`: measure this machine, print the figures, write them as JSON and render the page of benchmarks."""
 
-from __future__ import annotations
-
 import time
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -14,7 +13,7 @@ from embomatrix.bench.cluster.flow import FlowSizes, bench_flow
 from embomatrix.bench.cluster.prewarm import PrewarmSizes, bench_prewarm
 from embomatrix.bench.engine.engine import bench_engine
 from embomatrix.bench.engine.plan_writer import save_workload, write_workload
-from embomatrix.bench.engine.workload import PINNED, SIZES, load_workload
+from embomatrix.bench.engine.workload import PINNED, SIZES, Workload, load_workload
 from embomatrix.bench.fidelity.page import figures_of, read_disagreement, replay_trial
 from embomatrix.bench.fidelity.pool import Modes
 from embomatrix.bench.fidelity.suite import (
@@ -34,17 +33,12 @@ from embomatrix.bench.report.figures import (
 )
 from embomatrix.bench.report.output import console, errors, hand_in, refusals, write
 from embomatrix.bench.report.page import check_page, render_page
+from embomatrix.pages.figures import Figure
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.dataset import Dataset
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from embomatrix.bench.engine.workload import Workload
-    from embomatrix.pages.figures import Figure
-
-    OnStep = Callable[[str], None]
+OnStep = Callable[[str], None]
 
 app = typer.Typer(
     no_args_is_help=True,

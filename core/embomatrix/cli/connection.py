@@ -1,12 +1,11 @@
 """Commands that ask a manager: their common options, their client, and how its errors are shown."""
 
-from __future__ import annotations
-
 import asyncio
 import functools
 import inspect
+from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -16,10 +15,6 @@ from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.managers import FAILOVER_S
 from embomatrix.rpc.status import ClusterError
 from embomatrix.rpc.trust import read_ca, read_token
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine
-
 
 Manager = Annotated[str, typer.Option(help="HOST:PORT of the manager.", envvar="EMBOMATRIX_MANAGER")]
 Token = Annotated[

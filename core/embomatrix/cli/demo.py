@@ -1,7 +1,5 @@
 """`embomatrix demo`: dataset, local cluster and training in one command, by the same commands that users run."""
 
-from __future__ import annotations
-
 import itertools
 import logging
 import os

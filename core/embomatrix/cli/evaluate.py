@@ -4,8 +4,6 @@ Answers are stored, so the report can be made again. torch is imported only for 
 engine only without a manager.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import json
@@ -13,10 +11,12 @@ import logging
 import re
 import time
 import tomllib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Any, Final
 
+import numpy as np
 import typer
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from rich.console import Console
@@ -26,11 +26,13 @@ from embomatrix.cli.failure import INTERRUPTED, fail
 from embomatrix.host.limits import usable_cores
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.cluster.executor import Executor
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.eai.exam import CODEC as EAI_CODEC
 from embomatrix.trainer.eai.exam import NAME as NATIVE
 from embomatrix.trainer.eai.exam import NativeExam
 from embomatrix.trainer.evaluation.answer_sources import (
+    AnswerSource,
     EndpointSource,
     PolicySource,
     ScriptSource,
@@ -39,6 +41,7 @@ from embomatrix.trainer.evaluation.answer_sources import (
 from embomatrix.trainer.evaluation.answers import (
     FILE,
     MOST_SAMPLES,
+    Answer,
     AnswerSheet,
     EvaluationSetup,
     check_expected,
@@ -46,24 +49,12 @@ from embomatrix.trainer.evaluation.answers import (
     read_answers,
 )
 from embomatrix.trainer.evaluation.baselines import BaselineName, baseline_for
-from embomatrix.trainer.evaluation.benchmark import find_benchmark
-from embomatrix.trainer.evaluation.exam import WorldExam
+from embomatrix.trainer.evaluation.benchmark import Benchmark, find_benchmark
+from embomatrix.trainer.evaluation.exam import Exam, WorldExam
 from embomatrix.trainer.evaluation.page import evaluation_page
-from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
+from embomatrix.trainer.evaluation.table import ScoreRow, read_row, report_of, text_report
 from embomatrix.world.task import MAX_TABLE, Profile
 from embomatrix.world.whole_file import write_whole
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    import numpy as np
-
-    from embomatrix.trainer.cluster.executor import Executor
-    from embomatrix.trainer.evaluation.answer_sources import AnswerSource
-    from embomatrix.trainer.evaluation.answers import Answer
-    from embomatrix.trainer.evaluation.benchmark import Benchmark
-    from embomatrix.trainer.evaluation.exam import Exam
-    from embomatrix.trainer.evaluation.table import ScoreRow
 
 DEFAULT_BENCH: Final = "build/dataset"
 DEFAULT_OUT: Final = Path("runs/eval")

@@ -1,20 +1,16 @@
 """Failures of commands: one sentence on standard error and an exit status; tracebacks go to a log file."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import logging
 import os
 import tempfile
 import traceback
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NoReturn
+from typing import Final, NoReturn
 
 from rich.console import Console
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 logger = logging.getLogger(__name__)
 

@@ -1,21 +1,17 @@
 """Local cluster: a supervised manager and workers on loopback, and other commands run in the foreground beside it."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket
 import subprocess
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 from embomatrix.cli.failure import INTERRUPTED, fail
 from embomatrix.cli.supervisor import ChildSpec, Supervisor, embomatrix_command
 from embomatrix.host.parent import with_this_process
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-    from pathlib import Path
 
 MEMBERSHIP: Final = frozenset({"EMBOMATRIX_MANAGER", "EMBOMATRIX_TOKEN", "EMBOMATRIX_CA", "EMBOMATRIX_JOIN"})
 

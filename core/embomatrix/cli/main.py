@@ -4,24 +4,20 @@ Subcommands are entry points of the group ``embomatrix.commands``: `--help` list
 command whose packages are missing names the extra to install.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import os
 import sys
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
 from embomatrix.cli.failure import fail, shown
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
 
 GROUP: Final = "embomatrix.commands"
 

@@ -4,8 +4,6 @@ A child that exits with ``MENDABLE`` is not restarted: it would fail in the same
 process, even if it is killed.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import signal
@@ -13,15 +11,13 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, Self
+from pathlib import Path
+from typing import Final, Self
 
 from embomatrix.cli.failure import MENDABLE
 from embomatrix.host.parent import with_this_process
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
 
 logger = logging.getLogger(__name__)
 

@@ -1,32 +1,23 @@
 """Episodes in this process: a simulator and the reward, without a cluster."""
 
-from __future__ import annotations
-
 import contextlib
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Self
+from pathlib import Path
+from typing import Final, Self
 
+from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import score
-from embomatrix.reward.settings import PAPER
+from embomatrix.reward.settings import PAPER, RewardSettings
+from embomatrix.sim.executor import Simulator
 from embomatrix.sim.simulation import load_simulator
-from embomatrix.skills.prompt import Codec, prompt_for, situation_of
-from embomatrix.skills.syntax import MAX_STEPS
-from embomatrix.world.dataset import Dataset
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from embomatrix.reward.breakdown import RewardBreakdown
-    from embomatrix.reward.settings import RewardSettings
-    from embomatrix.sim.executor import Simulator
-    from embomatrix.skills.prompt import Prompt, Situation
-    from embomatrix.skills.syntax import Plan, SkillCall
-    from embomatrix.skills.trace import Step, Trace
-    from embomatrix.world.bundle import Bundle
-    from embomatrix.world.dataset import TaskRecord
-    from embomatrix.world.task import Task
+from embomatrix.skills.prompt import Codec, Prompt, Situation, prompt_for, situation_of
+from embomatrix.skills.syntax import MAX_STEPS, Plan, SkillCall
+from embomatrix.skills.trace import Step, Trace
+from embomatrix.world.bundle import Bundle
+from embomatrix.world.dataset import Dataset, TaskRecord
+from embomatrix.world.task import Task
 
 SCENES_KEPT: Final = 4
 """Simulators kept for the next task of their scene, about 100 MB each."""

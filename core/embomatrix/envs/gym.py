@@ -3,26 +3,20 @@
 Needs ``gymnasium``, which no other module needs.
 """
 
-from __future__ import annotations
-
 import math
 import string
-from typing import TYPE_CHECKING, Any, Final, SupportsFloat
+from pathlib import Path
+from typing import Any, Final, SupportsFloat
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from embomatrix.envs.episode import Household
+from embomatrix.envs.episode import Episode, EpisodeStep, Household
 from embomatrix.skills.limits import ROBOT
 from embomatrix.skills.syntax import PROFILES, SIGNATURES, Arg, PlaceRelation, SkillCall
 from embomatrix.world.dataset import SPLITS, DatasetError
 from embomatrix.world.task import MAX_TABLE, Profile
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from embomatrix.envs.episode import Episode, EpisodeStep
 
 SKILLS: Final = PROFILES[Profile.HOUSEHOLD]
 RELATIONS: Final = tuple(PlaceRelation)

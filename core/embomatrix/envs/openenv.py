@@ -3,25 +3,19 @@
 Needs ``openenv``, which no other module needs. ``uvicorn.run(server("build/dataset"))`` serves it.
 """
 
-from __future__ import annotations
-
 import functools
 import uuid
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from openenv.core.env_server.http_server import create_app
 from openenv.core.env_server.interfaces import Environment
 from openenv.core.env_server.types import Action, Observation, State
 
-from embomatrix.envs.episode import Household
+from embomatrix.envs.episode import Episode, Household
 from embomatrix.reward.settings import PAPER
 from embomatrix.skills.parse import PlanError, parse_plan
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from embomatrix.envs.episode import Episode
 
 SESSIONS: Final = 4
 """Concurrent episodes. Each has its own simulators, about 100 MB per scene."""

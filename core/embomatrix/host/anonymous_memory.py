@@ -1,7 +1,5 @@
 """Anonymous memory that processes share by passing a file descriptor. It is freed with its last descriptor."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 

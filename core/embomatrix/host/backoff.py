@@ -1,12 +1,7 @@
 """Exponential backoff between retries, with jitter so that many clients do not return at the same moment."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 def _no_jitter() -> float:

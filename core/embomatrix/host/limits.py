@@ -4,16 +4,12 @@ The files are those of version 2, and of version 1 for the processor and memory 
 cgroup-v2.rst and cgroup-v1/.
 """
 
-from __future__ import annotations
-
 import math
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from typing import Final
 
 MOUNT: Final = Path("/sys/fs/cgroup")
 MEMBERSHIP: Final = Path("/proc/self/cgroup")

@@ -1,16 +1,12 @@
 """Child processes that end with their parent."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import os
 import signal
 import sys
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
+from collections.abc import Callable
+from typing import Final
 
 _PR_SET_PDEATHSIG: Final = 1
 

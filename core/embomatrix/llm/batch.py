@@ -1,14 +1,10 @@
 """Support for synchronous code that asks a model many questions: one event loop, and a limit of unanswered questions."""
 
-from __future__ import annotations
-
 import asyncio
-from typing import TYPE_CHECKING, Final, Self
+from contextlib import AbstractAsyncContextManager
+from typing import Final, Self
 
-if TYPE_CHECKING:
-    from contextlib import AbstractAsyncContextManager
-
-    from embomatrix.llm.values import EndpointError
+from embomatrix.llm.values import EndpointError
 
 MOST_UNANSWERED: Final = 3
 """Consecutive questions without an answer, each retried, after which an endpoint counts as dead."""

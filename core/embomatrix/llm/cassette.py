@@ -1,20 +1,14 @@
 """Cassette: recorded answers of a model, so that a run can be repeated without the model."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections import Counter
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from embomatrix.llm.ledger import append_line
-from embomatrix.llm.values import CassetteError, Reply, Usage
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from embomatrix.llm.values import ChatModel, ChatRequest
+from embomatrix.llm.values import CassetteError, ChatModel, ChatRequest, Reply, Usage
 
 
 class CassetteMode(StrEnum):

@@ -11,15 +11,12 @@ import json
 import random
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import Any, Final, Self
 
 import httpx
 
 from embomatrix.host.backoff import Backoff
-from embomatrix.llm.values import EndpointError, Reply, Usage
-
-if TYPE_CHECKING:
-    from embomatrix.llm.values import ChatRequest, Message
+from embomatrix.llm.values import ChatRequest, EndpointError, Message, Reply, Usage
 
 RETRIED: Final = frozenset({408, 425, 429, 500, 502, 503, 504})
 """Statuses that are worth a retry."""

@@ -1,18 +1,11 @@
 """Ledger of model use by purpose: calls, tokens, seconds and money."""
 
-from __future__ import annotations
-
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
-from embomatrix.llm.values import LlmError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from embomatrix.llm.values import ChatModel, ChatRequest, Reply
+from embomatrix.llm.values import ChatModel, ChatRequest, LlmError, Reply
 
 MILLION = 1_000_000
 

@@ -1,20 +1,14 @@
 """Typed answers: a reply is read as JSON and validated; the model is asked again with the error. Text is never evaluated."""
 
-from __future__ import annotations
-
 import json
 import re
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from embomatrix.llm.values import Message, Speaker, UnusableReplyError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from embomatrix.llm.values import ChatModel, ChatRequest, Reply
+from embomatrix.llm.values import ChatModel, ChatRequest, Message, Reply, Speaker, UnusableReplyError
 
 T = TypeVar("T", bound=BaseModel)
 

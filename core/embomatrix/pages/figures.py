@@ -1,14 +1,9 @@
 """Figures of benchmarks and evaluations: a value, its number of measurements, and its goal."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
+from typing import Any, Final
 
 _DIGITS: Final = 3
 _MOST_DIGITS: Final = 6

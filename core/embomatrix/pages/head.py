@@ -1,7 +1,5 @@
 """Shared HTML head of self-contained pages: colours for light and dark themes, and table styles."""
 
-from __future__ import annotations
-
 import html
 import string
 from importlib.resources import files

@@ -1,16 +1,12 @@
 """Plan view of a scene as SVG: rooms and furniture from above, north up."""
 
-from __future__ import annotations
-
+from collections.abc import Collection, Iterable, Sequence
 from html import escape
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Sequence
-
-    from embomatrix.world.scene import Scene
+from embomatrix.world.scene import Scene
 
 OVERHEAD_M: Final = 1.6
 """Objects that begin above this height hang over the robot and are left out."""

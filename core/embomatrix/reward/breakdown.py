@@ -1,7 +1,5 @@
 """Three tiers of a rollout's reward and the atoms behind them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

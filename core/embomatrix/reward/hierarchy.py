@@ -1,16 +1,10 @@
 """Hierarchical reward: format, relevance and goal, with the paper's constants as defaults."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.world.evaluate import evaluate
-
-if TYPE_CHECKING:
-    from embomatrix.world.goal import Facts
-    from embomatrix.world.task import Task
+from embomatrix.world.goal import Facts
+from embomatrix.world.task import Task
 
 
 def score(

@@ -1,7 +1,5 @@
 """Coefficients of the three reward tiers. The defaults are the paper's; a run may change them."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass

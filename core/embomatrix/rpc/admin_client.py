@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.proto.v1 import admin_service_pb2_grpc
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.managers import FAILOVER_S, LeaderClient, of_the_leader
 from embomatrix.rpc.wire.codec import each, inside
-from embomatrix.rpc.wire.run_log import event_page_from_proto, explanation_from_proto, run_summary_from_proto
+from embomatrix.rpc.wire.run_log import (
+    EventPage,
+    RolloutExplanation,
+    RunEvent,
+    RunSummary,
+    event_page_from_proto,
+    explanation_from_proto,
+    run_summary_from_proto,
+)
 from embomatrix.rpc.wire.session import plan_cell_from_proto, run_info_from_proto, worker_info_from_proto
-from embomatrix.rpc.wire.tokens import ROLE_NUMBERS, token_info_from_proto
-from embomatrix.rpc.wire.values import FleetStatus
-
-if TYPE_CHECKING:
-    from embomatrix.rpc.wire.run_log import EventPage, RolloutExplanation, RunEvent, RunSummary
-    from embomatrix.rpc.wire.tokens import AccessRole, TokenInfo
-    from embomatrix.rpc.wire.values import PlanCell, RunInfo, WorkerInfo
+from embomatrix.rpc.wire.tokens import ROLE_NUMBERS, AccessRole, TokenInfo, token_info_from_proto
+from embomatrix.rpc.wire.values import FleetStatus, PlanCell, RunInfo, WorkerInfo
 
 CALL_S: Final = 10.0
 """Default time limit of one call."""

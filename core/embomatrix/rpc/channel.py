@@ -1,17 +1,13 @@
 """gRPC channels to a manager: common options, TLS, and the token on every call."""
 
-from __future__ import annotations
-
 import re
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Callable
+from typing import Any, Final
 
 import grpc
 
 from embomatrix.rpc.logs import hide
 from embomatrix.rpc.status import InvalidRequestError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 DEFAULT_ADDRESS: Final = "127.0.0.1:50070"
 MAX_MESSAGE_BYTES: Final = 32 * 1024 * 1024

@@ -6,8 +6,9 @@ import asyncio
 import contextlib
 import logging
 import time
+from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import grpc
 
@@ -22,6 +23,7 @@ from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.channel import DEFAULT_ADDRESS, chunks_of
 from embomatrix.rpc.managers import FAILOVER_S, of_the_leader
 from embomatrix.rpc.status import (
+    ClusterError,
     DeadlineError,
     InternalError,
     NotFoundError,
@@ -41,22 +43,17 @@ from embomatrix.rpc.wire.run import (
     run_stats_from_proto,
     run_terms_to_proto,
 )
-from embomatrix.rpc.wire.training import training_report_to_proto
-from embomatrix.rpc.wire.values import RolloutResult, RunTerms
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping, Sequence
-
-    from embomatrix.rpc.status import ClusterError
-    from embomatrix.rpc.wire.training import TrainingReport
-    from embomatrix.rpc.wire.values import (
-        Batch,
-        GroupDone,
-        LookaheadAnswer,
-        LookaheadEntry,
-        RunStats,
-        Warmth,
-    )
+from embomatrix.rpc.wire.training import TrainingReport, training_report_to_proto
+from embomatrix.rpc.wire.values import (
+    Batch,
+    GroupDone,
+    LookaheadAnswer,
+    LookaheadEntry,
+    RolloutResult,
+    RunStats,
+    RunTerms,
+    Warmth,
+)
 
 logger = logging.getLogger(__name__)
 

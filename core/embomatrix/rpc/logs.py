@@ -4,8 +4,6 @@ A message names its ids as ``name=%s`` ("lease expired rollout=%s worker=%s"); i
 adds an id to all later lines of a task.
 """
 
-from __future__ import annotations
-
 import contextvars
 import functools
 import json
@@ -13,12 +11,10 @@ import logging
 import re
 import sys
 import time
+from collections.abc import Mapping
 from enum import StrEnum
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Literal
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+from typing import Any, Final, Literal
 
 Id = Literal["run", "batch", "rollout", "lease", "worker", "session", "scene"]
 """Names of ids in log lines."""

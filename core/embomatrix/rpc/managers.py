@@ -1,21 +1,21 @@
 """Connections to the managers of one cluster, of which one leads and the others stand by."""
 
-from __future__ import annotations
-
 import asyncio
 import functools
 import time
-from typing import TYPE_CHECKING, Any, Concatenate, Final, ParamSpec, Self, TypeVar
+from collections.abc import Awaitable, Callable, Coroutine
+from typing import Any, Concatenate, Final, ParamSpec, Self, TypeVar
+
+import grpc
 
 from embomatrix.rpc.channel import DEFAULT_ADDRESS, is_address, open_channel
-from embomatrix.rpc.status import InvalidRequestError, StandbyError, UnavailableError, cluster_errors
-
-if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Coroutine
-
-    import grpc
-
-    from embomatrix.rpc.status import ClusterError
+from embomatrix.rpc.status import (
+    ClusterError,
+    InvalidRequestError,
+    StandbyError,
+    UnavailableError,
+    cluster_errors,
+)
 
 PAUSE_S: Final = 0.2
 """Pause between calls to two managers."""

@@ -1,7 +1,5 @@
 """Label that a trainer sends beside each prompt when it requests rewards over HTTP."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from typing import Annotated, Self
@@ -10,7 +8,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from embomatrix.rpc.status import InvalidRequestError
-from embomatrix.world.task import Profile  # noqa: TC001  # pydantic evaluates the annotations
+from embomatrix.world.task import Profile  # pydantic evaluates the annotations
 
 LARGEST_SEED = 2**31 - 1
 

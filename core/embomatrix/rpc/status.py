@@ -1,18 +1,14 @@
 """Cluster errors and their gRPC status codes, in one table for services and clients."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import re
-from typing import TYPE_CHECKING, Final
+from collections.abc import AsyncIterator, Iterator, Mapping
+from typing import Final
 
 import grpc
 
 from embomatrix.rpc.wire.codec import ConvertError
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator, Mapping
 
 logger = logging.getLogger(__name__)
 

@@ -1,18 +1,12 @@
 """Work intervals of each slot, reconstructed from the arrival times and durations of results."""
 
-from __future__ import annotations
-
 import itertools
 import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-from embomatrix.rpc.wire.run_log import EventKind
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from embomatrix.rpc.wire.run_log import RunEvent
+from embomatrix.rpc.wire.run_log import EventKind, RunEvent
 
 
 class SlotKey(NamedTuple):

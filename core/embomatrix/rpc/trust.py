@@ -1,7 +1,5 @@
 """Certificate authority that a client trusts, and invitations that carry its fingerprint to a new worker."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import hashlib

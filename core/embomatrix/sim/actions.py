@@ -7,27 +7,24 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Final
+
+import numpy as np
 
 from embomatrix.sim.blockers import arm_refusal, path_refusal, placing_refusal, room_refusal
 from embomatrix.sim.household import clean, cut, soak
 from embomatrix.sim.joints.panels import DoorPanels
 from embomatrix.sim.joints.swings import SWING
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.syntax import Skill
-from embomatrix.skills.view import metres, preposition, refuse, target_of
+from embomatrix.skills.syntax import Skill, SkillCall
+from embomatrix.skills.view import SkillRefusal, metres, preposition, refuse, target_of
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import Handling, StandPose
 from embomatrix.world.state import Relation, State
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
-    import numpy as np
-
     from embomatrix.sim.live_world import LiveWorld
-    from embomatrix.skills.syntax import SkillCall
-    from embomatrix.skills.view import SkillRefusal
 
     Action = Callable[[LiveWorld, SkillCall, np.random.Generator], SkillRefusal | None]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -10,17 +11,14 @@ import numpy as np
 from embomatrix.sim.floor.obstacles import WALLS
 from embomatrix.sim.geometry.surfaces import link_frame
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.view import refuse
+from embomatrix.skills.view import SkillRefusal, refuse
+from embomatrix.world.geometry import FloatArray, Vec2
+from embomatrix.world.poses import Handling
+from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from embomatrix.sim.floor.grid import FloorGrid
     from embomatrix.sim.live_world import LiveWorld
-    from embomatrix.skills.view import SkillRefusal
-    from embomatrix.world.geometry import FloatArray, Vec2
-    from embomatrix.world.poses import Handling
-    from embomatrix.world.state import Relation
 
 SAME_M: Final = 1e-6
 RASTER_M: Final = 0.1

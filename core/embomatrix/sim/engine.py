@@ -6,12 +6,11 @@ explicit calls, and ``settle`` simulates a copy of the object's surroundings. Th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from embomatrix.world.geometry import Aabb, Pose
     from embomatrix.world.scene import Scene
 

@@ -1,32 +1,25 @@
 """Execution of plans in a scene: preconditions, actions, effects of heat and water, and the trace."""
 
-from __future__ import annotations
-
 import hashlib
-from typing import TYPE_CHECKING, Protocol
+from collections.abc import Callable, Iterator, Sequence, Set
+from typing import Protocol
 
 import numpy as np
 
 from embomatrix.sim.actions import CachedActor
+from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.live_world import LiveWorld
+from embomatrix.sim.state.facts import EngineFacts
+from embomatrix.sim.state.sources import Change
 from embomatrix.skills.check import check
 from embomatrix.skills.describe import ObjectDescription, done, final_lines, gained
-from embomatrix.skills.syntax import Skill
+from embomatrix.skills.syntax import Plan, Skill, SkillCall
 from embomatrix.skills.trace import Step, Trace
-from embomatrix.skills.view import source_of, target_of
+from embomatrix.skills.view import SkillRefusal, source_of, target_of
+from embomatrix.world.bundle import Bundle
 from embomatrix.world.state import State
 from embomatrix.world.substances import in_words
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence, Set
-
-    from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.state.facts import EngineFacts
-    from embomatrix.sim.state.sources import Change
-    from embomatrix.skills.syntax import Plan, SkillCall
-    from embomatrix.skills.view import SkillRefusal
-    from embomatrix.world.bundle import Bundle
-    from embomatrix.world.task import Task
+from embomatrix.world.task import Task
 
 CHANGING = frozenset(
     {

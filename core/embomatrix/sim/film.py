@@ -8,22 +8,21 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.sim.bullet.robot import Posture
+from embomatrix.skills.syntax import Plan
+from embomatrix.skills.trace import Step
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose
+from embomatrix.world.scene import Scene
+from embomatrix.world.task import Task
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from embomatrix.sim.bullet.robot import Posture
     from embomatrix.sim.executor import Simulator
     from embomatrix.sim.live_world import LiveWorld
-    from embomatrix.skills.syntax import Plan
-    from embomatrix.skills.trace import Step
-    from embomatrix.world.scene import Scene
-    from embomatrix.world.task import Task
 
 FRAMES_PER_S: Final = 8
 DRIVE_M_S: Final = 1.2

@@ -7,25 +7,21 @@ its host. Each piece must come to rest without penetrating anything.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
+from embomatrix.sim.state.supports import Host
 from embomatrix.skills.appliances import coverings, liquids_given, taken_off
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.syntax import PlaceRelation
-from embomatrix.skills.view import preposition, refuse, source_of, target_of
-from embomatrix.world.geometry import Pose
+from embomatrix.skills.syntax import PlaceRelation, SkillCall
+from embomatrix.skills.view import SkillRefusal, preposition, refuse, source_of, target_of
+from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.state import State
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    import numpy as np
-
     from embomatrix.sim.live_world import LiveWorld
-    from embomatrix.sim.state.supports import Host
-    from embomatrix.skills.syntax import SkillCall
-    from embomatrix.skills.view import SkillRefusal
-    from embomatrix.world.geometry import Aabb
 
 CLEARANCE_M: Final = 0.002
 """Gap between pieces, and above the host, when they are put down."""

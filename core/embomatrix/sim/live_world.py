@@ -1,32 +1,24 @@
 """State of a rollout: the engine's scene, the symbolic states, the robot's base and its hand."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
+from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.floor.prepared import PreparedScene, prepared_arrays
 from embomatrix.sim.joints.swings import Swings
 from embomatrix.sim.placing.placement import Placer
 from embomatrix.sim.state.facts import EngineFacts, TrackedSets
 from embomatrix.sim.state.relations import Relations
-from embomatrix.sim.state.sources import ChangeReader, Thermal, Water
+from embomatrix.sim.state.sources import Change, ChangeReader, Thermal, Water
 from embomatrix.skills.appliances import cold_source, heat_source
 from embomatrix.skills.view import ObjectReach
-from embomatrix.world.state import State
+from embomatrix.world.asset import Asset
+from embomatrix.world.bundle import Bundle
+from embomatrix.world.geometry import Pose
+from embomatrix.world.state import State, SubstanceFact
 from embomatrix.world.substances import MEANINGS, facts_of
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence, Set
-
-    from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.state.sources import Change
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.bundle import Bundle
-    from embomatrix.world.geometry import Pose
-    from embomatrix.world.state import SubstanceFact
-    from embomatrix.world.task import Task
+from embomatrix.world.task import Task
 
 SYMBOLIC = frozenset(State) - {State.OPEN} - MEANINGS.keys()
 

@@ -1,20 +1,16 @@
 """Pools of worker processes that end with their parent."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import multiprocessing
 import os
 import signal
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from embomatrix.host.parent import die_with_parent
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
 
 
 class Closes(Protocol):

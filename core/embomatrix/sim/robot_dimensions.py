@@ -8,8 +8,6 @@ first and third joints turn about one line.
 Frames: x along the arm's first axis, y left of it, z up, from the base's centre on the floor.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 BASE_RADIUS_M: Final = 0.25

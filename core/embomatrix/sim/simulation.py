@@ -1,15 +1,8 @@
 """Simulators on PyBullet: joins the executor with a concrete physics engine."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.executor import Simulator
-
-if TYPE_CHECKING:
-    from embomatrix.sim.executor import Actor
-    from embomatrix.world.bundle import Bundle
+from embomatrix.sim.executor import Actor, Simulator
+from embomatrix.world.bundle import Bundle
 
 
 def load_simulator(bundle: Bundle, actor: Actor | None = None) -> Simulator:

@@ -1,21 +1,15 @@
 """Checks of a scene before physics loads it: Bullet silently accepts NaN, unknown ids and a 17th part."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from embomatrix.sim.engine import FLOOR, WALL, EngineError
 from embomatrix.world.asset import Asset, Link
 from embomatrix.world.codec import asset_from_json, asset_to_json
+from embomatrix.world.geometry import Pose
 from embomatrix.world.records import MAX_COORDINATE_M, UNIT_TOLERANCE, SceneInvalidError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.world.geometry import Pose
-    from embomatrix.world.scene import Scene, SceneObject
+from embomatrix.world.scene import Scene, SceneObject
 
 
 def check_scene(scene: Scene) -> None:

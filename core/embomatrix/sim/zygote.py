@@ -5,8 +5,6 @@ memory. A requester passes the child's end of a socket pair, talks to the child 
 stream.
 """
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import json
@@ -16,15 +14,13 @@ import select
 import socket
 import struct
 import sys
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from embomatrix.host.limits import MIB
 from embomatrix.host.parent import die_with_parent
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
 
 _PREFIX: Final = struct.Struct("!II")
 _written: Final = json.JSONEncoder(separators=(",", ":")).encode

@@ -4,11 +4,11 @@ Pure functions of assets and facts, shared by preconditions, both execution mode
 and cold sources are BEHAVIOR-1K's: a temperature in degrees Celsius and three flags.
 """
 
-from __future__ import annotations
-
+from collections.abc import Iterable, Set
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from embomatrix.world.asset import Asset
 from embomatrix.world.state import COOK_C, FREEZE_C, HOT_C, SubstanceFact, SubstanceRelation
 from embomatrix.world.substances import (
     RUNNING,
@@ -19,11 +19,6 @@ from embomatrix.world.substances import (
     removal_need,
     washed_off,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Set
-
-    from embomatrix.world.asset import Asset
 
 CLOTH: Final = "rag.n.01"
 """Tool whose removal rules apply to a cleaning agent that is poured on directly."""

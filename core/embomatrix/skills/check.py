@@ -4,12 +4,12 @@ Both execution modes run these checks before they act, so a skill means the same
 distances, go to the view.
 """
 
-from __future__ import annotations
-
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from embomatrix.skills.appliances import (
+    ThermalSource,
     cold_source,
     cook_temperature_c,
     cooks,
@@ -29,20 +29,13 @@ from embomatrix.skills.appliances import (
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.library import LIBRARY, Precondition
 from embomatrix.skills.limits import ROBOT
-from embomatrix.skills.syntax import PlaceRelation, Skill
-from embomatrix.skills.view import metres, preposition, refuse, source_of, target_of
+from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
+from embomatrix.skills.view import SkillRefusal, WorldView, metres, preposition, refuse, source_of, target_of
+from embomatrix.world.asset import Asset
 from embomatrix.world.state import FREEZE_C, HOT_C
 from embomatrix.world.substances import RUNNING, word_of
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from embomatrix.skills.appliances import ThermalSource
-    from embomatrix.skills.syntax import SkillCall
-    from embomatrix.skills.view import SkillRefusal, WorldView
-    from embomatrix.world.asset import Asset
-
-    Check = Callable[["BoundCall"], SkillRefusal | None]
+Check = Callable[["BoundCall"], SkillRefusal | None]
 
 
 class BoundCall(NamedTuple):

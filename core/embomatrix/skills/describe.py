@@ -1,18 +1,12 @@
 """Observations in words: the effect of a step, and the final state of objects."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from embomatrix.skills.syntax import SIGNATURES, Arg, Skill
+from embomatrix.skills.syntax import SIGNATURES, Arg, Skill, SkillCall
 from embomatrix.skills.view import preposition
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from embomatrix.skills.syntax import SkillCall
 
 MAX_FINAL_LINES: Final = 24
 """Largest number of objects in a final description: more do not fit a prompt."""

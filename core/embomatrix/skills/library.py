@@ -4,17 +4,13 @@ Angles are relative, in radians, counter-clockwise seen from above. ``turn`` add
 and then drives straight. A failed skill changes nothing.
 """
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Skill
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 
 class Precondition(StrEnum):

@@ -1,7 +1,5 @@
 """Limits of the robot: one table for both execution modes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -6,13 +6,12 @@ a model reasons first and answers last. Compact: calls on lines or between semic
 arguments in the order of ``SIGNATURES``. Skills outside the task's profile count as unknown.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re
+from collections.abc import Iterator, Mapping, Sequence
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import Any, Final, cast
 
 from embomatrix.skills.syntax import (
     ALIASES,
@@ -28,9 +27,6 @@ from embomatrix.skills.syntax import (
     SkillCall,
 )
 from embomatrix.world.task import Profile
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
 
 
 class PlanReason(StrEnum):

@@ -13,23 +13,21 @@ A prompt covers the rows of the task's object table and never contains the goal 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.skills.syntax import PROFILES, SIGNATURES, Arg, PlaceRelation, Skill
+from embomatrix.skills.syntax import PROFILES, SIGNATURES, Arg, PlaceRelation, Plan, Skill, SkillCall
 from embomatrix.world.state import OPEN_FRACTION, Relation, State
 from embomatrix.world.substances import MEANINGS, facts_of, in_words
-from embomatrix.world.task import Profile
+from embomatrix.world.task import Profile, Task
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
-
-    from embomatrix.skills.syntax import Plan, SkillCall
     from embomatrix.world.scene import Scene, SceneObject
-    from embomatrix.world.task import Task
 
-    _RowName = Callable[[int | None], str]
+
+_RowName = Callable[[int | None], str]
 
 
 class Codec(StrEnum):

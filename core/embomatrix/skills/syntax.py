@@ -1,15 +1,11 @@
 """Plan language: skills, arguments, profiles and calls."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.world.task import Profile
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 MAX_STEPS: Final = 64
 MAX_PLAN_BYTES: Final = 64 * 1024

@@ -1,13 +1,9 @@
 """Traces: the executed steps of a plan and the state reached, as data that travels with the result."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from embomatrix.skills.failure import FailureReason
-    from embomatrix.skills.syntax import Plan, SkillCall
+from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.syntax import Plan, SkillCall
 
 
 @dataclass(frozen=True, slots=True)

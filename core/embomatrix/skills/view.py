@@ -1,20 +1,14 @@
 """View of the world on which preconditions are checked, and the refusal of a call."""
 
-from __future__ import annotations
-
+from collections.abc import Set
 from dataclasses import dataclass
 from string import Formatter
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.syntax import PlaceRelation
-
-if TYPE_CHECKING:
-    from collections.abc import Set
-
-    from embomatrix.skills.syntax import SkillCall
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.state import SubstanceFact
+from embomatrix.skills.syntax import PlaceRelation, SkillCall
+from embomatrix.world.asset import Asset
+from embomatrix.world.state import SubstanceFact
 
 _FIELDS_AT_FAULT: Final = ("other", "container", "source", "target")
 """Fields of a sentence that name the object at fault, the most specific one first."""

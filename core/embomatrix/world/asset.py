@@ -6,13 +6,12 @@ the width, z up. Parts, joints, supports and interiors are given in this frame w
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
 
 FLOOR_CATEGORY: Final = "floors"

@@ -11,8 +11,9 @@ same type, and a room instance (``closet_0``) as an argument. Every error names 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final, NoReturn
+from typing import Final, NoReturn
 
 from embomatrix.world.evaluate import atoms_of, render
 from embomatrix.world.goal import (
@@ -30,9 +31,6 @@ from embomatrix.world.goal import (
 )
 from embomatrix.world.state import SubstanceRelation
 from embomatrix.world.substances import is_substance
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
 
 _UNARY: Final = (
     "cooked", "frozen", "open", "folded", "unfolded", "toggled_on", "hot", "on_fire", "future", "real", "broken",

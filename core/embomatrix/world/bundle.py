@@ -5,17 +5,18 @@ bounded, so a hostile bundle costs only its transfer. The content is a JSON head
 arrays with the numbers: see ``tables``.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import struct
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from pathlib import Path
+from typing import Annotated, Any, Final
 
 import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 
 from embomatrix.world.codec import scene_of, scene_to_json
 from embomatrix.world.codec_task import poses_of, poses_to_json, task_of, task_to_json
@@ -29,18 +30,11 @@ from embomatrix.world.inflation import (
 )
 from embomatrix.world.poses import PoseCache
 from embomatrix.world.records import PosesJson, Record, SceneInvalidError, SceneJson, TaskJson, decode
+from embomatrix.world.scene import Scene
 from embomatrix.world.tables import Tables, TableWriter
+from embomatrix.world.task import Task
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from embomatrix.world.scene import Scene
-    from embomatrix.world.task import Task
-
-    Arrays = Mapping[str, NDArray[np.generic]]
+Arrays = Mapping[str, NDArray[np.generic]]
 
 FORMAT: Final = 3
 MAGIC: Final = b"EMBX"

@@ -1,8 +1,7 @@
 """Scenes and assets encoded as JSON values and decoded again; ``records`` defines the JSON, ``tables`` the rows of bundles."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Final, TypeVar
 
 import msgspec
 import numpy as np
@@ -16,21 +15,16 @@ from embomatrix.world.records import (
     LinkJson,
     ObjectJson,
     PartJson,
+    PoseNumbers,
     SceneInvalidError,
     SceneJson,
     convert,
 )
 from embomatrix.world.scene import Doorway, RobotStart, Room, Scene, SceneObject, Window
 from embomatrix.world.state import Relation, SubstanceFact
-from embomatrix.world.tables import FLAT_HULL, check_unit, has_volume
+from embomatrix.world.tables import FLAT_HULL, Tables, TableWriter, check_unit, has_volume
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
-
-    from embomatrix.world.records import PoseNumbers
-    from embomatrix.world.tables import Tables, TableWriter
-
-    Json = dict[str, Any]
+Json = dict[str, Any]
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -1,24 +1,18 @@
 """Tasks and pose caches encoded as JSON values and decoded again."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 from embomatrix.world.bddl import BddlError, parse_formula
 from embomatrix.world.evaluate import GoalError, objects_of
 from embomatrix.world.placements import flattened
 from embomatrix.world.poses import PoseCache
-from embomatrix.world.records import SceneInvalidError
+from embomatrix.world.records import PosesJson, SceneInvalidError, TaskJson
+from embomatrix.world.state import Relation
+from embomatrix.world.tables import Tables, TableWriter
 from embomatrix.world.task import Profile, Task
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.world.records import PosesJson, TaskJson
-    from embomatrix.world.state import Relation
-    from embomatrix.world.tables import Tables, TableWriter
-
-    Json = dict[str, Any]
+Json = dict[str, Any]
 
 
 def task_to_json(task: Task) -> Json:

@@ -8,21 +8,17 @@ from __future__ import annotations
 
 import difflib
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
-from embomatrix.world.bundle import decode_bundle
+from embomatrix.world.bundle import Bundle, decode_bundle
 from embomatrix.world.codec_task import task_of, task_to_json
 from embomatrix.world.inflation import DEFAULT_LIMITS, BundleError
 from embomatrix.world.records import Record, SceneInvalidError, TaskJson, convert
+from embomatrix.world.task import Task
 from embomatrix.world.whole_file import read_whole, write_whole
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from embomatrix.world.bundle import Bundle
-    from embomatrix.world.task import Task
 
 TASKS_FILE: Final = "tasks.jsonl"
 BUNDLES_FOLDER: Final = "bundles"

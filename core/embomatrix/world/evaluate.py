@@ -4,16 +4,15 @@ Quantifiers range over ``types``: object names by synset, matched exactly. The s
 tests compare with its evaluator.
 """
 
-from __future__ import annotations
-
 import dataclasses
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Mapping
 
 from embomatrix.world.goal import (
     And,
     Atom,
     Compound,
     Exists,
+    Facts,
     Forall,
     Formula,
     ForN,
@@ -25,12 +24,7 @@ from embomatrix.world.goal import (
 )
 from embomatrix.world.substances import is_substance
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
-    from embomatrix.world.goal import Facts
-
-    Types = Mapping[str, tuple[str, ...]]
+Types = Mapping[str, tuple[str, ...]]
 
 
 class GoalError(ValueError):

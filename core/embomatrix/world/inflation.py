@@ -3,15 +3,11 @@
 Services that only relay bundles need this module alone, without numpy.
 """
 
-from __future__ import annotations
-
 import hashlib
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from typing import Final
 
 _CHUNK: Final = 1 << 20
 """Growth allowed beyond the ratio: small bundles compress best."""

@@ -3,24 +3,16 @@
 An analysis finds thousands of poses and a rollout uses a few: loading a bundle converts none of them.
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from embomatrix.world.geometry import Pose
+from embomatrix.world.geometry import FloatArray, Pose
 from embomatrix.world.poses import PlacementKey
 from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from embomatrix.world.geometry import FloatArray
 
 RELATIONS: Final = tuple(Relation)
 SET_NUMBERS: Final = 5

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+from embomatrix.world.state import Relation
 
+if TYPE_CHECKING:
     from embomatrix.world.geometry import Pose
-    from embomatrix.world.state import Relation
 
 
 @dataclass(frozen=True, slots=True)

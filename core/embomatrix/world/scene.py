@@ -1,21 +1,14 @@
 """Scenes: rooms and placed objects, frozen."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from embomatrix.world.geometry import Aabb
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import ConvexPart, Pose, Vec2, Vec3
-    from embomatrix.world.state import Relation, State, SubstanceFact
+from embomatrix.world.asset import Asset
+from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Vec2, Vec3
+from embomatrix.world.state import Relation, State, SubstanceFact
 
 
 @dataclass(frozen=True, slots=True)

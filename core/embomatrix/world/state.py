@@ -1,7 +1,5 @@
 """Relations and states that a goal can name."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
 

@@ -4,19 +4,15 @@ A substance is named by its synset, ``water.n.06``, in the place of an object's 
 rules of removal are BEHAVIOR-1K's (``data/substances.json.gz``), with one rule of the paper: plain water removes stains.
 """
 
-from __future__ import annotations
-
 import functools
 import gzip
 import json
+from collections.abc import Iterable, Mapping, Set
 from enum import StrEnum
 from importlib import resources
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from embomatrix.world.state import State, SubstanceFact, SubstanceRelation
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Set
 
 Json = Any
 

@@ -3,16 +3,16 @@
 The JSON of a bundle refers to poses and parts by row number. Reading arrays costs a tenth of reading the same numbers as text.
 """
 
-from __future__ import annotations
-
 import math
 import struct
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from embomatrix.world.geometry import ConvexPart, Pose, Shape
+from embomatrix.world.geometry import ConvexPart, FloatArray, Pose, Shape, Vec3
 from embomatrix.world.placements import SET_NUMBERS, Placements
 from embomatrix.world.poses import StandPose
 from embomatrix.world.records import (
@@ -23,14 +23,7 @@ from embomatrix.world.records import (
     SceneInvalidError,
 )
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from embomatrix.world.geometry import FloatArray, Vec3
-
-    Arrays = Mapping[str, NDArray[np.generic]]
+Arrays = Mapping[str, NDArray[np.generic]]
 
 T = TypeVar("T")
 

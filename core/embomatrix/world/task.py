@@ -1,18 +1,13 @@
 """Tasks: an instruction and a goal in a scene, and the table of objects that a plan may name."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.world.evaluate import objects_of, render, scored_atoms
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.world.goal import Formula
+from embomatrix.world.goal import Formula
 
 MAX_TABLE: Final = 60
 """Largest number of rows in a task's object table: more do not fit a prompt."""

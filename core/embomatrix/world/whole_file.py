@@ -1,13 +1,8 @@
 """Atomic writes and bounded reads of files."""
 
-from __future__ import annotations
-
 import errno
 import os
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from pathlib import Path
 
 
 def write_whole(path: Path, data: bytes) -> None:

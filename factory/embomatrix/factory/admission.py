@@ -5,25 +5,19 @@ oracle planner must find a plan that earns full success when it is executed, opt
 physics. A refusal is a value with a reason.
 """
 
-from __future__ import annotations
-
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final, Protocol, TypeVar
+from typing import Final, Protocol, TypeVar
 
 from embomatrix.reward.hierarchy import score
 from embomatrix.sim.planner.oracle import PlanNotFound
+from embomatrix.skills.syntax import Plan
+from embomatrix.skills.trace import Trace
+from embomatrix.world.bddl import InitLiteral
 from embomatrix.world.evaluate import evaluate, render, scored_atoms
-from embomatrix.world.goal import Not
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from embomatrix.skills.syntax import Plan
-    from embomatrix.skills.trace import Trace
-    from embomatrix.world.bddl import InitLiteral
-    from embomatrix.world.goal import Facts
-    from embomatrix.world.task import Task
+from embomatrix.world.goal import Facts, Not
+from embomatrix.world.task import Task
 
 
 class RefusalReason(StrEnum):

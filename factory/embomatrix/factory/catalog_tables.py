@@ -5,8 +5,6 @@ their categories, and the inventories of 51 scenes by room. This script reduces 
 are identical on every run, and adds the notice that the licence requires.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import gzip
@@ -16,12 +14,9 @@ import json
 import re
 import statistics
 from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-
+from typing import Any, Final
 
 Json = Any
 

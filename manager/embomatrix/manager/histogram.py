@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence
+from typing import Final
 
 PER_DECADE: Final = 32
 """Buckets per power of ten. Each is 7.5 % wide, so a quantile at the middle of its bucket has an error of at most 4

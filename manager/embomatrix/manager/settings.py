@@ -1,7 +1,5 @@
 """Settings of the manager, parsed once at the command line. Unknown keys are errors."""
 
-from __future__ import annotations
-
 import ipaddress
 import socket
 from pathlib import Path

@@ -6,42 +6,33 @@ the one before it has its result. Loading takes milliseconds here and most of a 
 twice: as they are, and with a wait at every load.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import tempfile
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
-from embomatrix.bench.cluster.cpu import CpuWatch
-from embomatrix.bench.cluster.load_generator import LoadGenerator, load_generator
-from embomatrix.bench.cluster.prewarm import SlowSteps
+from embomatrix.bench.cluster.cpu import CpuUse, CpuWatch
+from embomatrix.bench.cluster.load_generator import LoadGenerator, Submission, load_generator
+from embomatrix.bench.cluster.prewarm import SlowSteps, Submit
 from embomatrix.bench.cluster.processes import bench_cluster
 from embomatrix.bench.engine.engine import frozen_heap
+from embomatrix.bench.engine.workload import Workload
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.reward.hierarchy import score
+from embomatrix.rpc.wire.values import Rollout
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.floor.prepared import PreparedScene
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.worker.slots.physics import CLIENTS_PER_SCENE
-from embomatrix.world.bundle import decode_bundle
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from embomatrix.bench.cluster.cpu import CpuUse
-    from embomatrix.bench.cluster.load_generator import Submission
-    from embomatrix.bench.cluster.prewarm import Submit
-    from embomatrix.bench.engine.workload import Workload
-    from embomatrix.rpc.wire.values import Rollout
-    from embomatrix.world.bundle import Bundle
+from embomatrix.world.bundle import Bundle, decode_bundle
 
 FULL_GOAL_MS: Final = 2.0
 RATIO_GOAL: Final = 500.0

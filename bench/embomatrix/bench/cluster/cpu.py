@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -13,8 +14,6 @@ import psutil
 from embomatrix.bench.report.figures import BenchError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from embomatrix.bench.cluster.processes import BenchCluster
 
 TRIES: Final = 100

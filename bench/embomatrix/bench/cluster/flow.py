@@ -10,6 +10,7 @@ import asyncio
 import itertools
 import tempfile
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -17,20 +18,23 @@ from typing import TYPE_CHECKING, Final
 import psutil
 
 from embomatrix.bench.cluster.cpu import CpuWatch, cpu_s
-from embomatrix.bench.cluster.load_generator import load_generator
-from embomatrix.bench.cluster.processes import bench_cluster, redis_program, redis_server, running_process
+from embomatrix.bench.cluster.load_generator import LoadGenerator, load_generator
+from embomatrix.bench.cluster.processes import (
+    BenchCluster,
+    RedisServer,
+    bench_cluster,
+    redis_program,
+    redis_server,
+    running_process,
+)
 from embomatrix.bench.report.figures import quantile
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.wire.rollout import rollout_from_proto, rollout_to_proto
+from embomatrix.rpc.wire.values import Rollout
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from embomatrix.bench.cluster.load_generator import LoadGenerator
-    from embomatrix.bench.cluster.processes import BenchCluster, RedisServer
     from embomatrix.bench.engine.workload import Workload
-    from embomatrix.rpc.wire.values import Rollout
 
 MANAGER_GOAL_US: Final = 150.0
 DISPATCH_GOAL_MS: Final = 10.0

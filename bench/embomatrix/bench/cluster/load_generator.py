@@ -7,19 +7,25 @@ import contextlib
 import itertools
 import time
 from collections import Counter
+from collections.abc import AsyncIterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import ClusterError
-from embomatrix.rpc.wire.values import Batch, Completed, LookaheadEntry, Warmth
+from embomatrix.rpc.wire.values import (
+    Batch,
+    Completed,
+    LookaheadEntry,
+    Rollout,
+    RolloutResult,
+    RunStats,
+    Warmth,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Mapping, Sequence
-
     from embomatrix.bench.cluster.processes import BenchCluster
-    from embomatrix.rpc.wire.values import Rollout, RolloutResult, RunStats
 
 POLL_S: Final = 0.005
 COMPLETE_S: Final = 0.5

@@ -9,7 +9,8 @@ from __future__ import annotations
 import asyncio
 import sys
 import time
-from typing import TYPE_CHECKING, Final
+from collections.abc import AsyncIterator, Iterable
+from typing import Final
 
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
@@ -27,12 +28,7 @@ from embomatrix.rpc.wire.values import Completed, Resident, ResidentState, Resou
 from embomatrix.skills.syntax import Skill, SkillCall
 from embomatrix.skills.trace import Step
 from embomatrix.worker.link.membership import Membership
-from embomatrix.worker.link.session import HEARTBEAT_S, register
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterable
-
-    from embomatrix.worker.link.session import Registration
+from embomatrix.worker.link.session import HEARTBEAT_S, Registration, register
 
 EXECUTE_S: Final = 0.0015
 """Reported execution time of every rollout: that of a plan of the pinned workload."""

@@ -5,25 +5,24 @@ from __future__ import annotations
 import asyncio
 import tempfile
 import time
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.bench.cluster.load_generator import LoadGenerator, load_generator
+from embomatrix.bench.cluster.load_generator import LoadGenerator, Submission, load_generator
 from embomatrix.bench.cluster.processes import bench_cluster
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.pages.figures import Better, Figure
+from embomatrix.rpc.wire.values import Rollout, RunStats
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping, Sequence
-
-    from embomatrix.bench.cluster.load_generator import Submission
     from embomatrix.bench.engine.workload import Workload
-    from embomatrix.rpc.wire.values import Rollout, RunStats
 
-    Submit = Callable[[LoadGenerator, Sequence[Rollout]], Awaitable[Submission]]
+
+Submit = Callable[[LoadGenerator, Sequence[Rollout]], Awaitable[Submission]]
 
 HITS_GOAL: Final = 0.95
 START_GOAL: Final = 0.05

@@ -1,7 +1,5 @@
 """Processes of a benchmark: a manager and workers on loopback, a redis-server, and any program with a log."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import importlib.util
@@ -11,18 +9,16 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import psutil
 
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.cli.local_cluster import free_port
 from embomatrix.host.parent import with_this_process
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 GRACE_S: Final = 10.0
 """Time for a process to leave before it is killed."""

@@ -3,11 +3,11 @@
 Every simulation checks the manager's invariants and ends the benchmark if one breaks.
 """
 
-from __future__ import annotations
-
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from embomatrix.manager.simulation.report import Report
 from embomatrix.manager.simulation.run import simulate
 from embomatrix.manager.simulation.scenario import (
     INTERNET,
@@ -20,11 +20,6 @@ from embomatrix.manager.simulation.scenario import (
     Trainer,
 )
 from embomatrix.pages.figures import Better, Figure
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
-    from embomatrix.manager.simulation.report import Report
 
 GROUP: Final = 16
 USUAL_WORKERS: Final = 100

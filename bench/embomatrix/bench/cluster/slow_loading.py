@@ -4,21 +4,16 @@
 simulator by ``… simulator SECONDS FD PARENT``.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import signal
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from embomatrix.worker.slots.physics import Physics
+from embomatrix.worker.slots.physics import Physics, PhysicsScene
 from embomatrix.worker.slots.slot_program import run_program
-
-if TYPE_CHECKING:
-    from embomatrix.worker.slots.physics import PhysicsScene
 
 
 class SlowPhysics(Physics):

@@ -5,39 +5,31 @@ executed once, so no rollout reuses what an earlier one computed. Scenes have co
 announced scenes of a worker have.
 """
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import time
 from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from embomatrix.bench.engine.slots import SlotSample, measure_slots
-from embomatrix.bench.engine.workload import SIZES
+from embomatrix.bench.engine.workload import SIZES, Execution, SceneWork, Workload
 from embomatrix.bench.report.figures import BenchError, quantile, quantile_figure
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.reward.hierarchy import score
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.engine import NOTHING, SETTLE_STEPS
+from embomatrix.sim.engine import NOTHING, SETTLE_STEPS, Settled
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.floor.prepared import PreparedScene
 from embomatrix.sim.placing.pose_cache import PlacementLibrary, analyse_scene
 from embomatrix.sim.zygote import resident_mb
 from embomatrix.skills.syntax import Skill
 from embomatrix.worker.slots.physics import CLIENTS_PER_SCENE
-from embomatrix.world.bundle import decode_bundle
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
-    from embomatrix.bench.engine.workload import Execution, SceneWork, Workload
-    from embomatrix.sim.engine import Settled
-    from embomatrix.world.bundle import Bundle
+from embomatrix.world.bundle import Bundle, decode_bundle
 
 GOALS: Final = {
     "cold_load_ms": 25.0,

@@ -3,12 +3,12 @@
 A plan carries two objects to other places and opens one door, which makes five moves. All plans of a workload differ.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
+from collections.abc import Callable, Iterator, Sequence
 from itertools import cycle
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -22,20 +22,13 @@ from embomatrix.bench.engine.workload import (
     workload_to_text,
 )
 from embomatrix.bench.report.figures import BenchError
+from embomatrix.sim.executor import Simulator
 from embomatrix.sim.simulation import load_simulator
-from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
-from embomatrix.world.dataset import write_dataset
+from embomatrix.skills.syntax import PlaceRelation, Plan, Skill, SkillCall
+from embomatrix.world.bundle import Bundle
+from embomatrix.world.dataset import Dataset, write_dataset
+from embomatrix.world.task import Task
 from embomatrix.world.whole_file import write_whole
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-    from pathlib import Path
-
-    from embomatrix.sim.executor import Simulator
-    from embomatrix.skills.syntax import Plan
-    from embomatrix.world.bundle import Bundle
-    from embomatrix.world.dataset import Dataset
-    from embomatrix.world.task import Task
 
 OTHER_SCENES: Final = 1
 """Scenes of each size but the main one."""

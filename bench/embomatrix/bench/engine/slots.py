@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -13,14 +14,11 @@ from embomatrix.bench.report.figures import BenchError
 from embomatrix.rpc.wire.rollout import rollout_to_proto
 from embomatrix.rpc.wire.values import Rollout
 from embomatrix.sim.zygote import PipeMessage, private_mb
-from embomatrix.worker.slots.processes import ProcessGoneError, start_root
+from embomatrix.worker.slots.processes import Child, ProcessGoneError, Root, start_root
 from embomatrix.worker.slots.residents import SlotLimits
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from embomatrix.bench.engine.workload import SceneWork
-    from embomatrix.worker.slots.processes import Child, Root
 
 LOADS: Final = 3
 """Loads of each scene, each in a new process."""

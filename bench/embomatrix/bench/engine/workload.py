@@ -7,21 +7,18 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.rpc.wire.values import Rollout
 from embomatrix.skills.parse import PlanError, parse_plan, plan_to_lines
+from embomatrix.skills.syntax import Plan
 from embomatrix.world.dataset import Dataset, DatasetError
 from embomatrix.world.records import Name, Record, SceneInvalidError, decode
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from embomatrix.skills.syntax import Plan
 
 FORMAT: Final = 1
 PINNED: Final = Path(__file__).parents[1] / "data"

@@ -1,22 +1,18 @@
 """Paper's table of success on benchmarks before and after GRPO, from reports of `embomatrix eval`."""
 
-from __future__ import annotations
-
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from datetime import date
+from pathlib import Path
+from typing import Final
 
 from embomatrix.bench.report.page import table
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.evaluation.table import ScoreRow, head
 from embomatrix.trainer.evaluation.table import table as table_rows
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from datetime import date
-    from pathlib import Path
 
 _FIGURE_NAMES: Final = {"eai": "eai_world"}
 """Figure names of benchmarks with ambiguous names: EAI's tasks in our world are not EAI's own benchmark."""

@@ -1,15 +1,15 @@
 """`embomatrix experiment`: the paper's experiments. Each is one command; repeating it resumes its runs."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
 import tomllib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 import typer
 from rich.console import Console
@@ -35,17 +35,11 @@ from embomatrix.bench.report.output import write
 from embomatrix.cli.failure import fail
 from embomatrix.cli.local_cluster import no_problem, run_command
 from embomatrix.host.limits import usable_cores
-from embomatrix.pages.figures import shown
+from embomatrix.pages.figures import Figure, shown
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import checked_settings
 from embomatrix.trainer.logging.outcome import read_outcome
 from embomatrix.trainer.run.starting import default_threads
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-    from contextlib import AbstractContextManager
-
-    from embomatrix.pages.figures import Figure
 
 app = typer.Typer(
     no_args_is_help=True,

@@ -1,23 +1,16 @@
 """Runs of an experiment, one after the other, by the user's own commands. Finished runs are not repeated."""
 
-from __future__ import annotations
-
 import contextlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
-from embomatrix.bench.experiments.design import toml_of
+from embomatrix.bench.experiments.design import Arm, Budget, Design, toml_of
 from embomatrix.cli.local_cluster import cluster_problem, local_cluster, no_problem, run_command
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.logging.outcome import OUTCOME
 from embomatrix.world.whole_file import write_whole
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-    from contextlib import AbstractContextManager
-    from pathlib import Path
-
-    from embomatrix.bench.experiments.design import Arm, Budget, Design
 
 IMITATED = "imitated"
 """Folder of a seed's imitation, beside those of its arms."""

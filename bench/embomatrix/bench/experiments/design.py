@@ -1,20 +1,16 @@
 """Design of an experiment: seeds, a shared imitation, and the settings in which the arms differ."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re
 import tomllib
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.world.whole_file import write_whole
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-    from pathlib import Path
 
 WITH_RELEVANCE: Final = "with-relevance"
 WITHOUT_RELEVANCE: Final = "without-relevance"

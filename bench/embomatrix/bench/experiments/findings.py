@@ -1,25 +1,18 @@
 """Findings of an experiment: success of each arm over all seeds, learning curves, and time shares."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 
-from embomatrix.bench.experiments.design import WITHOUT_RELEVANCE
+from embomatrix.bench.experiments.design import WITHOUT_RELEVANCE, Design
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.trainer.evaluation.intervals import Interval, bootstrap
-from embomatrix.trainer.logging.outcome import OUTCOME, read_outcome
+from embomatrix.trainer.logging.outcome import OUTCOME, RunOutcome, TaskRate, read_outcome
 from embomatrix.trainer.logging.recorder import read_metrics
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
-
-    from embomatrix.bench.experiments.design import Design
-    from embomatrix.trainer.logging.outcome import RunOutcome, TaskRate
 
 BINS: Final = 10
 """Number of equal parts of a run; a curve has one mean per part."""

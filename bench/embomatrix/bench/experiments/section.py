@@ -1,25 +1,18 @@
 """Markdown section of an experiment: configuration, success, curves, times. Sections are appended, never replaced."""
 
-from __future__ import annotations
-
 import math
 import textwrap
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import date
+from pathlib import Path
+from typing import Any, Final
 
-from embomatrix.bench.experiments.findings import BINS, by_task, curve
+from embomatrix.bench.experiments.design import Design
+from embomatrix.bench.experiments.findings import BINS, ArmFindings, Run, by_task, curve
 from embomatrix.bench.report.page import table
 from embomatrix.trainer.evaluation.intervals import bootstrap
 from embomatrix.trainer.lifecycle.stopwatch import Activity
 from embomatrix.world.whole_file import write_whole
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-    from datetime import date
-    from pathlib import Path
-    from typing import Any
-
-    from embomatrix.bench.experiments.design import Design
-    from embomatrix.bench.experiments.findings import ArmFindings, Run
 
 WIDTH: Final = 128
 HEAD: Final = (

@@ -4,25 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import json
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.pages.figures import Better, Figure
-from embomatrix.sim.fidelity.compare import objects_in, trial_from_json, true_atoms
-from embomatrix.sim.fidelity.report import MANIPULATION, calls_of, report_on
+from embomatrix.sim.fidelity.compare import FidelityTrial, objects_in, trial_from_json, true_atoms
+from embomatrix.sim.fidelity.report import MANIPULATION, FidelityReport, calls_of, report_on
 from embomatrix.sim.fidelity.sampler import SKILLS
+from embomatrix.skills.trace import Step
+from embomatrix.world.dataset import Dataset
+from embomatrix.world.task import Task
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from embomatrix.bench.fidelity.pool import Modes
     from embomatrix.bench.fidelity.suite import SuiteResult
     from embomatrix.sim.executor import Simulator
-    from embomatrix.sim.fidelity.compare import FidelityTrial
-    from embomatrix.sim.fidelity.report import FidelityReport
-    from embomatrix.skills.trace import Step
-    from embomatrix.world.dataset import Dataset
-    from embomatrix.world.task import Task
 
 ATOMS_GOAL: Final = 0.99
 STEPS_GOAL: Final = 0.98

@@ -10,25 +10,25 @@ import os
 import threading
 import traceback
 from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.bench.cluster.processes import kill_tree
 from embomatrix.sim.fidelity.compare import FidelityTrial, compare, comparison_to_json, trial_to_json
 from embomatrix.sim.process_pool import process_pool
+from embomatrix.world.bundle import Bundle
 from embomatrix.world.dataset import Dataset
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
-
     from embomatrix.sim.executor import Simulator
-    from embomatrix.world.bundle import Bundle
 
     Load = Callable[[Bundle], Simulator]
-    OnResult = Callable[[Mapping[str, Any]], None]
+
+OnResult = Callable[[Mapping[str, Any]], None]
 
 LOST: Final = "lost"
 """Key of the reason in the result line of a lost trial."""

@@ -3,18 +3,20 @@
 A folder holds the trials, a line for each result, and the disagreements. An interrupted suite resumes from it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math
 from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 from embomatrix.bench.fidelity.pool import LOST, FidelityPool, Modes, TrialJob
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.sim.fidelity.compare import (
+    Comparison,
+    FidelityTrial,
     PlanKind,
     comparison_from_json,
     disagreement_to_json,
@@ -24,16 +26,9 @@ from embomatrix.sim.fidelity.compare import (
 from embomatrix.sim.fidelity.plans import SolvedTask, TrialRequest, write_trials
 from embomatrix.sim.fidelity.sampler import SKILLS
 from embomatrix.skills.parse import PlanError, plan_from_json
-from embomatrix.world.dataset import DatasetError
+from embomatrix.skills.syntax import Skill
+from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
 from embomatrix.world.whole_file import write_whole
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    from embomatrix.sim.fidelity.compare import Comparison, FidelityTrial
-    from embomatrix.skills.syntax import Skill
-    from embomatrix.world.dataset import Dataset, TaskRecord
 
 SHARES: Final[Mapping[PlanKind, float]] = {
     PlanKind.ORACLE: 0.20,

@@ -8,7 +8,9 @@ import os
 import shutil
 import subprocess
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.bench.report.figures import BenchError
@@ -19,9 +21,6 @@ from embomatrix.rpc.status import ClusterError
 from embomatrix.rpc.wire.values import Batch, Completed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
     from embomatrix.bench.engine.workload import Workload
 
 PROJECT: Final = "embomatrix-bench"

@@ -1,7 +1,5 @@
 """Cost of the dashboard with a thousand workers: the manager's CPU time for ten viewers, and the time to paint a page."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import shutil
@@ -9,24 +7,20 @@ import statistics
 import tempfile
 import time
 import urllib.request
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import psutil
 
 from embomatrix.bench.cluster.cpu import cpu_s
 from embomatrix.bench.cluster.null_worker import NullWorker, register_null_worker
-from embomatrix.bench.cluster.processes import SERVES, running_manager
+from embomatrix.bench.cluster.processes import SERVES, Process, running_manager
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.rpc.channel import open_channel
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-
-    from embomatrix.bench.cluster.processes import Process
-    from embomatrix.worker.link.session import Registration
+from embomatrix.worker.link.session import Registration
 
 WORKERS: Final = 1000
 VIEWERS: Final = 10

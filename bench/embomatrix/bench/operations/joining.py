@@ -1,21 +1,17 @@
 """Time for a spare PC to join: from the join command to the worker's registration."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.bench.cluster.processes import SERVES, running_manager, running_process
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.pages.figures import Better, Figure
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 JOIN_GOAL_S: Final = 30.0
 LIMIT_S: Final = 120.0

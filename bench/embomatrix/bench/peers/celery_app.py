@@ -4,8 +4,6 @@ It is tuned as Celery's guide advises for work that must not be lost: a message 
 the process dies. Messages are JSON, the default, because a worker with pickle does not run as root.
 """
 
-from __future__ import annotations
-
 import os
 from typing import Final
 

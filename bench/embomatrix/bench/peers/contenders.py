@@ -4,8 +4,6 @@ A plain library gets one call for each rollout, which loads its scene, as its tu
 have loaded every scene and take chunks of rollouts from one queue.
 """
 
-from __future__ import annotations
-
 import asyncio
 import concurrent.futures
 import contextlib
@@ -14,34 +12,27 @@ import multiprocessing
 import os
 import sys
 import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from pathlib import Path
+from typing import Any, Final, Protocol
 
 from embomatrix.bench.cluster.cpu import running_slot
-from embomatrix.bench.cluster.load_generator import load_generator
-from embomatrix.bench.cluster.processes import bench_cluster, redis_server, running_program
-from embomatrix.bench.peers.scene_process import execute_fresh, execute_held
+from embomatrix.bench.cluster.load_generator import LoadGenerator, load_generator
+from embomatrix.bench.cluster.processes import BenchCluster, bench_cluster, redis_server, running_program
+from embomatrix.bench.engine.workload import Workload
+from embomatrix.bench.peers.scene_process import Answer, execute_fresh, execute_held
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.rpc.wire.outcome import completed_from_proto
 from embomatrix.rpc.wire.rollout import rollout_to_proto
-from embomatrix.rpc.wire.values import Completed
+from embomatrix.rpc.wire.values import Completed, Rollout
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-    from contextlib import AbstractContextManager
-    from pathlib import Path
-
-    from embomatrix.bench.cluster.load_generator import LoadGenerator
-    from embomatrix.bench.cluster.processes import BenchCluster
-    from embomatrix.bench.engine.workload import Workload
-    from embomatrix.bench.peers.scene_process import Answer
-    from embomatrix.rpc.wire.values import Rollout
-
-    RolloutChunk = tuple[Rollout, ...]
-    """Rollouts that are sent together."""
-    Take = Callable[["Done | Lost"], None]
-    StartContender = Callable[["ContenderSetup"], AbstractContextManager["Contender"]]
+RolloutChunk = tuple[Rollout, ...]
+"""Rollouts that are sent together."""
+Take = Callable[["Done | Lost"], None]
+StartContender = Callable[["ContenderSetup"], AbstractContextManager["Contender"]]
 
 CLUSTER_LIMIT_S: Final = 120.0
 """Limit for the whole life of our cluster."""

@@ -4,8 +4,6 @@ Tuned processes have loaded the scenes before the clock starts. No plan is execu
 been measured.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import logging
@@ -13,19 +11,24 @@ import os
 import signal
 import tempfile
 import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
 from embomatrix.bench.cluster.cpu import descendants_cpu_s
 from embomatrix.bench.cluster.processes import kill_tree
+from embomatrix.bench.engine.workload import Workload
 from embomatrix.bench.peers.contenders import (
+    Contender,
     ContenderSetup,
     Done,
     Lost,
+    RolloutChunk,
+    StartContender,
     celery_on_redis,
     own_cluster,
     process_pool,
@@ -35,14 +38,8 @@ from embomatrix.bench.peers.scene_process import executed_twice, forget_executio
 from embomatrix.bench.report.figures import BenchError, quantile
 from embomatrix.bench.report.page import CONTEST
 from embomatrix.pages.figures import Better, Figure
+from embomatrix.rpc.wire.values import Rollout
 from embomatrix.sim.process_pool import process_pool as own_processes
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
-    from embomatrix.bench.engine.workload import Workload
-    from embomatrix.bench.peers.contenders import Contender, RolloutChunk, StartContender
-    from embomatrix.rpc.wire.values import Rollout
 
 logger = logging.getLogger(__name__)
 

@@ -11,26 +11,22 @@ import functools
 import gc
 import os
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.hierarchy import score
 from embomatrix.rpc.wire.outcome import completed_to_proto
 from embomatrix.rpc.wire.rollout import rollout_from_proto
-from embomatrix.rpc.wire.values import Completed, Timings
+from embomatrix.rpc.wire.values import Completed, Rollout, Timings
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.worker.slots.physics import Physics
 from embomatrix.worker.slots.slot_program import COLLECT_EVERY
 from embomatrix.world.bundle import read_bundle
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from embomatrix.rpc.wire.values import Rollout
-
-    Answer = tuple[int, list[bytes]]
-    """Process id and results."""
+Answer = tuple[int, list[bytes]]
+"""Process id and results."""
 
 EXECUTED: Final = "executed.log"
 GREETING_S: Final = 0.05

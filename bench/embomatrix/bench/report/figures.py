@@ -1,14 +1,13 @@
 """Result of a benchmark: figures with their goals, the machine and the commit they were measured on."""
 
-from __future__ import annotations
-
 import json
 import os
 import platform
 import subprocess
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import psutil
@@ -17,9 +16,6 @@ from embomatrix.host.limits import MIB, usable_cores
 from embomatrix.pages.figures import Better, Figure, figure_from_json, figure_to_json
 from embomatrix.worker.host.gpu import find_gpu
 from embomatrix.worker.host.resources import measure_score, versions
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
 
 BUSY_SHARE: Final = 0.25
 """Load of a core above which a machine counts as shared before a benchmark begins."""

@@ -1,15 +1,14 @@
 """Output of a benchmark: a table on the terminal, a JSON file for programs, one sentence for a refusal."""
 
-from __future__ import annotations
-
 import contextlib
 import json
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
-from embomatrix.bench.report.figures import BenchError, is_shared, result_to_json
+from embomatrix.bench.report.figures import BenchError, BenchResult, is_shared, result_to_json
 from embomatrix.cli.failure import fail
 from embomatrix.pages.figures import shown
 from embomatrix.rpc.status import ClusterError
@@ -17,12 +16,6 @@ from embomatrix.sim.engine import EngineError
 from embomatrix.world.dataset import DatasetError
 from embomatrix.world.inflation import BundleError
 from embomatrix.world.whole_file import write_whole
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from embomatrix.bench.report.figures import BenchResult
 
 console = Console()
 errors = Console(stderr=True, soft_wrap=True)

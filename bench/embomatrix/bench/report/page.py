@@ -1,19 +1,12 @@
 """Page of benchmarks: tables between marks are generated anew, all other text is kept as its authors wrote it."""
 
-from __future__ import annotations
-
 import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from embomatrix.bench.report.figures import BenchError, is_shared
-from embomatrix.pages.figures import shown
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-
-    from embomatrix.bench.report.figures import BenchResult
-    from embomatrix.pages.figures import Figure
+from embomatrix.bench.report.figures import BenchError, BenchResult, is_shared
+from embomatrix.pages.figures import Figure, shown
 
 END: Final = "<!-- end of figures -->"
 _BLOCK: Final = re.compile(r"<!-- figures: ([a-z-]+) -->\n.*?<!-- end of figures -->", re.DOTALL)

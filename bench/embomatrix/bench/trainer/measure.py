@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 import tempfile
 import time
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -22,9 +23,6 @@ from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.data.tasks import load_tasks
 from embomatrix.trainer.lifecycle.stopwatch import TimeShares
 from embomatrix.trainer.logging.recorder import read_metrics
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
 
 logger = logging.getLogger(__name__)
 

@@ -3,16 +3,16 @@
 Our steps run in this process; TRL's run in an environment with its own pins, as the program ``trl_steps``.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import time
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -21,10 +21,11 @@ from embomatrix.bench.report.figures import BenchError
 from embomatrix.bench.trainer.trl_steps import model_of, tokenizer_of
 from embomatrix.cli.local_cluster import without_membership
 from embomatrix.reward.breakdown import RewardBreakdown
-from embomatrix.skills.prompt import Codec, limited, prompt_for
+from embomatrix.skills.prompt import Codec, Situation, limited, prompt_for
 from embomatrix.skills.syntax import PROFILES, PlaceRelation
 from embomatrix.trainer.cluster.gateway import PlanOutcome
 from embomatrix.trainer.config.settings import GrpoSettings
+from embomatrix.trainer.data.tasks import TrainingTask
 from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers
 from embomatrix.trainer.grpo.learner import Learner
@@ -33,13 +34,6 @@ from embomatrix.trainer.lifecycle.stopwatch import Stopwatch
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.prompts import PromptBuilder
 from embomatrix.world.task import Profile
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from embomatrix.skills.prompt import Situation
-    from embomatrix.trainer.data.tasks import TrainingTask
 
 END: Final = "<end>"
 UNKNOWN: Final = "<unknown>"

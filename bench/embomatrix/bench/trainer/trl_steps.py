@@ -6,8 +6,6 @@ It writes the CPU seconds of each step as JSON on the last line of standard outp
 reward are those of our own steps.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

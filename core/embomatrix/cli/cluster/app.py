@@ -1,7 +1,5 @@
 """`embomatrix cluster`: the operator's command line for a manager."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 from pathlib import Path
@@ -23,7 +21,7 @@ from embomatrix.cli.cluster.tables import (
 from embomatrix.cli.cluster.trace import chrome_trace
 from embomatrix.cli.connection import AsJson, manager_command
 from embomatrix.cli.failure import fail
-from embomatrix.rpc.admin_client import AdminClient  # noqa: TC001  typer reads the annotations when a command runs
+from embomatrix.rpc.admin_client import AdminClient
 
 FOLLOW_S: Final = 0.5
 """Pause between two requests of `events --follow`."""

@@ -1,23 +1,16 @@
 """Charts of a run's report as SVG. The page sets their colours, for light and dark themes."""
 
-from __future__ import annotations
-
 import io
 import re
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
 
 import matplotlib as mpl
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from embomatrix.rpc.wire.run_log import RolloutPhase
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from matplotlib.axes import Axes
-
-    from embomatrix.rpc.wire.run_log import PhaseSummary, RunSeries
+from embomatrix.rpc.wire.run_log import PhaseSummary, RolloutPhase, RunSeries
 
 SIZE_IN: Final = (6.2, 2.5)
 MOST_POINTS: Final = 300

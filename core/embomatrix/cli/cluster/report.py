@@ -1,26 +1,19 @@
 """The report of a run: one HTML file with everything in it. It loads nothing and runs no script."""
 
-from __future__ import annotations
-
 import dataclasses
 import html
 import string
 import time
 from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.cli.cluster.charts import busy_chart, phase_chart, throughput_chart
 from embomatrix.pages.head import page_head
-from embomatrix.reward.settings import PAPER
+from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.timeline import busy_share, slot_spans
-from embomatrix.rpc.wire.run_log import EventKind, RolloutPhase
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from embomatrix.reward.settings import RewardSettings
-    from embomatrix.rpc.wire.run_log import PhaseSummary, RunEvent, RunSummary
+from embomatrix.rpc.wire.run_log import EventKind, PhaseSummary, RolloutPhase, RunEvent, RunSummary
 
 STEPS: Final = 240
 """Points of the chart of busy slots."""

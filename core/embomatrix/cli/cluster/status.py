@@ -1,31 +1,23 @@
 """`embomatrix status` and `embomatrix top`: the state of a cluster, in sentences and live."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import time
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 import typer
-from rich.console import Console, Group
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
 from embomatrix.cli.cluster.tables import run_table, show_json, worker_table
 from embomatrix.cli.connection import AsJson, manager_command
-from embomatrix.rpc.admin_client import AdminClient  # noqa: TC001  typer reads the annotations when a command runs
+from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.status import UnavailableError
-from embomatrix.rpc.wire.values import Warmth
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from rich.console import RenderableType
-
-    from embomatrix.rpc.wire.values import FleetStatus, PlanCell, RunInfo, WorkerInfo
+from embomatrix.rpc.wire.values import FleetStatus, PlanCell, RunInfo, Warmth, WorkerInfo
 
 REFRESH_S: Final = 1.0
 RATE_S: Final = 5.0

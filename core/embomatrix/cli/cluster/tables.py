@@ -1,11 +1,10 @@
 """Output of `embomatrix cluster`: tables, lines and JSON."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import time
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
 
 from rich.console import Console
 from rich.measure import Measurement
@@ -13,12 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from embomatrix.rpc.wire.run_log import EventKind, RolloutStep, RunEvent
-from embomatrix.rpc.wire.values import ResidentState, Warmth
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from embomatrix.rpc.wire.values import PlanCell, RunInfo, WorkerInfo
+from embomatrix.rpc.wire.values import PlanCell, ResidentState, RunInfo, Warmth, WorkerInfo
 
 STATE_STYLES: Final[Mapping[str, str]] = {
     "ready": "green",

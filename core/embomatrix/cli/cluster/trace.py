@@ -4,19 +4,12 @@ The format is Google's "Trace Event Format": complete slices (X), flows (s, f), 
 names (M); times are microseconds.
 """
 
-from __future__ import annotations
-
 import itertools
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, Final
 
-from embomatrix.rpc.timeline import slot_spans
-from embomatrix.rpc.wire.run_log import EventKind
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-
-    from embomatrix.rpc.timeline import SlotKey, Span
-    from embomatrix.rpc.wire.run_log import RunEvent
+from embomatrix.rpc.timeline import SlotKey, Span, slot_spans
+from embomatrix.rpc.wire.run_log import EventKind, RunEvent
 
 MANAGER: Final = 1
 """Process id of the manager's track; workers follow."""

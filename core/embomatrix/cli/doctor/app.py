@@ -1,10 +1,9 @@
 """`embomatrix doctor`: checks of this machine and of the connection to a manager."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
-from typing import TYPE_CHECKING, Annotated, Final
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Final
 
 import typer
 from rich.console import Console
@@ -12,19 +11,14 @@ from rich.table import Table
 from rich.text import Text
 
 from embomatrix.cli.cluster.tables import show_json
-from embomatrix.cli.connection import AsJson, Ca, Token  # noqa: TC001  typer reads the annotations when a command runs
-from embomatrix.cli.doctor.machine import Level, machine, verdict
+from embomatrix.cli.connection import AsJson, Ca, Token
+from embomatrix.cli.doctor.machine import Finding, Level, machine, verdict
 from embomatrix.cli.doctor.manager import Visit, manager, ports_held
 from embomatrix.cli.failure import MENDABLE, fail
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.managers import Managers
 from embomatrix.rpc.status import ClusterError
 from embomatrix.rpc.trust import read_ca, read_token
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from embomatrix.cli.doctor.machine import Finding
 
 STYLES: Final[Mapping[Level, str]] = {Level.FINE: "green", Level.NOTE: "yellow", Level.WRONG: "red"}
 

@@ -1,7 +1,5 @@
 """Findings about a machine: Python, packages, ports, memory and disk."""
 
-from __future__ import annotations
-
 import errno
 import importlib.util
 import os
@@ -9,13 +7,11 @@ import platform
 import shutil
 import socket
 import sys
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+from typing import Final
 
 NEEDED: Final[Mapping[str, tuple[str, ...]]] = {
     "worker": ("pybullet", "scipy", "psutil"),

@@ -1,16 +1,15 @@
 """Findings about the connection to a manager: network, TLS, versions, token and clock."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import http.client
 import socket
 import ssl
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from email.utils import parsedate_to_datetime
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.cli.doctor.machine import Finding, Level
 from embomatrix.proto.v1 import rollout_service_pb2_grpc
@@ -18,11 +17,7 @@ from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.status import ClusterError, NotAllowedError, PreconditionError, cluster_errors
 from embomatrix.rpc.versions import SPOKEN, Capabilities, agree, capabilities_of, software_version
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.rpc.wire.values import FleetStatus
+from embomatrix.rpc.wire.values import FleetStatus
 
 TIMEOUT_S: Final = 1.0
 """Timeout of each of the four requests."""

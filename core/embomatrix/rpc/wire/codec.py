@@ -7,16 +7,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from google.protobuf.descriptor import FieldDescriptor
+from google.protobuf.message import Message
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-
     from google.protobuf.internal.enum_type_wrapper import _EnumTypeWrapper
-    from google.protobuf.message import Message
 
 WireT = TypeVar("WireT")
 ValueT = TypeVar("ValueT")

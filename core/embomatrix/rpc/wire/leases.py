@@ -1,14 +1,9 @@
 """Lease values that manager and workers exchange; ``wire.session`` converts them to and from protobuf."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from embomatrix.reward.settings import PAPER, RewardSettings
-
-if TYPE_CHECKING:
-    from embomatrix.rpc.wire.values import Completed, InfraFailure, Resident, Rollout
+from embomatrix.rpc.wire.values import Completed, InfraFailure, Resident, Rollout
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,10 +1,8 @@
 """Conversion of rollout outcomes to and from protobuf."""
 
-from __future__ import annotations
-
 import functools
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
@@ -23,16 +21,12 @@ from embomatrix.rpc.wire.values import (
     Completed,
     InfraCode,
     InfraFailure,
+    Outcome,
     RolloutResult,
     Timings,
 )
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.trace import Step
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.rpc.wire.values import Outcome
 
 reward_to_proto, reward_from_proto = converters(
     RewardBreakdown,

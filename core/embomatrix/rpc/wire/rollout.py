@@ -1,9 +1,8 @@
 """Conversion of plans, rollouts and batches to and from protobuf."""
 
-from __future__ import annotations
-
 import functools
-from typing import TYPE_CHECKING, Final, Literal
+from collections.abc import Mapping, Sequence
+from typing import Final, Literal
 
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.rpc.wire.codec import ConvertError, each, each_known, finite, required
@@ -19,9 +18,6 @@ from embomatrix.skills.syntax import (
     Skill,
     SkillCall,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
 
 ArgField = Literal["object_index", "source_index", "relation", "yaw", "distance", "room_name"]
 

@@ -1,9 +1,8 @@
 """Conversion of run terms, look-ahead, groups and counters to and from protobuf."""
 
-from __future__ import annotations
-
 import dataclasses
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping
+from typing import Final
 
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.reward.settings import PAPER, RewardSettings, RewardSettingsError
@@ -17,10 +16,6 @@ from embomatrix.rpc.wire.values import (
     RunTerms,
     Warmth,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
 
 WARMTHS: Final = enum_numbers(Warmth, types_pb2.Warmth, "WARMTH")
 _POLICIES: Final = enum_numbers(GroupPolicy, rollout_service_pb2.GroupPolicy, "GROUP_POLICY")

@@ -3,21 +3,16 @@
 Times are seconds since the epoch on the manager's clock. Durations are measured by the side that spends them.
 """
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.rpc.wire.codec import ConvertError, converters, each, enum_numbers, finite, inside
 from embomatrix.rpc.wire.outcome import timings_from_proto, timings_to_proto
 from embomatrix.rpc.wire.session import run_info_from_proto, run_info_to_proto
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.rpc.wire.values import RunInfo, Timings
+from embomatrix.rpc.wire.values import RunInfo, Timings
 
 
 class RolloutPhase(StrEnum):

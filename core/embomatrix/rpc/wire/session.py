@@ -1,7 +1,5 @@
 """Conversion of worker sessions, and of the operator's lists, to and from protobuf."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from embomatrix.proto.v1 import admin_service_pb2, types_pb2, worker_service_pb2

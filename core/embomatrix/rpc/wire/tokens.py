@@ -1,16 +1,12 @@
 """Token roles, listed tokens, and their conversion to and from protobuf."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.rpc.wire.codec import converters, enum_member, enum_numbers
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 
 class AccessRole(StrEnum):

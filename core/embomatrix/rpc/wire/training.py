@@ -3,17 +3,13 @@
 A report beyond its size limits is rejected with the name of the field.
 """
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sized
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from embomatrix.proto.v1 import rollout_service_pb2 as pb
 from embomatrix.rpc.wire.codec import ConvertError, converters, each, finite, required
 from embomatrix.skills.syntax import MAX_STEPS
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sized
 
 T = TypeVar("T", bound="Sized")
 

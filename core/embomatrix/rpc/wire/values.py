@@ -5,20 +5,17 @@ An outcome is a union: an infrastructure failure is a type without a reward, so 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, ClassVar, Self
 
+from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.settings import PAPER, RewardSettings
+from embomatrix.skills.syntax import Plan
+from embomatrix.skills.trace import Step
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from embomatrix.reward.breakdown import RewardBreakdown
-    from embomatrix.skills.syntax import Plan
-    from embomatrix.skills.trace import Step
-
-    Reader = Callable[[bytes], Mapping[str, object]]
+Reader = Callable[[bytes], Mapping[str, object]]
 
 
 class _ReadWhenAsked:

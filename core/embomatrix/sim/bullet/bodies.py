@@ -4,22 +4,15 @@ A body's frame is its asset's frame: inertial frames lie at the asset's origin, 
 compounds from memory, so hulls beside other parts get their own links with a fixed joint.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from embomatrix.sim.bullet.client import pybullet
 from embomatrix.sim.geometry.bounds import joint_motion
-from embomatrix.world.asset import JointKind
-from embomatrix.world.geometry import IDENTITY, Pose, Shape, Vec3
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.world.asset import Asset, Joint
-    from embomatrix.world.geometry import ConvexPart
+from embomatrix.world.asset import Asset, Joint, JointKind
+from embomatrix.world.geometry import IDENTITY, ConvexPart, Pose, Shape, Vec3
 
 HULL_MARGIN_M = 0.001
 """Bullet rounds hulls outwards by this much; their vertices are drawn in to compensate."""

@@ -1,25 +1,19 @@
 """Pictures of a scene by Bullet's software renderer: oblique from above, and from the robot's camera."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from embomatrix.sim.bullet.robot import tucked
 from embomatrix.sim.bullet.visual_scene import VisualScene
-from embomatrix.world.geometry import IDENTITY, Pose
+from embomatrix.world.geometry import IDENTITY, ConvexPart, Pose
 from embomatrix.world.poses import StandPose
+from embomatrix.world.scene import Room, Scene, SceneObject
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from embomatrix.world.geometry import ConvexPart
-    from embomatrix.world.scene import Room, Scene, SceneObject
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 CUT_M: Final = 0.45
 """Walls between the camera and the rooms are shown up to this height."""

@@ -1,17 +1,13 @@
 """Connections to Bullet: silent and without the renderer."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import os
 import sys
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Iterator
+from typing import Any, Final
 
 from embomatrix.sim.engine import EngineError, EngineMissingError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 TINY_RENDERER: Final = 2
 """Index of the CPU renderer plugin. With it every body costs ten times as much to create."""

@@ -5,23 +5,17 @@ which costs almost nothing and keeps them in place. Contact with an awake body w
 woken by name. The world is rebuilt for every rollout and so does not depend on earlier ones.
 """
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterable, Mapping
+from typing import Final
 
 from embomatrix.sim.bullet.client import connect, near_contacts, pybullet
-from embomatrix.sim.bullet.dynamic_bodies import DynamicBodies, differ
+from embomatrix.sim.bullet.dynamic_bodies import BodyState, DynamicBodies, differ
 from embomatrix.sim.bullet.mini_world import GRAVITY_M_S2
 from embomatrix.sim.bullet.passage import Passage
 from embomatrix.sim.bullet.robot import Posture, RobotBody
 from embomatrix.world.geometry import Pose
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from embomatrix.sim.bullet.dynamic_bodies import BodyState
-    from embomatrix.world.scene import Scene
+from embomatrix.world.scene import Scene
 
 STEP_S: Final = 1 / 240
 TIP_M: Final = 0.1122

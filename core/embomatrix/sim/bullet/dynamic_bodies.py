@@ -1,24 +1,18 @@
 """Bodies of a stepped scene, addressed by object name: placed, moved, put to sleep and woken."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterable, Mapping
+from typing import Final
 
 from embomatrix.sim.bullet.bodies import BodyFactory
 from embomatrix.sim.bullet.client import pybullet
 from embomatrix.sim.engine import FLOOR, WALL
 from embomatrix.world.asset import JointKind
-from embomatrix.world.geometry import Pose
+from embomatrix.world.geometry import Pose, Vec3
+from embomatrix.world.scene import Scene
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from embomatrix.world.geometry import Vec3
-    from embomatrix.world.scene import Scene
-
-    BodyState = tuple[Vec3, tuple[float, ...]]
-    """Position and quaternion of what is movable; zeros and the joints' positions of furniture."""
+BodyState = tuple[Vec3, tuple[float, ...]]
+"""Position and quaternion of what is movable; zeros and the joints' positions of furniture."""
 
 FLOOR_HALF_M: Final = 200.0
 HINGE_NM: Final = 0.4

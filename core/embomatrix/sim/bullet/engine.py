@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.bullet.bodies import PART_LIMIT
@@ -24,18 +25,14 @@ from embomatrix.sim.engine import (
     Journal,
     Settled,
 )
-from embomatrix.sim.geometry.bounds import bounds_of, forget
+from embomatrix.sim.geometry.bounds import AssetBounds, bounds_of, forget
 from embomatrix.sim.geometry.spatial_hash import SpatialHash
 from embomatrix.sim.validation import check_fractions, check_pose, check_scene
-from embomatrix.world.geometry import IDENTITY
+from embomatrix.world.geometry import IDENTITY, Aabb, Pose
+from embomatrix.world.scene import Scene
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
     from embomatrix.sim.floor.prepared import PreparedScene
-    from embomatrix.sim.geometry.bounds import AssetBounds
-    from embomatrix.world.geometry import Aabb, Pose
-    from embomatrix.world.scene import Scene
 
 BOX_SLACK_M: Final = 0.01
 """Boxes this far apart are still compared part by part: boxes of tilted cylinders may be slightly too small."""

@@ -1,22 +1,16 @@
 """Small settling world: a client with a few bodies in which one object is let go."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.sim.bullet.bodies import BodyFactory
 from embomatrix.sim.bullet.client import ClientPool, pybullet
 from embomatrix.sim.engine import SETTLE_STEPS, Settled
 from embomatrix.sim.geometry.bounds import parts_of
-from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import Quat, Vec3
+from embomatrix.world.asset import Asset
+from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Quat, Shape, Vec3
 
 GRAVITY_M_S2: Final = -9.81
 CHUNK_STEPS: Final = 12

@@ -6,13 +6,12 @@ needed. Bullet checks every link of the robot and the held object at each postur
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.bullet.client import pybullet
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from embomatrix.sim.bullet.dynamic_bodies import DynamicBodies
     from embomatrix.sim.bullet.robot import Posture, RobotBody
     from embomatrix.world.geometry import Pose

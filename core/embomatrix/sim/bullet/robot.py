@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.sim.bullet.client import pybullet
 from embomatrix.sim.bullet.robot_model import (
@@ -18,11 +19,7 @@ from embomatrix.sim.bullet.robot_model import (
 )
 from embomatrix.sim.robot_dimensions import STAGE_SHARE
 from embomatrix.world.geometry import Pose
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from embomatrix.world.poses import StandPose
+from embomatrix.world.poses import StandPose
 
 BASE_N: Final = 1000.0
 BASE_NM: Final = 200.0

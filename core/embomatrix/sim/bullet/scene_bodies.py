@@ -4,19 +4,13 @@ Making a body costs fifteen times as much as a distance query, and a rollout que
 depend on which bodies exist: they are never stepped, only compared in pairs.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
 
 from embomatrix.sim.bullet.bodies import PART_LIMIT, BodyFactory
 from embomatrix.sim.bullet.client import pybullet
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import Pose
-    from embomatrix.world.scene import Scene
+from embomatrix.world.asset import Asset
+from embomatrix.world.geometry import Pose
+from embomatrix.world.scene import Scene
 
 
 class SceneBodies:

@@ -1,10 +1,9 @@
 """Settling of a whole scene: all movable objects fall at once in a temporary client."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -17,15 +16,10 @@ from embomatrix.sim.bullet.mini_world import (
     SLOW_RAD_S,
     settled_from,
 )
-from embomatrix.sim.engine import FLOOR, TOLERANCE_M, WALL
+from embomatrix.sim.engine import FLOOR, TOLERANCE_M, WALL, Settled
 from embomatrix.sim.validation import check_scene
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.sim.engine import Settled
-    from embomatrix.world.geometry import Pose
-    from embomatrix.world.scene import Scene
+from embomatrix.world.geometry import Pose
+from embomatrix.world.scene import Scene
 
 LEAST_STEPS: Final = 120
 MOST_STEPS: Final = 480

@@ -7,32 +7,26 @@ from __future__ import annotations
 
 import math
 import zlib
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from embomatrix.sim.bullet.client import pybullet
-from embomatrix.sim.bullet.robot import load_robot, spread
+from embomatrix.sim.bullet.robot import Posture, load_robot, spread
 from embomatrix.sim.bullet.robot_model import DRIVEN_JOINTS
 from embomatrix.sim.engine import EngineError
 from embomatrix.sim.geometry.bounds import joint_motion
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.geometry import IDENTITY, Pose, Shape
+from embomatrix.world.asset import Asset
+from embomatrix.world.geometry import IDENTITY, ConvexPart, Pose, Shape, Vec3
+from embomatrix.world.scene import Scene, SceneObject
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from types import TracebackType
-
-    from numpy.typing import NDArray
-
-    from embomatrix.sim.bullet.robot import Posture
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import ConvexPart, Vec3
-    from embomatrix.world.scene import Scene, SceneObject
-
-    FloatArray = NDArray[np.float64]
-    Rgba = tuple[float, float, float, float]
+FloatArray = NDArray[np.float64]
+Rgba = tuple[float, float, float, float]
 
 OUT_OF_SIGHT: Final = Pose((0.0, 0.0, -100.0))
 

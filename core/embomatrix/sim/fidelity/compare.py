@@ -9,25 +9,25 @@ from __future__ import annotations
 
 import itertools
 import time
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from embomatrix.skills.failure import FailureReason  # noqa: TC001 -- msgspec reads the annotations
+from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.parse import plan_from_json, plan_to_json
-from embomatrix.skills.syntax import Skill  # noqa: TC001 -- msgspec reads the annotations
+from embomatrix.skills.syntax import (
+    Plan,
+    Skill,
+)
 from embomatrix.world.evaluate import objects_of
 from embomatrix.world.state import Relation, State
-from embomatrix.world.task import Profile
+from embomatrix.world.task import Profile, Task
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
-
     from embomatrix.sim.executor import Simulator
-    from embomatrix.skills.syntax import Plan
-    from embomatrix.world.task import Task
 
 NEAR_M: Final = 0.5
 """Largest distance of boxes whose objects may be in a relation; ``nextto`` reaches no farther."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -10,15 +11,12 @@ import numpy as np
 
 from embomatrix.sim.fidelity.compare import FidelityTrial, PlanKind
 from embomatrix.sim.fidelity.sampler import ABILITY, SKILLS, PlanSampler, work_pairs
-from embomatrix.skills.syntax import Skill
+from embomatrix.skills.syntax import Plan, Skill, SkillCall
+from embomatrix.world.task import Task
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
     from embomatrix.sim.executor import Simulator
     from embomatrix.sim.live_world import LiveWorld
-    from embomatrix.skills.syntax import Plan, SkillCall
-    from embomatrix.world.task import Task
 
 LENGTHS: Final = (4, 9)
 MOST: Final = 12

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -11,8 +12,6 @@ import numpy as np
 from embomatrix.skills.syntax import Skill
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
     from embomatrix.sim.fidelity.compare import Comparison
 
 MANIPULATION: Final = (

@@ -7,22 +7,19 @@ numbers whenever it is executed with its seed.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.skills.appliances import cold_source, heat_source, starts_closed
 from embomatrix.skills.check import check, within_reach
-from embomatrix.skills.syntax import PROFILES, PlaceRelation, Skill, SkillCall
-from embomatrix.world.task import Profile
+from embomatrix.skills.syntax import PROFILES, PlaceRelation, Plan, Skill, SkillCall
+from embomatrix.world.task import Profile, Task
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
     import numpy as np
 
     from embomatrix.sim.executor import Simulator
     from embomatrix.sim.live_world import LiveWorld
-    from embomatrix.skills.syntax import Plan
-    from embomatrix.world.task import Task
 
 SKILLS: Final = PROFILES[Profile.PAPER]
 TRIES: Final = 4

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    BoolArray = NDArray[np.bool_]
-    IntArray = NDArray[np.int16]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int16]
 
 Window = tuple[slice, slice]
 

@@ -5,28 +5,22 @@ from __future__ import annotations
 import copy
 import functools
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Sequence
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
-from embomatrix.sim.floor.components import FloorParts, overlap
-from embomatrix.sim.floor.paths import RecentDistances, cheapest_path
+from embomatrix.sim.floor.components import FloorParts, Window, overlap
+from embomatrix.sim.floor.paths import Cell, Distances, RecentDistances, cheapest_path
 from embomatrix.skills.limits import ROBOT
+from embomatrix.world.geometry import FloatArray, Vec2
+from embomatrix.world.scene import Scene
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from numpy.typing import NDArray
-
-    from embomatrix.sim.floor.components import Window
-    from embomatrix.sim.floor.paths import Cell, Distances
-    from embomatrix.world.geometry import FloatArray, Vec2
-    from embomatrix.world.scene import Scene
-
-    BoolArray = NDArray[np.bool_]
-    IntArray = NDArray[np.int16]
-    Changes = tuple[tuple[FloatArray, int], ...]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int16]
+Changes = tuple[tuple[FloatArray, int], ...]
 
 CELL_M: Final = 0.05
 SNAP_CELLS: Final = 6

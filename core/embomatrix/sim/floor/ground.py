@@ -1,23 +1,17 @@
 """Obstacles on the floor and the free space between them, in the scene as loaded and now."""
 
-from __future__ import annotations
-
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.sim.caches import RecentCache
+from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.floor.grid import FloorGrid
 from embomatrix.sim.floor.obstacles import WALLS, Obstacles
-from embomatrix.sim.floor.open_panels import OpenPanels
+from embomatrix.sim.floor.open_panels import OpenJoints, OpenPanels
+from embomatrix.sim.floor.prepared import PreparedScene
 from embomatrix.sim.geometry.bounds import parts_of
 from embomatrix.world.geometry import IDENTITY, Pose
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.floor.open_panels import OpenJoints
-    from embomatrix.sim.floor.prepared import PreparedScene
 
 ON_FLOOR_M: Final = 0.05
 """A movable object with a lower underside stands on the floor."""

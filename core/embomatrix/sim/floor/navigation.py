@@ -4,33 +4,28 @@ Obstacles are walls, fixed objects, objects on the floor, and open doors and dra
 no panels.
 """
 
-from __future__ import annotations
-
 import functools
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Final
 
 import numpy as np
 
 from embomatrix.sim.caches import BoundedCache
+from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.floor.grid import CELL_M, FloorGrid
 from embomatrix.sim.floor.ground import Ground
 from embomatrix.sim.floor.obstacles import WALLS, crosses
+from embomatrix.sim.floor.open_panels import OpenJoints
+from embomatrix.sim.floor.paths import Cell
+from embomatrix.sim.floor.prepared import PreparedScene
 from embomatrix.sim.floor.standing import StandingArea
+from embomatrix.sim.state.relations import Relations
 from embomatrix.skills.limits import ROBOT
+from embomatrix.world.asset import Asset
+from embomatrix.world.geometry import Aabb, FloatArray, Vec2
 from embomatrix.world.poses import StandPose
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
-
-    from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.floor.open_panels import OpenJoints
-    from embomatrix.sim.floor.paths import Cell
-    from embomatrix.sim.floor.prepared import PreparedScene
-    from embomatrix.sim.state.relations import Relations
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import Aabb, FloatArray, Vec2
-    from embomatrix.world.scene import Room, Scene
+from embomatrix.world.scene import Room, Scene
 
 ROOFED_M: Final = 1.5
 """A cavity with less free height above its floor can't be reached from above."""

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from embomatrix.skills.limits import ROBOT
+from embomatrix.world.geometry import Aabb, FloatArray, Vec2
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from embomatrix.world.geometry import Aabb, FloatArray, Vec2
-
-    BoolArray = NDArray[np.bool_]
-    IntArray = NDArray[np.int32]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int32]
 
 FLAT_M: Final = 0.03
 """The robot drives over lower objects, such as rugs."""

@@ -3,18 +3,12 @@
 Panels open by no more than ``OPEN_FRACTION`` take none.
 """
 
-from __future__ import annotations
+from collections.abc import Iterator
 
-from typing import TYPE_CHECKING
-
+from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.floor.obstacles import WALLS, Obstacles
 from embomatrix.sim.geometry.bounds import parts_of
 from embomatrix.world.state import OPEN_FRACTION
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from embomatrix.sim.engine import PhysicsEngine
 
 OpenJoints = tuple[tuple[int, tuple[float, ...]], ...]
 """Fixed objects with an open panel: number in the scene and joint positions."""

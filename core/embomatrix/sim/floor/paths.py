@@ -1,27 +1,21 @@
 """Shortest paths over the free cells of a floor."""
 
-from __future__ import annotations
-
 import functools
 import heapq
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csgraph
 
 from embomatrix.sim.caches import RecentCache
+from embomatrix.sim.floor.components import Window
+from embomatrix.world.geometry import FloatArray
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
-
-    from embomatrix.sim.floor.components import Window
-    from embomatrix.world.geometry import FloatArray
-
-    BoolArray = NDArray[np.bool_]
+BoolArray = NDArray[np.bool_]
 
 Cell = tuple[int, int]
 

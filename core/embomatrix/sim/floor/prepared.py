@@ -7,24 +7,20 @@ With them a worker measures no box and rasterises no floor when it loads the sce
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from embomatrix.sim.floor.grid import grid_shape
+from embomatrix.sim.engine import PhysicsEngine
+from embomatrix.sim.floor.grid import FloorGrid, grid_shape
 from embomatrix.sim.floor.obstacles import WALLS, Obstacles
-from embomatrix.world.geometry import IDENTITY, Aabb
+from embomatrix.world.geometry import IDENTITY, Aabb, FloatArray
+from embomatrix.world.scene import Scene
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.floor.grid import FloorGrid
     from embomatrix.world.bundle import Bundle
-    from embomatrix.world.geometry import FloatArray
-    from embomatrix.world.scene import Scene
 
 VERSION: Final = 1
 """Incremented with every change in the definition of a box, an obstacle or the floor grid."""

@@ -1,19 +1,15 @@
 """Standing poses from which the robot works on an object: near, in front of it, with a free line for the arm."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from embomatrix.sim.floor.obstacles import FLAT_M, crosses
 from embomatrix.skills.limits import ROBOT
+from embomatrix.world.geometry import Aabb, FloatArray, Vec2
 from embomatrix.world.poses import StandPose
-
-if TYPE_CHECKING:
-    from embomatrix.world.geometry import Aabb, FloatArray, Vec2
 
 REACH_SLACK_M: Final = 0.05
 """Standing poses are this much nearer than the arm reaches, as slack for objects off their box's edge."""

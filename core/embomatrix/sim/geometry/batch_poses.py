@@ -5,25 +5,19 @@ The tests use boxes and are cheap and coarse. Exact collision tests follow, one 
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from embomatrix.sim.geometry.bounds import quarter_turns
+from embomatrix.sim.geometry.bounds import AssetBounds, IntArray, quarter_turns
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.geometry import IDENTITY, Aabb
+from embomatrix.world.geometry import IDENTITY, Aabb, FloatArray, Pose
+from embomatrix.world.poses import StandPose
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from embomatrix.sim.geometry.bounds import AssetBounds, IntArray
-    from embomatrix.world.geometry import FloatArray, Pose
-    from embomatrix.world.poses import StandPose
-
-    BoolArray = NDArray[np.bool_]
+BoolArray = NDArray[np.bool_]
 
 TAKEN_SHARE: Final = 0.16
 """If boxes of two upright cylinders overlap by this share of their extents along both axes, the cylinders overlap."""

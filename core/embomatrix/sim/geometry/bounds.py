@@ -3,32 +3,24 @@
 They derive from the parts: the physics engine's boxes include collision margins and grow as compounds turn.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from embomatrix.sim.caches import BoundedCache
-from embomatrix.world.asset import JointKind
-from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
+from embomatrix.world.asset import Asset, Joint, JointKind
+from embomatrix.world.geometry import Aabb, ConvexPart, FloatArray, Pose, Quat, Shape, Vec3
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from embomatrix.world.asset import Asset, Joint
-    from embomatrix.world.geometry import FloatArray, Quat, Vec3
-
-    IntArray = NDArray[np.int64]
-    Turned = tuple[Quat, tuple[float, ...]]
-    """Quaternion of an asset's frame and its joint positions: objects stand at few angles."""
-    Corners = tuple[Vec3, Vec3]
-    """Low and high corner of a box, relative to the asset's origin."""
+IntArray = NDArray[np.int64]
+Turned = tuple[Quat, tuple[float, ...]]
+"""Quaternion of an asset's frame and its joint positions: objects stand at few angles."""
+Corners = tuple[Vec3, Vec3]
+"""Low and high corner of a box, relative to the asset's origin."""
 
 RIM_POINTS: Final = 24
 """Points on each rim of a cylinder: a box is at most 0.9 % of the radius too small."""

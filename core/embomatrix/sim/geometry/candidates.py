@@ -1,26 +1,18 @@
 """Candidate poses of one asset on, in or under another, spread evenly by geometry alone."""
 
-from __future__ import annotations
-
 import itertools
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
-from embomatrix.sim.geometry.bounds import bounds_of
+from embomatrix.sim.geometry.bounds import AssetBounds, bounds_of
 from embomatrix.sim.geometry.surfaces import interior_around, is_under, surface_under
-from embomatrix.world.asset import SupportSurface
-from embomatrix.world.geometry import IDENTITY, Aabb, Pose
+from embomatrix.world.asset import Asset, SupportSurface
+from embomatrix.world.geometry import IDENTITY, Aabb, FloatArray, Pose, Vec2, Vec3
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from embomatrix.sim.geometry.bounds import AssetBounds
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import FloatArray, Vec2, Vec3
 
 GOLDEN: Final = (0.7548776662466927, 0.5698402909980532)
 """Steps of the R2 sequence: its first n points cover the square about as evenly as Poisson discs."""

@@ -4,8 +4,6 @@ Most pairs of an object and a support appear in no analysis. Two facts together 
 size stands level and free there, and the object stands by itself on a level floor.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Final

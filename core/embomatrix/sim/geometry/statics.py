@@ -4,22 +4,15 @@ The proof replaces a settle for the common case of a flat object on a flat surfa
 cover, such as a ball, a nested bowl or an object across two boards, may still be stable and has to be settled.
 """
 
-from __future__ import annotations
-
 import functools
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.sim.geometry.bounds import bounds_of, parts_of
-from embomatrix.world.asset import JointKind
-from embomatrix.world.geometry import IDENTITY, Aabb, Pose, Shape
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
+from embomatrix.world.asset import Asset, JointKind
+from embomatrix.world.geometry import IDENTITY, Aabb, ConvexPart, Pose, Shape, Vec2, Vec3
 
 FLAT_M: Final = 5e-5
 """Points of a base up to this much above its lowest still touch the support."""

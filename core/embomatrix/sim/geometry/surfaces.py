@@ -4,20 +4,14 @@ Surfaces and cavities of a drawer or a door move with their link. They are defin
 them use the link's frame. The frame of the base is the asset's own.
 """
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from typing import Final
 
 from embomatrix.sim.geometry.bounds import joint_motion, parts_of
-from embomatrix.world.geometry import IDENTITY
+from embomatrix.world.asset import Asset, Interior
+from embomatrix.world.geometry import IDENTITY, Aabb, Pose
 from embomatrix.world.state import OPEN_FRACTION, Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.world.asset import Asset, Interior
-    from embomatrix.world.geometry import Aabb, Pose
 
 REST_M: Final = 0.01
 """An underside this near to a surface rests on it."""

@@ -1,26 +1,18 @@
 """Regions behind open doors: the arm does not reach through a door panel."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterator, Sequence
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from embomatrix.sim.geometry.batch_poses import PoseBoxes
 from embomatrix.sim.geometry.bounds import joint_motion, parts_of
-from embomatrix.world.asset import JointKind
-from embomatrix.world.geometry import IDENTITY
+from embomatrix.world.asset import Asset, JointKind
+from embomatrix.world.geometry import IDENTITY, Aabb, FloatArray, Pose
+from embomatrix.world.poses import StandPose
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from embomatrix.sim.geometry.batch_poses import PoseBoxes
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import Aabb, FloatArray, Pose
-    from embomatrix.world.poses import StandPose
-
-    BoolArray = NDArray[np.bool_]
+BoolArray = NDArray[np.bool_]
 
 ARM_M: Final = 0.05
 """Half the width of the arm beside a door panel."""

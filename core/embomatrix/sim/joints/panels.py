@@ -1,21 +1,14 @@
 """Motion of doors, drawers and lids with the objects that they carry, up to the first obstacle."""
 
-from __future__ import annotations
-
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from embomatrix.sim.engine import FLOOR, WALL
+from embomatrix.sim.engine import FLOOR, WALL, PhysicsEngine
 from embomatrix.sim.geometry.bounds import bounds_of, parts_of
 from embomatrix.sim.geometry.surfaces import link_frame
-from embomatrix.world.geometry import Aabb
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.state.relations import Relations
-    from embomatrix.world.geometry import Pose
+from embomatrix.sim.state.relations import Relations
+from embomatrix.world.geometry import Aabb, Pose
 
 PANEL_SLACK_M: Final = 0.02
 """Range around the panels' boxes in which obstacles are considered."""

@@ -1,21 +1,15 @@
 """Opening of doors, drawers and lids, with predictions for the scene as loaded."""
 
-from __future__ import annotations
-
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.geometry.bounds import bounds_of, parts_of
 from embomatrix.sim.geometry.surfaces import links_with_surfaces
 from embomatrix.sim.joints.panels import PANEL_SLACK_M, DoorPanels, measure_swing
-from embomatrix.world.geometry import Aabb
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.state.relations import Relations
-    from embomatrix.world.geometry import Pose
+from embomatrix.sim.state.relations import Relations
+from embomatrix.world.geometry import Aabb, Pose
 
 SWING: Final = (0.25, 0.5, 0.75, 1.0)
 """Shares of its travel at which a door is checked for obstacles."""

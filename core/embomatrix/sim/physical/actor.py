@@ -4,16 +4,17 @@ Preconditions, relations and effects are those of cached mode, read in the same 
 touches, lifts and lets go, and physics decides the outcome. A failed skill leaves the changes that it made.
 """
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Mapping
+from typing import Final
 
 import numpy as np
 
 from embomatrix.sim.actions import ACTIONS, heading_after
 from embomatrix.sim.blockers import path_refusal, room_refusal
 from embomatrix.sim.bullet.dynamic import DynamicWorld
+from embomatrix.sim.executor import Simulator
+from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical.doors import close_all, open_all
 from embomatrix.sim.physical.pick import pick_up
 from embomatrix.sim.physical.place import place
@@ -22,20 +23,12 @@ from embomatrix.sim.physical.stage import PhysicalStage
 from embomatrix.sim.physical.travel import drive, travel
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.syntax import Skill
-from embomatrix.skills.view import metres, refuse, source_of, target_of
+from embomatrix.skills.syntax import Skill, SkillCall
+from embomatrix.skills.view import SkillRefusal, metres, refuse, source_of, target_of
+from embomatrix.world.bundle import Bundle
 from embomatrix.world.poses import StandPose
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from embomatrix.sim.executor import Simulator
-    from embomatrix.sim.live_world import LiveWorld
-    from embomatrix.skills.syntax import SkillCall
-    from embomatrix.skills.view import SkillRefusal
-    from embomatrix.world.bundle import Bundle
-
-    Motion = Callable[[PhysicalStage, SkillCall, np.random.Generator], SkillRefusal | None]
+Motion = Callable[[PhysicalStage, SkillCall, np.random.Generator], SkillRefusal | None]
 
 
 def physical_simulator(bundle: Bundle) -> Simulator:

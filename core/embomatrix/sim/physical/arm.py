@@ -5,15 +5,12 @@ the angle of the last joint given, the six others follow geometrically, as in He
 Franka Emika Panda", 2021. Lengths are those of the URDF in the installed ``pybullet_data`` package.
 """
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from embomatrix.world.geometry import FloatArray
+from embomatrix.world.geometry import FloatArray
 
 JOINTS: Final = 7
 LOW_RAD: Final = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])

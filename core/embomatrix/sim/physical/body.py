@@ -3,12 +3,11 @@
 A posture is a row of eleven numbers: x, y and heading of the base, height of the lift, and the arm's seven angles.
 """
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from embomatrix.sim.physical import arm
 from embomatrix.sim.robot_dimensions import (
@@ -24,13 +23,9 @@ from embomatrix.sim.robot_dimensions import (
     SHOULDER_LOW_M,
     STAGE_SHARE,
 )
+from embomatrix.world.geometry import FloatArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from embomatrix.world.geometry import FloatArray
-
-    BoolArray = NDArray[np.bool_]
+BoolArray = NDArray[np.bool_]
 
 CLEARANCE_M: Final = 0.01
 """Distance that the arm keeps from the robot's own trunk."""

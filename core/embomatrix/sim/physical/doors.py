@@ -1,13 +1,12 @@
 """Doors, drawers and lids: the hand takes the free edge of a panel and pulls it along its arc, or pushes it from within."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -18,26 +17,17 @@ from embomatrix.sim.physical import body
 from embomatrix.sim.physical.fold import PATHS_TRIED, approach, fold, unfold
 from embomatrix.sim.physical.grasp import cross, facing
 from embomatrix.sim.physical.pick import GENTLE_PACE, TOUCH_M
-from embomatrix.sim.physical.reach import JUMP_RAD, ArmReach, ToolPath
+from embomatrix.sim.physical.reach import JUMP_RAD, ArmPath, ArmReach, ToolPath
 from embomatrix.sim.physical.reach import TOUCH_M as PRESS_M
 from embomatrix.sim.physical.space import Boxes, boxes_of, collides, part_boxes
-from embomatrix.sim.physical.stage import compact
+from embomatrix.sim.physical.stage import PhysicalStage, compact
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.view import refuse
-from embomatrix.world.asset import JointKind
-from embomatrix.world.geometry import IDENTITY, Aabb, Pose
+from embomatrix.skills.view import SkillRefusal, refuse
+from embomatrix.world.asset import Asset, Joint, JointKind, Link
+from embomatrix.world.geometry import IDENTITY, Aabb, FloatArray, Pose
 from embomatrix.world.poses import StandPose
 from embomatrix.world.state import OPEN_FRACTION
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from embomatrix.sim.physical.reach import ArmPath
-    from embomatrix.sim.physical.stage import PhysicalStage
-    from embomatrix.skills.view import SkillRefusal
-    from embomatrix.world.asset import Asset, Joint, Link
-    from embomatrix.world.geometry import FloatArray
 
 EDGE: Final = 0.88
 """Grip point on a hinged panel, as a share of the distance from its hinge to its free edge."""

@@ -5,15 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.film import FRAMES_PER_S, Film, FilmFrame
+from embomatrix.skills.syntax import Plan
+from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose
+from embomatrix.world.scene import Scene
+from embomatrix.world.task import Task
 
 if TYPE_CHECKING:
     from embomatrix.sim.executor import Simulator
     from embomatrix.sim.physical.actor import PhysicalActor
-    from embomatrix.skills.syntax import Plan
-    from embomatrix.world.geometry import Pose
-    from embomatrix.world.scene import Scene
-    from embomatrix.world.task import Task
 
 PACE: Final = 2
 """Playback speed relative to simulated time."""

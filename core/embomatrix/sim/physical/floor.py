@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from embomatrix.sim.floor.obstacles import FLAT_M
+from embomatrix.sim.physical.space import Boxes
 from embomatrix.skills.limits import ROBOT
+from embomatrix.world.geometry import FloatArray, Vec2
 from embomatrix.world.poses import StandPose
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     from embomatrix.sim.floor.grid import FloorGrid
     from embomatrix.sim.floor.navigation import Navigator
     from embomatrix.sim.floor.paths import Cell
-    from embomatrix.sim.physical.space import Boxes
-    from embomatrix.world.geometry import FloatArray, Vec2
 
 OUT_M: Final = 0.45
 OUT_TRIED: Final = 60

@@ -1,34 +1,25 @@
 """Folding and unfolding of the arm: paths between the carrying posture over the base and the start of the work."""
 
-from __future__ import annotations
-
 import itertools
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterable, Iterator
+from typing import Final
 
 import numpy as np
 
 from embomatrix.sim.bullet.robot import TUCKED_ARM, TUCKED_LIFT_M
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.motion import standing, with_arm
-from embomatrix.sim.physical.reach import CLEARANCE_M
-from embomatrix.sim.physical.space import collides
-from embomatrix.sim.physical.stage import compact
+from embomatrix.sim.physical.reach import CLEARANCE_M, ArmPath, ArmReach, HeldGeometry
+from embomatrix.sim.physical.space import Boxes, collides
+from embomatrix.sim.physical.stage import PhysicalStage, compact
 from embomatrix.sim.physical.travel import SOMETHING, travel
 from embomatrix.sim.robot_dimensions import SHOULDER_LOW_M
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.limits import ROBOT
-from embomatrix.skills.view import refuse
+from embomatrix.skills.view import SkillRefusal, refuse
+from embomatrix.world.geometry import FloatArray
 from embomatrix.world.poses import StandPose
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    from embomatrix.sim.physical.reach import ArmPath, ArmReach, HeldGeometry
-    from embomatrix.sim.physical.space import Boxes
-    from embomatrix.sim.physical.stage import PhysicalStage
-    from embomatrix.skills.view import SkillRefusal
-    from embomatrix.world.geometry import FloatArray
 
 PATHS_TRIED: Final = 16
 ATTEMPTS: Final = 3

@@ -1,22 +1,16 @@
 """Grasp candidates: contact points of the hand on an object, and the tool paths to them."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from embomatrix.sim.physical.reach import ToolPath
 from embomatrix.sim.physical.space import part_boxes
-from embomatrix.world.geometry import Shape
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import FloatArray, Pose
+from embomatrix.world.asset import Asset
+from embomatrix.world.geometry import FloatArray, Pose, Shape
 
 OPEN_ELEVATIONS: Final = (30.0, 50.0, 10.0, 70.0, 90.0)
 ROOFED_ELEVATIONS: Final = (15.0, 30.0, 0.0, 45.0, 60.0)

@@ -1,24 +1,18 @@
 """Motions in the dynamic world: the motors follow postures at bounded speeds and stop at resistance."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Sequence
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.bullet.robot import Posture
 from embomatrix.sim.physical import body
 from embomatrix.sim.physical.body import ARM, LIFT, YAW
+from embomatrix.world.geometry import FloatArray
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from numpy.typing import NDArray
-
-    from embomatrix.sim.bullet.dynamic import DynamicWorld
-    from embomatrix.world.geometry import FloatArray
-
-    IntArray = NDArray[np.int_]
+IntArray = NDArray[np.int_]
 
 SPEED: Final = np.array([1.0, 1.0, 2.5, 0.5, 2.1, 2.1, 2.1, 2.1, 2.6, 2.6, 2.6])
 """Largest speeds in metres, and radians, a second. The arm's are the Panda's limits."""

@@ -1,28 +1,22 @@
 """Picking up: the hand approaches on a free path, touches, grips and lifts."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 
 from embomatrix.sim.physical.fold import ATTEMPTS, arrivals, fold
 from embomatrix.sim.physical.grasp import grasp_tool_paths
 from embomatrix.sim.physical.motion import raised
+from embomatrix.sim.physical.reach import ArmPath, ToolPath
+from embomatrix.sim.physical.space import Boxes
+from embomatrix.sim.physical.stage import PhysicalStage
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.view import refuse
+from embomatrix.skills.view import SkillRefusal, refuse
+from embomatrix.world.geometry import Aabb, FloatArray, Pose
 from embomatrix.world.poses import StandPose
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.sim.physical.reach import ArmPath, ToolPath
-    from embomatrix.sim.physical.space import Boxes
-    from embomatrix.sim.physical.stage import PhysicalStage
-    from embomatrix.skills.view import SkillRefusal
-    from embomatrix.world.geometry import Aabb, FloatArray, Pose
 
 GENTLE_PACE: Final = 0.25
 """Share of full speed on the last centimetres."""

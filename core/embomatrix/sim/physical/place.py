@@ -1,11 +1,10 @@
 """Placing: poses for the held object, regrasping if the hand can't reach them, and a check that the object stays."""
 
-from __future__ import annotations
-
 import itertools
 import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import Enum, auto
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -14,23 +13,17 @@ from embomatrix.sim.physical.fold import fold
 from embomatrix.sim.physical.grasp import grasp_tool_paths
 from embomatrix.sim.physical.pick import bases_at, entry, take_by
 from embomatrix.sim.physical.put import PutRequest, drop, put
+from embomatrix.sim.physical.reach import ToolPath
+from embomatrix.sim.physical.stage import Grip, PhysicalStage
 from embomatrix.sim.physical.travel import travel
 from embomatrix.sim.placing.trial import in_reach
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.limits import ROBOT
-from embomatrix.skills.view import preposition, refuse, target_of
-from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.skills.syntax import SkillCall
+from embomatrix.skills.view import SkillRefusal, preposition, refuse, target_of
+from embomatrix.world.geometry import Aabb, FloatArray, Pose
+from embomatrix.world.poses import StandPose
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
-    from embomatrix.sim.physical.reach import ToolPath
-    from embomatrix.sim.physical.stage import Grip, PhysicalStage
-    from embomatrix.skills.syntax import SkillCall
-    from embomatrix.skills.view import SkillRefusal
-    from embomatrix.world.geometry import FloatArray
-    from embomatrix.world.poses import StandPose
 
 PLACES: Final = 24
 HOSTS: Final = 3

@@ -3,29 +3,24 @@
 Cached and physical mode prefer the same reachable poses, so an object ends at the same place in both.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.sim.joints.panels import swing_panels
 from embomatrix.sim.joints.swings import SWING
 from embomatrix.sim.physical.pick import pick_paths
 from embomatrix.sim.physical.place import PLACES
 from embomatrix.sim.physical.put import PutRequest
+from embomatrix.sim.physical.reach import ArmPath
+from embomatrix.sim.physical.stage import Grip, PhysicalStage
 from embomatrix.sim.placing.placement import Placer
 from embomatrix.skills.failure import FailureReason
+from embomatrix.world.geometry import Pose
+from embomatrix.world.poses import PoseCache, StandPose
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-
-    from embomatrix.sim.physical.reach import ArmPath
-    from embomatrix.sim.physical.stage import Grip, PhysicalStage
-    from embomatrix.world.geometry import Pose
-    from embomatrix.world.poses import PoseCache, StandPose
 
 POSES_EXAMINED: Final = 9
 """Poses of one object at one target to examine."""

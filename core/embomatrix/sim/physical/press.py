@@ -1,9 +1,8 @@
 """Touching: the hand presses switches and works on objects."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterator
+from typing import Final
 
 import numpy as np
 
@@ -11,19 +10,13 @@ from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.fold import arrivals, fold
 from embomatrix.sim.physical.grasp import facing, surface_point
 from embomatrix.sim.physical.pick import GENTLE_PACE, TOUCH_M
-from embomatrix.sim.physical.reach import ToolPath
+from embomatrix.sim.physical.reach import ArmPath, ArmReach, ToolPath
 from embomatrix.sim.physical.space import collides, part_boxes
+from embomatrix.sim.physical.stage import PhysicalStage
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.view import refuse
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from embomatrix.sim.physical.reach import ArmPath, ArmReach
-    from embomatrix.sim.physical.stage import PhysicalStage
-    from embomatrix.skills.view import SkillRefusal
-    from embomatrix.world.geometry import FloatArray
+from embomatrix.skills.view import SkillRefusal, refuse
+from embomatrix.world.geometry import FloatArray
 
 HEIGHTS: Final = (0.85, 0.97, 0.65, 0.45, 0.25)
 """Shares of the object's height at which the hand presses, in order of preference."""

@@ -1,29 +1,22 @@
 """Putting down: the hand brings the held object in on a free path, sets it down, lets go and leaves."""
 
-from __future__ import annotations
-
 import itertools
 import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from embomatrix.sim.physical.fold import arrivals
 from embomatrix.sim.physical.motion import raised
 from embomatrix.sim.physical.pick import GENTLE_PACE, ROOFED_RAISE_M, bases_at, entry
-from embomatrix.sim.physical.reach import ArmReach, ToolPath
+from embomatrix.sim.physical.reach import ArmPath, ArmReach, ToolPath
+from embomatrix.sim.physical.stage import Grip, PhysicalStage
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.view import refuse
+from embomatrix.skills.view import SkillRefusal, refuse
 from embomatrix.world.geometry import Pose
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from embomatrix.sim.physical.reach import ArmPath
-    from embomatrix.sim.physical.stage import Grip, PhysicalStage
-    from embomatrix.skills.view import SkillRefusal
 
 CHUNKS: Final = (0, 1, 4, 9, 16, 24)
 """Poses are examined in these lots. The robot stands elsewhere for each lot."""

@@ -3,29 +3,22 @@
 Bases, lift heights and angles of the last joint are enumerated together. Of the free paths, the most comfortable is taken.
 """
 
-from __future__ import annotations
-
 import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from embomatrix.sim.engine import FLOOR
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.rrt import path_between
 from embomatrix.sim.physical.space import BallCollision, Boxes, collides
 from embomatrix.sim.robot_dimensions import LIFT_M, SHOULDER_LOW_M
-from embomatrix.world.geometry import Pose
+from embomatrix.world.geometry import FloatArray, Pose
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from embomatrix.world.geometry import FloatArray
-
-    BoolArray = NDArray[np.bool_]
+BoolArray = NDArray[np.bool_]
 
 OVER_WRIST_M: Final = (0.0, 0.2, 0.4, -0.2)
 """Heights of the shoulder over the wrist to try."""

@@ -4,19 +4,15 @@ Kuffner and LaValle, "RRT-Connect: an efficient approach to single-query path pl
 straight line to a drawn posture as far as that is free.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from typing import Final
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
+from embomatrix.world.geometry import FloatArray
 
-    from embomatrix.world.geometry import FloatArray
-
-    FreeUpTo = Callable[[FloatArray, FloatArray], FloatArray]
-    """Farthest free posture on the straight line from one posture to another, each of shape (k,)."""
+FreeUpTo = Callable[[FloatArray, FloatArray], FloatArray]
+"""Farthest free posture on the straight line from one posture to another, each of shape (k,)."""
 
 SHORTER_TRIES: Final = 12
 """Pairs of corners to try to join when a path is shortened."""

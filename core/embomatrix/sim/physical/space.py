@@ -5,25 +5,19 @@ The boxes come from the planning scene, to judge a motion before it is made.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from embomatrix.sim.engine import FLOOR, WALL
+from embomatrix.sim.engine import FLOOR, WALL, PhysicsEngine
 from embomatrix.sim.geometry.bounds import joint_motion
-from embomatrix.world.geometry import IDENTITY, Aabb, Pose, Shape
+from embomatrix.world.asset import Asset
+from embomatrix.world.geometry import IDENTITY, Aabb, FloatArray, Pose, Shape
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
-
-    from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import FloatArray
-
-    BoolArray = NDArray[np.bool_]
+BoolArray = NDArray[np.bool_]
 
 TOGETHER: Final = 6
 """Neighbouring balls that are first checked as one enclosing ball."""

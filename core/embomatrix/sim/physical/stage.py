@@ -6,11 +6,13 @@ Motions are planned in the first and made in the second. Objects that moved are 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.bullet.robot import tucked
 from embomatrix.sim.joints.panels import swing_panels
 from embomatrix.sim.joints.swings import SWING
@@ -18,18 +20,13 @@ from embomatrix.sim.physical import arm
 from embomatrix.sim.physical.floor import Floor
 from embomatrix.sim.physical.motion import Mover
 from embomatrix.sim.physical.reach import ArmReach, HeldGeometry, limb_balls
-from embomatrix.sim.physical.space import boxes_around, object_balls
+from embomatrix.sim.physical.space import Boxes, boxes_around, object_balls
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.geometry import Aabb, FloatArray, Pose
 from embomatrix.world.poses import StandPose
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
-    from embomatrix.sim.bullet.dynamic import DynamicWorld
     from embomatrix.sim.live_world import LiveWorld
-    from embomatrix.sim.physical.space import Boxes
-    from embomatrix.world.geometry import FloatArray
 
 SETTLE_STEPS: Final = 240
 """Longest settling time, in steps of 1/240 s. The world then counts as settled."""

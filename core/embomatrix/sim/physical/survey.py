@@ -4,45 +4,43 @@ Cached mode does not model the arm. The survey keeps it from promising actions t
 for arm paths once, in the initial scene, with the search of physical mode. Nothing is stepped, except for doors in doubt.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.joints.panels import DoorPanels, swing_panels
 from embomatrix.sim.joints.swings import SWING
-from embomatrix.sim.physical.doors import STRETCHES, close_all, open_all, panel_paths, panels_in_order
+from embomatrix.sim.live_world import LiveWorld
+from embomatrix.sim.physical.doors import (
+    STRETCHES,
+    DoorPanel,
+    close_all,
+    open_all,
+    panel_paths,
+    panels_in_order,
+)
 from embomatrix.sim.physical.fold import PATHS_TRIED, approach
 from embomatrix.sim.physical.pick import pick_paths
-from embomatrix.sim.physical.placement_reachability import PlacementReachability
+from embomatrix.sim.physical.placement_reachability import PlacementQuery, PlacementReachability
 from embomatrix.sim.physical.press import press_paths
+from embomatrix.sim.physical.reach import ArmPath, ArmReach
 from embomatrix.sim.physical.stage import AROUND_M, PhysicalStage
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.sim.placing.pose_cache import Contents
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.geometry import IDENTITY
-from embomatrix.world.poses import Handling, PoseCache
+from embomatrix.skills.view import SkillRefusal
+from embomatrix.world.asset import Asset
+from embomatrix.world.geometry import IDENTITY, FloatArray
+from embomatrix.world.poses import Handling, PoseCache, StandPose
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-
-    from embomatrix.sim.live_world import LiveWorld
-    from embomatrix.sim.physical.doors import DoorPanel
-    from embomatrix.sim.physical.placement_reachability import PlacementQuery
-    from embomatrix.sim.physical.reach import ArmPath, ArmReach
-    from embomatrix.skills.view import SkillRefusal
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import FloatArray
-    from embomatrix.world.poses import StandPose
-
-    Look = tuple[int | None, str]
-    """Number of the first suitable standing pose, and the blocker if there is none."""
+Look = tuple[int | None, str]
+"""Number of the first suitable standing pose, and the blocker if there is none."""
 
 STANDS: Final = 2
 """Standing poses to examine. More add little, because the robot steps aside to work."""

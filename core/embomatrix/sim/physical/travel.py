@@ -1,29 +1,22 @@
 """Driving: along the corners of a route, with headings at which arm and load pass, stopped by collisions."""
 
-from __future__ import annotations
-
 import itertools
 import math
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from embomatrix.sim.physical import body
 from embomatrix.sim.physical.space import collides
-from embomatrix.sim.physical.stage import compact
+from embomatrix.sim.physical.stage import PhysicalStage, compact
 from embomatrix.sim.placing.trial import in_reach
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.view import refuse
+from embomatrix.skills.view import SkillRefusal, refuse
+from embomatrix.world.geometry import FloatArray
 from embomatrix.world.poses import StandPose
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from embomatrix.sim.physical.stage import PhysicalStage
-    from embomatrix.skills.view import SkillRefusal
-    from embomatrix.world.geometry import FloatArray
-
-    BoolArray = NDArray[np.bool_]
+BoolArray = NDArray[np.bool_]
 
 HEADINGS: Final = 24
 SPACING_M: Final = 0.12

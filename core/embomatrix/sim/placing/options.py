@@ -1,36 +1,25 @@
 """Candidate poses of one object on, in or under another: verified poses and fresh ones, independent of the world's state."""
 
-from __future__ import annotations
-
 import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle, islice
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
-from embomatrix.sim.geometry.batch_poses import LinkBoxes, PoseSet
-from embomatrix.sim.geometry.bounds import bounds_of
-from embomatrix.sim.geometry.candidates import PLACE_RELATIONS, patches, proposed_places
+from embomatrix.sim.geometry.batch_poses import LinkBoxes, PoseBoxes, PoseSet
+from embomatrix.sim.geometry.bounds import AssetBounds, bounds_of
+from embomatrix.sim.geometry.candidates import PLACE_RELATIONS, Patch, patches, proposed_places
 from embomatrix.sim.geometry.footprints import LEVEL_FLOOR, footprint_of, pose_box_asset
-from embomatrix.sim.geometry.statics import base_of
+from embomatrix.sim.geometry.statics import Base, base_of
 from embomatrix.sim.geometry.surfaces import link_under, links_with_surfaces
-from embomatrix.world.geometry import IDENTITY, Aabb, Pose
+from embomatrix.world.asset import Asset
+from embomatrix.world.geometry import IDENTITY, Aabb, FloatArray, Pose, Vec2
 from embomatrix.world.placements import pose_rows, rows_of
-from embomatrix.world.poses import PlacementKey
+from embomatrix.world.poses import PlacementKey, PoseCache
+from embomatrix.world.scene import Scene
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-
-    from embomatrix.sim.geometry.batch_poses import PoseBoxes
-    from embomatrix.sim.geometry.bounds import AssetBounds
-    from embomatrix.sim.geometry.candidates import Patch
-    from embomatrix.sim.geometry.statics import Base
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import FloatArray, Vec2
-    from embomatrix.world.poses import PoseCache
-    from embomatrix.world.scene import Scene
 
 
 class CandidatePoses:

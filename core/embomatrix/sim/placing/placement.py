@@ -1,35 +1,26 @@
 """Placement of a held object: the first verified pose that is still free and in reach."""
 
-from __future__ import annotations
-
 import itertools
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Final
 
-from embomatrix.sim.floor.navigation import has_front
-from embomatrix.sim.geometry.batch_poses import Neighbours
+import numpy as np
+
+from embomatrix.sim.engine import PhysicsEngine
+from embomatrix.sim.floor.navigation import Navigator, has_front
+from embomatrix.sim.geometry.batch_poses import BoolArray, Neighbours, PoseBoxes
 from embomatrix.sim.geometry.bounds import bounds_of, parts_of
 from embomatrix.sim.geometry.candidates import candidates
 from embomatrix.sim.geometry.surfaces import is_shut, is_upright, link_frame, links_with_surfaces
 from embomatrix.sim.joints.behind_panels import behind_panels
-from embomatrix.sim.placing.options import PlacementOptions
+from embomatrix.sim.placing.options import CandidatePoses, PlacementOptions
 from embomatrix.sim.placing.trial import NEAR_M, PlacementRequest, PoseTrial
+from embomatrix.sim.state.relations import Relations
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.geometry import IDENTITY
+from embomatrix.world.geometry import IDENTITY, Pose
+from embomatrix.world.poses import PoseCache, StandPose
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    import numpy as np
-
-    from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.floor.navigation import Navigator
-    from embomatrix.sim.geometry.batch_poses import BoolArray, PoseBoxes
-    from embomatrix.sim.placing.options import CandidatePoses
-    from embomatrix.sim.state.relations import Relations
-    from embomatrix.world.geometry import Pose
-    from embomatrix.world.poses import PoseCache, StandPose
 
 LIVE_TRIES: Final = 64
 """Candidates tried beyond the cached ones."""

@@ -1,17 +1,16 @@
 """Offline scene analysis: terminal poses, each verified by settling, and standing poses."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import itertools
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterator, Sequence
+from typing import Final
 
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.mini_world import MiniWorld, StaticObject
-from embomatrix.sim.engine import TOLERANCE_M
+from embomatrix.sim.engine import TOLERANCE_M, PhysicsEngine
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.candidates import (
@@ -24,17 +23,11 @@ from embomatrix.sim.geometry.candidates import (
 )
 from embomatrix.sim.geometry.footprints import LEVEL_FLOOR, Footprint, box_of, footprint_of
 from embomatrix.sim.state.relations import Relations
-from embomatrix.world.geometry import IDENTITY, Pose
+from embomatrix.world.asset import Asset
+from embomatrix.world.geometry import IDENTITY, Aabb, Pose
 from embomatrix.world.poses import PlacementKey, PoseCache, StandPose
+from embomatrix.world.scene import Scene
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import Aabb
-    from embomatrix.world.scene import Scene
 
 POSES: Final = 16
 """Verified poses kept per pair."""

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.engine import FLOOR, TOLERANCE_M
+from embomatrix.sim.engine import FLOOR, TOLERANCE_M, PhysicsEngine
 from embomatrix.sim.geometry.statics import is_level, rest_pose
 from embomatrix.sim.geometry.surfaces import link_frame
+from embomatrix.sim.state.relations import Relations
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.geometry import IDENTITY, Pose
+from embomatrix.world.geometry import IDENTITY, Aabb, Pose
+from embomatrix.world.poses import StandPose
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.placing.options import CandidatePoses, PlacementOptions
-    from embomatrix.sim.state.relations import Relations
-    from embomatrix.world.geometry import Aabb
-    from embomatrix.world.poses import StandPose
 
 UNDISTURBED_M: Final = 0.005
 """A pose verified offline is settled again if anything but its support is this near."""

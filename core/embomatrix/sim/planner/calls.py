@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.skills.check import within_reach
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.syntax import MAX_STEPS, PlaceRelation, Skill, SkillCall
+from embomatrix.skills.syntax import MAX_STEPS, PlaceRelation, Plan, Skill, SkillCall
+from embomatrix.skills.trace import Step
+from embomatrix.world.task import Task
 
 if TYPE_CHECKING:
     from embomatrix.sim.executor import Simulator
-    from embomatrix.skills.syntax import Plan
-    from embomatrix.skills.trace import Step
-    from embomatrix.world.task import Task
 
 NEIGHBOURS: Final = 6
 """Neighbours of an object to try as standing places when the object's own standing poses do not serve."""

@@ -1,16 +1,16 @@
 """Alternative ways to make a goal true: conjunctions of ground literals, those that change least first."""
 
-from __future__ import annotations
-
 import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.world.evaluate import substitute
 from embomatrix.world.goal import (
     And,
     Atom,
     Exists,
+    Facts,
     Forall,
     Formula,
     ForN,
@@ -22,12 +22,7 @@ from embomatrix.world.goal import (
 )
 from embomatrix.world.state import Relation
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
-
-    from embomatrix.world.goal import Facts
-
-    Types = Mapping[str, tuple[str, ...]]
+Types = Mapping[str, tuple[str, ...]]
 
 WIDTH: Final = 12
 """Alternatives kept for each part of a goal."""

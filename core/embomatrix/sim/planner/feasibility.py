@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.sim.planner.choices import GroundLiteral
 from embomatrix.sim.planner.tool_work import methods_for, needs_tools, no_method, subgoal_for
 from embomatrix.skills.appliances import cold_source, cooks, freezes, heat_source, heats
 from embomatrix.skills.limits import ROBOT
+from embomatrix.world.asset import Asset
 from embomatrix.world.state import Relation, State
 from embomatrix.world.substances import word_of
-from embomatrix.world.task import Profile
+from embomatrix.world.task import Profile, Task
 
 if TYPE_CHECKING:
     from embomatrix.sim.live_world import LiveWorld
-    from embomatrix.sim.planner.choices import GroundLiteral
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.task import Task
 
 SYMMETRIC: Final = frozenset({Relation.NEXTTO, Relation.TOUCHING, Relation.UNDER})
 """Relations that come about by carrying either object."""

@@ -9,28 +9,26 @@ from __future__ import annotations
 
 import functools
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.planner.calls import StuckError, TooLongError
-from embomatrix.sim.planner.choices import choices
+from embomatrix.sim.planner.choices import Choice, GroundLiteral, choices
 from embomatrix.sim.planner.feasibility import needs_heat, portables, sources_for, why_impossible
 from embomatrix.sim.planner.script import PlanScript
 from embomatrix.sim.planner.subgoals import Exposure, PlacementGoal, Subgoals
 from embomatrix.sim.planner.tool_work import chosen_methods, needs_tools, subgoals_for
 from embomatrix.skills.prompt import plain_words
+from embomatrix.skills.syntax import Plan
 from embomatrix.world.evaluate import evaluate, render
 from embomatrix.world.goal import Not
+from embomatrix.world.scene import Scene
 from embomatrix.world.state import Relation, State
+from embomatrix.world.task import Task
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from embomatrix.sim.executor import Simulator
-    from embomatrix.sim.planner.choices import Choice, GroundLiteral
-    from embomatrix.skills.syntax import Plan
-    from embomatrix.world.scene import Scene
-    from embomatrix.world.task import Task
 
 PROOF_SEEDS: Final = (0, 1, 2)
 """A plan must succeed with each of these seeds, so that it does not depend on luck."""

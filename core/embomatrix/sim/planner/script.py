@@ -7,23 +7,20 @@ A failed call changes nothing and is left out of the plan. If there is a remedy,
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.planner.calls import PlanCalls, StuckError
-from embomatrix.sim.planner.choices import belongs_at, may_lie_on
+from embomatrix.sim.planner.choices import Choice, belongs_at, may_lie_on
 from embomatrix.skills.appliances import cold_source, heat_source, starts_closed
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.syntax import PlaceRelation, Skill
+from embomatrix.skills.syntax import PlaceRelation, Plan, Skill
+from embomatrix.skills.trace import Step
 from embomatrix.world.state import Relation
+from embomatrix.world.task import Task
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from embomatrix.sim.executor import Simulator
-    from embomatrix.sim.planner.choices import Choice
-    from embomatrix.skills.syntax import Plan
-    from embomatrix.skills.trace import Step
-    from embomatrix.world.task import Task
 
 DEPTH: Final = 8
 """Longest chain of objects that must be cleared away, each before the next."""

@@ -7,24 +7,22 @@ every object goes to its final place. Doors and switches get their final positio
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.geometry.candidates import candidates
 from embomatrix.sim.planner.calls import StuckError
-from embomatrix.sim.planner.tool_work import do_tool_work
+from embomatrix.sim.planner.script import PlanScript
+from embomatrix.sim.planner.tool_work import ToolMethod, ToolSubgoal, do_tool_work
 from embomatrix.skills.appliances import cold_source, heat_source
 from embomatrix.skills.syntax import PlaceRelation
 from embomatrix.world.asset import FLOOR_CATEGORY
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
     from embomatrix.sim.executor import Simulator
     from embomatrix.sim.live_world import LiveWorld
-    from embomatrix.sim.planner.script import PlanScript
-    from embomatrix.sim.planner.tool_work import ToolMethod, ToolSubgoal
 
 ON_OR_IN: Final = (PlaceRelation.ONTOP, PlaceRelation.INSIDE)
 MIDDLE: Final = (0.5, 0.5)

@@ -6,11 +6,14 @@ else.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
 from embomatrix.sim.planner.calls import StuckError
+from embomatrix.sim.planner.choices import GroundLiteral
+from embomatrix.sim.planner.script import PlanScript
 from embomatrix.sim.state.facts import REAL
 from embomatrix.skills.appliances import (
     gives_liquid,
@@ -25,11 +28,7 @@ from embomatrix.world.state import State, SubstanceRelation
 from embomatrix.world.substances import MEANINGS, RUNNING, word_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
     from embomatrix.sim.live_world import LiveWorld
-    from embomatrix.sim.planner.choices import GroundLiteral
-    from embomatrix.sim.planner.script import PlanScript
 
 
 class ToolWork(StrEnum):

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence, Set
 from typing import TYPE_CHECKING, TypeVar
 
-from embomatrix.world.state import Relation, State, SubstanceRelation
+from embomatrix.world.state import Relation, State, SubstanceFact, SubstanceRelation
 from embomatrix.world.substances import MEANINGS, fact_holds
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence, Set
-
     from embomatrix.sim.state.relations import Relations
-    from embomatrix.world.state import SubstanceFact
 
 T = TypeVar("T")
 

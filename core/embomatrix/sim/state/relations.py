@@ -3,22 +3,16 @@
 A parked object has no relations.
 """
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from typing import Final
 
+from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.surfaces import REST_M, heights_over, is_under
-from embomatrix.sim.state.supports import SupportTracker
+from embomatrix.sim.state.supports import Enclosure, Host, SupportTracker
+from embomatrix.world.geometry import Aabb
 from embomatrix.world.state import OPEN_FRACTION, Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.state.supports import Enclosure, Host
-    from embomatrix.world.geometry import Aabb
 
 TOUCH_M: Final = 0.005
 NEXT_SHARE: Final = 1 / 6

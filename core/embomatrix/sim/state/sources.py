@@ -4,12 +4,15 @@ The effects follow from the state alone, whichever call caused it, and are immed
 frozen until a source undoes it: a rollout is shorter than cooling. Cooked objects stay cooked. Nothing dries or empties.
 """
 
-from __future__ import annotations
-
+from collections.abc import Iterator, Mapping, MutableMapping, Set
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from embomatrix.sim.engine import PhysicsEngine
+from embomatrix.sim.state.relations import Relations
 from embomatrix.skills.appliances import (
+    ThermalSource,
+    Washing,
     cold_source,
     cooks,
     coverings,
@@ -21,17 +24,10 @@ from embomatrix.skills.appliances import (
     washed_away,
     washing,
 )
+from embomatrix.world.asset import Asset
 from embomatrix.world.geometry import Aabb
 from embomatrix.world.state import Relation, State, SubstanceFact, SubstanceRelation
 from embomatrix.world.substances import flows_from, in_words, word_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, MutableMapping, Set
-
-    from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.state.relations import Relations
-    from embomatrix.skills.appliances import ThermalSource, Washing
-    from embomatrix.world.asset import Asset
 
 VESSEL_M: Final = 0.3
 """Largest height over a source of the underside of an object that stands in a vessel on the source."""

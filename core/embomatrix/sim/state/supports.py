@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.geometry.bounds import bounds_of, square_box
 from embomatrix.sim.geometry.surfaces import (
     REST_M,
@@ -15,15 +17,9 @@ from embomatrix.sim.geometry.surfaces import (
     link_frame,
     surface_under,
 )
+from embomatrix.world.asset import Asset, Interior
+from embomatrix.world.geometry import Aabb, Pose, Vec3
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.world.asset import Asset, Interior
-    from embomatrix.world.geometry import Aabb, Pose, Vec3
-
 
 SLACK_M: Final = 0.05
 

@@ -3,23 +3,17 @@
 All coordinates are in the asset's frame: origin at the centre of its box, front at +x, z up, joints closed, metres.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.assets.shapes import box, box_of, rounded
 from embomatrix.world.asset import Interior, Joint, JointKind, Link, SupportSurface
-from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Vec2, Vec3
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
-
-    Proportions = tuple[Vec2, Vec2, Vec2]
+Proportions = tuple[Vec2, Vec2, Vec2]
 
 OPEN_ABOVE_M: Final = 2.0
 """Clearance of a surface with no part of the asset above it; no room is higher."""

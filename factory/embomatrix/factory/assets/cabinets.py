@@ -1,11 +1,9 @@
 """Assets with a cavity: cabinets, fridges, ovens, open shelving, chests with a lid, open boxes."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.assets.body import (
     FIT_M,
@@ -22,10 +20,7 @@ from embomatrix.factory.assets.body import (
 from embomatrix.factory.assets.drawers import add_drawers
 from embomatrix.factory.assets.furniture import slab
 from embomatrix.factory.assets.shapes import box, box_of
-from embomatrix.world.geometry import Aabb
-
-if TYPE_CHECKING:
-    from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
+from embomatrix.world.geometry import Aabb, ConvexPart, Vec2, Vec3
 
 MAX_PARTS: Final = 16
 """Upper limit for the parts of a link: Bullet silently drops further ones."""

@@ -3,12 +3,11 @@
 `check_asset` uses geometry alone and takes about two milliseconds. `check_standing` drops the asset in the engine.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.assets.families import Family
 from embomatrix.factory.assets.library import FLAT_ON_WALL, HUNG, family_of, family_of_model
@@ -16,13 +15,9 @@ from embomatrix.factory.assets.solids import Convex, Solids, convex_of
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.mini_world import MiniWorld
 from embomatrix.sim.geometry.bounds import joint_motion
+from embomatrix.world.asset import Asset, Link
+from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import IDENTITY, Aabb, Pose
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
-
-    from embomatrix.world.asset import Asset, Link
-    from embomatrix.world.catalog import Catalog
 
 SIZE_TOLERANCE: Final = 0.05
 PROBE_M: Final = 0.03

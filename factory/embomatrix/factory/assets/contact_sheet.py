@@ -1,22 +1,16 @@
 """Contact sheet of assets: one picture for each, and a second one with doors and drawers open."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from embomatrix.factory.assets.shapes import mesh_of
 from embomatrix.sim.geometry.bounds import joint_motion
-from embomatrix.world.geometry import IDENTITY
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import FloatArray
+from embomatrix.world.asset import Asset
+from embomatrix.world.geometry import IDENTITY, FloatArray
 
 TILE_PX: Final = 190
 _COLUMNS: Final = 8

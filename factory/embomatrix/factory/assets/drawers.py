@@ -1,16 +1,11 @@
 """Drawers: open boxes that slide out of the front of a carcass with their contents."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.assets.body import Body, Walls, clamp, region, shell
 from embomatrix.factory.assets.shapes import box_of, rounded
 from embomatrix.world.asset import Joint, JointKind, Link
-from embomatrix.world.geometry import Aabb
-
-if TYPE_CHECKING:
-    from embomatrix.world.geometry import Vec2
+from embomatrix.world.geometry import Aabb, Vec2
 
 TRAVEL_SHARE: Final = 0.8
 """Share of its depth by which a drawer slides out; the rest stays on the rails."""

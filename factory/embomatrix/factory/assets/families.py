@@ -1,22 +1,15 @@
 """Families of geometry: fixed proportions that are scaled to the size of a catalog model."""
 
-from __future__ import annotations
-
 import functools
+from collections.abc import Callable, Sequence
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from typing import Self
 
 from embomatrix.factory.assets import cabinets, fixtures, furniture, goods, structures, vessels
-from embomatrix.factory.assets.body import Body, proportioned
+from embomatrix.factory.assets.body import Body, Proportions, proportioned
+from embomatrix.world.geometry import Vec3
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from typing import Self
-
-    from embomatrix.factory.assets.body import Proportions
-    from embomatrix.world.geometry import Vec3
-
-    Generator = Callable[[Vec3], Body]
+Generator = Callable[[Vec3], Body]
 
 
 def _boxes(rows: Sequence[Proportions]) -> Generator:

@@ -1,8 +1,6 @@
 """Fixtures of a building: sinks, baths, toilets, stoves, doors, windows, screens, plants, cars."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.assets.body import (
     FIT_M,
@@ -21,10 +19,7 @@ from embomatrix.factory.assets.body import (
 )
 from embomatrix.factory.assets.furniture import legs
 from embomatrix.factory.assets.shapes import box, lump, octagon
-from embomatrix.world.geometry import Aabb
-
-if TYPE_CHECKING:
-    from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
+from embomatrix.world.geometry import Aabb, ConvexPart, Vec2, Vec3
 
 _ON_LEGS_M: Final = 0.6
 """Height from which a grill stands on legs."""

@@ -1,15 +1,11 @@
 """Tables, desks, seats, beds and lamps: boards on legs with free space below."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.assets.body import Body, Walls, centred, clamp, raised, region, shell
 from embomatrix.factory.assets.drawers import add_drawers
 from embomatrix.factory.assets.shapes import box, octagon
-
-if TYPE_CHECKING:
-    from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
+from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
 
 
 def legs(low: Vec2, high: Vec2, z: Vec2, thickness_m: float) -> list[ConvexPart]:

@@ -1,8 +1,7 @@
 """Small loose objects: food, cutlery, soft goods. All have a flat base, so they do not roll away."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from typing import Final
 
 from embomatrix.factory.assets.body import FULL, Body, centred
 from embomatrix.factory.assets.shapes import (
@@ -21,12 +20,7 @@ from embomatrix.factory.assets.shapes import (
     ring,
     wedge,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from embomatrix.world.geometry import Aabb, ConvexPart, Vec3
-
+from embomatrix.world.geometry import Aabb, ConvexPart, Vec3
 
 LEAST_ROUND_M: Final = 0.01
 """Thinner objects become plain boxes: the engine's collision margin is of this order, and a box comes to rest fastest."""

@@ -3,21 +3,16 @@
 A category gets its family from the table of names, else from a pattern of names, else from the taxonomy, else a plain block.
 """
 
-from __future__ import annotations
-
 import functools
 import re
 import zlib
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping
+from typing import Final
 
 from embomatrix.factory.assets.cabinets import MAX_PARTS
 from embomatrix.factory.assets.families import Family
 from embomatrix.world.asset import Asset, Link
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.world.catalog import Catalog
+from embomatrix.world.catalog import Catalog
 
 
 @functools.cache

@@ -4,21 +4,15 @@ Unit shapes are hulls computed once with trimesh; a part of an asset is a scaled
 mesh, for pictures and for checks of volume.
 """
 
-from __future__ import annotations
-
 import functools
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 import trimesh
 
-from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.world.geometry import FloatArray, Vec2, Vec3
+from embomatrix.world.geometry import Aabb, ConvexPart, FloatArray, Pose, Shape, Vec2, Vec3
 
 DECIMALS: Final = 6
 """Coordinates are rounded to 1 µm, so that equal models give equal bytes on every machine."""

@@ -8,21 +8,17 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from scipy.spatial import ConvexHull
 
 from embomatrix.sim.geometry.bounds import joint_motion
-from embomatrix.world.geometry import IDENTITY, Pose, Shape
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import ConvexPart, FloatArray
-    from embomatrix.world.scene import Scene
+from embomatrix.world.asset import Asset
+from embomatrix.world.geometry import IDENTITY, ConvexPart, FloatArray, Pose, Shape
+from embomatrix.world.scene import Scene
 
 TOLERANCE_M: Final = 0.001
 """Shallower overlaps are contact, not penetration."""

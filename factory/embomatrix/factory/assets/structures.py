@@ -1,8 +1,6 @@
 """Open structures and machines: posts, stands, racks, fences, canopies, stairs, gym machines, vehicles, wall fittings."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.assets.body import (
     FULL,
@@ -16,10 +14,7 @@ from embomatrix.factory.assets.body import (
 )
 from embomatrix.factory.assets.furniture import legs
 from embomatrix.factory.assets.shapes import box, octagon
-from embomatrix.world.geometry import Aabb
-
-if TYPE_CHECKING:
-    from embomatrix.world.geometry import ConvexPart, Vec3
+from embomatrix.world.geometry import Aabb, ConvexPart, Vec3
 
 COUNTER_M: Final = 0.9
 """Height of a stall's counter."""

@@ -1,10 +1,8 @@
 """Round objects: bowls, pots, pans, cups, glasses, plates, bottles, jars and pots with a lid."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.assets.body import (
     FIT_M,
@@ -19,10 +17,7 @@ from embomatrix.factory.assets.body import (
 )
 from embomatrix.factory.assets.cabinets import SHALLOW_M
 from embomatrix.factory.assets.shapes import box, inscribed, octagon, prism, ring, shouldered
-from embomatrix.world.geometry import Aabb
-
-if TYPE_CHECKING:
-    from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
+from embomatrix.world.geometry import Aabb, ConvexPart, Vec2, Vec3
 
 
 class Handle(StrEnum):

@@ -1,12 +1,11 @@
 """``embomatrix factory agent``: run one agent of the factory on a brief."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -19,14 +18,9 @@ from embomatrix.factory.commands.language_model import (
     model_layout_agents,
 )
 from embomatrix.factory.commands.terminal import fail, user_errors
-from embomatrix.factory.layout.agent_interfaces import LAYOUT_AGENTS, MODEL_BACKED, AgentName
+from embomatrix.factory.layout.agent_interfaces import LAYOUT_AGENTS, MODEL_BACKED, AgentInterface, AgentName
 from embomatrix.factory.social.agent_interfaces import SOCIAL_AGENTS, SocialAgent, answer_with_model
 from embomatrix.factory.social.model_agents import SocialModelAgents
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.factory.layout.agent_interfaces import AgentInterface
 
 ALL_AGENTS: Final[Mapping[str, AgentInterface]] = {
     **{name.value: interface for name, interface in SOCIAL_AGENTS.items()},

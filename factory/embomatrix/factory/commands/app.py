@@ -1,10 +1,8 @@
 """``embomatrix factory``: build, generate, list and export datasets of verified tasks."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -30,20 +28,17 @@ from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Scene
 from embomatrix.factory.commands.task_import import app as import_app
 from embomatrix.factory.commands.terminal import fail, progress, user_errors
 from embomatrix.factory.commands.verification import app as verify_app
+from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pipeline.build import BuildSummary, VariantCheck, build_dataset
 from embomatrix.factory.pipeline.cluster import cluster_check
 from embomatrix.factory.pipeline.export import dataset_card, encode_rows, export_rows
 from embomatrix.factory.pipeline.settings import SCENE_EXTRACTOR, BuildSettings, WriterKind, scene_ids
+from embomatrix.factory.writer.tasks import TaskWriter
 from embomatrix.llm.batch import FailureLimit
-from embomatrix.llm.ledger import Price
+from embomatrix.llm.ledger import Ledger, Price
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.task import TaskCategory
 from embomatrix.world.whole_file import write_whole
-
-if TYPE_CHECKING:
-    from embomatrix.factory.layout.request import LayoutAgents
-    from embomatrix.factory.writer.tasks import TaskWriter
-    from embomatrix.llm.ledger import Ledger
 
 app = typer.Typer(
     help="Build and inspect datasets of verified tasks.",

@@ -1,11 +1,10 @@
 """``embomatrix factory assets``: test the generated assets, look at them, and import models from files."""
 
-from __future__ import annotations
-
 from collections import Counter
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, NoReturn
+from typing import Annotated, Final, NoReturn
 
 import typer
 from rich.console import Console
@@ -14,20 +13,14 @@ from rich.table import Table
 from embomatrix.factory.assets.check import GLANCE_STEPS, STEPS, AssetRule, check_asset, check_standing
 from embomatrix.factory.assets.contact_sheet import draw_sheet
 from embomatrix.factory.assets.library import build_asset, family_of
-from embomatrix.factory.importers.assemble import import_model, read_model
+from embomatrix.factory.importers.assemble import ImportedAsset, import_model, read_model
 from embomatrix.factory.importers.convex import Coacd, by_components
 from embomatrix.factory.importers.model import AxisConvention, ModelFileError
 from embomatrix.factory.importers.shelf import save_asset
 from embomatrix.sim.engine import EngineError
-from embomatrix.world.asset import Credit
+from embomatrix.world.asset import Asset, Credit
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.records import SceneInvalidError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.factory.importers.assemble import ImportedAsset
-    from embomatrix.world.asset import Asset
 
 app = typer.Typer(
     help="Test, draw and import the models that scenes are built from.",

@@ -1,10 +1,8 @@
 """``embomatrix factory corpus``: build the training set and the frozen evaluation set Internal-Verified."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -13,9 +11,7 @@ from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Seed,
 from embomatrix.factory.commands.terminal import fail, progress, user_errors
 from embomatrix.factory.pipeline.build import build_dataset
 from embomatrix.factory.pipeline.corpus import HELDOUT_SCENES, CorpusSettings, check_frozen, freeze
-
-if TYPE_CHECKING:
-    from embomatrix.factory.pipeline.settings import BuildSettings
+from embomatrix.factory.pipeline.settings import BuildSettings
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 

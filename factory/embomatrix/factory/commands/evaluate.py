@@ -1,12 +1,11 @@
 """``embomatrix factory evaluate``: measure tasks and scenes, write the figures, render the benchmark page."""
 
-from __future__ import annotations
-
 import asyncio
 import json
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import Annotated, TypeVar
 
 import numpy as np
 import typer
@@ -20,7 +19,7 @@ from embomatrix.factory.evaluate.judges import evaluate_looks, judged
 from embomatrix.factory.evaluate.page import with_factory
 from embomatrix.factory.evaluate.scenes import LayoutMethod, OutcomeLog, evaluate_scenes, fixed_tasks
 from embomatrix.factory.evaluate.side_by_side import draw_side_by_side, named
-from embomatrix.factory.evaluate.tasks import asked_of, evaluate_tasks, panel, people_of
+from embomatrix.factory.evaluate.tasks import DraftFeatures, asked_of, evaluate_tasks, panel, people_of
 from embomatrix.factory.metrics.figures import (
     EvaluationError,
     EvaluationFigures,
@@ -28,15 +27,10 @@ from embomatrix.factory.metrics.figures import (
 )
 from embomatrix.factory.pipeline.corpus import training_scenes
 from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER
+from embomatrix.llm.values import ChatModel
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.whole_file import write_whole
-
-if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping, Sequence
-
-    from embomatrix.factory.evaluate.tasks import DraftFeatures
-    from embomatrix.llm.values import ChatModel
 
 app = typer.Typer(
     help="Measure tasks and scenes; write the figures as JSON and to the benchmark page.",

@@ -1,7 +1,5 @@
 """``embomatrix factory inspect`` and ``pictures``: HTML page of a task, pictures of a dataset's scenes."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Annotated

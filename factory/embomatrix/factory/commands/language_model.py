@@ -1,30 +1,24 @@
 """Language models for the factory's commands: options, endpoint, cassette, and the agents that run on them."""
 
-from __future__ import annotations
-
 import contextlib
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from embomatrix.factory.commands.terminal import fail
 from embomatrix.factory.layout.agent_interfaces import MODEL_BACKED, AgentName
 from embomatrix.factory.layout.model_agents import ModelLayoutAgents
+from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pictures.sights import sights_of
 from embomatrix.factory.social.model_agents import SocialModelAgents
 from embomatrix.factory.social.model_writer import ModelWriter
+from embomatrix.llm.batch import FailureLimit
 from embomatrix.llm.cassette import Cassette, CassetteMode
 from embomatrix.llm.endpoint import Endpoint
 from embomatrix.llm.ledger import Ledger, Price
-from embomatrix.llm.values import EndpointError
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
-
-    from embomatrix.factory.layout.request import LayoutAgents
-    from embomatrix.llm.batch import FailureLimit
-    from embomatrix.llm.values import ChatModel
+from embomatrix.llm.values import ChatModel, EndpointError
 
 Forms = Annotated[
     list[str] | None,

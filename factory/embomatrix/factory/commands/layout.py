@@ -1,10 +1,9 @@
 """``embomatrix factory lay``: run all layout agents on one task."""
 
-from __future__ import annotations
-
 import contextlib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -23,16 +22,12 @@ from embomatrix.factory.commands.terminal import fail, user_errors
 from embomatrix.factory.layout.agent_interfaces import LAYOUT_AGENTS, AgentName
 from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.generator import lay as lay_by_tree
+from embomatrix.factory.layout.request import Layout, LayoutRecord, RequestedObject
 from embomatrix.factory.pictures.scene import draw_plan
 from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.editor import SceneEditor
 from embomatrix.factory.task_import.sources import read_activity, read_file
 from embomatrix.factory.task_import.task import ImportOptions, import_problem
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.factory.layout.request import Layout, LayoutRecord, RequestedObject
-    from embomatrix.factory.scenes.editor import SceneEditor
 
 BASELINES = {"random": lay_at_random, "poses": lay_by_poses}
 METHODS = ("tree", *BASELINES)

@@ -1,7 +1,5 @@
 """Options shared by commands of the factory."""
 
-from __future__ import annotations
-
 import os
 from typing import Annotated, Final
 

@@ -1,13 +1,12 @@
 """``embomatrix play``: execute a plan in a task and explain every step and the reward."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import sys
+from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 import typer
 from rich.console import Console
@@ -16,9 +15,10 @@ from rich.progress import Progress
 from rich.table import Table
 
 from embomatrix.factory.pictures.film import Caption, FilmError, check_suffix, draw_film, write_film
+from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import score, unparsable
 from embomatrix.sim.engine import EngineError
-from embomatrix.sim.film import film_cached
+from embomatrix.sim.film import Film, film_cached
 from embomatrix.sim.physical.actor import PhysicalActor
 from embomatrix.sim.physical.film import film_physical
 from embomatrix.sim.planner.oracle import PlanNotFound, find_plan
@@ -26,20 +26,13 @@ from embomatrix.sim.simulation import load_simulator
 from embomatrix.sim.state.facts import FactError
 from embomatrix.skills.describe import call_in_words
 from embomatrix.skills.parse import PlanError, parse_plan
-from embomatrix.skills.syntax import MAX_PLAN_BYTES
+from embomatrix.skills.syntax import MAX_PLAN_BYTES, Plan
+from embomatrix.skills.trace import Trace
+from embomatrix.world.bundle import Bundle
 from embomatrix.world.dataset import Dataset, DatasetError
 from embomatrix.world.evaluate import GoalError
+from embomatrix.world.task import Task
 from embomatrix.world.whole_file import check_writable
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from embomatrix.reward.breakdown import RewardBreakdown
-    from embomatrix.sim.film import Film
-    from embomatrix.skills.syntax import Plan
-    from embomatrix.skills.trace import Trace
-    from embomatrix.world.bundle import Bundle
-    from embomatrix.world.task import Task
 
 DEFAULT_DATASET: Final = "build/dataset"
 BAD_INPUT: Final = 2

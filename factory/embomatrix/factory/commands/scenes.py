@@ -1,13 +1,12 @@
 """``embomatrix scene``: build, list, show, draw and check base scenes."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -24,19 +23,14 @@ from embomatrix.factory.pictures.scene import draw_plan
 from embomatrix.factory.pictures.sheet import draw_eyes, draw_sheet, draw_views
 from embomatrix.factory.scenes.batch import SceneBuildJob, run_batch
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.scenes.report import TABLE_COLUMNS, problem_lines, report_table
+from embomatrix.factory.scenes.report import TABLE_COLUMNS, SceneReport, problem_lines, report_table
 from embomatrix.factory.scenes.scene_file import SUFFIX, SceneFileError, read_scene
 from embomatrix.host.limits import usable_cores
 from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.sim.engine import EngineError
 from embomatrix.world.catalog import Catalog, CatalogError
+from embomatrix.world.scene import Scene
 from embomatrix.world.whole_file import check_writable, write_whole
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from embomatrix.factory.scenes.report import SceneReport
-    from embomatrix.world.scene import Scene
 
 app = typer.Typer(
     help="Build, check and draw base scenes.",

@@ -1,11 +1,10 @@
 """``embomatrix factory import``: bind BDDL problems to base scenes, verify them, and report refusals."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -14,7 +13,7 @@ from rich.table import Table
 from embomatrix.factory.admission import TaskRefusal
 from embomatrix.factory.commands.options import Jobs, LookAhead, Scenes, Seed, processes
 from embomatrix.factory.commands.terminal import fail, progress, user_errors
-from embomatrix.factory.metrics.figures import EvaluationError, write_evaluation
+from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures, write_evaluation
 from embomatrix.factory.pipeline.settings import scene_ids
 from embomatrix.factory.pipeline.store import ResumableLog
 from embomatrix.factory.task_import.batch import Verified
@@ -38,17 +37,12 @@ from embomatrix.factory.task_import.sources import (
     read_file,
     read_jsonl,
 )
+from embomatrix.factory.task_import.task import ImportedTask
 from embomatrix.world.bddl import BddlError
 from embomatrix.world.dataset import TASKS_FILE, write_dataset
 from embomatrix.world.substances import is_substance
 from embomatrix.world.task import Profile
 from embomatrix.world.whole_file import check_writable, write_whole
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from embomatrix.factory.metrics.figures import EvaluationFigures
-    from embomatrix.factory.task_import.task import ImportedTask
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 EVERY_ACTIVITY = "all"

@@ -1,9 +1,9 @@
 """Terminal output of the factory's commands: progress bars, user errors and tables of figures."""
 
-from __future__ import annotations
-
 import contextlib
-from typing import TYPE_CHECKING, NoReturn
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NoReturn
 
 import typer
 from rich.console import Console
@@ -19,7 +19,12 @@ from rich.table import Table
 
 from embomatrix.factory.layout.agent_interfaces import BriefError
 from embomatrix.factory.layout.distribution import DistributionError
-from embomatrix.factory.metrics.figures import EvaluationError, verdict_on, write_evaluation
+from embomatrix.factory.metrics.figures import (
+    EvaluationError,
+    EvaluationFigures,
+    verdict_on,
+    write_evaluation,
+)
 from embomatrix.factory.task_import.sources import ProblemSourceError
 from embomatrix.llm.values import LlmError
 from embomatrix.rpc.status import ClusterError
@@ -27,12 +32,6 @@ from embomatrix.sim.engine import EngineMissingError
 from embomatrix.world.bddl import BddlError
 from embomatrix.world.catalog import CatalogError
 from embomatrix.world.dataset import DatasetError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from embomatrix.factory.metrics.figures import EvaluationFigures
 
 
 def progress(console: Console) -> Progress:

@@ -1,7 +1,5 @@
 """``embomatrix factory verify``: verify the tasks of a dataset again, in other processes and in stepped physics."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,20 +1,16 @@
 """Admission figures from a build's ledger: share of admitted drafts, reasons against the others, tasks per hour."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
 
 from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures
 from embomatrix.factory.pipeline.settings import WriterKind
 from embomatrix.factory.pipeline.store import ATTEMPTS_FILE, BUILD_FILE, TIMES_FILE
 from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.pages.figures import Better, Figure
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
 
 GOAL_PERCENT: Final = 90.0
 GOAL_PER_HOUR: Final = 1000.0

@@ -10,24 +10,21 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from embomatrix.factory.evaluate.room_plans import FLOOR, RoomBox, RoomPlan, read_rooms
 from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures
 from embomatrix.pages.figures import Better, Figure
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 CELL_M: Final = 0.1
 ROBOT_M: Final = 0.2

@@ -3,31 +3,24 @@
 The scores of different models, and those of the geometric score, are not comparable.
 """
 
-from __future__ import annotations
-
 import json
 from collections import defaultdict
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Sequence
+from typing import Final
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from embomatrix.factory.evaluate.scenes import METHODS, RecordedMethod
+from embomatrix.factory.evaluate.scenes import METHODS, LayoutMethod, RecordedMethod, SceneTask
 from embomatrix.factory.layout.organization import tree_in
 from embomatrix.factory.metrics.figures import EvaluationFigures
 from embomatrix.factory.pictures.sights import sight_of_room
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
 from embomatrix.llm.structured import ask
-from embomatrix.llm.values import ChatRequest, Message, Speaker, UnusableReplyError
+from embomatrix.llm.values import ChatModel, ChatRequest, Message, Speaker, UnusableReplyError
 from embomatrix.pages.figures import Better, Figure
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from embomatrix.factory.evaluate.scenes import LayoutMethod, SceneTask
-    from embomatrix.llm.values import ChatModel
-    from embomatrix.world.scene import Scene
+from embomatrix.world.scene import Scene
 
 DIVERSITY_JUDGE: Final = "diversity judge"
 DIVERSITY_PROMPT: Final = """\

@@ -7,19 +7,17 @@ are not picked up.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.skills.limits import ROBOT
-from embomatrix.skills.syntax import Skill, SkillCall
+from embomatrix.skills.syntax import Plan, Skill, SkillCall
 from embomatrix.world.state import Relation
+from embomatrix.world.task import Task
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
     from embomatrix.factory.scenes.view import SceneView
     from embomatrix.sim.executor import Simulator
-    from embomatrix.skills.syntax import Plan
-    from embomatrix.world.task import Task
 
 SEED: Final = 0
 

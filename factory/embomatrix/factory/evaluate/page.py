@@ -3,20 +3,13 @@
 New figures replace the text under their heading; other headings stay.
 """
 
-from __future__ import annotations
-
 import textwrap
 from collections import Counter
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping, Sequence
+from typing import Final
 
-from embomatrix.factory.metrics.figures import EvaluationError, verdict_on
-from embomatrix.pages.figures import shown
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from embomatrix.factory.metrics.figures import EvaluationFigures
-    from embomatrix.pages.figures import Figure
+from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures, verdict_on
+from embomatrix.pages.figures import Figure, shown
 
 WIDTH: Final = 128
 BEGIN: Final = "<!-- by hand: factory -->"

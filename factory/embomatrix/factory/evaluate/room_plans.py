@@ -1,23 +1,18 @@
 """Simplified rooms for the aesthetics score: furniture as boxes on a rectangle, and small objects on the furniture."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import math
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 
 from embomatrix.factory.metrics.figures import EvaluationError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from embomatrix.world.scene import Scene
+from embomatrix.world.scene import Scene
 
 FLOOR: Final = "floor"
 MIN_PIECE_M: Final = 0.25

@@ -4,28 +4,22 @@ Bullet finds penetrations. Boxes of parts decide on supports, rooms and doorways
 that the robot reaches.
 """
 
-from __future__ import annotations
-
 import contextlib
+from collections.abc import Iterator, Sequence
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.engine import FLOOR
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import IDENTITY
+from embomatrix.world.scene import Scene, SceneObject
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from embomatrix.world.scene import Scene, SceneObject
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 CELL_M: Final = 0.05
 REST_M: Final = 0.012

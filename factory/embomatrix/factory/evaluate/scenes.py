@@ -12,10 +12,12 @@ import json
 import math
 import time
 from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from importlib import resources
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 
@@ -26,29 +28,22 @@ from embomatrix.factory.evaluate.room_plans import plan_of
 from embomatrix.factory.evaluate.scene_geometry import flaws_of
 from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.generator import lay
+from embomatrix.factory.layout.request import Layout, RequestedObject
 from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures
 from embomatrix.factory.pipeline.store import ResumableLog
 from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.editor import SceneEditor
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.batch import poses_for
 from embomatrix.factory.task_import.sources import SourceText, read_activity
-from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
+from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, Lay, import_problem
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.sim.process_pool import process_pool
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    from embomatrix.factory.layout.request import Layout, RequestedObject
-    from embomatrix.factory.scenes.editor import SceneEditor
-    from embomatrix.factory.task_import.task import Lay
-    from embomatrix.world.scene import Scene
-
+from embomatrix.world.scene import Scene
 
 LIST: Final = "scene_tasks.json"
 

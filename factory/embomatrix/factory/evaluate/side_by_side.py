@@ -1,24 +1,18 @@
 """Picture of one fixed task, laid out by every method of the scene evaluation, side by side."""
 
-from __future__ import annotations
-
 import textwrap
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from typing import Final
 
 from PIL import Image, ImageDraw, ImageFont
 
 from embomatrix.factory.admission import TaskRefusal
-from embomatrix.factory.evaluate.scenes import METHODS
+from embomatrix.factory.evaluate.scenes import METHODS, SceneTask
 from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.factory.pictures.scene import draw_plan
 from embomatrix.factory.pictures.sights import alone
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.task import ImportOptions, import_problem
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.factory.evaluate.scenes import SceneTask
 
 CAPTION_PX: Final = 26
 LEAST_PX: Final = 420

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 import re
 import zlib
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -17,18 +19,12 @@ from embomatrix.factory.scenes.build import base_scene_of, build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.casting import NAMES
 from embomatrix.factory.social.writer import SocialWriter
-from embomatrix.factory.writer.tasks import Draft, DraftOrder, PlainWriter
+from embomatrix.factory.writer.tasks import Draft, DraftOrder, PlainWriter, TaskWriter
 from embomatrix.factory.writer.variant import build_variant
 from embomatrix.pages.figures import Better, Figure
+from embomatrix.world.dataset import TaskRecord
+from embomatrix.world.scene import Scene
 from embomatrix.world.task import TaskCategory
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    from embomatrix.factory.writer.tasks import TaskWriter
-    from embomatrix.world.dataset import TaskRecord
-    from embomatrix.world.scene import Scene
 
 GOALS: Final[Mapping[str, tuple[Better, float]]] = {
     "self_bleu4": (Better.LOWER, 0.35),

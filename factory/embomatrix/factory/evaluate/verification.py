@@ -4,36 +4,29 @@ Two processes without shared state judge each task. Both find and execute a plan
 Optionally a robot also executes the dataset's plan in stepped physics.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 
-from embomatrix.factory.admission import SEED, Admitted, admit, plan_failure
+from embomatrix.factory.admission import SEED, Admitted, PlanFailure, admit, plan_failure
 from embomatrix.factory.metrics.figures import EvaluationFigures
 from embomatrix.factory.task_import.batch import max_held_share
 from embomatrix.pages.figures import Better, Figure
+from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.sim.process_pool import process_pool
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import plan_from_json, plan_to_json
-from embomatrix.world.dataset import Dataset, DatasetError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    from embomatrix.factory.admission import PlanFailure
-    from embomatrix.sim.executor import Simulator
-    from embomatrix.world.bundle import Bundle
-    from embomatrix.world.dataset import TaskRecord
+from embomatrix.world.bundle import Bundle
+from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
 
 SUCCESS: Final = ""
 """Empty sentence of a task without an objection."""

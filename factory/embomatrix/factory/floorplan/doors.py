@@ -1,9 +1,10 @@
 """Doorways of a floor plan: one from each room to the room it is entered from, and more if the inventory lists them."""
 
-from __future__ import annotations
-
 from collections import Counter
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
 
 from embomatrix.factory.floorplan.spec import (
     ENTRANCES,
@@ -15,16 +16,10 @@ from embomatrix.factory.floorplan.spec import (
     SLEEPING,
     FloorPlanError,
     OpeningSpec,
+    RoomSpec,
 )
 from embomatrix.factory.floorplan.walls import Rect, WallCut, shared_edge
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    import numpy as np
-
-    from embomatrix.factory.floorplan.spec import RoomSpec
-    from embomatrix.world.scene import Doorway
+from embomatrix.world.scene import Doorway
 
 FRONT_YARD_M: Final = 3.0
 """Preferred free ground before the front door, so that it does not open into a gap between two rooms."""

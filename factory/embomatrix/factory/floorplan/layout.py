@@ -4,27 +4,19 @@ Every room is packed as its floor grown by half a wall on each side, so neighbou
 best of many seeded trials of slot packing wins.
 """
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from embomatrix.factory.floorplan.doors import place_doorways
-from embomatrix.factory.floorplan.packing import pack
-from embomatrix.factory.floorplan.spec import MIN_DOOR_M, FloorPlanError
+from embomatrix.factory.floorplan.packing import Packing, pack
+from embomatrix.factory.floorplan.spec import MIN_DOOR_M, FloorPlanError, RoomSpec
 from embomatrix.factory.floorplan.walls import WALL_M, build_walls
 from embomatrix.factory.floorplan.windows import place_windows
-from embomatrix.world.scene import Room
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.factory.floorplan.packing import Packing
-    from embomatrix.factory.floorplan.spec import RoomSpec
-    from embomatrix.world.geometry import ConvexPart
-    from embomatrix.world.scene import Doorway, Window
+from embomatrix.world.geometry import ConvexPart
+from embomatrix.world.scene import Doorway, Room, Window
 
 TRIALS: Final = 80
 FINALISTS: Final = 6

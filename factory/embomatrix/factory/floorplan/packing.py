@@ -1,23 +1,24 @@
 """Slot packing: rooms are attached one by one to a side of a placed room; trials differ by order and noise."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from embomatrix.factory.floorplan.spec import HUBS, MIN_DOOR_M, OPEN_PASSAGE_M, OUTDOORS, PARENTS, PRIVATE
+from embomatrix.factory.floorplan.spec import (
+    HUBS,
+    MIN_DOOR_M,
+    OPEN_PASSAGE_M,
+    OUTDOORS,
+    PARENTS,
+    PRIVATE,
+    RoomSpec,
+)
 from embomatrix.factory.floorplan.walls import WALL_M, Rect
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from embomatrix.factory.floorplan.spec import RoomSpec
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 CONTACT_WORTH: Final = 1.5
 """Worth of a metre of shared wall, in square metres of extent."""

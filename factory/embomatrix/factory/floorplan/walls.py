@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Generic, TypeVar
+from typing import Final, Generic, TypeVar
 
-from embomatrix.world.geometry import ConvexPart, Pose, Shape
+from embomatrix.world.geometry import ConvexPart, Pose, Shape, Vec2
 from embomatrix.world.scene import Doorway, Window
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from embomatrix.world.geometry import Vec2
 
 WALL_M: Final = 0.12
 WALL_HEIGHT_M: Final = 2.4

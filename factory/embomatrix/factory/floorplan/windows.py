@@ -1,21 +1,13 @@
 """Windows of a floor plan, set into the outer walls of their rooms between the doorways and spread over each wall."""
 
-from __future__ import annotations
-
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from embomatrix.factory.floorplan.spec import OUTDOORS, OpeningSpec
-from embomatrix.factory.floorplan.walls import Edge, WallCut, shared_edge, subtract
-from embomatrix.world.scene import Window
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from embomatrix.factory.floorplan.spec import RoomSpec
-    from embomatrix.factory.floorplan.walls import Rect
-    from embomatrix.world.scene import Doorway
+from embomatrix.factory.floorplan.spec import OUTDOORS, OpeningSpec, RoomSpec
+from embomatrix.factory.floorplan.walls import Edge, Rect, WallCut, shared_edge, subtract
+from embomatrix.world.scene import Doorway, Window
 
 SILL_M: Final = 0.9
 HEAD_M: Final = 2.15

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from embomatrix.factory.furnish.pieces import Style
+from embomatrix.factory.furnish.pieces import FurnitureGroup, Placed, Style
 from embomatrix.factory.furnish.roles import FurnitureRole
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from numpy.typing import NDArray
-
-    from embomatrix.factory.furnish.pieces import FurnitureGroup, Placed
-    from embomatrix.factory.furnish.space import FloatArray, RoomSpace
+from embomatrix.factory.furnish.space import FloatArray, RoomSpace
 
 WALL_GAP_M: Final = 0.006
 SIDE_GAP_M: Final = 0.005

@@ -1,10 +1,9 @@
 """Groups of a room: counters, seating, table sets, and the order in which they are placed."""
 
-from __future__ import annotations
-
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.furnish.halls import hall_groups, mat_rows, planting_groups
 from embomatrix.factory.furnish.hung import ceiling_groups, hung_groups, on_wall, rug_groups
@@ -12,6 +11,7 @@ from embomatrix.factory.furnish.kitchen import COOKERS, SINKS, basin, run_groups
 from embomatrix.factory.furnish.pieces import (
     CORNER_SOFA_M,
     FurnitureGroup,
+    FurniturePiece,
     Member,
     Pool,
     Rows,
@@ -23,11 +23,6 @@ from embomatrix.factory.furnish.pieces import (
 )
 from embomatrix.factory.furnish.roles import FurnitureRole
 from embomatrix.factory.furnish.tables import table_groups, work_groups
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from embomatrix.factory.furnish.pieces import FurniturePiece
 
 _COFFEE_GAP_M: Final = 0.38
 _PAIR: Final = 2

@@ -1,17 +1,11 @@
 """Groups of shops, gardens and halls: lines of shelves, plants along the edges, mats and machines in the open."""
 
-from __future__ import annotations
-
 from collections import defaultdict
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from typing import Final
 
-from embomatrix.factory.furnish.pieces import FurnitureGroup, Member, Rows, Style, worth
+from embomatrix.factory.furnish.pieces import FurnitureGroup, FurniturePiece, Member, Pool, Rows, Style, worth
 from embomatrix.factory.furnish.roles import FurnitureRole
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.factory.furnish.pieces import FurniturePiece, Pool
 
 _SHELVES: Final = ("grocery_shelf", "snack_rack", "dry_food_dispenser_shelf", "candy_dispenser_shelf")
 _TALL_M: Final = 1.9

@@ -4,14 +4,10 @@ Hosts are ordered by their frequency in the hand-made rooms of iTHOR (Kolve et a
 plates on dining table and counter before the cupboard, books on the desk, pillows on bed and sofa.
 """
 
-from __future__ import annotations
-
 import functools
 import re
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+from collections.abc import Mapping
+from typing import Final
 
 _COLD: Final = "grocery_fridge display_fridge fridge freezer wine_fridge"
 _STORE: Final = "grocery_shelf snack_rack display_case"

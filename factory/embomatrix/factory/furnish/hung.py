@@ -1,19 +1,13 @@
 """Groups off the floor: cabinets and hoods over the counters, objects on walls, lights under the ceiling; and rugs."""
 
-from __future__ import annotations
-
 from collections import defaultdict
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping, Sequence
+from typing import Final
 
 from embomatrix.factory.floorplan.walls import WALL_HEIGHT_M
 from embomatrix.factory.furnish.kitchen import COOKERS, SINKS, UNDER_COUNTER
-from embomatrix.factory.furnish.pieces import REST_GAP_M, FurnitureGroup, Member, Rows, Style
+from embomatrix.factory.furnish.pieces import REST_GAP_M, FurnitureGroup, FurniturePiece, Member, Rows, Style
 from embomatrix.factory.furnish.roles import HUNG_BOTTOM_M, FurnitureRole, wall_height_m
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from embomatrix.factory.furnish.pieces import FurniturePiece
 
 _NEAR_ON_WALL: Final[Mapping[str, tuple[str, ...]]] = {
     "mirror": SINKS,

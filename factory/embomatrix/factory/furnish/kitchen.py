@@ -1,14 +1,15 @@
 """Runs along the walls: worktops over base cabinets and low appliances, with sinks and cookers set into the line."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.furnish.pieces import (
     REST_GAP_M,
     FurnitureGroup,
+    FurniturePiece,
     Member,
+    Pool,
     Style,
     before_table,
     stacked,
@@ -16,12 +17,7 @@ from embomatrix.factory.furnish.pieces import (
 )
 from embomatrix.factory.furnish.roles import FurnitureRole
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.factory.furnish.pieces import FurniturePiece, Pool
-
-    Unplaced = tuple[FurniturePiece, str]
+Unplaced = tuple[FurniturePiece, str]
 
 UNDER_COUNTER: Final = (
     "bottom_cabinet",

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
@@ -15,15 +16,12 @@ import numpy as np
 
 from embomatrix.factory.furnish.roles import FurnitureRole, importance_of
 from embomatrix.sim.geometry.bounds import joint_motion
-from embomatrix.world.geometry import Pose
+from embomatrix.world.asset import Asset, Link
+from embomatrix.world.geometry import ConvexPart, Pose, Vec3
+from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
     from embomatrix.factory.furnish.space import Box
-    from embomatrix.world.asset import Asset, Link
-    from embomatrix.world.geometry import ConvexPart, Vec3
-    from embomatrix.world.state import Relation
 
 CORNER_SOFA_M: Final = 1.4
 """A sofa larger than this along both sides is a corner sofa with its second arm on the right; its nook is open floor."""

@@ -3,17 +3,12 @@
 The tables list categories of the 51 inventories that need a decision. Any other model gets its role from its size and mass.
 """
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.skills.limits import ROBOT
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.world.asset import Asset
+from embomatrix.world.asset import Asset
 
 
 class FurnitureRole(StrEnum):

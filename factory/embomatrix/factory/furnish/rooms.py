@@ -1,29 +1,23 @@
 """Furnishing of a floor plan: the inventory of every room, placed so that the robot can reach everything it may use."""
 
-from __future__ import annotations
-
 from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+import numpy as np
+
+from embomatrix.factory.floorplan.layout import FloorPlan
 from embomatrix.factory.floorplan.walls import WALL_HEIGHT_M
 from embomatrix.factory.furnish.groups import alone, hung_and_laid, in_the_open, room_groups
-from embomatrix.factory.furnish.pieces import Rows
+from embomatrix.factory.furnish.pieces import FurnitureGroup, FurniturePiece, Member, Placed, Rows
 from embomatrix.factory.furnish.roles import FurnitureRole, importance_of
 from embomatrix.factory.furnish.solver import RoomSolver, lay_rows
 from embomatrix.factory.furnish.space import RoomSpace
 from embomatrix.factory.furnish.surfaces import SurfacePlacer
 from embomatrix.factory.furnish.tables import STOOLS
 from embomatrix.skills.limits import ROBOT
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    import numpy as np
-
-    from embomatrix.factory.floorplan.layout import FloorPlan
-    from embomatrix.factory.furnish.pieces import FurnitureGroup, FurniturePiece, Member, Placed
-    from embomatrix.world.scene import Doorway, Room
+from embomatrix.world.scene import Doorway, Room
 
 ATTEMPTS: Final = 24
 CROWDED_ATTEMPTS: Final = 6

@@ -4,16 +4,12 @@ The vocabulary is small on purpose: a policy with a word-level vocabulary learns
 recombine the same words.
 """
 
-from __future__ import annotations
-
 import functools
+from collections.abc import Mapping
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.furnish.hosts import NO_HOSTS, hosts_of
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 
 class ItemKind(StrEnum):

@@ -3,13 +3,13 @@
 Equal groups are placed as rows: on a lattice, an aisle apart, like desks of a class, tables of a restaurant, mats of a gym.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from embomatrix.factory.furnish.candidates import (
     AHEAD,
@@ -18,19 +18,21 @@ from embomatrix.factory.furnish.candidates import (
     RoomSurroundings,
     candidates_of,
 )
-from embomatrix.factory.furnish.pieces import Access, Placed, access_of, front_depth_m
+from embomatrix.factory.furnish.pieces import (
+    Access,
+    FurnitureGroup,
+    FurniturePiece,
+    Member,
+    Placed,
+    Rect4,
+    Rows,
+    access_of,
+    front_depth_m,
+)
 from embomatrix.factory.furnish.roles import FurnitureRole
-from embomatrix.factory.furnish.space import LOW_M, Target
+from embomatrix.factory.furnish.space import LOW_M, BoolArray, Box, FloatArray, RoomSpace, Target
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from embomatrix.factory.furnish.pieces import FurnitureGroup, FurniturePiece, Member, Rect4, Rows
-    from embomatrix.factory.furnish.space import BoolArray, Box, FloatArray, RoomSpace
 
 TRIES: Final = 12
 """Candidates of a group that are tested for reachability before the group is given up."""

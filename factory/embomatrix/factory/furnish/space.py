@@ -1,11 +1,10 @@
 """Occupancy of a room while it is furnished: solids, zones that stay free, and the floor that the robot can reach."""
 
-from __future__ import annotations
-
 import functools
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +12,7 @@ from scipy import ndimage
 
 from embomatrix.factory.floorplan.walls import WALL_M
 from embomatrix.skills.limits import ROBOT
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from embomatrix.world.scene import Doorway, Room, Window
+from embomatrix.world.scene import Doorway, Room, Window
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -1,28 +1,21 @@
 """Placement of small objects: free places on the surfaces and in the cavities of placed furniture."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from embomatrix.factory.furnish.hosts import NO_HOSTS, hosts_of, kept_behind_doors
-from embomatrix.factory.furnish.pieces import REST_GAP_M, Placed
+from embomatrix.factory.furnish.pieces import REST_GAP_M, FurniturePiece, Placed
 from embomatrix.factory.furnish.roles import FurnitureRole
 from embomatrix.factory.furnish.space import BoxStack
 from embomatrix.world.state import Relation
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
-
-    from embomatrix.factory.furnish.pieces import FurniturePiece
-
-    FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 _EDGE_M: Final = 0.01
 _SAMPLES: Final = 60

@@ -1,12 +1,13 @@
 """Groups of tables and seats: dining sets, workplaces, rows that face a board, booths and bars."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from typing import Final
 
 from embomatrix.factory.furnish.pieces import (
     FurnitureGroup,
+    FurniturePiece,
     Member,
+    Pool,
     Rows,
     Style,
     around_table,
@@ -16,11 +17,6 @@ from embomatrix.factory.furnish.pieces import (
     worth,
 )
 from embomatrix.factory.furnish.roles import FurnitureRole
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.factory.furnish.pieces import FurniturePiece, Pool
 
 STOOLS: Final = ("music_stool", "taboret")
 _KNEE_M: Final = 0.05

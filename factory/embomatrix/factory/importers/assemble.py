@@ -4,12 +4,12 @@ An imported model replaces one model of the catalog. It has that model's id, siz
 lists the catalog's model can be built with it.
 """
 
-from __future__ import annotations
-
 import functools
 import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -17,23 +17,15 @@ from scipy.spatial import ConvexHull, QhullError
 from embomatrix.factory.assets.body import OPEN_ABOVE_M, Body
 from embomatrix.factory.assets.shapes import box, hull, mesh_of, rounded
 from embomatrix.factory.importers.cavities import cavities, solid_cells, top_surface
-from embomatrix.factory.importers.convex import MAX_HULLS, MAX_VERTICES, merged
+from embomatrix.factory.importers.convex import MAX_HULLS, MAX_VERTICES, Decomposer, merged
 from embomatrix.factory.importers.hinges import linked
 from embomatrix.factory.importers.meshes import GROUPED, read_groups
 from embomatrix.factory.importers.model import AxisConvention, Mesh, ModelFileError, RawModel
 from embomatrix.factory.importers.urdf import read_urdf
-from embomatrix.world.asset import Asset, Joint, JointKind, Link
+from embomatrix.world.asset import Asset, Credit, Joint, JointKind, Link
+from embomatrix.world.catalog import Catalog, Model
 from embomatrix.world.codec import asset_from_json, asset_to_json
-from embomatrix.world.geometry import Aabb, Shape
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    from embomatrix.factory.importers.convex import Decomposer
-    from embomatrix.world.asset import Credit
-    from embomatrix.world.catalog import Catalog, Model
-    from embomatrix.world.geometry import ConvexPart, FloatArray, Vec3
+from embomatrix.world.geometry import Aabb, ConvexPart, FloatArray, Shape, Vec3
 
 THIN_M: Final = 0.002
 """Least thickness of a part, in metres: the engine can't handle flat sheets."""

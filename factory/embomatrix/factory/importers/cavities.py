@@ -1,24 +1,17 @@
 """Surfaces and cavities of imported models, found in a grid of cells over their convex parts."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
-from embomatrix.world.geometry import Aabb
+from embomatrix.world.geometry import Aabb, FloatArray, Vec3
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from embomatrix.world.geometry import FloatArray, Vec3
-
-    Grid = NDArray[np.bool_]
-    Cells = NDArray[np.int64]
+Grid = NDArray[np.bool_]
+Cells = NDArray[np.int64]
 
 CELLS: Final = 40
 """Cells along each side of the box: a thinner part than 1/40 of it may be missed."""

@@ -1,26 +1,20 @@
 """Convex decomposition of meshes: by CoACD (Wei et al., SIGGRAPH 2022) with a disk cache, or one hull per component."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
 import numpy as np
 import trimesh
 
-from embomatrix.factory.importers.model import ModelFileError
+from embomatrix.factory.importers.model import Mesh, ModelFileError
+from embomatrix.world.geometry import FloatArray
 from embomatrix.world.whole_file import write_whole
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.factory.importers.model import Mesh
-    from embomatrix.world.geometry import FloatArray
 
 MAX_HULLS: Final = 16
 """Upper limit for the hulls of a link: Bullet silently drops further ones."""

@@ -5,11 +5,10 @@ the rod ``sweethome3d_rail_N`` or ``sweethome3d_unique_rail``. Names may have an
 because an opening passes through its own rod.
 """
 
-from __future__ import annotations
-
 import math
 import re
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterable, Mapping
+from typing import Final
 
 import numpy as np
 
@@ -23,11 +22,7 @@ from embomatrix.factory.importers.model import (
     triple,
 )
 from embomatrix.world.asset import JointKind
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from embomatrix.world.geometry import FloatArray
+from embomatrix.world.geometry import FloatArray
 
 _OPENING: Final = re.compile(r"sweethome3d_opening_on_(hinge|rail)_(\d+)")
 _HINGE: Final = re.compile(r"sweethome3d_hinge_(\d+)")

@@ -1,22 +1,16 @@
 """Triangle meshes of OBJ, STL and GLB files by group, without materials and textures."""
 
-from __future__ import annotations
-
 import io
 import itertools
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
 
 import numpy as np
 import trimesh
 
-from embomatrix.factory.importers.model import Mesh, ModelFileError, read_bytes
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from embomatrix.factory.importers.model import IntArray
-    from embomatrix.world.geometry import FloatArray
+from embomatrix.factory.importers.model import IntArray, Mesh, ModelFileError, read_bytes
+from embomatrix.world.geometry import FloatArray
 
 GROUPED: Final = frozenset({".obj", ".glb", ".stl"})
 

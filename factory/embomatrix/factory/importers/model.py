@@ -1,22 +1,17 @@
 """Content of a model file: links of triangle meshes and their motions, in the file's own frame and units."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from pathlib import Path
+from embomatrix.world.asset import JointKind
+from embomatrix.world.geometry import FloatArray
 
-    from numpy.typing import NDArray
-
-    from embomatrix.world.asset import JointKind
-    from embomatrix.world.geometry import FloatArray
-
-    IntArray = NDArray[np.int64]
+IntArray = NDArray[np.int64]
 
 MAX_BYTES: Final = 64 * 1024 * 1024
 MAX_FACES: Final = 400_000

@@ -1,20 +1,15 @@
 """A folder of imported assets: one JSON file each, read back when a scene is built."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
 
 from embomatrix.factory.importers.model import ModelFileError
+from embomatrix.world.asset import Asset
 from embomatrix.world.codec import asset_from_json, asset_to_json
 from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.whole_file import read_whole, write_whole
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from embomatrix.world.asset import Asset
 
 SUFFIX: Final = ".asset.json"
 MAX_BYTES: Final = 4 * 1024 * 1024

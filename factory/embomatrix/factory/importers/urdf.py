@@ -4,13 +4,12 @@ Entities and document types are rejected before parsing, and mesh paths must sta
 one tree. Masses must not be negative; they are unused, because the catalog has its own.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import numpy as np
 import trimesh
@@ -27,11 +26,7 @@ from embomatrix.factory.importers.model import (
     triple,
 )
 from embomatrix.world.asset import JointKind
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from embomatrix.world.geometry import FloatArray
+from embomatrix.world.geometry import FloatArray
 
 MAX_TEXT: Final = 4 * 1024 * 1024
 MAX_LINKS: Final = 100

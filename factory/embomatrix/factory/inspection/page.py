@@ -24,11 +24,11 @@ from embomatrix.pages.head import page_head
 from embomatrix.pages.plan_view import PlanView
 from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.world.evaluate import objects_of
+from embomatrix.world.scene import Scene
 
 if TYPE_CHECKING:
     from embomatrix.factory.inspection.playing import OraclePlayback, PlayMoment
     from embomatrix.world.dataset import TaskRecord
-    from embomatrix.world.scene import Scene
 
 TEMPLATE: Final = "page.html"
 PICTURE_PX: Final = (960, 720)

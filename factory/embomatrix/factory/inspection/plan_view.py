@@ -1,18 +1,13 @@
 """Plan view of a scene for the inspection page, with markers for the robot and the task's small objects."""
 
-from __future__ import annotations
-
+from collections.abc import Collection
 from html import escape
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.pictures.scene import is_overhead
+from embomatrix.pages.plan_view import PlanView
 from embomatrix.world.geometry import IDENTITY
-
-if TYPE_CHECKING:
-    from collections.abc import Collection
-
-    from embomatrix.pages.plan_view import PlanView
-    from embomatrix.world.scene import Scene
+from embomatrix.world.scene import Scene
 
 UNIT: Final = 100
 """SVG units per metre."""

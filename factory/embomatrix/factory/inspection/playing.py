@@ -1,24 +1,18 @@
 """Playback of a plan call by call: robot pose, carried objects and moved objects after each step."""
 
-from __future__ import annotations
-
 import contextlib
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from embomatrix.factory.admission import SEED
 from embomatrix.reward.hierarchy import score
+from embomatrix.sim.executor import Simulator
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.describe import call_in_words
 from embomatrix.skills.parse import plan_from_json
+from embomatrix.world.bundle import Bundle
+from embomatrix.world.dataset import TaskRecord
 from embomatrix.world.evaluate import evaluate, render, scored_atoms
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.sim.executor import Simulator
-    from embomatrix.world.bundle import Bundle
-    from embomatrix.world.dataset import TaskRecord
 
 
 @dataclass(frozen=True, slots=True)

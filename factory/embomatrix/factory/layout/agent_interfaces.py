@@ -3,11 +3,10 @@
 The four agents follow the paper. Three of them can be a language model; poses are always sampled by code.
 """
 
-from __future__ import annotations
-
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -32,9 +31,6 @@ from embomatrix.factory.layout.values import (
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.editor import PlacementError, SceneEditor
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
 
 
 class AgentName(StrEnum):

@@ -3,28 +3,21 @@
 Both ignore robot positions and earlier failures. They use the same objects and models as ``generator.lay``.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Iterator, Sequence
+from typing import Final
 
 import numpy as np
 
 from embomatrix.factory.layout.organization import hosts_first
-from embomatrix.factory.layout.request import Layout, LayoutRecord, object_brief
+from embomatrix.factory.layout.request import Layout, LayoutRecord, RequestedObject, object_brief
 from embomatrix.factory.layout.sampling import LIFT_M, ObjectSampler
-from embomatrix.factory.scenes.editor import LayoutReason, PlacementError
+from embomatrix.factory.layout.values import LayoutFailure
+from embomatrix.factory.scenes.editor import LayoutReason, PlacementError, SceneEditor
+from embomatrix.world.asset import Asset
 from embomatrix.world.geometry import Pose
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from embomatrix.factory.layout.request import RequestedObject
-    from embomatrix.factory.layout.values import LayoutFailure
-    from embomatrix.factory.scenes.editor import SceneEditor
-    from embomatrix.world.asset import Asset
 
 TRIES: Final = 10
 """Samples per object, as for OmniGibson's sampler in the paper's code."""

@@ -9,34 +9,28 @@ plane, and ``middle`` has an effect.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from embomatrix.factory.furnish.roles import FurnitureRole, role_of
 from embomatrix.factory.layout.values import (
+    ConstraintBrief,
     ConstraintKind,
+    ObjectBrief,
     PlacementClass,
     PlacementConstraint,
     PlacementConstraints,
+    PlaneFootprint,
+    Size2,
+    Size3,
 )
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from numpy.typing import NDArray
-
-    from embomatrix.factory.layout.values import (
-        ConstraintBrief,
-        ObjectBrief,
-        PlaneFootprint,
-        Size2,
-        Size3,
-    )
-
-    FloatArray = NDArray[np.float64]
-    BoolArray = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 
 WEIGHTS: Final[Mapping[ConstraintKind, float]] = {

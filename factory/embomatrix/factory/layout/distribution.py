@@ -4,21 +4,21 @@ The task's demands come first: objects that a relation ties together share a roo
 furniture, size and the number of objects already assigned.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping, Sequence
+from typing import Final
 
 import numpy as np
 
 from embomatrix.factory.furnish.small_objects import belongs, is_usual_host, preferred_hosts
-from embomatrix.factory.layout.values import Distribution, PlacementClass
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from embomatrix.factory.layout.values import DistributionBrief, LayoutRoomFacts, ObjectBrief
+from embomatrix.factory.layout.values import (
+    Distribution,
+    DistributionBrief,
+    LayoutRoomFacts,
+    ObjectBrief,
+    PlacementClass,
+)
 
 ROOM_TYPE_SCORE: Final = 1.0
 """Score of a room whose type suits the object."""

@@ -1,22 +1,17 @@
 """Facts about a scene for the agents' briefs: rooms, and the spaces that furniture offers."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Container, Iterator
+from typing import Final
 
 from embomatrix.factory.furnish.small_objects import HOST_GROUPS
 from embomatrix.factory.layout.organization import HIGHEST_M, LOWEST_M
 from embomatrix.factory.layout.values import HostFacts, HostOffer, LayoutRelation, LayoutRoomFacts
+from embomatrix.factory.scenes.editor import SceneEditor
 from embomatrix.sim.geometry.candidates import EDGE_M, surfaces_for
 from embomatrix.skills.limits import ROBOT
+from embomatrix.world.asset import Asset
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Container, Iterator
-
-    from embomatrix.factory.scenes.editor import SceneEditor
-    from embomatrix.world.asset import Asset
 
 OFFERED: Final = (LayoutRelation.ONTOP, LayoutRelation.INSIDE, LayoutRelation.UNDER)
 MIN_SPACE_M: Final = 0.08

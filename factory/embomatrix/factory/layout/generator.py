@@ -5,27 +5,27 @@ one surface are arranged together. Object level: sampling finds a continuous pos
 and stable. Failures go back to the room level with their reason.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import math
 import time
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from embomatrix.factory.layout.distribution import DistributionError
 from embomatrix.factory.layout.facts import hosts_in, rooms_of
 from embomatrix.factory.layout.hanging import Hanger
-from embomatrix.factory.layout.organization import tree_in
+from embomatrix.factory.layout.organization import LayoutTree, tree_in
 from embomatrix.factory.layout.pending import PendingObjects, Support
-from embomatrix.factory.layout.planes import brief_for, objects_on, planes_of, pose_at
+from embomatrix.factory.layout.planes import Plane, brief_for, objects_on, planes_of, pose_at
 from embomatrix.factory.layout.request import (
     Layout,
     LayoutAgents,
     LayoutRecord,
+    RequestedObject,
     object_brief,
     placement_class_of,
 )
@@ -37,23 +37,17 @@ from embomatrix.factory.layout.values import (
     DistributionBrief,
     LayoutFailure,
     LayoutRelation,
+    ObjectBrief,
     PlacementClass,
+    PlacementConstraint,
+    PlaneSpot,
     RoomBrief,
 )
-from embomatrix.factory.scenes.editor import LayoutReason, PlacementError
+from embomatrix.factory.scenes.editor import LayoutReason, PlacementError, SceneEditor
+from embomatrix.world.asset import Asset
+from embomatrix.world.geometry import Pose
+from embomatrix.world.scene import Room
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from embomatrix.factory.layout.organization import LayoutTree
-    from embomatrix.factory.layout.planes import Plane
-    from embomatrix.factory.layout.request import RequestedObject
-    from embomatrix.factory.layout.values import ObjectBrief, PlacementConstraint, PlaneSpot
-    from embomatrix.factory.scenes.editor import SceneEditor
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import Pose
-    from embomatrix.world.scene import Room
 
 MAX_ROUNDS: Final = 24
 """Maximum number of trees requested for one room."""

@@ -1,27 +1,20 @@
 """Poses on walls, clear of doors and windows, and under the ceiling."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
 
 from embomatrix.factory.floorplan.walls import WALL_HEIGHT_M
 from embomatrix.factory.furnish.roles import HUNG_BOTTOM_M, FurnitureRole, role_of, wall_height_m
-from embomatrix.factory.scenes.editor import LayoutReason, PlacementError
+from embomatrix.factory.scenes.editor import LayoutReason, PlacementError, SceneEditor
 from embomatrix.factory.scenes.floor import box_at
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.skills.limits import ROBOT
+from embomatrix.world.asset import Asset
 from embomatrix.world.geometry import IDENTITY, Pose
-from embomatrix.world.scene import Doorway
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    import numpy as np
-
-    from embomatrix.factory.scenes.editor import SceneEditor
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.scene import Room, Window
+from embomatrix.world.scene import Doorway, Room, Window
 
 TRIES: Final = 80
 GAP_M: Final = 0.002

@@ -3,11 +3,11 @@
 If the model's answers stay unusable, the rules answer instead and a warning is logged.
 """
 
-from __future__ import annotations
-
 import logging
+from collections.abc import Callable, Collection
+from contextlib import AbstractAsyncContextManager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import Final, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -19,23 +19,18 @@ from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.layout.values import (
     PLANE_CONSTRAINTS,
     Branch,
+    ConstraintBrief,
     ConstraintKind,
     Distribution,
+    DistributionBrief,
     LayoutRelation,
     PlacementConstraint,
     PlacementConstraints,
+    RoomBrief,
 )
 from embomatrix.llm.batch import FailureLimit, OnOneLoop
 from embomatrix.llm.structured import ask
-from embomatrix.llm.values import ChatRequest, EndpointError, Message, Speaker, UnusableReplyError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection
-    from contextlib import AbstractAsyncContextManager
-
-    from embomatrix.factory.layout.values import ConstraintBrief, DistributionBrief, RoomBrief
-    from embomatrix.llm.values import ChatModel
-
+from embomatrix.llm.values import ChatModel, ChatRequest, EndpointError, Message, Speaker, UnusableReplyError
 
 logger = logging.getLogger(__name__)
 TEMPERATURE: Final = 0.3

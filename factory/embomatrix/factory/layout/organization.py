@@ -7,8 +7,9 @@ conventions, by the objects already there, and by earlier failures.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -17,23 +18,17 @@ from embomatrix.factory.furnish.small_objects import is_appliance_top, preferred
 from embomatrix.factory.layout.values import (
     CLOTH_RELATIONS,
     Branch,
+    HostFacts,
+    HostOffer,
+    LayoutFailure,
     LayoutRelation,
+    ObjectBrief,
     PlacementClass,
+    RoomBrief,
+    Size3,
 )
 from embomatrix.factory.scenes.editor import LayoutReason
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-
-    from embomatrix.factory.layout.values import (
-        HostFacts,
-        HostOffer,
-        LayoutFailure,
-        ObjectBrief,
-        RoomBrief,
-        Size3,
-    )
-    from embomatrix.world.scene import SceneObject
+from embomatrix.world.scene import SceneObject
 
 
 class TreeError(ValueError):

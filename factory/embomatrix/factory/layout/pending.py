@@ -4,25 +4,18 @@ A placed object can be replaced by its next model, moved, or replaced by a narro
 doesn't need can be removed.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.furnish.roles import FurnitureRole, role_of
-from embomatrix.factory.layout.request import placement_class_of
+from embomatrix.factory.layout.request import RequestedObject, placement_class_of
 from embomatrix.factory.layout.values import LayoutFailure, LayoutRelation, PlacementClass
-from embomatrix.factory.scenes.editor import LayoutReason
+from embomatrix.factory.scenes.editor import LayoutReason, SceneEditor
+from embomatrix.world.asset import Asset
+from embomatrix.world.geometry import Pose
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.factory.layout.request import RequestedObject
-    from embomatrix.factory.scenes.editor import SceneEditor
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import Pose
 
 MAX_REMOVALS: Final = 3
 """Maximum number of scene objects removed from a full host for one requested object."""

@@ -5,17 +5,19 @@ Required constraints are hard as well; the others add their weights to a score. 
 rotated footprints. Free spots are really free, but some free spots are rejected.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from embomatrix.factory.layout.constraints import (
     GRADED_SHARE,
     WEIGHTS,
+    BoolArray,
+    FloatArray,
     SpotCandidates,
     gaps,
     half_extents,
@@ -30,17 +32,10 @@ from embomatrix.factory.layout.values import (
     PlaneFootprint,
     PlaneObject,
     PlaneSpot,
+    Size2,
 )
 from embomatrix.factory.scenes.editor import LayoutReason
 from embomatrix.skills.limits import ROBOT
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from embomatrix.factory.layout.constraints import BoolArray, FloatArray
-    from embomatrix.factory.layout.values import Size2
 
 BEAMS: Final = 3
 BRANCHES: Final = 6

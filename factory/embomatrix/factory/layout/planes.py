@@ -1,29 +1,30 @@
 """Planes of a scene editor: surfaces of furniture and floors of rooms, converted to planar briefs."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from embomatrix.factory.layout.constraints import half_extents
 from embomatrix.factory.layout.sampling import LIFT_M
-from embomatrix.factory.layout.values import PlacementConstraint, PlaneBrief, PlaneFootprint, PlaneObject
+from embomatrix.factory.layout.values import (
+    ObjectBrief,
+    PlacementConstraint,
+    PlaneBrief,
+    PlaneFootprint,
+    PlaneObject,
+    PlaneSpot,
+    Size2,
+)
+from embomatrix.factory.scenes.editor import SceneEditor
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.candidates import surfaces_for
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.geometry import IDENTITY, Pose
+from embomatrix.world.asset import Asset
+from embomatrix.world.geometry import IDENTITY, Aabb, Pose
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from embomatrix.factory.layout.values import ObjectBrief, PlaneSpot, Size2
-    from embomatrix.factory.scenes.editor import SceneEditor
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import Aabb
 
 MAX_STANDS: Final = 72
 """Maximum number of robot positions in a brief. More positions only cost time."""

@@ -1,15 +1,14 @@
 """Objects to lay out, the agents that decide, and the result of a layout."""
 
-from __future__ import annotations
-
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.furnish.roles import FurnitureRole, role_of
 from embomatrix.factory.layout.constraints import choose_constraints
 from embomatrix.factory.layout.distribution import distribute
-from embomatrix.factory.layout.organization import organize
+from embomatrix.factory.layout.organization import LayoutTree, organize
 from embomatrix.factory.layout.planar import arrange
 from embomatrix.factory.layout.values import (
     ConstraintBrief,
@@ -24,14 +23,9 @@ from embomatrix.factory.layout.values import (
     PlaneBrief,
     RoomBrief,
 )
+from embomatrix.factory.scenes.editor import LayoutReason
+from embomatrix.world.asset import Asset
 from embomatrix.world.catalog import Catalog
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from embomatrix.factory.layout.organization import LayoutTree
-    from embomatrix.factory.scenes.editor import LayoutReason
-    from embomatrix.world.asset import Asset
 
 _FRONTED: Final = (
     "alarm_clock picture_frame radio laptop monitor microwave toaster toaster_oven coffee_maker printer standing_tv "

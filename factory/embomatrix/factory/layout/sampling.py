@@ -3,29 +3,23 @@
 Each pose is free, reachable and blocks no path.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
+
+import numpy as np
 
 from embomatrix.factory.assets.library import build_asset
-from embomatrix.factory.scenes.editor import LayoutReason, PlacementError
+from embomatrix.factory.scenes.editor import LayoutReason, PlacementError, SceneEditor
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.candidates import candidates, patches, stands_in
+from embomatrix.world.asset import Asset
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.geometry import Pose
+from embomatrix.world.scene import Room, SceneObject
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    import numpy as np
-
-    from embomatrix.factory.scenes.editor import SceneEditor
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.scene import Room, SceneObject
 
 TRIES: Final = 64
 PACKING_GAP_M: Final = 0.004

@@ -3,27 +3,22 @@
 Geometry proves stability if it can. Otherwise the object is dropped in physics.
 """
 
-from __future__ import annotations
-
 import contextlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from embomatrix.factory.scenes.editor import SceneEditor
 from embomatrix.factory.scenes.feasibility import SimulatedRobot
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.geometry.statics import base_of, is_level, rest_pose
 from embomatrix.sim.state.relations import Relations
+from embomatrix.world.geometry import Pose
 from embomatrix.world.state import Relation
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
-
-    from embomatrix.factory.scenes.editor import SceneEditor
-    from embomatrix.world.geometry import Pose
-
-    AlternativePoses = Callable[[str], Iterable[Pose]]
-    """Other collision-free poses for an object at its host."""
+AlternativePoses = Callable[[str], Iterable[Pose]]
+"""Other collision-free poses for an object at its host."""
 
 
 HIGH_M: Final = 2.0

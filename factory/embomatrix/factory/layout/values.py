@@ -3,15 +3,13 @@
 Field types are resolved at run time, because pydantic reads these dataclasses in ``layout.agent_interfaces``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final, TypeVar, dataclass_transform
 
 from pydantic import ConfigDict, with_config
 
-from embomatrix.factory.scenes.editor import LayoutReason  # noqa: TC001  pydantic reads the annotation
+from embomatrix.factory.scenes.editor import LayoutReason
 
 T = TypeVar("T")
 

@@ -3,15 +3,11 @@
 All figures depend on the number of instructions (self-BLEU grows with it): compare sets of equal size.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
+from typing import Final
 
 NEAR: Final = 0.9
 """Cosine similarity above which two instructions are near-duplicates."""

@@ -1,19 +1,13 @@
 """Result of an evaluation: figures with their goals in the format of the benchmarks, and the conditions of measurement."""
 
-from __future__ import annotations
-
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
-from embomatrix.pages.figures import figure_from_json, figure_to_json
+from embomatrix.pages.figures import Figure, figure_from_json, figure_to_json
 from embomatrix.world.whole_file import write_whole
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from embomatrix.pages.figures import Figure
 
 
 class EvaluationError(Exception):

@@ -1,10 +1,10 @@
 """Films of a plan: the robot's room, its camera view, and the plan as text, drawn in separate processes."""
 
-from __future__ import annotations
-
 import textwrap
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -12,15 +12,9 @@ from PIL import Image, ImageDraw, ImageFont
 from embomatrix.sim.bullet.camera import furnish_cutaway, furnish_whole, shoot_egocentric, shoot_oblique
 from embomatrix.sim.bullet.robot import tucked
 from embomatrix.sim.bullet.visual_scene import VisualScene
-from embomatrix.sim.film import FRAMES_PER_S
+from embomatrix.sim.film import FRAMES_PER_S, Film, FilmFrame
 from embomatrix.sim.process_pool import process_pool
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
-
-    from embomatrix.sim.film import Film, FilmFrame
-    from embomatrix.world.scene import Room, Scene
+from embomatrix.world.scene import Room, Scene
 
 ROOM_PX: Final = (640, 480)
 EYE_PX: Final = (256, 192)

@@ -1,17 +1,13 @@
 """Placement of text on a picture: legible and without overlaps."""
 
-from __future__ import annotations
-
 import itertools
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
 
 Box = tuple[int, int, int, int]
 """Left, top, right and bottom in pixels, y down."""

@@ -1,17 +1,13 @@
 """Legend beside a plan: meaning of colours, numbers of objects, and contents of furniture."""
 
-from __future__ import annotations
-
 import math
 import textwrap
 from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from PIL import Image, ImageDraw, ImageFont
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
 
 _SIZE: Final = 12
 _LINE_PX: Final = 16

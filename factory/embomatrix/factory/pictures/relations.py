@@ -1,9 +1,8 @@
 """Pictures of every relation: small rendered scenes, each with the simulator's verdict."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -13,16 +12,11 @@ from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.visual_scene import VisualScene
 from embomatrix.sim.geometry.bounds import AssetBounds
 from embomatrix.sim.state.relations import Relations
+from embomatrix.world.asset import Asset
 from embomatrix.world.catalog import Catalog
-from embomatrix.world.geometry import IDENTITY, Aabb, Pose
+from embomatrix.world.geometry import IDENTITY, Aabb, Pose, Vec3
 from embomatrix.world.scene import RobotStart, Room, Scene, SceneObject
 from embomatrix.world.state import Relation, State
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import Vec3
 
 MODELS: Final = {
     "table": ("breakfast_table", "pdpkuw"),

@@ -1,26 +1,19 @@
 """Plan of a scene from above: rooms, walls, doorways, furniture with its front, small objects as dots."""
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
 
 import numpy as np
 from PIL import Image, ImageDraw
 
-from embomatrix.factory.pictures.labels import GAP, Labels, boxes
+from embomatrix.factory.pictures.labels import GAP, Box, Labels, boxes
 from embomatrix.factory.pictures.legend import counted, draw_legend, in_order
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import IDENTITY, Aabb
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from embomatrix.factory.pictures.labels import Box
-    from embomatrix.world.geometry import Aabb
-    from embomatrix.world.scene import Scene, SceneObject
+from embomatrix.world.scene import Scene, SceneObject
 
 _MARGIN_PX: Final = 15
 _FINEST_PX_PER_M: Final = 110.0

@@ -1,22 +1,16 @@
 """Many scenes in one picture without labels: a sheet of plans, and oblique views side by side."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from embomatrix.factory.pictures.labels import Box
 from embomatrix.factory.pictures.scene import FILL, draw_building, is_overhead, kind_of
 from embomatrix.sim.bullet.camera import render_egocentric, render_oblique
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.factory.pictures.labels import Box
-    from embomatrix.world.scene import Scene
-
+from embomatrix.world.scene import Scene
 
 _MARGIN_M: Final = 0.3
 _CAPTION_PX: Final = 16

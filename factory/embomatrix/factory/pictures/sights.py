@@ -1,20 +1,15 @@
 """PNG pictures for vision-language models: a scene from above, the robot's view, and single rooms."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
+
+from PIL import Image
 
 from embomatrix.factory.pictures.scene import draw_plan
 from embomatrix.factory.pictures.sheet import draw_eyes
-from embomatrix.world.geometry import IDENTITY
-
-if TYPE_CHECKING:
-    from PIL import Image
-
-    from embomatrix.world.geometry import Aabb
-    from embomatrix.world.scene import Room, Scene
+from embomatrix.world.geometry import IDENTITY, Aabb
+from embomatrix.world.scene import Room, Scene
 
 WALL_M: Final = 0.3
 """Walls and openings within this distance of a room belong to it."""

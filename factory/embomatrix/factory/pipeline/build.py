@@ -4,16 +4,17 @@ Variants are made in rounds. The variants of a round know the tasks of earlier r
 round. Therefore the dataset does not depend on the number of processes.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
+from embomatrix.factory.layout.request import LayoutAgents
+from embomatrix.factory.pipeline.settings import BuildSettings
 from embomatrix.factory.pipeline.store import BuildStore, Rejection
 from embomatrix.factory.pipeline.variants import (
     TASKS_PER_VARIANT,
@@ -24,23 +25,15 @@ from embomatrix.factory.pipeline.variants import (
 )
 from embomatrix.factory.scenes.build import base_scene_of, build_base_scene
 from embomatrix.factory.scenes.view import SceneView
+from embomatrix.factory.writer.tasks import TaskWriter
 from embomatrix.sim.process_pool import shared_work
 from embomatrix.world.catalog import Catalog
-from embomatrix.world.dataset import DatasetError, write_dataset
+from embomatrix.world.dataset import DatasetError, TaskRecord, write_dataset
+from embomatrix.world.scene import Scene
 from embomatrix.world.task import TaskCategory
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    from embomatrix.factory.layout.request import LayoutAgents
-    from embomatrix.factory.pipeline.settings import BuildSettings
-    from embomatrix.factory.writer.tasks import TaskWriter
-    from embomatrix.world.dataset import TaskRecord
-    from embomatrix.world.scene import Scene
-
-    MakeVariants = Callable[[Sequence[VariantOrder]], Iterator[VariantYield]]
-    """Function that makes variants and yields the results in the order of the orders."""
+MakeVariants = Callable[[Sequence[VariantOrder]], Iterator[VariantYield]]
+"""Function that makes variants and yields the results in the order of the orders."""
 
 
 VariantCheck = Callable[[VariantYield], VariantYield]

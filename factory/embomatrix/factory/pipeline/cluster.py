@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.admission import SEED, RefusalReason
@@ -12,13 +13,10 @@ from embomatrix.factory.pipeline.store import Rejection
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.wire.values import Batch, Completed, Rollout, RolloutResult
 from embomatrix.skills.parse import plan_from_json
-from embomatrix.world.dataset import DatasetError
+from embomatrix.world.dataset import DatasetError, TaskRecord
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
     from embomatrix.factory.pipeline.variants import VariantYield
-    from embomatrix.world.dataset import TaskRecord
 
 RUN: Final = "factory"
 """Name of the run on the manager's pages."""

@@ -4,24 +4,18 @@ Two builds share one seed, which splits the goal signatures, so a signature held
 other. More than half of Internal-Verified lies in six scenes that training never sees, the rest in unseen rooms.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
 from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.world.catalog import Catalog
-from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, write_dataset
+from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, TaskRecord, write_dataset
 from embomatrix.world.whole_file import write_whole
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from embomatrix.world.dataset import TaskRecord
 
 HELDOUT_SCENES: Final = (
     "Ihlen_1_int",

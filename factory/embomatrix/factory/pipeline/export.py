@@ -1,23 +1,17 @@
 """Export of a dataset for other tools: one row per task as JSON lines or Parquet, with a dataset card."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 from embomatrix.factory.pipeline.store import BUILD_FILE, TRANSCRIPTS_FOLDER
 from embomatrix.factory.scenes.build import base_scene_of
-from embomatrix.world.dataset import DatasetError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from embomatrix.world.dataset import Dataset, TaskRecord
+from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
 
 FIELDS: Final[Mapping[str, str]] = {
     "task_id": "unique id in the dataset",

@@ -1,7 +1,5 @@
 """Settings of a dataset build."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final

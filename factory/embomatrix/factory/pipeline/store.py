@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from embomatrix.factory.admission import RefusalReason
@@ -19,9 +21,6 @@ from embomatrix.world.dataset import (
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-    from pathlib import Path
-
     from _typeshed import DataclassInstance
 
 

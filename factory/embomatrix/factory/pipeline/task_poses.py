@@ -6,38 +6,30 @@ is, or both objects are carried to one host; then the neighbour has one pose the
 beside it.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 from embomatrix.factory.assets.solids import Solids, placed_parts
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.candidates import PLACE_RELATIONS
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical.placement_reachability import PlacementQuery
-from embomatrix.sim.physical.survey import placement_reachability
-from embomatrix.sim.placing.pose_cache import footprint_placements, standing_poses
+from embomatrix.sim.physical.survey import ReachabilitySurvey, placement_reachability
+from embomatrix.sim.placing.pose_cache import PlacementLibrary, footprint_placements, standing_poses
 from embomatrix.skills.appliances import cold_source, heat_source
+from embomatrix.world.asset import Asset
 from embomatrix.world.bundle import Bundle
-from embomatrix.world.poses import Handling, PlacementKey, PoseCache
+from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.poses import Handling, PlacementKey, PoseCache, StandPose
+from embomatrix.world.scene import Scene
 from embomatrix.world.state import Relation
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-
-    from embomatrix.factory.scenes.view import SceneView
-    from embomatrix.sim.physical.survey import ReachabilitySurvey
-    from embomatrix.sim.placing.pose_cache import PlacementLibrary
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import Aabb, Pose
-    from embomatrix.world.poses import StandPose
-    from embomatrix.world.scene import Scene
-
-    Poses = dict[PlacementKey, tuple[Pose, ...]]
+Poses = dict[PlacementKey, tuple[Pose, ...]]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,26 +1,34 @@
 """Scene variants: one variant at a time is furnished with small objects, described by tasks, judged and bundled."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import time
 import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
 from embomatrix.factory.admission import Admitted, TaskRefusal, admit
-from embomatrix.factory.pipeline.settings import WriterKind
+from embomatrix.factory.layout.request import LayoutAgents
+from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
 from embomatrix.factory.pipeline.store import Rejection, VariantResult
 from embomatrix.factory.pipeline.task_poses import PoseNeeds, SceneSurvey, cache_poses
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.feasibility import SimulatedRobot
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.writer import SocialWriter
-from embomatrix.factory.writer.tasks import BatchTaskWriter, DraftOrder, PlainWriter, is_heldout_signature
+from embomatrix.factory.writer.tasks import (
+    BatchTaskWriter,
+    Draft,
+    DraftOrder,
+    PlainWriter,
+    TaskWriter,
+    is_heldout_signature,
+)
 from embomatrix.factory.writer.variant import Variant, build_variant
+from embomatrix.sim.executor import Simulator
 from embomatrix.sim.live_world import prepare
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.physical.survey import ReachabilitySurvey
@@ -28,20 +36,12 @@ from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import plan_to_json
+from embomatrix.skills.syntax import Plan
 from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import TaskRecord
 from embomatrix.world.inflation import bundle_digest
+from embomatrix.world.scene import Scene
 from embomatrix.world.task import TaskCategory
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from embomatrix.factory.layout.request import LayoutAgents
-    from embomatrix.factory.pipeline.settings import BuildSettings
-    from embomatrix.factory.writer.tasks import Draft, TaskWriter
-    from embomatrix.sim.executor import Simulator
-    from embomatrix.skills.syntax import Plan
-    from embomatrix.world.scene import Scene
 
 TASKS_PER_VARIANT: Final = 8
 """Number of tasks that a variant should yield."""

@@ -1,19 +1,14 @@
 """Access to furniture: the robot needs floor before or beside furniture that opens, works or carries objects."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Container, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.furnish.pieces import Access, FurniturePiece, access_of
 from embomatrix.factory.furnish.roles import FurnitureRole, role_of
 from embomatrix.factory.scenes.floor import ReachableFloor, box_of
-
-if TYPE_CHECKING:
-    from collections.abc import Container, Iterator
-
-    from embomatrix.world.scene import Scene, SceneObject
+from embomatrix.world.scene import Scene, SceneObject
 
 # These reasons are content of a scene, so its digest depends on their wording.
 _NO_FRONT: Final = "nobody could stand before its front"

@@ -1,20 +1,15 @@
 """Parallel building and checking of scenes, largest inventories first."""
 
-from __future__ import annotations
-
+from collections.abc import Iterator, Sequence
 from concurrent.futures import BrokenExecutor, as_completed
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from embomatrix.factory.importers.shelf import read_assets
 from embomatrix.factory.scenes.report import SceneReport, report_on, report_on_file
 from embomatrix.factory.scenes.scene_file import write_scene
 from embomatrix.sim.process_pool import process_pool
 from embomatrix.world.catalog import Catalog
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
 
 
 @dataclass(frozen=True, slots=True)

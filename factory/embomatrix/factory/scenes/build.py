@@ -1,32 +1,25 @@
 """Base scenes: rooms, walls, doorways and furniture made from an inventory."""
 
-from __future__ import annotations
-
 import logging
 import zlib
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.floorplan.layout import FloorPlan, plan_floor
 from embomatrix.factory.floorplan.spec import OpeningSpec, RoomSpec
-from embomatrix.factory.furnish.pieces import FurniturePiece
+from embomatrix.factory.furnish.pieces import FurniturePiece, Placed
 from embomatrix.factory.furnish.roles import FurnitureRole, is_portable, role_of
 from embomatrix.factory.furnish.rooms import Furnishing, furnish
 from embomatrix.factory.furnish.space import RoomSpace
 from embomatrix.factory.scenes.access import with_all_served
-from embomatrix.world.catalog import Catalog
+from embomatrix.world.asset import Asset
+from embomatrix.world.catalog import Catalog, RoomInventory, SceneInventory
 from embomatrix.world.scene import RobotStart, Scene, SceneObject
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from embomatrix.factory.furnish.pieces import Placed
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.catalog import RoomInventory, SceneInventory
 
 logger = logging.getLogger(__name__)
 

@@ -3,12 +3,11 @@
 Most rules are checked by geometry. The engine tests penetration a second time and lets all movable objects settle.
 """
 
-from __future__ import annotations
-
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.assets.solids import Solids, placed_parts
 from embomatrix.factory.floorplan.spec import MIN_DOOR_M
@@ -19,13 +18,9 @@ from embomatrix.factory.scenes.floor import ReachableFloor, box_of
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.settling import settle_scene
 from embomatrix.sim.engine import FLOOR
+from embomatrix.world.geometry import Aabb
+from embomatrix.world.scene import Scene, SceneObject
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from embomatrix.world.geometry import Aabb
-    from embomatrix.world.scene import Scene, SceneObject
 
 REST_M: Final = 0.002
 HANG_M: Final = 0.03

@@ -1,11 +1,11 @@
 """Clearance: the floor before doorways and the space before windows must stay free of objects with shut joints."""
 
-from __future__ import annotations
-
 import functools
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterator
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from embomatrix.factory.furnish.space import (
     DOOR_CLEAR_M,
@@ -14,16 +14,10 @@ from embomatrix.factory.furnish.space import (
     WINDOW_CLEAR_M,
     WINDOW_FROM_M,
 )
+from embomatrix.world.geometry import Aabb, FloatArray
+from embomatrix.world.scene import Doorway, Room, Scene, Window
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from embomatrix.world.geometry import Aabb, FloatArray
-    from embomatrix.world.scene import Doorway, Room, Scene, Window
-
-    BoolArray = NDArray[np.bool_]
+BoolArray = NDArray[np.bool_]
 
 SHALLOW: Final = 0.7
 """Upper limit of the clearance as a share of the room's shorter side."""

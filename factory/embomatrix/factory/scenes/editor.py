@@ -3,12 +3,11 @@
 The editor checks poses; the layout agents choose them.
 """
 
-from __future__ import annotations
-
 from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.assets.solids import Solids, placed_parts
 from embomatrix.factory.furnish.roles import is_portable
@@ -20,13 +19,8 @@ from embomatrix.factory.scenes.view import SceneView
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.asset import FLOOR_CATEGORY, Asset, Link, SupportSurface
 from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
-from embomatrix.world.scene import SceneObject
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from embomatrix.world.scene import Room, Scene
-    from embomatrix.world.state import Relation, State
+from embomatrix.world.scene import Room, Scene, SceneObject
+from embomatrix.world.state import Relation, State
 
 _ON_FLOOR_M: Final = 0.05
 _FLAT_M: Final = 0.03

@@ -5,9 +5,8 @@ open door covers the only position to serve it. An atom that fails alone fails i
 are only checked by admission.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final, Self
+from collections.abc import Callable, Sequence
+from typing import Final, Self
 
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.sim.actions import HANDLINGS
@@ -17,21 +16,14 @@ from embomatrix.sim.planner.subgoals import Exposure, PlacementGoal, Subgoals
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.evaluate import evaluate, render
-from embomatrix.world.goal import Atom, Not
-from embomatrix.world.poses import PoseCache
-from embomatrix.world.state import State
+from embomatrix.world.goal import Atom, Formula, Not
+from embomatrix.world.poses import Handling, PoseCache
+from embomatrix.world.scene import Scene
+from embomatrix.world.state import Relation, State
 from embomatrix.world.task import Task, TaskCategory
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from embomatrix.world.goal import Formula
-    from embomatrix.world.poses import Handling
-    from embomatrix.world.scene import Scene
-    from embomatrix.world.state import Relation
-
-    ArmLimits = Callable[[Sequence[tuple[Handling, str]]], bool]
-    """True if the arm can't do one of these handlings in the initial scene."""
+ArmLimits = Callable[[Sequence[tuple[Handling, str]]], bool]
+"""True if the arm can't do one of these handlings in the initial scene."""
 
 SEED: Final = 0
 """Seed of the trials."""

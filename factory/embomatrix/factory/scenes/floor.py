@@ -1,27 +1,20 @@
 """Floor of a scene that the robot can reach, and the places on it from which the arm reaches an object."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterable, Iterator
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from embomatrix.sim.floor.grid import CELL_M, FloorGrid
 from embomatrix.sim.geometry.bounds import joint_motion
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.geometry import IDENTITY, Aabb, Pose
+from embomatrix.world.asset import Asset
+from embomatrix.world.geometry import IDENTITY, Aabb, FloatArray, Pose
+from embomatrix.world.scene import Room, Scene, SceneObject
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    from numpy.typing import NDArray
-
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import FloatArray
-    from embomatrix.world.scene import Room, Scene, SceneObject
-
-    BoolArray = NDArray[np.bool_]
+BoolArray = NDArray[np.bool_]
 
 _FLAT_M: Final = 0.03
 _REACH_SLACK_M: Final = 0.05

@@ -1,21 +1,14 @@
 """Opening and closing a scene's furniture together with the objects carried by its moving links."""
 
-from __future__ import annotations
-
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
-from embomatrix.factory.assets.solids import placed_parts
+from embomatrix.factory.assets.solids import Solids, placed_parts
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.surfaces import link_frame, link_under, links_with_surfaces
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from embomatrix.factory.assets.solids import Solids
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import Pose
-    from embomatrix.world.scene import Scene, SceneObject
+from embomatrix.world.asset import Asset
+from embomatrix.world.geometry import Pose
+from embomatrix.world.scene import Scene, SceneObject
 
 
 def with_joints(

@@ -1,13 +1,13 @@
 """Reports of built scenes: time, contents, objects left out with the reason, and broken rules."""
 
-from __future__ import annotations
-
 import re
 import time
 from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from rich.table import Table
 
@@ -24,14 +24,9 @@ from embomatrix.factory.scenes.check import (
 from embomatrix.factory.scenes.floor import ReachableFloor
 from embomatrix.factory.scenes.scene_file import SceneFileError, read_scene
 from embomatrix.sim.engine import EngineError
+from embomatrix.world.asset import Asset
 from embomatrix.world.catalog import Catalog, CatalogError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.scene import Scene
+from embomatrix.world.scene import Scene
 
 Json = dict[str, Any]
 

@@ -1,18 +1,13 @@
 """Scene files, as written by ``scene build``. Files are untrusted and checked in every part when read."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 from embomatrix.world.codec import scene_from_json, scene_to_json
 from embomatrix.world.records import SceneInvalidError
+from embomatrix.world.scene import Scene
 from embomatrix.world.whole_file import read_whole, write_whole
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from embomatrix.world.scene import Scene
 
 SUFFIX: Final = ".json"
 MAX_BYTES: Final = 64 * 1024 * 1024

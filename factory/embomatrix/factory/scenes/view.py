@@ -1,9 +1,8 @@
 """Index of a scene for task writing: affordances and places of its objects."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
 from embomatrix.factory.assets.solids import Solids
 from embomatrix.factory.furnish.roles import FurnitureRole, role_of
@@ -12,14 +11,9 @@ from embomatrix.factory.scenes.joints import bumped_into
 from embomatrix.sim.joints.swings import SWING
 from embomatrix.skills.appliances import cold_source, cooks, freezes, heat_source, heats
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.asset import FLOOR_CATEGORY
+from embomatrix.world.asset import FLOOR_CATEGORY, Asset
+from embomatrix.world.scene import Scene, SceneObject
 from embomatrix.world.state import OPEN_FRACTION, Relation, State
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.scene import Scene, SceneObject
 
 
 class RobotFeasibility(Protocol):

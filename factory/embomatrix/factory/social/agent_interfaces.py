@@ -3,11 +3,10 @@
 The answer of one agent is the brief of the next: scene, people, conversation, instruction.
 """
 
-from __future__ import annotations
-
 import zlib
+from collections.abc import Mapping
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -19,18 +18,13 @@ from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.conversing import starting_slots
 from embomatrix.factory.social.facts import SceneFacts, facts_of, with_sights
 from embomatrix.factory.social.fitting import reasons_for
+from embomatrix.factory.social.model_agents import SocialModelAgents
 from embomatrix.factory.social.summary import instruction_of
 from embomatrix.factory.social.values import RequestSummary, SceneBrief, SummaryBrief, TalkBrief
 from embomatrix.factory.social.writer import SocialWriter
-from embomatrix.factory.writer.variant import build_variant
+from embomatrix.factory.writer.variant import Variant, build_variant
 from embomatrix.factory.writer.words import Voice
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.factory.social.model_agents import SocialModelAgents
-    from embomatrix.factory.writer.variant import Variant
-    from embomatrix.world.scene import Scene
+from embomatrix.world.scene import Scene
 
 ROOMS: Final = 3
 """Number of a scene's rooms that a conversation is about."""

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.social.occasions import ELSEWHERE, occasions_in
+from embomatrix.factory.social.occasions import ELSEWHERE, Occasion, occasions_in
 from embomatrix.factory.social.values import Cast, DaySlot, Person
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     import numpy as np
 
-    from embomatrix.factory.social.occasions import Occasion
     from embomatrix.world.scene import Room, Scene
 
 

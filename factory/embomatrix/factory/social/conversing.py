@@ -6,6 +6,7 @@ reason, a question, an answer that may change, a request that the robot refuses,
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -20,19 +21,15 @@ from embomatrix.factory.social.phrases import (
     shorten_repeated_rooms,
     spoken_category,
 )
-from embomatrix.factory.social.values import ROBOT, Act, Conversation, DialogueTurn
-from embomatrix.factory.writer.goals import placed_elsewhere
+from embomatrix.factory.social.values import ROBOT, Act, Cast, Conversation, DaySlot, DialogueTurn
+from embomatrix.factory.writer.goals import GoalConjunct, GoalContext, placed_elsewhere
+from embomatrix.factory.writer.words import Voice
 from embomatrix.skills.limits import ROBOT as ROBOT_LIMITS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     import numpy as np
 
     from embomatrix.factory.scenes.view import SceneView
-    from embomatrix.factory.social.values import Cast, DaySlot
-    from embomatrix.factory.writer.goals import GoalConjunct, GoalContext
-    from embomatrix.factory.writer.words import Voice
 
 
 _ANYWHERE: Final = (

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.writer.words import spoken
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from embomatrix.factory.scenes.view import SceneView
 
 MAX_OBJECTS_IN_ROOM: Final = 40

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 from pydantic import Field
 
+from embomatrix.factory.social.facts import SceneFacts
 from embomatrix.factory.social.prompts import (
     CAST_SYSTEM,
     CAST_USER,
@@ -24,16 +25,21 @@ from embomatrix.factory.social.prompts import (
     answer_schema,
 )
 from embomatrix.factory.social.requests import TaskRequest, check_request
-from embomatrix.factory.social.values import ROBOT, Act, Cast, Conversation, DialogueTurn, StrictModel
+from embomatrix.factory.social.values import (
+    ROBOT,
+    Act,
+    Cast,
+    Conversation,
+    DaySlot,
+    DialogueTurn,
+    StrictModel,
+)
 from embomatrix.llm.structured import ask
-from embomatrix.llm.values import ChatRequest, Message, Speaker
+from embomatrix.llm.values import ChatModel, ChatRequest, Message, Speaker
+from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:
     from embomatrix.factory.scenes.view import SceneView
-    from embomatrix.factory.social.facts import SceneFacts
-    from embomatrix.factory.social.values import DaySlot
-    from embomatrix.llm.values import ChatModel
-    from embomatrix.world.task import TaskCategory
 
 SIGHT: Final = "scene information extraction"
 CAST: Final = "role-playing agent"

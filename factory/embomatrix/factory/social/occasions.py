@@ -3,22 +3,16 @@
 The table is ``occasions.toml`` beside this module.
 """
 
-from __future__ import annotations
-
 import functools
 import tomllib
+from collections.abc import Mapping
 from enum import StrEnum
 from importlib import resources
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from pydantic import Field, TypeAdapter
 
-from embomatrix.factory.social.values import StrictModel
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.factory.social.values import Person
+from embomatrix.factory.social.values import Person, StrictModel
 
 
 class Theme(StrEnum):

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.social.values import Act
 from embomatrix.factory.writer.words import room_words, spoken
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from embomatrix.factory.scenes.view import SceneView
 
 

@@ -3,8 +3,6 @@
 Cassettes are keyed by prompt and schema. A change of either invalidates recorded answers.
 """
 
-from __future__ import annotations
-
 import json
 from importlib import resources
 from typing import Any, Final

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from embomatrix.factory.social.phrases import (
@@ -11,15 +12,12 @@ from embomatrix.factory.social.phrases import (
     room_called,
     shorten_repeated_rooms,
 )
-from embomatrix.factory.social.values import ROBOT
+from embomatrix.factory.social.values import ROBOT, Cast, Conversation
+from embomatrix.factory.writer.goals import GoalConjunct
+from embomatrix.factory.writer.words import Voice
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from embomatrix.factory.scenes.view import SceneView
-    from embomatrix.factory.social.values import Cast, Conversation
-    from embomatrix.factory.writer.goals import GoalConjunct
-    from embomatrix.factory.writer.words import Voice
 
 
 def instruction_of(conversation: Conversation, cast: Cast, view: SceneView, voice: Voice, why: str) -> str:

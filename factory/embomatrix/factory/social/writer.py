@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import zlib
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -22,19 +23,16 @@ from embomatrix.factory.social.phrases import (
     room_called,
 )
 from embomatrix.factory.social.summary import instruction_of, transcript_of
-from embomatrix.factory.writer.goals import GoalContext
+from embomatrix.factory.social.values import Cast, Conversation, DaySlot
+from embomatrix.factory.writer.goals import GoalConjunct, GoalContext
 from embomatrix.factory.writer.tasks import Draft, DraftOrder, draft_of, draw_conjuncts
 from embomatrix.factory.writer.words import FreshVoice
+from embomatrix.world.scene import Scene
+from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from embomatrix.factory.scenes.view import SceneView
-    from embomatrix.factory.social.values import Cast, Conversation, DaySlot
-    from embomatrix.factory.writer.goals import GoalConjunct
     from embomatrix.factory.writer.variant import Variant
-    from embomatrix.world.scene import Scene
-    from embomatrix.world.task import TaskCategory
 
 MAX_EQUAL_WISHES: Final = 2
 """Maximum number of equal requests in one variant."""

@@ -1,11 +1,10 @@
 """Import of problems over many scenes: each problem is bound to the first suitable scene and verified in the simulator."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import Final, TypeVar
 
 from embomatrix.factory.admission import MAX_HELD_SHARE, Admitted, RefusalReason, TaskRefusal, admit
 from embomatrix.factory.pipeline.task_poses import PoseNeeds, SceneSurvey, cache_poses
@@ -13,26 +12,20 @@ from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.neighbours import neighbours_of
 from embomatrix.factory.task_import.size_requirements import requirements_of
-from embomatrix.factory.task_import.sources import BEHAVIOR, EAI
+from embomatrix.factory.task_import.sources import BEHAVIOR, EAI, SourceText
 from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
 from embomatrix.sim.live_world import prepare
+from embomatrix.sim.physical.survey import ReachabilitySurvey
+from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import TaskRecord
 from embomatrix.world.inflation import bundle_digest
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from embomatrix.factory.task_import.sources import SourceText
-    from embomatrix.sim.physical.survey import ReachabilitySurvey
-    from embomatrix.sim.placing.pose_cache import PlacementLibrary
-    from embomatrix.world.poses import PoseCache
-    from embomatrix.world.scene import Scene
-    from embomatrix.world.task import Task
-
+from embomatrix.world.poses import PoseCache
+from embomatrix.world.scene import Scene
+from embomatrix.world.task import Task
 
 SCENE_INDEPENDENT: Final = frozenset(
     {

@@ -5,27 +5,22 @@ puts on, in, under or beside something are added later. Substances have no place
 soaked with them. Future objects are the halves of sliceable objects.
 """
 
-from __future__ import annotations
-
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
+
+import numpy as np
 
 from embomatrix.factory.admission import RefusalReason, RefusedError
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.expressible import AGENT, FLOORS, check_evaluable, check_expressible
 from embomatrix.factory.task_import.reach import pieces_of
 from embomatrix.factory.task_import.search import abilities_needed, search
+from embomatrix.world.bddl import BddlProblem
 from embomatrix.world.catalog import Catalog
+from embomatrix.world.scene import Scene
 from embomatrix.world.state import Relation
 from embomatrix.world.substances import is_substance
-
-if TYPE_CHECKING:
-    from collections.abc import Container, Mapping
-
-    import numpy as np
-
-    from embomatrix.world.bddl import BddlProblem
-    from embomatrix.world.scene import Scene
 
 PLACING: Final = (Relation.INSIDE, Relation.ONTOP, Relation.UNDER, Relation.NEXTTO)
 """Relations by which ``:init`` places an object, the most specific first."""

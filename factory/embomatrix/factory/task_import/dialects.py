@@ -4,26 +4,18 @@ Renamed types are replaced. A type for a whole group (a table, a book) is replac
 that the problem does not name yet. The domains of the quantifiers stay the same.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import re
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping
+from typing import Final
 
 from embomatrix.factory.task_import.expressible import FLOORS
-from embomatrix.factory.task_import.sources import EAI
-from embomatrix.world.bddl import InitLiteral, is_room_instance, parse_problem
+from embomatrix.factory.task_import.sources import EAI, SourceText
+from embomatrix.world.bddl import BddlProblem, InitLiteral, is_room_instance, parse_problem
 from embomatrix.world.evaluate import map_atoms
 from embomatrix.world.goal import Atom
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.factory.task_import.sources import SourceText
-    from embomatrix.world.bddl import BddlProblem
-
 
 RENAMED: Final[Mapping[str, tuple[str, ...]]] = {
     "cupboard.n.01": ("cabinet.n.01",),

@@ -1,21 +1,16 @@
 """Checks of a problem before any scene is considered: known types, representable state, and goals within the skills' reach."""
 
-from __future__ import annotations
-
 import difflib
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.admission import RefusalReason, RefusedError
 from embomatrix.factory.task_import.reach import FUTURE, HELD, INSOURCE, Reachability, pieces_of
-from embomatrix.world.bddl import is_room_instance
+from embomatrix.world.bddl import BddlProblem, is_room_instance
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.evaluate import atoms_of, render
+from embomatrix.world.goal import Atom
 from embomatrix.world.state import Relation
 from embomatrix.world.substances import is_substance
-
-if TYPE_CHECKING:
-    from embomatrix.world.bddl import BddlProblem
-    from embomatrix.world.goal import Atom
 
 FLOORS: Final = frozenset({"floor.n.01", "driveway.n.01", "lawn.n.01"})
 """Types of floors. A garden is one plane here; lawn and driveway are its floor."""

@@ -1,29 +1,23 @@
 """Importer of problems in this process or in several processes."""
 
-from __future__ import annotations
-
 import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING
 
+from embomatrix.factory.admission import TaskRefusal
 from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.batch import Verified, bind_first, verify_first
 from embomatrix.factory.task_import.report import ProblemOutcome, outcome_of
+from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.factory.task_import.task import ImportedTask, ImportOptions
 from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.process_pool import shared_work
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from embomatrix.factory.admission import TaskRefusal
-    from embomatrix.factory.task_import.sources import SourceText
-
-    ImportMany = Callable[[Sequence[SourceText]], Iterator["ImportOutcome"]]
-    """Function that imports problems and yields the outcomes in order."""
+ImportMany = Callable[[Sequence[SourceText]], Iterator["ImportOutcome"]]
+"""Function that imports problems and yields the outcomes in order."""
 
 
 class Depth(StrEnum):

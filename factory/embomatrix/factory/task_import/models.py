@@ -4,30 +4,23 @@ The catalog has only one model, of one size, for many types: a sausage larger th
 the gripper. If no model of a type meets the requirements, a scaled model is used, within limits.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
+
+import numpy as np
 
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.scenes.view import is_liftable
+from embomatrix.factory.task_import.binding import Addition
 from embomatrix.factory.task_import.search import has_abilities
 from embomatrix.factory.task_import.size_requirements import CavityFit, Requirement, floor_needed_m2, room_for
 from embomatrix.sim.geometry.candidates import candidates, surfaces_for
 from embomatrix.sim.planner.subgoals import CANDIDATES, MIDDLE
-from embomatrix.world.catalog import Catalog
+from embomatrix.world.asset import Asset
+from embomatrix.world.catalog import Catalog, Model
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    import numpy as np
-
-    from embomatrix.factory.task_import.binding import Addition
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.catalog import Model
-
 
 MODEL_TRIES: Final = 5
 """Maximum number of models tried for an object."""

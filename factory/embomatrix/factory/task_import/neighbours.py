@@ -1,21 +1,15 @@
 """Pairs of objects that a goal wants next to each other, and the object of each pair that is carried."""
 
-from __future__ import annotations
-
 import itertools
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from embomatrix.factory.pipeline.task_poses import NeighbourPair
 from embomatrix.factory.task_import.reach import literals
+from embomatrix.world.goal import Formula
 from embomatrix.world.state import Relation
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
-
-    from embomatrix.world.goal import Formula
-
-    Atoms = Iterable[tuple[str, tuple[str, ...]]]
-    """Predicates with their arguments."""
+Atoms = Iterable[tuple[str, tuple[str, ...]]]
+"""Predicates with their arguments."""
 
 BORNE = (Relation.ONTOP, Relation.INSIDE, Relation.TOUCHING)
 

@@ -4,12 +4,12 @@ A ground atom can become true or false if a skill of the profile has this effect
 an atom that does not hold at the start and that no skill achieves is inexpressible.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterator, Mapping
+from typing import Final
 
+from embomatrix.world.bddl import BddlProblem
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.evaluate import atoms_of, render, substitute
 from embomatrix.world.goal import (
@@ -37,11 +37,6 @@ from embomatrix.world.substances import (
     kind_of,
 )
 from embomatrix.world.task import Profile
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from embomatrix.world.bddl import BddlProblem
 
 INSOURCE: Final = "insource"
 REAL, FUTURE = "real", "future"

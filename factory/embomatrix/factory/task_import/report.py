@@ -1,11 +1,10 @@
 """Report on imported problems: outcomes, refusals with reasons, unreachable goals, and import rates."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from embomatrix.factory.admission import TaskRefusal
 from embomatrix.factory.metrics.figures import EvaluationFigures
@@ -13,15 +12,10 @@ from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.factory.task_import.batch import Verified
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.reach import unreachable_atoms
-from embomatrix.factory.task_import.sources import BEHAVIOR, EAI
+from embomatrix.factory.task_import.sources import BEHAVIOR, EAI, SourceText
+from embomatrix.factory.task_import.task import ImportedTask
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.task import Profile
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from embomatrix.factory.task_import.sources import SourceText
-    from embomatrix.factory.task_import.task import ImportedTask
 
 FIGURES: Final[Mapping[str, tuple[str, float]]] = {
     "embomatrix": ("import_rate_sample", 0.97),

@@ -1,30 +1,27 @@
 """Search for a problem's furniture in a scene, by backtracking over rooms and objects."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import defaultdict
-from typing import TYPE_CHECKING, Final
+from collections.abc import Container, Iterable, Iterator, Mapping
+from typing import Final
+
+import numpy as np
 
 from embomatrix.factory.admission import RefusalReason, RefusedError
-from embomatrix.factory.scenes.view import is_liftable
-from embomatrix.factory.task_import.size_requirements import requirement_on, requirements_of, room_for
-from embomatrix.world.bddl import is_room_instance
+from embomatrix.factory.scenes.view import SceneView, is_liftable
+from embomatrix.factory.task_import.size_requirements import (
+    Requirement,
+    requirement_on,
+    requirements_of,
+    room_for,
+)
+from embomatrix.world.asset import Asset
+from embomatrix.world.bddl import BddlProblem, is_room_instance
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.evaluate import atoms_of
+from embomatrix.world.scene import Scene
 from embomatrix.world.state import Relation, State
-
-if TYPE_CHECKING:
-    from collections.abc import Container, Iterable, Iterator, Mapping
-
-    import numpy as np
-
-    from embomatrix.factory.scenes.view import SceneView
-    from embomatrix.factory.task_import.size_requirements import Requirement
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.bddl import BddlProblem
-    from embomatrix.world.scene import Scene
 
 MAX_STEPS: Final = 20_000
 """Maximum number of assignments tried."""

@@ -1,28 +1,23 @@
 """Size requirements of a problem: contents of its objects, and objects that must be carried."""
 
-from __future__ import annotations
-
 import functools
 import math
 import operator
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.scenes.view import is_liftable
 from embomatrix.factory.task_import.reach import literals
 from embomatrix.sim.geometry.candidates import surfaces_for
+from embomatrix.world.asset import Asset, SupportSurface
+from embomatrix.world.bddl import BddlProblem
 from embomatrix.world.catalog import Catalog, CatalogError
+from embomatrix.world.geometry import Vec3
+from embomatrix.world.goal import Atom
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.world.asset import Asset, SupportSurface
-    from embomatrix.world.bddl import BddlProblem
-    from embomatrix.world.geometry import Vec3
-    from embomatrix.world.goal import Atom
 
 SLACK: Final = 2.2
 """Ratio of a cavity's floor to the footprints of its contents. Objects are placed loosely, not packed."""

@@ -1,18 +1,14 @@
 """Sources of BDDL problems: BEHAVIOR-1K's activities, EAI's tasks, a file, or a JSON lines file."""
 
-from __future__ import annotations
-
 import difflib
 import importlib.util
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.world.whole_file import read_whole
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 MAX_PROBLEM_BYTES: Final = 1024 * 1024
 MAX_RECORDS_BYTES: Final = 256 * 1024 * 1024

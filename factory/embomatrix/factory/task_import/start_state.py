@@ -1,23 +1,16 @@
 """Start state of a scene: position of the robot, open doors, symbolic states and substances."""
 
-from __future__ import annotations
-
 import dataclasses
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
 
 import numpy as np
 
 from embomatrix.factory.admission import RefusalReason, RefusedError
 from embomatrix.factory.scenes.floor import ReachableFloor
 from embomatrix.factory.scenes.joints import with_joints
-from embomatrix.world.scene import RobotStart
+from embomatrix.world.bddl import InitLiteral
+from embomatrix.world.scene import RobotStart, Scene, SceneObject
 from embomatrix.world.state import State, SubstanceFact, SubstanceRelation
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from embomatrix.world.bddl import InitLiteral
-    from embomatrix.world.scene import Scene, SceneObject
 
 
 def with_robot_in(scene: Scene, room_name: str) -> Scene:

@@ -1,13 +1,12 @@
 """Import of one BDDL problem: a task in its own scene, or a refusal with a reason."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import math
 import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -15,17 +14,18 @@ from embomatrix.factory.admission import RefusalReason, RefusedError, TaskRefusa
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.furnish.roles import is_portable
 from embomatrix.factory.layout.generator import lay
-from embomatrix.factory.layout.request import RequestedObject
-from embomatrix.factory.layout.values import LayoutRelation
+from embomatrix.factory.layout.request import Layout, RequestedObject
+from embomatrix.factory.layout.values import LayoutFailure, LayoutRelation
 from embomatrix.factory.scenes.editor import SceneEditor, add_floor
 from embomatrix.factory.scenes.view import SceneView, is_liftable
-from embomatrix.factory.task_import.binding import bind
+from embomatrix.factory.task_import.binding import Addition, Binding, bind
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.expressible import AGENT, FLOORS
 from embomatrix.factory.task_import.models import models_for, with_sizes
 from embomatrix.factory.task_import.neighbours import neighbours_of
 from embomatrix.factory.task_import.reach import FUTURE, INSOURCE, REAL, pieces_of, profile_for
 from embomatrix.factory.task_import.size_requirements import requirement_on, requirements_of
+from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.factory.task_import.start_state import with_robot_in, with_states
 from embomatrix.factory.task_import.task_fields import (
     SWITCHED,
@@ -36,24 +36,14 @@ from embomatrix.factory.task_import.task_fields import (
     taps_for,
 )
 from embomatrix.factory.writer.tasks import object_table
-from embomatrix.world.bddl import InitLiteral, is_room_instance
-from embomatrix.world.catalog import Catalog, share_of
+from embomatrix.world.bddl import BddlProblem, InitLiteral, is_room_instance
+from embomatrix.world.catalog import Catalog, Model, share_of
 from embomatrix.world.evaluate import atoms_of, objects_of, render, substitute, types_of
 from embomatrix.world.goal import Atom
+from embomatrix.world.scene import Scene
 from embomatrix.world.state import SubstanceRelation
 from embomatrix.world.substances import flows_from, is_substance
 from embomatrix.world.task import MAX_TABLE, Task
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from embomatrix.factory.layout.request import Layout
-    from embomatrix.factory.layout.values import LayoutFailure
-    from embomatrix.factory.task_import.binding import Addition, Binding
-    from embomatrix.factory.task_import.sources import SourceText
-    from embomatrix.world.bddl import BddlProblem
-    from embomatrix.world.catalog import Model
-    from embomatrix.world.scene import Scene
 
 
 class Lay(Protocol):

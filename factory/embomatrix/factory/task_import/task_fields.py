@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import itertools
 import re
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.task_import.reach import REAL
+from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.skills.appliances import liquids_given
-from embomatrix.world.bddl import ROOM_TYPES, is_room_instance
+from embomatrix.world.bddl import ROOM_TYPES, BddlProblem, is_room_instance
 from embomatrix.world.evaluate import atoms_of
+from embomatrix.world.goal import Formula
 from embomatrix.world.state import Relation, State, SubstanceRelation
 from embomatrix.world.substances import MEANINGS, WATER
 from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
-
     from embomatrix.factory.scenes.view import SceneView
-    from embomatrix.factory.task_import.sources import SourceText
-    from embomatrix.world.bddl import BddlProblem
-    from embomatrix.world.goal import Formula
 
 
 KITCHEN: Final = frozenset({State.COOKED, State.FROZEN, State.HOT, State.SLICED, REAL})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
 
@@ -21,15 +22,14 @@ from embomatrix.world.goal import And, Formula
 from embomatrix.world.task import MAX_TABLE, Task, TaskCategory
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
     import numpy as np
 
     from embomatrix.factory.admission import TaskRefusal
     from embomatrix.factory.scenes.view import SceneView
     from embomatrix.factory.writer.variant import Variant
 
-    Maker = Callable[[GoalContext], GoalConjunct | None]
+
+Maker = Callable[[GoalContext], GoalConjunct | None]
 
 ROWS: Final = (16, 24)
 """Minimum and maximum number of rows of an object table."""

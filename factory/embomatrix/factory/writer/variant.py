@@ -1,10 +1,11 @@
 """Scene variants: a base scene with small objects, some open doors and some lights on. Several tasks share one."""
 
-from __future__ import annotations
-
 import itertools
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
+
+import numpy as np
 
 from embomatrix.factory.assets.solids import Solids, placed_parts
 from embomatrix.factory.furnish.small_objects import (
@@ -16,24 +17,16 @@ from embomatrix.factory.furnish.small_objects import (
     is_left_on,
 )
 from embomatrix.factory.layout.generator import lay
-from embomatrix.factory.layout.request import RequestedObject
+from embomatrix.factory.layout.organization import LayoutTree
+from embomatrix.factory.layout.request import LayoutAgents, RequestedObject
 from embomatrix.factory.scenes.check import reach_problems
 from embomatrix.factory.scenes.editor import SceneEditor
 from embomatrix.factory.scenes.floor import ReachableFloor, box_of
 from embomatrix.factory.scenes.joints import bumped_into, with_joints
 from embomatrix.factory.scenes.view import SceneView, is_liftable
 from embomatrix.world.catalog import Catalog
+from embomatrix.world.scene import Scene
 from embomatrix.world.state import State
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    import numpy as np
-
-    from embomatrix.factory.layout.organization import LayoutTree
-    from embomatrix.factory.layout.request import LayoutAgents
-    from embomatrix.world.scene import Scene
-
 
 SWEEP: Final = (1 / 3, 2 / 3, 1.0)
 """Fractions of a door's travel at which its swing is checked."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.world.bddl import is_room_instance
 
 if TYPE_CHECKING:
-    from collections import Counter
-    from collections.abc import Callable, Mapping, Sequence
-
     import numpy as np
 
     from embomatrix.factory.scenes.view import SceneView

@@ -9,8 +9,9 @@ import hashlib
 import hmac
 import json
 import secrets
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.manager.store.protocol import ShelfRow
 from embomatrix.rpc.status import (
@@ -21,9 +22,6 @@ from embomatrix.rpc.status import (
     OverloadedError,
 )
 from embomatrix.rpc.wire.tokens import AccessRole, TokenInfo
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
 
 LONGEST_JOIN_S: Final = 86_400.0
 """Longest validity of a join token, which is meant for immediate use."""

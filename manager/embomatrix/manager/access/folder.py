@@ -1,13 +1,13 @@
 """Folder ``access`` of a data folder: authority, certificate and first tokens, made by ``manager init``."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 from embomatrix.manager.access.certificates import (
     RENEWAL,
@@ -22,10 +22,6 @@ from embomatrix.manager.settings import LOOPBACK_NAMES
 from embomatrix.manager.store.protocol import ShelfRow
 from embomatrix.rpc.trust import fingerprint_of
 from embomatrix.rpc.wire.tokens import AccessRole
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-    from pathlib import Path
 
 FIRST_ROLES: Final = (AccessRole.ADMIN, AccessRole.TRAINER, AccessRole.VIEWER, AccessRole.JOIN)
 _PRIVATE: Final = 0o600

@@ -1,13 +1,14 @@
 """Access control of every call: stored credentials and role checks."""
 
-from __future__ import annotations
-
 import asyncio
 import hmac
 import logging
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
+
+import grpc
 
 from embomatrix.manager.access.credentials import (
     NO_TOKEN,
@@ -17,7 +18,7 @@ from embomatrix.manager.access.credentials import (
 )
 from embomatrix.manager.access.folder import AccessError
 from embomatrix.manager.access.roles import OPEN, may_call, who_may
-from embomatrix.manager.store.protocol import Shelf, StateError
+from embomatrix.manager.store.protocol import Shelf, StateError, StateStore
 from embomatrix.rpc.channel import TOKEN_KEY, token_of
 from embomatrix.rpc.status import (
     ClusterError,
@@ -26,15 +27,7 @@ from embomatrix.rpc.status import (
     PreconditionError,
     UnavailableError,
 )
-from embomatrix.rpc.wire.tokens import AccessRole
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    import grpc
-
-    from embomatrix.manager.store.protocol import StateStore
-    from embomatrix.rpc.wire.tokens import TokenInfo
+from embomatrix.rpc.wire.tokens import AccessRole, TokenInfo
 
 logger = logging.getLogger(__name__)
 

@@ -1,23 +1,16 @@
 """Protection of a manager: TLS and tokens, which only loopback addresses may lack."""
 
-from __future__ import annotations
-
 import logging
 import ssl
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from embomatrix.manager.access.certificates import RENEWAL, life_left, names_in
+from embomatrix.manager.access.credentials import Credential
 from embomatrix.manager.access.folder import AccessError, AccessFolder
-from embomatrix.manager.settings import is_loopback
+from embomatrix.manager.settings import ManagerSettings, is_loopback
 from embomatrix.rpc.trust import fingerprint_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from embomatrix.manager.access.credentials import Credential
-    from embomatrix.manager.settings import ManagerSettings
 
 logger = logging.getLogger(__name__)
 

@@ -1,13 +1,9 @@
 """Roles that may call each method. A test checks that the table names every method."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping
+from typing import Final
 
 from embomatrix.rpc.wire.tokens import AccessRole
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 _PACKAGE: Final = "embomatrix.proto.v1"
 _WORKER: Final = frozenset({AccessRole.WORKER})

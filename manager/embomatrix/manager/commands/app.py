@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path  # typer evaluates the annotation
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
@@ -10,8 +11,6 @@ import typer
 from embomatrix.rpc.logs import LogFormat, hide, log_to_stderr, without_secrets
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Coroutine, Mapping
-
     from embomatrix.manager.settings import ManagerSettings
     from embomatrix.rpc.admin_client import AdminClient
     from embomatrix.rpc.wire.tokens import AccessRole, TokenInfo

@@ -1,24 +1,17 @@
 """Scheduler and dispatcher as one state machine: the dispatcher's demand feeds the scheduler, whose answers feed back."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from typing import Final
 
-from embomatrix.manager.control.commands import QuarantineWorker
+from embomatrix.manager.control.commands import Command, QuarantineWorker
 from embomatrix.manager.control.dispatch.dispatcher import Dispatcher
 from embomatrix.manager.control.dispatch.state import DispatchLimits
-from embomatrix.manager.control.events import RunClosed, ScenesUnplaceable
+from embomatrix.manager.control.events import Event, RunClosed, ScenesUnplaceable
 from embomatrix.manager.control.schedule.scheduler import ScheduleLimits, Scheduler, Urgency
+from embomatrix.rpc.wire.run_log import RolloutStep
 from embomatrix.rpc.wire.values import RunStats
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.manager.control.commands import Command
-    from embomatrix.manager.control.events import Event
-    from embomatrix.rpc.wire.run_log import RolloutStep
 
 UNIT_COST_S: Final = 1e-5
 """Assumed CPU time of a placement for each need and worker that it examines."""

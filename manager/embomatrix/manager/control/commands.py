@@ -1,16 +1,11 @@
 """Commands of the manager's state machines; the runtime carries them out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
+from embomatrix.manager.control.events import Event
 from embomatrix.reward.settings import PAPER, RewardSettings
-
-if TYPE_CHECKING:
-    from embomatrix.manager.control.events import Event
-    from embomatrix.rpc.wire.leases import LeaseOrigin, LeaseRef
-    from embomatrix.rpc.wire.values import Rollout, RolloutResult
+from embomatrix.rpc.wire.leases import LeaseOrigin, LeaseRef
+from embomatrix.rpc.wire.values import Rollout, RolloutResult
 
 
 @dataclass(frozen=True, slots=True)

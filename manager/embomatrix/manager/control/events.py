@@ -1,24 +1,19 @@
 """Events of the manager's state machines. Times are seconds of one monotonic clock."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.manager.control.reputation import Reputation
-    from embomatrix.rpc.wire.leases import LeaseClaim, LeaseProgress, LeaseRef
-    from embomatrix.rpc.wire.values import (
-        Batch,
-        Completed,
-        InfraFailure,
-        LookaheadEntry,
-        Resident,
-        Resources,
-        RunTerms,
-    )
+from embomatrix.manager.control.reputation import Reputation
+from embomatrix.rpc.wire.leases import LeaseClaim, LeaseProgress, LeaseRef
+from embomatrix.rpc.wire.values import (
+    Batch,
+    Completed,
+    InfraFailure,
+    LookaheadEntry,
+    Resident,
+    Resources,
+    RunTerms,
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,15 +8,13 @@ catches 1 - 0.9^50 = 99.5 % of the workers that falsify a tenth of their results
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
 from itertools import combinations
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from embomatrix.rpc.wire.values import Completed
+from embomatrix.rpc.wire.values import Completed
 
 PLATFORM: Final = "platform"
 """Name of the platform fingerprint among a worker's versions."""

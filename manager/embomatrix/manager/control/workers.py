@@ -1,12 +1,13 @@
 """State of each worker as the manager decides by it, and the pool of live workers."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from embomatrix.manager.control.dispatch.fair_share import SlotTimes
+from embomatrix.manager.control.dispatch.records import LeaseRecord, RolloutRecord
 from embomatrix.manager.control.events import (
     WorkerDrained,
     WorkerRecovered,
@@ -14,13 +15,7 @@ from embomatrix.manager.control.events import (
     WorkerResumed,
     WorkerSuspected,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
-    from embomatrix.manager.control.dispatch.fair_share import SlotTimes
-    from embomatrix.manager.control.dispatch.records import LeaseRecord, RolloutRecord
-    from embomatrix.rpc.wire.values import Resources
+from embomatrix.rpc.wire.values import Resources
 
 AHEAD_S: Final = 0.2
 """Work that a worker may hold beyond its running rollouts, so that slots stay busy while messages are batched."""

@@ -9,22 +9,26 @@ import functools
 import itertools
 import logging
 from collections import Counter, OrderedDict, deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+from embomatrix.manager.control.commands import DeliverResult, GiveLease
+from embomatrix.manager.control.dispatch.records import LeaseRecord
 from embomatrix.manager.histogram import Histogram, merged
 from embomatrix.manager.observe.run_figures import RunFigures
 from embomatrix.reward.settings import PAPER, RewardSettings
+from embomatrix.rpc.wire.leases import LeaseResult
 from embomatrix.rpc.wire.run_log import EventKind, EventPage, RolloutPhase, RunEvent
-from embomatrix.rpc.wire.values import Cancelled, Completed, InfraFailure, ResidentState
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-
-    from embomatrix.manager.control.commands import DeliverResult, GiveLease
-    from embomatrix.manager.control.dispatch.records import LeaseRecord
-    from embomatrix.rpc.wire.leases import LeaseResult
-    from embomatrix.rpc.wire.values import Batch, Resident, Resources
+from embomatrix.rpc.wire.values import (
+    Batch,
+    Cancelled,
+    Completed,
+    InfraFailure,
+    Resident,
+    ResidentState,
+    Resources,
+)
 
 logger = logging.getLogger(__name__)
 

@@ -1,19 +1,13 @@
 """Load of the manager (CPU accounting, clock lag, store latency), and counters of delivered results."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter, deque
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from embomatrix.manager.histogram import Histogram, quantile
-from embomatrix.rpc.wire.values import Cancelled, Completed, InfraFailure
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.rpc.wire.values import RolloutResult
+from embomatrix.rpc.wire.values import Cancelled, Completed, InfraFailure, RolloutResult
 
 WINDOW_S: Final = 60.0
 OPERATIONS: Final = 64

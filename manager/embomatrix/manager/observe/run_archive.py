@@ -10,13 +10,17 @@ import os
 import re
 import time
 import zlib
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
 
 from google.protobuf.message import DecodeError
 
-from embomatrix.manager.observe.event_log import PAGE
+from embomatrix.manager.control.cluster_state import ClusterState
+from embomatrix.manager.observe.event_log import PAGE, RunEventLog, RunRecord
 from embomatrix.manager.observe.run_figures import summary_of
 from embomatrix.proto.v1 import admin_service_pb2 as pb
+from embomatrix.reward.settings import RewardSettings
 from embomatrix.rpc.status import NotFoundError
 from embomatrix.rpc.versions import software_version
 from embomatrix.rpc.wire.codec import ConvertError, each
@@ -31,16 +35,7 @@ from embomatrix.rpc.wire.run_log import (
     run_summary_from_proto,
     run_summary_to_proto,
 )
-from embomatrix.rpc.wire.values import RunInfo
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from embomatrix.manager.control.cluster_state import ClusterState
-    from embomatrix.manager.observe.event_log import RunEventLog, RunRecord
-    from embomatrix.reward.settings import RewardSettings
-    from embomatrix.rpc.wire.values import Batch, RunStats
+from embomatrix.rpc.wire.values import Batch, RunInfo, RunStats
 
 logger = logging.getLogger(__name__)
 

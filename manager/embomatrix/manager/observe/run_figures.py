@@ -1,16 +1,12 @@
 """Figures of an open run in bounded memory: durations by phase, work by worker, outcomes over time, latest failures."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.manager.histogram import Histogram
 from embomatrix.rpc.wire.run_log import PhaseSummary, RolloutPhase, RunEvent, RunSeries, RunWorker
-
-if TYPE_CHECKING:
-    from embomatrix.rpc.wire.values import Timings
+from embomatrix.rpc.wire.values import Timings
 
 FAILURES_KEPT: Final = 200
 WORKERS_KEPT: Final = 4096

@@ -3,18 +3,12 @@
 They are not stored: after a restart the curves continue from the next report.
 """
 
-from __future__ import annotations
-
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.rpc.status import NotFoundError
-from embomatrix.rpc.wire.training import FIGURES, PLANS, SampledPlan
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from embomatrix.rpc.wire.training import TrainingReport
+from embomatrix.rpc.wire.training import FIGURES, PLANS, SampledPlan, TrainingReport
 
 RUNS_KEPT: Final = 16
 PHASES_KEPT: Final = 4

@@ -1,7 +1,5 @@
 """Bundles on disk, each named after the digest of its content."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import hashlib
@@ -10,17 +8,14 @@ import os
 import re
 import tempfile
 import time
-from typing import TYPE_CHECKING, Final
+from collections.abc import AsyncIterator, Callable
+from collections.abc import Set as AbstractSet
+from pathlib import Path
+from typing import IO, Final
 
 from embomatrix.rpc.channel import CHUNK_BYTES
 from embomatrix.rpc.status import InvalidRequestError, NotFoundError, OverloadedError
 from embomatrix.world.inflation import BundleError, Inflation
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-    from collections.abc import Set as AbstractSet
-    from pathlib import Path
-    from typing import IO
 
 logger = logging.getLogger(__name__)
 

@@ -3,14 +3,14 @@
 Everything runs on one event loop and never awaits between an event and its commands, so it needs no lock.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging
 import time
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Iterator, Sequence
+from typing import Final
 
+from embomatrix.manager.control.cluster_state import ClusterState
 from embomatrix.manager.control.commands import (
     AcknowledgeLease,
     CancelLease,
@@ -24,29 +24,20 @@ from embomatrix.manager.control.commands import (
 from embomatrix.manager.control.events import DispatchPaused, DispatchResumed
 from embomatrix.manager.observe.event_log import RunEventLog
 from embomatrix.manager.observe.metrics import ManagerLoad, Meter
-from embomatrix.manager.observe.run_archive import RunHistory
+from embomatrix.manager.observe.run_archive import RunArchive, RunHistory
 from embomatrix.manager.observe.training_reports import TrainingBook
+from embomatrix.manager.runtime.bundles import BundleStore
 from embomatrix.manager.runtime.intake import TICK_S, Heartbeat, Intake
-from embomatrix.manager.runtime.registry import WorkerStanding
+from embomatrix.manager.runtime.registry import Registry, WorkerSession, WorkerStanding
 from embomatrix.manager.runtime.results import ResultDelivery, ResultLogs
 from embomatrix.manager.runtime.runs import Runs
 from embomatrix.manager.runtime.state_journal import StateJournal
-from embomatrix.manager.runtime.worker_link import WorkerLink
+from embomatrix.manager.runtime.worker_link import WorkerCommand, WorkerLink
 from embomatrix.manager.store.opening import timed_store
-from embomatrix.rpc.status import SupersededError, UnavailableError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from embomatrix.manager.control.cluster_state import ClusterState
-    from embomatrix.manager.observe.run_archive import RunArchive
-    from embomatrix.manager.runtime.bundles import BundleStore
-    from embomatrix.manager.runtime.registry import Registry, WorkerSession
-    from embomatrix.manager.runtime.worker_link import WorkerCommand
-    from embomatrix.manager.store.protocol import StateStore
-    from embomatrix.rpc.status import ClusterError
-    from embomatrix.rpc.wire.leases import LeaseResult, WorkerState
-    from embomatrix.rpc.wire.values import Resources
+from embomatrix.manager.store.protocol import StateStore
+from embomatrix.rpc.status import ClusterError, SupersededError, UnavailableError
+from embomatrix.rpc.wire.leases import LeaseResult, WorkerState
+from embomatrix.rpc.wire.values import Resources
 
 logger = logging.getLogger(__name__)
 

@@ -5,9 +5,11 @@ Free of I/O. The services call it with messages and the real clock, the simulato
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.manager.control.commands import Command
 from embomatrix.manager.control.events import (
     Event,
     LeaseFinished,
@@ -16,15 +18,12 @@ from embomatrix.manager.control.events import (
     WorkerLost,
     WorkerReported,
 )
+from embomatrix.rpc.wire.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
+from embomatrix.rpc.wire.values import Resources
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from embomatrix.manager.control.cluster_state import ClusterState
-    from embomatrix.manager.control.commands import Command
     from embomatrix.manager.runtime.registry import Registry, WorkerSession
-    from embomatrix.rpc.wire.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
-    from embomatrix.rpc.wire.values import Resources
 
 
 TICK_S: Final = 0.1

@@ -1,21 +1,15 @@
 """Leader election: of several managers on one store one leads, the others stand by until its leader lease lapses."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging
 import secrets
 import time
-from typing import TYPE_CHECKING, Final
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Final
 
-from embomatrix.manager.store.protocol import FencedError, Shelf, ShelfRow, StateError
-
-if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
-    from pathlib import Path
-
-    from embomatrix.manager.store.protocol import Candidate, StateStore
+from embomatrix.manager.store.protocol import Candidate, FencedError, Shelf, ShelfRow, StateError, StateStore
 
 logger = logging.getLogger(__name__)
 

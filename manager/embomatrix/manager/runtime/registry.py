@@ -1,14 +1,13 @@
 """Registry of worker sessions: presence, epochs and silence. Free of I/O; the clock is an argument."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import secrets
 from collections import OrderedDict
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.manager.control.events import (
     Event,
@@ -20,12 +19,7 @@ from embomatrix.manager.control.events import (
     WorkerSuspected,
 )
 from embomatrix.rpc.status import NotFoundError, SupersededError, UnknownSessionError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
-
-    from embomatrix.rpc.wire.values import Resources
-
+from embomatrix.rpc.wire.values import Resources
 
 LISTED: Final = 10
 """Names listed in one message at most."""

@@ -7,21 +7,15 @@ import bisect
 import contextlib
 import logging
 import time
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
-from embomatrix.manager.control.commands import DeliverResult, FinishBatch
+from embomatrix.manager.control.commands import AcknowledgeLease, DeliverResult, FinishBatch
 from embomatrix.manager.control.dispatch.batches import GroupEnds
 from embomatrix.manager.runtime.serialization import result_row, timed_row
-from embomatrix.manager.store.protocol import BatchResults, FencedError, StateError
-from embomatrix.rpc.wire.values import Completed
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
-
-    from embomatrix.manager.control.commands import AcknowledgeLease
-    from embomatrix.manager.store.protocol import ResultRow, StateStore
-    from embomatrix.rpc.wire.values import RolloutResult
+from embomatrix.manager.store.protocol import BatchResults, FencedError, ResultRow, StateError, StateStore
+from embomatrix.rpc.wire.values import Completed, RolloutResult
 
 logger = logging.getLogger(__name__)
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from embomatrix.manager.runtime.event_loop import ManagerRuntime
 from embomatrix.manager.runtime.registry import name_list
 from embomatrix.rpc.status import NotFoundError, NotSignedInError
 
 if TYPE_CHECKING:
     from embomatrix.manager.access.gate import Gate
-    from embomatrix.manager.runtime.event_loop import ManagerRuntime
 
 
 class Revocation:

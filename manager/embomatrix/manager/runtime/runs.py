@@ -1,27 +1,30 @@
 """Open runs and their batches: operations of the trainer."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging
 import secrets
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Final
 
+from embomatrix.manager.control.cluster_state import ClusterState
+from embomatrix.manager.control.commands import Command
 from embomatrix.manager.control.dispatch.batches import group_sizes
 from embomatrix.manager.control.events import (
     BatchCancelled,
     BatchContinued,
     BatchRestored,
     BatchSubmitted,
+    Event,
     LookaheadAnnounced,
     RunOpened,
     WorkersExpected,
 )
-from embomatrix.manager.observe.run_archive import RUN_ID
-from embomatrix.manager.runtime.results import BatchLog
+from embomatrix.manager.observe.run_archive import RUN_ID, RunHistory
+from embomatrix.manager.runtime.bundles import BundleStore
+from embomatrix.manager.runtime.results import BatchLog, ResultLogs
 from embomatrix.manager.runtime.serialization import (
     announced_in,
     batch_of,
@@ -31,7 +34,14 @@ from embomatrix.manager.runtime.serialization import (
     terms_of,
     terms_payload,
 )
-from embomatrix.manager.store.protocol import PutOutcome, RunRow, Shelf, StateError, StateFullError
+from embomatrix.manager.store.protocol import (
+    PutOutcome,
+    RunRow,
+    Shelf,
+    StateError,
+    StateFullError,
+    StateStore,
+)
 from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.status import (
     ConflictError,
@@ -41,19 +51,7 @@ from embomatrix.rpc.status import (
     PreconditionError,
     UnavailableError,
 )
-from embomatrix.rpc.wire.values import RunTerms
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
-    from embomatrix.manager.control.cluster_state import ClusterState
-    from embomatrix.manager.control.commands import Command
-    from embomatrix.manager.control.events import Event
-    from embomatrix.manager.observe.run_archive import RunHistory
-    from embomatrix.manager.runtime.bundles import BundleStore
-    from embomatrix.manager.runtime.results import ResultLogs
-    from embomatrix.manager.store.protocol import StateStore
-    from embomatrix.rpc.wire.values import Batch, LookaheadAnswer, LookaheadEntry, RunStats
+from embomatrix.rpc.wire.values import Batch, LookaheadAnswer, LookaheadEntry, RunStats, RunTerms
 
 logger = logging.getLogger(__name__)
 

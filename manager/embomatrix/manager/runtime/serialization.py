@@ -3,17 +3,17 @@
 Result streams send the stored bytes without parsing them.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import struct
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.manager.control.events import LookaheadAnnounced
 from embomatrix.manager.control.reputation import Reputation
-from embomatrix.manager.store.protocol import BatchRow, ResultRow, ShelfRow
+from embomatrix.manager.control.schedule.lookahead import LookaheadWindow
+from embomatrix.manager.store.protocol import BatchRow, ResultRow, RunRow, ShelfRow
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.rpc.wire.codec import each
 from embomatrix.rpc.wire.outcome import rollout_result_to_proto
@@ -24,14 +24,15 @@ from embomatrix.rpc.wire.run import (
     run_terms_from_proto,
     run_terms_to_proto,
 )
-from embomatrix.rpc.wire.values import Cancelled, Completed, InfraFailure
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from embomatrix.manager.control.schedule.lookahead import LookaheadWindow
-    from embomatrix.manager.store.protocol import RunRow
-    from embomatrix.rpc.wire.values import Batch, Outcome, RolloutResult, RunTerms
+from embomatrix.rpc.wire.values import (
+    Batch,
+    Cancelled,
+    Completed,
+    InfraFailure,
+    Outcome,
+    RolloutResult,
+    RunTerms,
+)
 
 _KINDS: Final[Mapping[str, type[Outcome]]] = {
     "completed": Completed,

@@ -1,21 +1,16 @@
 """State journal for later managers: present workers, reputations, look-ahead windows, and the dispatch pause."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from embomatrix.manager.control.cluster_state import ClusterState
 from embomatrix.manager.control.events import ReputationsKnown
+from embomatrix.manager.runtime.registry import Registry
 from embomatrix.manager.runtime.serialization import reputation_of, reputation_row, window_row
-from embomatrix.manager.store.protocol import Shelf, ShelfRow, StateError
+from embomatrix.manager.store.protocol import Shelf, ShelfRow, StateError, StateStore
 from embomatrix.rpc.status import UnavailableError
-
-if TYPE_CHECKING:
-    from embomatrix.manager.control.cluster_state import ClusterState
-    from embomatrix.manager.runtime.registry import Registry
-    from embomatrix.manager.store.protocol import StateStore
 
 logger = logging.getLogger(__name__)
 

@@ -7,12 +7,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from embomatrix.manager.control.commands import AcknowledgeLease, CancelLease, GiveLease, SetDesired
-from embomatrix.rpc.wire.leases import Lease
+from embomatrix.rpc.wire.leases import Lease, LeaseRef
 
 if TYPE_CHECKING:
     from embomatrix.manager.runtime.registry import WorkerSession
     from embomatrix.rpc.status import ClusterError
-    from embomatrix.rpc.wire.leases import LeaseRef
 
 WorkerCommand = SetDesired | GiveLease | CancelLease | AcknowledgeLease
 

@@ -5,6 +5,10 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
+import grpc
+
+from embomatrix.manager.runtime.event_loop import ManagerRuntime
+from embomatrix.manager.runtime.revocation import Revocation
 from embomatrix.manager.web.cluster_view import health, overview, plan, run_infos, worker_infos
 from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.proto.v1 import admin_service_pb2_grpc
@@ -14,11 +18,7 @@ from embomatrix.rpc.wire.session import plan_cell_to_proto, run_info_to_proto, w
 from embomatrix.rpc.wire.tokens import role_from_proto, token_info_to_proto
 
 if TYPE_CHECKING:
-    import grpc
-
     from embomatrix.manager.access.gate import Gate
-    from embomatrix.manager.runtime.event_loop import ManagerRuntime
-    from embomatrix.manager.runtime.revocation import Revocation
 
 
 class AdminServicer(admin_service_pb2_grpc.AdminServiceServicer):

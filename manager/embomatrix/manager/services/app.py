@@ -9,13 +9,18 @@ import logging
 import secrets
 import signal
 import socket
+from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+import grpc
 import uvicorn
+from fastapi import FastAPI
+from starlette.types import Receive, Scope, Send
 
 from embomatrix.manager.access.gate import Gate
-from embomatrix.manager.access.protection import protection_of
+from embomatrix.manager.access.protection import Tls, protection_of
 from embomatrix.manager.control.cluster_state import ClusterState
 from embomatrix.manager.control.dispatch.state import DispatchLimits
 from embomatrix.manager.control.reputation import AuditRules
@@ -29,25 +34,14 @@ from embomatrix.manager.runtime.revocation import Revocation
 from embomatrix.manager.services.listen import bound_socket
 from embomatrix.manager.services.server import build_server
 from embomatrix.manager.services.standby import Standby
-from embomatrix.manager.settings import is_every_address, is_loopback
+from embomatrix.manager.settings import ManagerSettings, is_every_address, is_loopback
 from embomatrix.manager.store.opening import open_store
-from embomatrix.manager.store.protocol import Candidate, StateError
+from embomatrix.manager.store.protocol import Candidate, StateError, StateStore
 from embomatrix.manager.web.api import build_api
-from embomatrix.manager.web.connections import allow_files, connections_of
+from embomatrix.manager.web.connections import BoundedListener, allow_files, connections_of
 from embomatrix.manager.web.http_rules import HttpRules, allowed_hosts
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Iterator
-    from pathlib import Path
-
-    import grpc
-    from fastapi import FastAPI
-    from starlette.types import Receive, Scope, Send
-
-    from embomatrix.manager.access.protection import Tls
-    from embomatrix.manager.settings import ManagerSettings
-    from embomatrix.manager.store.protocol import StateStore
-    from embomatrix.manager.web.connections import BoundedListener
     from embomatrix.manager.web.gallery import Gallery
 
 logger = logging.getLogger(__name__)

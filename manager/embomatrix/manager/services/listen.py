@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import socket
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Final
 
 import grpc
@@ -12,8 +13,6 @@ import grpc
 from embomatrix.manager.web.connections import BoundedListener
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
     from embomatrix.manager.access.protection import Tls
 
 

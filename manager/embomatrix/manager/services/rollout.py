@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import AsyncIterator, Sequence
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.runtime.runs import BATCH_ROLLOUTS
+import grpc
+
+from embomatrix.manager.observe.training_reports import TrainingBook
+from embomatrix.manager.runtime.results import BatchLog
+from embomatrix.manager.runtime.runs import BATCH_ROLLOUTS, Runs
+from embomatrix.manager.store.protocol import ResultRow
 from embomatrix.proto.v1 import rollout_service_pb2 as pb
 from embomatrix.proto.v1 import rollout_service_pb2_grpc
 from embomatrix.rpc.logs import bind
@@ -22,19 +28,11 @@ from embomatrix.rpc.wire.run import (
     run_terms_from_proto,
 )
 from embomatrix.rpc.wire.training import training_report_from_proto
+from embomatrix.rpc.wire.values import Batch, Rollout
 from embomatrix.world.inflation import DEFAULT_LIMITS
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Sequence
-
-    import grpc
-
     from embomatrix.manager.access.gate import Gate
-    from embomatrix.manager.observe.training_reports import TrainingBook
-    from embomatrix.manager.runtime.results import BatchLog
-    from embomatrix.manager.runtime.runs import Runs
-    from embomatrix.manager.store.protocol import ResultRow
-    from embomatrix.rpc.wire.values import Batch, Rollout
 
 SLICE: Final = 128
 """Rollouts of a batch converted without a pause, which takes about 2 ms."""

@@ -1,19 +1,13 @@
 """SceneService: upload and download of bundles by digest."""
 
-from __future__ import annotations
+from collections.abc import AsyncIterator
 
-from typing import TYPE_CHECKING
+import grpc
 
+from embomatrix.manager.runtime.bundles import BundleStore
 from embomatrix.proto.v1 import scene_service_pb2 as pb
 from embomatrix.proto.v1 import scene_service_pb2_grpc
 from embomatrix.rpc.status import InvalidRequestError, translate
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    import grpc
-
-    from embomatrix.manager.runtime.bundles import BundleStore
 
 
 class SceneServicer(scene_service_pb2_grpc.SceneServiceServicer):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Final
 
 import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
+from embomatrix.manager.runtime.event_loop import ManagerRuntime
 from embomatrix.manager.runtime.revocation import Revocation
 from embomatrix.manager.services.admin import AdminServicer
 from embomatrix.manager.services.listen import bind_server
@@ -28,11 +30,8 @@ from embomatrix.proto.v1 import (
 from embomatrix.rpc.channel import SERVER_OPTIONS, TOKEN_KEY
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
-
     from embomatrix.manager.access.gate import Gate
     from embomatrix.manager.access.protection import Tls
-    from embomatrix.manager.runtime.event_loop import ManagerRuntime
     from embomatrix.manager.settings import ManagerSettings
 
 SERVICES: Final = tuple(

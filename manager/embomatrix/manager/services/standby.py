@@ -11,11 +11,10 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
 from embomatrix.manager.services.listen import bind_server
 from embomatrix.rpc.channel import SERVER_OPTIONS
-from embomatrix.rpc.status import StandbyError, translate
+from embomatrix.rpc.status import ClusterError, StandbyError, translate
 
 if TYPE_CHECKING:
     from embomatrix.manager.access.protection import Tls
-    from embomatrix.rpc.status import ClusterError
 
 
 class Standby:

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import re
+from collections.abc import AsyncIterator, Coroutine, Sequence
 from typing import TYPE_CHECKING, Final
 
+import grpc
+
+from embomatrix.manager.runtime.event_loop import ManagerRuntime
 from embomatrix.manager.runtime.intake import Heartbeat
-from embomatrix.manager.runtime.registry import WorkerStanding
+from embomatrix.manager.runtime.registry import WorkerSession, WorkerStanding
+from embomatrix.manager.runtime.worker_link import OutgoingMessage, WorkerLink
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.rpc.logs import bind
@@ -20,6 +25,7 @@ from embomatrix.rpc.status import (
 )
 from embomatrix.rpc.versions import SPOKEN, VersionRange, agree
 from embomatrix.rpc.wire.codec import each, inside
+from embomatrix.rpc.wire.leases import Lease, LeaseResult
 from embomatrix.rpc.wire.session import (
     lease_progress_from_proto,
     lease_ref_from_proto,
@@ -31,15 +37,7 @@ from embomatrix.rpc.wire.session import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Coroutine, Sequence
-
-    import grpc
-
     from embomatrix.manager.access.gate import Gate
-    from embomatrix.manager.runtime.event_loop import ManagerRuntime
-    from embomatrix.manager.runtime.registry import WorkerSession
-    from embomatrix.manager.runtime.worker_link import OutgoingMessage, WorkerLink
-    from embomatrix.rpc.wire.leases import Lease, LeaseResult
 
 FIRST_STATE_S: Final = 10.0
 """Time limit for the first state on a session stream."""

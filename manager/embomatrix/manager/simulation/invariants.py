@@ -1,9 +1,8 @@
 """Invariants of the manager's commands, checked from outside during a simulation."""
 
-from __future__ import annotations
-
 from collections import Counter
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterable
+from typing import Final
 
 from embomatrix.manager.control.commands import (
     AcknowledgeLease,
@@ -13,15 +12,16 @@ from embomatrix.manager.control.commands import (
     FinishBatch,
     GiveLease,
 )
-from embomatrix.rpc.wire.values import Completed, GroupPolicy, InfraFailure, ResidentState
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from embomatrix.manager.simulation.network import EventQueue
-    from embomatrix.rpc.wire.leases import LeaseRef, WorkerState
-    from embomatrix.rpc.wire.values import Batch, RolloutResult
-
+from embomatrix.manager.simulation.network import EventQueue
+from embomatrix.rpc.wire.leases import LeaseRef, WorkerState
+from embomatrix.rpc.wire.values import (
+    Batch,
+    Completed,
+    GroupPolicy,
+    InfraFailure,
+    ResidentState,
+    RolloutResult,
+)
 
 HEDGE_SHARE: Final = 0.05
 """Largest share of rollouts that may be hedged."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from embomatrix.manager.control.commands import (
     AcknowledgeLease,
     CancelLease,
+    Command,
     DeliverResult,
     FinishBatch,
     GiveLease,
@@ -15,27 +17,22 @@ from embomatrix.manager.control.commands import (
     SetDesired,
 )
 from embomatrix.manager.control.events import BatchSubmitted, LookaheadAnnounced, RunOpened
-from embomatrix.manager.runtime.intake import TICK_S, Heartbeat
-from embomatrix.rpc.wire.leases import Lease
+from embomatrix.manager.runtime.intake import TICK_S, Heartbeat, Intake
+from embomatrix.manager.simulation.invariants import InvariantChecker
+from embomatrix.manager.simulation.network import EventQueue
+from embomatrix.manager.simulation.report import Measurements
+from embomatrix.rpc.wire.leases import Lease, LeaseProgress, LeaseRef, LeaseResult, WorkerState
+from embomatrix.rpc.wire.values import (
+    Batch,
+    LookaheadEntry,
+    Resources,
+    RolloutResult,
+    RunTerms,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-
-    from embomatrix.manager.control.commands import Command
-    from embomatrix.manager.runtime.intake import Intake
     from embomatrix.manager.runtime.registry import WorkerSession
-    from embomatrix.manager.simulation.invariants import InvariantChecker
-    from embomatrix.manager.simulation.network import EventQueue
-    from embomatrix.manager.simulation.report import Measurements
     from embomatrix.manager.simulation.scenario import ManagerPace
-    from embomatrix.rpc.wire.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
-    from embomatrix.rpc.wire.values import (
-        Batch,
-        LookaheadEntry,
-        Resources,
-        RolloutResult,
-        RunTerms,
-    )
 
 
 @dataclass(slots=True)

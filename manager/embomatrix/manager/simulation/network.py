@@ -1,13 +1,8 @@
 """Simulated time and network: an event queue, and paths that delay, reorder nothing, and may be cut."""
 
-from __future__ import annotations
-
 import heapq
 import itertools
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
+from collections.abc import Callable
 
 
 class EventQueue:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+from embomatrix.rpc.wire.values import RunStats
 
+if TYPE_CHECKING:
     from embomatrix.manager.simulation.scenario import SimulationScenario
-    from embomatrix.rpc.wire.values import RunStats
 
 
 class Measurements:

@@ -1,12 +1,11 @@
 """Discrete-event simulation of a cluster, from scenario to report. A broken invariant ends it."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import random
+from collections.abc import Iterator
 from statistics import fmean
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.manager.control.cluster_state import ClusterState
 from embomatrix.manager.histogram import quantile
@@ -17,13 +16,9 @@ from embomatrix.manager.simulation.machines import rng_for, setting_of
 from embomatrix.manager.simulation.manager import SimulatedManager
 from embomatrix.manager.simulation.network import EventQueue
 from embomatrix.manager.simulation.report import Measurements, Report
+from embomatrix.manager.simulation.scenario import SimulationScenario
 from embomatrix.manager.simulation.trainer import SimulatedTrainer
 from embomatrix.manager.simulation.worker import SimulatedWorker
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from embomatrix.manager.simulation.scenario import SimulationScenario
 
 SAMPLE_S: Final = 0.1
 """Sampling interval of busy slots."""

@@ -1,7 +1,5 @@
 """Scenarios: machines, scenes, trainers and faults as values. Times are seconds, sizes megabytes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 from embomatrix.manager.control.dispatch.state import DispatchLimits

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import random
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.manager.simulation.network import EventQueue
+from embomatrix.manager.simulation.report import Measurements
 from embomatrix.reward.breakdown import RewardBreakdown
-from embomatrix.rpc.wire.leases import LeaseProgress, LeaseResult
+from embomatrix.rpc.wire.leases import Lease, LeaseProgress, LeaseRef, LeaseResult
 from embomatrix.rpc.wire.values import (
     Completed,
     InfraCode,
@@ -18,14 +22,8 @@ from embomatrix.rpc.wire.values import (
 )
 
 if TYPE_CHECKING:
-    import random
-    from collections.abc import Callable
-
     from embomatrix.manager.simulation.machines import Setting, SimulatedMachine
-    from embomatrix.manager.simulation.network import EventQueue
-    from embomatrix.manager.simulation.report import Measurements
     from embomatrix.manager.simulation.scenario import Faults
-    from embomatrix.rpc.wire.leases import Lease, LeaseRef
 
 RETRY_LOAD_S: Final = 10.0
 """Pause before a failed load is tried again, as in the real worker."""

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from embomatrix.rpc.wire.values import Batch, Completed, LookaheadEntry, Rollout
+from embomatrix.manager.simulation.manager import SimulatedManager
+from embomatrix.manager.simulation.network import EventQueue
+from embomatrix.manager.simulation.report import Measurements
+from embomatrix.rpc.wire.values import Batch, Completed, LookaheadEntry, Rollout, RolloutResult
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     import numpy as np
 
-    from embomatrix.manager.simulation.manager import SimulatedManager
-    from embomatrix.manager.simulation.network import EventQueue
-    from embomatrix.manager.simulation.report import Measurements
     from embomatrix.manager.simulation.scenario import Trainer
-    from embomatrix.rpc.wire.values import RolloutResult
 
 
 class SimulatedTrainer:

@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
+import random
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from embomatrix.host.backoff import Backoff
-from embomatrix.manager.simulation.manager import Stream
-from embomatrix.manager.simulation.network import NetworkPath
+from embomatrix.manager.runtime.registry import WorkerSession
+from embomatrix.manager.simulation.invariants import InvariantChecker
+from embomatrix.manager.simulation.manager import SimulatedManager, Stream, WorkerMessage
+from embomatrix.manager.simulation.network import EventQueue, NetworkPath
+from embomatrix.manager.simulation.report import Measurements
+from embomatrix.manager.simulation.scenario import SimulationScenario
 from embomatrix.manager.simulation.slots import SimulatedSlots, SlotEnvironment
 from embomatrix.rpc.status import SupersededError
-from embomatrix.rpc.wire.leases import WorkerState
+from embomatrix.rpc.wire.leases import LeaseRef, LeaseResult, WorkerState
 from embomatrix.rpc.wire.values import Completed
 
 if TYPE_CHECKING:
-    import random
-    from collections.abc import Callable
-
-    from embomatrix.manager.runtime.registry import WorkerSession
-    from embomatrix.manager.simulation.invariants import InvariantChecker
     from embomatrix.manager.simulation.machines import Setting, SimulatedMachine
-    from embomatrix.manager.simulation.manager import SimulatedManager, WorkerMessage
-    from embomatrix.manager.simulation.network import EventQueue
-    from embomatrix.manager.simulation.report import Measurements
-    from embomatrix.manager.simulation.scenario import SimulationScenario
-    from embomatrix.rpc.wire.leases import LeaseRef, LeaseResult
 
 ANSWER_S: Final = 2.0
 """Timeout of a heartbeat and of a new stream."""

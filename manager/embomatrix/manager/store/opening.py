@@ -1,19 +1,13 @@
 """Selection of the state store by its URL, with timed operations."""
 
-from __future__ import annotations
-
 import inspect
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
-from embomatrix.manager.store.protocol import StateError
+from embomatrix.manager.store.protocol import StateError, StateStore
 from embomatrix.rpc.logs import without_secrets
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from embomatrix.manager.store.protocol import StateStore
 
 
 def open_store(url: str) -> StateStore:

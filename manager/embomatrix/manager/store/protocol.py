@@ -3,14 +3,10 @@
 Leases are not stored: the workers that hold them report them.
 """
 
-from __future__ import annotations
-
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Protocol
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+from typing import Protocol
 
 
 class StateError(Exception):

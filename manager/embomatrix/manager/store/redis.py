@@ -7,11 +7,10 @@ payload), ``done:RUN:BATCH`` (set of rollouts), ``results:RUN:BATCH`` (sorted se
 payload" by cursor). Every conditional write is one Lua script that checks the epoch first.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
-from typing import TYPE_CHECKING, Any, Final, cast
+from collections.abc import Awaitable, Collection, Sequence
+from typing import Any, Final, cast
 
 import redis.asyncio
 from redis.exceptions import OutOfMemoryError, RedisError, ResponseError
@@ -31,9 +30,6 @@ from embomatrix.manager.store.protocol import (
     StateFullError,
 )
 from embomatrix.rpc.logs import without_secrets
-
-if TYPE_CHECKING:
-    from collections.abc import Awaitable, Collection, Sequence
 
 logger = logging.getLogger(__name__)
 

@@ -1,12 +1,12 @@
 """State store in one SQLite file, which survives a restart and needs no server, or in memory."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import sqlite3
 import time
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from collections.abc import Callable, Collection, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final, TypeVar
 
 from embomatrix.manager.store.protocol import (
     BatchResults,
@@ -22,10 +22,6 @@ from embomatrix.manager.store.protocol import (
     StateError,
     StateFullError,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
-    from pathlib import Path
 
 T = TypeVar("T")
 

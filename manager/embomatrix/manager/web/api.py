@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from importlib.resources import files
 from typing import TYPE_CHECKING, Final
 
@@ -9,9 +11,12 @@ from fastapi import FastAPI, HTTPException, Response
 from fastapi.responses import FileResponse
 from fastapi.staticfiles import StaticFiles
 from starlette.middleware.gzip import GZipMiddleware
+from starlette.types import Scope
 
+from embomatrix.manager.runtime.event_loop import ManagerRuntime
+from embomatrix.manager.runtime.revocation import Revocation
 from embomatrix.manager.web.cluster_view import Snapshots
-from embomatrix.manager.web.http_rules import STATIC, Guard
+from embomatrix.manager.web.http_rules import STATIC, Guard, HttpRules
 from embomatrix.manager.web.prometheus import CONTENT_TYPE, metrics_page
 from embomatrix.manager.web.rest import PREFIX, command_routes, read_routes
 from embomatrix.manager.web.rest_tasks import task_routes
@@ -19,15 +24,7 @@ from embomatrix.manager.web.rewards import reward_routes
 from embomatrix.rpc.versions import software_version
 
 if TYPE_CHECKING:
-    import os
-    from collections.abc import Mapping
-
-    from starlette.types import Scope
-
-    from embomatrix.manager.runtime.event_loop import ManagerRuntime
-    from embomatrix.manager.runtime.revocation import Revocation
     from embomatrix.manager.web.gallery import Gallery
-    from embomatrix.manager.web.http_rules import HttpRules
 
 DASHBOARD: Final = str(files("embomatrix.manager.web") / "dashboard")
 COMPRESSED_BYTES: Final = 1024

@@ -1,31 +1,23 @@
 """State of the cluster at one moment, as the dashboard, the REST API and AdminService report it."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.manager.control.schedule.lookahead import LookaheadWindow
 from embomatrix.manager.observe.metrics import FAILURES_KEPT, FailureNote
 from embomatrix.manager.observe.run_figures import summary_of
-from embomatrix.manager.observe.training_reports import TrainingView  # noqa: TC001  # OpenAPI reads annotations
-from embomatrix.manager.runtime.event_loop import UNAUDITED
-from embomatrix.manager.runtime.registry import WorkerStanding
+from embomatrix.manager.observe.training_reports import TrainingView  # OpenAPI reads annotations
+from embomatrix.manager.runtime.event_loop import UNAUDITED, ManagerRuntime
+from embomatrix.manager.runtime.registry import WorkerSession, WorkerStanding
 from embomatrix.rpc.status import NotFoundError
-from embomatrix.rpc.wire.run_log import PhaseSummary  # noqa: TC001  # OpenAPI reads annotations
-from embomatrix.rpc.wire.values import Resident, ResidentState, RunInfo, Warmth, WorkerInfo
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from embomatrix.manager.runtime.event_loop import ManagerRuntime
-    from embomatrix.manager.runtime.registry import WorkerSession
-    from embomatrix.rpc.wire.values import PlanCell
+from embomatrix.rpc.wire.run_log import PhaseSummary  # OpenAPI reads annotations
+from embomatrix.rpc.wire.values import PlanCell, Resident, ResidentState, RunInfo, Warmth, WorkerInfo
 
 NO_WINDOW: Final = LookaheadWindow(0, ())
 PAGES_KEPT: Final = 64

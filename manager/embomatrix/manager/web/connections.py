@@ -6,15 +6,12 @@ import asyncio
 import contextlib
 import resource
 import socket
-from typing import TYPE_CHECKING, Any, Final, cast
+from collections.abc import Callable
+from typing import Any, Final, cast
 
+from uvicorn import Config
 from uvicorn.protocols.http.h11_impl import H11Protocol
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from uvicorn import Config
-    from uvicorn.server import ServerState
+from uvicorn.server import ServerState
 
 CONNECTIONS: Final = 2048
 """Connections at most. A page opens six, an event stream holds one."""

@@ -4,21 +4,14 @@ The manager has no physics: a moved object appears at the centre of its target. 
 verified poses.
 """
 
-from __future__ import annotations
+from typing import Final
 
-from typing import TYPE_CHECKING, Final
-
-from embomatrix.manager.web.gallery_values import FloorPlanView, MomentView
+from embomatrix.manager.web.gallery_values import Box, FloorPlanView, MomentView
 from embomatrix.skills.describe import call_in_words
-from embomatrix.skills.syntax import Skill
-from embomatrix.world.geometry import IDENTITY
-
-if TYPE_CHECKING:
-    from embomatrix.manager.web.gallery_values import Box
-    from embomatrix.skills.syntax import Plan, SkillCall
-    from embomatrix.world.geometry import Vec2, Vec3
-    from embomatrix.world.scene import Scene
-    from embomatrix.world.task import Task
+from embomatrix.skills.syntax import Plan, Skill, SkillCall
+from embomatrix.world.geometry import IDENTITY, Vec2, Vec3
+from embomatrix.world.scene import Scene
+from embomatrix.world.task import Task
 
 HUNG_M: Final = 1.6
 """Objects whose lower edge is above this height are left out."""

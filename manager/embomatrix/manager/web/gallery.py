@@ -4,16 +4,17 @@ Names in a dataset are untrusted. Only plain names become paths, links must stay
 limited.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import re
 from collections import Counter, OrderedDict
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 from embomatrix.manager.web.floor_plan import floor_plan, moments_of, movable_objects
 from embomatrix.manager.web.gallery_values import (
+    FloorPlanView,
+    MomentView,
     ObjectRow,
     SceneCount,
     SceneName,
@@ -23,16 +24,10 @@ from embomatrix.manager.web.gallery_values import (
 )
 from embomatrix.rpc.status import NotFoundError, UnavailableError
 from embomatrix.skills.parse import PlanError, plan_from_json
-from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError
+from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, TaskRecord
 from embomatrix.world.evaluate import GoalError
+from embomatrix.world.scene import Scene
 from embomatrix.world.whole_file import read_whole
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from embomatrix.manager.web.gallery_values import FloorPlanView, MomentView
-    from embomatrix.world.dataset import TaskRecord
-    from embomatrix.world.scene import Scene
 
 TASKS_BYTES: Final = 256_000_000
 """Size limit of ``tasks.jsonl``, about 60,000 tasks."""

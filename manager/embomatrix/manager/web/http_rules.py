@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from embomatrix.manager.settings import LOOPBACK_NAMES, is_loopback
 from embomatrix.manager.web.rewards import REWARDS
@@ -16,10 +18,6 @@ from embomatrix.rpc.status import NotSignedInError
 from embomatrix.rpc.wire.tokens import AccessRole
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from starlette.types import ASGIApp, Receive, Scope, Send
-
     from embomatrix.manager.access.gate import Gate
     from embomatrix.manager.access.protection import Tls
 

@@ -3,31 +3,23 @@
 Labels have closed sets of values; none carries the id of a run, rollout, worker or scene.
 """
 
-from __future__ import annotations
-
 import functools
 from collections import Counter
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Final
 
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
+from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
-from embomatrix.manager.histogram import BOUNDS_S
+from embomatrix.manager.control.workers import WorkerRecord
+from embomatrix.manager.histogram import BOUNDS_S, Histogram
 from embomatrix.manager.observe.run_archive import manager_version
+from embomatrix.manager.runtime.event_loop import ManagerRuntime
 from embomatrix.manager.runtime.registry import WorkerStanding
 from embomatrix.manager.web.cluster_view import standing_counts
 from embomatrix.rpc.wire.values import InfraCode, ResidentState
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    from prometheus_client.metrics_core import Metric
-
-    from embomatrix.manager.control.workers import WorkerRecord
-    from embomatrix.manager.histogram import Histogram
-    from embomatrix.manager.runtime.event_loop import ManagerRuntime
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 OUTCOMES: Final = ("completed", "cancelled", *(code.value for code in InfraCode))

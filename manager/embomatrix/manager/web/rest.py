@@ -3,19 +3,20 @@
 ``http_rules`` has checked the caller's role before a request arrives here.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import dataclasses
 import json
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from collections.abc import AsyncIterator, Iterator, Mapping
+from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Body, HTTPException, Query, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 
 from embomatrix.manager.observe.training_reports import TrainingDetail, TrainingView
-from embomatrix.manager.web.cluster_view import LookaheadStep, Overview
+from embomatrix.manager.runtime.event_loop import ManagerRuntime
+from embomatrix.manager.runtime.revocation import Revocation
+from embomatrix.manager.web.cluster_view import LookaheadStep, Overview, Snapshots
 from embomatrix.manager.web.rest_values import (
     LARGEST_PAGE,
     PAGE,
@@ -37,14 +38,7 @@ from embomatrix.rpc.status import (
     PreconditionError,
     UnavailableError,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator, Mapping
-
-    from embomatrix.manager.runtime.event_loop import ManagerRuntime
-    from embomatrix.manager.runtime.revocation import Revocation
-    from embomatrix.manager.web.cluster_view import Snapshots
-    from embomatrix.rpc.wire.run_log import RunEvent
+from embomatrix.rpc.wire.run_log import RunEvent
 
 PREFIX: Final = "/api/v1"
 VIEWERS: Final = 256

@@ -7,28 +7,24 @@ from __future__ import annotations
 
 import asyncio
 import secrets
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping, Sequence
+from typing import Final
 
 from fastapi import APIRouter, HTTPException, Request
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from embomatrix.manager.runtime.results import BatchLog
+from embomatrix.manager.runtime.runs import Runs
 from embomatrix.manager.web.rest import PREFIX, http_errors
 from embomatrix.proto.v1 import types_pb2
+from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import unparsable
 from embomatrix.rpc.reward_label import RewardLabel, answer_in
 from embomatrix.rpc.status import InvalidRequestError, UnavailableError
 from embomatrix.rpc.wire.outcome import rollout_result_from_proto
-from embomatrix.rpc.wire.values import Batch, Completed, GroupPolicy, Rollout, RunTerms
+from embomatrix.rpc.wire.values import Batch, Completed, GroupPolicy, Outcome, Rollout, RunTerms
 from embomatrix.skills.parse import PlanError, parse_plan
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from embomatrix.manager.runtime.results import BatchLog
-    from embomatrix.manager.runtime.runs import Runs
-    from embomatrix.reward.breakdown import RewardBreakdown
-    from embomatrix.rpc.wire.values import Outcome
 
 REWARDS: Final = f"{PREFIX}/rewards"
 RUN_ID: Final = "http-rewards"

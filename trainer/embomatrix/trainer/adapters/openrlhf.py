@@ -4,29 +4,23 @@
 (``give_bundles``). ``--reward.remote_url THIS_FILE`` calls ``reward_func`` in OpenRLHF's own process.
 """
 
-from __future__ import annotations
-
 import asyncio
 import functools
 import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import torch
 
+from embomatrix.reward.breakdown import RewardBreakdown
+from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.reward_label import RewardLabel, answer_in
 from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.trainer.adapters.rows import messages, tasks_of
-from embomatrix.trainer.adapters.scorer import ATTEMPTS, retries_exhausted, scorer_for
+from embomatrix.trainer.adapters.scorer import ATTEMPTS, PlanScorer, retries_exhausted, scorer_for
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.data.tasks import group_seed, load_tasks
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from embomatrix.reward.breakdown import RewardBreakdown
-    from embomatrix.rpc.client import ClusterClient
-    from embomatrix.trainer.adapters.scorer import PlanScorer
 
 DATASET: Final = "EMBOMATRIX_DATASET"
 

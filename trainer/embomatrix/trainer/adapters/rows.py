@@ -1,17 +1,11 @@
 """Dataset rows for other trainers: the prompt, and the key by which the reward finds the task."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from embomatrix.skills.prompt import Codec, prompt_for
+from embomatrix.skills.prompt import Codec, Situation, prompt_for
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.data.tasks import load_tasks
-
-if TYPE_CHECKING:
-    from embomatrix.skills.prompt import Situation
-    from embomatrix.trainer.data.tasks import TrainingTask
+from embomatrix.trainer.data.tasks import TrainingTask, load_tasks
 
 SOURCE = "embomatrix"
 

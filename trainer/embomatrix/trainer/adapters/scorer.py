@@ -12,29 +12,23 @@ import functools
 import itertools
 import os
 import threading
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import Any, Final, Self
 
-from embomatrix.reward.settings import PAPER
+from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import ClusterError
 from embomatrix.rpc.trust import read_ca, read_token
 from embomatrix.rpc.wire.values import GroupPolicy, RunTerms
 from embomatrix.skills.prompt import Codec
-from embomatrix.trainer.cluster.gateway import Gateway
+from embomatrix.trainer.cluster.gateway import Gateway, PlanOutcome
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.data.tasks import TaskSet, load_tasks
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from concurrent.futures import Future
-    from contextlib import AbstractAsyncContextManager
-
-    from embomatrix.reward.settings import RewardSettings
-    from embomatrix.trainer.cluster.gateway import PlanOutcome
-    from embomatrix.trainer.data.tasks import TrainingTask
+from embomatrix.trainer.data.tasks import TaskSet, TrainingTask, load_tasks
 
 RUN_NAME: Final = "adapter"
 GROUPING_S: Final = 0.005

@@ -3,23 +3,16 @@
 TRL itself is not imported: the reward is a callable, and the mixin overrides one method of the trainer class.
 """
 
-from __future__ import annotations
-
 import itertools
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 
-from embomatrix.trainer.adapters.scorer import scorer_for
+from embomatrix.trainer.adapters.scorer import PlanScorer, scorer_for
+from embomatrix.trainer.cluster.gateway import PlanOutcome
 from embomatrix.trainer.data.lookahead import Lookahead
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-    from pathlib import Path
-    from typing import Self
-
-    from embomatrix.trainer.adapters.scorer import PlanScorer
-    from embomatrix.trainer.cluster.gateway import PlanOutcome
 
 
 class ClusterReward:

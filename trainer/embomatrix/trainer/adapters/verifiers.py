@@ -4,21 +4,14 @@ Commands of verifiers load a taskset from a single-word module such as `docs/exa
 environment configures the cluster.
 """
 
-from __future__ import annotations
-
 import functools
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import verifiers.v1 as vf
 
 from embomatrix.skills.prompt import Codec, prompt_for
 from embomatrix.trainer.adapters.rows import tasks_of
-from embomatrix.trainer.adapters.scorer import retries_exhausted, scorer_for
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from embomatrix.trainer.adapters.scorer import PlanScorer
+from embomatrix.trainer.adapters.scorer import PlanScorer, retries_exhausted, scorer_for
 
 __all__ = ["HouseholdTaskset"]
 NO_DATASET = "no dataset: pass its folder with --env.taskset.dataset"

@@ -4,18 +4,11 @@ Set ``custom_reward_function.path`` to this file and ``custom_reward_function.na
 sample as soon as it is generated, so simulation and generation overlap.
 """
 
-from __future__ import annotations
-
 import functools
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
-from embomatrix.trainer.adapters.scorer import ATTEMPTS, retries_exhausted, scorer_for
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.reward.breakdown import RewardBreakdown
-    from embomatrix.trainer.adapters.scorer import PlanScorer
+from embomatrix.reward.breakdown import RewardBreakdown
+from embomatrix.trainer.adapters.scorer import ATTEMPTS, PlanScorer, retries_exhausted, scorer_for
 
 
 @functools.cache

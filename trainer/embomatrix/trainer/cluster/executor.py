@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from embomatrix.rpc.wire.values import Batch, GroupPolicy, RunTerms
+from embomatrix.rpc.wire.values import Batch, GroupPolicy, Outcome, Rollout, RunTerms
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Sequence
-
     from embomatrix.rpc.client import ClusterClient
-    from embomatrix.rpc.wire.values import Outcome, Rollout
 
-    OnResult = Callable[[str, Outcome], None]
+
+OnResult = Callable[[str, Outcome], None]
 
 CONCURRENT_BATCHES: Final = 4
 """Batches in flight. The manager loads the scenes of the next ones meanwhile, so no look-ahead is needed."""

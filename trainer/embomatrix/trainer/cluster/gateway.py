@@ -4,49 +4,41 @@ The gRPC client runs on an event loop in its own thread. A group is submitted as
 trainer waits only when it needs the rewards.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import math
 import threading
 from collections import deque
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol, Self, TypeVar
+from typing import Any, Final, Protocol, Self, TypeVar
 
+from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import unparsable
+from embomatrix.reward.settings import RewardSettings
+from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.logs import bind
 from embomatrix.rpc.status import ClusterError, DeadlineError, PreconditionError, UnavailableError
+from embomatrix.rpc.wire.training import TrainingReport
 from embomatrix.rpc.wire.values import (
     Batch,
     Cancelled,
     Completed,
     InfraFailure,
     LookaheadEntry,
+    Outcome,
     Rollout,
     RunStats,
     RunTerms,
 )
 from embomatrix.skills.parse import PlanError, parse_plan
-from embomatrix.skills.prompt import Codec, with_indices
+from embomatrix.skills.prompt import Codec, Situation, with_indices
+from embomatrix.skills.syntax import Plan
+from embomatrix.skills.trace import Step
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.data.tasks import group_seed
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Mapping, Sequence
-    from concurrent.futures import Future
-    from contextlib import AbstractAsyncContextManager
-    from typing import Any
-
-    from embomatrix.reward.breakdown import RewardBreakdown
-    from embomatrix.reward.settings import RewardSettings
-    from embomatrix.rpc.client import ClusterClient
-    from embomatrix.rpc.wire.training import TrainingReport
-    from embomatrix.rpc.wire.values import Outcome
-    from embomatrix.skills.prompt import Situation
-    from embomatrix.skills.syntax import Plan
-    from embomatrix.skills.trace import Step
-    from embomatrix.trainer.data.tasks import TrainingTask
+from embomatrix.trainer.data.tasks import TrainingTask, group_seed
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")

@@ -1,9 +1,7 @@
 """`embomatrix eai`: install EAI's judge, and judge files of answers."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path  # noqa: TC003  typer reads the annotations when the command runs
+from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer

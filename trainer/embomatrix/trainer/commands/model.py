@@ -1,8 +1,6 @@
 """`embomatrix model`: convert packaged language models to folders that can be trained."""
 
-from __future__ import annotations
-
-from pathlib import Path  # noqa: TC003  typer reads the annotations when the command runs
+from pathlib import Path
 from typing import Annotated
 
 import typer

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -13,18 +14,17 @@ from rich.console import Console
 from rich.table import Table
 
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
+from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.logs import LogFormat, log_to_stderr
 from embomatrix.trainer.config.errors import TrainerError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
-    from embomatrix.rpc.client import ClusterClient
     from embomatrix.trainer.lifecycle.checkpoint import ImitationState
     from embomatrix.trainer.logging.report import TrainingSummary
     from embomatrix.trainer.run.starting import RunStart
 
-    Connect = Callable[[], ClusterClient]
+
+Connect = Callable[[], ClusterClient]
 
 _DATASET = Annotated[Path, typer.Option(help="Dataset folder from `embomatrix factory build`.")]
 _MANAGER = Annotated[str, typer.Option(help="HOST:PORT of the manager.", envvar="EMBOMATRIX_MANAGER")]

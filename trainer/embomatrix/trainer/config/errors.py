@@ -1,7 +1,5 @@
 """Errors that a user can fix. Each message names the object, the finding, the expectation and the remedy."""
 
-from __future__ import annotations
-
 import pickle
 from typing import Final
 

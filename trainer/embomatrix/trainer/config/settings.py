@@ -1,20 +1,16 @@
 """Settings of a training run, parsed once from the command line, a TOML file or a checkpoint."""
 
-from __future__ import annotations
-
 import tomllib
+from collections.abc import Mapping
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final, Self
+from pathlib import Path
+from typing import Any, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.config.errors import TrainerError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
 
 
 class LossKind(StrEnum):

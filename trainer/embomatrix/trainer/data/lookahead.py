@@ -10,13 +10,9 @@ Wrap your ``DataLoader`` or sampler, and announce the window to the cluster:
 Batches keep the loader's order, and each is drawn exactly once, ``steps`` earlier than needed.
 """
 
-from __future__ import annotations
-
 from collections import deque
-from typing import TYPE_CHECKING, Generic, TypeVar
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator
+from typing import Generic, TypeVar
 
 T = TypeVar("T")
 

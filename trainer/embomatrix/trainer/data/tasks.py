@@ -1,28 +1,22 @@
 """Training tasks and their order: a seeded permutation per epoch, known arbitrarily far ahead."""
 
-from __future__ import annotations
-
 import hashlib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from embomatrix.skills.parse import PlanError, plan_from_json
 from embomatrix.skills.prompt import Situation, situation_of
+from embomatrix.skills.syntax import Plan
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.world.dataset import Dataset, DatasetError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
-
-    from embomatrix.skills.syntax import Plan
-    from embomatrix.world.asset import Asset
-    from embomatrix.world.bundle import Bundle
-    from embomatrix.world.dataset import TaskRecord
-    from embomatrix.world.scene import Scene
-    from embomatrix.world.task import Task
+from embomatrix.world.asset import Asset
+from embomatrix.world.bundle import Bundle
+from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
+from embomatrix.world.scene import Scene
+from embomatrix.world.task import Task
 
 
 @dataclass(frozen=True, slots=True)

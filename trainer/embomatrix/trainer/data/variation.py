@@ -10,18 +10,15 @@ Held-out tasks contribute category names only, never their instructions, goals o
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.skills.prompt import subset
+from embomatrix.skills.prompt import Situation, subset
+from embomatrix.skills.syntax import Plan
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     import numpy as np
-
-    from embomatrix.skills.prompt import Situation
-    from embomatrix.skills.syntax import Plan
 
 _WORD: Final = re.compile(r"[a-z0-9_]+", re.IGNORECASE)
 _MAX_PHRASE_WORDS: Final = 6

@@ -9,14 +9,12 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.trainer.config.errors import TrainerError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 PACKAGE: Final = "eai-eval==1.0.5"
 WHEEL_SHA256: Final = "fe09f2a84cfb2451e111d02a2fa57e18797e747b73de23cb036d0d4e6502099f"

@@ -4,25 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.skills.prompt import Prompt
+from embomatrix.skills.prompt import Codec, Prompt
 from embomatrix.trainer.eai.environment import PACKAGE
+from embomatrix.trainer.eai.judge import NativeJudge, NativeResult, NativeTask
 from embomatrix.trainer.evaluation.exam import ExamResult, Question
-from embomatrix.trainer.evaluation.intervals import mean_over_tasks
+from embomatrix.trainer.evaluation.intervals import Estimate, mean_over_tasks
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
 from embomatrix.trainer.evaluation.taxonomy import Cause
 from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
 from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from embomatrix.skills.prompt import Codec
-    from embomatrix.trainer.eai.judge import NativeJudge, NativeResult, NativeTask
     from embomatrix.trainer.evaluation.answers import Answer, EvaluationSetup
-    from embomatrix.trainer.evaluation.intervals import Estimate
 
 NAME: Final = "eai-native"
 CODEC: Final = "eai"

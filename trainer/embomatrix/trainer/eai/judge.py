@@ -1,7 +1,5 @@
 """EAI's judge in a separate process, so a hostile answer can only affect its own verdict."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import resource
@@ -9,17 +7,14 @@ import select
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import Any, Final, Self
 
 from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.eai.environment import JudgeEnvironment
 from embomatrix.trainer.eai.sanitise import sanitise_answer
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.trainer.eai.environment import JudgeEnvironment
 
 ANSWER_S: Final = 60.0
 """Timeout per answer. The longest human plan takes 0.2 s; starting takes a few seconds."""

@@ -1,14 +1,10 @@
 """Sanitising of model texts for EAI's judge, whose parser calls ``eval`` on them."""
 
-from __future__ import annotations
-
 import ast
 import json
 import re
-from typing import TYPE_CHECKING, Any, Final
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from collections.abc import Iterator
+from typing import Any, Final
 
 MAX_CHARS: Final = 64 * 1024
 MAX_STARTS: Final = 256

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
@@ -11,18 +13,15 @@ import numpy as np
 from embomatrix.llm.ledger import Ledger
 from embomatrix.llm.values import ChatRequest, LlmError, Message, Speaker
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.evaluation.answers import Answer
+from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, EvaluationSetup
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-    from pathlib import Path
-
     from embomatrix.llm.endpoint import Endpoint
-    from embomatrix.trainer.evaluation.answers import AnswerSheet, EvaluationSetup
     from embomatrix.trainer.evaluation.exam import Question
     from embomatrix.trainer.policy.protocol import Policy
 
-    OnProgress = Callable[[int, int], None]
+
+OnProgress = Callable[[int, int], None]
 
 PURPOSE: Final = "eval"
 CHUNK: Final = 8

@@ -3,24 +3,19 @@
 Each answer is appended as it arrives, so an interrupted evaluation continues without loss.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, fields
-from typing import TYPE_CHECKING, Annotated, Any, Final, Self
+from pathlib import Path
+from typing import IO, Annotated, Any, Final, Self
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.config.errors import TrainerError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-    from pathlib import Path
-    from typing import IO
 
 VERSION: Final = 1
 """Version of the file format and of everything that a verdict depends on."""

@@ -9,24 +9,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.skills.syntax import MAX_STEPS, PlaceRelation, Skill, SkillCall
+from embomatrix.skills.prompt import PromptRow
+from embomatrix.skills.syntax import MAX_STEPS, PlaceRelation, Plan, Skill, SkillCall
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.world.evaluate import substitute
-from embomatrix.world.goal import And, Atom, Exists, Forall, ForN, ForNPairs, ForPairs, Imply, Not, Or
+from embomatrix.world.goal import (
+    And,
+    Atom,
+    Exists,
+    Forall,
+    Formula,
+    ForN,
+    ForNPairs,
+    ForPairs,
+    Imply,
+    Not,
+    Or,
+)
 from embomatrix.world.state import Relation, State
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
     import numpy as np
 
-    from embomatrix.skills.prompt import PromptRow
-    from embomatrix.skills.syntax import Plan
     from embomatrix.trainer.data.tasks import TrainingTask
-    from embomatrix.world.goal import Formula
 
     Baseline = Callable[[TrainingTask, np.random.Generator], Plan]
 

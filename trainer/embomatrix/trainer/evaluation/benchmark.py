@@ -1,25 +1,18 @@
 """Benchmarks: tasks of a dataset or of a file, identified by a digest."""
 
-from __future__ import annotations
-
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.data.tasks import read_tasks
-from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, record_to_json
+from embomatrix.trainer.data.tasks import TrainingTask, read_tasks
+from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, TaskRecord, record_to_json
+from embomatrix.world.scene import Scene
 from embomatrix.world.task import Profile
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.trainer.data.tasks import TrainingTask
-    from embomatrix.world.dataset import TaskRecord
-    from embomatrix.world.scene import Scene
 
 ALL: Final = "all"
 IMPORT_REPORT: Final = "import.json"

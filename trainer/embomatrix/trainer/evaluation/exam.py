@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
-from embomatrix.skills.prompt import limited, prompt_for
+from embomatrix.skills.prompt import Codec, Prompt, limited, prompt_for
+from embomatrix.trainer.cluster.executor import Executor
+from embomatrix.trainer.evaluation.benchmark import Benchmark
+from embomatrix.trainer.evaluation.intervals import Estimate
 from embomatrix.trainer.evaluation.judging import judge_answers
-from embomatrix.trainer.evaluation.pictures import chosen_pictures
+from embomatrix.trainer.evaluation.pictures import Picture, chosen_pictures
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from embomatrix.skills.prompt import Codec, Prompt
-    from embomatrix.trainer.cluster.executor import Executor
     from embomatrix.trainer.evaluation.answers import Answer, EvaluationSetup
-    from embomatrix.trainer.evaluation.benchmark import Benchmark
-    from embomatrix.trainer.evaluation.intervals import Estimate
-    from embomatrix.trainer.evaluation.pictures import Picture
 
 
 @dataclass(frozen=True, slots=True)

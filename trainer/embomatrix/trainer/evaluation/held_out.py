@@ -5,24 +5,21 @@ Samples of one task are not independent, so intervals come from a bootstrap over
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from embomatrix.trainer.cluster.gateway import result_of
-from embomatrix.trainer.evaluation.intervals import bootstrap
+from embomatrix.trainer.cluster.gateway import Gateway, PlanOutcome, result_of
+from embomatrix.trainer.data.tasks import TrainingTask
+from embomatrix.trainer.evaluation.intervals import Interval, bootstrap
+from embomatrix.trainer.policy.prompts import PromptBuilder
+from embomatrix.trainer.policy.protocol import Policy
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from concurrent.futures import Future
-
-    from embomatrix.trainer.cluster.gateway import Gateway, PlanOutcome
     from embomatrix.trainer.config.settings import EvaluationSettings
-    from embomatrix.trainer.data.tasks import TrainingTask
-    from embomatrix.trainer.evaluation.intervals import Interval
-    from embomatrix.trainer.policy.prompts import PromptBuilder
-    from embomatrix.trainer.policy.protocol import Policy
 
 
 @dataclass(frozen=True, slots=True)

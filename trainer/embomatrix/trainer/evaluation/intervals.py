@@ -1,16 +1,12 @@
 """Confidence intervals over tasks: samples of one task are not independent."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 RESAMPLES: Final = 4000
 LEVEL: Final = 0.95

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from embomatrix.rpc.wire.values import Rollout
+from embomatrix.rpc.wire.values import Outcome, Rollout
 from embomatrix.skills.parse import PlanError, parse_plan
 from embomatrix.skills.prompt import Codec, limited, with_indices
+from embomatrix.skills.syntax import Plan
+from embomatrix.trainer.cluster.executor import Executor
 from embomatrix.trainer.data.tasks import group_seed
-from embomatrix.trainer.evaluation.verdicts import executed_verdict, unparsable_verdict
+from embomatrix.trainer.evaluation.benchmark import Benchmark
+from embomatrix.trainer.evaluation.verdicts import AnswerVerdict, executed_verdict, unparsable_verdict
+from embomatrix.world.task import Profile
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from embomatrix.rpc.wire.values import Outcome
-    from embomatrix.skills.syntax import Plan
-    from embomatrix.trainer.cluster.executor import Executor
     from embomatrix.trainer.evaluation.answers import Answer, EvaluationSetup
-    from embomatrix.trainer.evaluation.benchmark import Benchmark
-    from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
-    from embomatrix.world.task import Profile
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,7 @@
 """Models to evaluate: a checkpoint of a run, a saved policy, or any Hugging Face model."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 
@@ -14,10 +11,8 @@ from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, LoraSett
 from embomatrix.trainer.lifecycle.checkpoint import read_state
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.loading import configure_torch, saved_policy
+from embomatrix.trainer.policy.protocol import Policy
 from embomatrix.trainer.policy.tiny import TinyPolicy
-
-if TYPE_CHECKING:
-    from embomatrix.trainer.policy.protocol import Policy
 
 
 @dataclass(frozen=True, slots=True)

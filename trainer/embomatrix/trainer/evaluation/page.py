@@ -1,14 +1,14 @@
 """HTML page of an evaluation: one file without scripts or external resources."""
 
-from __future__ import annotations
-
 import html
 import string
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import PurePath
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from embomatrix.pages.head import page_head
+from embomatrix.trainer.evaluation.pictures import Picture
 from embomatrix.trainer.evaluation.plan_view import ExecutedPlan, plan_view
 from embomatrix.trainer.evaluation.table import (
     COLUMNS,
@@ -21,11 +21,6 @@ from embomatrix.trainer.evaluation.table import (
     percent,
     table,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from embomatrix.trainer.evaluation.pictures import Picture
 
 _CHART_W: Final = 560
 _LINE_H: Final = 44

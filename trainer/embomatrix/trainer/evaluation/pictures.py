@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.skills.describe import call_in_words
+from embomatrix.skills.syntax import Plan
+from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
+from embomatrix.world.task import Task
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from embomatrix.skills.syntax import Plan
     from embomatrix.trainer.evaluation.benchmark import Benchmark
     from embomatrix.trainer.evaluation.scoreboard import Scoreboard
-    from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
     from embomatrix.world.scene import Scene
-    from embomatrix.world.task import Task
 
 MAX_PICTURES: Final = 8
 

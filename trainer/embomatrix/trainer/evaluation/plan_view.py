@@ -1,17 +1,13 @@
 """Executed plan on the plan view of its scene. Each step is marked at its object's initial position."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.pages.plan_view import OVERHEAD_M, PlanView
-
-if TYPE_CHECKING:
-    from embomatrix.skills.syntax import Plan, SkillCall
-    from embomatrix.world.geometry import Vec2
-    from embomatrix.world.scene import Scene
-    from embomatrix.world.task import Task
+from embomatrix.skills.syntax import Plan, SkillCall
+from embomatrix.world.geometry import Vec2
+from embomatrix.world.scene import Scene
+from embomatrix.world.task import Task
 
 FIT_PX: Final = (560.0, 430.0)
 """Maximum width and height. Text keeps its size."""

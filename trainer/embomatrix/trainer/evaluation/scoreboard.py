@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from embomatrix.trainer.evaluation.intervals import Estimate, mean_over_tasks, pass_at
 from embomatrix.trainer.evaluation.taxonomy import Cause
+from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
 from embomatrix.world.task import TaskCategory
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
 
 KS: Final = (1, 2, 3, 5, 10, 20, 50, 100)
 """Values of k for pass@k, as far as there are samples."""

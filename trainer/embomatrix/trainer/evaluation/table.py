@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.trainer.config.errors import TrainerError
@@ -12,9 +14,6 @@ from embomatrix.trainer.evaluation.taxonomy import MEANINGS, Cause
 from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-    from pathlib import Path
-
     from embomatrix.trainer.evaluation.answers import EvaluationSetup
     from embomatrix.trainer.evaluation.exam import ExamResult
 

@@ -3,21 +3,15 @@
 The first failure decides. `docs/evaluation.md` explains the rules; a test proves the tables complete.
 """
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.parse import PlanReason
-from embomatrix.skills.syntax import Skill
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from embomatrix.skills.syntax import Plan, SkillCall
-    from embomatrix.skills.trace import Step
+from embomatrix.skills.syntax import Plan, Skill, SkillCall
+from embomatrix.skills.trace import Step
 
 
 class Cause(StrEnum):

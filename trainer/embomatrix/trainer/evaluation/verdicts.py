@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from embomatrix.rpc.wire.values import Completed
+from embomatrix.rpc.wire.values import Completed, Outcome
+from embomatrix.skills.parse import PlanError
+from embomatrix.skills.syntax import Plan
 from embomatrix.trainer.evaluation.taxonomy import Cause, cause_of_text, cause_of_trace
+from embomatrix.world.task import Task
 
 if TYPE_CHECKING:
-    from embomatrix.rpc.wire.values import Outcome
-    from embomatrix.skills.parse import PlanError
-    from embomatrix.skills.syntax import Plan
     from embomatrix.trainer.evaluation.answers import Answer
-    from embomatrix.world.task import Task
 
 
 @dataclass(frozen=True, slots=True)

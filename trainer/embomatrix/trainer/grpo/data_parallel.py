@@ -11,29 +11,23 @@ import multiprocessing
 import os
 import pickle
 import signal
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from multiprocessing.connection import Connection
 from multiprocessing.reduction import DupFd
-from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
+from pathlib import Path
+from typing import Any, Final, Self, TypeVar
 
 import torch
+from torch import Tensor
 
 from embomatrix.host.anonymous_memory import nameless_file
 from embomatrix.trainer.config.errors import DAMAGE, TrainerError
 from embomatrix.trainer.config.settings import TrainSettings
-from embomatrix.trainer.grpo.learner import Learner
+from embomatrix.trainer.grpo.learner import Learner, Microbatch, SamplingLearner
+from embomatrix.trainer.grpo.objective import LossMetrics
 from embomatrix.trainer.policy.loading import saved_policy
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from concurrent.futures import Future
-    from multiprocessing.connection import Connection
-    from pathlib import Path
-
-    from torch import Tensor
-
-    from embomatrix.trainer.grpo.learner import Microbatch, SamplingLearner
-    from embomatrix.trainer.grpo.objective import LossMetrics
-    from embomatrix.trainer.policy.protocol import Policy, Samples, Tokens
+from embomatrix.trainer.policy.protocol import Policy, Samples, Tokens
 
 T = TypeVar("T")
 _ALIGNMENT_BYTES: Final = 64

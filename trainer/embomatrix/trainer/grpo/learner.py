@@ -1,21 +1,15 @@
 """Work on one microbatch that any process with a copy of the policy can do: sample, score, back-propagate."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import torch
+from torch import Tensor
 
+from embomatrix.trainer.config.settings import GrpoSettings
 from embomatrix.trainer.grpo.objective import LossInputs, LossMetrics, LossTotals, surrogate_loss
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from torch import Tensor
-
-    from embomatrix.trainer.config.settings import GrpoSettings
-    from embomatrix.trainer.policy.protocol import Policy, Samples, Tokens
+from embomatrix.trainer.policy.protocol import Policy, Samples, Tokens
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,19 +12,12 @@ Sources of the other kinds: GRPO, Shao et al. 2024 (DeepSeekMath); DAPO, Yu et a
 Zheng et al. 2025; BNPO as in TRL. All kinds equal TRL's losses in value and gradient (tests/peers/test_losses_of_trl.py).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
-from embomatrix.trainer.config.settings import LossKind, RatioLevel
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from embomatrix.trainer.config.settings import GrpoSettings
+from embomatrix.trainer.config.settings import GrpoSettings, LossKind, RatioLevel
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from embomatrix.rpc.wire.values import Completed
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from embomatrix.trainer.cluster.gateway import PlanOutcome
     from embomatrix.trainer.data.tasks import TrainingTask
     from embomatrix.trainer.grpo.objective import LossMetrics

@@ -3,29 +3,25 @@
 from __future__ import annotations
 
 import functools
-from concurrent.futures import FIRST_COMPLETED, wait
+from collections.abc import Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
 import torch
+from torch import Tensor
 
-from embomatrix.trainer.cluster.gateway import result_of
+from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.cluster.gateway import PlanOutcome, PlanSubmitter, result_of
+from embomatrix.trainer.data.tasks import TrainingTask
+from embomatrix.trainer.policy.prompts import PromptBuilder, TaskPrompt
+from embomatrix.trainer.policy.protocol import Samples
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from concurrent.futures import Future
-
-    import numpy as np
-    from torch import Tensor
-
-    from embomatrix.skills.prompt import Codec
-    from embomatrix.trainer.cluster.gateway import PlanOutcome, PlanSubmitter
     from embomatrix.trainer.config.settings import GrpoSettings
-    from embomatrix.trainer.data.tasks import TrainingTask
     from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers
     from embomatrix.trainer.grpo.learner import SamplingLearner
-    from embomatrix.trainer.policy.prompts import PromptBuilder, TaskPrompt
-    from embomatrix.trainer.policy.protocol import Samples
 
 _SEEDS: Final = 2**62
 

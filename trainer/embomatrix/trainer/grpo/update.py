@@ -12,35 +12,27 @@ from __future__ import annotations
 import functools
 import math
 import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
+from embomatrix.trainer.cluster.gateway import PlanOutcome, PlanSubmitter
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.config.settings import LossKind, OnLost, Overlap
+from embomatrix.trainer.config.settings import GrpoSettings, LossKind, OnLost, Overlap
+from embomatrix.trainer.data.tasks import TrainingTask
+from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers, RemoteLearner
 from embomatrix.trainer.grpo.gradients import GradientSum
 from embomatrix.trainer.grpo.learner import Microbatch
 from embomatrix.trainer.grpo.objective import LossMetrics, LossTotals, group_advantages, loss_divisor
 from embomatrix.trainer.grpo.records import GroupLog, StepRecord, record_of
-from embomatrix.trainer.grpo.sampling import Sampler, wait_for_next
-from embomatrix.trainer.lifecycle.stopwatch import Activity
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from concurrent.futures import Future
-
-    import numpy as np
-
-    from embomatrix.trainer.cluster.gateway import PlanOutcome, PlanSubmitter
-    from embomatrix.trainer.config.settings import GrpoSettings
-    from embomatrix.trainer.data.tasks import TrainingTask
-    from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers, RemoteLearner
-    from embomatrix.trainer.grpo.sampling import SampledChunk
-    from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
-    from embomatrix.trainer.lifecycle.stopwatch import Stopwatch
-    from embomatrix.trainer.policy.prompts import PromptBuilder
-    from embomatrix.trainer.policy.protocol import Policy
+from embomatrix.trainer.grpo.sampling import SampledChunk, Sampler, wait_for_next
+from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
+from embomatrix.trainer.lifecycle.stopwatch import Activity, Stopwatch
+from embomatrix.trainer.policy.prompts import PromptBuilder
+from embomatrix.trainer.policy.protocol import Policy
 
 MAX_STORED_GRADIENTS = 2
 """Microbatches back-propagated before their turn. Each stores a gradient as large as the policy."""

@@ -4,21 +4,14 @@ Muon (Jordan et al. 2024, "Muon: an optimizer for hidden layers in neural networ
 nearest matrix whose singular values are all 1, so rare directions learn as fast as frequent ones.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import nn
+from torch.optim import Optimizer
 
-from embomatrix.trainer.config.settings import OptimiserKind
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from torch.optim import Optimizer
-
-    from embomatrix.trainer.config.settings import ImitationSettings
+from embomatrix.trainer.config.settings import ImitationSettings, OptimiserKind
 
 _BETAS = (0.9, 0.95)
 

@@ -7,29 +7,28 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import ImitationSettings
 from embomatrix.trainer.imitation.optimiser import ImitationOptimiser
 from embomatrix.trainer.lifecycle.checkpoint import ImitationState
 from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
+from embomatrix.trainer.policy.prompts import PromptBuilder
+from embomatrix.trainer.policy.protocol import Policy, Tokens
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from torch import Tensor
-
-    from embomatrix.trainer.config.settings import ImitationSettings
     from embomatrix.trainer.data.tasks import TrainingTask
-    from embomatrix.trainer.policy.prompts import PromptBuilder
-    from embomatrix.trainer.policy.protocol import Policy, Tokens
 
-    Example = tuple[Tokens, Tokens]  # prompt and plan
+
+Example = tuple[Tokens, Tokens]  # prompt and plan
 
 
 @dataclass(frozen=True, slots=True)

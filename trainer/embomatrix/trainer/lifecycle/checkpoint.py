@@ -1,24 +1,19 @@
 """Atomic checkpoints with the complete state of a run."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
 import shutil
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import torch
 
 from embomatrix.trainer.config.errors import DAMAGE, TrainerError, reason_of
 from embomatrix.trainer.config.settings import TrainSettings
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-    from pathlib import Path
-
-    from embomatrix.trainer.policy.protocol import Policy
+from embomatrix.trainer.policy.protocol import Policy
 
 SCHEMA = 3
 CHECKPOINTS = "checkpoints"

@@ -1,13 +1,9 @@
 """Deferred Ctrl-C: a policy that was updated by half can't be resumed."""
 
-from __future__ import annotations
-
 import signal
 import threading
-from typing import TYPE_CHECKING, Any, Self
-
-if TYPE_CHECKING:
-    from types import FrameType, TracebackType
+from types import FrameType, TracebackType
+from typing import Any, Self
 
 
 class DeferredInterrupts:

@@ -1,16 +1,11 @@
 """Wall-clock seconds of a run by activity."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import time
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
 
 
 class Activity(StrEnum):

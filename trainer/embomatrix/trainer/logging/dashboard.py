@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.rpc.wire.training import (
@@ -13,13 +14,11 @@ from embomatrix.rpc.wire.training import (
     SampledStep,
     TrainingReport,
 )
+from embomatrix.trainer.grpo.records import GroupLog
 from embomatrix.trainer.logging.trackers import GRPO_PHASE
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
     from embomatrix.trainer.cluster.gateway import PlanOutcome
-    from embomatrix.trainer.grpo.records import GroupLog
 
 PLANS_SHOWN: Final = 4
 """Plans per step: from the group with the widest spread of rewards, from the best to the worst."""

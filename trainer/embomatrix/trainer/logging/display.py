@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final, Self
 
-from rich.console import Group
+from rich.console import Console, Group
 from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from embomatrix.trainer.grpo.records import StepRecord
+
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from rich.console import Console
-
     from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation
-    from embomatrix.trainer.grpo.records import StepRecord
     from embomatrix.trainer.imitation.teacher_forcing import ImitationProgress
 
 _LINE_INTERVAL_S: Final = 10.0

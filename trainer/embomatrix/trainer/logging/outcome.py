@@ -1,19 +1,15 @@
 """Machine-readable result of a finished run: one JSON file, written last, so its presence marks a finished run."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 from pydantic import TypeAdapter
 
 from embomatrix.trainer.config.errors import TrainerError, reason_of
 from embomatrix.trainer.lifecycle.stopwatch import TimeShares
 from embomatrix.world.whole_file import write_whole
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 OUTCOME: Final = "outcome.json"
 SCHEMA: Final = 1

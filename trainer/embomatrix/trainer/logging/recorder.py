@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from embomatrix.trainer.logging.trackers import GRPO_PHASE, IMITATION_PHASE
+from embomatrix.trainer.grpo.records import GroupLog, StepRecord
+from embomatrix.trainer.logging.trackers import GRPO_PHASE, IMITATION_PHASE, Tracker
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
     from embomatrix.trainer.cluster.gateway import PlanOutcome
     from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation
-    from embomatrix.trainer.grpo.records import GroupLog, StepRecord
     from embomatrix.trainer.imitation.teacher_forcing import ImitationProgress
-    from embomatrix.trainer.logging.trackers import Tracker
 
 METRICS = "metrics.jsonl"
 SAMPLES = "samples.jsonl"

@@ -1,20 +1,14 @@
 """HTML report of a run: learning curves, success before and after GRPO, and time by activity, in one file."""
 
-from __future__ import annotations
-
 import html
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
-from embomatrix.trainer.evaluation.held_out import improvement
+from embomatrix.rpc.wire.values import RunStats
+from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation, improvement
 from embomatrix.trainer.logging.outcome import RunOutcome, TaskRate
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from embomatrix.rpc.wire.values import RunStats
-    from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation
 
 REPORT = "report.html"
 _WIDTH, _HEIGHT, _MARGIN = 640, 220, 44

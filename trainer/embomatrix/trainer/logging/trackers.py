@@ -1,19 +1,13 @@
 """Experiment trackers: TensorBoard, Weights & Biases, trackio. Each is imported only if a run uses it."""
 
-from __future__ import annotations
-
 import contextlib
 import secrets
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, Protocol
 
 from embomatrix.trainer.config.errors import TrainerError, reason_of
-from embomatrix.trainer.config.settings import TrackerKind
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    from embomatrix.trainer.config.settings import TrainSettings
+from embomatrix.trainer.config.settings import TrackerKind, TrainSettings
 
 PROJECT: Final = "embomatrix"
 IMITATION_PHASE: Final = "imitation"

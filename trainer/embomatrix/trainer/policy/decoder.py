@@ -13,16 +13,12 @@ V words.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.nn import functional
 
 from embomatrix.trainer.policy.compute_dtype import MixedLinear
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 _MASKED = -1e9
 _MIN_PROBABILITY = 1e-9

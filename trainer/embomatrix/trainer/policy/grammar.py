@@ -8,21 +8,16 @@ Shapes: Q prompts of P tokens, R rows (plans), T tokens of a plan, V words, N nu
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import torch
+from torch import Tensor
 
 from embomatrix.skills.syntax import SIGNATURES, Arg, PlaceRelation
-from embomatrix.trainer.policy.vocabulary import BREAK, END, PAD
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from torch import Tensor
-
-    from embomatrix.trainer.policy.vocabulary import Vocabulary
+from embomatrix.trainer.policy.vocabulary import BREAK, END, PAD, Vocabulary
 
 
 class _Expects(IntEnum):

@@ -10,27 +10,20 @@ import contextlib
 import copy
 import functools
 import json
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import torch
+from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from embomatrix.skills.prompt import Codec
+from embomatrix.skills.prompt import Codec, Prompt
 from embomatrix.trainer.config.errors import TrainerError, reason_of
-from embomatrix.trainer.config.settings import ComputeDtype
+from embomatrix.trainer.config.settings import ComputeDtype, LoraSettings
 from embomatrix.trainer.policy.compute_dtype import frozen_weights, torch_dtype, use_compute_dtype
 from embomatrix.trainer.policy.lora import add_adapters, load_adapters, save_adapters
-from embomatrix.trainer.policy.protocol import Samples, TokenScores, draw, pad_left
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from torch import Tensor, nn
-
-    from embomatrix.skills.prompt import Prompt
-    from embomatrix.trainer.config.settings import LoraSettings
-    from embomatrix.trainer.policy.protocol import Tokens
+from embomatrix.trainer.policy.protocol import Samples, Tokens, TokenScores, draw, pad_left
 
 HUB_TIMEOUT_S: Final = 10.0
 TOKENIZERS: Final = (

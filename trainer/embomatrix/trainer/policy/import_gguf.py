@@ -1,18 +1,14 @@
 """Import of GGUF files: quantised weights become plain ones that can be trained and saved."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import tempfile
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from embomatrix.trainer.config.errors import TrainerError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 def import_gguf(source: Path, out: Path) -> Path:

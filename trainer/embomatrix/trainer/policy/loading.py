@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING, Final
 import torch
 
 from embomatrix.trainer.config.errors import DAMAGE, TrainerError, reason_of
+from embomatrix.trainer.config.settings import TrainSettings
 from embomatrix.trainer.policy.compute_dtype import torch_dtype
 from embomatrix.trainer.policy.decoder import DecoderShape
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.lora import has_adapters
+from embomatrix.trainer.policy.protocol import Policy
 from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.policy.vocabulary import build_vocabulary
 
 if TYPE_CHECKING:
-    from embomatrix.trainer.config.settings import TrainSettings
     from embomatrix.trainer.data.tasks import TaskSet
-    from embomatrix.trainer.policy.protocol import Policy
 
 TINY: Final = "tiny"
 

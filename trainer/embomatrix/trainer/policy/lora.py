@@ -6,17 +6,15 @@ Optimiser state and gradients have the size of the adapters, and the reference p
 from __future__ import annotations
 
 import hashlib
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import torch
+from torch import nn
 
 from embomatrix.trainer.config.errors import DAMAGE, TrainerError, reason_of
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from torch import nn
-
     from embomatrix.trainer.config.settings import LoraSettings
 
 ADAPTERS: Final = "adapter"

@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from embomatrix.skills.parse import plan_to_json, plan_to_lines
-from embomatrix.skills.prompt import Codec, limited, plan_in_names, prompt_for, subset
+from embomatrix.skills.prompt import Codec, Situation, limited, plan_in_names, prompt_for, subset
+from embomatrix.skills.syntax import Plan
 from embomatrix.trainer.data.variation import Variation, drop_bystanders, used_rows, vary
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from embomatrix.skills.prompt import Situation
-    from embomatrix.skills.syntax import Plan
     from embomatrix.trainer.data.tasks import TrainingTask
     from embomatrix.trainer.policy.protocol import Policy, Tokens
 

@@ -4,29 +4,21 @@ from __future__ import annotations
 
 import copy
 import json
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Self
+from pathlib import Path
+from typing import Self
 
 import torch
+from torch import Tensor, nn
 from torch.nn import functional
 
-from embomatrix.skills.prompt import Codec
+from embomatrix.skills.prompt import Codec, Prompt
 from embomatrix.trainer.policy.compute_dtype import frozen_weights
-from embomatrix.trainer.policy.decoder import Decoder, DecoderShape
-from embomatrix.trainer.policy.grammar import PlanGrammar
-from embomatrix.trainer.policy.protocol import Samples, TokenScores, draw, pad_left
+from embomatrix.trainer.policy.decoder import Decoder, DecoderShape, PlanCache, PromptCache
+from embomatrix.trainer.policy.grammar import GrammarState, PlanGrammar, PromptNames
+from embomatrix.trainer.policy.protocol import Samples, Tokens, TokenScores, draw, pad_left
 from embomatrix.trainer.policy.vocabulary import END, GO, PAD, Vocabulary
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    from torch import Tensor, nn
-
-    from embomatrix.skills.prompt import Prompt
-    from embomatrix.trainer.policy.decoder import PlanCache, PromptCache
-    from embomatrix.trainer.policy.grammar import GrammarState, PromptNames
-    from embomatrix.trainer.policy.protocol import Tokens
 
 _COMPACTION_THRESHOLD = 0.6
 """Finished rows leave the sampling loop when this share or less is active: most plans are much shorter than the longest."""

@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from embomatrix.skills.prompt import Situation
 from embomatrix.skills.syntax import PROFILES, PlaceRelation
 from embomatrix.world.state import State
 from embomatrix.world.task import Profile
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from embomatrix.skills.prompt import Situation
 
 PAD: Final = 0
 END: Final = 1

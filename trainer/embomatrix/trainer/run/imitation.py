@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.trainer.imitation.teacher_forcing import Imitation
-from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, restore
-from embomatrix.trainer.logging.recorder import IMITATION
+from embomatrix.trainer.config.settings import TrainSettings
+from embomatrix.trainer.imitation.teacher_forcing import Imitation, ImitationProgress
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, restore
+from embomatrix.trainer.logging.recorder import IMITATION, Recorder
+from embomatrix.trainer.policy.prompts import PromptBuilder
+from embomatrix.trainer.policy.protocol import Policy
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
-
-    from embomatrix.trainer.config.settings import TrainSettings
     from embomatrix.trainer.data.tasks import TrainingTask
-    from embomatrix.trainer.imitation.teacher_forcing import ImitationProgress
-    from embomatrix.trainer.lifecycle.checkpoint import TrainingProgress
-    from embomatrix.trainer.logging.recorder import Recorder
-    from embomatrix.trainer.policy.prompts import PromptBuilder
-    from embomatrix.trainer.policy.protocol import Policy
 
 LOG_EVERY: Final = 10
 """Steps between two lines of the log. Steps with a validation loss are always logged."""

@@ -8,17 +8,22 @@ import logging
 import platform
 import resource
 import time
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from embomatrix.host.limits import usable_cores
-from embomatrix.trainer.data.tasks import Curriculum, Schedule
+from embomatrix.trainer.cluster.gateway import Gateway
+from embomatrix.trainer.config.settings import TrainSettings
+from embomatrix.trainer.data.tasks import Curriculum, Schedule, TaskSet
 from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation, evaluate_policy
 from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers
 from embomatrix.trainer.grpo.learner import Learner
+from embomatrix.trainer.grpo.records import GroupLog, StepRecord
 from embomatrix.trainer.grpo.update import StepPlan, Updater
 from embomatrix.trainer.lifecycle.checkpoint import (
     CHECKPOINTS,
@@ -33,21 +38,13 @@ from embomatrix.trainer.logging.dashboard import DashboardReporter
 from embomatrix.trainer.logging.outcome import write_outcome
 from embomatrix.trainer.logging.recorder import METRICS, SAMPLES, Recorder, read_metrics
 from embomatrix.trainer.logging.report import REPORT, TrainingSummary, outcome_of, write_report
+from embomatrix.trainer.logging.trackers import Tracker
+from embomatrix.trainer.policy.prompts import PromptBuilder
+from embomatrix.trainer.policy.protocol import Policy
 from embomatrix.trainer.run.imitation import run_imitation
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
-    from typing import Any
-
-    from embomatrix.trainer.cluster.gateway import Gateway
-    from embomatrix.trainer.config.settings import TrainSettings
-    from embomatrix.trainer.data.tasks import TaskSet
-    from embomatrix.trainer.grpo.records import GroupLog, StepRecord
     from embomatrix.trainer.logging.display import LineDisplay
-    from embomatrix.trainer.logging.trackers import Tracker
-    from embomatrix.trainer.policy.prompts import PromptBuilder
-    from embomatrix.trainer.policy.protocol import Policy
 
 logger = logging.getLogger(__name__)
 REFERENCE = "reference"

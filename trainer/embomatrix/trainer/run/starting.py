@@ -1,29 +1,26 @@
 """Start of a run: settings, tasks and policy, new or from a checkpoint."""
 
-from __future__ import annotations
-
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from embomatrix.host.limits import usable_cores
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, read_settings, with_changes
-from embomatrix.trainer.data.tasks import load_tasks
+from embomatrix.trainer.config.settings import (
+    LANGUAGE_MODEL_DEFAULTS,
+    TrainSettings,
+    read_settings,
+    with_changes,
+)
+from embomatrix.trainer.data.tasks import TaskSet, load_tasks
 from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.loading import TINY, configure_torch, is_word_level, new_policy, saved_policy
 from embomatrix.trainer.policy.prompts import PromptBuilder
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.trainer.config.settings import TrainSettings
-    from embomatrix.trainer.data.tasks import TaskSet
-    from embomatrix.trainer.policy.protocol import Policy
-
+from embomatrix.trainer.policy.protocol import Policy
 
 CHANGEABLE: Final = frozenset(
     {

@@ -1,13 +1,10 @@
 """`embomatrix worker`: run a worker on this machine, or check whether the machine is fit."""
 
-from __future__ import annotations
-
 import asyncio
 import platform
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import typer
 from rich.console import Console
@@ -22,11 +19,9 @@ from embomatrix.worker.commands.ray import ray_workers
 from embomatrix.worker.commands.run import run
 from embomatrix.worker.commands.status import status
 from embomatrix.worker.host.resources import measure
+from embomatrix.worker.host.settings import WorkerSettings
 from embomatrix.worker.link.membership import membership_of
 from embomatrix.worker.slots.processes import ProcessGoneError, start_root
-
-if TYPE_CHECKING:
-    from embomatrix.worker.host.settings import WorkerSettings
 
 app = typer.Typer(
     no_args_is_help=True,

@@ -1,22 +1,18 @@
 """`embomatrix worker install`: a systemd unit that runs the worker permanently."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import stat
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 import typer
 from rich.console import Console
 
 from embomatrix.worker.commands.options import fail
 from embomatrix.worker.commands.run import settings_of
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 UNIT: Final = "embomatrix-worker.service"
 USER_UNITS: Final = Path("~/.config/systemd/user")

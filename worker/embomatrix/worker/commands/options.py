@@ -1,11 +1,10 @@
 """Options of the subcommands of `embomatrix worker`, and one-sentence errors instead of tracebacks."""
 
-from __future__ import annotations
-
 import importlib.util
 import platform
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
+from typing import Annotated, Any, Final, NoReturn
 
 import typer
 from pydantic import ValidationError
@@ -14,9 +13,6 @@ from rich.console import Console
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.worker.host.owner_policy import Preferences
 from embomatrix.worker.host.settings import WorkerSettings
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 EXPECTED: Final[Mapping[str, str]] = {
     "manager": f"expected HOST:PORT, as in {DEFAULT_ADDRESS}",

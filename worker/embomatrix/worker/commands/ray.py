@@ -4,8 +4,6 @@ Ray places them by cores and memory and restarts them if a node is lost. The man
 any worker.
 """
 
-from __future__ import annotations
-
 import importlib
 import os
 import subprocess

@@ -1,16 +1,16 @@
 """`embomatrix worker run`: options over a settings file, and the daemon that they configure."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
+import enum
 import logging
 import os
 import signal
 import sys
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Protocol
+from typing import Annotated, Any, Final, Protocol
 
 import numpy as np
 import psutil
@@ -23,16 +23,11 @@ from embomatrix.worker.commands.options import Ca, Manager, StateDir, Token, che
 from embomatrix.worker.host.machine import HostMachine
 from embomatrix.worker.host.owner_policy import Preferences
 from embomatrix.worker.host.resources import measure
+from embomatrix.worker.host.settings import WorkerSettings
 from embomatrix.worker.link.daemon import Daemon, serve
 from embomatrix.worker.link.membership import membership_of
 from embomatrix.worker.link.status import daemon_pids
 from embomatrix.worker.slots.processes import ProcessGoneError
-
-if TYPE_CHECKING:
-    import enum
-    from collections.abc import Sequence
-
-    from embomatrix.worker.host.settings import WorkerSettings
 
 logger = logging.getLogger(__name__)
 

@@ -1,21 +1,16 @@
 """`embomatrix worker status`: current state of the daemons of this machine."""
 
-from __future__ import annotations
-
 import json
 import time
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Console
 
 from embomatrix.worker.commands.options import StateDir, fail
 from embomatrix.worker.host.settings import WorkerSettings
-from embomatrix.worker.link.status import running_daemons
-
-if TYPE_CHECKING:
-    from embomatrix.worker.link.status import WorkerStatus
+from embomatrix.worker.link.status import WorkerStatus, running_daemons
 
 
 def status(

@@ -1,7 +1,5 @@
 """First NVIDIA GPU of this machine, as ``nvidia-smi`` reports it. Rollouts need no GPU."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from dataclasses import dataclass

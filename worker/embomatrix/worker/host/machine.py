@@ -6,18 +6,14 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
 import psutil
 
-from embomatrix.worker.host.owner_policy import Observation
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
-    from embomatrix.worker.host.owner_policy import Preferences
+from embomatrix.worker.host.owner_policy import Observation, Preferences
 
 SESSIONS_ASKED_S: Final = 10.0
 """Interval between two queries of the desktop sessions, which start two processes each."""

@@ -8,6 +8,7 @@ import platform
 import shutil
 import time
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -18,8 +19,6 @@ from embomatrix.rpc.wire.values import Resources
 from embomatrix.worker.host.gpu import find_gpu
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from embomatrix.worker.host.settings import WorkerSettings
 
 REFERENCE_S: Final = 0.0065

@@ -1,7 +1,5 @@
 """Settings of a worker daemon: parsed once, at the command line."""
 
-from __future__ import annotations
-
 import secrets
 import socket
 from pathlib import Path

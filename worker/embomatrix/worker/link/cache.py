@@ -1,7 +1,5 @@
 """Bundle cache on disk by digest: verified at every use, bounded in size, evicted by last use."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import errno
@@ -10,16 +8,14 @@ import os
 import re
 import secrets
 import time
-from typing import TYPE_CHECKING, Final
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Final
 
 from embomatrix.host.limits import MIB
 from embomatrix.rpc.wire.values import InfraCode
 from embomatrix.worker.slots.residents import LoadError
 from embomatrix.world.inflation import bundle_digest
-
-if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
-    from pathlib import Path
 
 logger = logging.getLogger(__name__)
 

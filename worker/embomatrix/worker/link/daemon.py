@@ -9,6 +9,7 @@ import logging
 import math
 import secrets
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
@@ -25,12 +26,14 @@ from embomatrix.rpc.status import (
     UnavailableError,
     UnknownSessionError,
 )
-from embomatrix.rpc.wire.values import Completed, InfraCode
-from embomatrix.worker.host.machine import HostMachine
+from embomatrix.rpc.wire.leases import LeaseResult
+from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, Resources
+from embomatrix.worker.host.machine import HostMachine, Probe
+from embomatrix.worker.host.settings import WorkerSettings
 from embomatrix.worker.link.cache import BundleCache
 from embomatrix.worker.link.membership import Membership, MembershipFile, SessionConflicts
 from embomatrix.worker.link.outbox import ResultOutbox
-from embomatrix.worker.link.session import ManagerSession, register
+from embomatrix.worker.link.session import ManagerSession, Registration, register
 from embomatrix.worker.link.status import StatusReport, daemon_pids
 from embomatrix.worker.slots.pool import SlotPool
 from embomatrix.worker.slots.processes import SIMULATOR_PROGRAM
@@ -38,15 +41,7 @@ from embomatrix.worker.slots.residents import LoadError, SlotLimits
 from embomatrix.worker.slots.yielding import MemoryWatch, OwnerWatch
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     import numpy as np
-
-    from embomatrix.rpc.wire.leases import LeaseResult
-    from embomatrix.rpc.wire.values import InfraFailure, Resources
-    from embomatrix.worker.host.machine import Probe
-    from embomatrix.worker.host.settings import WorkerSettings
-    from embomatrix.worker.link.session import Registration
 
 logger = logging.getLogger(__name__)
 

@@ -6,14 +6,13 @@ import hashlib
 import json
 import os
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.rpc.trust import Invitation, fetch_ca, read_ca, read_token
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from embomatrix.worker.host.settings import WorkerSettings
 
 CONFLICTS_ALLOWED: Final = 3

@@ -1,14 +1,9 @@
 """Outbox of unacknowledged results: they survive broken streams and are sent again on the next one."""
 
-from __future__ import annotations
-
 import logging
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from embomatrix.rpc.wire.leases import LeaseClaim
-
-if TYPE_CHECKING:
-    from embomatrix.rpc.wire.leases import LeaseRef, LeaseResult
+from embomatrix.rpc.wire.leases import LeaseClaim, LeaseRef, LeaseResult
 
 logger = logging.getLogger(__name__)
 

@@ -1,14 +1,15 @@
 """One registration with the manager: its session stream, its heartbeats, and the bundles fetched with it."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging
 import math
 import time
+from collections.abc import AsyncGenerator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
+
+import grpc
 
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
@@ -32,19 +33,12 @@ from embomatrix.rpc.wire.session import (
     worker_state_to_proto,
     write_lease_result,
 )
-from embomatrix.rpc.wire.values import InfraCode
+from embomatrix.rpc.wire.values import InfraCode, Resources
+from embomatrix.worker.link.membership import Membership
+from embomatrix.worker.link.outbox import ResultOutbox
+from embomatrix.worker.slots.pool import SlotPool
 from embomatrix.worker.slots.residents import LoadError
 from embomatrix.world.inflation import DEFAULT_LIMITS
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator
-
-    import grpc
-
-    from embomatrix.rpc.wire.values import Resources
-    from embomatrix.worker.link.membership import Membership
-    from embomatrix.worker.link.outbox import ResultOutbox
-    from embomatrix.worker.slots.pool import SlotPool
 
 logger = logging.getLogger(__name__)
 

@@ -8,24 +8,22 @@ import json
 import logging
 import os
 import time
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import psutil
 
-from embomatrix.rpc.wire.values import Completed
+from embomatrix.rpc.wire.leases import LeaseResult
+from embomatrix.rpc.wire.values import Completed, Resources
+from embomatrix.worker.link.cache import BundleCache
+from embomatrix.worker.link.outbox import ResultOutbox
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from embomatrix.rpc.wire.leases import LeaseResult
-    from embomatrix.rpc.wire.values import Resources
     from embomatrix.worker.host.settings import WorkerSettings
-    from embomatrix.worker.link.cache import BundleCache
     from embomatrix.worker.link.membership import Membership
-    from embomatrix.worker.link.outbox import ResultOutbox
     from embomatrix.worker.slots.pool import SlotPool
 
 logger = logging.getLogger(__name__)

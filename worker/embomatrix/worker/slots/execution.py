@@ -4,32 +4,26 @@ A slot's process has its next plans in its stream before it has answered the las
 Meanwhile the daemon reads answers in batches of some milliseconds.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import dataclasses
 import time
 from collections import deque
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from embomatrix.reward.settings import PAPER
+from embomatrix.rpc.wire.leases import Lease
 from embomatrix.rpc.wire.outcome import unread_completed
 from embomatrix.rpc.wire.rollout import rollout_to_proto
-from embomatrix.rpc.wire.values import InfraCode, InfraFailure, Timings
+from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, Timings
 from embomatrix.sim.zygote import PipeMessage
 from embomatrix.worker.slots.processes import ProcessGoneError
+from embomatrix.worker.slots.residents import Residents, ResidentScene, Slot
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-
-    from embomatrix.rpc.wire.leases import Lease
-    from embomatrix.rpc.wire.values import Completed
-    from embomatrix.worker.slots.residents import Residents, ResidentScene, Slot
-
-    TakeMore = Callable[[int], Sequence["HeldLease"]]
-    Finish = Callable[["HeldLease", Completed | InfraFailure], None]
+TakeMore = Callable[[int], Sequence["HeldLease"]]
+Finish = Callable[["HeldLease", Completed | InfraFailure], None]
 
 ROLLOUTS_PER_SLOT: Final = 5_000
 GROWTH_MB: Final = 128.0

@@ -5,7 +5,9 @@ The daemon starts it as ``python -m embomatrix.worker.slots.physics FD PARENT``.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final
 
 from embomatrix.reward.hierarchy import score
 from embomatrix.reward.settings import PAPER, RewardSettings
@@ -18,14 +20,8 @@ from embomatrix.sim.executor import Simulator
 from embomatrix.sim.floor.prepared import PreparedScene
 from embomatrix.worker.slots.slot_program import BundleCorruptError, run_program
 from embomatrix.worker.slots.warm_up import PLANS, TIMES, WARM_UP, warm_up_bundle
-from embomatrix.world.bundle import decode_bundle, encode_bundle, read_bundle
+from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle, read_bundle
 from embomatrix.world.inflation import BundleError, bundle_digest
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from embomatrix.world.bundle import Bundle
 
 CLIENTS_PER_SCENE: Final = 2
 """Physics clients of one engine: one holds the scene, another settles objects."""

@@ -1,30 +1,22 @@
 """Slot pool of a worker: leases wait for their scene and a permit, run in a process, and end in one result."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import functools
 import heapq
 import logging
 import time
-from typing import TYPE_CHECKING, Final
+from collections.abc import Awaitable, Callable, Iterable
+from pathlib import Path
+from typing import Final
 
-from embomatrix.rpc.wire.leases import LeaseClaim, LeaseProgress, LeaseResult
-from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, ResidentState
+from embomatrix.rpc.wire.leases import Lease, LeaseClaim, LeaseProgress, LeaseRef, LeaseResult
+from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, Resident, ResidentState
 from embomatrix.worker.slots.execution import HeldLease, SlotRun
 from embomatrix.worker.slots.processes import SIMULATOR_PROGRAM, ProcessGoneError
-from embomatrix.worker.slots.residents import Residents
+from embomatrix.worker.slots.residents import Residents, ResidentScene, SlotLimits
 from embomatrix.worker.slots.slot_program import ProgressBoard
 from embomatrix.worker.slots.waiting import WaitingLeases
-
-if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable
-    from pathlib import Path
-
-    from embomatrix.rpc.wire.leases import Lease, LeaseRef
-    from embomatrix.rpc.wire.values import Resident
-    from embomatrix.worker.slots.residents import ResidentScene, SlotLimits
 
 logger = logging.getLogger(__name__)
 

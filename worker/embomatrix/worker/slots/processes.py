@@ -9,14 +9,13 @@ import os
 import signal
 import socket
 import sys
+from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.zygote import PREFIX_BYTES, PipeMessage, frame_lengths, pack, unpack
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
-
     from embomatrix.worker.slots.slot_program import ProgressBoard
 
 SIMULATOR_PROGRAM: Final = (sys.executable, "-m", "embomatrix.worker.slots.physics")

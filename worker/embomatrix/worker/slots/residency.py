@@ -1,12 +1,8 @@
 """Residency decisions: the scenes to load and evict, from the wanted ones, the held ones and the memory."""
 
-from __future__ import annotations
-
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+from typing import Final
 
 UNKNOWN_MB: Final = 60.0
 """Expected memory of a scene that was never loaded here."""

@@ -5,19 +5,24 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.rpc.wire.values import InfraCode, Resident, ResidentState
 from embomatrix.sim.zygote import PipeMessage
-from embomatrix.worker.slots.processes import FORK_S, SIMULATOR_PROGRAM, ProcessGoneError, start_root
+from embomatrix.worker.slots.processes import (
+    FORK_S,
+    SIMULATOR_PROGRAM,
+    Child,
+    ProcessGoneError,
+    Root,
+    start_root,
+)
 from embomatrix.worker.slots.residency import HeldScene, decide, surplus
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Sequence
-    from pathlib import Path
-
-    from embomatrix.worker.slots.processes import Child, Root
     from embomatrix.worker.slots.slot_program import ProgressBoard
 
 logger = logging.getLogger(__name__)

@@ -4,29 +4,22 @@ Processes are spawned, never forked, because the parent may hold threads. If one
 then given up.
 """
 
-from __future__ import annotations
-
 import concurrent.futures
 import functools
+from collections.abc import Callable, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from typing import TYPE_CHECKING
+from pathlib import Path
 
-from embomatrix.rpc.wire.values import InfraCode, InfraFailure
+from embomatrix.rpc.wire.values import InfraCode, InfraFailure, Outcome, Rollout
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.engine import EngineError, EngineMissingError
 from embomatrix.sim.process_pool import process_pool
 from embomatrix.worker.slots.physics import CLIENTS_PER_SCENE, PhysicsScene
 from embomatrix.world.dataset import Dataset, DatasetError
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
-
-    from embomatrix.rpc.wire.values import Outcome, Rollout
-
-    OnResult = Callable[[str, Outcome], None]
-    Results = list[tuple[str, Outcome]]
-    Waiting = dict[concurrent.futures.Future[Results], list[Rollout]]
+OnResult = Callable[[str, Outcome], None]
+Results = list[tuple[str, Outcome]]
+Waiting = dict[concurrent.futures.Future[Results], list[Rollout]]
 
 
 class RolloutPool:

@@ -19,8 +19,9 @@ import struct
 import sys
 import time
 import weakref
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final, Protocol
 
 from embomatrix.host.anonymous_memory import nameless_file
 from embomatrix.host.parent import die_with_parent
@@ -28,7 +29,7 @@ from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.wire.outcome import completed_to_proto
 from embomatrix.rpc.wire.rollout import rollout_from_proto
-from embomatrix.rpc.wire.values import InfraCode
+from embomatrix.rpc.wire.values import Completed, InfraCode, Rollout
 from embomatrix.sim.zygote import (
     PipeMessage,
     give_back_memory,
@@ -40,11 +41,6 @@ from embomatrix.sim.zygote import (
     serve_forks,
     take_small_pages,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
-    from embomatrix.rpc.wire.values import Completed, Rollout
 
 MAX_ERROR_CHARS: Final = 500
 IDLE_S: Final = 0.1

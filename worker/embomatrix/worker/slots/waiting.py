@@ -1,18 +1,13 @@
 """Queue of leases that wait for a slot, in order of arrival except that leases of a scene with an idle slot may overtake."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 from collections import deque
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Iterable, Iterator
+from typing import Final
 
 from embomatrix.worker.slots.execution import HeldLease
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-
-    from embomatrix.worker.slots.residents import ResidentScene
+from embomatrix.worker.slots.residents import ResidentScene
 
 OVERTAKEN_S: Final = 0.5
 """A lease that has waited this long is not overtaken."""

@@ -4,24 +4,19 @@ Patterns are compiled, libraries initialise, and the interpreter specialises its
 warm-up, loading a scene takes a third longer.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.skills.parse import parse_plan
+from embomatrix.skills.syntax import Plan
 from embomatrix.world.asset import Asset, Interior, Joint, JointKind, Link, SupportSurface
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.evaluate import render
-from embomatrix.world.geometry import ConvexPart, Pose, Shape
+from embomatrix.world.geometry import ConvexPart, Pose, Shape, Vec3
 from embomatrix.world.goal import And, Atom, Not
 from embomatrix.world.poses import PlacementKey, PoseCache, StandPose
 from embomatrix.world.scene import Doorway, RobotStart, Room, Scene, SceneObject, Window
 from embomatrix.world.state import Relation, State, SubstanceFact, SubstanceRelation
 from embomatrix.world.task import Task, TaskCategory
-
-if TYPE_CHECKING:
-    from embomatrix.skills.syntax import Plan
-    from embomatrix.world.geometry import Vec3
 
 WARM_UP: Final = "warm-up"
 """Name of the scene and of its task."""

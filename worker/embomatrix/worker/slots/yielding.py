@@ -5,18 +5,22 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
 import psutil
 
 from embomatrix.host.limits import MIB, find_limits
-from embomatrix.worker.host.owner_policy import WORKING, next_pause_state
+from embomatrix.worker.host.machine import Probe
+from embomatrix.worker.host.owner_policy import (
+    WORKING,
+    Observation,
+    PauseState,
+    Preferences,
+    next_pause_state,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from embomatrix.worker.host.machine import Probe
-    from embomatrix.worker.host.owner_policy import Observation, PauseState, Preferences
     from embomatrix.worker.slots.pool import SlotPool
 
 logger = logging.getLogger(__name__)

@@ -5,10 +5,8 @@ run that requests verified results, the check is queued and the result is held b
 idle slot.
 """
 
-from __future__ import annotations
-
 from itertools import islice
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.manager.control.commands import CancelLease, QuarantineWorker
 from embomatrix.manager.control.dispatch.leasing import (
@@ -19,17 +17,12 @@ from embomatrix.manager.control.dispatch.leasing import (
     with_free_slot_for,
 )
 from embomatrix.manager.control.dispatch.outcomes import close_case, deliver, return_lease
-from embomatrix.manager.control.dispatch.records import RolloutRecord
-from embomatrix.manager.control.dispatch.state import AuditCase
+from embomatrix.manager.control.dispatch.records import LeaseRecord, RolloutRecord
+from embomatrix.manager.control.dispatch.state import AuditCase, DispatchState
 from embomatrix.manager.control.reputation import Ruling, judge, opinion_of
+from embomatrix.manager.control.workers import WorkerRecord
 from embomatrix.rpc.wire.run_log import RolloutStepKind
-from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure
-
-if TYPE_CHECKING:
-    from embomatrix.manager.control.dispatch.records import LeaseRecord
-    from embomatrix.manager.control.dispatch.state import DispatchState
-    from embomatrix.manager.control.workers import WorkerRecord
-    from embomatrix.rpc.wire.values import Outcome
+from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, Outcome
 
 LOOKED_AT: Final = 256
 """Audits examined at each tick, in rotation."""

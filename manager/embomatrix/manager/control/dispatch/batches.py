@@ -1,11 +1,10 @@
 """Open batches with their groups, deadlines and result cursors."""
 
-from __future__ import annotations
-
 import heapq
 import itertools
 from collections import Counter
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Final
 
 from embomatrix.manager.control.dispatch.records import (
     BatchRecord,
@@ -14,14 +13,17 @@ from embomatrix.manager.control.dispatch.records import (
     RolloutKey,
     RolloutRecord,
 )
-from embomatrix.rpc.wire.values import Cancelled, Completed, GroupDone, GroupPolicy, InfraFailure
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
-
-    from embomatrix.manager.store.protocol import ResultRow
-    from embomatrix.reward.settings import RewardSettings
-    from embomatrix.rpc.wire.values import Batch, Outcome
+from embomatrix.manager.store.protocol import ResultRow
+from embomatrix.reward.settings import RewardSettings
+from embomatrix.rpc.wire.values import (
+    Batch,
+    Cancelled,
+    Completed,
+    GroupDone,
+    GroupPolicy,
+    InfraFailure,
+    Outcome,
+)
 
 
 class OpenBatches:

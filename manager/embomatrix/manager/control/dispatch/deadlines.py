@@ -1,22 +1,17 @@
 """Time limits: expired and stalled leases, overdue batches, and rollouts that wait too long for a worker."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping
+from typing import Final
 
 from embomatrix.manager.control.dispatch.audits import finish, tick_audits
 from embomatrix.manager.control.dispatch.lease_ends import judge_scene, take_away
 from embomatrix.manager.control.dispatch.leasing import fill_workers, hedge_late
 from embomatrix.manager.control.dispatch.membership import release_awaited
+from embomatrix.manager.control.dispatch.records import LeaseRecord
+from embomatrix.manager.control.dispatch.state import DispatchState
+from embomatrix.manager.control.events import LeasesRenewed
 from embomatrix.rpc.wire.run_log import RolloutStepKind
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.manager.control.dispatch.records import LeaseRecord
-    from embomatrix.manager.control.dispatch.state import DispatchState
-    from embomatrix.manager.control.events import LeasesRenewed
 
 STALL_TIMES: Final = 5.0
 """A lease has stalled after this multiple of the 99th percentile of its run's slot times without a step."""

@@ -16,10 +16,9 @@ A pure state machine: ``handle`` is the only way to change it, the clock is an a
 ``audits``, ``lease_ends``, ``membership``, ``deadlines``; each uses only those before it.
 """
 
-from __future__ import annotations
+from collections.abc import Mapping
 
-from typing import TYPE_CHECKING
-
+from embomatrix.manager.control.commands import Command
 from embomatrix.manager.control.dispatch.audits import drop_run
 from embomatrix.manager.control.dispatch.deadlines import note_unplaceable, renew_leases, tick
 from embomatrix.manager.control.dispatch.lease_ends import settle_result
@@ -32,7 +31,7 @@ from embomatrix.manager.control.dispatch.membership import (
     worker_reported,
 )
 from embomatrix.manager.control.dispatch.outcomes import cancel_batch, open_batch, queue_next
-from embomatrix.manager.control.dispatch.records import DispatchPhase
+from embomatrix.manager.control.dispatch.records import DispatchPhase, LeaseRecord, RunCounters
 from embomatrix.manager.control.dispatch.state import DispatchLimits, DispatchState
 from embomatrix.manager.control.events import (
     BatchCancelled,
@@ -59,14 +58,8 @@ from embomatrix.manager.control.events import (
     WorkersExpected,
     WorkerSuspected,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.manager.control.commands import Command
-    from embomatrix.manager.control.dispatch.records import LeaseRecord, RunCounters
-    from embomatrix.manager.control.reputation import Auditor
-    from embomatrix.manager.control.workers import WorkerRecord
+from embomatrix.manager.control.reputation import Auditor
+from embomatrix.manager.control.workers import WorkerRecord
 
 
 class Dispatcher:

@@ -5,19 +5,13 @@ run that had nothing waiting starts level with the others, so idle time earns no
 paid: the advance charge of live leases is an estimate and may be many times too high.
 """
 
-from __future__ import annotations
-
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from embomatrix.manager.control.dispatch.records import RunCounters
+from embomatrix.manager.control.dispatch.records import FairShareTurn, LeaseRecord, RolloutRecord, RunCounters
 from embomatrix.rpc.wire.values import RunTerms
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from embomatrix.manager.control.dispatch.records import FairShareTurn, LeaseRecord, RolloutRecord
 
 GUESS_S: Final = 1.0
 """Assumed slot time before the first measurement; equal for all runs, so that they start level."""

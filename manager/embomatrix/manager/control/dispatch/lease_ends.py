@@ -1,22 +1,17 @@
 """Ends of leases: results and failures that workers report, revoked leases, and scenes that fail to load."""
 
-from __future__ import annotations
-
 import dataclasses
-from typing import TYPE_CHECKING
 
 from embomatrix.manager.control.commands import AcknowledgeLease, CancelLease
 from embomatrix.manager.control.dispatch.audits import finish, hold_for_audit
 from embomatrix.manager.control.dispatch.batches import attempts_allowed
 from embomatrix.manager.control.dispatch.leasing import offer_scene
 from embomatrix.manager.control.dispatch.outcomes import requeue
+from embomatrix.manager.control.dispatch.records import LeaseRecord
+from embomatrix.manager.control.dispatch.state import DispatchState
+from embomatrix.manager.control.events import LeaseFinished
 from embomatrix.rpc.wire.run_log import RolloutStepKind
 from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure
-
-if TYPE_CHECKING:
-    from embomatrix.manager.control.dispatch.records import LeaseRecord
-    from embomatrix.manager.control.dispatch.state import DispatchState
-    from embomatrix.manager.control.events import LeaseFinished
 
 
 def settle_result(state: DispatchState, event: LeaseFinished) -> None:

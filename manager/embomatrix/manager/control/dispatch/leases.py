@@ -1,21 +1,15 @@
 """Lease table of the dispatcher."""
 
-from __future__ import annotations
-
 import heapq
 import itertools
 from collections import Counter, OrderedDict
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterable
+from typing import Final
 
+from embomatrix.manager.control.dispatch.fair_share import RunAccounts
 from embomatrix.manager.control.dispatch.records import DispatchPhase, LeaseRecord, RolloutRecord
-from embomatrix.rpc.wire.leases import LeaseRef
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from embomatrix.manager.control.dispatch.fair_share import RunAccounts
-    from embomatrix.manager.control.workers import WorkerPool, WorkerRecord
-    from embomatrix.rpc.wire.leases import LeaseProgress
+from embomatrix.manager.control.workers import WorkerPool, WorkerRecord
+from embomatrix.rpc.wire.leases import LeaseProgress, LeaseRef
 
 STALE_MEMORY: Final = 65_536
 """Ended leases remembered, to count a late result for its run."""

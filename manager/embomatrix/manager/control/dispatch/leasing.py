@@ -1,20 +1,15 @@
 """Granting of leases: to warm workers, to freed slots, by stealing, and as hedges of late rollouts."""
 
-from __future__ import annotations
-
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.manager.control.commands import CancelLease, GiveLease
+from embomatrix.manager.control.dispatch.records import LeaseRecord, RolloutRecord
+from embomatrix.manager.control.dispatch.state import DispatchState
+from embomatrix.manager.control.workers import WorkerRecord
 from embomatrix.rpc.wire.leases import LeaseOrigin
 from embomatrix.rpc.wire.run_log import RolloutStepKind
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-
-    from embomatrix.manager.control.dispatch.records import LeaseRecord, RolloutRecord
-    from embomatrix.manager.control.dispatch.state import DispatchState
-    from embomatrix.manager.control.workers import WorkerRecord
 
 LOOKED_AT: Final = 256
 """Rollouts of tails examined for hedging at each tick, in rotation."""

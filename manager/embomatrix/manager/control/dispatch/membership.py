@@ -4,26 +4,24 @@ Leases are not stored when they are granted. After a restart of the manager its 
 they hold, with epochs and rollouts, and the new manager adopts them. Restored rollouts wait for these claims.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 from embomatrix.manager.control.commands import CancelLease
 from embomatrix.manager.control.dispatch.audits import restore_quarantine
 from embomatrix.manager.control.dispatch.lease_ends import give_back, judge_scene
 from embomatrix.manager.control.dispatch.leasing import fill_workers, offer_scene, queue_rollouts, revoke
 from embomatrix.manager.control.dispatch.outcomes import open_batch
-from embomatrix.manager.control.dispatch.records import DispatchPhase
-from embomatrix.manager.control.events import WorkerJoined, WorkerLost, WorkerReported, WorkerResumed
+from embomatrix.manager.control.dispatch.records import DispatchPhase, RolloutRecord
+from embomatrix.manager.control.dispatch.state import DispatchState
+from embomatrix.manager.control.events import (
+    BatchRestored,
+    WorkerJoined,
+    WorkerLost,
+    WorkerReported,
+    WorkerResumed,
+)
+from embomatrix.manager.control.workers import Standing, WorkerRecord
+from embomatrix.rpc.wire.leases import LeaseOrigin, LeaseRef
 from embomatrix.rpc.wire.run_log import RolloutStepKind
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure, ResidentState
-
-if TYPE_CHECKING:
-    from embomatrix.manager.control.dispatch.records import RolloutRecord
-    from embomatrix.manager.control.dispatch.state import DispatchState
-    from embomatrix.manager.control.events import BatchRestored
-    from embomatrix.manager.control.workers import Standing, WorkerRecord
-    from embomatrix.rpc.wire.leases import LeaseOrigin, LeaseRef
 
 
 def worker_joined(state: DispatchState, event: WorkerJoined) -> None:

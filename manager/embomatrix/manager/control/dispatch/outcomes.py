@@ -1,27 +1,21 @@
 """Outcomes of rollouts, and the consequences for their groups and batches."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 from embomatrix.manager.control.commands import DeliverResult, FinishBatch
 from embomatrix.manager.control.dispatch.batches import failed_with
 from embomatrix.manager.control.dispatch.leasing import enqueue, queue_rollouts, revoke
-from embomatrix.manager.control.dispatch.records import DispatchPhase, RolloutKey
+from embomatrix.manager.control.dispatch.records import (
+    BatchRecord,
+    DispatchPhase,
+    GroupRecord,
+    LeaseRecord,
+    RolloutKey,
+    RolloutRecord,
+)
+from embomatrix.manager.control.dispatch.state import AuditCase, DispatchState
 from embomatrix.rpc.wire.run_log import RolloutStepKind
-from embomatrix.rpc.wire.values import Cancelled, InfraFailure, RolloutResult
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.manager.control.dispatch.records import (
-        BatchRecord,
-        GroupRecord,
-        LeaseRecord,
-        RolloutRecord,
-    )
-    from embomatrix.manager.control.dispatch.state import AuditCase, DispatchState
-    from embomatrix.rpc.wire.values import Batch, Outcome
+from embomatrix.rpc.wire.values import Batch, Cancelled, InfraFailure, Outcome, RolloutResult
 
 CANCELLED = Cancelled("the trainer called it off")
 

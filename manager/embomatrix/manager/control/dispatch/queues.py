@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Iterator
 
-from embomatrix.manager.control.dispatch.records import DispatchPhase, QueueKey, RolloutRecord
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-
-    from embomatrix.manager.control.dispatch.records import FairShareTurn
-    from embomatrix.manager.control.workers import WorkerRecord
+from embomatrix.manager.control.dispatch.records import DispatchPhase, FairShareTurn, QueueKey, RolloutRecord
+from embomatrix.manager.control.workers import WorkerRecord
 
 _Heap = list[tuple[int, RolloutRecord]]
 

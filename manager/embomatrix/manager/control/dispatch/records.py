@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import Enum, auto
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from embomatrix.reward.settings import PAPER, RewardSettings
-from embomatrix.rpc.wire.values import RunStats, Timings
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from embomatrix.rpc.wire.leases import LeaseRef
-    from embomatrix.rpc.wire.values import Rollout
-
+from embomatrix.rpc.wire.leases import LeaseRef
+from embomatrix.rpc.wire.values import Rollout, RunStats, Timings
 
 FairShareTurn = tuple[float, float, int]
 """Sort key of waiting rollouts; the smallest goes first."""

@@ -1,27 +1,21 @@
 """State of the dispatcher: its one owner, with its invariants and the recent history of every rollout."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from embomatrix.manager.control.commands import Command
 from embomatrix.manager.control.dispatch.batches import OpenBatches
 from embomatrix.manager.control.dispatch.fair_share import RunAccounts
 from embomatrix.manager.control.dispatch.leases import LeaseTable
 from embomatrix.manager.control.dispatch.queues import PendingQueues
 from embomatrix.manager.control.dispatch.records import DispatchPhase, LeaseRecord, RolloutKey, RolloutRecord
+from embomatrix.manager.control.events import Event
 from embomatrix.manager.control.reputation import Auditor, AuditRules, Opinion
 from embomatrix.manager.control.workers import WorkerPool
 from embomatrix.rpc.wire.run_log import RolloutStep, RolloutStepKind
-from embomatrix.rpc.wire.values import InfraCode, InfraFailure
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.manager.control.commands import Command
-    from embomatrix.manager.control.events import Event
-    from embomatrix.rpc.wire.values import Completed
+from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure
 
 HISTORY_KEPT: Final = 32_768
 """Steps of all rollouts that ``explain`` can look back on, at about 150 bytes each."""

@@ -1,16 +1,10 @@
 """Look-ahead windows of runs, and what loading scenes ahead was worth."""
 
-from __future__ import annotations
-
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from embomatrix.manager.histogram import Histogram
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from embomatrix.rpc.wire.values import Batch, LookaheadEntry
+from embomatrix.rpc.wire.values import Batch, LookaheadEntry
 
 
 class LookaheadWindow:

@@ -14,13 +14,11 @@ import heapq
 import itertools
 import math
 from collections import Counter
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-
-    from embomatrix.rpc.wire.values import LookaheadEntry
+from embomatrix.rpc.wire.values import LookaheadEntry
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,17 +1,11 @@
 """Readiness forecast for trainers and operators: when each scene will be warm, or why it will not."""
 
-from __future__ import annotations
+from collections.abc import Mapping
+from typing import Final
 
-from typing import TYPE_CHECKING, Final
-
-from embomatrix.rpc.wire.values import LookaheadAnswer, PlanCell, ResidentState, Warmth
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.manager.control.schedule.lookahead import LookaheadWindow
-    from embomatrix.manager.control.schedule.residency import Residencies, WorkerResidency
-    from embomatrix.rpc.wire.values import Resident
+from embomatrix.manager.control.schedule.lookahead import LookaheadWindow
+from embomatrix.manager.control.schedule.residency import Residencies, WorkerResidency
+from embomatrix.rpc.wire.values import LookaheadAnswer, PlanCell, Resident, ResidentState, Warmth
 
 LEARNING: Final = 0.05
 """Weight of the latest measurement in moving averages."""

@@ -1,22 +1,15 @@
 """Residency of scenes on workers: the held and the desired scenes of each worker, indexed by scene."""
 
-from __future__ import annotations
-
 import bisect
 import math
 from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
-from embomatrix.manager.control.schedule.placement import Site
+from embomatrix.manager.control.schedule.placement import Need, Site
+from embomatrix.manager.control.workers import WorkerRecord
 from embomatrix.rpc.wire.values import Resident, ResidentState
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-    from collections.abc import Set as AbstractSet
-
-    from embomatrix.manager.control.schedule.placement import Need
-    from embomatrix.manager.control.workers import WorkerRecord
 
 
 @dataclass(slots=True, eq=False)

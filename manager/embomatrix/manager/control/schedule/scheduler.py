@@ -4,12 +4,11 @@ A pure state machine like the Task-Dispatcher. Its inputs are the look-ahead of 
 the reports of workers. Its output is one desired set per worker, sent again only when it changes.
 """
 
-from __future__ import annotations
-
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.manager.control.commands import Command, SetDesired
 from embomatrix.manager.control.events import (
@@ -34,12 +33,8 @@ from embomatrix.manager.control.schedule.lookahead import LookaheadWindow, Prewa
 from embomatrix.manager.control.schedule.placement import Need, RunShare, needs_of, place
 from embomatrix.manager.control.schedule.readiness import ReadinessForecast, SceneCosts, refusal_reason
 from embomatrix.manager.control.schedule.residency import Residencies, ResidencySites
+from embomatrix.manager.control.workers import WorkerRecord
 from embomatrix.rpc.wire.values import Batch, Completed, Resident, RunTerms
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from embomatrix.manager.control.workers import WorkerRecord
 
 DEFAULT_TERMS: Final = RunTerms()
 OVERDUE: Final = 3.0

@@ -3,15 +3,10 @@
 Only literals of the goal's first ground option that are false at the start count.
 """
 
-from __future__ import annotations
-
 import re
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-from embomatrix.trainer.eai.inside.demo import flat
-
-if TYPE_CHECKING:
-    from embomatrix.trainer.eai.inside.demo import Package
+from embomatrix.trainer.eai.inside.demo import Package, flat
 
 REACHED: Final = frozenset(
     [

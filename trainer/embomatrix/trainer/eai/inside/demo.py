@@ -4,18 +4,14 @@ Unpublished facts are reconstructed by the same rules for all tasks: bounding bo
 (false), cartons (open), and furniture (on its room's floor).
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from embomatrix.trainer.eai.inside.stand_ins import BINARY, UNARY, make_object, state_class
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 PREDICATES: Final = {
     "inside": "Inside",

@@ -3,20 +3,16 @@
 The line protocol shows the caller at which answer the program crashed.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
 import os
 import sys
 import types
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+from embomatrix.trainer.eai.inside.demo import Demo, Package
 from embomatrix.trainer.eai.inside.stand_ins import install
-
-if TYPE_CHECKING:
-    from embomatrix.trainer.eai.inside.demo import Demo, Package
 
 FORBIDDEN: Final = (
     "subprocess",

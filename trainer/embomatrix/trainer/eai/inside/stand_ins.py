@@ -4,8 +4,6 @@ The judge only asks iGibson for names, states, boxes and initial relations of ob
 are the published code.
 """
 
-from __future__ import annotations
-
 import importlib
 import sys
 import types
