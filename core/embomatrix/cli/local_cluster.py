@@ -1,6 +1,8 @@
 """Local cluster: a supervised manager and workers on loopback, and other commands run in the foreground beside it."""
 
+import contextlib
 import os
+import random
 import signal
 import socket
 import subprocess
@@ -14,6 +16,7 @@ from embomatrix.cli.supervisor import ChildSpec, Supervisor, embomatrix_command
 from embomatrix.host.parent import with_this_process
 
 MEMBERSHIP: Final = frozenset({"EMBOMATRIX_MANAGER", "EMBOMATRIX_TOKEN", "EMBOMATRIX_CA", "EMBOMATRIX_JOIN"})
+SERVER_PORTS: Final = range(20_000, 32_768)
 
 STOP_S: Final = 60.0
 """Time for an interrupted command to save its state."""
@@ -60,10 +63,16 @@ def without_membership(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 def free_port() -> int:
-    """Return a TCP port that is free on the loopback interface at the moment."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """Return a TCP port that is free on the loopback interface at the moment.
+
+    It lies below the range from which Linux takes the ports of outgoing connections, so that none of them occupies it
+    before its server does.
+    """
+    while True:
+        port = random.SystemRandom().choice(SERVER_PORTS)
+        with socket.socket() as probe, contextlib.suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
 
 
 def run_command(command: str, problem: Callable[[], str], *arguments: str) -> None:
