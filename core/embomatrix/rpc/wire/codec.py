@@ -97,6 +97,19 @@ def enum_member(field: str, members: Mapping[int, EnumT], number: int) -> EnumT:
     return member
 
 
+def maker(
+    message_type: type[MessageT], write: Callable[[ValueT, MessageT], None]
+) -> Callable[[ValueT], MessageT]:
+    """Return the function that makes the message of a value. ``write`` fills an empty message."""
+
+    def to_proto(value: ValueT) -> MessageT:
+        message = message_type()
+        write(value, message)
+        return message
+
+    return to_proto
+
+
 def converters(
     value_type: type[ValueT],
     message_type: type[MessageT],
@@ -109,7 +122,7 @@ def converters(
     """Return the functions that convert a value to its message and back. The two have fields of the same names.
 
     ``required_names`` are texts that may not be empty. ``enums`` maps an enum field to its wire numbers, ``parts`` a message
-    field to its own two converters, ``absent`` a message field to its value when it is not set. Numbers must be finite.
+    field to its own two converters, ``absent`` a field to its value when it is not set. Numbers must be finite.
     """
     absent = absent or {}
     values: Any = value_type
@@ -143,13 +156,19 @@ def converters(
         return value_type(
             **{
                 name: absent[name]
-                if name in absent and not message.HasField(name)
+                if name in absent and not _is_set(message, name)
                 else read(name, getattr(message, name))
                 for name, read in readers.items()
             }
         )
 
     return to_proto, from_proto
+
+
+def _is_set(message: Message, name: str) -> bool:
+    """Return whether the field has a value. A number without presence counts as unset if it is 0."""
+    has_presence = message.DESCRIPTOR.fields_by_name[name].has_presence
+    return message.HasField(name) if has_presence else bool(getattr(message, name))
 
 
 def _plain(_: str, value: Any) -> Any:

@@ -13,6 +13,7 @@ from embomatrix.rpc.wire.codec import (
     enum_numbers,
     finite,
     inside,
+    maker,
     required,
 )
 from embomatrix.rpc.wire.rollout import KNOWN, skill_call_from_proto, skill_call_to_proto
@@ -71,16 +72,13 @@ def _failure_reason(text: str) -> FailureReason | None:
         ) from None
 
 
-def timings_to_proto(timings: Timings) -> types_pb2.Timings:
-    message = types_pb2.Timings()
-    _write_timings(timings, message)
-    return message
-
-
 def _write_timings(timings: Timings, message: types_pb2.Timings) -> None:
     """Overwrite all timings of the message."""
     message.queued_s, message.load_s, message.execute_s = timings.queued_s, timings.load_s, timings.execute_s
     message.lease_s, message.deliver_s = timings.lease_s, timings.deliver_s
+
+
+timings_to_proto = maker(types_pb2.Timings, _write_timings)
 
 
 def timings_from_proto(message: types_pb2.Timings) -> Timings:
@@ -89,12 +87,6 @@ def timings_from_proto(message: types_pb2.Timings) -> Timings:
         for name, seconds in zip(Timings.__slots__, durations_s, strict=True):
             finite(name, seconds)
     return Timings(*durations_s)
-
-
-def completed_to_proto(completed: Completed) -> types_pb2.Completed:
-    message = types_pb2.Completed()
-    write_completed(completed, message)
-    return message
 
 
 def write_completed(completed: Completed, message: types_pb2.Completed) -> None:
@@ -110,6 +102,9 @@ def write_completed(completed: Completed, message: types_pb2.Completed) -> None:
     message.timings.SetInParent()
     _write_timings(completed.timings, message.timings)
     message.warm = completed.warm
+
+
+completed_to_proto = maker(types_pb2.Completed, write_completed)
 
 
 def completed_from_proto(message: types_pb2.Completed) -> Completed:
@@ -154,7 +149,7 @@ def _reward_in(message: types_pb2.Completed) -> types_pb2.Reward:
 
 def unread_completed(wire: bytes, *, timings: Timings, warm: bool) -> Completed:
     """Return the result in these bytes unchecked. The first access to a value parses it."""
-    return Completed.unread(wire, _completed_fields, timings=timings, warm=warm)
+    return Completed.unread(wire, _completed_fields, timings=timings, warm=warm, worker_id="")
 
 
 def _completed_fields(wire: bytes) -> Mapping[str, object]:

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Final, Literal
 
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
-from embomatrix.rpc.wire.codec import ConvertError, each, each_known, finite, required
+from embomatrix.rpc.wire.codec import ConvertError, each, each_known, enum_numbers, finite, maker, required
 from embomatrix.rpc.wire.values import Batch, Rollout
 from embomatrix.skills.syntax import (
     MAX_PLAN_BYTES,
@@ -21,24 +21,7 @@ from embomatrix.skills.syntax import (
 
 ArgField = Literal["object_index", "source_index", "relation", "yaw", "distance", "room_name"]
 
-SKILL_KINDS: Final[Mapping[Skill, types_pb2.SkillKind.ValueType]] = {
-    Skill.MOVE: types_pb2.SKILL_KIND_MOVE,
-    Skill.TURN: types_pb2.SKILL_KIND_TURN,
-    Skill.PICK_UP: types_pb2.SKILL_KIND_PICK_UP,
-    Skill.PLACE: types_pb2.SKILL_KIND_PLACE,
-    Skill.MOVE_FORWARD: types_pb2.SKILL_KIND_MOVE_FORWARD,
-    Skill.OPEN: types_pb2.SKILL_KIND_OPEN,
-    Skill.CLOSE: types_pb2.SKILL_KIND_CLOSE,
-    Skill.TOGGLE_ON: types_pb2.SKILL_KIND_TOGGLE_ON,
-    Skill.TOGGLE_OFF: types_pb2.SKILL_KIND_TOGGLE_OFF,
-    Skill.HEAT: types_pb2.SKILL_KIND_HEAT,
-    Skill.COOK: types_pb2.SKILL_KIND_COOK,
-    Skill.FREEZE: types_pb2.SKILL_KIND_FREEZE,
-    Skill.GO_TO_ROOM: types_pb2.SKILL_KIND_GO_TO_ROOM,
-    Skill.SLICE: types_pb2.SKILL_KIND_SLICE,
-    Skill.CLEAN: types_pb2.SKILL_KIND_CLEAN,
-    Skill.SOAK: types_pb2.SKILL_KIND_SOAK,
-}
+SKILL_KINDS: Final = enum_numbers(Skill, types_pb2.SkillKind, "SKILL_KIND")
 MAX_ROLLOUT_BYTES: Final = MAX_PLAN_BYTES + 4096
 """Largest serialized rollout: the largest plan plus its names."""
 KNOWN: Final = 65_536
@@ -114,12 +97,6 @@ def _plan_from(calls: Sequence[bytes]) -> Plan:
     return each_known("plan", _call_of, calls)
 
 
-def rollout_to_proto(rollout: Rollout) -> types_pb2.Rollout:
-    message = types_pb2.Rollout()
-    write_rollout(rollout, message)
-    return message
-
-
 def write_rollout(rollout: Rollout, message: types_pb2.Rollout) -> None:
     """Fill an empty message. A rollout that was received is written with its original bytes."""
     if rollout.wire:
@@ -132,6 +109,9 @@ def write_rollout(rollout: Rollout, message: types_pb2.Rollout) -> None:
     message.plan.extend(map(skill_call_to_proto, rollout.plan))
     message.seed = rollout.seed
     message.render = rollout.render
+
+
+rollout_to_proto = maker(types_pb2.Rollout, write_rollout)
 
 
 def rollout_from_proto(message: types_pb2.Rollout) -> Rollout:

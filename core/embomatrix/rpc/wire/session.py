@@ -4,7 +4,7 @@ from typing import Final
 
 from embomatrix.proto.v1 import admin_service_pb2, types_pb2, worker_service_pb2
 from embomatrix.reward.settings import PAPER
-from embomatrix.rpc.wire.codec import ConvertError, converters, enum_numbers, finite, inside, required
+from embomatrix.rpc.wire.codec import ConvertError, converters, enum_numbers, finite, inside, maker, required
 from embomatrix.rpc.wire.leases import (
     Lease,
     LeaseClaim,
@@ -86,31 +86,25 @@ worker_info_to_proto, worker_info_from_proto = converters(
 )
 
 
-def lease_ref_to_proto(ref: LeaseRef) -> worker_service_pb2.LeaseRef:
-    message = worker_service_pb2.LeaseRef()
-    write_lease_ref(ref, message)
-    return message
-
-
 def write_lease_ref(ref: LeaseRef, message: worker_service_pb2.LeaseRef) -> None:
     """Fill an empty message in place, which saves a copy."""
     message.lease_id, message.lease_epoch = ref.lease_id, ref.lease_epoch
+
+
+lease_ref_to_proto = maker(worker_service_pb2.LeaseRef, write_lease_ref)
 
 
 def lease_ref_from_proto(message: worker_service_pb2.LeaseRef) -> LeaseRef:
     return LeaseRef(required("lease_id", message.lease_id), message.lease_epoch)
 
 
-def lease_origin_to_proto(origin: LeaseOrigin) -> worker_service_pb2.LeaseOrigin:
-    message = worker_service_pb2.LeaseOrigin()
-    write_lease_origin(origin, message)
-    return message
-
-
 def write_lease_origin(origin: LeaseOrigin, message: worker_service_pb2.LeaseOrigin) -> None:
     """Fill an empty message in place."""
     message.run_id, message.batch_id = origin.run_id, origin.batch_id
     message.rollout_id, message.attempt = origin.rollout_id, origin.attempt
+
+
+lease_origin_to_proto = maker(worker_service_pb2.LeaseOrigin, write_lease_origin)
 
 
 def lease_origin_from_proto(message: worker_service_pb2.LeaseOrigin) -> LeaseOrigin:
@@ -151,12 +145,6 @@ def lease_from_proto(message: worker_service_pb2.Lease) -> Lease:
     )
 
 
-def lease_result_to_proto(result: LeaseResult) -> worker_service_pb2.LeaseResult:
-    message = worker_service_pb2.LeaseResult()
-    write_lease_result(result, message)
-    return message
-
-
 def write_lease_result(result: LeaseResult, message: worker_service_pb2.LeaseResult) -> None:
     """Fill an empty message in place."""
     write_lease_ref(result.ref, message.lease)
@@ -166,6 +154,9 @@ def write_lease_result(result: LeaseResult, message: worker_service_pb2.LeaseRes
             write_completed(completed, message.completed)
         case InfraFailure() as failure:
             message.infra_failure.CopyFrom(infra_failure_to_proto(failure))
+
+
+lease_result_to_proto = maker(worker_service_pb2.LeaseResult, write_lease_result)
 
 
 def lease_result_from_proto(message: worker_service_pb2.LeaseResult) -> LeaseResult:

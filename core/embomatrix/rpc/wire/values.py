@@ -29,9 +29,10 @@ class _ReadWhenAsked:
     """Slots that may be empty."""
 
     @classmethod
-    def _unread(cls, read: Reader, **known: object) -> Self:
+    def unread(cls, wire: bytes, read: Reader, **known: object) -> Self:
+        """Return a value of which only the ``known`` fields are parsed."""
         value = object.__new__(cls)
-        for name, content in (*known.items(), ("read", read)):
+        for name, content in (*known.items(), ("wire", wire), ("read", read)):
             object.__setattr__(value, name, content)
         return value
 
@@ -63,11 +64,6 @@ class Rollout(_ReadWhenAsked):
     """Original message, which is passed on unchanged; a modified copy has none."""
     read: Reader | None = field(default=None, init=False, compare=False, repr=False)
     """Parser of ``wire`` for the empty slots; None once everything is parsed."""
-
-    @classmethod
-    def unread(cls, wire: bytes, read: Reader, *, bundle_digest: str) -> Rollout:
-        """Return a rollout of which only the scene is parsed."""
-        return cls._unread(read, wire=wire, bundle_digest=bundle_digest)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,13 +111,6 @@ class Completed(_ReadWhenAsked):
     """Original message, which is passed on with the ``noted`` fields replaced; a copy with other changes has none."""
     read: Reader | None = field(default=None, init=False, compare=False, repr=False)
     """Parser of ``wire`` for the empty slots; None once everything is parsed."""
-
-    @classmethod
-    def unread(
-        cls, wire: bytes, read: Reader, *, timings: Timings, warm: bool, worker_id: str = ""
-    ) -> Completed:
-        """Return a result of which only the fields that may be ``noted`` are parsed."""
-        return cls._unread(read, wire=wire, timings=timings, warm=warm, worker_id=worker_id)
 
     def noted(
         self, *, timings: Timings | None = None, worker_id: str | None = None, warm: bool | None = None
