@@ -15,7 +15,7 @@ from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.facts import facts_of
 from embomatrix.factory.social.model_agents import SocialModelAgents
 from embomatrix.factory.social.values import ROBOT, Act, Cast, Conversation, DaySlot, DialogueTurn, Person
-from embomatrix.llm.cassette import Cassette, CassetteMode
+from embomatrix.llm.cassette import Cassette
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
 from embomatrix.llm.values import UnusableReplyError
 from embomatrix.world.task import TaskCategory
@@ -65,8 +65,9 @@ async def ask_everything(model):
 
 
 async def _record(url, model):
+    RECORDING.unlink(missing_ok=True)
     async with Endpoint(url, model, limits=PATIENT) as endpoint:
-        found = await ask_everything(Cassette(RECORDING, CassetteMode.RECORD, endpoint))
+        found = await ask_everything(Cassette(RECORDING, endpoint))
     for name, value in found.items():
         sys.stdout.write(f"{name}: {value}\n")
 

@@ -3,7 +3,6 @@
 import hashlib
 import json
 from collections import Counter
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -11,33 +10,20 @@ from embomatrix.llm.ledger import append_line
 from embomatrix.llm.values import CassetteError, ChatModel, ChatRequest, Reply, Usage
 
 
-class CassetteMode(StrEnum):
-    """Use of a cassette."""
-
-    REPLAY = "replay"  # never ask; an unknown question is an error
-    RECORD = "record"  # always ask, and record
-    AUTO = "auto"  # ask unrecorded questions
-
-
 class Cassette:
     """Model behind a recording: a file of JSON lines, one answer each.
 
-    Repeated equal questions are counted, and the n-th gets the n-th answer. ``model`` may be absent for replay. Raises
-    CassetteError if the file is damaged or lacks a question.
+    Repeated equal questions are counted, and the n-th gets the n-th answer. ``model`` is asked unrecorded questions. Without
+    it, CassetteError is raised for a missing file and for an unrecorded question; in any case for a damaged file.
     """
 
-    def __init__(self, path: Path, mode: CassetteMode, model: ChatModel | None = None) -> None:
-        if model is None and mode is not CassetteMode.REPLAY:
-            raise CassetteError(
-                f"the cassette {path} is opened for recording, but there is no model to ask: pass a model, or replay"
-            )
+    def __init__(self, path: Path, model: ChatModel | None = None) -> None:
+        if model is None and not path.exists():
+            raise CassetteError(f"there is no cassette at {path}: record one first")
         self._path = path
-        self._mode = mode
         self._model = model
         self._asked: Counter[str] = Counter()
-        self._answers = _read(path) if mode is not CassetteMode.RECORD and path.exists() else {}
-        if mode is CassetteMode.REPLAY and not path.exists():
-            raise CassetteError(f"there is no cassette at {path}: record one first")
+        self._answers = _read(path) if path.exists() else {}
 
     async def complete(self, request: ChatRequest) -> Reply:
         """Return the recorded answer, or ask the model and record its answer."""
@@ -47,7 +33,7 @@ class Cassette:
         found = self._answers.get((question, number))
         if found is not None:
             return found
-        if self._model is None or self._mode is CassetteMode.REPLAY:
+        if self._model is None:
             raise CassetteError(
                 f"{request.purpose}: the cassette {self._path} has no answer {number + 1} to question {question[:12]}: the "
                 "question has changed since the recording; record it again"

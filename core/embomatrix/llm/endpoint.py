@@ -53,13 +53,11 @@ class Endpoint:
         *,
         api_key: str = "",
         limits: EndpointLimits | None = None,
-        constrain: bool = False,
         jitter: random.Random | None = None,
     ) -> None:
         self.model = model
         self._url = f"{base_url.rstrip('/')}/chat/completions"
         self._limits = limits or EndpointLimits()
-        self._constrain = constrain
         self._jitter = jitter or random.Random()
         self._gate = asyncio.Semaphore(self._limits.concurrent)
         headers = {"authorization": f"Bearer {api_key}"} if api_key else {}
@@ -102,9 +100,6 @@ class Endpoint:
         }
         if request.seed is not None:
             body["seed"] = request.seed
-        if self._constrain and request.json_schema is not None:
-            schema = {"name": "answer", "schema": request.json_schema, "strict": True}
-            body["response_format"] = {"type": "json_schema", "json_schema": schema}
         return body
 
     async def _attempt(self, body: dict[str, Any]) -> _Answer | _Failure:

@@ -3,8 +3,8 @@
 import json
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from typing import Any, Final, Generic, TypeVar
+from dataclasses import replace
+from typing import Any, Final, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -19,14 +19,6 @@ _FENCE: Final = re.compile(r"```(?:json)?\s*\n(.*?)```", re.DOTALL)
 _BRACKET: Final = re.compile(r"[{\[]")
 
 
-@dataclass(frozen=True, slots=True)
-class StructuredReply(Generic[T]):
-    """A valid answer, with all replies that led to it."""
-
-    value: T
-    replies: tuple[Reply, ...]
-
-
 async def ask(
     model: ChatModel,
     request: ChatRequest,
@@ -34,30 +26,27 @@ async def ask(
     *,
     check: Callable[[T], None] | None = None,
     attempts: int = 3,
-) -> StructuredReply[T]:
+) -> T:
     """Ask until the answer has the shape and passes ``check``, which raises ValueError with a message for the model.
 
     Raises UnusableReplyError after ``attempts`` answers, EndpointError without an answer.
     """
     request = replace(request, json_schema=request.json_schema or shape.model_json_schema())
-    replies: list[Reply] = []
     problem = ""
     for _ in range(attempts):
         reply = await model.complete(request)
-        replies.append(reply)
         try:
             value = read_json(reply.text, shape)
             if check is not None:
                 check(value)
-            return StructuredReply(value, tuple(replies))
+            return value
         except ValueError as error:
             problem = str(error)
         if reply.finish == "length":
             problem = f"the answer was cut off after {request.max_tokens} tokens: {problem}"
         request = replace(request, messages=(*request.messages, *_objection(reply, problem)))
     raise UnusableReplyError(
-        f"{request.purpose}: {attempts} answers of {replies[-1].model}, none usable, the last because {problem}",
-        tuple(reply.text for reply in replies),
+        f"{request.purpose}: {attempts} answers of {reply.model}, none usable, the last because {problem}"
     )
 
 

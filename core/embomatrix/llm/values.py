@@ -25,7 +25,7 @@ class Message:
 class ChatRequest:
     """One question. ``purpose`` names the asking component, for ledger and errors; it is not sent.
 
-    ``json_schema`` asks endpoints to constrain their output. Replies are validated in any case.
+    ``json_schema`` is the form of the answer. It is not sent either, but identifies the question in a cassette.
     """
 
     purpose: str
@@ -71,11 +71,7 @@ class EndpointError(LlmError):
 
 
 class UnusableReplyError(LlmError):
-    """Raised when no answer had the requested form. ``replies`` are the answers, first to last."""
-
-    def __init__(self, sentence: str, replies: tuple[str, ...]) -> None:
-        super().__init__(sentence)
-        self.replies = replies
+    """Raised when no answer had the requested form."""
 
 
 class CassetteError(LlmError):

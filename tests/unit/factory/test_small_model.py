@@ -12,19 +12,18 @@ from embomatrix.factory.social.model_agents import CAST, SUMMARY, TALK, Conversa
 from embomatrix.factory.social.prompts import answer_schema
 from embomatrix.factory.social.requests import TaskRequest
 from embomatrix.factory.social.values import Cast, Conversation
-from embomatrix.llm.cassette import Cassette, CassetteMode
+from embomatrix.llm.cassette import Cassette
 from embomatrix.llm.values import UnusableReplyError
 
 SHAPES = {"cast": Cast, "converse": Conversation, "summarise": TaskRequest}
 
 
 def test_each_agent_returns_a_value_or_reports_the_problem():
-    found = asyncio.run(ask_everything(Cassette(RECORDING, CassetteMode.REPLAY)))
+    found = asyncio.run(ask_everything(Cassette(RECORDING)))
     assert set(found) == set(SHAPES)
     for name, value in found.items():
         if isinstance(value, UnusableReplyError):
             assert re.search(r"answers of .+, none usable, the last because .+", str(value))
-            assert all(value.replies)
         else:
             assert isinstance(value, SHAPES[name])
 

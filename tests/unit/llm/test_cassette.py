@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 from tests.fakes.chat_server import ChatServer
 
-from embomatrix.llm.cassette import Cassette, CassetteMode, digest
+from embomatrix.llm.cassette import Cassette, digest
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
 from embomatrix.llm.ledger import Ledger, Price
 from embomatrix.llm.values import CassetteError, ChatRequest, EndpointError, Message, Speaker
@@ -15,16 +15,16 @@ QUESTION = ChatRequest("cast", (Message(Speaker.USER, "Who?", (b"png",)),))
 OTHER = replace(QUESTION, messages=(Message(Speaker.USER, "Where?"),))
 
 
-async def recorded(path, *questions, mode=CassetteMode.RECORD):
+async def recorded(path, *questions):
     server = ChatServer("Ann.", "Bo.", "Cy.")
     with server.serving() as url:
         async with Endpoint(url, "small-1") as endpoint:
-            cassette = Cassette(path, mode, endpoint)
+            cassette = Cassette(path, endpoint)
             return [(await cassette.complete(question)).text for question in questions], len(server.requests)
 
 
 async def replayed(path, *questions):
-    cassette = Cassette(path, CassetteMode.REPLAY)
+    cassette = Cassette(path)
     return [(await cassette.complete(question)).text for question in questions]
 
 
@@ -34,10 +34,10 @@ async def test_recorded_answers_are_replayed_in_order(tmp_path):
     assert await replayed(path, QUESTION, QUESTION, OTHER) == ["Ann.", "Cy.", "Bo."]
 
 
-async def test_auto_mode_asks_only_unrecorded_questions(tmp_path):
+async def test_only_unrecorded_questions_are_asked(tmp_path):
     path = tmp_path / "cast.jsonl"
     await recorded(path, QUESTION)
-    texts, asked = await recorded(path, QUESTION, OTHER, mode=CassetteMode.AUTO)
+    texts, asked = await recorded(path, QUESTION, OTHER)
     assert (texts, asked) == (["Ann.", "Ann."], 1)
     assert len(path.read_text().splitlines()) == 2
 
@@ -58,14 +58,12 @@ async def test_damaged_line_is_reported(tmp_path, line):
     with path.open("a") as file:
         file.write(f"{line}\n")
     with pytest.raises(CassetteError, match="line 2, is not a recorded answer"):
-        Cassette(path, CassetteMode.REPLAY)
+        Cassette(path)
 
 
-def test_missing_cassette_or_missing_model_is_refused(tmp_path):
+def test_missing_cassette_without_a_model_is_refused(tmp_path):
     with pytest.raises(CassetteError, match="record one first"):
-        Cassette(tmp_path / "none.jsonl", CassetteMode.REPLAY)
-    with pytest.raises(CassetteError, match="there is no model to ask"):
-        Cassette(tmp_path / "none.jsonl", CassetteMode.RECORD)
+        Cassette(tmp_path / "none.jsonl")
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from embomatrix.factory.pictures.sights import sights_of
 from embomatrix.factory.social.model_agents import SocialModelAgents
 from embomatrix.factory.social.model_writer import ModelWriter
 from embomatrix.llm.batch import FailureLimit
-from embomatrix.llm.cassette import Cassette, CassetteMode
+from embomatrix.llm.cassette import Cassette
 from embomatrix.llm.endpoint import Endpoint
 from embomatrix.llm.ledger import Ledger, Price
 from embomatrix.llm.values import ChatModel, EndpointError
@@ -47,7 +47,7 @@ def _chat_model(url: str, model: str, key: str, cassette: Path | None) -> tuple[
         raise EndpointError("--llm needs the name of a model at the endpoint: give --model")
     endpoint = Endpoint(url, model, api_key=key) if url else None
     if cassette is not None:
-        return Cassette(cassette, CassetteMode.AUTO if endpoint else CassetteMode.REPLAY, endpoint), endpoint
+        return Cassette(cassette, endpoint), endpoint
     if endpoint is None:
         raise EndpointError("no language model is given: add --llm URL and --model NAME, or --cassette FILE")
     return endpoint, endpoint
@@ -100,12 +100,12 @@ def model_task_writer(
     if endpoint is None:
         if cassette is None:
             raise ValueError("found neither an endpoint nor a cassette: expected one of them")
-        chat: ChatModel = Cassette(cassette, CassetteMode.REPLAY)
+        chat: ChatModel = Cassette(cassette)
         ledger = chat = Ledger(chat)
     else:
         # The ledger sits behind the cassette: replayed answers cost nothing.
         ledger = Ledger(endpoint, price=price, path=accounts)
-        chat = ledger if cassette is None else Cassette(cassette, CassetteMode.AUTO, ledger)
+        chat = ledger if cassette is None else Cassette(cassette, ledger)
     with ModelWriter(SocialModelAgents(chat), endpoint, sights_of if look else None) as writer:
         yield writer, ledger
 

@@ -63,7 +63,7 @@ async def judged(model: ChatModel, commands: Sequence[str], seed: int, attempts:
         temperature=0.0,
         seed=seed,
     )
-    return (await ask(model, request, DiversityScores, attempts=attempts)).value
+    return await ask(model, request, DiversityScores, attempts=attempts)
 
 
 SCENE_JUDGE: Final = "scene judge"
@@ -131,7 +131,7 @@ async def impression_of(
     pictures = tuple(sight_of_room(scene, room) for room in rooms)
     message = Message(Speaker.USER, SCENE_PROMPT.format(tree=json.dumps(trees)), pictures)
     request = ChatRequest(SCENE_JUDGE, (message,), temperature=0.0, seed=seed)
-    return (await ask(model, request, Impression, attempts=attempts)).value
+    return await ask(model, request, Impression, attempts=attempts)
 
 
 async def evaluate_looks(

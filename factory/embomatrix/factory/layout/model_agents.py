@@ -214,7 +214,7 @@ class ModelLayoutAgents(OnOneLoop):
             logger.warning("using rules instead of the model: %s", error)
             return None
         self._failure_limit.answered()
-        return answer.value
+        return answer
 
 
 def _check_complete(wanted: Collection[str], given: Collection[str], what: str) -> None:

@@ -86,7 +86,7 @@ class SocialModelAgents:
         user = Message(Speaker.USER, SIGHT_USER.format(scene=facts.described()), pictures)
         messages = (Message(Speaker.SYSTEM, SIGHT_SYSTEM), user)
         request = ChatRequest(SIGHT, messages, self._max_tokens, 0.2, seed)
-        return (await ask(self._model, request, RoomSighting, check=check, attempts=self._attempts)).value
+        return await ask(self._model, request, RoomSighting, check=check, attempts=self._attempts)
 
     async def cast(self, facts: SceneFacts, seed: int) -> Cast:
         """Invent people who suit the scene and cover every room. Raise LlmError."""
@@ -102,7 +102,7 @@ class SocialModelAgents:
                 raise ValueError(f"nobody is ever in {', '.join(empty)}: give each of these rooms somebody")
 
         request = self._request(CAST, CAST_SYSTEM.format(), CAST_USER.format(scene=facts.described()), seed)
-        return (await ask(self._model, request, Cast, check=check, attempts=self._attempts)).value
+        return await ask(self._model, request, Cast, check=check, attempts=self._attempts)
 
     async def converse(
         self, facts: SceneFacts, cast: Cast, slot: DaySlot, category: TaskCategory, seed: int
@@ -134,9 +134,7 @@ class SocialModelAgents:
             hint=CATEGORY_HINTS[category.value],
         )
         request = self._request(TALK, TALK_SYSTEM.format(limits=ROBOT_LIMITS), user, seed)
-        talk = (
-            await ask(self._model, request, ConversationAnswer, check=check, attempts=self._attempts)
-        ).value
+        talk = await ask(self._model, request, ConversationAnswer, check=check, attempts=self._attempts)
         return Conversation(
             slot=slot, turns=talk.turns, first_wish=talk.first_wish, last_wishes=talk.last_wishes
         )
@@ -149,14 +147,13 @@ class SocialModelAgents:
         said = "\n".join(f"{turn.speaker}: {turn.text}" for turn in conversation.turns)
         user = SUMMARY_USER.format(scene=facts.described(), conversation=said)
         request = self._request(SUMMARY, SUMMARY_SYSTEM, user, seed)
-        answer = await ask(
+        return await ask(
             self._model,
             request,
             TaskRequest,
             check=lambda value: check_request(value, view, known),
             attempts=self._attempts,
         )
-        return answer.value
 
     def _request(self, purpose: str, system: str, user: str, seed: int) -> ChatRequest:
         messages = (Message(Speaker.SYSTEM, system), Message(Speaker.USER, user))
