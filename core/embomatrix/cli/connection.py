@@ -9,21 +9,14 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from embomatrix.cli.failure import fail
+from embomatrix.host.failure import fail
 from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.managers import FAILOVER_S
+from embomatrix.rpc.options import Ca, Manager, Token
 from embomatrix.rpc.status import ClusterError
 from embomatrix.rpc.trust import read_ca, read_token
 
-Manager = Annotated[str, typer.Option(help="HOST:PORT of the manager.", envvar="EMBOMATRIX_MANAGER")]
-Token = Annotated[
-    str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="A token, or @FILE that holds it.", show_default=False)
-]
-Ca = Annotated[
-    Path | None,
-    typer.Option(envvar="EMBOMATRIX_CA", help="The ca.pem of a manager that uses TLS.", show_default=False),
-]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 _OPTIONS: Final = (("manager", Manager, DEFAULT_ADDRESS), ("token", Token, ""), ("ca", Ca, None))
 

@@ -11,8 +11,8 @@ import typer
 from rich.console import Console
 from rich.logging import RichHandler
 
-from embomatrix.cli.failure import fail
 from embomatrix.cli.local_cluster import LocalCluster, cluster_problem, local_cluster, no_problem, run_command
+from embomatrix.host.failure import fail
 
 DEFAULT_OUT: Final = Path("runs/demo")
 TASKS: Final = 960

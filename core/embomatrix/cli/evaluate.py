@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from embomatrix.cli.failure import INTERRUPTED, fail
+from embomatrix.host.failure import INTERRUPTED, fail
 from embomatrix.host.limits import usable_cores
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from embomatrix.cli.failure import INTERRUPTED, fail
 from embomatrix.cli.supervisor import ChildSpec, Supervisor, embomatrix_command
+from embomatrix.host.failure import INTERRUPTED, fail
 from embomatrix.host.parent import with_this_process
 
 MEMBERSHIP: Final = frozenset({"EMBOMATRIX_MANAGER", "EMBOMATRIX_TOKEN", "EMBOMATRIX_CA", "EMBOMATRIX_JOIN"})

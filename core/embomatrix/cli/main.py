@@ -17,7 +17,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from embomatrix.cli.failure import fail, shown
+from embomatrix.host.failure import fail, shown
 
 GROUP: Final = "embomatrix.commands"
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Self
 
-from embomatrix.cli.failure import MENDABLE
+from embomatrix.host.failure import MENDABLE
 from embomatrix.host.parent import with_this_process
 
 logger = logging.getLogger(__name__)

@@ -240,6 +240,6 @@ def test_data_folder_that_is_a_file_is_explained(tmp_path):
 
 
 def test_unreachable_manager_error_names_the_serve_command():
-    result = CliRunner().invoke(app, ["token", "list", "--address", "127.0.0.1:1"])
+    result = CliRunner().invoke(app, ["token", "list", "--manager", "127.0.0.1:1"])
     assert result.exit_code == 2
     assert "embomatrix manager serve" in result.output

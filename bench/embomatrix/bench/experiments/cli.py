@@ -32,8 +32,8 @@ from embomatrix.bench.experiments.findings import figures_of, findings_of, read_
 from embomatrix.bench.experiments.section import add_section, learning_section
 from embomatrix.bench.report.figures import BenchResult, commit_here, describe_machine, result_to_json
 from embomatrix.bench.report.output import write
-from embomatrix.cli.failure import fail
 from embomatrix.cli.local_cluster import no_problem, run_command
+from embomatrix.host.failure import fail
 from embomatrix.host.limits import usable_cores
 from embomatrix.pages.figures import Figure, shown
 from embomatrix.trainer.config.errors import TrainerError

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from embomatrix.bench.report.figures import BenchError, BenchResult, is_shared, result_to_json
-from embomatrix.cli.failure import fail
+from embomatrix.host.failure import fail
 from embomatrix.pages.figures import shown
 from embomatrix.rpc.status import ClusterError
 from embomatrix.sim.engine import EngineError

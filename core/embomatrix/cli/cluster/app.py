@@ -20,7 +20,7 @@ from embomatrix.cli.cluster.tables import (
 )
 from embomatrix.cli.cluster.trace import chrome_trace
 from embomatrix.cli.connection import AsJson, manager_command
-from embomatrix.cli.failure import fail
+from embomatrix.host.failure import fail
 from embomatrix.rpc.admin_client import AdminClient
 
 FOLLOW_S: Final = 0.5

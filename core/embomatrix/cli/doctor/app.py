@@ -11,26 +11,18 @@ from rich.table import Table
 from rich.text import Text
 
 from embomatrix.cli.cluster.tables import show_json
-from embomatrix.cli.connection import AsJson, Ca, Token
+from embomatrix.cli.connection import AsJson
 from embomatrix.cli.doctor.machine import Finding, Level, machine, verdict
 from embomatrix.cli.doctor.manager import Visit, manager, ports_held
-from embomatrix.cli.failure import MENDABLE, fail
+from embomatrix.host.failure import MENDABLE, fail
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.managers import Managers
+from embomatrix.rpc.options import Ca, Manager, Token
 from embomatrix.rpc.status import ClusterError
 from embomatrix.rpc.trust import read_ca, read_token
 
 STYLES: Final[Mapping[Level, str]] = {Level.FINE: "green", Level.NOTE: "yellow", Level.WRONG: "red"}
 
-Manager = Annotated[
-    str,
-    typer.Option(
-        "--manager",
-        help="HOST:PORT of the manager to check.",
-        envvar="EMBOMATRIX_MANAGER",
-        show_default=False,
-    ),
-]
 PagePort = Annotated[int, typer.Option(help="Port of its status page, to compare clocks.", min=1, max=65535)]
 
 

@@ -36,6 +36,7 @@ from embomatrix.factory.pipeline.settings import SCENE_EXTRACTOR, BuildSettings,
 from embomatrix.factory.writer.tasks import TaskWriter
 from embomatrix.llm.batch import FailureLimit
 from embomatrix.llm.ledger import Ledger, Price
+from embomatrix.rpc.options import Ca, Token
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.task import TaskCategory
 from embomatrix.world.whole_file import write_whole
@@ -127,10 +128,8 @@ def generate(
     price: PriceOfTokens = (0.0, 0.0),
     manager: ManagerAt = "",
     look: Look = False,
-    token: Annotated[str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="Access token for the manager.")] = "",
-    ca: Annotated[
-        Path | None, typer.Option(envvar="EMBOMATRIX_CA", help="CA certificate of the manager, ca.pem.")
-    ] = None,
+    token: Token = "",
+    ca: Ca = None,
 ) -> None:
     """Simulate conversations of a scene's people with the robot, and turn their requests into verified tasks."""
     kind = WriterKind.MODEL if llm or cassette is not None else WriterKind.SOCIAL

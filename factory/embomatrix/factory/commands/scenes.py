@@ -25,6 +25,7 @@ from embomatrix.factory.scenes.batch import SceneBuildJob, run_batch
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.report import TABLE_COLUMNS, SceneReport, problem_lines, report_table
 from embomatrix.factory.scenes.scene_file import SUFFIX, SceneFileError, read_scene
+from embomatrix.host.failure import fail
 from embomatrix.host.limits import usable_cores
 from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.sim.engine import EngineError
@@ -234,9 +235,9 @@ def _print_reports(reports: Sequence[SceneReport], path: Path | None) -> None:
 
 def _chosen(names: Sequence[str] | None, every: bool) -> tuple[str, ...]:
     if every and names:
-        raise _refused(f"found both --all and {names[0]!r}: give names or --all")
+        fail("scene", f"found both --all and {names[0]!r}: give names or --all")
     if not every and not names:
-        raise _refused("no scene is named: give a name that `embomatrix scene list` shows, or --all")
+        fail("scene", "no scene is named: give a name that `embomatrix scene list` shows, or --all")
     return Catalog.load().scene_ids if every else tuple(dict.fromkeys(names or ()))
 
 
@@ -287,14 +288,10 @@ def _user_errors(path: Path | None = None) -> Iterator[None]:
     try:
         yield
     except (CatalogError, EngineError, FloorPlanError, ModelFileError, SceneFileError) as error:
-        raise _refused(str(error)) from None
+        fail("scene", str(error))
     except OSError as error:
-        raise _refused(
+        fail(
+            "scene",
             f"{path or error.filename or '.'} can't be written ({error.strerror}): free disk space, or name another "
-            "folder with --out"
-        ) from None
-
-
-def _refused(sentence: str) -> typer.Exit:
-    Console(stderr=True, soft_wrap=True).print(f"embomatrix scene: {sentence}", highlight=False, markup=False)
-    return typer.Exit(2)
+            "folder with --out",
+        )

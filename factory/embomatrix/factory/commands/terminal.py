@@ -1,11 +1,10 @@
 """Terminal output of the factory's commands: progress bars, user errors and tables of figures."""
 
 import contextlib
+import functools
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NoReturn
 
-import typer
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -26,12 +25,16 @@ from embomatrix.factory.metrics.figures import (
     write_evaluation,
 )
 from embomatrix.factory.task_import.sources import ProblemSourceError
+from embomatrix.host import failure
 from embomatrix.llm.values import LlmError
 from embomatrix.rpc.status import ClusterError
 from embomatrix.sim.engine import EngineMissingError
 from embomatrix.world.bddl import BddlError
 from embomatrix.world.catalog import CatalogError
 from embomatrix.world.dataset import DatasetError
+
+fail = functools.partial(failure.fail, "factory")
+"""Print a sentence on standard error and exit the command."""
 
 
 def progress(console: Console) -> Progress:
@@ -76,14 +79,6 @@ def user_errors(out: Path | None = None, kept: str = "") -> Iterator[None]:
         fail(f"{out} can't be written ({error.strerror}): free disk space, or name another path{kept}")
     except KeyboardInterrupt:
         fail(f"interrupted{kept}", status=130)
-
-
-def fail(sentence: str, status: int = 2) -> NoReturn:
-    """Print a sentence on standard error and exit the command."""
-    Console(stderr=True).print(
-        f"embomatrix factory: {sentence}", highlight=False, markup=False, soft_wrap=True
-    )
-    raise typer.Exit(status) from None
 
 
 def report_evaluation(evaluation: EvaluationFigures, json_file: Path | None) -> None:

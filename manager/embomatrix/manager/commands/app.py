@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path  # typer evaluates the annotation
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
+from embomatrix.host.failure import fail
 from embomatrix.rpc.logs import LogFormat, hide, log_to_stderr, without_secrets
+from embomatrix.rpc.options import Ca, LogLines, Manager, Token
 
 if TYPE_CHECKING:
     from embomatrix.manager.settings import ManagerSettings
@@ -27,21 +30,9 @@ token_app = typer.Typer(
 )
 app.add_typer(token_app, name="token")
 T = TypeVar("T")
+_refuse = functools.partial(fail, "manager")
+"""Print one sentence and exit with status 2."""
 
-Token = Annotated[str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="Token, or @FILE.", show_default=False)]
-AdminToken = Annotated[
-    str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="Token of an admin, or @FILE.", show_default=False)
-]
-Manager = Annotated[
-    str,
-    typer.Option("--manager", "--address", help="HOST:PORT of the manager.", envvar="EMBOMATRIX_MANAGER"),
-]
-Ca = Annotated[
-    Path | None,
-    typer.Option(
-        envvar="EMBOMATRIX_CA", help="CA certificate (ca.pem) of a manager with TLS.", show_default=False
-    ),
-]
 DataDir = Annotated[
     Path | None, typer.Option(help="Folder of bundles and the state file.", show_default=False)
 ]
@@ -85,9 +76,6 @@ Audit = Annotated[
         help="Audit the results of all runs on other workers. Default: if other machines may join.",
         show_default=False,
     ),
-]
-LogLines = Annotated[
-    LogFormat, typer.Option(help="Format of log lines: human or json.", envvar="EMBOMATRIX_LOG_FORMAT")
 ]
 
 
@@ -253,12 +241,6 @@ def _log_to_stderr(level: str, log_format: LogFormat) -> None:
         _refuse(f"--log-level {level!r}: {error}")
 
 
-def _refuse(sentence: str) -> NoReturn:
-    """Print one sentence and exit with status 2, without a traceback."""
-    typer.echo(f"embomatrix manager: {sentence}", err=True)
-    raise typer.Exit(2)
-
-
 @token_app.command()
 def issue(
     role: Annotated[str, typer.Option(help="Role: join, worker, trainer, viewer or admin.")],
@@ -267,7 +249,7 @@ def issue(
         float, typer.Option(min=0.0, help="Validity in hours; 0: until revoked, or one day for a join token.")
     ] = 0.0,
     manager: Manager = "127.0.0.1:50070",
-    token: AdminToken = "",
+    token: Token = "",
     ca: Ca = None,
 ) -> None:
     """Issue a token. It is shown once: the manager keeps only a hash."""
@@ -290,7 +272,7 @@ def issue(
 
 
 @token_app.command(name="list")
-def list_(manager: Manager = "127.0.0.1:50070", token: AdminToken = "", ca: Ca = None) -> None:
+def list_(manager: Manager = "127.0.0.1:50070", token: Token = "", ca: Ca = None) -> None:
     """List the valid tokens by id."""
     from rich.console import Console
     from rich.table import Table
@@ -305,7 +287,7 @@ def list_(manager: Manager = "127.0.0.1:50070", token: AdminToken = "", ca: Ca =
 def revoke(
     token_id: Annotated[str, typer.Argument(help="Token id, as `list` shows it.")],
     manager: Manager = "127.0.0.1:50070",
-    token: AdminToken = "",
+    token: Token = "",
     ca: Ca = None,
 ) -> None:
     """Revoke a token. Worker sessions that it opened end at once."""

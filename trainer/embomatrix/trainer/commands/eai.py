@@ -2,11 +2,12 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
+from embomatrix.host.failure import fail
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.eai.environment import JudgeEnvironment, default_folder, install
 from embomatrix.trainer.eai.judge import NativeJudge
@@ -31,7 +32,7 @@ def install_command(
     try:
         found = install(folder, console.print)
     except TrainerError as error:
-        _exit("install", error)
+        fail("eai install", str(error))
     console.print(f"EAI's judge is installed in {found.folder}")
     console.print(f"import its tasks: embomatrix factory import --eai {found.package_root}")
     if folder is not None and folder != default_folder():
@@ -53,9 +54,9 @@ def judge_command(
             results = [_result(judge, known, entry) for entry in given]
         out.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
-        _exit("judge", TrainerError(f"{out} can't be written ({error.strerror}): pass another file"))
+        fail("eai judge", f"{out} can't be written ({error.strerror}): pass another file")
     except TrainerError as error:
-        _exit("judge", error)
+        fail("eai judge", str(error))
     counts = {
         name: sum(bool(entry[name]) for entry in results)
         for name in ("official", "exact", "executed", "lost")
@@ -95,10 +96,3 @@ def _result(judge: NativeJudge, known: set[str], entry: dict[str, str]) -> dict[
         "goals": list(found.goals),
         "errors": dict(found.errors),
     }
-
-
-def _exit(command: str, error: TrainerError) -> NoReturn:
-    Console(stderr=True, soft_wrap=True).print(
-        f"embomatrix eai {command}: {error}", highlight=False, markup=False
-    )
-    raise typer.Exit(2) from None

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from embomatrix.host.failure import fail
 from embomatrix.trainer.config.errors import TrainerError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
@@ -30,10 +31,7 @@ def import_gguf_command(
     try:
         import_gguf(source, out)
     except TrainerError as error:
-        Console(stderr=True, soft_wrap=True).print(
-            f"embomatrix model: {error}", highlight=False, markup=False
-        )
-        raise typer.Exit(2) from None
+        fail("model", str(error))
     Console().print(
         f"model written to {out}: train it with `embomatrix train --model {out}`", highlight=False
     )

@@ -7,15 +7,17 @@ import functools
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
+from embomatrix.host.failure import INTERRUPTED, fail
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.logs import LogFormat, log_to_stderr
+from embomatrix.rpc.options import Ca, Manager, Token
 from embomatrix.trainer.config.errors import TrainerError
 
 if TYPE_CHECKING:
@@ -27,12 +29,6 @@ if TYPE_CHECKING:
 Connect = Callable[[], ClusterClient]
 
 _DATASET = Annotated[Path, typer.Option(help="Dataset folder from `embomatrix factory build`.")]
-_MANAGER = Annotated[str, typer.Option(help="HOST:PORT of the manager.", envvar="EMBOMATRIX_MANAGER")]
-_TOKEN = Annotated[
-    str,
-    typer.Option(help="Token of the trainer role, or @FILE.", envvar="EMBOMATRIX_TOKEN"),
-]
-_CA = Annotated[Path | None, typer.Option(help="The ca.pem of a manager with TLS.", envvar="EMBOMATRIX_CA")]
 _LOG_FORMAT = Annotated[
     LogFormat | None,
     typer.Option(
@@ -72,7 +68,7 @@ _PROCESSES = Annotated[
 
 def train(
     dataset: _DATASET = Path("build/dataset"),
-    manager: _MANAGER = DEFAULT_ADDRESS,
+    manager: Manager = DEFAULT_ADDRESS,
     model: _MODEL = "tiny",
     out: _OUT = Path("runs/train"),
     minutes: Annotated[float | None, typer.Option(min=0, help="Minutes of GRPO. Default: 5.")] = None,
@@ -86,8 +82,8 @@ def train(
     processes: _PROCESSES = None,
     device: _DEVICE = None,
     track: _TRACK = None,
-    token: _TOKEN = "",
-    ca: _CA = None,
+    token: Token = "",
+    ca: Ca = None,
     log_format: _LOG_FORMAT = None,
 ) -> None:
     """Train a policy: imitation of the oracle, then GRPO on the cluster, with held-out evaluation before and after."""
@@ -167,19 +163,13 @@ def _report_errors(command: str, out: Path | None = None) -> Iterator[None]:
     try:
         yield
     except (TrainerError, ClusterError) as error:
-        _exit(command, str(error), 2)
+        fail(command, str(error))
     except KeyboardInterrupt:
         from embomatrix.trainer.run.starting import has_checkpoint
 
         saved = out is not None and has_checkpoint(out)
-        _exit(command, f"interrupted: continue with `--resume --out={out}`" if saved else "interrupted", 130)
-
-
-def _exit(command: str, sentence: str, status: int) -> NoReturn:
-    Console(stderr=True, soft_wrap=True).print(
-        f"embomatrix {command}: {sentence}", highlight=False, markup=False
-    )
-    raise typer.Exit(status) from None
+        sentence = f"interrupted: continue with `--resume --out={out}`" if saved else "interrupted"
+        fail(command, sentence, INTERRUPTED)
 
 
 def _coefficients(options: Sequence[str]) -> dict[str, str]:

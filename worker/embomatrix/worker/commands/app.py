@@ -12,9 +12,10 @@ from rich.table import Table
 
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.client import ClientLimits, ClusterClient
+from embomatrix.rpc.options import Ca, Manager, Token
 from embomatrix.rpc.status import ClusterError, ManagerUnreachableError
 from embomatrix.worker.commands.install import install
-from embomatrix.worker.commands.options import Ca, Manager, Token, check_engine, fail, parse
+from embomatrix.worker.commands.options import check_engine, fail, parse
 from embomatrix.worker.commands.ray import ray_workers
 from embomatrix.worker.commands.run import run
 from embomatrix.worker.commands.status import status

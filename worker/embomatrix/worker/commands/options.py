@@ -1,15 +1,16 @@
 """Options of the subcommands of `embomatrix worker`, and one-sentence errors instead of tracebacks."""
 
+import functools
 import importlib.util
 import platform
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Final, NoReturn
+from typing import Annotated, Any, Final
 
 import typer
 from pydantic import ValidationError
-from rich.console import Console
 
+from embomatrix.host import failure
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.worker.host.owner_policy import Preferences
 from embomatrix.worker.host.settings import WorkerSettings
@@ -19,24 +20,9 @@ EXPECTED: Final[Mapping[str, str]] = {
     "name": "expected up to 64 letters, digits, '.', '_' and '-'",
 }
 """Expected values of settings whose validator only knows a pattern."""
+fail = functools.partial(failure.fail, "worker")
+"""Print a sentence to standard error and exit with status 2."""
 
-Manager = Annotated[
-    str, typer.Option(help="HOST:PORT of the manager, or of several: A,B.", envvar="EMBOMATRIX_MANAGER")
-]
-Token = Annotated[
-    str,
-    typer.Option(
-        envvar="EMBOMATRIX_TOKEN",
-        help="Token of the worker role, or @FILE that contains it.",
-        show_default=False,
-    ),
-]
-Ca = Annotated[
-    Path | None,
-    typer.Option(
-        envvar="EMBOMATRIX_CA", help="The ca.pem of a manager that serves by TLS.", show_default=False
-    ),
-]
 StateDir = Annotated[
     Path | None,
     typer.Option(help="Folder of this machine's credentials and its workers' status.", show_default=False),
@@ -72,11 +58,3 @@ def check_engine() -> None:
             f"{platform.machine()} does not have: use Python 3.11 on x86-64 Linux and install it with "
             "`pip install 'embomatrix[worker]'`"
         )
-
-
-def fail(sentence: str) -> NoReturn:
-    """Print a sentence to standard error and exit with status 2."""
-    Console(stderr=True, soft_wrap=True).print(
-        f"embomatrix worker: {sentence}", highlight=False, markup=False
-    )
-    raise typer.Exit(2)

@@ -18,8 +18,9 @@ import typer
 
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.logs import LogFormat, bind, hide, log_to_stderr
+from embomatrix.rpc.options import Ca, LogLines, Manager, Token
 from embomatrix.rpc.status import ClusterError
-from embomatrix.worker.commands.options import Ca, Manager, StateDir, Token, check_engine, fail, parse
+from embomatrix.worker.commands.options import StateDir, check_engine, fail, parse
 from embomatrix.worker.host.machine import HostMachine
 from embomatrix.worker.host.owner_policy import Preferences
 from embomatrix.worker.host.resources import measure
@@ -64,7 +65,6 @@ Config = Annotated[
 ]
 Once = Annotated[bool, typer.Option("--once", help="Exit if the manager can't be reached.")]
 Verbose = Annotated[bool, typer.Option("--verbose", help="Log every rollout.")]
-LogLines = Annotated[LogFormat, typer.Option(help="Format of log lines.", envvar="EMBOMATRIX_LOG_FORMAT")]
 
 
 def run(
