@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
-import grpc
+from grpc.aio import ServicerContext as Context
 
 from embomatrix.manager.runtime.event_loop import ManagerRuntime
 from embomatrix.manager.runtime.revocation import Revocation
@@ -27,100 +27,84 @@ class AdminServicer(admin_service_pb2_grpc.AdminServiceServicer):
         self._gate = gate
         self._revocation = revocation
 
-    async def ListWorkers(
-        self, request: pb.ListWorkersRequest, context: grpc.aio.ServicerContext
-    ) -> pb.ListWorkersResponse:
+    async def ListWorkers(self, request: pb.ListWorkersRequest, context: Context) -> pb.ListWorkersResponse:
         async with translate(context):
             workers = [worker_info_to_proto(info) for info in worker_infos(self._runtime)]
             verdict = health(overview(self._runtime), paused=self._runtime.paused, now_s=time.time())
         return pb.ListWorkersResponse(workers=workers, health=verdict.sentence, mood=verdict.mood)
 
-    async def ListRuns(
-        self, request: pb.ListRunsRequest, context: grpc.aio.ServicerContext
-    ) -> pb.ListRunsResponse:
+    async def ListRuns(self, request: pb.ListRunsRequest, context: Context) -> pb.ListRunsResponse:
         async with translate(context):
             found = await self._runtime.history.kept() if request.closed else run_infos(self._runtime)
             runs = [run_info_to_proto(info) for info in found]
         return pb.ListRunsResponse(runs=runs)
 
-    async def GetRun(self, request: pb.GetRunRequest, context: grpc.aio.ServicerContext) -> pb.GetRunResponse:
+    async def GetRun(self, request: pb.GetRunRequest, context: Context) -> pb.GetRunResponse:
         async with translate(context):
             summary = await self._runtime.history.summary(request.run_id)
         return run_summary_to_proto(summary)
 
-    async def ReadEvents(
-        self, request: pb.ReadEventsRequest, context: grpc.aio.ServicerContext
-    ) -> pb.ReadEventsResponse:
+    async def ReadEvents(self, request: pb.ReadEventsRequest, context: Context) -> pb.ReadEventsResponse:
         async with translate(context):
             page = await self._runtime.history.events(request.run_id, request.after, request.limit)
         return event_page_to_proto(page)
 
     async def ExplainRollout(
-        self, request: pb.ExplainRolloutRequest, context: grpc.aio.ServicerContext
+        self, request: pb.ExplainRolloutRequest, context: Context
     ) -> pb.ExplainRolloutResponse:
         async with translate(context):
             found = self._runtime.history.explain(request.rollout_id)
         return explanation_to_proto(found)
 
-    async def DrainWorker(
-        self, request: pb.DrainWorkerRequest, context: grpc.aio.ServicerContext
-    ) -> pb.DrainWorkerResponse:
+    async def DrainWorker(self, request: pb.DrainWorkerRequest, context: Context) -> pb.DrainWorkerResponse:
         async with translate(context):
             self._runtime.drain_worker(request.worker_id)
         return pb.DrainWorkerResponse()
 
     async def ResumeWorker(
-        self, request: pb.ResumeWorkerRequest, context: grpc.aio.ServicerContext
+        self, request: pb.ResumeWorkerRequest, context: Context
     ) -> pb.ResumeWorkerResponse:
         async with translate(context):
             self._runtime.resume_worker(request.worker_id)
         return pb.ResumeWorkerResponse()
 
-    async def GetPlan(
-        self, request: pb.GetPlanRequest, context: grpc.aio.ServicerContext
-    ) -> pb.GetPlanResponse:
+    async def GetPlan(self, request: pb.GetPlanRequest, context: Context) -> pb.GetPlanResponse:
         async with translate(context):
             cells = [plan_cell_to_proto(cell) for cell in plan(self._runtime, request.run_id)]
         return pb.GetPlanResponse(cells=cells)
 
     async def PauseDispatch(
-        self, request: pb.PauseDispatchRequest, context: grpc.aio.ServicerContext
+        self, request: pb.PauseDispatchRequest, context: Context
     ) -> pb.PauseDispatchResponse:
         async with translate(context):
             await self._runtime.pause_dispatch()
         return pb.PauseDispatchResponse()
 
     async def ResumeDispatch(
-        self, request: pb.ResumeDispatchRequest, context: grpc.aio.ServicerContext
+        self, request: pb.ResumeDispatchRequest, context: Context
     ) -> pb.ResumeDispatchResponse:
         async with translate(context):
             await self._runtime.resume_dispatch()
         return pb.ResumeDispatchResponse()
 
-    async def IssueToken(
-        self, request: pb.IssueTokenRequest, context: grpc.aio.ServicerContext
-    ) -> pb.IssueTokenResponse:
+    async def IssueToken(self, request: pb.IssueTokenRequest, context: Context) -> pb.IssueTokenResponse:
         async with translate(context):
             role = role_from_proto(request.role)
             token, token_id = await self._gate.issue(role, valid_s=request.valid_s, label=request.label)
         return pb.IssueTokenResponse(token=token, token_id=token_id)
 
-    async def ListTokens(
-        self, request: pb.ListTokensRequest, context: grpc.aio.ServicerContext
-    ) -> pb.ListTokensResponse:
+    async def ListTokens(self, request: pb.ListTokensRequest, context: Context) -> pb.ListTokensResponse:
         async with translate(context):
             tokens = [token_info_to_proto(info) for info in self._gate.infos()]
         return pb.ListTokensResponse(tokens=tokens)
 
-    async def RevokeToken(
-        self, request: pb.RevokeTokenRequest, context: grpc.aio.ServicerContext
-    ) -> pb.RevokeTokenResponse:
+    async def RevokeToken(self, request: pb.RevokeTokenRequest, context: Context) -> pb.RevokeTokenResponse:
         async with translate(context):
             await self._revocation.revoke_token(request.token_id)
         return pb.RevokeTokenResponse()
 
     async def RevokeWorker(
-        self, request: pb.RevokeWorkerRequest, context: grpc.aio.ServicerContext
+        self, request: pb.RevokeWorkerRequest, context: Context
     ) -> pb.RevokeWorkerResponse:
         async with translate(context):
             await self._revocation.revoke_worker(request.worker_id, request.reason[:200] or "by the operator")

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Sequence
-from typing import TYPE_CHECKING, Final
+from collections.abc import AsyncIterator
+from typing import TYPE_CHECKING, Final, TypeVar
 
-import grpc
+from grpc.aio import ServicerContext as Context
 
 from embomatrix.manager.observe.training_reports import TrainingBook
 from embomatrix.manager.runtime.results import BatchLog
 from embomatrix.manager.runtime.runs import BATCH_ROLLOUTS, Runs
-from embomatrix.manager.store.protocol import ResultRow
 from embomatrix.proto.v1 import rollout_service_pb2 as pb
 from embomatrix.proto.v1 import rollout_service_pb2_grpc
 from embomatrix.rpc.logs import bind
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
 
 SLICE: Final = 128
 """Rollouts of a batch converted without a pause, which takes about 2 ms."""
+ResultsT = TypeVar("ResultsT", pb.ExecuteResponse, pb.WaitExecutionResponse)
 
 
 class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
@@ -48,7 +48,7 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
         self._authority = authority.decode("ascii")
 
     async def GetCapabilities(
-        self, request: pb.GetCapabilitiesRequest, context: grpc.aio.ServicerContext
+        self, request: pb.GetCapabilitiesRequest, context: Context
     ) -> pb.GetCapabilitiesResponse:
         return pb.GetCapabilitiesResponse(
             protocol_low=SPOKEN.oldest,
@@ -59,9 +59,7 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
             ca_certificate=self._authority,
         )
 
-    async def OpenRun(
-        self, request: pb.OpenRunRequest, context: grpc.aio.ServicerContext
-    ) -> pb.OpenRunResponse:
+    async def OpenRun(self, request: pb.OpenRunRequest, context: Context) -> pb.OpenRunResponse:
         async with translate(context):
             spoken = request.protocol_version
             agree(SPOKEN, VersionRange(spoken, spoken), us="this manager", them="the trainer")
@@ -69,7 +67,7 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
         return pb.OpenRunResponse(run_id=run_id)
 
     async def AnnounceLookahead(
-        self, request: pb.AnnounceLookaheadRequest, context: grpc.aio.ServicerContext
+        self, request: pb.AnnounceLookaheadRequest, context: Context
     ) -> pb.AnnounceLookaheadResponse:
         async with translate(context):
             bind("run", request.run_id)
@@ -78,34 +76,26 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
         return pb.AnnounceLookaheadResponse(answers=[lookahead_answer_to_proto(one) for one in answers])
 
     async def Execute(
-        self, request: pb.ExecuteRequest, context: grpc.aio.ServicerContext
+        self, request: pb.ExecuteRequest, context: Context
     ) -> AsyncIterator[pb.ExecuteResponse]:
         async with translate(context):
             bind("run", request.run_id)
             bind("batch", request.batch_id)
             log = await self._runs.submit(await _batch(request))
-            async for rows in _results(log, 0):
-                self._gate.caller_of(context)  # A revoked token reads no further results.
-                message = pb.ExecuteResponse()
-                _fill(log, rows, message)
+            async for message in self._results(context, log, 0, pb.ExecuteResponse):
                 yield message
 
     async def WaitExecution(
-        self, request: pb.WaitExecutionRequest, context: grpc.aio.ServicerContext
+        self, request: pb.WaitExecutionRequest, context: Context
     ) -> AsyncIterator[pb.WaitExecutionResponse]:
         async with translate(context):
             bind("run", request.run_id)
             bind("batch", request.batch_id)
             log = self._runs.log_of(request.run_id, request.batch_id)
-            async for rows in _results(log, request.after_cursor):
-                self._gate.caller_of(context)
-                message = pb.WaitExecutionResponse()
-                _fill(log, rows, message)
+            async for message in self._results(context, log, request.after_cursor, pb.WaitExecutionResponse):
                 yield message
 
-    async def CancelBatch(
-        self, request: pb.CancelBatchRequest, context: grpc.aio.ServicerContext
-    ) -> pb.CancelBatchResponse:
+    async def CancelBatch(self, request: pb.CancelBatchRequest, context: Context) -> pb.CancelBatchResponse:
         async with translate(context):
             bind("run", request.run_id)
             bind("batch", request.batch_id)
@@ -113,7 +103,7 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
         return pb.CancelBatchResponse()
 
     async def ReportTraining(
-        self, request: pb.ReportTrainingRequest, context: grpc.aio.ServicerContext
+        self, request: pb.ReportTrainingRequest, context: Context
     ) -> pb.ReportTrainingResponse:
         async with translate(context):
             bind("run", request.run_id)
@@ -122,13 +112,29 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
             self._training.note(request.run_id, name, report, at_s=time.time())
         return pb.ReportTrainingResponse()
 
-    async def CloseRun(
-        self, request: pb.CloseRunRequest, context: grpc.aio.ServicerContext
-    ) -> pb.CloseRunResponse:
+    async def CloseRun(self, request: pb.CloseRunRequest, context: Context) -> pb.CloseRunResponse:
         async with translate(context):
             bind("run", request.run_id)
             stats = await self._runs.close_run(request.run_id)
         return pb.CloseRunResponse(stats=run_stats_to_proto(stats))
+
+    async def _results(
+        self, context: Context, log: BatchLog, cursor: int, kind: type[ResultsT]
+    ) -> AsyncIterator[ResultsT]:
+        """Yield stored results after the cursor, and the groups that end with them, until the batch ends."""
+        if cursor > log.last_cursor and log.ended:
+            raise TrimmedError(
+                f"batch {log.batch_id!r} ends at cursor {log.last_cursor}: {cursor} lies beyond it"
+            )
+        async for rows in log.messages(cursor):
+            self._gate.caller_of(context)  # A revoked token reads no further results.
+            message = kind()
+            for row in rows:
+                message.results.add().MergeFromString(row.payload)
+            message.groups.extend(map(group_done_to_proto, log.ends.among(rows)))
+            yield message
+        if log.dropped:
+            raise NotFoundError(f"batch {log.batch_id!r} was discarded: its run was closed")
 
 
 async def _batch(request: pb.ExecuteRequest) -> Batch:
@@ -139,24 +145,3 @@ async def _batch(request: pb.ExecuteRequest) -> Batch:
         rollouts += each("rollouts", rollout_from_proto, part, first=start)
         await asyncio.sleep(0)
     return batch_with(request, tuple(rollouts))
-
-
-async def _results(log: BatchLog, cursor: int) -> AsyncIterator[list[ResultRow]]:
-    """Yield the results after the cursor, as they arrive, until the batch ends."""
-    if cursor > log.last_cursor and log.ended:
-        raise TrimmedError(
-            f"batch {log.batch_id!r} ends at cursor {log.last_cursor}: {cursor} lies beyond it"
-        )
-    async for rows in log.messages(cursor):
-        yield rows
-    if log.dropped:
-        raise NotFoundError(f"batch {log.batch_id!r} was discarded: its run was closed")
-
-
-def _fill(
-    log: BatchLog, rows: Sequence[ResultRow], message: pb.ExecuteResponse | pb.WaitExecutionResponse
-) -> None:
-    """Fill an empty message with stored results and the groups that end with them."""
-    for row in rows:
-        message.results.add().MergeFromString(row.payload)
-    message.groups.extend(map(group_done_to_proto, log.ends.among(rows)))

@@ -2,7 +2,7 @@
 
 from collections.abc import AsyncIterator
 
-import grpc
+from grpc.aio import ServicerContext as Context
 
 from embomatrix.manager.runtime.bundles import BundleStore
 from embomatrix.proto.v1 import scene_service_pb2 as pb
@@ -15,14 +15,14 @@ class SceneServicer(scene_service_pb2_grpc.SceneServiceServicer):
         self._bundles = bundles
 
     async def MissingBundles(
-        self, request: pb.MissingBundlesRequest, context: grpc.aio.ServicerContext
+        self, request: pb.MissingBundlesRequest, context: Context
     ) -> pb.MissingBundlesResponse:
         async with translate(context):
             missing = await self._bundles.missing_or_damaged(list(request.bundle_digests))
         return pb.MissingBundlesResponse(bundle_digests=missing)
 
     async def PutBundle(
-        self, request_iterator: AsyncIterator[pb.PutBundleRequest], context: grpc.aio.ServicerContext
+        self, request_iterator: AsyncIterator[pb.PutBundleRequest], context: Context
     ) -> pb.PutBundleResponse:
         async with translate(context):
             first = await anext(request_iterator, None)
@@ -32,7 +32,7 @@ class SceneServicer(scene_service_pb2_grpc.SceneServiceServicer):
         return pb.PutBundleResponse()
 
     async def GetBundle(
-        self, request: pb.GetBundleRequest, context: grpc.aio.ServicerContext
+        self, request: pb.GetBundleRequest, context: Context
     ) -> AsyncIterator[pb.GetBundleResponse]:
         async with translate(context):
             async for chunk in self._bundles.get(request.bundle_digest):

@@ -7,7 +7,7 @@ import re
 from collections.abc import AsyncIterator, Coroutine, Sequence
 from typing import TYPE_CHECKING, Final
 
-import grpc
+from grpc.aio import ServicerContext as Context
 
 from embomatrix.manager.runtime.event_loop import ManagerRuntime
 from embomatrix.manager.runtime.intake import Heartbeat
@@ -58,9 +58,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
         self._gate = gate
         self._lease_ttl_s = lease_ttl_s
 
-    async def Register(
-        self, request: pb.RegisterRequest, context: grpc.aio.ServicerContext
-    ) -> pb.RegisterResponse:
+    async def Register(self, request: pb.RegisterRequest, context: Context) -> pb.RegisterResponse:
         async with translate(context):
             _check_name(request.worker_id)
             bind("worker", request.worker_id)
@@ -86,7 +84,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
         )
 
     async def Session(  # type: ignore[override]  # gRPC also takes a coroutine that writes by the context
-        self, request_iterator: AsyncIterator[pb.SessionRequest], context: grpc.aio.ServicerContext
+        self, request_iterator: AsyncIterator[pb.SessionRequest], context: Context
     ) -> None:
         async with translate(context):
             first = await _first_state(request_iterator)
@@ -98,9 +96,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
                 await self._take(link, first, resync=True)
                 await _until_one_ends(self._listen(link, request_iterator), _speak(link, context))
 
-    async def Heartbeat(
-        self, request: pb.HeartbeatRequest, context: grpc.aio.ServicerContext
-    ) -> pb.HeartbeatResponse:
+    async def Heartbeat(self, request: pb.HeartbeatRequest, context: Context) -> pb.HeartbeatResponse:
         async with translate(context):
             self._check_session(context, self._runtime.registry.find_by_id(request.session_id))
             interval_s = self._runtime.process_heartbeat(
@@ -116,7 +112,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
         return pb.HeartbeatResponse(next_interval_s=interval_s)
 
     async def FetchBundle(
-        self, request: pb.FetchBundleRequest, context: grpc.aio.ServicerContext
+        self, request: pb.FetchBundleRequest, context: Context
     ) -> AsyncIterator[pb.FetchBundleResponse]:
         async with translate(context):
             session = self._runtime.registry.find_by_id(request.session_id)
@@ -128,9 +124,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
             async for chunk in self._runtime.bundles.get(request.bundle_digest):
                 yield pb.FetchBundleResponse(chunk=chunk)
 
-    async def Deregister(
-        self, request: pb.DeregisterRequest, context: grpc.aio.ServicerContext
-    ) -> pb.DeregisterResponse:
+    async def Deregister(self, request: pb.DeregisterRequest, context: Context) -> pb.DeregisterResponse:
         async with translate(context):
             session = self._runtime.registry.find(request.session_id, request.session_epoch)
             self._check_session(context, session)
@@ -138,7 +132,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
             self._runtime.end_session(session, "it left", left, WorkerStanding.LEFT)
         return pb.DeregisterResponse()
 
-    def _check_session(self, context: grpc.aio.ServicerContext, session: WorkerSession) -> None:
+    def _check_session(self, context: Context, session: WorkerSession) -> None:
         self._gate.check_session(context, session.worker_id, session.credential_id)
 
     async def _listen(self, link: WorkerLink, requests: AsyncIterator[pb.SessionRequest]) -> None:
@@ -161,7 +155,7 @@ def _results(request: pb.SessionRequest, first: int) -> tuple[LeaseResult, ...]:
     return each("results", lease_result_from_proto, part, first=first)
 
 
-async def _speak(link: WorkerLink, context: grpc.aio.ServicerContext) -> None:
+async def _speak(link: WorkerLink, context: Context) -> None:
     while True:
         for message in _messages(await link.take()):
             await context.write(message)
