@@ -49,42 +49,24 @@ redis.call('HSET', KEYS[2], 'holder', ARGV[1], 'address', ARGV[2])
 redis.call('PEXPIRE', KEYS[2], ARGV[3])
 return {epoch, ARGV[2], 1}
 """
-_RENEW: Final = (
-    _GUARD
-    + """
+_RENEW: Final = """
 redis.call('HSET', KEYS[2], 'holder', ARGV[2], 'address', ARGV[3])
 redis.call('PEXPIRE', KEYS[2], ARGV[4])
-return 1
 """
-)
-_RESIGN: Final = (
-    _GUARD
-    + """
+_RESIGN: Final = """
 redis.call('DEL', KEYS[2])
-return 1
 """
-)
-_PUT_WORKERS: Final = (
-    _GUARD
-    + """
+_PUT_WORKERS: Final = """
 redis.call('DEL', KEYS[2])
 for index = 2, #ARGV do redis.call('SADD', KEYS[2], ARGV[index]) end
-return 1
 """
-)
-_OPEN_RUN: Final = (
-    _GUARD
-    + """
+_OPEN_RUN: Final = """
 if redis.call('HSETNX', KEYS[2], ARGV[2], ARGV[3]) == 1 then
     redis.call('RPUSH', KEYS[3], ARGV[2])
     redis.call('HSET', KEYS[4], ARGV[2], ARGV[4])
 end
-return 1
 """
-)
-_PUT_BATCH: Final = (
-    _GUARD
-    + """
+_PUT_BATCH: Final = """
 if redis.call('HEXISTS', KEYS[2], ARGV[2]) == 0 then return 'no_run' end
 local known = redis.call('HGET', KEYS[3], 'digest')
 if known then
@@ -95,10 +77,7 @@ redis.call('HSET', KEYS[3], 'digest', ARGV[4], 'payload', ARGV[5])
 redis.call('RPUSH', KEYS[4], ARGV[3])
 return 'created'
 """
-)
-_APPEND: Final = (
-    _GUARD
-    + """
+_APPEND: Final = """
 local added, index = 0, 2
 for key = 2, #KEYS, 3 do
     local known = redis.call('EXISTS', KEYS[key]) == 1
@@ -114,33 +93,20 @@ for key = 2, #KEYS, 3 do
 end
 return added
 """
-)
-_DROP_BATCH: Final = (
-    _GUARD
-    + """
+_DROP_BATCH: Final = """
 redis.call('DEL', KEYS[2], KEYS[3], KEYS[4])
 redis.call('LREM', KEYS[5], 0, ARGV[2])
-return 1
 """
-)
-_CLOSE_RUN: Final = (
-    _GUARD
-    + """
+_CLOSE_RUN: Final = """
 redis.call('HDEL', KEYS[2], ARGV[2])
 redis.call('LREM', KEYS[3], 0, ARGV[2])
 redis.call('DEL', KEYS[4])
 redis.call('HDEL', KEYS[5], ARGV[2])
 redis.call('HDEL', KEYS[6], ARGV[2])
-return 1
 """
-)
-_PUT_ROWS: Final = (
-    _GUARD
-    + """
+_PUT_ROWS: Final = """
 for index = 2, #ARGV, 2 do redis.call('HSET', KEYS[2], ARGV[index], ARGV[index + 1]) end
-return 1
 """
-)
 
 
 class RedisStore:
@@ -271,9 +237,10 @@ class RedisStore:
         return f"{self._prefix}:{name}"
 
     async def _script(self, source: str, names: Sequence[str], *values: str | bytes | int) -> Any:
+        """Run a script, if this manager still leads. Its ``KEYS`` are the epoch and these names."""
         keys = [self._key("epoch"), *map(self._key, names)]
         # EVAL instead of EVALSHA: scripts need no reload after a server restart.
-        return await self._call(self._redis.eval(source, len(keys), *keys, self._epoch, *values))
+        return await self._call(self._redis.eval(_GUARD + source, len(keys), *keys, self._epoch, *values))
 
     async def _call(self, answer: Any) -> Any:
         try:
