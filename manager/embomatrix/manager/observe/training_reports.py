@@ -4,7 +4,7 @@ They are not stored: after a restart the curves continue from the next report.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from embomatrix.rpc.status import NotFoundError
@@ -38,65 +38,53 @@ class Curves:
     figures: dict[str, list[float | None]]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class TrainingDetail:
     """All reports of a run. ``plans`` belong to step ``plans_step``."""
 
     run: TrainingView
-    phases: list[Curves]
-    plans_step: int
-    plans: list[SampledPlan]
-
-
-@dataclass(slots=True, eq=False)
-class _Record:
-    name: str
-    phases: dict[str, Curves] = field(default_factory=dict)
-    plans: tuple[SampledPlan, ...] = ()
+    phases: list[Curves] = field(default_factory=list)
     plans_step: int = 0
-    phase: str = ""
-    step: int = 0
-    reported_s: float = 0.0
-    revision: int = 0
+    plans: list[SampledPlan] = field(default_factory=list)
 
 
 class TrainingBook:
     """Runs by id, latest report last. Beyond ``RUNS_KEPT`` the first run is dropped."""
 
     def __init__(self) -> None:
-        self._runs: dict[str, _Record] = {}
+        self._runs: dict[str, TrainingDetail] = {}
 
     def note(self, run_id: str, name: str, report: TrainingReport, *, at_s: float) -> None:
         """Add a report. A repeated step is updated; a lower step discards all later ones."""
-        record = self._runs.pop(run_id, None) or _Record(name)
-        self._runs[run_id] = record
+        first = TrainingDetail(TrainingView(run_id, name, "", 0, 0.0, 0))
+        detail = self._runs[run_id] = self._runs.pop(run_id, first)
         while len(self._runs) > RUNS_KEPT:
             del self._runs[next(iter(self._runs))]
-        if report.figures and (report.phase in record.phases or len(record.phases) < PHASES_KEPT):
-            curves = record.phases.setdefault(report.phase, Curves(report.phase, [], {}))
-            _add(curves, report.step, report.figures)
+        if report.figures:
+            curves = next((known for known in detail.phases if known.phase == report.phase), None)
+            if curves is None and len(detail.phases) < PHASES_KEPT:
+                curves = Curves(report.phase, [], {})
+                detail.phases.append(curves)
+            if curves is not None:
+                _add(curves, report.step, report.figures)
         if report.plans:
-            record.plans, record.plans_step = report.plans[:PLANS], report.step
-        record.phase, record.step, record.reported_s = report.phase, report.step, at_s
-        record.revision += 1
+            detail.plans, detail.plans_step = list(report.plans[:PLANS]), report.step
+        revision = detail.run.revision + 1
+        detail.run = replace(
+            detail.run, phase=report.phase, step=report.step, reported_s=at_s, revision=revision
+        )
 
     def views(self) -> list[TrainingView]:
         """Return the runs, latest report first."""
-        return [_view(run_id, record) for run_id, record in reversed(self._runs.items())]
+        return [detail.run for detail in reversed(self._runs.values())]
 
     def detail(self, run_id: str) -> TrainingDetail:
-        """Return all reports of a run. Raises NotFoundError."""
-        record = self._runs.get(run_id)
-        if record is None:
+        """Return all reports of a run, which later reports change. Raises NotFoundError."""
+        if run_id not in self._runs:
             raise NotFoundError(
                 f"no training of run {run_id!r} was reported to this manager: the latest {RUNS_KEPT} are kept"
             )
-        phases = list(record.phases.values())
-        return TrainingDetail(_view(run_id, record), phases, record.plans_step, list(record.plans))
-
-
-def _view(run_id: str, record: _Record) -> TrainingView:
-    return TrainingView(run_id, record.name, record.phase, record.step, record.reported_s, record.revision)
+        return self._runs[run_id]
 
 
 def _add(curves: Curves, step: int, figures: Mapping[str, float]) -> None:
