@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from tests.fakes.worker import completed
 
-from embomatrix.manager.control.reputation import Auditor, AuditRules, Reputation, Ruling, judge, opinion_of
+from embomatrix.manager.control.reputation import Auditor, AuditRules, Reputation, judge, opinion_of
 from embomatrix.manager.runtime.serialization import reputation_of, reputation_row
 from embomatrix.reward.breakdown import AtomResult
 
@@ -32,10 +32,10 @@ def test_workers_without_a_fingerprint_are_compared_by_facts():
 
 def test_only_an_opinion_against_two_that_agree_is_wrong():
     first, second, third = opinion("w1"), opinion("w2"), opinion("w3", trace_digest="invented")
-    assert judge([first]).ruling is Ruling.OPEN
-    assert judge([first, third]).ruling is Ruling.OPEN
-    assert judge([first, third, second]).wrong == (1,)
-    assert judge([first, third, opinion("w2", trace_digest="too")]).ruling is Ruling.SPLIT
+    assert judge([first]) is None
+    assert judge([first, third]) is None
+    assert judge([first, third, second]) == ((0, 2), (1,))
+    assert judge([first, third, opinion("w2", trace_digest="too")]) is None
     # Another platform agrees with two results that differ only in their traces: neither is proved wrong.
     assert judge([first, third, opinion("w2", OTHER)]).wrong == ()
 

@@ -74,7 +74,7 @@ class ClusterState:
         stats = self.stats(run_id)
         self._closed = _sum([self._closed, stats])
         self.scheduler.prewarm.forget(run_id)
-        self.dispatcher.forget_run(run_id)
+        self.dispatcher.state.runs.forget(run_id)
         return stats, commands
 
     def needed_scenes(self) -> frozenset[str]:
@@ -101,7 +101,7 @@ class ClusterState:
 
     def totals(self) -> RunStats:
         """Return the summed counters of all runs, closed ones included."""
-        open_runs = [self.stats(run_id) for run_id in self.dispatcher.runs]
+        open_runs = [self.stats(run_id) for run_id in self.dispatcher.state.runs]
         return _sum([self._closed, *open_runs])
 
     def explain(self, rollout_id: str) -> tuple[list[RolloutStep], str]:

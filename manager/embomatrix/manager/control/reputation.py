@@ -10,9 +10,8 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from enum import Enum, auto
 from itertools import combinations
-from typing import Final
+from typing import Final, NamedTuple
 
 from embomatrix.rpc.wire.values import Completed
 
@@ -74,36 +73,25 @@ def opinion_of(worker_id: str, platform: Mapping[str, str], completed: Completed
     return Opinion(worker_id, platform, (completed.trace_digest, *tiers), digest)
 
 
-class Ruling(Enum):
-    """Decision of a case."""
+class AuditVerdict(NamedTuple):
+    """Indices of the right and of the wrong opinions."""
 
-    OPEN = auto()
-    """Another execution must decide."""
-    AGREED = auto()
-    SPLIT = auto()
-    """All of them differ."""
+    right: tuple[int, ...]
+    wrong: tuple[int, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class AuditVerdict:
-    """``right`` and ``wrong`` index the opinions; both are empty unless the ruling is AGREED."""
+def judge(opinions: Sequence[Opinion]) -> AuditVerdict | None:
+    """Decide a case: two opinions that agree are right, and only an opinion that contradicts both is wrong.
 
-    ruling: Ruling
-    right: tuple[int, ...] = ()
-    wrong: tuple[int, ...] = ()
-
-
-def judge(opinions: Sequence[Opinion]) -> AuditVerdict:
-    """Decide a case: two opinions that agree are right, and only an opinion that contradicts both is wrong."""
+    None if no two opinions agree.
+    """
     for one, two in combinations(range(len(opinions)), 2):
         if opinions[one].agrees(opinions[two]):
             others = [at for at in range(len(opinions)) if at not in (one, two)]
             right = [opinions[one], opinions[two]]
             wrong = tuple(at for at in others if not any(opinions[at].agrees(o) for o in right))
-            return AuditVerdict(
-                Ruling.AGREED, tuple(at for at in range(len(opinions)) if at not in wrong), wrong
-            )
-    return AuditVerdict(Ruling.SPLIT if len(opinions) >= OPINIONS else Ruling.OPEN)
+            return AuditVerdict(tuple(at for at in range(len(opinions)) if at not in wrong), wrong)
+    return None
 
 
 @dataclass(slots=True)

@@ -76,7 +76,7 @@ class _Cluster(Collector):
         yield _histograms("embo_rollout_seconds", "Time of completed rollouts by phase.", "phase", phases)
         yield _attempts(event_log.attempts)
         yield _counter("embo_redispatched", "Re-dispatched leases.", totals.redispatched)
-        yield _counter("embo_lease_expired", "Expired leases.", dispatcher.expired)
+        yield _counter("embo_lease_expired", "Expired leases.", dispatcher.state.leases.expired)
         yield _counter("embo_stale_results", "Late results that were rejected.", totals.stale_results)
         won = event_log.hedges_won
         hedges = {"true": won, "false": max(0, totals.hedged - won)}

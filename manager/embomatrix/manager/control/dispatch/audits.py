@@ -19,7 +19,7 @@ from embomatrix.manager.control.dispatch.leasing import (
 from embomatrix.manager.control.dispatch.outcomes import close_case, deliver, return_lease
 from embomatrix.manager.control.dispatch.records import LeaseRecord, RolloutRecord
 from embomatrix.manager.control.dispatch.state import AuditCase, DispatchState
-from embomatrix.manager.control.reputation import Ruling, judge, opinion_of
+from embomatrix.manager.control.reputation import OPINIONS, judge, opinion_of
 from embomatrix.manager.control.workers import WorkerRecord
 from embomatrix.rpc.wire.run_log import RolloutStepKind
 from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, Outcome
@@ -97,7 +97,7 @@ def tick_audits(state: DispatchState) -> None:
         if state.now_s - case.alone_s < state.auditor.rules.timeout_s:
             continue
         if len(case.opinions) > 1:
-            _give_up(state, case, _mismatch(case))
+            _end_in_mismatch(state, case)
         else:
             # No worker can compare: the single result is accepted.
             state.auditor.lone = True
@@ -109,10 +109,13 @@ def _check_ended(state: DispatchState, check: RolloutRecord, outcome: Outcome) -
     if case is None or case.check is not check:
         return
     if not isinstance(outcome, Completed):
-        failure = (
-            outcome if isinstance(outcome, InfraFailure) else InfraFailure(InfraCode.DEADLINE, "no audit")
-        )
-        _give_up(state, case, failure)
+        if len(case.opinions) > 1:
+            _end_in_mismatch(state, case)
+        else:
+            failed = isinstance(outcome, InfraFailure)
+            _close_and_deliver(
+                state, case, outcome if failed else InfraFailure(InfraCode.DEADLINE, "no audit")
+            )
         return
     versions = state.pool.workers[outcome.worker_id].resources.versions
     case.opinions.append(opinion_of(outcome.worker_id, versions, outcome))
@@ -124,24 +127,23 @@ def _check_ended(state: DispatchState, check: RolloutRecord, outcome: Outcome) -
 def _rule(state: DispatchState, case: AuditCase) -> None:
     """Decide the case by its opinions, or ask a further worker."""
     verdict = judge(case.opinions)
-    match verdict.ruling:
-        case Ruling.OPEN:
-            case.disputed = tuple(opinion.worker_id for opinion in case.opinions)
-            for worker_id in case.disputed:
-                state.auditor.of(worker_id).disputed += 1
-            case.check = _make_check(state, case.check, frozenset(case.disputed))
-            case.alone_s = None
-            if case.held is not None:
-                queue_rollouts(state, [case.check])
-        case Ruling.SPLIT:
-            _give_up(state, case, _mismatch(case))
-        case Ruling.AGREED:
-            _count(state, case, mismatch=len(case.opinions) > 2)
-            for at in verdict.right:
-                state.auditor.agreed(case.opinions[at].worker_id)
-            _close_and_deliver(state, case, case.results[verdict.right[0]] if case.results else None)
-            for at in verdict.wrong:
-                _convict(state, case.opinions[at].worker_id, case)
+    if verdict is not None:
+        _count(state, case, mismatch=len(case.opinions) > 2)
+        for at in verdict.right:
+            state.auditor.agreed(case.opinions[at].worker_id)
+        _close_and_deliver(state, case, case.results[verdict.right[0]] if case.results else None)
+        for at in verdict.wrong:
+            _convict(state, case.opinions[at].worker_id, case)
+    elif len(case.opinions) >= OPINIONS:
+        _end_in_mismatch(state, case)
+    else:
+        case.disputed = tuple(opinion.worker_id for opinion in case.opinions)
+        for worker_id in case.disputed:
+            state.auditor.of(worker_id).disputed += 1
+        case.check = _make_check(state, case.check, frozenset(case.disputed))
+        case.alone_s = None
+        if case.held is not None:
+            queue_rollouts(state, [case.check])
 
 
 def _convict(state: DispatchState, worker_id: str, case: AuditCase) -> None:
@@ -174,12 +176,12 @@ def _convict(state: DispatchState, worker_id: str, case: AuditCase) -> None:
             offer_scene(state, scene)
 
 
-def _give_up(state: DispatchState, case: AuditCase, failure: InfraFailure) -> None:
+def _end_in_mismatch(state: DispatchState, case: AuditCase) -> None:
     """End a case undecided: a held rollout fails, and no worker is blamed."""
-    if len(case.opinions) > 1:
-        _count(state, case, mismatch=True)
-        failure = _mismatch(case)
-    _close_and_deliver(state, case, failure)
+    _count(state, case, mismatch=True)
+    names = ", ".join(opinion.worker_id for opinion in case.opinions)
+    message = f"{names} came to different results, and no two others agree with either"
+    _close_and_deliver(state, case, InfraFailure(InfraCode.RESULT_MISMATCH, message))
 
 
 def _close_and_deliver(state: DispatchState, case: AuditCase, outcome: Outcome | None) -> None:
@@ -189,13 +191,6 @@ def _close_and_deliver(state: DispatchState, case: AuditCase, outcome: Outcome |
     if held is not None and outcome is not None:
         held.held = False
         deliver(state, held, outcome)
-
-
-def _mismatch(case: AuditCase) -> InfraFailure:
-    names = ", ".join(opinion.worker_id for opinion in case.opinions)
-    return InfraFailure(
-        InfraCode.RESULT_MISMATCH, f"{names} came to different results, and no two others agree with either"
-    )
 
 
 def _count(state: DispatchState, case: AuditCase, *, mismatch: bool) -> None:

@@ -143,11 +143,6 @@ def _records(
             )
 
 
-def attempts_allowed(policy: GroupPolicy, usual: int) -> int:
-    """Return the number of failed leases after which a rollout ends as an infrastructure failure."""
-    return 1 if policy is GroupPolicy.FAIL_FAST else usual
-
-
 def failed_with(
     policy: GroupPolicy, batch: BatchRecord, group: GroupRecord
 ) -> tuple[list[GroupRecord], list[RolloutRecord]]:

@@ -58,7 +58,6 @@ from embomatrix.manager.control.events import (
     WorkersExpected,
     WorkerSuspected,
 )
-from embomatrix.manager.control.reputation import Auditor
 from embomatrix.manager.control.workers import WorkerRecord
 
 
@@ -73,6 +72,9 @@ class Dispatcher:
         self, limits: DispatchLimits, *, boot_id: str, first_epoch: int = 1, audit_key: bytes = b""
     ) -> None:
         self.state = DispatchState(limits, boot_id=boot_id, first_epoch=first_epoch, audit_key=audit_key)
+        self.auditor = self.state.auditor
+        self.live_leases: Mapping[str, LeaseRecord] = self.state.leases.live
+        self.workers: Mapping[str, WorkerRecord] = self.state.pool.workers
 
     def handle(self, *events: Event, now_s: float) -> list[Command]:
         """Apply events of one moment; return the commands in order. Freed slots are filled after all events."""
@@ -162,43 +164,17 @@ class Dispatcher:
         return len(state.queues) + state.batches.coming + awaited
 
     @property
-    def expired(self) -> int:
-        """Number of leases that expired so far."""
-        return self.state.leases.expired
-
-    @property
     def expected(self) -> frozenset[str]:
         """Workers of a former manager that have not reported, while the dispatcher waits for them."""
         return frozenset(self.state.expected_workers or ()) if self.state.awaited else frozenset()
-
-    @property
-    def auditor(self) -> Auditor:
-        return self.state.auditor
 
     @property
     def scenes(self) -> frozenset[str]:
         """Scenes of rollouts without an outcome."""
         return frozenset().union(*(batch.open_scenes for batch in self.state.batches))
 
-    @property
-    def live_leases(self) -> Mapping[str, LeaseRecord]:
-        return self.state.leases.live
-
-    @property
-    def workers(self) -> Mapping[str, WorkerRecord]:
-        return self.state.pool.workers
-
-    @property
-    def runs(self) -> tuple[str, ...]:
-        """Ids of runs with counters."""
-        return tuple(self.state.runs)
-
     def counters(self, run_id: str) -> RunCounters:
         return self.state.runs.of(run_id).counters
-
-    def forget_run(self, run_id: str) -> None:
-        """Drop the counters of a closed run."""
-        self.state.runs.forget(run_id)
 
     def pending_of(self, run_id: str) -> int:
         """Return the number of the run's rollouts without an outcome."""

@@ -4,14 +4,13 @@ import dataclasses
 
 from embomatrix.manager.control.commands import AcknowledgeLease, CancelLease
 from embomatrix.manager.control.dispatch.audits import finish, hold_for_audit
-from embomatrix.manager.control.dispatch.batches import attempts_allowed
 from embomatrix.manager.control.dispatch.leasing import offer_scene
 from embomatrix.manager.control.dispatch.outcomes import requeue
 from embomatrix.manager.control.dispatch.records import LeaseRecord
 from embomatrix.manager.control.dispatch.state import DispatchState
 from embomatrix.manager.control.events import LeaseFinished
 from embomatrix.rpc.wire.run_log import RolloutStepKind
-from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure
+from embomatrix.rpc.wire.values import Completed, GroupPolicy, InfraCode, InfraFailure
 
 
 def settle_result(state: DispatchState, event: LeaseFinished) -> None:
@@ -50,7 +49,7 @@ def give_back(state: DispatchState, lease: LeaseRecord, failure: InfraFailure, *
     if record.leases or record.held:
         return
     policy = state.runs.of(record.key.run_id).terms.group_policy
-    most = attempts_allowed(policy, state.limits.max_attempts)
+    most = 1 if policy is GroupPolicy.FAIL_FAST else state.limits.max_attempts
     if record.attempts >= most:
         message = f"{failure.message} (attempt {record.attempts} of {most})"
         finish(state, record, dataclasses.replace(failure, message=message))

@@ -79,10 +79,6 @@ class LeaseTable:
         """True if a former manager granted the lease."""
         return ref.lease_epoch < self._first_epoch
 
-    def reject(self, ref: LeaseRef, run_id: str) -> None:
-        """Remember a former manager's lease that is not adopted: its result counts as stale."""
-        self._remember_ended(ref.lease_id, run_id)
-
     def end(self, lease: LeaseRecord, now_s: float) -> None:
         """Remove a live lease; the caller decides about its rollout."""
         lease.record.leases.remove(lease)
@@ -93,7 +89,13 @@ class LeaseTable:
         self.in_use[pair] -= 1
         if not self.in_use[pair]:
             del self.in_use[pair]
-        self._remember_ended(lease.ref.lease_id, lease.record.key.run_id)
+        self.remember_ended(lease.ref, lease.record.key.run_id)
+
+    def remember_ended(self, ref: LeaseRef, run_id: str) -> None:
+        """Remember a lease that ended, or was not adopted from a former manager: its result counts as stale."""
+        self._ended[ref.lease_id] = run_id
+        while len(self._ended) > STALE_MEMORY:
+            self._ended.popitem(last=False)
 
     def find(self, worker_id: str, ref: LeaseRef) -> LeaseRecord | None:
         """Return the live lease with this id, epoch and worker; None for a stale one."""
@@ -156,8 +158,3 @@ class LeaseTable:
             assert (
                 len({other.worker_id for other in record.leases}) == len(record.leases) <= 1 + record.hedged
             )
-
-    def _remember_ended(self, lease_id: str, run_id: str) -> None:
-        self._ended[lease_id] = run_id
-        while len(self._ended) > STALE_MEMORY:
-            self._ended.popitem(last=False)

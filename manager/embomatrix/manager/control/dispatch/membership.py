@@ -131,7 +131,7 @@ def _adopt(state: DispatchState, worker: WorkerRecord, ref: LeaseRef, origin: Le
     record = batch.open.get(origin.rollout_id) if batch is not None else None
     others = list(record.leases) if record is not None else []
     if record is None or any(other.ref.lease_epoch >= ref.lease_epoch for other in others):
-        state.leases.reject(ref, origin.run_id)
+        state.leases.remember_ended(ref, origin.run_id)
         return False
     for other in others:
         revoke(state, other, f"{worker.worker_id} holds a later lease")

@@ -96,7 +96,7 @@ def close_case(state: DispatchState, case: AuditCase) -> None:
         state.auditor.of(worker_id).disputed -= 1
     case.disputed = ()
     if case.check.phase is DispatchPhase.PENDING:
-        state.queues.discard(case.check)
+        state.queues.uncount(case.check)
     for lease in list(case.check.leases):
         revoke(state, lease, "its audit ended")
     case.check.phase = DispatchPhase.DONE
@@ -104,7 +104,7 @@ def close_case(state: DispatchState, case: AuditCase) -> None:
 
 def _conclude(state: DispatchState, record: RolloutRecord, outcome: Outcome) -> None:
     if record.phase is DispatchPhase.PENDING:
-        state.queues.discard(record)
+        state.queues.uncount(record)
     for lease in list(record.leases):
         revoke(state, lease, "the rollout has its outcome")
     if record.held:

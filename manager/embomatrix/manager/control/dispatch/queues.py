@@ -54,10 +54,6 @@ class PendingQueues:
         self._counts[record.scene] += 1
         self._by_run[record.key.run_id] += 1
 
-    def discard(self, record: RolloutRecord) -> None:
-        """Uncount a waiting record. The caller ends it, which makes its heap entry stale."""
-        self._uncount(record)
-
     def heads(self, scene: str) -> list[RolloutRecord]:
         """Return the first rollout of each queue of the scene, in order of turns."""
         queues = self._heaps.get(scene, {})
@@ -85,17 +81,11 @@ class PendingQueues:
         else:
             heap.remove((record.sequence, record))
             heapq.heapify(heap)
-        self._uncount(record)
+        self.uncount(record)
         record.phase = DispatchPhase.LEASED
 
-    def check_invariants(self) -> None:
-        """Raise AssertionError if a count disagrees with the queues."""
-        waiting = set(self)
-        assert Counter(record.scene for record in waiting) == self._counts
-        assert Counter(record.key.run_id for record in waiting) == self._by_run
-        assert not any(record.leases or record.held for record in waiting)
-
-    def _uncount(self, record: RolloutRecord) -> None:
+    def uncount(self, record: RolloutRecord) -> None:
+        """Count a waiting record no more. The caller changes its phase, which makes its heap entry stale."""
         scene, run_id = record.scene, record.key.run_id
         self._counts[scene] -= 1
         self._by_run[run_id] -= 1
@@ -105,6 +95,13 @@ class PendingQueues:
             # Only stale entries are left in the heaps.
             del self._counts[scene]
             self._heaps.pop(scene, None)
+
+    def check_invariants(self) -> None:
+        """Raise AssertionError if a count disagrees with the queues."""
+        waiting = set(self)
+        assert Counter(record.scene for record in waiting) == self._counts
+        assert Counter(record.key.run_id for record in waiting) == self._by_run
+        assert not any(record.leases or record.held for record in waiting)
 
 
 class Choice:
