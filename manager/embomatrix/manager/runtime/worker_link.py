@@ -27,9 +27,23 @@ class OutgoingMessage:
     drain: bool = False
     resume: bool = False
 
+    def add(self, command: WorkerCommand) -> None:
+        """Add a command. A later desired set replaces an earlier one."""
+        match command:
+            case SetDesired(_, scenes):
+                self.desired = scenes
+            case GiveLease():
+                self.leases.append(
+                    Lease(command.ref, command.rollout, command.deadline_s, command.origin, command.reward)
+                )
+            case CancelLease(_, ref):
+                self.cancelled.append(ref)
+            case AcknowledgeLease(_, ref):
+                self.acknowledged.append(ref)
+
 
 class WorkerLink:
-    """Open session stream. The worker's credits bound its outbox; a later desired set replaces an earlier one."""
+    """Open session stream. The worker's credits bound its outbox."""
 
     def __init__(self, session: WorkerSession) -> None:
         self.session = session
@@ -41,16 +55,9 @@ class WorkerLink:
         match command:
             case SetDesired():
                 self.session.allowed_bundles.update(command.bundle_digests)
-                self._outbox.desired = command.bundle_digests
             case GiveLease():
                 self.session.allowed_bundles.add(command.rollout.bundle_digest)
-                self._outbox.leases.append(
-                    Lease(command.ref, command.rollout, command.deadline_s, command.origin, command.reward)
-                )
-            case CancelLease():
-                self._outbox.cancelled.append(command.ref)
-            case AcknowledgeLease():
-                self._outbox.acknowledged.append(command.ref)
+        self._outbox.add(command)
         self._ready.set()
 
     def drain(self) -> None:

@@ -1,4 +1,4 @@
-"""Machines and scenes of a scenario, drawn from its seed."""
+"""World of a simulation: machines and scenes drawn from the scenario's seed, and the parts that all actors share."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from embomatrix.manager.simulation.invariants import InvariantChecker
+from embomatrix.manager.simulation.network import EventQueue
+from embomatrix.manager.simulation.report import Report
 from embomatrix.rpc.wire.values import Resources
 
 if TYPE_CHECKING:
@@ -46,6 +49,7 @@ class SceneSize:
 class Setting:
     """A scenario with drawn machines, scenes and execution times."""
 
+    scenario: SimulationScenario
     machines: tuple[SimulatedMachine, ...]
     scenes: dict[str, SceneSize]
     execute_s: tuple[float, ...]
@@ -60,6 +64,16 @@ class Setting:
     @property
     def slots(self) -> int:
         return sum(machine.resources.slots for machine in self.machines)
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedWorld:
+    """Parts of one simulation that its manager, trainers and workers share."""
+
+    setting: Setting
+    queue: EventQueue
+    checker: InvariantChecker
+    report: Report
 
 
 def rng_for(scenario: SimulationScenario, *key: int) -> np.random.Generator:
@@ -81,7 +95,7 @@ def setting_of(scenario: SimulationScenario) -> Setting:
     spread = np.exp(rng.normal(0.0, scenario.execute_spread, DURATIONS))
     durations = tuple(float(value) for value in scenario.execute_s * spread)
     lengths = {trainer.name: trainer.length for trainer in scenario.trainers}
-    return Setting(_machines(scenario, rng), scenes, durations, lengths)
+    return Setting(scenario, _machines(scenario, rng), scenes, durations, lengths)
 
 
 def _machines(scenario: SimulationScenario, rng: np.random.Generator) -> tuple[SimulatedMachine, ...]:

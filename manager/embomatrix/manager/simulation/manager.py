@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from embomatrix.manager.control.commands import (
-    AcknowledgeLease,
-    CancelLease,
     Command,
     DeliverResult,
     FinishBatch,
-    GiveLease,
     QuarantineWorker,
-    SetDesired,
 )
 from embomatrix.manager.control.events import BatchSubmitted, LookaheadAnnounced, RunOpened
 from embomatrix.manager.runtime.intake import TICK_S, Heartbeat, Intake
-from embomatrix.manager.simulation.invariants import InvariantChecker
-from embomatrix.manager.simulation.network import EventQueue
-from embomatrix.manager.simulation.report import Measurements
-from embomatrix.rpc.wire.leases import Lease, LeaseProgress, LeaseRef, LeaseResult, WorkerState
+from embomatrix.manager.runtime.worker_link import OutgoingMessage
+from embomatrix.manager.simulation.machines import SimulatedWorld
+from embomatrix.rpc.wire.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
 from embomatrix.rpc.wire.values import (
     Batch,
     LookaheadEntry,
@@ -32,25 +27,13 @@ from embomatrix.rpc.wire.values import (
 
 if TYPE_CHECKING:
     from embomatrix.manager.runtime.registry import WorkerSession
-    from embomatrix.manager.simulation.scenario import ManagerPace
-
-
-@dataclass(slots=True)
-class WorkerMessage:
-    """Commands sent to a worker together. ``desired`` is None if it is unchanged."""
-
-    desired: tuple[str, ...] | None = None
-    leases: list[Lease] = field(default_factory=list)
-    ended: list[LeaseRef] = field(default_factory=list)
-    """Leases with acknowledged results."""
-    cancelled: list[LeaseRef] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stream:
     """Receiving end of a worker. ``ended`` reports the end of its session."""
 
-    take: Callable[[WorkerMessage], None]
+    take: Callable[[OutgoingMessage], None]
     ended: Callable[[], None]
 
 
@@ -60,21 +43,14 @@ class SimulatedManager:
     A manager with a ``pace`` handles them one after the other, any other at once.
     """
 
-    def __init__(
-        self,
-        queue: EventQueue,
-        intake: Intake,
-        checker: InvariantChecker,
-        measured: Measurements,
-        pace: ManagerPace,
-    ) -> None:
-        self._queue = queue
-        self._pace = pace
+    def __init__(self, world: SimulatedWorld, intake: Intake) -> None:
+        self._queue = world.queue
+        self._checker = world.checker
+        self._report = world.report
+        self._pace = world.setting.scenario.manager
         self._free_s = 0.0
         """Time at which all calls so far are handled."""
         self._intake = intake
-        self._checker = checker
-        self._measured = measured
         self._streams: dict[str, Stream] = {}
         self._trainers: dict[str, Callable[[Sequence[RolloutResult]], None]] = {}
 
@@ -87,25 +63,25 @@ class SimulatedManager:
         now_s = self._queue.now_s
         begins_s = max(now_s, self._free_s)
         self._free_s = begins_s + cost_s
-        self._measured.lags_s.append(begins_s - now_s)
+        self._report.lags_s.append(begins_s - now_s)
         self._queue.after(self._free_s - now_s, call)
 
     def tick_forever(self) -> None:
         """Tick now and at every interval from now on."""
-        with self._measured.deciding():
+        with self._report.deciding():
             lost, commands = self._intake.tick(now_s=self._queue.now_s)
         names = [event.worker_id for event in lost]
         for name in names:
-            self._measured.counts["workers lost"] += 1
-            self._measured.lost(name, self._queue.now_s)
+            self._report.counts["workers lost"] += 1
+            self._report.note_lost(name, self._queue.now_s)
             self._end_stream(name)
         self._carry_out(commands, lost=names)
         self._queue.after(TICK_S, self.tick_forever)
 
     def register(self, worker_id: str, boot_id: str, resources: Resources) -> WorkerSession:
-        with self._measured.deciding():
+        with self._report.deciding():
             session, commands = self._intake.register(worker_id, boot_id, resources, now_s=self._queue.now_s)
-        self._measured.lost(worker_id, self._queue.now_s)
+        self._report.note_lost(worker_id, self._queue.now_s)
         self._end_stream(worker_id)
         self._carry_out(commands, lost=(worker_id,))
         return session
@@ -139,7 +115,7 @@ class SimulatedManager:
         """Raise SupersededError if the session is over."""
         if state is not None:
             self._checker.report(session.worker_id, state, resync=resync)
-        with self._measured.deciding():
+        with self._report.deciding():
             commands = self._intake.report(session, state, results, resync=resync, now_s=self._queue.now_s)
         self._carry_out(commands)
 
@@ -147,7 +123,7 @@ class SimulatedManager:
         self, session: WorkerSession, held: tuple[LeaseRef, ...], progress: tuple[LeaseProgress, ...]
     ) -> float:
         """Raise SupersededError if the session is over."""
-        with self._measured.deciding():
+        with self._report.deciding():
             interval_s, commands = self._intake.heartbeat(
                 session.session_id,
                 session.epoch,
@@ -164,14 +140,14 @@ class SimulatedManager:
         self._carry_out(self._intake.feed(RunOpened(run_id, terms), now_s=self._queue.now_s))
 
     def announce(self, run_id: str, version: int, entries: tuple[LookaheadEntry, ...]) -> None:
-        with self._measured.deciding():
+        with self._report.deciding():
             event = LookaheadAnnounced(run_id, version, entries)
             commands = self._intake.feed(event, now_s=self._queue.now_s)
         self._carry_out(commands)
 
     def submit(self, batch: Batch) -> None:
         self._checker.submit(batch)
-        with self._measured.deciding():
+        with self._report.deciding():
             commands = self._intake.feed(BatchSubmitted(batch), now_s=self._queue.now_s)
         self._carry_out(commands)
 
@@ -182,7 +158,7 @@ class SimulatedManager:
 
     def _carry_out(self, commands: Sequence[Command], *, lost: Iterable[str] = ()) -> None:
         self._checker.watch(commands, lost=lost)
-        messages: dict[str, WorkerMessage] = {}
+        messages: dict[str, OutgoingMessage] = {}
         results: dict[str, list[RolloutResult]] = {}
         for command in commands:
             match command:
@@ -191,9 +167,9 @@ class SimulatedManager:
                 case FinishBatch():
                     pass
                 case QuarantineWorker():
-                    self._measured.caught[command.worker_id] = command.audited
+                    self._report.caught[command.worker_id] = command.audited
                 case _:
-                    _add(messages.setdefault(command.worker_id, WorkerMessage()), command)
+                    messages.setdefault(command.worker_id, OutgoingMessage()).add(command)
         for worker_id, message in messages.items():
             # Without a stream the message is lost; the worker's next full state shows that.
             stream = self._streams.get(worker_id)
@@ -201,15 +177,3 @@ class SimulatedManager:
                 stream.take(message)
         for run_id, found in results.items():
             self._trainers[run_id](found)
-
-
-def _add(message: WorkerMessage, command: SetDesired | GiveLease | CancelLease | AcknowledgeLease) -> None:
-    match command:
-        case SetDesired(_, scenes):
-            message.desired = scenes
-        case GiveLease(_, ref, rollout, deadline_s):
-            message.leases.append(Lease(ref, rollout, deadline_s))
-        case CancelLease(_, ref):
-            message.cancelled.append(ref)
-        case AcknowledgeLease(_, ref):
-            message.ended.append(ref)

@@ -1,49 +1,104 @@
-"""Measurements of a simulation and the report made from them."""
+"""Report of a simulation: figures that its actors collect, and shares made from them."""
 
 from __future__ import annotations
 
 import time
-from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections import Counter, defaultdict
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from statistics import fmean
 from typing import TYPE_CHECKING
 
+from embomatrix.manager.histogram import quantile
 from embomatrix.rpc.wire.values import RunStats
 
 if TYPE_CHECKING:
     from embomatrix.manager.simulation.scenario import SimulationScenario
 
 
-class Measurements:
-    """Counters of one simulation, read at its end."""
+@dataclass(slots=True)
+class Report:
+    """Figures of one simulation, complete at its end. Times are simulated seconds; CPU times are real."""
 
-    def __init__(self) -> None:
-        self.cpu_s = 0.0
-        """CPU time of the manager's decisions."""
-        self.waits_s: list[float] = []
-        """Time from the last submission of each step to its last result: the trainer stands still."""
-        self.first_queued_s: list[float] = []
-        """Time from the submission of each group to the start of its first execution, which waits for the scene."""
-        self.foretold = self.warm = 0
-        """Groups after a run's first step, whose scenes could be announced in time, and those with a warm scene."""
-        self.loads = 0
-        self.loads_unused = 0
-        self.pressed: list[tuple[int, int]] = []
-        """Samples of (executing, existing) slots while there is work for every slot."""
-        self.shared: Counter[str] = Counter()
-        """Executions of each run, summed over the samples in which every run wanted all slots."""
-        self.died_s: dict[str, float] = {}
-        """Time of each worker's last death, until the manager detects it."""
-        self.detected_s: list[float] = []
-        """Time from each death of a worker to its detection."""
-        self.counts: Counter[str] = Counter()
-        self.lags_s: list[float] = []
-        """Time that each message waited for the manager to handle earlier ones."""
-        self.caught: dict[str, int] = {}
-        """Executions compared by then, for each worker put in quarantine."""
+    scenario: SimulationScenario
+    slots: int
+    submitted: int = 0
+    delivered: int = 0
+    infra_failures: int = 0
+    stats: RunStats = field(default_factory=RunStats)
+    elapsed_s: float = 0.0
+    """Time from the start of the first step to the last result."""
+    waits_s: list[float] = field(default_factory=list)
+    """Time from the last submission of each step to its last result: the trainer stands still."""
+    stall: float = 0.0
+    """Share of the time after the first step in which trainers only waited for results."""
+    busy: list[int] = field(default_factory=list)
+    """Samples of the number of executing slots, after the first steps, while there is work for every slot."""
+    shared: Counter[str] = field(default_factory=Counter)
+    """Executions of each run, summed over the samples in which every run wanted all slots."""
+    foretold: int = 0
+    """Groups after the first step of their run, whose scenes could be announced in time."""
+    warm: int = 0
+    """Those of them with a warm scene on arrival."""
+    loads: int = 0
+    loads_unused: int = 0
+    cpu_s: float = 0.0
+    """CPU time of the manager's decisions."""
+    died_s: dict[str, float] = field(default_factory=dict)
+    """Time of each worker's last death, until the manager detects it."""
+    detected_s: list[float] = field(default_factory=list)
+    """Time from each death of a worker to its detection."""
+    orphaned_s: list[float] = field(default_factory=list)
+    """Time from the loss of a worker to the next lease of each rollout that it held."""
+    first_queued_s: list[float] = field(default_factory=list)
+    """Time from the submission of each group to the start of its first execution, which waits for the scene."""
+    first_result_s: float = 0.0
+    """Longest time of any run from its first submission to its first result."""
+    groups_s: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    """Time from the submission of each group to its last result, by run."""
+    lags_s: list[float] = field(default_factory=list)
+    """Time that each message waited for the manager to handle earlier ones."""
+    counts: Counter[str] = field(default_factory=Counter)
+    caught: dict[str, int] = field(default_factory=dict)
+    """Executions compared by then, for each worker put in quarantine."""
 
-    def lost(self, worker_id: str, now_s: float) -> None:
+    @property
+    def pressed_utilisation(self) -> float | None:
+        """Mean share of slots executing while there was work for every slot; None if never."""
+        return sum(self.busy) / (len(self.busy) * self.slots) if self.busy else None
+
+    @property
+    def hit_rate(self) -> float:
+        """Share of the announced groups with a warm scene on arrival; 1 if there were none."""
+        return self.warm / self.foretold if self.foretold else 1.0
+
+    @property
+    def waste(self) -> float:
+        """Share of the loads that no rollout used."""
+        return self.loads_unused / self.loads if self.loads else 0.0
+
+    @property
+    def start_latency_s(self) -> float:
+        """Mean time from a group's submission to its first execution."""
+        return fmean(self.first_queued_s) if self.first_queued_s else 0.0
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """Share of the busy slots of each run, while every run wanted all of them; empty if that never happened."""
+        return {run: count / self.shared.total() for run, count in self.shared.items()}
+
+    @property
+    def lag_p99_s(self) -> float:
+        """99th percentile of the time that messages waited for the manager; 0 for one that answers at once."""
+        return quantile(sorted(self.lags_s), 0.99)
+
+    @property
+    def cpu_us_per_rollout(self) -> float:
+        """CPU time of all decisions per delivered rollout, in microseconds."""
+        return 1e6 * self.cpu_s / self.delivered
+
+    def note_lost(self, worker_id: str, now_s: float) -> None:
         """Note that the manager gave up a worker, or saw it register again."""
         if worker_id in self.died_s:
             self.detected_s.append(now_s - self.died_s.pop(worker_id))
@@ -56,56 +111,3 @@ class Measurements:
             yield
         finally:
             self.cpu_s += time.thread_time() - begin_s
-
-
-@dataclass(frozen=True, slots=True)
-class Report:
-    """Results of a simulation. Times are simulated seconds; CPU times are real."""
-
-    scenario: SimulationScenario
-    slots: int
-    submitted: int
-    delivered: int
-    infra_failures: int
-    stats: RunStats
-    elapsed_s: float
-    """Time from the start of the first step to the last result."""
-    waits_s: tuple[float, ...]
-    pressed_utilisation: float | None
-    """Share of slots executing, after the first steps, while at least as many rollouts as slots were open; None if never."""
-    stall: float
-    """Share of the time after the first step in which trainers only waited for results."""
-    foretold: int
-    """Groups after the first step of their run, whose scenes could be announced in time."""
-    hit_rate: float
-    """Share of these with a warm scene on arrival; 1 if there were none."""
-    loads: int
-    loads_unused: int
-    cpu_s: float
-    detected_s: tuple[float, ...]
-    """Time from each death of a worker to its detection."""
-    orphaned_s: tuple[float, ...]
-    """Time from the loss of a worker to the next lease of each rollout that it held."""
-    start_latency_s: float
-    """Mean time from a group's submission to its first execution."""
-    first_result_s: float
-    """Longest time of any run from its first submission to its first result."""
-    groups_s: Mapping[str, tuple[float, ...]]
-    """Time from the submission of each group to its last result, by run."""
-    shares: Mapping[str, float]
-    """Share of the busy slots of each run, while every run wanted all of them; empty if that never happened."""
-    lag_p99_s: float
-    """99th percentile of the time that messages waited for the manager; 0 for one that answers at once."""
-    counts: Mapping[str, int]
-    caught: Mapping[str, int]
-    """Executions compared by then, for each worker put in quarantine."""
-
-    @property
-    def waste(self) -> float:
-        """Share of the loads that no rollout used."""
-        return self.loads_unused / self.loads if self.loads else 0.0
-
-    @property
-    def cpu_us_per_rollout(self) -> float:
-        """CPU time of all decisions per delivered rollout, in microseconds."""
-        return 1e6 * self.cpu_s / self.delivered

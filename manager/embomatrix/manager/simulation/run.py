@@ -8,14 +8,13 @@ from statistics import fmean
 from typing import Final
 
 from embomatrix.manager.control.cluster_state import ClusterState
-from embomatrix.manager.histogram import quantile
 from embomatrix.manager.runtime.intake import Intake
 from embomatrix.manager.runtime.registry import Registry
 from embomatrix.manager.simulation.invariants import BrokenInvariantError, InvariantChecker
-from embomatrix.manager.simulation.machines import rng_for, setting_of
+from embomatrix.manager.simulation.machines import SimulatedWorld, rng_for, setting_of
 from embomatrix.manager.simulation.manager import SimulatedManager
 from embomatrix.manager.simulation.network import EventQueue
-from embomatrix.manager.simulation.report import Measurements, Report
+from embomatrix.manager.simulation.report import Report
 from embomatrix.manager.simulation.scenario import SimulationScenario
 from embomatrix.manager.simulation.trainer import SimulatedTrainer
 from embomatrix.manager.simulation.worker import SimulatedWorker
@@ -29,25 +28,18 @@ class ClusterSimulation:
 
     def __init__(self, scenario: SimulationScenario) -> None:
         self._scenario = scenario
-        self._setting = setting_of(scenario)
         self.queue = EventQueue()
         self._checker = InvariantChecker(self.queue)
-        self._measured = Measurements()
+        self._setting = setting_of(scenario)
+        self._report = Report(scenario, self._setting.slots)
+        self._world = SimulatedWorld(self._setting, self.queue, self._checker, self._report)
         self._cluster = ClusterState(scenario.dispatch, scenario.schedule, boot_id="simulated")
         numbers = iter(range(1 << 62))
         registry = Registry(scenario.liveness, new_id=lambda: f"session-{next(numbers)}")
-        intake = Intake(self._cluster, registry)
-        self.manager = SimulatedManager(self.queue, intake, self._checker, self._measured, scenario.manager)
+        self.manager = SimulatedManager(self._world, Intake(self._cluster, registry))
         self.workers = self._make_workers()
         self._trainers = [
-            SimulatedTrainer(
-                plan,
-                list(self._setting.scenes),
-                self.queue,
-                self.manager,
-                self._measured,
-                rng_for(scenario, 3, at),
-            )
+            SimulatedTrainer(plan, self._world, self.manager, rng_for(scenario, 3, at))
             for at, plan in enumerate(scenario.trainers)
         ]
 
@@ -65,22 +57,15 @@ class ClusterSimulation:
                 f"after {self.queue.now_s:.0f} s {self._checker.delivered} of {self._scenario.rollouts} rollouts have "
                 f"an outcome, {len(live)} leases live"
             )
-        return self._report()
+        self._complete_report()
+        return self._report
 
     def _make_workers(self) -> list[SimulatedWorker]:
         joins = rng_for(self._scenario, 2).uniform(0.0, self._scenario.join_s, len(self._setting.machines))
         workers = []
         for at, machine in enumerate(self._setting.machines):
-            worker = SimulatedWorker(
-                machine,
-                self._scenario,
-                self._setting,
-                self.queue,
-                self.manager,
-                self._checker,
-                self._measured,
-                random.Random(f"{self._scenario.seed}.{at}"),
-            )
+            dice = random.Random(f"{self._scenario.seed}.{at}")
+            worker = SimulatedWorker(machine, self._world, self.manager, dice)
             self.queue.after(float(joins[at]), worker.boot)
             workers.append(worker)
         return workers
@@ -92,7 +77,7 @@ class ClusterSimulation:
         warmed_up = all(trainer.warmed_up for trainer in self._trainers)
         if warmed_up and self._checker.open_rollouts >= self._setting.slots:
             at_work = sum(worker.slots.executing for worker in self.workers if worker.slots is not None)
-            self._measured.pressed.append((at_work, self._setting.slots))
+            self._report.busy.append(at_work)
         if len(self._trainers) > 1:
             self._sample_shares()
         self.queue.after(SAMPLE_S, self._sample)
@@ -103,42 +88,19 @@ class ClusterSimulation:
         if all(wanted[trainer.plan.name] >= 2 * self._setting.slots for trainer in self._trainers):
             for worker in self.workers:
                 if worker.slots is not None:
-                    self._measured.shared += worker.slots.executing_of()
+                    self._report.shared += worker.slots.executing_of()
 
-    def _report(self) -> Report:
+    def _complete_report(self) -> None:
         for worker in self.workers:
             if worker.slots is not None:
                 worker.slots.count_unused()
-        began_s = min(plan.start_s for plan in self._scenario.trainers)
-        elapsed_s = max(trainer.ended_s for trainer in self._trainers) - began_s
-        measured = self._measured
-        at_work, there = (sum(column) for column in zip((0, 0), *measured.pressed, strict=True))
-        return Report(
-            scenario=self._scenario,
-            slots=self._setting.slots,
-            submitted=self._checker.submitted,
-            delivered=self._checker.delivered,
-            infra_failures=self._checker.infra_failures,
-            stats=self._cluster.totals(),
-            elapsed_s=elapsed_s,
-            waits_s=tuple(measured.waits_s),
-            pressed_utilisation=at_work / there if there else None,
-            stall=fmean(t.waited_s / (t.ended_s - t.warmed_up_s) for t in self._trainers),
-            foretold=measured.foretold,
-            hit_rate=measured.warm / measured.foretold if measured.foretold else 1.0,
-            loads=measured.loads,
-            loads_unused=measured.loads_unused,
-            cpu_s=measured.cpu_s,
-            detected_s=tuple(measured.detected_s),
-            orphaned_s=tuple(self._checker.orphaned_s),
-            start_latency_s=fmean(measured.first_queued_s) if measured.first_queued_s else 0.0,
-            first_result_s=max(trainer.first_result_s for trainer in self._trainers),
-            groups_s={trainer.plan.name: tuple(trainer.groups_s) for trainer in self._trainers},
-            shares={run: count / measured.shared.total() for run, count in sorted(measured.shared.items())},
-            lag_p99_s=quantile(sorted(measured.lags_s), 0.99),
-            counts=measured.counts,
-            caught=measured.caught,
-        )
+        report, checker, trainers = self._report, self._checker, self._trainers
+        report.submitted, report.delivered = checker.submitted, checker.delivered
+        report.infra_failures, report.orphaned_s = checker.infra_failures, checker.orphaned_s
+        report.stats = self._cluster.totals()
+        report.elapsed_s = max(t.ended_s for t in trainers) - min(t.plan.start_s for t in trainers)
+        report.stall = fmean(t.waited_s / (t.ended_s - t.warmed_up_s) for t in trainers)
+        report.first_result_s = max(t.first_result_s for t in trainers)
 
 
 @contextlib.contextmanager

@@ -6,10 +6,9 @@ import random
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from embomatrix.manager.simulation.network import EventQueue
-from embomatrix.manager.simulation.report import Measurements
+from embomatrix.manager.simulation.machines import SimulatedMachine, SimulatedWorld
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.rpc.wire.leases import Lease, LeaseProgress, LeaseRef, LeaseResult
 from embomatrix.rpc.wire.values import (
@@ -20,10 +19,6 @@ from embomatrix.rpc.wire.values import (
     ResidentState,
     Timings,
 )
-
-if TYPE_CHECKING:
-    from embomatrix.manager.simulation.machines import Setting, SimulatedMachine
-    from embomatrix.manager.simulation.scenario import Faults
 
 RETRY_LOAD_S: Final = 10.0
 """Pause before a failed load is tried again, as in the real worker."""
@@ -44,26 +39,30 @@ class _Scene:
     running: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class SlotEnvironment:
-    """Parts of the simulation that slots use, and their callbacks."""
-
-    queue: EventQueue
-    setting: Setting
-    faults: Faults
-    dice: random.Random
-    measured: Measurements
-    on_result: Callable[[LeaseResult], None]
-    on_change: Callable[[], None]
-
-
 class SimulatedSlots:
-    """Slots of one worker process. ``stop`` ends all activity; ``fetched`` bundles stay on disk."""
+    """Slots of one worker process. ``stop`` ends all activity; ``fetched`` bundles stay on disk.
 
-    def __init__(self, machine: SimulatedMachine, around: SlotEnvironment, fetched: set[str]) -> None:
+    ``on_result`` receives each result; ``on_change`` is called after the residents changed.
+    """
+
+    def __init__(
+        self,
+        machine: SimulatedMachine,
+        world: SimulatedWorld,
+        dice: random.Random,
+        fetched: set[str],
+        on_result: Callable[[LeaseResult], None],
+        on_change: Callable[[], None],
+    ) -> None:
         self._machine = machine
-        self._around = around
+        self._setting = world.setting
+        self._faults = world.setting.scenario.faults
+        self._queue = world.queue
+        self._report = world.report
+        self._dice = dice
         self._fetched = fetched
+        self._on_result = on_result
+        self._on_change = on_change
         self._stopped = False
         self._wanted: tuple[str, ...] = ()
         self._scenes: dict[str, _Scene] = {}
@@ -84,7 +83,7 @@ class SimulatedSlots:
 
     def progress(self) -> tuple[LeaseProgress, ...]:
         """Return the steps of running leases: one per ``STEP_S`` until the execution hangs."""
-        now_s = self._around.queue.now_s
+        now_s = self._queue.now_s
         return tuple(
             LeaseProgress(ref, int((min(now_s, self._stuck_s.get(ref, now_s)) - began_s) / STEP_S))
             for ref, (_, began_s) in self._running.items()
@@ -115,7 +114,7 @@ class SimulatedSlots:
     def count_unused(self) -> None:
         """Count loads that were never used, at the end of the simulation."""
         for scene in self._scenes.values():
-            self._around.measured.loads_unused += scene.state is ResidentState.WARM and not scene.last_used
+            self._report.loads_unused += scene.state is ResidentState.WARM and not scene.last_used
 
     def want(self, digests: tuple[str, ...]) -> None:
         self._wanted = digests
@@ -135,7 +134,7 @@ class SimulatedSlots:
         for ref in [ref for ref in self._running if ref in refs]:
             lease, _ = self._running.pop(ref)
             self._leave(lease)
-            self._around.queue.after(RESPAWN_S, self._free_slot)
+            self._queue.after(RESPAWN_S, self._free_slot)
         self._waiting = deque(lease for lease in self._waiting if lease.ref not in refs)
 
     def _settle(self) -> None:
@@ -149,11 +148,11 @@ class SimulatedSlots:
             self._load(digest)
             loading, begun = loading + 1, True
         if begun:
-            self._around.on_change()
+            self._on_change()
 
     def _next_load(self) -> str:
         """Evict for, and return, the most urgent missing scene that fits; empty if there is none."""
-        now_s = self._around.queue.now_s
+        now_s = self._queue.now_s
         for digest, scene in list(self._scenes.items()):
             if scene.state is ResidentState.FAILED and now_s - scene.failed_s >= RETRY_LOAD_S:
                 del self._scenes[digest]
@@ -165,7 +164,7 @@ class SimulatedSlots:
         if place is None:
             return ""
         digest = wanted[place]
-        need_mb = self._around.setting.scenes[digest].memory_mb
+        need_mb = self._setting.scenes[digest].memory_mb
         free_mb = self._machine.resources.memory_mb - sum(scene.memory_mb for scene in held.values())
         evicted: list[str] = []
         for victim in _victims(wanted, place, held):
@@ -176,33 +175,33 @@ class SimulatedSlots:
         if need_mb > free_mb and len(evicted) < len(held):
             return ""
         for victim in evicted:
-            self._around.measured.loads_unused += not self._scenes.pop(victim).last_used
+            self._report.loads_unused += not self._scenes.pop(victim).last_used
         return digest
 
     def _load(self, digest: str) -> None:
-        size, machine = self._around.setting.scenes[digest], self._machine
+        size, machine = self._setting.scenes[digest], self._machine
         load_s = size.load_s / machine.speed
         fetch_s = 0.0
         if digest not in self._fetched:
             self._fetched.add(digest)
             fetch_s = 2 * machine.latency_s + size.bundle_mb / machine.bandwidth_mb_s
         scene = self._scenes[digest] = _Scene(size.memory_mb, load_s)
-        self._around.measured.loads += 1
-        fails = self._around.dice.random() < self._around.faults.load_failure
-        self._around.queue.after(fetch_s + load_s, lambda: self._loaded(digest, scene, fails=fails))
+        self._report.loads += 1
+        fails = self._dice.random() < self._faults.load_failure
+        self._queue.after(fetch_s + load_s, lambda: self._loaded(digest, scene, fails=fails))
 
     def _loaded(self, digest: str, scene: _Scene, *, fails: bool) -> None:
         if self._stopped or self._scenes.get(digest) is not scene:
             return
         scene.state = ResidentState.FAILED if fails else ResidentState.WARM
         if fails:
-            scene.failed_s = self._around.queue.now_s
-            self._around.queue.after(RETRY_LOAD_S, self._settle)
+            scene.failed_s = self._queue.now_s
+            self._queue.after(RETRY_LOAD_S, self._settle)
             failure = InfraFailure(InfraCode.SCENE_LOAD_FAILED, "no such mesh", self._machine.worker_id)
             for lease in [lease for lease in self._waiting if lease.rollout.bundle_digest == digest]:
                 self.cancel({lease.ref})
-                self._around.on_result(LeaseResult(lease.ref, failure))
-        self._around.on_change()
+                self._on_result(LeaseResult(lease.ref, failure))
+        self._on_change()
         self._settle()
         self._start()
 
@@ -219,20 +218,19 @@ class SimulatedSlots:
                 self._execute(lease, scene)
 
     def _execute(self, lease: Lease, scene: _Scene) -> None:
-        around = self._around
         self._clock += 1
         scene.last_used = self._clock
         scene.running += 1
         self._free -= 1
-        began_s = around.queue.now_s
+        began_s = self._queue.now_s
         self._running[lease.ref] = lease, began_s
         rendering = sum(running.rollout.render for running, _ in self._running.values())
-        around.measured.counts["rendered without a slot for it"] += (
+        self._report.counts["rendered without a slot for it"] += (
             rendering > self._machine.resources.render_slots
         )
         rollout_id = lease.rollout.rollout_id
-        seconds = around.setting.duration_s(rollout_id) / self._machine.speed
-        fate, crash, hang = around.dice.random(), around.faults.crash, around.faults.hang
+        seconds = self._setting.duration_s(rollout_id) / self._machine.speed
+        fate, crash, hang = self._dice.random(), self._faults.crash, self._faults.hang
         outcome: Completed | InfraFailure
         if fate < crash:
             seconds *= fate / crash
@@ -245,12 +243,12 @@ class SimulatedSlots:
         else:
             timings = Timings(execute_s=seconds)
             outcome = self._result(rollout_id, timings)
-        around.queue.after(seconds, lambda: self._finished(lease, outcome))
+        self._queue.after(seconds, lambda: self._finished(lease, outcome))
 
     def _result(self, rollout_id: str, timings: Timings) -> Completed:
         """Return a result whose trace names its rollout, unless the machine lies."""
         lies, worker_id = self._machine.lies, self._machine.worker_id
-        if lies and self._around.dice.random() < lies:
+        if lies and self._dice.random() < lies:
             return Completed(
                 INVENTED, (), (), f"{rollout_id} as {worker_id} has it", worker_id, timings, warm=True
             )
@@ -263,8 +261,8 @@ class SimulatedSlots:
         if isinstance(outcome, Completed):
             self._free += 1
         else:
-            self._around.queue.after(RESPAWN_S, self._free_slot)
-        self._around.on_result(LeaseResult(lease.ref, outcome))
+            self._queue.after(RESPAWN_S, self._free_slot)
+        self._on_result(LeaseResult(lease.ref, outcome))
         self._start()
 
     def _leave(self, lease: Lease) -> None:

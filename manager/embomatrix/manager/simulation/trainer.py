@@ -7,9 +7,8 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from embomatrix.manager.simulation.machines import SimulatedWorld
 from embomatrix.manager.simulation.manager import SimulatedManager
-from embomatrix.manager.simulation.network import EventQueue
-from embomatrix.manager.simulation.report import Measurements
 from embomatrix.rpc.wire.values import Batch, Completed, LookaheadEntry, Rollout, RolloutResult
 
 if TYPE_CHECKING:
@@ -24,10 +23,8 @@ class SimulatedTrainer:
     def __init__(
         self,
         plan: Trainer,
-        scenes: Sequence[str],
-        queue: EventQueue,
+        world: SimulatedWorld,
         manager: SimulatedManager,
-        measured: Measurements,
         rng: np.random.Generator,
     ) -> None:
         self.plan = plan
@@ -35,16 +32,14 @@ class SimulatedTrainer:
         self.ended_s = 0.0
         self.warmed_up_s = plan.start_s
         """End of its first step, which could not be announced in time; the start if there is only one step."""
-        self.groups_s: list[float] = []
-        """Time from the submission of each group to its last result."""
         self.waited_s = 0.0
         """Total time after the first step that it only waited for results."""
         self.first_result_s = math.inf
         """Time from the first submission to the first result."""
-        self._queue = queue
+        self._queue = world.queue
         self._manager = manager
-        self._measured = measured
-        self._announced, self._actual = _schedule(plan, scenes, rng)
+        self._report = world.report
+        self._announced, self._actual = _schedule(plan, list(world.setting.scenes), rng)
         self._step = 0
         self._left = 0
         self._starts_s: dict[str, list[float]] = {}
@@ -54,7 +49,7 @@ class SimulatedTrainer:
         self._open: dict[str, tuple[int, float]] = {}
         """Missing results and submission time of each group."""
         manager.open_run(plan.name, plan.terms, self._take)
-        queue.after(plan.start_s, self._begin_step)
+        self._queue.after(plan.start_s, self._begin_step)
 
     @property
     def warmed_up(self) -> bool:
@@ -97,7 +92,7 @@ class SimulatedTrainer:
             left, sent_s = self._open[result.group_id]
             self._open[result.group_id] = left - 1, sent_s
             if left == 1:
-                self.groups_s.append(self._queue.now_s - sent_s)
+                self._report.groups_s[self.plan.name].append(self._queue.now_s - sent_s)
             if isinstance(result.outcome, Completed):
                 self._starts_s.setdefault(result.group_id, []).append(result.outcome.timings.queued_s)
                 self._warm[result.group_id] = result.outcome.warm
@@ -108,13 +103,13 @@ class SimulatedTrainer:
         self._left -= results
         if self._left:
             return
-        self._measured.first_queued_s += [min(starts) for starts in self._starts_s.values()]
+        self._report.first_queued_s += [min(starts) for starts in self._starts_s.values()]
         if self._step:
-            self._measured.foretold += len(self._warm)
-            self._measured.warm += sum(self._warm.values())
+            self._report.foretold += len(self._warm)
+            self._report.warm += sum(self._warm.values())
         self._starts_s.clear()
         self._warm.clear()
-        self._measured.waits_s.append(self._queue.now_s - self._sent_s)
+        self._report.waits_s.append(self._queue.now_s - self._sent_s)
         if self._step or self.plan.steps == 1:
             self.waited_s += self._queue.now_s - self._sent_s
         else:

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import Final, TypeVar
 
 from embomatrix.host.backoff import Backoff
 from embomatrix.manager.runtime.registry import WorkerSession
-from embomatrix.manager.simulation.invariants import InvariantChecker
-from embomatrix.manager.simulation.manager import SimulatedManager, Stream, WorkerMessage
-from embomatrix.manager.simulation.network import EventQueue, NetworkPath
-from embomatrix.manager.simulation.report import Measurements
-from embomatrix.manager.simulation.scenario import SimulationScenario
-from embomatrix.manager.simulation.slots import SimulatedSlots, SlotEnvironment
+from embomatrix.manager.runtime.worker_link import OutgoingMessage
+from embomatrix.manager.simulation.machines import SimulatedMachine, SimulatedWorld
+from embomatrix.manager.simulation.manager import SimulatedManager, Stream
+from embomatrix.manager.simulation.network import NetworkPath
+from embomatrix.manager.simulation.slots import SimulatedSlots
 from embomatrix.rpc.status import SupersededError
 from embomatrix.rpc.wire.leases import LeaseRef, LeaseResult, WorkerState
 from embomatrix.rpc.wire.values import Completed
-
-if TYPE_CHECKING:
-    from embomatrix.manager.simulation.machines import Setting, SimulatedMachine
 
 ANSWER_S: Final = 2.0
 """Timeout of a heartbeat and of a new stream."""
@@ -38,25 +34,17 @@ class SimulatedWorker:
     def __init__(
         self,
         machine: SimulatedMachine,
-        scenario: SimulationScenario,
-        setting: Setting,
-        queue: EventQueue,
+        world: SimulatedWorld,
         manager: SimulatedManager,
-        checker: InvariantChecker,
-        measured: Measurements,
         dice: random.Random,
     ) -> None:
         self.machine = machine
-        self._scenario = scenario
-        self._queue = queue
+        self._world = world
+        self._scenario = world.setting.scenario
+        self._queue = world.queue
         self._manager = manager
-        self._checker = checker
-        self._measured = measured
         self._dice = dice
-        self._path = NetworkPath(queue, machine.latency_s)
-        self._around = SlotEnvironment(
-            queue, setting, scenario.faults, dice, measured, self._take_result, self._residents_changed
-        )
+        self._path = NetworkPath(world.queue, machine.latency_s)
         self._fetched: set[str] = set()
         self._life = 0
         self._misses = 0
@@ -72,7 +60,9 @@ class SimulatedWorker:
         """Start the process and schedule its faults."""
         self._life += 1
         self._session, self._outbox = None, {}
-        self.slots = SimulatedSlots(self.machine, self._around, self._fetched)
+        self.slots = SimulatedSlots(
+            self.machine, self._world, self._dice, self._fetched, self._take_result, self._residents_changed
+        )
         self._register()
         self._later_at_random(self._scenario.faults.death_rate, self._die)
         self._later_at_random(self._scenario.faults.partition_rate, self._lose_network)
@@ -81,8 +71,8 @@ class SimulatedWorker:
         """End the process; another starts later. A ``silent`` death breaks no connection."""
         if self.slots is None:
             return
-        self._measured.counts["silent deaths" if silent else "deaths"] += 1
-        self._measured.died_s[self.machine.worker_id] = self._queue.now_s
+        self._world.report.counts["silent deaths" if silent else "deaths"] += 1
+        self._world.report.died_s[self.machine.worker_id] = self._queue.now_s
         self._disconnect(silent=silent)
         self.slots.stop()
         self.slots = None
@@ -91,7 +81,7 @@ class SimulatedWorker:
 
     def cut(self, seconds: float, *, up: bool = True, down: bool = True) -> None:
         """Cut its network for ``seconds``."""
-        self._measured.counts["partitions"] += 1
+        self._world.report.counts["partitions"] += 1
         self._path.cut(seconds, up=up, down=down)
 
     def _die(self) -> None:
@@ -229,16 +219,16 @@ class SimulatedWorker:
         """End a session that the manager gave up: its leases are void."""
         if stream is not self._stream or self.slots is None:
             return
-        self._measured.counts["sessions given up"] += 1
+        self._world.report.counts["sessions given up"] += 1
         self.slots.cancel(set(self.slots.held()))
         self._disconnect(silent=True)
         self._session = None
         self._register()
 
-    def _read(self, stream: Stream, message: WorkerMessage) -> None:
+    def _read(self, stream: Stream, message: OutgoingMessage) -> None:
         if stream is not self._stream or self.slots is None:
             return
-        for ref in (*message.ended, *message.cancelled):
+        for ref in (*message.acknowledged, *message.cancelled):
             self._outbox.pop(ref, None)
         if message.cancelled:
             self.slots.cancel(set(message.cancelled))
@@ -249,7 +239,7 @@ class SimulatedWorker:
 
     def _take_result(self, result: LeaseResult) -> None:
         if isinstance(result.outcome, Completed):
-            self._checker.executed(result.outcome.trace_digest, self.machine.worker_id)
+            self._world.checker.executed(result.outcome.trace_digest, self.machine.worker_id)
         self._outbox[result.ref] = result
         self._send(None, (result,))
 
