@@ -11,6 +11,7 @@ from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 from embomatrix.manager.web.floor_plan import floor_plan, moments_of, movable_objects
 from embomatrix.manager.web.gallery import Gallery
 from embomatrix.manager.web.gallery_values import SceneName
+from embomatrix.manager.web.rest import answer_errors
 from embomatrix.manager.web.rest_tasks import NO_DATASET, task_routes
 from embomatrix.rpc.status import NotFoundError, UnavailableError
 from embomatrix.skills.parse import parse_plan, plan_to_json
@@ -65,6 +66,7 @@ async def test_dataset_names_the_scenes_of_bundles(folder):
 
 def test_manager_without_a_dataset_shows_no_tasks():
     app = FastAPI()
+    answer_errors(app)
     app.include_router(task_routes(None))
     http = TestClient(app)
     assert http.get("/api/v1/tasks").json()["notice"] == NO_DATASET

@@ -18,7 +18,7 @@ from embomatrix.manager.runtime.revocation import Revocation
 from embomatrix.manager.web.cluster_view import Snapshots
 from embomatrix.manager.web.http_rules import STATIC, Guard, HttpRules
 from embomatrix.manager.web.prometheus import CONTENT_TYPE, metrics_page
-from embomatrix.manager.web.rest import PREFIX, command_routes, read_routes
+from embomatrix.manager.web.rest import PREFIX, answer_errors, command_routes, read_routes
 from embomatrix.manager.web.rest_tasks import task_routes
 from embomatrix.manager.web.rewards import reward_routes
 from embomatrix.rpc.versions import software_version
@@ -53,6 +53,7 @@ def build_api(
         docs_url=None,
         redoc_url=None,
     )
+    answer_errors(app)
     app.add_middleware(GZipMiddleware, minimum_size=COMPRESSED_BYTES, compresslevel=1)
     app.add_middleware(Guard, rules=rules)
     app.mount(STATIC, _PageFiles(directory=DASHBOARD))

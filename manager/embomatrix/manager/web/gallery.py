@@ -5,9 +5,10 @@ limited.
 """
 
 import asyncio
+import functools
 import json
 import re
-from collections import Counter, OrderedDict
+from collections import Counter
 from pathlib import Path
 from typing import Final
 
@@ -52,9 +53,9 @@ class Gallery:
         self._reading = asyncio.Lock()
         self._stamp: tuple[int, int] | None = None
         self._records: dict[str, TaskRecord] = {}
-        self._dataset: Dataset | None = None
-        self._scenes: OrderedDict[str, Scene] = OrderedDict()
-        self._plans: OrderedDict[str, FloorPlanView] = OrderedDict()
+        self._dataset: Dataset  # set with the stamp
+        self._scene = functools.lru_cache(SCENES_KEPT)(self._read_scene)
+        self._floor = functools.lru_cache(PLANS_KEPT)(lambda digest: floor_plan(self._scene(digest)))
 
     async def page(self, *, search: str, scene: str, category: str, offset: int, limit: int) -> TaskPage:
         """Return a page of the tasks with these words in their instruction or id, in file order. Raises
@@ -94,7 +95,7 @@ class Gallery:
         """Return the floor plan of a bundle's scene. Raises NotFoundError."""
         await self._check_bundle(digest)
         async with self._reading:
-            return await asyncio.to_thread(self._read_floor, digest)
+            return await asyncio.to_thread(self._floor, digest)
 
     async def picture(self, digest: str) -> bytes:
         """Return the JPEG of a bundle's scene that ``embomatrix factory pictures`` made. Raises NotFoundError."""
@@ -133,8 +134,8 @@ class Gallery:
                 dataset = Dataset.load(self._folder)
                 self._dataset, self._stamp = dataset, (known.st_mtime_ns, known.st_size)
                 self._records = {record.task.task_id: record for record in dataset.records}
-                self._scenes.clear()
-                self._plans.clear()
+                self._scene.cache_clear()
+                self._floor.cache_clear()
         except OSError as error:
             raise UnavailableError(
                 f"the dataset {self._folder} can't be read ({error.strerror}): start the manager with another --dataset"
@@ -143,22 +144,11 @@ class Gallery:
             raise UnavailableError(str(error)) from error
         return self._records
 
-    def _scene(self, digest: str) -> Scene:
-        if digest not in self._scenes and self._dataset is not None:
-            try:
-                self._scenes[digest] = self._dataset.read_bundle(digest).scene
-            except DatasetError as error:
-                raise UnavailableError(str(error)) from error
-            while len(self._scenes) > SCENES_KEPT:
-                self._scenes.popitem(last=False)
-        return self._scenes[digest]
-
-    def _read_floor(self, digest: str) -> FloorPlanView:
-        if digest not in self._plans:
-            self._plans[digest] = floor_plan(self._scene(digest))
-            while len(self._plans) > PLANS_KEPT:
-                self._plans.popitem(last=False)
-        return self._plans[digest]
+    def _read_scene(self, digest: str) -> Scene:
+        try:
+            return self._dataset.read_bundle(digest).scene
+        except DatasetError as error:
+            raise UnavailableError(str(error)) from error
 
     def _read_detail(self, record: TaskRecord) -> TaskDetail:
         task, scene = record.task, self._scene(record.bundle_digest)
@@ -180,7 +170,7 @@ class Gallery:
             objects=[_row(scene, name, about) for name in task.table if name in scene.by_name],
             transcript=self._note("transcripts", task.task_id, "md"),
             tree=_parsed(tree),
-            floor=self._read_floor(record.bundle_digest),
+            floor=self._floor(record.bundle_digest),
             things=movable_objects(scene, task),
             moments=moments,
             problem=problem,

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
-from starlette.responses import PlainTextResponse
+from starlette.responses import PlainTextResponse, Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from embomatrix.manager.settings import LOOPBACK_NAMES, is_loopback
@@ -34,13 +34,6 @@ SUFFICIENT_ROLES: Final[Mapping[AccessRole, frozenset[AccessRole]]] = {
 """Roles that may send a request, by the lowest role that it needs."""
 
 
-class HttpRefusal(NamedTuple):
-    """HTTP status and message of a refused request."""
-
-    status: int
-    sentence: str
-
-
 @dataclass(frozen=True, slots=True)
 class HttpRules:
     """``hosts`` are the names that this server answers to; empty: any name."""
@@ -48,28 +41,29 @@ class HttpRules:
     gate: Gate
     hosts: frozenset[str]
 
-    def refusal(self, method: str, path: str, headers: Headers) -> HttpRefusal | None:
-        """Return the reason to refuse the request; None if it is allowed."""
+    def refusal(self, method: str, path: str, headers: Headers) -> Response | None:
+        """Return the answer to a refused request; None if the request is allowed."""
         host = headers.get("host", "")
         if self.hosts and _name_of(host) not in self.hosts:
             # Prevents DNS rebinding: a foreign page must not reach this server under its own name.
-            return HttpRefusal(
-                400, f"this server is not called {host[:100]!r}: add the name with `manager init --san`"
+            return PlainTextResponse(
+                f"this server is not called {host[:100]!r}: add the name with `manager init --san`", 400
             )
         changes = method not in READING
         if changes and _is_foreign(headers, host):
-            return HttpRefusal(
-                403, "a page of another origin requested a change: open the manager's own dashboard"
+            return PlainTextResponse(
+                "a page of another origin requested a change: open the manager's own dashboard", 403
             )
         if (path in OPEN_PATHS or path.startswith(STATIC)) and not changes:
             return None
         try:
             role = self.gate.caller(token_of(headers.get("authorization"))).role
         except NotSignedInError as error:
-            return HttpRefusal(401, f"{error}; HTTP requests send it as `Authorization: Bearer TOKEN`")
+            sentence = f"{error}; HTTP requests send it as `Authorization: Bearer TOKEN`"
+            return PlainTextResponse(sentence, 401, {"www-authenticate": "Bearer"})
         needed = _needed_role(path, changes=changes)
         if role not in SUFFICIENT_ROLES[needed]:
-            return HttpRefusal(403, f"a token of the role {role} may not do this: it needs {needed}")
+            return PlainTextResponse(f"a token of the role {role} may not do this: it needs {needed}", 403)
         return None
 
 
@@ -85,11 +79,7 @@ class Guard:
             await send({"type": "websocket.close", "code": 1008})
             return
         refusal = self._rules.refusal(scope["method"], scope["path"], Headers(scope=scope))
-        if refusal is None:
-            await self._app(scope, receive, send)
-        else:
-            challenge = {"www-authenticate": "Bearer"} if refusal.status == 401 else None
-            await PlainTextResponse(refusal.sentence, refusal.status, challenge)(scope, receive, send)
+        await (refusal or self._app)(scope, receive, send)
 
 
 def allowed_hosts(bound: str, tls: Tls | None) -> frozenset[str]:

@@ -6,11 +6,12 @@
 import asyncio
 import contextlib
 import dataclasses
+import functools
 import json
 from collections.abc import AsyncIterator, Iterator, Mapping
 from typing import Annotated, Any, Final
 
-from fastapi import APIRouter, Body, HTTPException, Query, Response
+from fastapi import APIRouter, Body, FastAPI, HTTPException, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 
 from embomatrix.manager.observe.training_reports import TrainingDetail, TrainingView
@@ -90,12 +91,14 @@ def read_routes(runtime: ManagerRuntime, snapshots: Snapshots) -> APIRouter:
         state: State = "", search: Search = "", offset: Offset = 0, limit: Limit = PAGE
     ) -> Response:
         """Workers, those that need attention first."""
-        return _json(worker_page(snapshots.now(), state=state, search=search, offset=offset, limit=limit))
+        return json_response(
+            worker_page(snapshots.now(), state=state, search=search, offset=offset, limit=limit)
+        )
 
     @router.get("/runs", response_model=RunPage)
     async def runs(offset: Offset = 0, limit: Limit = PAGE) -> Response:
         """Open runs, newest first."""
-        return _json(run_page(snapshots.now(), offset=offset, limit=limit))
+        return json_response(run_page(snapshots.now(), offset=offset, limit=limit))
 
     _figures(router, snapshots)
     _logs(router, runtime)
@@ -150,12 +153,12 @@ def _figures(router: APIRouter, snapshots: Snapshots) -> None:
     @router.get("/overview", response_model=Overview)
     async def overview() -> Response:
         """Figures of the cluster."""
-        return _json(snapshots.now().overview)
+        return json_response(snapshots.now().overview)
 
     @router.get("/lookahead", response_model=list[LookaheadStep])
     async def lookahead() -> Response:
         """Scenes that coming steps need, with the loading state of each."""
-        return JSONResponse([dataclasses.asdict(step) for step in snapshots.now().lookahead])
+        return json_response(snapshots.now().lookahead)
 
 
 def _logs(router: APIRouter, runtime: ManagerRuntime) -> None:
@@ -164,23 +167,20 @@ def _logs(router: APIRouter, runtime: ManagerRuntime) -> None:
     @router.get("/runs/{run_id}")
     async def run(run_id: str) -> Response:
         """Totals of an open run, or of one of the last 50 closed runs."""
-        with http_errors():
-            summary = await history.summary(run_id)
+        summary = await history.summary(run_id)
         values = dataclasses.asdict(dataclasses.replace(summary, failures=()))
         return JSONResponse({**values, "failures": [_event(event) for event in summary.failures]})
 
     @router.get("/runs/{run_id}/timeline", response_model=Timeline)
     async def tracks(run_id: str, seconds: Seconds = 60.0, search: Search = "") -> Response:
         """Work of each slot in the last seconds of a run, on workers with the text in their name."""
-        with http_errors():
-            latest = await history.latest(run_id, seconds)
-            return _json(timeline(run_id, latest, seconds=seconds, search=search))
+        latest = await history.latest(run_id, seconds)
+        return json_response(timeline(run_id, latest, seconds=seconds, search=search))
 
     @router.get("/events")
     async def events(run: Run = "", after: After = 0) -> Response:
         """Page of the log of a run, or of workers and scenes."""
-        with http_errors():
-            page = await history.events(run, after, 0)
+        page = await history.events(run, after, 0)
         return JSONResponse({"events": [_event(event) for event in page.events], "dropped": page.dropped})
 
 
@@ -188,13 +188,12 @@ def _training(router: APIRouter, runtime: ManagerRuntime, snapshots: Snapshots) 
     @router.get("/training", response_model=list[TrainingView])
     async def reporting() -> Response:
         """Runs whose trainers report, latest report first. Includes some closed runs."""
-        return JSONResponse([dataclasses.asdict(view) for view in snapshots.now().training])
+        return json_response(snapshots.now().training)
 
     @router.get("/training/{run_id}", response_model=TrainingDetail)
     async def detail(run_id: str) -> Response:
         """Learning curves of a run, and recent plans of its policy."""
-        with http_errors():
-            return _json(runtime.training.detail(run_id))
+        return json_response(runtime.training.detail(run_id))
 
 
 def _stream(router: APIRouter, runtime: ManagerRuntime) -> None:
@@ -204,8 +203,7 @@ def _stream(router: APIRouter, runtime: ManagerRuntime) -> None:
     async def stream(run: Run = "", after: After = 0) -> Response:
         """New events as server-sent events: `id` is the sequence number, `data` the event as JSON."""
         nonlocal viewers
-        with http_errors():
-            await runtime.history.events(run, after, 1)
+        await runtime.history.events(run, after, 1)
         if viewers >= VIEWERS:
             raise HTTPException(503, f"{VIEWERS} streams are open: close one, or ask for pages of /events")
 
@@ -248,25 +246,26 @@ def _event(event: RunEvent) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value}
 
 
-def _json(value: Any) -> Response:
-    return JSONResponse(dataclasses.asdict(value))
+def json_response(value: object) -> Response:
+    """Return a dataclass, or a list of them, as JSON."""
+    text = json.dumps(value, default=dataclasses.asdict, separators=(",", ":"), allow_nan=False)
+    return Response(text, media_type="application/json")
 
 
-@contextlib.contextmanager
-def http_errors() -> Iterator[None]:
-    """Turn a ClusterError into an HTTP error with the same message."""
-    try:
-        yield
-    except tuple(STATUSES) as error:
-        status = next(number for kind, number in STATUSES.items() if isinstance(error, kind))
-        raise HTTPException(status, str(error)) from error
+def answer_errors(app: FastAPI) -> None:
+    """Answer each ClusterError of a route with an HTTP error and the same message."""
+    for kind, status in STATUSES.items():
+        app.add_exception_handler(kind, functools.partial(_problem, status))
+
+
+async def _problem(status: int, _: Request, error: Exception) -> Response:
+    return JSONResponse({"detail": str(error)}, status)
 
 
 @contextlib.contextmanager
 def _changing(snapshots: Snapshots) -> Iterator[None]:
     """Run a command, and let the next request see its effect."""
     try:
-        with http_errors():
-            yield
+        yield
     finally:
         snapshots.forget()

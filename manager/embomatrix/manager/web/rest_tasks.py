@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from typing import TYPE_CHECKING, Annotated, Final
 
 from fastapi import APIRouter, Query, Response
 
 from embomatrix.manager.web.gallery_values import FloorPlanView, SceneName, TaskDetail, TaskPage
-from embomatrix.manager.web.rest import PREFIX, Limit, Offset, http_errors
+from embomatrix.manager.web.rest import PREFIX, Limit, Offset, json_response
 from embomatrix.manager.web.rest_values import PAGE
 from embomatrix.rpc.status import NotFoundError
 
@@ -38,37 +36,32 @@ def task_routes(gallery: Gallery | None) -> APIRouter:
     ) -> Response:
         """Tasks of the dataset, in its order."""
         if gallery is None:
-            return _json(TaskPage(0, offset, [], [], [], NO_DATASET))
-        with http_errors():
-            return _json(
-                await gallery.page(search=search, scene=scene, category=category, offset=offset, limit=limit)
-            )
+            return json_response(TaskPage(0, offset, [], [], [], NO_DATASET))
+        return json_response(
+            await gallery.page(search=search, scene=scene, category=category, offset=offset, limit=limit)
+        )
 
     @router.get("/tasks/{task_id}", response_model=TaskDetail)
     async def task(task_id: str) -> Response:
         """One task: instruction, objects, and the oracle's plan on the floor plan."""
-        with http_errors():
-            return _json(await _shown(gallery).detail(task_id))
+        return json_response(await _shown(gallery).detail(task_id))
 
     @router.get("/scenes", response_model=list[SceneName])
     async def scenes(offset: Offset = 0, limit: Limit = PAGE) -> Response:
         """Names of the dataset's scenes, by bundle digest."""
         if gallery is None:
-            return _json([])
-        with http_errors():
-            return _json(await gallery.scenes(offset=offset, limit=limit))
+            return json_response([])
+        return json_response(await gallery.scenes(offset=offset, limit=limit))
 
     @router.get("/scenes/{digest}/floor", response_model=FloorPlanView)
     async def floor(digest: str) -> Response:
         """Floor plan of a scene."""
-        with http_errors():
-            return _json(await _shown(gallery).floor(digest))
+        return json_response(await _shown(gallery).floor(digest))
 
     @router.get("/scenes/{digest}/picture", response_class=Response)
     async def picture(digest: str) -> Response:
         """Rendered picture of a scene, as JPEG."""
-        with http_errors():
-            return Response(await _shown(gallery).picture(digest), media_type="image/jpeg")
+        return Response(await _shown(gallery).picture(digest), media_type="image/jpeg")
 
     return router
 
@@ -77,8 +70,3 @@ def _shown(gallery: Gallery | None) -> Gallery:
     if gallery is None:
         raise NotFoundError(NO_DATASET)
     return gallery
-
-
-def _json(value: object) -> Response:
-    text = json.dumps(value, default=dataclasses.asdict, separators=(",", ":"))
-    return Response(text, media_type="application/json")

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from embomatrix.manager.runtime.results import BatchLog
 from embomatrix.manager.runtime.runs import Runs
-from embomatrix.manager.web.rest import PREFIX, http_errors
+from embomatrix.manager.web.rest import PREFIX
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import unparsable
@@ -62,9 +62,8 @@ def reward_routes(runs: Runs) -> APIRouter:
     @router.post("/rewards", openapi_extra={"requestBody": _BODY})
     async def rewards(request: Request) -> JSONResponse:
         """Reward, success (as score) and tiers of each answer; 503 after an infrastructure failure."""
-        with http_errors():
-            requested = _request(await _body(request))
-            return JSONResponse(_response(await _rewards(runs, requested)))
+        requested = _request(await _body(request))
+        return JSONResponse(_response(await _rewards(runs, requested)))
 
     return router
 
