@@ -20,30 +20,21 @@ TASKS: Final = 960
 console = Console()
 
 
-_Out = Annotated[
-    Path | None,
-    typer.Option(help=f"Output folder. Default: {DEFAULT_OUT}, or the first free {DEFAULT_OUT}-2, -3 …"),
-]
-_Dataset = Annotated[Path, typer.Option(help="Dataset folder. It is built if missing.")]
-_Workers = Annotated[int, typer.Option(min=1, max=64, help="Workers on this machine.")]
-_Slots = Annotated[int, typer.Option(min=1, max=64, help="Slots per worker.")]
-_Minutes = Annotated[float, typer.Option(min=0.1, help="Minutes of GRPO.")]
-_ImitateSeconds = Annotated[float, typer.Option(min=0.0, help="Seconds of imitation before GRPO.")]
-_Model = Annotated[str, typer.Option(help="`tiny`, or a Hugging Face model by name or folder.")]
-_Seed = Annotated[int, typer.Option(help="Random seed of tasks, policy and sampling.")]
-_Threads = Annotated[int, typer.Option(min=0, help="torch threads per process. 0: half of the cores.")]
-
-
 def demo(
-    out: _Out = None,
-    dataset: _Dataset = Path("build/dataset"),
-    workers: _Workers = 2,
-    slots: _Slots = 1,
-    minutes: _Minutes = 5.5,
-    imitate_seconds: _ImitateSeconds = 80.0,
-    model: _Model = "tiny",
-    seed: _Seed = 0,
-    threads: _Threads = 0,
+    out: Annotated[
+        Path | None,
+        typer.Option(help=f"Output folder. Default: {DEFAULT_OUT}, or the first free {DEFAULT_OUT}-2, -3 …"),
+    ] = None,
+    dataset: Annotated[Path, typer.Option(help="Dataset folder. It is built if missing.")] = Path(
+        "build/dataset"
+    ),
+    workers: Annotated[int, typer.Option(min=1, max=64, help="Workers on this machine.")] = 2,
+    slots: Annotated[int, typer.Option(min=1, max=64, help="Slots per worker.")] = 1,
+    minutes: Annotated[float, typer.Option(min=0.1, help="Minutes of GRPO.")] = 5.5,
+    imitate_seconds: Annotated[float, typer.Option(min=0.0, help="Seconds of imitation before GRPO.")] = 80.0,
+    model: Annotated[str, typer.Option(help="`tiny`, or a Hugging Face model by name or folder.")] = "tiny",
+    seed: Annotated[int, typer.Option(help="Random seed of tasks, policy and sampling.")] = 0,
+    threads: Annotated[int, typer.Option(min=0, help="torch threads per process. 0: half of the cores.")] = 0,
 ) -> None:
     """Start a local cluster and train on real tasks, from nothing to a report."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[RichHandler(show_path=False)])

@@ -10,7 +10,6 @@ import json
 import logging
 import re
 import time
-import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +27,7 @@ from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.cluster.executor import Executor
 from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import read_toml, settings_error
 from embomatrix.trainer.eai.exam import CODEC as EAI_CODEC
 from embomatrix.trainer.eai.exam import NAME as NATIVE
 from embomatrix.trainer.eai.exam import NativeExam
@@ -127,80 +127,77 @@ _BENCH: Final = "Benchmark"
 _QUESTIONS: Final = "Questions"
 _EXECUTION: Final = "Execution"
 _OUTPUT: Final = "Output"
-_Model = Annotated[str, _option(_SUBJECT, help="Checkpoint, or a Hugging Face model by name or folder.")]
-_Endpoint = Annotated[
-    str, _option(_SUBJECT, help="URL of an OpenAI-compatible endpoint, before /chat/completions.")
-]
-_ModelName = Annotated[str, _option(_SUBJECT, help="Model name at the endpoint.")]
-_Key = Annotated[
-    str, _option(_SUBJECT, "--llm-key", envvar="EMBOMATRIX_LLM_KEY", help="API key of the endpoint.")
-]
-_Baseline = Annotated[BaselineName | None, _option(_SUBJECT, help="Baseline without a model.")]
-_Answers = Annotated[Path | None, _option(_SUBJECT, help="Stored answers to judge again.")]
-_Bench = Annotated[
-    str,
-    _option(_BENCH, help="eai-native, eai, internal-verified, a dataset folder, or a file of task records."),
-]
-_Split = Annotated[str, _option(_BENCH, help="heldout, train or all. Default: heldout if there is one.")]
-_Profile = Annotated[
-    Profile | None, _option(_BENCH, help="paper: tasks that need another household skill count as failed.")
-]
-_Tasks = Annotated[int | None, _option(_BENCH, min=1, help="Evaluate only the first tasks.")]
-_Samples = Annotated[
-    int | None, _option(_QUESTIONS, min=1, max=MOST_SAMPLES, help="Plans per task. Default: 10.")
-]
-_Temperature = Annotated[float | None, _option(_QUESTIONS, min=0, help="Sampling temperature. Default: 1.")]
-_Seed = Annotated[int | None, _option(_QUESTIONS, min=0, help="Seed of sampling and execution. Default: 0.")]
-_MaxTokens = Annotated[int | None, _option(_QUESTIONS, min=1, help="Maximum tokens of an answer.")]
-_Codec = Annotated[Codec | None, _option(_QUESTIONS, help="Plan format of a language model: json or lines.")]
-_Settings = Annotated[
-    Path | None,
-    _option(_QUESTIONS, "--settings", help="TOML file with further settings (docs/evaluation.md)."),
-]
-_Manager = Annotated[
-    str,
-    _option(_EXECUTION, envvar="EMBOMATRIX_MANAGER", help="HOST:PORT of a manager. Default: this machine."),
-]
-_Token = Annotated[
-    str, _option(_EXECUTION, envvar="EMBOMATRIX_TOKEN", help="Token of the trainer role, or @FILE.")
-]
-_Ca = Annotated[
-    Path | None, _option(_EXECUTION, envvar="EMBOMATRIX_CA", help="ca.pem of a manager with TLS.")
-]
-_Jobs = Annotated[int | None, _option(_EXECUTION, min=1, help="Simulator processes without a manager.")]
-_Threads = Annotated[int | None, _option(_EXECUTION, min=1, help="torch threads.")]
-_Out = Annotated[
-    Path | None, _option(_OUTPUT, help=f"Folder of answers and report. Default: {DEFAULT_OUT}/BENCH-MODEL.")
-]
-_Beside = Annotated[
-    list[Path] | None, _option(_OUTPUT, help="A report.json of the same tasks, as another row. Repeatable.")
-]
 
 
 def evaluate(
-    model: _Model = "",
-    endpoint: _Endpoint = "",
-    model_name: _ModelName = "",
-    key: _Key = "",
-    baseline: _Baseline = None,
-    answers: _Answers = None,
-    bench: _Bench = "",
-    split: _Split = "",
-    profile: _Profile = None,
-    tasks: _Tasks = None,
-    samples: _Samples = None,
-    temperature: _Temperature = None,
-    seed: _Seed = None,
-    max_tokens: _MaxTokens = None,
-    codec: _Codec = None,
-    settings_file: _Settings = None,
-    manager: _Manager = "",
-    token: _Token = "",
-    ca: _Ca = None,
-    jobs: _Jobs = None,
-    threads: _Threads = None,
-    out: _Out = None,
-    beside: _Beside = None,
+    context: typer.Context,
+    model: Annotated[
+        str, _option(_SUBJECT, help="Checkpoint, or a Hugging Face model by name or folder.")
+    ] = "",
+    endpoint: Annotated[
+        str, _option(_SUBJECT, help="URL of an OpenAI-compatible endpoint, before /chat/completions.")
+    ] = "",
+    model_name: Annotated[str, _option(_SUBJECT, help="Model name at the endpoint.")] = "",
+    key: Annotated[
+        str, _option(_SUBJECT, "--llm-key", envvar="EMBOMATRIX_LLM_KEY", help="API key of the endpoint.")
+    ] = "",
+    baseline: Annotated[BaselineName | None, _option(_SUBJECT, help="Baseline without a model.")] = None,
+    answers: Annotated[Path | None, _option(_SUBJECT, help="Stored answers to judge again.")] = None,
+    bench: Annotated[
+        str,
+        _option(
+            _BENCH, help="eai-native, eai, internal-verified, a dataset folder, or a file of task records."
+        ),
+    ] = "",
+    split: Annotated[
+        str, _option(_BENCH, help="heldout, train or all. Default: heldout if there is one.")
+    ] = "",
+    profile: Annotated[
+        Profile | None,
+        _option(_BENCH, help="paper: tasks that need another household skill count as failed."),
+    ] = None,
+    tasks: Annotated[int | None, _option(_BENCH, min=1, help="Evaluate only the first tasks.")] = None,
+    samples: Annotated[
+        int | None, _option(_QUESTIONS, min=1, max=MOST_SAMPLES, help="Plans per task. Default: 10.")
+    ] = None,
+    temperature: Annotated[
+        float | None, _option(_QUESTIONS, min=0, help="Sampling temperature. Default: 1.")
+    ] = None,
+    seed: Annotated[
+        int | None, _option(_QUESTIONS, min=0, help="Seed of sampling and execution. Default: 0.")
+    ] = None,
+    max_tokens: Annotated[int | None, _option(_QUESTIONS, min=1, help="Maximum tokens of an answer.")] = None,
+    codec: Annotated[
+        Codec | None, _option(_QUESTIONS, help="Plan format of a language model: json or lines.")
+    ] = None,
+    settings_file: Annotated[
+        Path | None,
+        _option(_QUESTIONS, "--settings", help="TOML file with further settings (docs/evaluation.md)."),
+    ] = None,
+    manager: Annotated[
+        str,
+        _option(
+            _EXECUTION, envvar="EMBOMATRIX_MANAGER", help="HOST:PORT of a manager. Default: this machine."
+        ),
+    ] = "",
+    token: Annotated[
+        str, _option(_EXECUTION, envvar="EMBOMATRIX_TOKEN", help="Token of the trainer role, or @FILE.")
+    ] = "",
+    ca: Annotated[
+        Path | None, _option(_EXECUTION, envvar="EMBOMATRIX_CA", help="ca.pem of a manager with TLS.")
+    ] = None,
+    jobs: Annotated[
+        int | None, _option(_EXECUTION, min=1, help="Simulator processes without a manager.")
+    ] = None,
+    threads: Annotated[int | None, _option(_EXECUTION, min=1, help="torch threads.")] = None,
+    out: Annotated[
+        Path | None,
+        _option(_OUTPUT, help=f"Folder of answers and report. Default: {DEFAULT_OUT}/BENCH-MODEL."),
+    ] = None,
+    beside: Annotated[
+        list[Path] | None,
+        _option(_OUTPUT, help="A report.json of the same tasks, as another row. Repeatable."),
+    ] = None,
 ) -> None:
     """Evaluate a model, an endpoint or a baseline: success by category with intervals, and causes of failure.
 
@@ -211,18 +208,7 @@ def evaluate(
             raise TrainerError(
                 "expected one of --model, --endpoint, --baseline and --answers: give one of them"
             )
-        options = {
-            "samples": samples,
-            "temperature": temperature,
-            "seed": seed,
-            "max_tokens": max_tokens,
-            "codec": codec,
-            "profile": profile,
-            "tasks": tasks,
-            "jobs": jobs,
-            "threads": threads,
-        }
-        settings = read_eval_settings(settings_file, options)
+        settings = read_eval_settings(settings_file, context.params)
         open_executor = functools.partial(_executor, manager, token, ca, settings.jobs)
         if answers is not None:
             _judge_stored(answers, bench, out, open_executor, beside or [])
@@ -238,21 +224,15 @@ def evaluate(
 
 
 def read_eval_settings(path: Path | None, options: dict[str, Any]) -> EvalSettings:
-    """Merge a TOML file and the given options. Raises TrainerError."""
+    """Merge a TOML file and those of the given options that are settings. Raises TrainerError."""
+    values = {} if path is None else read_toml(path)
+    given = {name: options.get(name) for name in EvalSettings.model_fields}
     try:
-        values = {} if path is None else tomllib.loads(path.read_text(encoding="utf-8"))
-        values |= {name: value for name, value in options.items() if value is not None}
-        return EvalSettings.model_validate(values)
-    except OSError as error:
-        raise TrainerError(
-            f"the settings {path} can't be read ({error.strerror}): expected a TOML file"
-        ) from error
+        return EvalSettings.model_validate(
+            values | {name: value for name, value in given.items() if value is not None}
+        )
     except ValidationError as error:
-        first = error.errors()[0]
-        expected = first["msg"][:1].lower() + first["msg"][1:]
-        raise TrainerError(f"setting {first['loc'][0]!r}: {expected} (found {first['input']!r})") from error
-    except ValueError as error:
-        raise TrainerError(f"the settings {path} are not valid TOML ({error}): fix the file") from error
+        raise settings_error(error) from error
 
 
 @contextlib.contextmanager

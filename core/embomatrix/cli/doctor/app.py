@@ -23,14 +23,14 @@ from embomatrix.rpc.trust import read_ca, read_token
 
 STYLES: Final[Mapping[Level, str]] = {Level.FINE: "green", Level.NOTE: "yellow", Level.WRONG: "red"}
 
-PagePort = Annotated[int, typer.Option(help="Port of its status page, to compare clocks.", min=1, max=65535)]
-
 
 def doctor(
     manager: Manager = "",
     token: Token = "",
     ca: Ca = None,
-    page_port: PagePort = 8070,
+    page_port: Annotated[
+        int, typer.Option(help="Port of its status page, to compare clocks.", min=1, max=65535)
+    ] = 8070,
     as_json: AsJson = False,
 ) -> None:
     """Check Python, packages, ports, memory, disk and the connection to a manager. Exits with 2 if something is wrong."""

@@ -277,17 +277,20 @@ def read_settings(
     values: dict[str, Any] = {}
     _set_all(values, defaults or {})
     if path is not None:
-        try:
-            _merge(values, tomllib.loads(path.read_text(encoding="utf-8")))
-        except OSError as error:
-            raise TrainerError(
-                f"the settings file {path} can't be read ({error.strerror}): expected a TOML file"
-            ) from error
-        except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise TrainerError(
-                f"the settings file {path} is not valid TOML ({error}): fix the file"
-            ) from error
+        _merge(values, read_toml(path))
     return with_changes(values, changes)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file of settings. Raises TrainerError."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise TrainerError(
+            f"the settings file {path} can't be read ({error.strerror}): expected a TOML file"
+        ) from error
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise TrainerError(f"the settings file {path} is not valid TOML ({error}): fix the file") from error
 
 
 def with_changes(values: dict[str, Any], changes: Mapping[str, Any]) -> TrainSettings:
@@ -301,13 +304,18 @@ def checked_settings(values: Mapping[str, Any]) -> TrainSettings:
     try:
         return TrainSettings.model_validate(values)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        if first["type"] == "extra_forbidden":
-            raise TrainerError(f"unknown setting {where!r}: correct its name or remove it") from error
-        expected = first["msg"].removeprefix("Value error, ")
-        expected = expected[:1].lower() + expected[1:]
-        raise TrainerError(f"setting {where!r}: {expected} (found {first.get('input')!r})") from error
+        raise settings_error(error) from error
+
+
+def settings_error(error: ValidationError) -> TrainerError:
+    """Return an error about the first wrong setting, with its name."""
+    first = error.errors()[0]
+    where = ".".join(map(str, first["loc"]))
+    if first["type"] == "extra_forbidden":
+        return TrainerError(f"unknown setting {where!r}: correct its name or remove it")
+    expected = first["msg"].removeprefix("Value error, ")
+    expected = expected[:1].lower() + expected[1:]
+    return TrainerError(f"setting {where!r}: {expected} (found {first.get('input')!r})")
 
 
 def _set_all(values: dict[str, Any], changes: Mapping[str, Any]) -> None:

@@ -36,59 +36,50 @@ PREFERENCES: Final = frozenset(Preferences.model_fields)
 NOT_SETTINGS: Final = frozenset({"config", "labels", "verbose", "log_format"})
 """Options that are no settings of the daemon, or have another name there."""
 
-Slots = Annotated[int, typer.Option(help="Concurrent rollouts; 0: one for each core.")]
-Join = Annotated[
-    str,
-    typer.Option(
-        envvar="EMBOMATRIX_JOIN",
-        help="Invitation TOKEN@HOST:PORT of the operator, instead of --manager and --token.",
-        show_default=False,
-    ),
-]
-Name = Annotated[str, typer.Option(help="Worker id; by default the host's name and a random part.")]
-Labels = Annotated[list[str] | None, typer.Option("--label", help="KEY=VALUE, for operators; repeatable.")]
-WorkHours = Annotated[str, typer.Option(help="Work only in these hours: 18:00-08:00, local time.")]
-IdleS = Annotated[float, typer.Option(help="Work only after this many seconds without a sign of a user.")]
-MainsOnly = Annotated[bool, typer.Option("--mains-only", help="Pause on battery.")]
-MaxLoad = Annotated[
-    float, typer.Option(help="Pause if other programs use more than this share of all cores, such as 0.5.")
-]
-MemoryMb = Annotated[int, typer.Option(help="Memory for scenes in MB; 0: a share of the free memory.")]
-MemoryShare = Annotated[float, typer.Option(help="Share of the free memory for scenes.")]
-CacheDir = Annotated[Path | None, typer.Option(help="Folder of bundles and the simulator's log.")]
-CacheMb = Annotated[int, typer.Option(help="Disk space for bundles in MB.")]
-Nice = Annotated[
-    int, typer.Option(help="Nice value of the CPU, 0 to 19; above 0 the disk has idle priority, too.")
-]
-Config = Annotated[
-    Path | None, typer.Option(help="TOML file of these options; options on the command line take precedence.")
-]
-Once = Annotated[bool, typer.Option("--once", help="Exit if the manager can't be reached.")]
-Verbose = Annotated[bool, typer.Option("--verbose", help="Log every rollout.")]
-
 
 def run(
     context: typer.Context,
     manager: Manager = DEFAULT_ADDRESS,
-    slots: Slots = 0,
+    slots: Annotated[int, typer.Option(help="Concurrent rollouts; 0: one for each core.")] = 0,
     token: Token = "",
-    join: Join = "",
+    join: Annotated[
+        str,
+        typer.Option(
+            envvar="EMBOMATRIX_JOIN",
+            help="Invitation TOKEN@HOST:PORT of the operator, instead of --manager and --token.",
+            show_default=False,
+        ),
+    ] = "",
     ca: Ca = None,
-    name: Name = "",
-    labels: Labels = None,
-    hours: WorkHours = "",
-    idle_s: IdleS = 0.0,
-    mains_only: MainsOnly = False,
-    max_load: MaxLoad = 0.0,
-    memory_mb: MemoryMb = 0,
-    memory_share: MemoryShare = 0.4,
-    cache_dir: CacheDir = None,
-    cache_mb: CacheMb = 1024,
-    nice: Nice = 10,
+    name: Annotated[str, typer.Option(help="Worker id; by default the host's name and a random part.")] = "",
+    labels: Annotated[
+        list[str] | None, typer.Option("--label", help="KEY=VALUE, for operators; repeatable.")
+    ] = None,
+    hours: Annotated[str, typer.Option(help="Work only in these hours: 18:00-08:00, local time.")] = "",
+    idle_s: Annotated[
+        float, typer.Option(help="Work only after this many seconds without a sign of a user.")
+    ] = 0.0,
+    mains_only: Annotated[bool, typer.Option("--mains-only", help="Pause on battery.")] = False,
+    max_load: Annotated[
+        float,
+        typer.Option(help="Pause if other programs use more than this share of all cores, such as 0.5."),
+    ] = 0.0,
+    memory_mb: Annotated[
+        int, typer.Option(help="Memory for scenes in MB; 0: a share of the free memory.")
+    ] = 0,
+    memory_share: Annotated[float, typer.Option(help="Share of the free memory for scenes.")] = 0.4,
+    cache_dir: Annotated[Path | None, typer.Option(help="Folder of bundles and the simulator's log.")] = None,
+    cache_mb: Annotated[int, typer.Option(help="Disk space for bundles in MB.")] = 1024,
+    nice: Annotated[
+        int, typer.Option(help="Nice value of the CPU, 0 to 19; above 0 the disk has idle priority, too.")
+    ] = 10,
     state_dir: StateDir = None,
-    config: Config = None,
-    once: Once = False,
-    verbose: Verbose = False,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="TOML file of these options; options on the command line take precedence."),
+    ] = None,
+    once: Annotated[bool, typer.Option("--once", help="Exit if the manager can't be reached.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Log every rollout.")] = False,
     log_format: LogLines = LogFormat.HUMAN,
 ) -> None:
     """Join the manager and execute rollouts until stopped. Ctrl-C drains; a second Ctrl-C exits at once."""
