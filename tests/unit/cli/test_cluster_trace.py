@@ -69,9 +69,6 @@ def test_track_has_no_overlap_and_each_rollout_once(history):
         )
     executed = [event["args"]["rollout"] for event in trace if event.get("name") == "execute"]
     assert Counter(executed) == Counter(event.rollout_id for event in events[1:])
-    begun = sorted(event["id"] for event in trace if event["ph"] == "s")
-    assert begun == sorted(event["id"] for event in trace if event["ph"] == "f")
-    assert len(begun) == len(executed)
     assert all(event["ts"] >= 0 for event in trace if "ts" in event)
 
 
@@ -88,20 +85,18 @@ def test_gaps_are_split_into_idle_and_load_time():
     ]
 
 
-def test_failed_lease_occupies_its_slot_and_has_no_flow():
+def test_failed_lease_occupies_its_slot():
     failed = completed(2, 12.0, 0.0)._replace(
         kind=EventKind.FAILED, timings=None, held_s=2.0, code="slot_crashed", message="died"
     )
     trace = chrome_trace([submitted(1, 10.0, 1), failed], (), "a run")["traceEvents"]
     (part,) = [event for event in trace if event["name"] == "failed"]
     assert (part["ts"], part["dur"], part["args"]["message"]) == (0, 2e6, "died")
-    assert not [event for event in trace if event["ph"] in "sf"]
 
 
-def test_rollout_with_a_dropped_submission_has_no_flow():
+def test_rollout_with_a_dropped_submission_is_drawn():
     trace = chrome_trace([completed(2, 12.0, 1.0)], (), "a run")["traceEvents"]
     assert [event["name"] for event in trace if event["ph"] == "X"] == ["execute"]
-    assert not [event for event in trace if event["ph"] in "sf"]
 
 
 def test_scene_loads_and_losses_are_shown_beside_the_slots():

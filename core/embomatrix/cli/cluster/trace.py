@@ -1,6 +1,6 @@
 """A run as a Chrome trace, for https://ui.perfetto.dev or chrome://tracing.
 
-The format is Google's "Trace Event Format": complete slices (X), flows (s, f), asynchronous slices (b, e), instants (i) and
+The format is Google's "Trace Event Format": complete slices (X), asynchronous slices (b, e), instants (i) and
 names (M); times are microseconds.
 """
 
@@ -29,12 +29,11 @@ def chrome_trace(run: Sequence[RunEvent], fleet: Sequence[RunEvent], name: str) 
     processes = {worker_id: number for number, worker_id in enumerate(workers, MANAGER + 1)}
     origin_s = min((event.at_s for event in run), default=0.0)
     clock = _Clock(min([origin_s, *(track[0].begin_s - track[0].load_s for track in spans.values())]))
-    flows = _flow_ids(run)
     events = [
         *_names(name, processes, spans),
-        *_submissions(run, clock, flows),
+        *_submissions(run, clock),
         *itertools.chain.from_iterable(
-            _track(processes[key.worker_id], key.slot, track, clock, flows) for key, track in spans.items()
+            _track(processes[key.worker_id], key.slot, track, clock) for key, track in spans.items()
         ),
         *_fleet(fleet, processes, clock),
     ]
@@ -66,25 +65,8 @@ def _meta(kind: str, process: int, thread: int, name: str) -> TraceEvent:
     return {"ph": "M", "name": kind, "pid": process, "tid": thread, "args": {"name": name}}
 
 
-def _flow_ids(run: Sequence[RunEvent]) -> dict[tuple[str, str], int]:
-    """Number the completed rollouts, by (batch, rollout), whose submission is still in the log."""
-    submitted = {event.batch_id for event in run if event.kind is EventKind.SUBMITTED}
-    done = [
-        event
-        for event in run
-        if event.kind is EventKind.COMPLETED and event.slot and event.batch_id in submitted
-    ]
-    return {(event.batch_id, event.rollout_id): event.sequence for event in done}
-
-
-def _submissions(
-    run: Sequence[RunEvent], clock: _Clock, flows: Mapping[tuple[str, str], int]
-) -> Iterator[TraceEvent]:
+def _submissions(run: Sequence[RunEvent], clock: _Clock) -> Iterator[TraceEvent]:
     submitted = [event for event in run if event.kind is EventKind.SUBMITTED]
-    of_batch: dict[str, list[int]] = {}
-    for (batch_id, _), flow in flows.items():
-        of_batch.setdefault(batch_id, []).append(flow)
-    track = {"pid": MANAGER, "tid": 1}
     for event, after in itertools.zip_longest(submitted, submitted[1:]):
         begin = clock.us(event.at_s)
         length = min(SUBMISSION_US, clock.us(after.at_s) - begin) if after is not None else SUBMISSION_US
@@ -95,15 +77,12 @@ def _submissions(
             "ts": begin,
             "dur": length,
             "args": arguments,
-            **track,
+            "pid": MANAGER,
+            "tid": 1,
         }
-        for flow in of_batch.get(event.batch_id, ()):
-            yield {"ph": "s", "name": "rollout", "cat": "rollout", "id": flow, "ts": begin, **track}
 
 
-def _track(
-    process: int, slot: int, spans: Sequence[Span], clock: _Clock, flows: Mapping[tuple[str, str], int]
-) -> Iterator[TraceEvent]:
+def _track(process: int, slot: int, spans: Sequence[Span], clock: _Clock) -> Iterator[TraceEvent]:
     """Yield the slices of one slot. Gaps are split into result delivery, idle time and scene load."""
     track = {"pid": process, "tid": slot}
 
@@ -131,10 +110,6 @@ def _track(
         yield from part("load", loading_s, begin_s, {"scene": span.event.bundle_digest})
         failed = span.event.kind is EventKind.FAILED
         yield from part("failed" if failed else "execute", begin_s, span.end_s, _arguments(span.event))
-        flow = None if failed else flows.get((span.event.batch_id, span.event.rollout_id))
-        if flow is not None:
-            at = {"ts": clock.us(begin_s), **track}
-            yield {"ph": "f", "bp": "e", "name": "rollout", "cat": "rollout", "id": flow, **at}
         free_s, arrived_s = span.end_s, span.event.at_s
     if free_s is not None:
         yield from part("deliver", free_s, max(free_s, arrived_s), {})
