@@ -2,11 +2,13 @@
 
 import asyncio
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, TypeVar
 
 import typer
 from rich.console import Console
+from rich.table import Table
 
 from embomatrix.cli.cluster.tables import (
     event_line,
@@ -23,6 +25,7 @@ from embomatrix.cli.connection import AsJson, manager_command
 from embomatrix.host.failure import fail
 from embomatrix.rpc.admin_client import AdminClient
 
+T = TypeVar("T")
 FOLLOW_S: Final = 0.5
 """Pause between two requests of `events --follow`."""
 
@@ -43,12 +46,7 @@ Out = Annotated[Path | None, typer.Option(help="File to write.", show_default=Fa
 async def workers(client: AdminClient, as_json: AsJson = False) -> None:
     """List workers: state, slots, scenes, and why one does not work."""
     found = await client.list_workers()
-    if as_json:
-        show_json(found)
-    elif found:
-        show(worker_table(found))
-    else:
-        print("no workers: start one with `embomatrix worker run`")
+    _list(found, worker_table, "no workers: start one with `embomatrix worker run`", as_json)
 
 
 @app.command()
@@ -60,12 +58,8 @@ async def runs(
 ) -> None:
     """List open runs, or closed ones."""
     found = await client.list_runs(closed=closed)
-    if as_json:
-        show_json(found)
-    elif found:
-        show(run_table(found))
-    else:
-        print("no closed runs are kept" if closed else "no open runs; closed ones: --closed")
+    nothing = "no closed runs are kept" if closed else "no open runs; closed ones: --closed"
+    _list(found, run_table, nothing, as_json)
 
 
 @app.command()
@@ -76,13 +70,8 @@ async def plan(
     as_json: AsJson = False,
 ) -> None:
     """Show the look-ahead: scenes of each coming step, how warm they are, and on which workers."""
-    cells = await client.plan(run)
-    if as_json:
-        show_json(cells)
-    elif cells:
-        show(plan_table(cells))
-    else:
-        print("no look-ahead: no trainer has announced coming steps with AnnounceLookahead")
+    nothing = "no look-ahead: no trainer has announced coming steps with AnnounceLookahead"
+    _list(await client.plan(run), plan_table, nothing, as_json)
 
 
 @app.command()
@@ -201,6 +190,15 @@ async def revoke(
     """Expel a worker: its credential becomes void, and its leases are re-dispatched."""
     await client.revoke_worker(name, reason)
     _done(as_json, worker=name, state="revoked")
+
+
+def _list(found: Sequence[T], table: Callable[[Sequence[T]], Table], nothing: str, as_json: bool) -> None:
+    if as_json:
+        show_json(found)
+    elif found:
+        show(table(found))
+    else:
+        print(nothing)
 
 
 def _write(path: Path, text: str) -> None:
