@@ -73,7 +73,6 @@ def checkpoint(kitchen, tmp_path_factory):
         ("train", "--dataset=DATASET", "--out=OUT"),
         ("eval", "--baseline=oracle", "--bench=DATASET", "--out=OUT"),
         ("worker", "run", "--once", "--cache-dir=OUT"),
-        ("worker", "doctor"),
         ("status",),
     ],
     ids=lambda arguments: " ".join(arguments[:2]),

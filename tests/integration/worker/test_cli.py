@@ -49,8 +49,8 @@ def test_wrong_address_is_reported_with_an_example():
     assert "--manager 'nowhere': expected HOST:PORT, as in 127.0.0.1:50070" in result.stderr
 
 
-def test_doctor_reports_resources_and_missing_parts():
-    result = _worker("doctor", "--manager=127.0.0.1:1")
-    assert result.returncode == 2
+def test_doctor_reports_resources_and_starts_the_simulator():
+    result = _worker("doctor")
+    assert result.returncode == 0
     assert "pybullet 3.2.7" in result.stdout
-    assert "no manager answers at 127.0.0.1:1" in result.stderr
+    assert "starts in" in result.stdout

@@ -10,18 +10,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from embomatrix.rpc.channel import DEFAULT_ADDRESS
-from embomatrix.rpc.client import ClientLimits, ClusterClient
-from embomatrix.rpc.options import Ca, Manager, Token
-from embomatrix.rpc.status import ClusterError, ManagerUnreachableError
 from embomatrix.worker.commands.install import install
 from embomatrix.worker.commands.options import check_engine, fail, parse
 from embomatrix.worker.commands.ray import ray_workers
 from embomatrix.worker.commands.run import run
 from embomatrix.worker.commands.status import status
 from embomatrix.worker.host.resources import measure
-from embomatrix.worker.host.settings import WorkerSettings
-from embomatrix.worker.link.membership import membership_of
 from embomatrix.worker.slots.processes import ProcessGoneError, start_root
 
 app = typer.Typer(
@@ -39,11 +33,10 @@ app.command("ray", context_settings={"ignore_unknown_options": True, "allow_extr
 
 
 @app.command()
-def doctor(manager: Manager = DEFAULT_ADDRESS, token: Token = "", ca: Ca = None) -> None:
-    """Check the engine, its processes, memory, and the connection to the manager."""
+def doctor() -> None:
+    """Report the resources of this machine and start the simulator. `embomatrix doctor` checks the connection."""
     check_engine()
-    settings = parse({"manager": manager, "token": token, "ca": ca})
-    resources = measure(settings)
+    resources = measure(parse({}))
     table = Table(box=None, show_header=False, padding=(0, 2))
     table.add_row("python", f"{platform.python_version()} on {platform.machine()}")
     table.add_row("engine", f"pybullet {resources.versions['pybullet']}")
@@ -59,15 +52,6 @@ def doctor(manager: Manager = DEFAULT_ADDRESS, token: Token = "", ca: Ca = None)
         console.print(table)
         fail(str(error))
     table.add_row("simulator", f"starts in {started_s:.1f} s, {memory_mb:.0f} MB")
-    try:
-        workers = asyncio.run(_ask_manager(settings))
-    except ManagerUnreachableError as error:
-        console.print(table)
-        fail(str(error))
-    except ClusterError as error:
-        # A worker's token may not list workers, but the manager has answered.
-        workers = f"answers ({error})"
-    table.add_row("manager", workers)
     console.print(table)
 
 
@@ -78,11 +62,3 @@ async def _start_simulator() -> tuple[float, float]:
         elapsed_s = time.monotonic() - started_s
         await root.end()
     return elapsed_s, root.memory_mb
-
-
-async def _ask_manager(settings: WorkerSettings) -> str:
-    member = await membership_of(settings)
-    limits = ClientLimits(call_s=5.0)
-    async with ClusterClient(member.manager, member.token, ca=member.ca, limits=limits) as client:
-        workers = await client.list_workers()
-    return f"answers at {member.manager}, {len(workers)} workers"
