@@ -182,7 +182,7 @@ class ClusterClient(AdminClient):
                 if attached.cursor == cursor:
                     # The batch ended although results are missing: a store that lost its last second has reused the
                     # cursors that were read before.
-                    attached.read_again()
+                    attached.cursor = 0
             except _TRANSIENT as error:
                 logger.info("batch %s: attaching again after: %s", batch.batch_id, error)
                 if isinstance(error, UnavailableError):
@@ -191,7 +191,7 @@ class ClusterClient(AdminClient):
                 # The manager lost or never received the batch: submit the same id and content again.
                 if not attached.submitted:
                     raise
-                attached.forget_cursor()
+                attached.submitted, attached.cursor = False, 0
             if len(attached.missing) < before:
                 backoff.reset()
             if attached.missing:
@@ -265,14 +265,6 @@ class _AttachedBatch:
             if group.group_id not in self._groups:
                 self._groups.add(group.group_id)
                 yield group
-
-    def read_again(self) -> None:
-        """Read all results again from the first."""
-        self.cursor = 0
-
-    def forget_cursor(self) -> None:
-        self.submitted = False
-        self.cursor = 0
 
     def wait_request(self) -> rollout_service_pb2.WaitExecutionRequest:
         return rollout_service_pb2.WaitExecutionRequest(

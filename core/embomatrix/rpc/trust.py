@@ -129,17 +129,23 @@ async def _fetch_from(address: str, fingerprint: str) -> bytes:
     )
 
 
+def tls_context(ca: bytes = b"") -> ssl.SSLContext:
+    """Return a context for gRPC that trusts the authority ``ca`` (PEM); without it, one that accepts any certificate."""
+    context = ssl.create_default_context(cadata=ca.decode("ascii") or None)
+    if not ca:
+        context.check_hostname = False
+        context.verify_mode = ssl.CERT_NONE
+    context.set_alpn_protocols(["h2"])
+    return context
+
+
 def _certificate_at(address: str) -> bytes:
     """Return the certificate (PEM) that HOST:PORT shows, without verification."""
     host, _, port = address.rpartition(":")
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.check_hostname = False
-    context.verify_mode = ssl.CERT_NONE
-    context.set_alpn_protocols(["h2"])
     try:
         with (
             socket.create_connection((host.strip("[]"), int(port)), FIRST_CONTACT_S) as plain,
-            context.wrap_socket(plain) as tls,
+            tls_context().wrap_socket(plain) as tls,
         ):
             shown = tls.getpeercert(binary_form=True)
     except ssl.SSLError as error:

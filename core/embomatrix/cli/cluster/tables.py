@@ -1,11 +1,11 @@
 """Output of `embomatrix cluster`: tables, lines and JSON."""
 
-import dataclasses
 import json
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+from pydantic_core import to_jsonable_python
 from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
@@ -44,18 +44,7 @@ def show(table: Table) -> None:
 
 def show_json(value: object) -> None:
     """Print a value as JSON; dataclasses become objects."""
-    print(json.dumps(value, default=plain, ensure_ascii=False))
-
-
-def plain(value: object) -> Any:
-    """Return a JSON-serialisable form of a value, for ``json.dumps``."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-    if isinstance(value, frozenset | set):
-        return sorted(value)
-    if hasattr(value, "items"):
-        return dict(value.items())
-    raise TypeError(f"{type(value).__name__} has no JSON form")
+    print(json.dumps(value, default=to_jsonable_python, ensure_ascii=False))
 
 
 def event_plain(event: RunEvent) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from embomatrix.proto.v1 import rollout_service_pb2_grpc
 from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.status import ClusterError, NotAllowedError, PreconditionError, cluster_errors
+from embomatrix.rpc.trust import tls_context
 from embomatrix.rpc.versions import SPOKEN, Capabilities, agree, capabilities_of, software_version
 from embomatrix.rpc.wire.values import FleetStatus
 
@@ -142,12 +143,10 @@ def _reach(visit: Visit) -> Finding:
 
 
 def _tls(visit: Visit) -> Finding:
-    context = ssl.create_default_context(cadata=visit.ca.decode("ascii")) if visit.ca else _trusting()
-    context.set_alpn_protocols(["h2"])
     try:
         with (
             socket.create_connection((visit.host, visit.port), TIMEOUT_S) as plain,
-            context.wrap_socket(plain, server_hostname=visit.host) as tls,
+            tls_context(visit.ca).wrap_socket(plain, server_hostname=visit.host) as tls,
         ):
             shown = tls.getpeercert()
     except ssl.SSLCertVerificationError as error:
@@ -161,14 +160,6 @@ def _tls(visit: Visit) -> Finding:
         return Finding("TLS", Level.WRONG, "it serves by TLS, and no authority to trust was named", remedy)
     ends_s = ssl.cert_time_to_seconds(str((shown or {}).get("notAfter")))
     return certificate((ends_s - time.time()) / DAY_S)
-
-
-def _trusting() -> ssl.SSLContext:
-    """Return a context that accepts any certificate, to find out whether there is TLS."""
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.check_hostname = False
-    context.verify_mode = ssl.CERT_NONE
-    return context
 
 
 async def _versions(visit: Visit) -> Finding:

@@ -9,6 +9,7 @@ import logging
 import math
 import secrets
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
@@ -31,7 +32,7 @@ from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, Resou
 from embomatrix.worker.host.machine import HostMachine, Probe
 from embomatrix.worker.host.settings import WorkerSettings
 from embomatrix.worker.link.cache import BundleCache
-from embomatrix.worker.link.membership import Membership, MembershipFile, SessionConflicts
+from embomatrix.worker.link.membership import Membership, MembershipFile
 from embomatrix.worker.link.outbox import ResultOutbox
 from embomatrix.worker.link.session import ManagerSession, Registration, register
 from embomatrix.worker.link.status import StatusReport, daemon_pids
@@ -55,6 +56,9 @@ FETCH_AGAIN_S: Final = 0.25
 """Wait before a bundle is requested again after a broken connection."""
 DRAIN_RETRY_S: Final = 1.0
 """Longest wait between attempts to deliver the last results of a draining worker."""
+CONFLICTS: Final = 3
+"""More session conflicts than this within the window mean that another worker has the same name."""
+CONFLICT_WINDOW_S: Final = 60.0
 _PASSING: Final = (UnavailableError, DeadlineError, OverloadedError, InternalError)
 """Errors after which the daemon connects again. Others need a user."""
 
@@ -98,7 +102,8 @@ class Daemon:
         self._renewed_s = time.monotonic()
         self._lease_ttl_s = math.inf
         self._registration: Registration | None = None
-        self._conflicts = SessionConflicts()
+        self._conflicts_s: deque[float] = deque(maxlen=CONFLICTS + 1)
+        """Times at which another worker of this name took the session over."""
         self._draining = asyncio.Event()
         self._forced = asyncio.Event()
 
@@ -285,7 +290,9 @@ class Daemon:
     def _note_conflict(self, error: SupersededError) -> None:
         """Register again, unless another worker of this name keeps doing the same."""
         self._registration = None
-        if self._conflicts.add(time.monotonic()):
+        now_s = time.monotonic()
+        self._conflicts_s.append(now_s)
+        if len(self._conflicts_s) > CONFLICTS and now_s - self._conflicts_s[0] < CONFLICT_WINDOW_S:
             raise SupersededError(
                 f"the session of worker {self._membership.name!r} is taken over again and again: another worker of "
                 "that name is running; stop it, or give one of them another --name"

@@ -7,17 +7,13 @@ import json
 import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.rpc.trust import Invitation, fetch_ca, read_ca, read_token
 
 if TYPE_CHECKING:
     from embomatrix.worker.host.settings import WorkerSettings
-
-CONFLICTS_ALLOWED: Final = 3
-"""More session conflicts than this within the window mean that another worker has the same name."""
-CONFLICT_WINDOW_S: Final = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,15 +80,3 @@ async def membership_of(settings: WorkerSettings) -> Membership:
     token = read_token(settings.token)
     kept = MembershipFile(settings.state_dir, token).read() if token else None
     return kept or Membership(settings.manager, settings.name, token, read_ca(settings.ca))
-
-
-class SessionConflicts:
-    """Times at which another worker of the same name took the session over."""
-
-    def __init__(self) -> None:
-        self._at_s: list[float] = []
-
-    def add(self, now_s: float) -> bool:
-        """Record a conflict; return whether there were too many within the window."""
-        self._at_s = [at_s for at_s in self._at_s if now_s - at_s < CONFLICT_WINDOW_S] + [now_s]
-        return len(self._at_s) > CONFLICTS_ALLOWED

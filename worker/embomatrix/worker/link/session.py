@@ -23,7 +23,7 @@ from embomatrix.rpc.status import (
 )
 from embomatrix.rpc.versions import PROTOCOL_VERSION
 from embomatrix.rpc.wire.codec import each
-from embomatrix.rpc.wire.leases import WorkerState
+from embomatrix.rpc.wire.leases import LeaseClaim, LeaseResult, WorkerState
 from embomatrix.rpc.wire.session import (
     lease_from_proto,
     lease_progress_to_proto,
@@ -232,23 +232,14 @@ class ManagerSession:
         self._outbox.begin_stream()
         finished = self._outbox.take_unsent(len(self._outbox))
         claims = (*self._pool.claims(), *self._outbox.claims())
-        yield self._request(
-            state=WorkerState(
-                self._pool.residents(),
-                self._pool.held(),
-                finished,
-                self._draining,
-                self._paused,
-                claims,
-            )
-        )
+        yield self._request(self._state(finished, claims))
         while not self._drained() and not self._resync_due:
             await self._due.wait()
             self._due.clear()
             self._stop_lingering()
             while not self._resync_due and (self._state_due or self._outbox.has_unsent):
                 results = self._outbox.take_unsent(RESULTS_PER_MESSAGE)
-                message = self._request(state=self._state() if self._state_due else None)
+                message = self._request(self._state() if self._state_due else None)
                 for result in results:
                     write_lease_result(result, message.results.add())
                 if results:
@@ -261,8 +252,11 @@ class ManagerSession:
             self._lingering.cancel()
             self._lingering = None
 
-    def _state(self) -> WorkerState:
-        return WorkerState(self._pool.residents(), self._pool.held(), (), self._draining, self._paused)
+    def _state(
+        self, finished: tuple[LeaseResult, ...] = (), claims: tuple[LeaseClaim, ...] = ()
+    ) -> WorkerState:
+        residents, held = self._pool.residents(), self._pool.held()
+        return WorkerState(residents, held, finished, self._draining, self._paused, claims)
 
     def _request(self, state: WorkerState | None) -> pb.SessionRequest:
         return pb.SessionRequest(
