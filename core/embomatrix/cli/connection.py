@@ -5,7 +5,7 @@ import functools
 import inspect
 from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import typer
 
@@ -13,7 +13,7 @@ from embomatrix.host.failure import fail
 from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.managers import FAILOVER_S
-from embomatrix.rpc.options import Ca, Manager, Token
+from embomatrix.rpc.options import Ca, Manager, Token, set_parameters
 from embomatrix.rpc.status import ClusterError
 from embomatrix.rpc.trust import read_ca, read_token
 
@@ -35,7 +35,7 @@ def manager_command(
     expected = (KeyboardInterrupt, BrokenPipeError) if until_interrupted else ()
 
     def decorate(function: Callable[..., Coroutine[None, None, None]]) -> Callable[..., None]:
-        @functools.wraps(function)
+        @functools.wraps(function, updated=())
         def run(*, manager: str, token: str = "", ca: Path | None = None, **arguments: object) -> None:
             async def ask() -> None:
                 secret, trusted = read_token(token), read_ca(ca)
@@ -54,11 +54,7 @@ def manager_command(
             inspect.Parameter(option, inspect.Parameter.KEYWORD_ONLY, annotation=kind, default=default)
             for option, kind, default in _OPTIONS
         ]
-        parameters = [*(one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in own), *options]
-        command: Any = run
-        del command.__wrapped__
-        command.__signature__ = inspect.Signature(parameters)
-        command.__annotations__ = {one.name: one.annotation for one in parameters}
+        set_parameters(run, [*own, *options])
         return run
 
     return decorate

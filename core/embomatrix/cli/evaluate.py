@@ -23,6 +23,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from embomatrix.host.failure import INTERRUPTED, fail
 from embomatrix.host.limits import usable_cores
+from embomatrix.rpc.options import add_settings, given_options
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.cluster.executor import Executor
@@ -66,7 +67,7 @@ console = Console(highlight=False, markup=False, soft_wrap=True)
 class EvalSettings(BaseModel):
     """Settings of an evaluation. Options of the command override those of the TOML file."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
     samples: int = Field(10, ge=1, le=MOST_SAMPLES)
     """Plans per task."""
     temperature: float = Field(1.0, ge=0)
@@ -76,17 +77,17 @@ class EvalSettings(BaseModel):
     tasks: int | None = Field(None, ge=1)
     """Evaluate only the first tasks."""
     max_tokens: int | None = Field(None, ge=1)
-    """Maximum tokens of an answer. None: as the model was trained, 1024 for an endpoint."""
+    """Maximum tokens of an answer. Default: as the model was trained, 1024 for an endpoint."""
     codec: Codec | None = None
-    """Plan format of a language model. None: as it was trained here, else JSON."""
+    """Plan format of a language model. Default: as it was trained here, else JSON."""
     profile: Profile = Profile.HOUSEHOLD
-    """PAPER: tasks that need another household skill count as failed."""
+    """paper: tasks that need another household skill count as failed."""
     concurrent: int = Field(8, ge=1)
     """Concurrent requests to the endpoint."""
     attempts: int = Field(6, ge=1)
     """Attempts per request, with waits between."""
     jobs: int | None = Field(None, ge=1)
-    """Simulator processes without a manager. None: one per core."""
+    """Simulator processes without a manager. Default: one per core."""
     threads: int | None = Field(None, ge=1)
     """torch threads."""
     device: str = "cpu"
@@ -124,7 +125,6 @@ def _option(panel: str, *names: str, **options: Any) -> Any:
 
 _SUBJECT: Final = "Subject (exactly one of --model, --endpoint, --baseline, --answers)"
 _BENCH: Final = "Benchmark"
-_QUESTIONS: Final = "Questions"
 _EXECUTION: Final = "Execution"
 _OUTPUT: Final = "Output"
 
@@ -152,27 +152,9 @@ def evaluate(
     split: Annotated[
         str, _option(_BENCH, help="heldout, train or all. Default: heldout if there is one.")
     ] = "",
-    profile: Annotated[
-        Profile | None,
-        _option(_BENCH, help="paper: tasks that need another household skill count as failed."),
-    ] = None,
-    tasks: Annotated[int | None, _option(_BENCH, min=1, help="Evaluate only the first tasks.")] = None,
-    samples: Annotated[
-        int | None, _option(_QUESTIONS, min=1, max=MOST_SAMPLES, help="Plans per task. Default: 10.")
-    ] = None,
-    temperature: Annotated[
-        float | None, _option(_QUESTIONS, min=0, help="Sampling temperature. Default: 1.")
-    ] = None,
-    seed: Annotated[
-        int | None, _option(_QUESTIONS, min=0, help="Seed of sampling and execution. Default: 0.")
-    ] = None,
-    max_tokens: Annotated[int | None, _option(_QUESTIONS, min=1, help="Maximum tokens of an answer.")] = None,
-    codec: Annotated[
-        Codec | None, _option(_QUESTIONS, help="Plan format of a language model: json or lines.")
-    ] = None,
     settings_file: Annotated[
         Path | None,
-        _option(_QUESTIONS, "--settings", help="TOML file with further settings (docs/evaluation.md)."),
+        _option(_BENCH, "--settings", help="TOML file with settings (docs/evaluation.md)."),
     ] = None,
     manager: Annotated[
         str,
@@ -186,10 +168,6 @@ def evaluate(
     ca: Annotated[
         Path | None, _option(_EXECUTION, envvar="EMBOMATRIX_CA", help="ca.pem of a manager with TLS.")
     ] = None,
-    jobs: Annotated[
-        int | None, _option(_EXECUTION, min=1, help="Simulator processes without a manager.")
-    ] = None,
-    threads: Annotated[int | None, _option(_EXECUTION, min=1, help="torch threads.")] = None,
     out: Annotated[
         Path | None,
         _option(_OUTPUT, help=f"Folder of answers and report. Default: {DEFAULT_OUT}/BENCH-MODEL."),
@@ -198,6 +176,7 @@ def evaluate(
         list[Path] | None,
         _option(_OUTPUT, help="A report.json of the same tasks, as another row. Repeatable."),
     ] = None,
+    **_: object,
 ) -> None:
     """Evaluate a model, an endpoint or a baseline: success by category with intervals, and causes of failure.
 
@@ -208,7 +187,7 @@ def evaluate(
             raise TrainerError(
                 "expected one of --model, --endpoint, --baseline and --answers: give one of them"
             )
-        settings = read_eval_settings(settings_file, context.params)
+        settings = read_eval_settings(settings_file, given_options(context))
         open_executor = functools.partial(_executor, manager, token, ca, settings.jobs)
         if answers is not None:
             _judge_stored(answers, bench, out, open_executor, beside or [])
@@ -223,14 +202,15 @@ def evaluate(
             _judge(exam, setup, given, folder, rows)
 
 
+add_settings(evaluate, EvalSettings, panel="Settings (also in the file of --settings)")
+
+
 def read_eval_settings(path: Path | None, options: dict[str, Any]) -> EvalSettings:
     """Merge a TOML file and those of the given options that are settings. Raises TrainerError."""
     values = {} if path is None else read_toml(path)
-    given = {name: options.get(name) for name in EvalSettings.model_fields}
+    given = {name: value for name, value in options.items() if name in EvalSettings.model_fields}
     try:
-        return EvalSettings.model_validate(
-            values | {name: value for name, value in given.items() if value is not None}
-        )
+        return EvalSettings.model_validate(values | given)
     except ValidationError as error:
         raise settings_error(error) from error
 

@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import enum
 import logging
 import os
 import signal
@@ -10,7 +9,7 @@ import sys
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final, Protocol
+from typing import Annotated, Any, Final
 
 import numpy as np
 import psutil
@@ -18,7 +17,7 @@ import typer
 
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.logs import LogFormat, bind, hide, log_to_stderr
-from embomatrix.rpc.options import Ca, LogLines, Manager, Token
+from embomatrix.rpc.options import Ca, CommandLine, LogLines, Manager, Token, add_settings, given_options
 from embomatrix.rpc.status import ClusterError
 from embomatrix.worker.commands.options import StateDir, check_engine, fail, parse
 from embomatrix.worker.host.machine import HostMachine
@@ -40,8 +39,8 @@ NOT_SETTINGS: Final = frozenset({"config", "labels", "verbose", "log_format"})
 def run(
     context: typer.Context,
     manager: Manager = DEFAULT_ADDRESS,
-    slots: Annotated[int, typer.Option(help="Concurrent rollouts; 0: one for each core.")] = 0,
     token: Token = "",
+    ca: Ca = None,
     join: Annotated[
         str,
         typer.Option(
@@ -50,37 +49,17 @@ def run(
             show_default=False,
         ),
     ] = "",
-    ca: Ca = None,
-    name: Annotated[str, typer.Option(help="Worker id; by default the host's name and a random part.")] = "",
+    state_dir: StateDir = None,
     labels: Annotated[
         list[str] | None, typer.Option("--label", help="KEY=VALUE, for operators; repeatable.")
     ] = None,
-    hours: Annotated[str, typer.Option(help="Work only in these hours: 18:00-08:00, local time.")] = "",
-    idle_s: Annotated[
-        float, typer.Option(help="Work only after this many seconds without a sign of a user.")
-    ] = 0.0,
-    mains_only: Annotated[bool, typer.Option("--mains-only", help="Pause on battery.")] = False,
-    max_load: Annotated[
-        float,
-        typer.Option(help="Pause if other programs use more than this share of all cores, such as 0.5."),
-    ] = 0.0,
-    memory_mb: Annotated[
-        int, typer.Option(help="Memory for scenes in MB; 0: a share of the free memory.")
-    ] = 0,
-    memory_share: Annotated[float, typer.Option(help="Share of the free memory for scenes.")] = 0.4,
-    cache_dir: Annotated[Path | None, typer.Option(help="Folder of bundles and the simulator's log.")] = None,
-    cache_mb: Annotated[int, typer.Option(help="Disk space for bundles in MB.")] = 1024,
-    nice: Annotated[
-        int, typer.Option(help="Nice value of the CPU, 0 to 19; above 0 the disk has idle priority, too.")
-    ] = 10,
-    state_dir: StateDir = None,
     config: Annotated[
         Path | None,
         typer.Option(help="TOML file of these options; options on the command line take precedence."),
     ] = None,
-    once: Annotated[bool, typer.Option("--once", help="Exit if the manager can't be reached.")] = False,
     verbose: Annotated[bool, typer.Option("--verbose", help="Log every rollout.")] = False,
     log_format: LogLines = LogFormat.HUMAN,
+    **_: object,
 ) -> None:
     """Join the manager and execute rollouts until stopped. Ctrl-C drains; a second Ctrl-C exits at once."""
     check_engine()
@@ -98,12 +77,7 @@ def run(
         fail(f"{where} can't be used ({error.strerror or error}): name another folder with --cache-dir")
 
 
-class CommandLine(Protocol):
-    """Parsed command line: values by option name, and the source of each."""
-
-    params: dict[str, Any]
-
-    def get_parameter_source(self, name: str, /) -> enum.Enum | None: ...
+add_settings(run, WorkerSettings, Preferences, skip=("preferences",))
 
 
 def settings_of(words: Sequence[str]) -> WorkerSettings:
@@ -118,9 +92,8 @@ def values_of(context: CommandLine, config: Path | None, labels: list[str]) -> d
     """Merge the file with options and environment variables, which take precedence."""
     values = read_config(config) if config is not None else {}
     preferences = values.setdefault("preferences", {})
-    for name, value in context.params.items():
-        source = context.get_parameter_source(name)
-        if name in NOT_SETTINGS or source is None or source.name.startswith("DEFAULT"):
+    for name, value in given_options(context).items():
+        if name in NOT_SETTINGS:
             continue
         if name == "join" and not value:
             fail("--join is empty, perhaps an unset variable: expected TOKEN@HOST:PORT from the operator")

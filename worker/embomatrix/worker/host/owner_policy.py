@@ -46,7 +46,7 @@ class Hours:
 class Preferences(BaseModel):
     """Times at which a worker works: always by default. Each preference can pause it."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     hours: str = ""
     """Local working hours, ``18:00-08:00``; empty: all day."""

@@ -16,7 +16,7 @@ from embomatrix.worker.host.owner_policy import Preferences
 class WorkerSettings(BaseModel):
     """Settings of a worker daemon. Zeros are replaced by measured values."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     manager: str = DEFAULT_ADDRESS
     """HOST:PORT of the manager, or of several separated by commas. Only the worker opens connections."""
