@@ -9,16 +9,21 @@ V = TypeVar("V")
 
 
 class BoundedCache(dict[K, V]):
-    """Cache that is emptied when a new key does not fit. Reading it costs no more than reading a dictionary."""
+    """Cache that makes missing values with a function of the key, and is emptied when a new key does not fit.
 
-    def __init__(self, most: int) -> None:
+    Reading it costs no more than reading a dictionary.
+    """
+
+    def __init__(self, most: int, make: Callable[[K], V]) -> None:
         super().__init__()
         self._most = most
+        self._make = make
 
-    def __setitem__(self, key: K, value: V) -> None:
-        if len(self) >= self._most and key not in self:
+    def __missing__(self, key: K) -> V:
+        if len(self) >= self._most:
             self.clear()
-        super().__setitem__(key, value)
+        self[key] = value = self._make(key)
+        return value
 
 
 class RecentCache(Generic[K, V]):

@@ -14,7 +14,7 @@ import numpy as np
 from embomatrix.sim.caches import BoundedCache
 from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.floor.grid import CELL_M, FloorGrid
-from embomatrix.sim.floor.ground import Ground
+from embomatrix.sim.floor.ground import Floor, Ground
 from embomatrix.sim.floor.obstacles import WALLS, crosses
 from embomatrix.sim.floor.open_panels import OpenJoints
 from embomatrix.sim.floor.paths import Cell
@@ -23,7 +23,7 @@ from embomatrix.sim.floor.standing import StandingArea
 from embomatrix.sim.state.relations import Relations
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.asset import Asset
-from embomatrix.world.geometry import Aabb, FloatArray, Vec2
+from embomatrix.world.geometry import Aabb, FloatArray, Pose, Vec2
 from embomatrix.world.poses import StandPose
 from embomatrix.world.scene import Room, Scene
 
@@ -35,6 +35,10 @@ ENTRY_M: Final = 0.4
 STEP_ASIDE_M: Final = (0.45, 0.9, 1.6)
 """Distances within which the robot steps aside from an opened panel, tried in this order."""
 STEP_M: Final = CELL_M / 2
+
+
+Surroundings = tuple[Floor, str, Pose, tuple[str, ...]]
+"""Layout of the floor, and an object with its pose and its hosts."""
 
 
 class Navigator:
@@ -53,9 +57,9 @@ class Navigator:
         self._scene = engine.scene
         self.ground = Ground(engine, prepared)
         """Current obstacles. Read-only."""
-        self._stands: BoundedCache[tuple[object, ...], tuple[StandPose, ...]] = BoundedCache(ANSWERS_KEPT)
-        self._asides: BoundedCache[tuple[object, ...], StandPose] = BoundedCache(ANSWERS_KEPT)
-        self._blockers: BoundedCache[tuple[object, ...], FloatArray] = BoundedCache(ANSWERS_KEPT)
+        self._stands = BoundedCache(ANSWERS_KEPT, self._find_stands)
+        self._asides = BoundedCache(ANSWERS_KEPT, self._find_aside)
+        self._blockers = BoundedCache(ANSWERS_KEPT, self._find_blockers)
         self._found_before = stands if stands is not None else {}
 
     def refresh(self) -> None:
@@ -163,7 +167,7 @@ class Navigator:
                 found = True
                 yield stand
         if not found:
-            yield from self._stands_on(grid, (self._key(name), self.ground.open_joints, label), name)
+            yield from self._stands[self._key(name), self.ground.open_joints, label]
 
     def stands_past_shut(self, name: str, origin: StandPose) -> tuple[StandPose, ...]:
         """Evaluate ``stands`` as if all doors and drawers were shut: few panels block any of these places."""
@@ -178,7 +182,7 @@ class Navigator:
         found = self._found_before.get(name) if label == self._part_of_start else None
         if found is not None and self.is_as_loaded(name) and self._is_untouched(name):
             return found
-        return self._stands_on(self.ground.shut, (self._key(name), (), label), name)
+        return self._stands[self._key(name), (), label]
 
     def _is_untouched(self, name: str) -> bool:
         """Return True if changes on the floor left the object's standing area and the arm's access unchanged."""
@@ -191,14 +195,11 @@ class Navigator:
         own = [self.ground.numbers[item] for item in (name, *self._relations.hosts_of(name))]
         return np.array_equal(_within_reach(before.blockers(area.box, own), area.box), area.blockers)
 
-    def _stands_on(
-        self, grid: FloorGrid, key: tuple[tuple[object, ...], OpenJoints, int], name: str
-    ) -> tuple[StandPose, ...]:
-        """Standing poses on the component at the end of the key, cached by key."""
-        if key not in self._stands:
-            area = self.standing_area(name)
-            self._stands[key] = area.stands(grid.free_centers(*area.window, key[2]))
-        return self._stands[key]
+    def _find_stands(self, key: tuple[Surroundings, OpenJoints, int]) -> tuple[StandPose, ...]:
+        """Standing poses on one component of the current grid, or of the grid with all panels shut."""
+        (_, name, *_), open_joints, label = key
+        grid, area = self.ground.grid if open_joints else self.ground.shut, self.standing_area(name)
+        return area.stands(grid.free_centers(*area.window, label))
 
     def step_aside(self, name: str, origin: StandPose) -> StandPose:
         """Pose to serve an object near ``origin``: ``origin`` itself unless a panel takes its place or cuts it off.
@@ -207,13 +208,11 @@ class Navigator:
         """
         if not self.ground.grid.may_differ_at(self.ground.shut, origin.x_m, origin.y_m):
             return origin
-        key = self.ground.floor, name, self._engine.pose(name), self.ground.open_joints, origin
-        if key not in self._asides:
-            self._asides[key] = self._find_aside(self.standing_area(name), origin)
-        return self._asides[key]
+        return self._asides[self.ground.floor, name, self._engine.pose(name), self.ground.open_joints, origin]
 
-    def _find_aside(self, area: StandingArea, origin: StandPose) -> StandPose:
-        grid = self.ground.grid
+    def _find_aside(self, key: tuple[Floor, str, Pose, OpenJoints, StandPose]) -> StandPose:
+        _, name, _, _, origin = key
+        grid, area = self.ground.grid, self.standing_area(name)
         main = grid.main_part_of(self.ground.shut, origin.x_m, origin.y_m)
         if grid.label_at(origin.x_m, origin.y_m) == main:
             return origin
@@ -227,7 +226,7 @@ class Navigator:
     def warm_up(self) -> Iterator[None]:
         """Compute the obstacles of the arm to each object, and the grids with open doors, one per step. Changes no answer."""
         for item in self._scene.objects:
-            self._blockers_of(item.name)
+            self._blockers[self._key(item.name)]
             yield
         yield from self.ground.warm_up()
 
@@ -237,14 +236,15 @@ class Navigator:
         fixed = [host for host in self._relations.hosts_of(name) if self._scene.by_name[host].fixed]
         yaw = self._engine.pose(fixed[0] if fixed else name).yaw
         from_front = has_front(self._scene.asset_of(name))
-        return StandingArea(self._relations.body(name), yaw, from_front, self._blockers_of(name))
+        return StandingArea(self._relations.body(name), yaw, from_front, self._blockers[self._key(name)])
 
     def line_is_clear(self, origin: StandPose, name: str) -> bool:
         """Return True if no wall nor anything much taller than the object stands between it and the robot."""
         box = self._relations.body(name)
         here, nearest = _line(origin, box)
         near = math.dist(here, nearest) <= ROBOT.reach_m
-        return not crosses(here, nearest, self._blockers_of(name) if near else self._all_blockers_of(name))
+        blockers = self._blockers[self._key(name)] if near else self._all_blockers_of(name)
+        return not crosses(here, nearest, blockers)
 
     def line_would_be_clear(self, origin: StandPose, box: Aabb, own: Iterable[str]) -> bool:
         """Evaluate ``line_is_clear`` for an object that is not there yet: ``own`` are its name and its would-be hosts."""
@@ -258,21 +258,18 @@ class Navigator:
             for item in (name, *self._relations.hosts_of(name))
         )
 
-    def _blockers_of(self, name: str) -> FloatArray:
-        """Rectangles within reach of the object that block the arm on its way to it, shape (4, n)."""
-        key = self._key(name)
-        if key not in self._blockers:
-            self._blockers[key] = _within_reach(self._all_blockers_of(name), self._relations.body(name))
-        return self._blockers[key]
+    def _find_blockers(self, key: Surroundings) -> FloatArray:
+        """Rectangles within reach of an object that block the arm on its way to it, shape (4, n)."""
+        _, name, *_ = key
+        return _within_reach(self._all_blockers_of(name), self._relations.body(name))
 
     def _all_blockers_of(self, name: str) -> FloatArray:
         own = [self.ground.numbers[item] for item in (name, *self._relations.hosts_of(name))]
         return self.ground.obstacles.blockers(self._relations.body(name), own)
 
-    def _key(self, name: str) -> tuple[object, ...]:
+    def _key(self, name: str) -> Surroundings:
         """Cache key of standing poses and lines of approach, without the robot's position."""
-        hosts = tuple(self._relations.hosts_of(name))
-        return self.ground.floor, name, self._engine.pose(name), hosts
+        return self.ground.floor, name, self._engine.pose(name), self._relations.hosts_of(name)
 
     @functools.cached_property
     def _part_of_start(self) -> int:

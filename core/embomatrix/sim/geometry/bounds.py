@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from embomatrix.sim.caches import BoundedCache
 from embomatrix.world.asset import Asset, Joint, JointKind
-from embomatrix.world.geometry import Aabb, ConvexPart, FloatArray, Pose, Quat, Shape, Vec3
+from embomatrix.world.geometry import IDENTITY, Aabb, ConvexPart, FloatArray, Pose, Quat, Shape, Vec3
 
 IntArray = NDArray[np.int64]
 Turned = tuple[Quat, tuple[float, ...]]
@@ -79,14 +79,12 @@ class AssetBounds:
 
     def __init__(self, asset: Asset) -> None:
         self._links = [(link.parts, link.joint) for link in asset.links if link.parts]
-        self._extents: BoundedCache[Turned, Corners] = BoundedCache(EXTENTS_KEPT)
-        self._clouds_at: BoundedCache[tuple[float, ...], tuple[FloatArray, FloatArray | None]] = BoundedCache(
-            EXTENTS_KEPT
-        )
+        self._extents = BoundedCache(EXTENTS_KEPT, self._find_extents)
+        self._points_at = BoundedCache(EXTENTS_KEPT, self._find_points)
 
     def box(self, pose: Pose, fractions: Sequence[float] = ()) -> Aabb:
         """Bounding box in the target of ``pose``, with the joints at these shares of their travel."""
-        (a, b, c), (d, e, f) = self._extents_at(pose.quat_xyzw, tuple(fractions))
+        (a, b, c), (d, e, f) = self._extents[pose.quat_xyzw, tuple(fractions)]
         x, y, z = pose.position_m
         return Aabb((x + a, y + b, z + c), (x + d, y + e, z + f))
 
@@ -94,41 +92,30 @@ class AssetBounds:
         self, rotations: FloatArray, fractions: Sequence[float] = ()
     ) -> tuple[FloatArray, FloatArray]:
         """Corners of the boxes relative to the origin at rotations of shape (n, 3, 3); each of shape (n, 3)."""
-        points, radii = self._placed(tuple(fractions))
+        points, radii = self._points_at[tuple(fractions)]
         turned = rotations @ points  # (n, 3, m)
         if radii is None:
             return turned.min(axis=2), turned.max(axis=2)
         return (turned - radii).min(axis=2), (turned + radii).max(axis=2)
 
-    def _placed(self, fractions: tuple[float, ...]) -> tuple[FloatArray, FloatArray | None]:
+    def _find_points(self, fractions: tuple[float, ...]) -> tuple[FloatArray, FloatArray | None]:
         """Points of all links in the asset's frame, shape (3, m), and the radii of balls around them; None for no balls."""
-        known = self._clouds_at.get(fractions)
-        if known is None:
-            moving = iter(fractions)
-            points: list[FloatArray] = []
-            for (cloud, _), joint in self._clouds:
-                fraction = next(moving, 0.0) if joint is not None else 0.0
-                points.append(joint_motion(joint, fraction).apply_all(cloud) if joint and fraction else cloud)
-            radii = np.concatenate([balls[:, 0] for (_, balls), _ in self._clouds])
-            known = np.ascontiguousarray(np.concatenate(points).T), radii if radii.any() else None
-            self._clouds_at[fractions] = known
-        return known
+        moving = iter(fractions)
+        points: list[FloatArray] = []
+        for (cloud, _), joint in self._clouds:
+            fraction = next(moving, 0.0) if joint is not None else 0.0
+            points.append(joint_motion(joint, fraction).apply_all(cloud) if joint and fraction else cloud)
+        radii = np.concatenate([balls[:, 0] for (_, balls), _ in self._clouds])
+        return np.ascontiguousarray(np.concatenate(points).T), radii if radii.any() else None
 
     @functools.cached_property
     def _clouds(self) -> list[tuple[tuple[FloatArray, FloatArray], Joint | None]]:
         return [(_cloud(parts), joint) for parts, joint in self._links]
 
-    def _extents_at(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> Corners:
-        """Cached corners of the box."""
-        key = (quat_xyzw, fractions)
-        known = self._extents.get(key)
-        if known is None:
-            known = self._extents[key] = self._reckon(Pose((0.0, 0.0, 0.0), quat_xyzw), fractions)
-        return known
-
-    def _reckon(self, pose: Pose, fractions: tuple[float, ...]) -> Corners:
-        points, radii = self._placed(fractions)
-        turned = pose.rotation @ points  # (3, m)
+    def _find_extents(self, turned_as: Turned) -> Corners:
+        quat_xyzw, fractions = turned_as
+        points, radii = self._points_at[fractions]
+        turned = Pose(IDENTITY.position_m, quat_xyzw).rotation @ points  # (3, m)
         lows, highs = (turned, turned) if radii is None else (turned - radii, turned + radii)
         # ufunc.reduce directly: the array methods go through Python, which doubles the cost.
         a, b, c = np.minimum.reduce(lows, 1).tolist()
@@ -142,15 +129,15 @@ class AssetParts:
     def __init__(self, asset: Asset) -> None:
         self._links = [(link.joint, link.parts) for link in asset.links if link.parts]
         self._of_base = len(asset.links[0].parts)
-        self._extents: BoundedCache[Turned, list[Corners]] = BoundedCache(EXTENTS_KEPT)
-        self._panels: BoundedCache[Turned, list[Corners]] = BoundedCache(EXTENTS_KEPT)
+        self._extents = BoundedCache(EXTENTS_KEPT, self._find_extents)
+        self._panels = BoundedCache(EXTENTS_KEPT, self._find_panels)
 
     def boxes(self, pose: Pose, fractions: Sequence[float]) -> list[Aabb]:
         """World box of every part, in the order of the links; equal to ``ConvexPart.aabb``."""
         x, y, z = pose.position_m
         return [
             Aabb((x + a, y + b, z + c), (x + d, y + e, z + f))
-            for (a, b, c), (d, e, f) in self._extents_at(pose.quat_xyzw, tuple(fractions))
+            for (a, b, c), (d, e, f) in self._extents[pose.quat_xyzw, tuple(fractions)]
         ]
 
     def base_boxes(self, pose: Pose) -> list[Aabb]:
@@ -160,17 +147,16 @@ class AssetParts:
     def panels(self, pose: Pose, fractions: Sequence[float]) -> list[Aabb]:
         """World box of every moving link."""
         x, y, z = pose.position_m
-        key = (pose.quat_xyzw, tuple(fractions))
-        known = self._panels.get(key)
-        if known is None:
-            known = self._panels[key] = self._reckon_panels(*key)
-        return [Aabb((x + a, y + b, z + c), (x + d, y + e, z + f)) for (a, b, c), (d, e, f) in known]
+        return [
+            Aabb((x + a, y + b, z + c), (x + d, y + e, z + f))
+            for (a, b, c), (d, e, f) in self._panels[pose.quat_xyzw, tuple(fractions)]
+        ]
 
     def within(self, pose: Pose, fractions: Sequence[float], box: Aabb) -> list[ConvexPart]:
         """Parts whose boxes overlap a world box, each at its world pose."""
         x, y, z = pose.position_m
         (low_x, low_y, low_z), (high_x, high_y, high_z) = box.low_m, box.high_m
-        extents = iter(self._extents_at(pose.quat_xyzw, tuple(fractions)))
+        extents = iter(self._extents[pose.quat_xyzw, tuple(fractions)])
         found: list[ConvexPart] = []
         for frame, parts in self._frames(pose, fractions):
             for part, ((a, b, c), (d, e, f)) in zip(parts, extents, strict=False):
@@ -185,16 +171,8 @@ class AssetParts:
                     found.append(ConvexPart(part.shape, frame @ part.pose, part.size_m, part.vertices_m))
         return found
 
-    def _extents_at(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> list[Corners]:
-        """Cached corners of each part's box."""
-        key = (quat_xyzw, fractions)
-        known = self._extents.get(key)
-        if known is None:
-            known = self._extents[key] = self._reckon(Pose((0.0, 0.0, 0.0), quat_xyzw), fractions)
-        return known
-
-    def _reckon_panels(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> list[Corners]:
-        extents = iter(self._extents_at(quat_xyzw, fractions))
+    def _find_panels(self, turned_as: Turned) -> list[Corners]:
+        extents = iter(self._extents[turned_as])
         found: list[Corners] = []
         for joint, parts in self._links:
             boxes = [Aabb(low, high) for low, high in itertools.islice(extents, len(parts))]
@@ -209,10 +187,11 @@ class AssetParts:
         corners = [part.pose.apply_all(part.corners()) for _, parts in self._links for part in parts]
         return np.concatenate(corners), np.cumsum([0, *map(len, corners)])[:-1]
 
-    def _reckon(self, pose: Pose, fractions: tuple[float, ...]) -> list[Corners]:
+    def _find_extents(self, turned_as: Turned) -> list[Corners]:
+        quat_xyzw, fractions = turned_as
         points, starts = self._points
         chunks, first = [], 0
-        for frame, parts in self._frames(pose, fractions):
+        for frame, parts in self._frames(Pose(IDENTITY.position_m, quat_xyzw), fractions):
             count = sum(len(part.vertices_m) or CORNERS for part in parts)
             chunks.append(frame.apply_all(points[first : first + count]))
             first += count
@@ -248,13 +227,15 @@ def forget(assets: Iterable[Asset]) -> None:
         _KNOWN.pop(id(asset), None)
 
 
-_KNOWN: Final[BoundedCache[int, tuple[Asset, AssetBounds, AssetParts]]] = BoundedCache(ASSETS_KEPT)
+_KNOWN: Final[dict[int, tuple[Asset, AssetBounds, AssetParts]]] = {}
 """Caches by the asset's id. Holding the asset keeps its id from being reused."""
 
 
 def _known(asset: Asset) -> tuple[AssetBounds, AssetParts]:
     known = _KNOWN.get(id(asset))
     if known is None:
+        if len(_KNOWN) >= ASSETS_KEPT:
+            _KNOWN.clear()
         known = _KNOWN[id(asset)] = (asset, AssetBounds(asset), AssetParts(asset))
     return known[1], known[2]
 

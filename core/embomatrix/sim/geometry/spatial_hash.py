@@ -5,7 +5,9 @@ A query in a household meets a dozen boxes. Checking them costs less than whole-
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.caches import BoundedCache
@@ -31,7 +33,7 @@ class SpatialHash:
         self._cells: dict[Cell, dict[int, Extent]] = {}
         """Boxes over each cell; wide ones are kept separately."""
         self._wide: dict[int, Extent] = {}
-        self._seen: BoundedCache[Span, list[dict[int, Extent]]] = BoundedCache(SPANS_KEPT)
+        self._seen = BoundedCache(SPANS_KEPT, self._find_places)
         """Buckets by queried span, valid until a new cell appears."""
         self._homes: dict[int, list[dict[int, Extent]]] = {}
         self._spans: dict[int, Span] = {}
@@ -66,12 +68,9 @@ class SpatialHash:
         high_x, high_y, high_z = high_x + reach_m, high_y + reach_m, high_z + reach_m
         floor = math.floor
         span = floor(low_x / CELL_M), floor(low_y / CELL_M), floor(high_x / CELL_M), floor(high_y / CELL_M)
-        places = self._seen.get(span)
-        if places is None:
-            places = self._find_places(span)
         found = [
             number
-            for place in places
+            for place in self._seen[span]
             for number, (a, b, c, d, e, f) in place.items()
             if c <= high_z and f >= low_z and a <= high_x and d >= low_x and b <= high_y and e >= low_y
         ]
@@ -79,27 +78,25 @@ class SpatialHash:
 
     def _find_places(self, span: Span) -> list[dict[int, Extent]]:
         """Buckets of a span; a box may be in several."""
-        self._seen[span] = [self._wide, *self._cells_of(span)]
-        return self._seen[span]
-
-    def _cells_of(self, span: Span) -> list[dict[int, Extent]]:
-        first_i, first_j, last_i, last_j = span
-        if (last_i - first_i + 1) * (last_j - first_j + 1) > WIDE_CELLS:
-            return list(self._cells.values())
-        cells = self._cells
-        places = (cells.get((i, j)) for i in range(first_i, last_i + 1) for j in range(first_j, last_j + 1))
-        return [place for place in places if place is not None]
+        if _is_wide(span):
+            return [self._wide, *self._cells.values()]
+        return [self._wide, *(self._cells[cell] for cell in _cells_of(span) if cell in self._cells)]
 
     def _homes_of(self, span: Span) -> list[dict[int, Extent]]:
-        first_i, first_j, last_i, last_j = span
-        if (last_i - first_i + 1) * (last_j - first_j + 1) > WIDE_CELLS:
+        if _is_wide(span):
             return [self._wide]
         count = len(self._cells)
-        homes = [
-            self._cells.setdefault((i, j), {})
-            for i in range(first_i, last_i + 1)
-            for j in range(first_j, last_j + 1)
-        ]
+        homes = [self._cells.setdefault(cell, {}) for cell in _cells_of(span)]
         if len(self._cells) != count:
             self._seen.clear()
         return homes
+
+
+def _is_wide(span: Span) -> bool:
+    first_i, first_j, last_i, last_j = span
+    return (last_i - first_i + 1) * (last_j - first_j + 1) > WIDE_CELLS
+
+
+def _cells_of(span: Span) -> Iterator[Cell]:
+    first_i, first_j, last_i, last_j = span
+    return itertools.product(range(first_i, last_i + 1), range(first_j, last_j + 1))
