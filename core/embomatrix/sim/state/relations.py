@@ -4,7 +4,6 @@ A parked object has no relations.
 """
 
 import math
-from collections.abc import Callable
 from typing import Final
 
 from embomatrix.sim.engine import PhysicsEngine
@@ -32,11 +31,12 @@ class Relations:
         self._engine = engine
         self._scene = engine.scene
         self.supports = SupportTracker(engine)
-        self._kept: dict[tuple[str, str], tuple[str, ...]] = {}
-        self._kept_at = (-1, 0)
 
     def holds(self, relation: Relation, a: str, b: str) -> bool:
-        """Return True if ``relation(a, b)`` holds; ``b`` is a room for INROOM and an object otherwise."""
+        """Return True if ``relation(a, b)`` holds; ``b`` is a room for INROOM and an object otherwise.
+
+        An object is in the room under its centre; in a wall, the first room within 15 cm counts.
+        """
         match relation:
             case Relation.ONTOP:
                 return self.ontop(a, b)
@@ -49,7 +49,7 @@ class Relations:
             case Relation.TOUCHING:
                 return self.touching(a, b)
             case Relation.INROOM:
-                return self.inroom(a, b)
+                return not self._engine.is_parked(a) and self.room_of(a) == b
 
     def ontop(self, a: str, b: str) -> bool:
         """Return True if ``a`` rests on a surface of ``b``: underside within 1 cm, centre above the rectangle (+ 5 mm).
@@ -106,10 +106,6 @@ class Relations:
         """Return True if two surfaces are 5 mm apart or less."""
         return self._apart(a, b) and self._engine.gap(a, b, TOUCH_M) is not None
 
-    def inroom(self, a: str, room: str) -> bool:
-        """Return True if the centre of ``a`` is over the room's floor; in a wall, the first room within 15 cm counts."""
-        return not self._engine.is_parked(a) and self.room_of(a) == room
-
     def open(self, a: str) -> bool:
         """Return True if any joint of ``a`` is beyond 5 % of its travel."""
         return max(self._engine.joints(a), default=0.0) > OPEN_FRACTION
@@ -135,9 +131,6 @@ class Relations:
 
     def hosts_of(self, name: str) -> tuple[str, ...]:
         """Chain of hosts: the object's host, that one's host, and so on."""
-        return self._answer("hosts", name, self._find_hosts)
-
-    def _find_hosts(self, name: str) -> tuple[str, ...]:
         chain = [name]
         while (host := self.host_of(chain[-1])) is not None and host.name not in chain:
             chain.append(host.name)
@@ -145,30 +138,16 @@ class Relations:
 
     def resting_on(self, name: str) -> tuple[str, ...]:
         """Objects with this host, in scene order: on its surfaces and in its cavities."""
-        return self._answer("resting", name, self._find_resting)
-
-    def _find_resting(self, name: str) -> tuple[str, ...]:
         if self._engine.is_parked(name):
             return ()
         around = self._engine.near(self._engine.aabb(name).grown(REST_M), frozenset((name,)))
-        return tuple(other for other in around if self._is_host(name, other))
-
-    def _answer(self, question: str, name: str, find: Callable[[str], tuple[str, ...]]) -> tuple[str, ...]:
-        """Cached answer since the last change, or the result of ``find``: a step repeats its questions."""
-        journal = self._engine.journal
-        now = (journal.rounds, len(journal.entries))
-        if now != self._kept_at:
-            self._kept.clear()
-            self._kept_at = now
-        answer = self._kept.get((question, name))
-        if answer is None:
-            answer = self._kept[question, name] = find(name)
-        return answer
+        hosts = ((other, self.host_of(other)) for other in around)
+        return tuple(other for other, host in hosts if host is not None and host.name == name)
 
     def group_of(self, name: str) -> tuple[str, ...]:
         """Object and all that moves with it: the contents of its cavities and what rests on or in those."""
         group = {name: None}
-        waiting = [other for other in self.resting_on(name) if self._lies_in(other, name)]
+        waiting = [other for other in self.resting_on(name) if self._lies_in_host(other)]
         while waiting:
             other = waiting.pop(0)
             if other not in group:
@@ -180,13 +159,9 @@ class Relations:
         """Containers around the object, innermost first."""
         return self.supports.of(name).enclosures
 
-    def _lies_in(self, name: str, container: str) -> bool:
+    def _lies_in_host(self, name: str) -> bool:
         host = self.host_of(name)
-        return host is not None and host.name == container and host.relation is Relation.INSIDE
-
-    def _is_host(self, name: str, other: str) -> bool:
-        host = self.host_of(other)
-        return host is not None and host.name == name
+        return host is not None and host.relation is Relation.INSIDE
 
     def _apart(self, a: str, b: str) -> bool:
         """Return True if both objects are in the world and differ."""
