@@ -11,7 +11,7 @@ from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.placing.placement import Placer
-from embomatrix.sim.placing.trial import in_reach
+from embomatrix.sim.placing.search import in_reach
 from embomatrix.sim.state.relations import Relations
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.geometry import Aabb, Pose

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from embomatrix.sim.geometry.batch_poses import Neighbours, PoseBoxes, PoseSet
 from embomatrix.sim.geometry.bounds import bounds_of, square_box
-from embomatrix.sim.placing.trial import in_reach
+from embomatrix.sim.placing.search import in_reach
 from embomatrix.world.asset import Asset, Joint, JointKind, Link
 from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
 from embomatrix.world.placements import pose_rows
@@ -50,52 +50,11 @@ def test_batch_boxes_equal_single_boxes(spots, frame, drawer, then) -> None:
     poses, links = [pose for pose, _ in spots], [link for _, link in spots]
     frames = {"": frame, "drawer": drawer}
     bounds = bounds_of(LAMP)
-    boxes = PoseSet.of(pose_rows(poses), links, then).world_boxes(bounds, (0.5,), frames)
+    boxes = PoseSet.of(bounds, pose_rows(poses), links, then).world_boxes((0.5,), frames)
     for row, (pose, link) in enumerate(spots):
         box = bounds.box(frames[link] @ (pose @ then), (0.5,))
         assert boxes.lows_m[row].tolist() == pytest.approx(box.low_m, abs=1e-9)
         assert boxes.highs_m[row].tolist() == pytest.approx(box.high_m, abs=1e-9)
-
-
-SQUARE_POSE = st.builds(
-    lambda x, y, z, quarters: Pose.from_xyz_yaw(x, y, z, quarters * math.pi / 2),
-    COORDINATE,
-    COORDINATE,
-    COORDINATE,
-    st.integers(-3, 4),
-)
-
-
-@given(
-    st.lists(st.tuples(POSE, st.sampled_from(("", "drawer", "gone"))), min_size=1, max_size=5),
-    SQUARE_POSE,
-    SQUARE_POSE,
-)
-def test_boxes_in_a_square_supports_frame_equal_world_boxes(spots, frame, drawer):
-    places = PoseSet.of(pose_rows([pose for pose, _ in spots]), [link for _, link in spots])
-    frames = {"": frame, "drawer": drawer}
-    expected = places.world_boxes(bounds_of(LAMP), (0.0,), frames)
-    found = places.boxes(bounds_of(LAMP)).world_boxes(frames)
-    assert found is not None
-    assert found.lows_m == pytest.approx(expected.lows_m, abs=1e-9)
-    assert found.highs_m == pytest.approx(expected.highs_m, abs=1e-9)
-
-
-@pytest.mark.parametrize(
-    "askew", [Pose.from_xyz_yaw(0.0, 0.0, 0.0, 0.1), Pose((0.0, 0.0, 0.0), (0.6, 0.0, 0.0, 0.8))]
-)
-def test_boxes_in_a_tilted_supports_frame_have_no_world_boxes(askew) -> None:
-    places = PoseSet.of(pose_rows([Pose((0.0, 0.0, 0.5))]), [""])
-    assert places.boxes(bounds_of(LAMP)).world_boxes({"": askew}) is None
-
-
-def test_moved_boxes_keep_their_links_and_sizes() -> None:
-    places = PoseSet.of(pose_rows([Pose((0.0, 0.0, 0.5)), Pose((0.0, 0.0, 0.9))]), ["", "drawer"])
-    boxes = places.boxes(bounds_of(LAMP))
-    moved = boxes.moved(np.array([1, 0, 1]), np.array([(1.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, 3.0)]))
-    assert [moved.links[number] for number in moved.link_of] == ["drawer", "", "drawer"]
-    assert moved.corners_m[0] == pytest.approx(boxes.corners_m[1] + (1.0, 0.0, 0.0, 1.0, 0.0, 0.0))
-    assert moved.corners_m[2] == pytest.approx(boxes.corners_m[1] + (0.0, 0.0, 3.0, 0.0, 0.0, 3.0))
 
 
 @given(st.lists(BOX, min_size=1, max_size=6), COORDINATE, COORDINATE)
@@ -128,17 +87,19 @@ def test_object_with_a_cavity_is_taken_only_on_its_own_level() -> None:
 
 
 def test_pose_on_a_link_without_a_frame_is_out_of_reach() -> None:
-    boxes = PoseSet.of(pose_rows([Pose((0.0, 0.0, 0.5))]), ["drawer"]).world_boxes(
-        bounds_of(LAMP), (0.0,), {"": Pose((0.0, 0.0, 0.0))}
-    )
+    places = PoseSet.of(bounds_of(LAMP), pose_rows([Pose((0.0, 0.0, 0.5))]), ["drawer"])
+    boxes = places.world_boxes((0.0,), {"": Pose((0.0, 0.0, 0.0))})
     assert not boxes.reached_from(StandPose(0.0, 0.0, 0.0)).any()
 
 
 def test_poses_taken_in_turn_keep_their_rotations() -> None:
-    turned = PoseSet.of(pose_rows([Pose.from_xyz_yaw(0.0, 0.0, 0.0, yaw) for yaw in (0.0, 1.0)]), ["", ""])
-    again = turned.repeated_at(np.arange(9.0).reshape(3, 3))
-    assert np.array_equal(again.rotations[again.turn_of], turned.rotations[[0, 1, 0]])
-    assert again.positions_m[2].tolist() == [6.0, 7.0, 8.0]
+    bounds, poses = bounds_of(LAMP), [Pose.from_xyz_yaw(0.0, 0.0, 0.0, yaw) for yaw in (0.0, 1.0)]
+    again = PoseSet.of(bounds, pose_rows(poses), ["", ""]).repeated_at(np.arange(9.0).reshape(3, 3))
+    boxes = again.world_boxes((0.0,), {"": Pose((0.0, 0.0, 0.0))})
+    for row, yaw in enumerate((0.0, 1.0, 0.0)):
+        box = bounds.box(Pose.from_xyz_yaw(3.0 * row, 3.0 * row + 1, 3.0 * row + 2, yaw), (0.0,))
+        assert boxes.lows_m[row].tolist() == pytest.approx(box.low_m)
+        assert boxes.highs_m[row].tolist() == pytest.approx(box.high_m)
 
 
 @given(BOX, COORDINATE, COORDINATE, st.sampled_from((0, 1, 2, 3)))

@@ -12,7 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from embomatrix.sim.geometry.bounds import AssetBounds, IntArray, quarter_turns
+from embomatrix.sim.caches import BoundedCache
+from embomatrix.sim.geometry.bounds import AssetBounds, IntArray, Turned
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import IDENTITY, Aabb, FloatArray, Pose
 from embomatrix.world.poses import StandPose
@@ -25,6 +26,8 @@ HANDY_M: Final = 0.75
 HANDY_HEIGHTS_M: Final = (0.35, 1.5)
 """Distance from the base's centre and heights of a place that is easy to reach."""
 SAME_LEVEL_M: Final = 0.02
+ROTATIONS_KEPT: Final = 8
+"""Rotations of the support for which a set of poses keeps the extents of the object."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +61,16 @@ class PoseBoxes:
         (a, b, c), (d, e, f) = self.lows_m.min(axis=0).tolist(), self.highs_m.max(axis=0).tolist()
         return Aabb((a, b, c), (d, e, f))
 
+    def each(self) -> Iterator[Aabb]:
+        """Yield them one by one."""
+        for (a, b, c), (d, e, f) in zip(self.lows_m.tolist(), self.highs_m.tolist(), strict=True):
+            yield Aabb((a, b, c), (d, e, f))
+
     def crowded(self, others: Sequence[Aabb], margin_m: float) -> Iterator[bool]:
         """Tell box by box if it overlaps any other one within a margin. Lazy: most callers take the first few."""
-        for (a, b, c), (d, e, f) in zip(self.lows_m.tolist(), self.highs_m.tolist(), strict=True):
-            box = Aabb((a, b, c), (d, e, f)).grown(margin_m)
-            yield any(box.overlaps(other) for other in others)
+        for box in self.each():
+            grown = box.grown(margin_m)
+            yield any(grown.overlaps(other) for other in others)
 
     def at(self, rows: Sequence[int]) -> PoseBoxes:
         """Some of the poses, in the order of ``rows``."""
@@ -109,80 +117,26 @@ class PoseBoxes:
         return np.asarray(meets.any(axis=1)), np.asarray(most)
 
 
-_COLUMNS: Final = tuple(
-    np.array(columns)
-    for columns in ((0, 1, 2, 3, 4, 5), (4, 0, 2, 1, 3, 5), (3, 4, 2, 0, 1, 5), (1, 3, 2, 4, 0, 5))
-)
-"""Source column of each of a box's corners after 0 to 3 quarter turns about z."""
-_SIGNS: Final = tuple(
-    np.array(signs, dtype=np.float64)
-    for signs in ((1, 1, 1, 1, 1, 1), (-1, 1, 1, -1, 1, 1), (-1, -1, 1, -1, -1, 1), (1, -1, 1, 1, -1, 1))
-)
-"""Signs of these columns."""
-
-
-@dataclass(frozen=True, slots=True)
-class LinkBoxes:
-    """Boxes of one object at n poses, each in the frame of the support's link that carries it.
-
-    ``corners_m`` has shape (n, 6), the low corner first; ``link_of``, shape (n,), holds indices into ``links``.
-    """
-
-    corners_m: FloatArray
-    links: tuple[str, ...]
-    link_of: IntArray
-
-    def moved(self, rows: IntArray, by_m: FloatArray) -> LinkBoxes:
-        """Boxes of these rows, shape (m,), each moved on its link by its own vector, shape (m, 3)."""
-        return LinkBoxes(self.corners_m[rows] + np.tile(by_m, 2), self.links, self.link_of[rows])
-
-    def world_boxes(self, frames: Mapping[str, Pose]) -> PoseBoxes | None:
-        """Boxes in the world; at infinity on links without a frame. None if a frame is not square to the world."""
-        turns = {link: quarter_turns(frames[link]) for link in self.links if link in frames}
-        if -1 in turns.values():
-            return None
-        if len(self.links) == 1 and turns:
-            (link,) = self.links
-            return _split(_turned(self.corners_m, turns[link], frames[link]))
-        placed = np.full_like(self.corners_m, np.inf)
-        for number, link in enumerate(self.links):
-            if link in turns:
-                rows = self.link_of == number
-                placed[rows] = _turned(self.corners_m[rows], turns[link], frames[link])
-        return _split(placed)
-
-
-def _turned(corners_m: FloatArray, turns: int, frame: Pose) -> FloatArray:
-    """World boxes, shape (n, 6), of a frame that is turned by quarter turns about z."""
-    placed = corners_m[:, _COLUMNS[turns]]
-    placed *= _SIGNS[turns]
-    placed += np.array(frame.position_m * 2)
-    return placed
-
-
-def _split(corners_m: FloatArray) -> PoseBoxes:
-    return PoseBoxes(corners_m[:, :3], corners_m[:, 3:])
-
-
 @dataclass(frozen=True, slots=True)
 class PoseSet:
     """Poses of an object in the frames of a support's links, as arrays over n.
 
-    ``positions_m`` has shape (n, 3), ``rotations`` (k, 3, 3); ``turn_of`` and ``link_of``, shape (n,), hold indices into
-    ``rotations`` and ``links``.
+    ``positions_m`` has shape (n, 3); ``turn_of`` and ``link_of``, shape (n,), hold indices into k rotations and into
+    ``links``. ``extents`` holds the corners, shape (k, 3) each, of the object's boxes at the rotations relative to its origin,
+    by the rotation of a link and the object's joints: furniture rarely turns.
     """
 
     positions_m: FloatArray
-    rotations: FloatArray
+    extents: BoundedCache[Turned, tuple[FloatArray, FloatArray]]
     turn_of: IntArray
     links: tuple[str, ...]
     link_of: IntArray
 
     @staticmethod
-    def of(rows: FloatArray, links: Sequence[str], then: Pose = IDENTITY) -> PoseSet:
-        """Poses on ``links``, one link each; ``then`` is the object's pose in each of their frames.
+    def of(bounds: AssetBounds, rows: FloatArray, links: Sequence[str], then: Pose = IDENTITY) -> PoseSet:
+        """Poses of an object with these bounds on ``links``, one link each.
 
-        ``rows``, shape (n, 7), are positions and quaternions.
+        ``rows``, shape (n, 7), are positions and quaternions; ``then`` is the object's pose in each of their frames.
         """
         positions, rotations = np.ascontiguousarray(rows[:, :3]), _rotations(rows[:, 3:])
         if then is not IDENTITY:
@@ -195,40 +149,36 @@ class PoseSet:
             link_of = np.array([names.index(link) for link in links], dtype=np.int64)
         else:
             link_of = np.zeros(len(links), dtype=np.int64)
-        return PoseSet(positions, rotations, np.arange(len(rows)), names, link_of)
+
+        def extents(turned: Turned) -> tuple[FloatArray, FloatArray]:
+            quat_xyzw, fractions = turned
+            return bounds.extents(Pose(IDENTITY.position_m, quat_xyzw).rotation @ rotations, fractions)
+
+        extents_of = BoundedCache(ROTATIONS_KEPT, extents)
+        return PoseSet(positions, extents_of, np.arange(len(rows)), names, link_of)
 
     def repeated_at(self, positions_m: FloatArray) -> PoseSet:
         """Poses repeated in turn at other positions on their links, shape (m, 3)."""
         rows = np.arange(len(positions_m)) % max(len(self.link_of), 1)
-        return PoseSet(positions_m, self.rotations, self.turn_of[rows], self.links, self.link_of[rows])
+        return PoseSet(positions_m, self.extents, self.turn_of[rows], self.links, self.link_of[rows])
 
-    def boxes(self, bounds: AssetBounds) -> LinkBoxes:
-        """Boxes of an object with these bounds, its joints shut, in the frames of the links."""
-        found = self.world_boxes(bounds, (), dict.fromkeys(self.links, IDENTITY))
-        return LinkBoxes(np.concatenate([found.lows_m, found.highs_m], axis=1), self.links, self.link_of)
-
-    def world_boxes(
-        self, bounds: AssetBounds, fractions: Sequence[float], frames: Mapping[str, Pose]
-    ) -> PoseBoxes:
-        """World boxes of an object with these bounds and joint positions; at infinity on links without a frame."""
-        if not self.links:
-            return PoseBoxes(np.zeros((0, 3)), np.zeros((0, 3)))
+    def world_boxes(self, fractions: tuple[float, ...], frames: Mapping[str, Pose]) -> PoseBoxes:
+        """World boxes of the object with these joint positions; at infinity on links without a frame."""
         if len(self.links) == 1 and self.links[0] in frames:
-            return PoseBoxes(*self._extents(bounds, fractions, frames[self.links[0]], np.s_[:]))
+            return PoseBoxes(*self._corners(fractions, frames[self.links[0]], np.s_[:]))
         lows, highs = np.full_like(self.positions_m, np.inf), np.full_like(self.positions_m, np.inf)
         for number, link in enumerate(self.links):
             if link in frames:
                 rows = self.link_of == number
-                lows[rows], highs[rows] = self._extents(bounds, fractions, frames[link], rows)
+                lows[rows], highs[rows] = self._corners(fractions, frames[link], rows)
         return PoseBoxes(lows, highs)
 
-    def _extents(
-        self, bounds: AssetBounds, fractions: Sequence[float], frame: Pose, rows: slice | BoolArray
+    def _corners(
+        self, fractions: tuple[float, ...], frame: Pose, rows: slice | BoolArray
     ) -> tuple[FloatArray, FloatArray]:
         """Corners of the boxes at some of the poses, shape (m, 3) each, with their link at ``frame``."""
-        turn = frame.rotation
-        below, above = bounds.extents(turn @ self.rotations, fractions)  # (k, 3) each
-        origins = self.positions_m[rows] @ turn.T + frame.position_m
+        below, above = self.extents[frame.quat_xyzw, fractions]
+        origins = self.positions_m[rows] @ frame.rotation.T + frame.position_m
         turns = self.turn_of[rows]
         return origins + below[turns], origins + above[turns]
 

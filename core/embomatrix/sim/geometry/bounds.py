@@ -45,20 +45,6 @@ def joint_motion(joint: Joint, fraction: float) -> Pose:
     return turn @ Pose((-ox, -oy, -oz))
 
 
-def quarter_turns(frame: Pose) -> int:
-    """Number of quarter turns about z, 0 to 3, to within a microradian; -1 for any other rotation."""
-    x, y, z, w = frame.quat_xyzw
-    if abs(x) > SQUARE or abs(y) > SQUARE:
-        return -1
-    if abs(z) <= SQUARE:
-        return 0
-    if abs(w) <= SQUARE:
-        return 2
-    if abs(z - w) <= SQUARE:
-        return 1
-    return 3 if abs(z + w) <= SQUARE else -1
-
-
 def square_box(box: Aabb, frame: Pose) -> Aabb | None:
     """Box in the target of ``frame``; None if its sides are not along that frame's axes to within a microradian."""
     x, y, z, w = (abs(value) for value in frame.quat_xyzw)

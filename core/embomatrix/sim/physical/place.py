@@ -16,7 +16,7 @@ from embomatrix.sim.physical.put import PutRequest, drop, put
 from embomatrix.sim.physical.reach import ToolPath
 from embomatrix.sim.physical.stage import Grip, PhysicalStage
 from embomatrix.sim.physical.travel import travel
-from embomatrix.sim.placing.trial import in_reach
+from embomatrix.sim.placing.search import in_reach
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.limits import ROBOT
 from embomatrix.skills.syntax import SkillCall

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from embomatrix.sim.physical import body
 from embomatrix.sim.physical.space import collides
 from embomatrix.sim.physical.stage import PhysicalStage, compact
-from embomatrix.sim.placing.trial import in_reach
+from embomatrix.sim.placing.search import in_reach
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.view import SkillRefusal, refuse
 from embomatrix.world.geometry import FloatArray

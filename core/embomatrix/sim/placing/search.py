@@ -1,0 +1,235 @@
+"""Search for poses of one held object on, in or under another, in the engine's present state."""
+
+import functools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from embomatrix.sim.engine import FLOOR, TOLERANCE_M, PhysicsEngine
+from embomatrix.sim.floor.navigation import has_front
+from embomatrix.sim.geometry.batch_poses import BoolArray, Neighbours, PoseBoxes
+from embomatrix.sim.geometry.statics import is_level, rest_pose
+from embomatrix.sim.geometry.surfaces import is_shut, link_frame, links_with_surfaces
+from embomatrix.sim.joints.behind_panels import behind_panels
+from embomatrix.sim.placing.options import CandidatePoses, PlacementOptions
+from embomatrix.sim.state.relations import Relations
+from embomatrix.skills.limits import ROBOT
+from embomatrix.world.asset import Asset
+from embomatrix.world.geometry import IDENTITY, Aabb, Pose
+from embomatrix.world.poses import StandPose
+from embomatrix.world.state import Relation
+
+UNDISTURBED_M: Final = 0.005
+"""A pose verified offline is settled again if anything but its support is this near."""
+NEAR_M: Final = UNDISTURBED_M + TOLERANCE_M
+"""Margin for penetration queries at this distance, which subtract the tolerance."""
+LIVE_TRIES: Final = 64
+"""Candidates tried beyond the cached ones."""
+LIVE_SETTLES: Final = 8
+"""Most of these candidates that are simulated."""
+HIGH_RIM_M: Final = ROBOT.reach_high_m - ROBOT.extent_m / 2
+"""Highest rim over which the arm lifts any object it can hold."""
+
+
+@dataclass(frozen=True)
+class PlacementSearch:
+    """Search for poses of an object with a relation to a target, in reach of a standing pose.
+
+    A found pose has the relation, penetrates nothing, is within the robot's reach and is stable. Poses within reach of
+    ``excluded_stands`` are skipped. The search moves the held object and leaves it where it was tried last.
+    """
+
+    engine: PhysicsEngine
+    relations: Relations
+    options: PlacementOptions
+    held: str
+    target: str
+    relation: Relation
+    robot: StandPose
+    excluded_stands: tuple[StandPose, ...] = ()
+
+    def poses(self, rng: np.random.Generator | None, reached: int | None) -> Iterator[Pose]:
+        """Accepted poses: verified for the pair, then for the footprint class, then fresh ones.
+
+        The pose with the number ``reached`` comes first in the first set. Without ``rng`` the cache's order holds.
+        """
+        for options in self.options.verified(self.held, self.target, self.relation):
+            order = range(len(options)) if rng is None else rng.permutation(len(options)).tolist()
+            if reached is not None and reached < len(options):
+                yield from (pose for _, pose in self.accepted(options, [reached]))
+                order = [number for number in order if number != reached]
+            for _, pose in self.accepted(options, order):
+                yield pose
+            reached = None
+        yield from self._fresh(rng)
+
+    def accepted(self, options: CandidatePoses, order: Sequence[int]) -> Iterator[tuple[int, Pose]]:
+        """Accepted poses of a verified set, each with its number."""
+        for number, nearest in self._roomy_first(options, order):
+            found = self._verified(options.pose(number, self._frames), nearest)
+            if found is not None:
+                yield number, found
+
+    def _fresh(self, rng: np.random.Generator | None) -> Iterator[Pose]:
+        """Poses for pairs that the analysis did not cover, and on surfaces that have filled up."""
+        shift = (0.5, 0.5) if rng is None else (float(rng.random()), float(rng.random()))
+        options = self.options.fresh(self.held, self.target, self.relation, shift, LIVE_TRIES)
+        settles = 0
+        for number, nearest in self._roomy_first(options, range(len(options))):
+            if settles == LIVE_SETTLES:
+                return
+            found = self._proved(options, number)
+            if found is None:
+                if not self._is_free(options.pose(number, self._frames), nearest) or not self._holds():
+                    continue
+                settles += 1
+                found = self._settled()
+            if found is not None:
+                yield found
+
+    def _roomy_first(self, options: CandidatePoses, order: Sequence[int]) -> Iterator[tuple[int, str]]:
+        """Candidates in reach: first those with nothing but the target around, then the others; handy ones lead each group.
+
+        Each of the others comes with the object it most likely meets. This coarse test uses boxes only; candidates that
+        certainly collide are left out.
+        """
+        if not order:
+            return
+        engine, held = self.engine, self.held
+        boxes = options.places.world_boxes(engine.joints(held), self._frames)
+        reached = self._served(boxes, self.robot)
+        for stand in self.excluded_stands:
+            reached &= ~self._served(boxes, stand)
+        flags = reached.tolist()
+        rows = [number for number in order if flags[number]]
+        if not rows:
+            return
+        handy = boxes.handy_from(self.robot).tolist()
+        rows.sort(key=lambda number: not handy[number])
+        boxes = boxes.at(rows)
+        near = engine.near(boxes.around().grown(NEAR_M), frozenset((held, self.target)))
+        others = [engine.aabb(name) for name in near]
+        crowded: list[int] = []
+        for place, is_crowded in enumerate(boxes.crowded(others, NEAR_M)):
+            if is_crowded:
+                crowded.append(place)
+            else:
+                yield rows[place], ""
+        if not crowded:
+            return
+        boxes, rows = boxes.at(crowded), [rows[place] for place in crowded]
+        taken, most = (answers.tolist() for answers in boxes.overlaps(_neighbours(engine, near)))
+        for number, full, nearest in zip(rows, taken, most, strict=True):
+            if not full:
+                yield number, near[nearest]
+
+    def _served(self, boxes: PoseBoxes, stand: StandPose) -> BoolArray:
+        """Tell for each box, shape (n,), if the arm reaches it over the target's rim and past its open doors."""
+        engine, asset, fractions = self.engine, self._asset(self.target), self.engine.joints(self.target)
+        reached = boxes.reached_from(stand)
+        rim_m = engine.aabb(self.target).high_m[2]
+        if self.relation is Relation.INSIDE and rim_m > HIGH_RIM_M and not has_front(asset):
+            reached &= boxes.raised_over(rim_m).reached_from(stand)
+        if any(fractions):
+            reached &= ~behind_panels(boxes, asset, engine.pose(self.target), fractions, stand)
+        return reached
+
+    @functools.cached_property
+    def _frames(self) -> dict[str, Pose]:
+        """Frame of each link of the target that can carry objects; shut drawers are left out."""
+        asset = self._asset(self.target)
+        pose, fractions = self.engine.pose(self.target), self.engine.joints(self.target)
+        shut = {
+            item.link
+            for item in asset.interiors
+            if item.link and self.relation is Relation.INSIDE and is_shut(asset, item, fractions)
+        }
+        links = ({""} | links_with_surfaces(asset)) - shut
+        return {link: link_frame(asset, pose, fractions, link) for link in sorted(links)}
+
+    def _asset(self, name: str) -> Asset:
+        return self.engine.scene.asset_of(name)
+
+    def _verified(self, pose: Pose, nearest: str) -> Pose | None:
+        """Accept a pose that was verified with nothing but its support around; settle it if anything else is near."""
+        engine, held, target = self.engine, self.held, self.target
+        engine.set_pose(held, pose)
+        if nearest and self._is_deep(nearest):
+            return None
+        other = engine.penetrates(held, NEAR_M, frozenset((target, FLOOR)))
+        if other in engine.scene.by_name and self._is_deep(other):
+            return None
+        if other:
+            return None if engine.penetrates(held) else self._settled()
+        # The pose was verified with all joints shut: while they are, the object is free of its support.
+        if any((*engine.joints(target), *engine.joints(held))) and self._is_deep(target):
+            return None
+        return pose if self._holds() else self._settled()
+
+    def _proved(self, options: CandidatePoses, number: int) -> Pose | None:
+        """Rest pose by statics with nothing but the support within 5 mm; None if only a settle can decide."""
+        engine, held, target = self.engine, self.held, self.target
+        one, other = self._asset(held), self._asset(target)
+        base, link = self.options.bases[one.asset_id], options.link(number)
+        if base is None or not is_level(self._frames[link]):
+            return None
+        fractions = engine.joints(target)
+        start = link_frame(other, IDENTITY, fractions, link) @ options.exact(number)
+        rest = rest_pose(one, base, start, other, fractions)
+        if rest is None:
+            return None
+        pose = engine.pose(target) @ rest
+        x, y, z = pose.position_m
+        # Checked slightly higher, out of range of objects below the support, such as the table under a sheet.
+        engine.set_pose(held, Pose((x, y, z + NEAR_M), pose.quat_xyzw))
+        if engine.penetrates(held, NEAR_M, frozenset((target, FLOOR))):
+            return None
+        engine.set_pose(held, pose)
+        return pose if self._holds() and self._reaches() else None
+
+    def _settled(self) -> Pose | None:
+        """Let the object settle and accept the pose if all conditions still hold."""
+        settled = self.engine.settle(self.held)
+        if not settled.stable or not self._is_free(settled.pose, "") or not self._reaches():
+            return None
+        return settled.pose if self._holds() else None
+
+    def _holds(self) -> bool:
+        """Return True if the relation holds at the pose under trial."""
+        match self.relation:
+            case Relation.ONTOP:
+                return self.relations.supports.would_be_on(self.held, self.target)
+            case Relation.INSIDE:
+                return self.relations.supports.would_be_in(self.held, self.target)
+            case _:
+                return self.relations.holds(self.relation, self.held, self.target)
+
+    def _is_free(self, pose: Pose, nearest: str) -> bool:
+        """Put the object at the pose. Return True if it penetrates nothing; ``nearest`` is checked first."""
+        self.engine.set_pose(self.held, pose)
+        return not (nearest and self._is_deep(nearest)) and not self.engine.penetrates(self.held)
+
+    def _is_deep(self, other: str) -> bool:
+        gap_m = self.engine.gap(self.held, other, 0.0)
+        return gap_m is not None and gap_m < -TOLERANCE_M
+
+    def _reaches(self) -> bool:
+        return in_reach(self.engine.aabb(self.held), self.robot)
+
+
+def in_reach(box: Aabb, robot: StandPose) -> bool:
+    """Return True if the arm reaches the nearest point of a box in the plane, and the height of its middle."""
+    near = box.level_distance_m(robot.x_m, robot.y_m) <= ROBOT.reach_m
+    return near and ROBOT.reach_low_m <= box.center_m[2] <= ROBOT.reach_high_m
+
+
+def _neighbours(engine: PhysicsEngine, names: Sequence[str]) -> Neighbours:
+    items = [engine.scene.by_name[name] for name in names]
+    links = [engine.scene.assets[item.asset_id].links for item in items]
+    return Neighbours.of(
+        [engine.aabb(name) for name in names],
+        [len(chain) == 1 and len(chain[0].parts) == 1 for chain in links],
+        [not item.fixed for item in items],
+    )
