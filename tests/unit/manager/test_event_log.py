@@ -114,14 +114,14 @@ def test_scene_events_are_logged_on_change_only():
     warm = Resident("a", ResidentState.WARM, load_s=0.5)
     broken = Resident("b", ResidentState.FAILED, error="no mesh")
     for now_s, residents in enumerate([[loading], [warm], [warm, broken], [warm, broken], [broken], []]):
-        log.fleet.residents("w1", residents, now_s=now_s)
+        log.residents("w1", residents, now_s=now_s)
     found = [(event.at_s - EPOCH_S, event.kind, event.bundle_digest) for event in log.page("", 0).events]
     assert found == [
         (1, EventKind.SCENE_WARM, "a"),
         (2, EventKind.SCENE_FAILED, "b"),
         (4, EventKind.SCENE_EVICTED, "a"),
     ]
-    assert log.fleet.scene_load.sum_s == 0.5
+    assert log.scene_load.sum_s == 0.5
 
 
 def summary(run_id):
@@ -130,16 +130,16 @@ def summary(run_id):
     return RunSummary(run, {}, (), RunSeries(1.0, (), ()), (), 0.0, nothing, nothing, 0, "1")
 
 
-async def test_archive_keeps_the_latest_runs_and_skips_damaged_files(tmp_path):
+def test_archive_keeps_the_latest_runs_and_skips_damaged_files(tmp_path):
     archive = RunArchive(tmp_path / "runs", kept=3)
     for number in range(5):
-        await archive.keep(summary(f"r{number}"), log_of("r").page("r", 0).events)
-    assert [kept.run.run_id for kept in await archive.summaries()] == ["r4", "r3", "r2"]
+        archive.keep(summary(f"r{number}"), log_of("r").page("r", 0).events)
+    assert [kept.run.run_id for kept in archive.summaries()] == ["r4", "r3", "r2"]
     (tmp_path / "runs" / "r3.run.gz").write_bytes(b"no gzip")
-    assert [kept.run.run_id for kept in await archive.summaries()] == ["r4", "r2"]
-    assert await archive.load("r3") is None
-    assert await archive.load("r0") is None
-    assert await archive.load("../runs/r4") is None
-    assert await archive.load("r4\0") is None
-    _, events = await archive.load("r4")
+    assert [kept.run.run_id for kept in archive.summaries()] == ["r4", "r2"]
+    assert archive.load("r3") is None
+    assert archive.load("r0") is None
+    assert archive.load("../runs/r4") is None
+    assert archive.load("r4\0") is None
+    _, events = archive.load("r4")
     assert [event.kind for event in events] == [EventKind.RUN_OPENED]

@@ -1,4 +1,4 @@
-"""Credentials of tokens: hashes, roles and expiry. Free of I/O; clock and randomness are arguments.
+"""Credentials of tokens: hashes, roles and expiry. Free of I/O; the clock is an argument.
 
 A token is ``ID.SECRET``. The public id finds the credential. The secret has 256 random bits, so a plain hash is safe.
 """
@@ -9,7 +9,7 @@ import hashlib
 import hmac
 import json
 import secrets
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from typing import Final
 
@@ -69,26 +69,10 @@ class Credential:
         return f"the token {self.token_id}" + (f" ({self.label})" if self.label else "")
 
 
-def new_secret() -> str:
-    return secrets.token_urlsafe(32)
-
-
-def new_id() -> str:
-    return secrets.token_hex(6)
-
-
 class CredentialBook:
     """All credentials of a cluster. Changing methods return credentials to store, and ``keep`` adds them afterwards."""
 
-    def __init__(
-        self,
-        credentials: Iterable[Credential] = (),
-        *,
-        make_secret: Callable[[], str] = new_secret,
-        make_id: Callable[[], str] = new_id,
-    ) -> None:
-        self._make_secret = make_secret
-        self._make_id = make_id
+    def __init__(self, credentials: Iterable[Credential] = ()) -> None:
         self._by_id: dict[str, Credential] = {}
         self._of_worker: dict[str, dict[str, Credential]] = {}
         """Credentials of role worker by worker name, then by id."""
@@ -139,9 +123,9 @@ class CredentialBook:
                 )
         if len(self._by_id) >= LIMIT:
             raise OverloadedError(f"{len(self._by_id)} tokens exist, which is the limit: revoke some")
-        secret = self._make_secret()
+        secret = secrets.token_urlsafe(32)
         credential = Credential(
-            token_id=self._make_id(),
+            token_id=_new_id(),
             role=role,
             secret_hash=hash_of(secret),
             label=label[:LABEL_LENGTH],
@@ -214,9 +198,7 @@ class CredentialBook:
         own = self._credentials_of(worker_id)
         if own:
             return tuple(replace(c, revoked=reason) for c in own)
-        return (
-            Credential(self._make_id(), AccessRole.WORKER, _NOTHING, worker_id=worker_id, revoked=reason),
-        )
+        return (Credential(_new_id(), AccessRole.WORKER, _NOTHING, worker_id=worker_id, revoked=reason),)
 
     def knows_worker(self, worker_id: str) -> bool:
         """Return True if a credential, valid or revoked, belongs to this name."""
@@ -238,6 +220,10 @@ class CredentialBook:
 
     def _holder(self, worker_id: str) -> Credential | None:
         return next(iter(self._credentials_of(worker_id)), None)
+
+
+def _new_id() -> str:
+    return secrets.token_hex(6)
 
 
 def hash_of(secret: str) -> str:

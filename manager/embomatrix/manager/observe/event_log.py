@@ -9,7 +9,7 @@ import functools
 import itertools
 import logging
 from collections import Counter, OrderedDict, deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -22,7 +22,6 @@ from embomatrix.rpc.wire.leases import LeaseResult
 from embomatrix.rpc.wire.run_log import EventKind, EventPage, RolloutPhase, RunEvent
 from embomatrix.rpc.wire.values import (
     Batch,
-    Cancelled,
     Completed,
     InfraFailure,
     Resident,
@@ -35,6 +34,7 @@ logger = logging.getLogger(__name__)
 EVENTS_KEPT: Final = 32_768
 """Events of all open runs together, about 350 bytes each. Every run may keep at least ``LEAST_KEPT``."""
 LEAST_KEPT: Final = 256
+FLEET_EVENTS_KEPT: Final = 4096
 HEDGES_KEPT: Final = 4096
 PAGE: Final = 4096
 """Events of one page at most."""
@@ -59,8 +59,11 @@ class RunEventLog:
 
     def __init__(self, *, epoch_s: float) -> None:
         self.epoch_s = epoch_s
+        self.fleet = EventRing(FLEET_EVENTS_KEPT)
+        """Events of workers and scenes."""
+        self.scene_load = Histogram()
         self._sequences = itertools.count(1)
-        self.fleet = FleetLog(self._sequences, epoch_s=epoch_s)
+        self._residents: dict[str, dict[str, ResidentState]] = {}
         self.attempts: Counter[int] = Counter()
         """Rollouts by number of attempts."""
         self.execute_s = 0.0
@@ -87,7 +90,7 @@ class RunEventLog:
     def page(self, run_id: str, after: int, limit: int = PAGE) -> EventPage | None:
         """Return events of an open run, or of workers and scenes for an empty id; None if the run is not open."""
         if not run_id:
-            return self.fleet.ring.after(after, limit)
+            return self.fleet.after(after, limit)
         return self._runs[run_id].ring.after(after, limit) if run_id in self._runs else None
 
     def open_run(
@@ -159,18 +162,30 @@ class RunEventLog:
         if run is None:
             return
         result = command.result
+        code, message, worker_id = "cancelled", "", ""
         match result.outcome:
             case Completed(timings=timings):
                 self.attempts[result.attempt] += 1
                 self.execute_s += timings.execute_s
                 run.figures.completed(timings, now_s)
-            case InfraFailure(code, message, worker_id):
+                return
+            case InfraFailure(failure, message, worker_id):
                 self.attempts[result.attempt] += 1
                 run.figures.series.count(now_s, failed=1)
-                ended = self._end(command, now_s, code.value, message, worker_id)
-                run.figures.failures.append(ended)
-            case Cancelled():
-                self._end(command, now_s, "cancelled", "", "")
+                code = failure.value
+        event = self._note(
+            EventKind.ENDED,
+            command.run_id,
+            now_s=now_s,
+            batch_id=command.batch_id,
+            rollout_id=result.rollout_id,
+            worker_id=worker_id,
+            attempt=result.attempt,
+            code=code,
+            message=message[:MESSAGE_CHARS],
+        )
+        if isinstance(result.outcome, InfraFailure):
+            run.figures.failures.append(event)
 
     def count_deliveries(self, run_id: str, durations_s: Sequence[float]) -> None:
         """Count the delivery times, in seconds, of results that reached the run's result log."""
@@ -179,6 +194,34 @@ class RunEventLog:
             histogram = run.figures.phases[RolloutPhase.DELIVER]
             for seconds in durations_s:
                 histogram.observe(seconds)
+
+    def joined(self, worker_id: str, resources: Resources, *, now_s: float) -> None:
+        self._residents.pop(worker_id, None)
+        self._note(EventKind.WORKER_JOINED, worker_id=worker_id, now_s=now_s, size=resources.slots)
+
+    def lost(self, worker_id: str, reason: str, *, now_s: float) -> None:
+        self._residents.pop(worker_id, None)
+        message = reason[:MESSAGE_CHARS]
+        self._note(EventKind.WORKER_LOST, worker_id=worker_id, now_s=now_s, message=message)
+
+    def residents(self, worker_id: str, residents: Sequence[Resident], *, now_s: float) -> None:
+        """Log the changes of a worker's scenes since its last report."""
+        before = self._residents.get(worker_id, {})
+        after = {resident.bundle_digest: resident.state for resident in residents}
+        self._residents[worker_id] = after
+        note = functools.partial(self._note, worker_id=worker_id, now_s=now_s)
+        for resident in residents:
+            scene = resident.bundle_digest
+            if before.get(scene) is resident.state:
+                continue
+            if resident.state is ResidentState.WARM:
+                self.scene_load.observe(resident.load_s)
+                note(EventKind.SCENE_WARM, bundle_digest=scene, held_s=resident.load_s)
+            elif resident.state is ResidentState.FAILED:
+                note(EventKind.SCENE_FAILED, bundle_digest=scene, message=resident.error[:MESSAGE_CHARS])
+        for scene, state in before.items():
+            if scene not in after and state is ResidentState.WARM:
+                note(EventKind.SCENE_EVICTED, bundle_digest=scene)
 
     def _ended_lease(self, result: LeaseResult, lease: LeaseRecord, now_s: float) -> None:
         record = lease.record
@@ -216,23 +259,12 @@ class RunEventLog:
             run.figures.failures.append(event)
             _log_failed(event)
 
-    def _end(self, command: DeliverResult, now_s: float, code: str, message: str, worker_id: str) -> RunEvent:
-        return self._note(
-            EventKind.ENDED,
-            command.run_id,
-            now_s=now_s,
-            batch_id=command.batch_id,
-            rollout_id=command.result.rollout_id,
-            worker_id=worker_id,
-            attempt=command.result.attempt,
-            code=code,
-            message=message[:MESSAGE_CHARS],
-        )
-
-    def _note(self, kind: EventKind, run_id: str, *, now_s: float, **fields: Any) -> RunEvent:
-        """Log an infrequent event."""
+    def _note(self, kind: EventKind, run_id: str = "", *, now_s: float, **fields: Any) -> RunEvent:
+        """Log an infrequent event of a run, or of workers and scenes for an empty id."""
         event = RunEvent(next(self._sequences), self.epoch_s + now_s, kind, run_id, **fields)
-        if run_id in self._runs:
+        if not run_id:
+            self.fleet.append(event)
+        elif run_id in self._runs:
             self._runs[run_id].ring.append(event)
         return event
 
@@ -277,51 +309,3 @@ class EventRing:
                 if len(found) == limit:
                     break
         return EventPage(tuple(found), self.dropped)
-
-
-FLEET_EVENTS_KEPT: Final = 4096
-
-
-class FleetLog:
-    """Events of workers and scenes. ``sequences`` is shared with the logs of runs, so that all events have one order.
-
-    ``epoch_s`` is the wall-clock time at second 0 of the monotonic clock of every ``now_s``.
-    """
-
-    def __init__(self, sequences: Iterator[int], *, epoch_s: float) -> None:
-        self.ring = EventRing(FLEET_EVENTS_KEPT)
-        self.scene_load = Histogram()
-        self._sequences = sequences
-        self._epoch_s = epoch_s
-        self._residents: dict[str, dict[str, ResidentState]] = {}
-
-    def joined(self, worker_id: str, resources: Resources, *, now_s: float) -> None:
-        self._residents.pop(worker_id, None)
-        self._note(EventKind.WORKER_JOINED, worker_id, now_s=now_s, size=resources.slots)
-
-    def lost(self, worker_id: str, reason: str, *, now_s: float) -> None:
-        self._residents.pop(worker_id, None)
-        self._note(EventKind.WORKER_LOST, worker_id, now_s=now_s, message=reason[:MESSAGE_CHARS])
-
-    def residents(self, worker_id: str, residents: Sequence[Resident], *, now_s: float) -> None:
-        """Log the changes of a worker's scenes since its last report."""
-        before = self._residents.get(worker_id, {})
-        after = {resident.bundle_digest: resident.state for resident in residents}
-        self._residents[worker_id] = after
-        note = functools.partial(self._note, worker_id=worker_id, now_s=now_s)
-        for resident in residents:
-            scene = resident.bundle_digest
-            if before.get(scene) is resident.state:
-                continue
-            if resident.state is ResidentState.WARM:
-                self.scene_load.observe(resident.load_s)
-                note(EventKind.SCENE_WARM, bundle_digest=scene, held_s=resident.load_s)
-            elif resident.state is ResidentState.FAILED:
-                note(EventKind.SCENE_FAILED, bundle_digest=scene, message=resident.error[:MESSAGE_CHARS])
-        for scene, state in before.items():
-            if scene not in after and state is ResidentState.WARM:
-                note(EventKind.SCENE_EVICTED, bundle_digest=scene)
-
-    def _note(self, kind: EventKind, worker_id: str, *, now_s: float, **fields: Any) -> None:
-        event = RunEvent(next(self._sequences), self._epoch_s + now_s, kind, worker_id=worker_id, **fields)
-        self.ring.append(event)

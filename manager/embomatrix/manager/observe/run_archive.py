@@ -69,7 +69,8 @@ class RunHistory:
         )
         if record is not None:
             info = self._info(record, stats, pending=0, closed_s=time.time())
-            await self._archive.keep(self._summed(record, info, leads), tuple(record.ring.events))
+            summary = self._summed(record, info, leads)
+            await asyncio.to_thread(self._archive.keep, summary, tuple(record.ring.events))
 
     async def summary(self, run_id: str) -> RunSummary:
         """Return the totals of an open or archived run. Raises NotFoundError."""
@@ -85,7 +86,7 @@ class RunHistory:
 
     async def kept(self) -> list[RunInfo]:
         """Return the archived runs, the last closed first."""
-        return [summary.run for summary in await self._archive.summaries()]
+        return [summary.run for summary in await asyncio.to_thread(self._archive.summaries)]
 
     async def events(self, run_id: str, after: int, limit: int) -> EventPage:
         """Return a page of the run's log, or of workers and scenes for an empty id. Raises NotFoundError."""
@@ -122,7 +123,7 @@ class RunHistory:
         return EventPage(tuple(late)[::-1], dropped)
 
     async def _archived(self, run_id: str) -> tuple[RunSummary, tuple[RunEvent, ...]]:
-        kept = await self._archive.load(run_id)
+        kept = await asyncio.to_thread(self._archive.load, run_id)
         if kept is None:
             raise NotFoundError(
                 f"no run {run_id!r} is open or kept: `embomatrix cluster runs --closed` lists those that are kept"
@@ -139,7 +140,7 @@ class RunHistory:
             failures=tuple(figures.failures),
             manager_cpu_s=time.process_time() - record.cpu_s,
             prewarm_lead=leads,
-            scene_load=summary_of(self._event_log.fleet.scene_load),
+            scene_load=summary_of(self._event_log.scene_load),
             events_dropped=record.ring.dropped,
             version=manager_version(),
         )
@@ -172,32 +173,15 @@ RUN_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 class RunArchive:
     """Folder with one file for each of the ``kept`` last closed runs.
 
-    Read and write errors are logged and ignored: no run fails for its history.
+    Its methods wait for the disk. Read and write errors are logged and ignored: no run fails for its history.
     """
 
     def __init__(self, folder: Path, *, kept: int = RUNS_KEPT) -> None:
         self._folder = folder
         self._kept = kept
 
-    async def keep(self, summary: RunSummary, events: Sequence[RunEvent]) -> None:
+    def keep(self, summary: RunSummary, events: Sequence[RunEvent]) -> None:
         """Write a closed run. It replaces an earlier run of the same id."""
-        await asyncio.to_thread(self._write, summary, events)
-
-    async def summaries(self) -> list[RunSummary]:
-        """Return the archived runs, the last closed first."""
-        return await asyncio.to_thread(self._read_all)
-
-    async def load(self, run_id: str) -> tuple[RunSummary, tuple[RunEvent, ...]] | None:
-        """Return an archived run; None if there is none of that id."""
-        # The id becomes a file name, so only valid run ids are accepted.
-        if not RUN_ID.fullmatch(run_id):
-            return None
-        return await asyncio.to_thread(self._read, self._path(run_id))
-
-    def _path(self, run_id: str) -> Path:
-        return self._folder / f"{run_id}{SUFFIX}"
-
-    def _write(self, summary: RunSummary, events: Sequence[RunEvent]) -> None:
         message = pb.KeptRun(summary=run_summary_to_proto(summary), events=map(run_event_to_proto, events))
         path = self._path(summary.run.run_id)
         fresh = path.with_suffix(".new")
@@ -210,14 +194,23 @@ class RunArchive:
         except OSError as error:
             logger.warning("run history not archived run=%s: %s", summary.run.run_id, error)
 
+    def summaries(self) -> list[RunSummary]:
+        """Return the archived runs, the last closed first."""
+        found = (self._read(path) for path in self._files())
+        return [entry[0] for entry in found if entry is not None]
+
+    def load(self, run_id: str) -> tuple[RunSummary, tuple[RunEvent, ...]] | None:
+        """Return an archived run; None if there is none of that id."""
+        # The id becomes a file name, so only valid run ids are accepted.
+        return self._read(self._path(run_id)) if RUN_ID.fullmatch(run_id) else None
+
+    def _path(self, run_id: str) -> Path:
+        return self._folder / f"{run_id}{SUFFIX}"
+
     def _files(self) -> list[Path]:
         """Return the files, newest first."""
         found = self._folder.glob(f"*{SUFFIX}")
         return sorted(found, key=lambda path: (path.stat().st_mtime_ns, path.name), reverse=True)
-
-    def _read_all(self) -> list[RunSummary]:
-        found = (self._read(path) for path in self._files())
-        return [entry[0] for entry in found if entry is not None]
 
     def _read(self, path: Path) -> tuple[RunSummary, tuple[RunEvent, ...]] | None:
         try:

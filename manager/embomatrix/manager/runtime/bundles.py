@@ -69,11 +69,8 @@ class BundleStore:
 
     async def missing_or_damaged(self, digests: list[str]) -> list[str]:
         """Return the digests of bundles that are absent or damaged. Damaged files are deleted."""
-
-        def check() -> list[str]:
-            return [digest for digest in dict.fromkeys(digests) if not self._is_sound(digest)]
-
-        return await asyncio.to_thread(check)
+        known = dict.fromkeys(digests)
+        return await asyncio.to_thread(lambda: [digest for digest in known if not self._is_sound(digest)])
 
     async def put(self, digest: str, chunks: AsyncIterator[bytes]) -> None:
         """Store a bundle. It gets its name only when it is complete and its digest is right.

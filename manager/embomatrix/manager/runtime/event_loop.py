@@ -129,7 +129,7 @@ class ManagerRuntime:
         session, commands = self._intake.register(worker_id, boot_id, resources, now_s=time.monotonic())
         session.credential_id = credential_id
         self._close_link(worker_id)
-        self.event_log.fleet.joined(worker_id, resources, now_s=time.monotonic())
+        self.event_log.joined(worker_id, resources, now_s=time.monotonic())
         self._carry_out(commands)
         logger.info("worker registered worker=%s slots=%d", worker_id, resources.slots)
         await self._journal.wait_until_noted(worker_id)
@@ -162,7 +162,7 @@ class ManagerRuntime:
         self.event_log.reported(worker_id, ended, self.cluster.dispatcher.live_leases, now_s=now_s)
         commands = self._intake.report(link.session, state, results, resync=resync, now_s=now_s)
         if state is not None:
-            self.event_log.fleet.residents(worker_id, state.residents, now_s=now_s)
+            self.event_log.residents(worker_id, state.residents, now_s=now_s)
         self._carry_out(commands, more=True)
 
     def deliver(self) -> None:
@@ -304,7 +304,7 @@ class ManagerRuntime:
             lost, commands = self._intake.tick(now_s=time.monotonic())
             for event in lost:
                 logger.warning("worker lost worker=%s: %s", event.worker_id, event.reason)
-                self.event_log.fleet.lost(event.worker_id, event.reason, now_s=time.monotonic())
+                self.event_log.lost(event.worker_id, event.reason, now_s=time.monotonic())
                 self._close_link(event.worker_id)
             self._carry_out(commands)
 

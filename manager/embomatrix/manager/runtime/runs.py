@@ -157,7 +157,7 @@ class Runs:
         self, run_id: str, version: int, entries: tuple[LookaheadEntry, ...]
     ) -> list[LookaheadAnswer]:
         """Replace the run's look-ahead window. Return the loading state of each scene."""
-        self._check_run(run_id)
+        self.touch(run_id)
         if len(entries) > LOOKAHEAD_ENTRIES:
             raise InvalidRequestError(
                 f"{len(entries)} look-ahead entries: at most {LOOKAHEAD_ENTRIES}, announce fewer steps"
@@ -169,7 +169,7 @@ class Runs:
 
     async def submit(self, batch: Batch) -> BatchLog:
         """Queue the batch, or attach to an earlier submission. Return its result log."""
-        self._check_run(batch.run_id)
+        self.touch(batch.run_id)
         row = batch_row(batch)
         taken = ConflictError(
             f"batch {batch.batch_id!r} was submitted before with other rollouts: use a new id"
@@ -187,7 +187,7 @@ class Runs:
                 outcome = await self._store.put_batch(row)
             if outcome is PutOutcome.CONFLICT:
                 raise taken
-            self._check_run(batch.run_id)
+            self.touch(batch.run_id)
         except BaseException:
             self._logs.remove(log)
             raise
@@ -197,7 +197,7 @@ class Runs:
 
     def log_of(self, run_id: str, batch_id: str) -> BatchLog:
         """Return the result log of a submitted batch. Raises NotFoundError."""
-        self._check_run(run_id)
+        self.touch(run_id)
         log = self._logs.get(run_id, batch_id)
         if log is None:
             raise NotFoundError(
@@ -212,7 +212,7 @@ class Runs:
 
     async def close_run(self, run_id: str) -> RunStats:
         """Close the run and discard its results. Return its counters."""
-        self._check_run(run_id)
+        self.touch(run_id)
         del self._runs[run_id], self._heard_s[run_id]
         leads = self._history.leads(run_id)
         stats, commands = self._cluster.close_run(run_id, now_s=time.monotonic())
@@ -233,13 +233,10 @@ class Runs:
 
     def touch(self, run_id: str) -> RunRow:
         """Return the open run and note a sign of life of its trainer. Raises NotFoundError."""
-        self._check_run(run_id)
-        return self._runs[run_id]
-
-    def _check_run(self, run_id: str) -> None:
         if run_id not in self._runs:
             raise NotFoundError(f"run {run_id!r} is not open: open it with OpenRun")
         self._heard_s[run_id] = time.monotonic()
+        return self._runs[run_id]
 
     def _check_batch(self, batch: Batch) -> None:
         count = len(batch.rollouts)

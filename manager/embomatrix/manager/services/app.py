@@ -119,8 +119,9 @@ async def running(
         leadership = Leadership(store, _candidate(settings))
         standby = Standby(protection.tls)
         http = _HttpServer(standby.page(), http_socket, protection.tls)
-        group = await stack.enter_async_context(_stopped_at_exit())
-        group.create_task(http.serve())
+        # The first failing task ends the block; the end of the block cancels the tasks.
+        group = await stack.enter_async_context(asyncio.TaskGroup())
+        stack.callback(group.create_task(http.serve()).cancel)
         epoch = await _win(leadership, standby, settings, on_standby)
         runtime = await _start_runtime(settings, store, bundles, leadership, epoch)
         gate = Gate(store, guarded=protection.guarded, shared_token=settings.token)
@@ -128,8 +129,8 @@ async def running(
         server, port = await build_server(runtime, gate, protection.tls, settings)
         rules = HttpRules(gate, hosts=allowed_hosts(settings.http_host, protection.tls))
         http.show(build_api(runtime, rules, Revocation(runtime, gate), _gallery(settings.dataset)))
-        group.create_task(leadership.keep())
-        group.create_task(runtime.serve())
+        stack.callback(group.create_task(leadership.keep()).cancel)
+        stack.callback(group.create_task(runtime.serve()).cancel)
         await server.start()
         stack.push_async_callback(server.stop, STOP_GRACE_S)
         page_url = _page_url(settings.http_host, http_socket.getsockname()[1], protection.tls)
@@ -280,21 +281,6 @@ class _HttpServer:
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         await self._app(scope, receive, send)
-
-
-@contextlib.asynccontextmanager
-async def _stopped_at_exit() -> AsyncIterator[asyncio.TaskGroup]:
-    """Task group whose tasks are cancelled when the block ends. The first failing task ends the block."""
-    try:
-        async with asyncio.TaskGroup() as group:
-            yield group
-            raise _BlockEndedError
-    except* _BlockEndedError:
-        pass
-
-
-class _BlockEndedError(Exception):
-    """Signal that the block ended."""
 
 
 @contextlib.contextmanager

@@ -59,7 +59,7 @@ class _Cluster(Collector):
         )
         found = {state.value: residents[state.value] for state in ResidentState}
         yield _gauge("embo_residents", "Scenes on workers by state.", found, "state")
-        loads = self._runtime.event_log.fleet.scene_load
+        loads = self._runtime.event_log.scene_load
         yield _histograms(
             "embo_scene_load_seconds", "Time that workers took to load a scene.", "", {"": loads}
         )
@@ -104,7 +104,7 @@ class _Cluster(Collector):
         operations = runtime.load.store
         yield _histograms("embo_store_op_seconds", "Time of the state store's operations.", "op", operations)
         dropped = sum(run.ring.dropped for run in runtime.event_log.runs.values())
-        dropped += runtime.event_log.dropped + runtime.event_log.fleet.ring.dropped
+        dropped += runtime.event_log.dropped + runtime.event_log.fleet.dropped
         yield _counter("embo_events_dropped", "Events discarded from full logs.", dropped)
 
     def _slot_states(self) -> dict[str, int]:
