@@ -4,7 +4,7 @@ import json
 import os
 import socket
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -31,12 +31,12 @@ class AccessError(Exception):
     """Unusable or missing certificates or tokens. The message names a remedy."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class PreparedAccess:
     """Report of ``prepare``: sentences about created and existing files."""
 
-    made: tuple[str, ...]
-    found: tuple[str, ...]
+    made: list[str] = field(default_factory=list)
+    found: list[str] = field(default_factory=list)
 
 
 class AccessFolder:
@@ -87,18 +87,17 @@ def prepare(
     """
     folder = AccessFolder(data_dir)
     moment = now or datetime.now(UTC)
-    made: list[str] = []
-    found: list[str] = []
+    done = PreparedAccess()
     try:
         folder.path.mkdir(parents=True, exist_ok=True, mode=0o700)
-        authority = _authority(folder, moment, made, found)
-        _certify(folder, authority, tuple(sans), moment, made, found)
-        _first_tokens(folder, roles, moment, made, found)
+        authority = _authority(folder, moment, done)
+        _certify(folder, authority, tuple(sans), moment, done)
+        _first_tokens(folder, roles, moment, done)
     except OSError as error:
         raise AccessError(
             f"{error.filename or folder.path} can't be written ({error.strerror}): pass another --data-dir"
         ) from error
-    return PreparedAccess(tuple(made), tuple(found))
+    return done
 
 
 def hand_out_to(data_dir: Path, role: AccessRole, target: Path) -> None:
@@ -137,34 +136,27 @@ def _write(path: Path, content: bytes, mode: int) -> None:
     part.replace(path)
 
 
-def _authority(folder: AccessFolder, now: datetime, made: list[str], found: list[str]) -> KeyPair:
+def _authority(folder: AccessFolder, now: datetime, done: PreparedAccess) -> KeyPair:
     if folder.ca.exists():
-        found.append(f"the authority {folder.ca}")
-        if not folder.ca_key.exists():
-            return KeyPair(folder.ca.read_bytes(), b"")
-        return KeyPair(folder.ca.read_bytes(), folder.ca_key.read_bytes())
+        done.found.append(f"the authority {folder.ca}")
+        return KeyPair(folder.ca.read_bytes(), folder.ca_key.read_bytes() if folder.ca_key.exists() else b"")
     authority = make_authority(f"EmboMatrix authority of {socket.gethostname()}", now)
     # The key is written first: a certificate without a key means an authority that is kept elsewhere.
     write_private(folder.ca_key, authority.key)
     write_public(folder.ca, authority.certificate)
-    made.append(f"the authority {folder.ca}: clients pass it as --ca")
+    done.made.append(f"the authority {folder.ca}: clients pass it as --ca")
     return authority
 
 
 def _certify(
-    folder: AccessFolder,
-    authority: KeyPair,
-    sans: tuple[str, ...],
-    now: datetime,
-    made: list[str],
-    found: list[str],
+    folder: AccessFolder, authority: KeyPair, sans: Sequence[str], now: datetime, done: PreparedAccess
 ) -> None:
     before: tuple[str, ...] = ()
     if folder.server.exists():
         certificate = folder.server.read_bytes()
         before = names_in(certificate)
         if set(sans) <= set(before) and life_left(certificate, now) > RENEWAL:
-            found.append(f"the certificate {folder.server}, for {', '.join(before)}")
+            done.found.append(f"the certificate {folder.server}, for {', '.join(before)}")
             return
     if not authority.key:
         raise AccessError(
@@ -177,7 +169,7 @@ def _certify(
         raise AccessError(f"--san: {error}") from error
     write_private(folder.server_key, pair.key)
     write_public(folder.server, pair.certificate)
-    made.append(f"the certificate {folder.server}, for {', '.join(names)}")
+    done.made.append(f"the certificate {folder.server}, for {', '.join(names)}")
 
 
 def _own_names() -> tuple[str, ...]:
@@ -185,14 +177,14 @@ def _own_names() -> tuple[str, ...]:
 
 
 def _first_tokens(
-    folder: AccessFolder, roles: Sequence[AccessRole], now: datetime, made: list[str], found: list[str]
+    folder: AccessFolder, roles: Sequence[AccessRole], now: datetime, done: PreparedAccess
 ) -> None:
     credentials = list(folder.first_credentials())
     known = {credential.role for credential in credentials}
     book = CredentialBook()
     for role in roles:
         if role in known:
-            found.append(f"a first token of the role {role}")
+            done.found.append(f"a first token of the role {role}")
             continue
         path = folder.token(role)
         path.parent.mkdir(exist_ok=True, mode=0o700)
@@ -203,7 +195,7 @@ def _first_tokens(
         pinned = f".{fingerprint_of(folder.ca.read_text())}" if role is AccessRole.JOIN else ""
         write_private(path, f"{token}{pinned}\n".encode())
         credentials.append(credential)
-        made.append(
+        done.made.append(
             f"a token of the role {role}: {path}" + (", valid for one worker and one day" if valid_s else "")
         )
     if len(credentials) > len(known):

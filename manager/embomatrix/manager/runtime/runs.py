@@ -29,7 +29,6 @@ from embomatrix.manager.runtime.serialization import (
     announced_in,
     batch_of,
     batch_row,
-    failed_rows,
     group_and_kind,
     terms_of,
     terms_payload,
@@ -51,7 +50,14 @@ from embomatrix.rpc.status import (
     PreconditionError,
     UnavailableError,
 )
-from embomatrix.rpc.wire.values import Batch, LookaheadAnswer, LookaheadEntry, RunStats, RunTerms
+from embomatrix.rpc.wire.values import (
+    Batch,
+    InfraFailure,
+    LookaheadAnswer,
+    LookaheadEntry,
+    RunStats,
+    RunTerms,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -108,16 +114,19 @@ class Runs:
             for row in await self._store.batches(run.run_id):
                 batch = batch_of(row)
                 log = BatchLog(run.run_id, row.batch_id, row.digest, groups=group_sizes(batch))
+                failed = 0
                 while page := await self._store.results_after(
                     run.run_id, row.batch_id, log.last_cursor, PAGE
                 ):
                     for result in page:
-                        log.ends.take(result.cursor, *group_and_kind(result))
+                        group_id, kind = group_and_kind(result)
+                        log.ends.take(result.cursor, group_id, kind)
+                        failed += kind is InfraFailure
                     log.append(page)
                 self._logs.add(log)
                 delivered = {result.rollout_id: result.cursor for result in log.rows}
                 self._history.submitted(batch)
-                self._feed(BatchRestored(batch, delivered, failed_rows(log.rows)))
+                self._feed(BatchRestored(batch, delivered, failed))
         self._feed(WorkersExpected(await self._store.workers()))
         if self._runs:
             logger.info("restored %d runs of a former manager", len(self._runs))

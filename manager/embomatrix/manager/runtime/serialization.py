@@ -6,7 +6,7 @@ Result streams send the stored bytes without parsing them.
 import hashlib
 import json
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Final
 
@@ -55,12 +55,6 @@ def batch_row(batch: Batch) -> BatchRow:
 
 def batch_of(row: BatchRow) -> Batch:
     return batch_from_proto(rollout_service_pb2.ExecuteRequest.FromString(row.payload))
-
-
-def failed_rows(rows: Iterable[ResultRow]) -> int:
-    """Return how many of these results are infrastructure failures."""
-    results = (types_pb2.RolloutResult.FromString(row.payload) for row in rows)
-    return sum(result.WhichOneof("outcome") == "infra_failure" for result in results)
 
 
 def result_row(result: RolloutResult) -> ResultRow:

@@ -55,7 +55,7 @@ class ReadinessForecast:
         self._now_s = now_s
 
     def warmth(self, scene: str) -> Warmth:
-        if self._residencies.warm_on(scene):
+        if self._residencies.warm_since_s(scene) is not None:
             return Warmth.WARM
         if scene in self._unplaceable:
             return Warmth.UNPLACEABLE

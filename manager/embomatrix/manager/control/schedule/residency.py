@@ -108,9 +108,7 @@ class Residencies:
         #: Workers with ``failed_s``.
         self._assigned: dict[str, frozenset[str]] = {}
         self._assigned_on: dict[str, set[str]] = {}
-        self._warm: dict[str, frozenset[str]] = {}
-        self._warm_on: dict[str, set[str]] = {}
-        #: ``_x_on`` is the inverse of ``_x``; no empty entries.
+        #: Inverse of ``_assigned``; no empty entries.
         self._memory_mb: Counter[int] = Counter()
         self._slow: set[str] = set()
 
@@ -123,7 +121,7 @@ class Residencies:
         residency = self.by_id.pop(worker_id, None)
         if residency is None:
             return
-        self._index(worker_id, frozenset(), frozenset())
+        self._index(worker_id, frozenset())
         self._list(residency, usable=False)
         self.failing.discard(worker_id)
         memory_mb = residency.worker.resources.memory_mb
@@ -147,7 +145,7 @@ class Residencies:
     def changed(self, residency: WorkerResidency) -> None:
         """Bring the indices up to date."""
         worker_id, usable = residency.worker_id, residency.worker.usable
-        self._index(worker_id, frozenset(residency.assigned()), frozenset(residency.warm_since_s))
+        self._index(worker_id, frozenset(residency.assigned()))
         self._list(residency, usable=usable)
         (self.failing.add if residency.failed_s else self.failing.discard)(worker_id)
         if usable:
@@ -173,9 +171,10 @@ class Residencies:
         """Return the workers, usable or not, that have the scene or were ordered to load it."""
         return self._assigned_on.get(scene, frozenset())
 
-    def warm_on(self, scene: str) -> AbstractSet[str]:
-        """Return the workers that reported the scene warm."""
-        return self._warm_on.get(scene, frozenset())
+    def warm_since_s(self, scene: str) -> float | None:
+        """Return the time since which the first of the present workers has the scene warm; None if none has it."""
+        times = (self.by_id[worker_id].warm_since_s.get(scene) for worker_id in self.assigned_on(scene))
+        return min((at_s for at_s in times if at_s is not None), default=None)
 
     def having(self, scene: str) -> Sequence[WorkerResidency]:
         """Return the usable workers that have the scene or were ordered to load it."""
@@ -203,22 +202,16 @@ class Residencies:
         if not usable:
             self.fresh.discard(residency.worker_id)
 
-    def _index(self, worker_id: str, assigned: frozenset[str], warm: frozenset[str]) -> None:
-        for scenes, of, on in (
-            (assigned, self._assigned, self._assigned_on),
-            (warm, self._warm, self._warm_on),
-        ):
-            before = of.get(worker_id, frozenset())
-            for scene in before - scenes:
-                on[scene].discard(worker_id)
-                if not on[scene]:
-                    del on[scene]
-            for scene in scenes - before:
-                on.setdefault(scene, set()).add(worker_id)
-            if scenes:
-                of[worker_id] = scenes
-            else:
-                of.pop(worker_id, None)
+    def _index(self, worker_id: str, scenes: frozenset[str]) -> None:
+        before = self._assigned.pop(worker_id, frozenset())
+        for scene in before - scenes:
+            self._assigned_on[scene].discard(worker_id)
+            if not self._assigned_on[scene]:
+                del self._assigned_on[scene]
+        for scene in scenes - before:
+            self._assigned_on.setdefault(scene, set()).add(worker_id)
+        if scenes:
+            self._assigned[worker_id] = scenes
 
 
 class ResidencySites:

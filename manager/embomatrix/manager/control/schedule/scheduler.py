@@ -198,7 +198,7 @@ class Scheduler:
     def _on_submitted(self, event: BatchSubmitted) -> Urgency:
         batch, urgency = event.batch, Urgency.LATER
         for scene in dict.fromkeys(rollout.bundle_digest for rollout in batch.rollouts):
-            self.prewarm.demanded(batch.run_id, self._warm_since(scene), self._now_s)
+            self.prewarm.demanded(batch.run_id, self._residencies.warm_since_s(scene), self._now_s)
             if not self._residencies.having(scene):
                 urgency = Urgency.NOW
         self._consume(batch)
@@ -240,10 +240,6 @@ class Scheduler:
             self._costs.learn(resident)
         self._residencies.changed(residency)
         return urgency
-
-    def _warm_since(self, scene: str) -> float | None:
-        names = self._residencies.warm_on(scene)
-        return min((self._residencies.by_id[name].warm_since_s[scene] for name in names), default=None)
 
     def _share(self, run_id: str) -> RunShare:
         terms = self._terms.get(run_id, DEFAULT_TERMS)
