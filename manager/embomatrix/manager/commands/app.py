@@ -81,6 +81,7 @@ Audit = Annotated[
 
 @app.command()
 def serve(
+    context: typer.Context,
     host: Annotated[str, typer.Option(help="Address of the gRPC services.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="gRPC port; 0 takes a free one.")] = 50070,
     http_host: Annotated[str, typer.Option(help="Address of the dashboard.")] = "127.0.0.1",
@@ -102,24 +103,8 @@ def serve(
     log_format: LogLines = LogFormat.HUMAN,
 ) -> None:
     """Serve until interrupted."""
-    options = {
-        "host": host,
-        "port": port,
-        "http_host": http_host,
-        "http_port": http_port,
-        "state": state,
-        "advertise": advertise,
-        "dataset": dataset,
-        "token": _token(token),
-        "tls_cert": tls_cert,
-        "tls_key": tls_key,
-        "tls_ca": tls_ca,
-        "insecure_bind": insecure_bind,
-        "audit": audit,
-        **({"data_dir": data_dir} if data_dir is not None else {}),
-    }
     _log_to_stderr(log_level, log_format)
-    settings = _settings(options)
+    settings = _settings({**context.params, "token": _token(token)})
     hide(settings.token)
     _serve(settings)
 
@@ -143,7 +128,7 @@ def init(
     """Create certificates and first tokens for a manager that other machines reach. Existing files stay."""
     from embomatrix.manager.access.folder import FIRST_ROLES, AccessError, hand_out_to, prepare
 
-    folder = _settings({} if data_dir is None else {"data_dir": data_dir}).data_dir
+    folder = _settings({"data_dir": data_dir}).data_dir
     recipients = [_recipient(text) for text in hand_out or ()]
     roles = tuple(dict.fromkeys((*FIRST_ROLES, *(role for role, _ in recipients))))
     try:
@@ -179,12 +164,15 @@ def _token(text: str) -> str:
 
 
 def _settings(options: Mapping[str, object]) -> ManagerSettings:
+    """Return the settings of the same names as the given options, or exit with a sentence about a wrong one."""
     from pydantic import ValidationError
 
     from embomatrix.manager.settings import ManagerSettings
 
+    known = ManagerSettings.model_fields
+    given = {name: value for name, value in options.items() if name in known and value is not None}
     try:
-        return ManagerSettings.model_validate(options)
+        return ManagerSettings.model_validate(given)
     except ValidationError as error:
         first = error.errors()[0]
         expected = first["msg"].removeprefix("Value error, ")
@@ -206,11 +194,8 @@ def _serve(settings: ManagerSettings) -> None:
     from embomatrix.manager.store.protocol import StateError
 
     def on_ready(endpoints: Endpoints) -> None:
-        kept = (
-            "nowhere: it is lost on restart"
-            if settings.state_url == "memory:"
-            else f"in {without_secrets(settings.state_url)}"
-        )
+        lost = settings.state_url == "memory:"
+        kept = "nowhere: it is lost on restart" if lost else f"in {without_secrets(settings.state_url)}"
         print(
             f"manager serves at {endpoints.address}, status page {endpoints.status_url}, state {kept}",
             flush=True,
