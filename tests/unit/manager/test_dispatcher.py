@@ -382,12 +382,3 @@ def test_history_of_a_redispatched_rollout_names_workers_reasons_and_causes(tabl
     ]
     assert steps[2].reason == "worker lost: killed"
     assert (state.where("b1-0"), state.explain("b1-9")) == ("", [])
-
-
-def test_every_command_carries_the_event_that_caused_it(table):
-    table.worker("w1")
-    commands = table.submit(2)
-    assert [type(command.caused_by) for command in commands] == [BatchSubmitted, BatchSubmitted]
-    lost = WorkerLost("w1", "killed")
-    table.worker("w2")
-    assert all(command.caused_by is lost for command in table.apply(lost))

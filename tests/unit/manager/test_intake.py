@@ -31,7 +31,7 @@ class Manager:
         batch = Batch(
             "r", "b", 1, tuple(Rollout(f"x{i}", "g", "kitchen", "t", (), 0) for i in range(rollouts))
         )
-        self.given = gives(self.intake.feed(BatchSubmitted(batch), now_s=0.1))
+        self.given = gives(self.intake.cluster.handle(BatchSubmitted(batch), now_s=0.1))
 
     def report(self, state, now_s, resync=False):
         return self.intake.report(self.session, state, (), resync=resync, now_s=now_s)

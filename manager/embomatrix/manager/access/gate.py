@@ -49,14 +49,6 @@ ANYONE: Final = Caller(AccessRole.ADMIN)
 """Caller of a manager without tokens."""
 
 
-@dataclass(frozen=True, slots=True)
-class Admission:
-    """Admission of a worker: the id of its token from now on, and the token of a new credential, if any."""
-
-    token_id: str
-    credential: str = ""
-
-
 class Gate:
     """Access control of one cluster. ``shared_token`` has the role of an admin; ``guarded`` False accepts every
     caller.
@@ -118,8 +110,11 @@ class Gate:
 
     async def admit(
         self, context: grpc.aio.ServicerContext, join_token: str, worker_id: str, boot_id: str
-    ) -> Admission:
-        """Admit a worker under this name, by the token of its call or the join token of its request."""
+    ) -> tuple[str, str]:
+        """Admit a worker under this name, by the token of its call or the join token of its request.
+
+        Return the id of its token from now on, and the token of its new credential; empty if it keeps its own.
+        """
         token = token_of(_header(context)) or join_token
         caller = self.caller(token)
         if not may_call(caller.role, _REGISTER):
@@ -130,7 +125,7 @@ class Gate:
             return await self._join(token, worker_id, boot_id)
         if self._guarded:
             self._book.check_name(caller.token_id, caller.worker_id, worker_id)
-        return Admission(caller.token_id)
+        return caller.token_id, ""
 
     def check_session(self, context: grpc.aio.ServicerContext, worker_id: str, credential_id: str) -> None:
         """Raise NotAllowedError unless the caller's credential is the one that opened the worker's session."""
@@ -172,7 +167,7 @@ class Gate:
     def infos(self) -> tuple[TokenInfo, ...]:
         return self._book.infos(now_s=time.time())
 
-    async def _join(self, token: str, worker_id: str, boot_id: str) -> Admission:
+    async def _join(self, token: str, worker_id: str, boot_id: str) -> tuple[str, str]:
         async with self._lock:
             now_s = time.time()
             # Looked up again: another process may have used the token during the wait for the lock.
@@ -183,7 +178,7 @@ class Gate:
         logger.info(
             "worker joined worker=%s token=%s by=%s", worker_id, changed[0].token_id, changed[0].joined_by
         )
-        return Admission(changed[0].token_id, own)
+        return changed[0].token_id, own
 
     async def _keep(self, *credentials: Credential) -> None:
         """Store the credentials before they take effect, so that grants and revocations survive a restart."""

@@ -62,7 +62,7 @@ class ClusterState:
             urgency = max(urgency, Urgency.LATER)
         self._urgency = max(urgency, self._urgency)
         if self._urgency and now_s - self._placed_s >= self._pause_s():
-            commands += self._place(now_s, events[-1] if events else None)
+            commands += self._place(now_s)
         if self._debug:
             self.check_invariants()
         return commands
@@ -118,13 +118,11 @@ class ClusterState:
         cost_s = UNIT_COST_S * self.scheduler.cost
         return cost_s / NOW_SHARE if self._urgency is Urgency.NOW else max(LATER_S, cost_s / LATER_SHARE)
 
-    def _place(self, now_s: float, cause: Event | None) -> list[Command]:
+    def _place(self, now_s: float) -> list[Command]:
         self._placed_s, self._urgency = now_s, Urgency.NONE
         self._waiting = self.dispatcher.waiting_scenes
         self.scheduler.note(self.dispatcher.demand(), now_s=now_s)
         commands = self.scheduler.place(now_s=now_s)
-        for command in commands:
-            object.__setattr__(command, "caused_by", cause)
         if self.scheduler.unplaceable != self._unplaceable:
             self._unplaceable = dict(self.scheduler.unplaceable)
             commands += self.dispatcher.handle(ScenesUnplaceable(self._unplaceable), now_s=now_s)

@@ -1,22 +1,14 @@
 """Commands of the manager's state machines; the runtime carries them out."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from embomatrix.manager.control.events import Event
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.wire.leases import LeaseOrigin, LeaseRef
 from embomatrix.rpc.wire.values import Rollout, RolloutResult
 
 
 @dataclass(frozen=True, slots=True)
-class CausedCommand:
-    """``caused_by`` is the event that led to the command, set by the state machine that emits it."""
-
-    caused_by: Event | None = field(init=False, compare=False, repr=False)
-
-
-@dataclass(frozen=True, slots=True)
-class SetDesired(CausedCommand):
+class SetDesired:
     """The worker should hold these scenes, most urgent first; it may evict all others."""
 
     worker_id: str
@@ -24,7 +16,7 @@ class SetDesired(CausedCommand):
 
 
 @dataclass(frozen=True, slots=True)
-class GiveLease(CausedCommand):
+class GiveLease:
     """The worker executes the rollout within ``deadline_s`` seconds of execution."""
 
     worker_id: str
@@ -41,7 +33,7 @@ class GiveLease(CausedCommand):
 
 
 @dataclass(frozen=True, slots=True)
-class CancelLease(CausedCommand):
+class CancelLease:
     """The lease is void: the worker stops or forgets it."""
 
     worker_id: str
@@ -49,7 +41,7 @@ class CancelLease(CausedCommand):
 
 
 @dataclass(frozen=True, slots=True)
-class AcknowledgeLease(CausedCommand):
+class AcknowledgeLease:
     """The worker may forget the result: it was taken, or it is stale."""
 
     worker_id: str
@@ -57,7 +49,7 @@ class AcknowledgeLease(CausedCommand):
 
 
 @dataclass(frozen=True, slots=True)
-class DeliverResult(CausedCommand):
+class DeliverResult:
     """The one outcome of a rollout."""
 
     run_id: str
@@ -66,7 +58,7 @@ class DeliverResult(CausedCommand):
 
 
 @dataclass(frozen=True, slots=True)
-class FinishBatch(CausedCommand):
+class FinishBatch:
     """Every rollout of the batch has its outcome."""
 
     run_id: str
@@ -74,7 +66,7 @@ class FinishBatch(CausedCommand):
 
 
 @dataclass(frozen=True, slots=True)
-class QuarantineWorker(CausedCommand):
+class QuarantineWorker:
     """The worker's results are wrong and it gets no more work. Reported to operators, not to the worker."""
 
     worker_id: str

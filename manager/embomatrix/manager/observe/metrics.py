@@ -2,7 +2,6 @@
 
 import time
 from collections import Counter, deque
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -28,18 +27,14 @@ class ManagerLoad:
     def __init__(self) -> None:
         self.lag = Histogram()
         """Lag of each tick in seconds. More than a few hundredths mean that the event loop is saturated."""
-        self._store: dict[str, Histogram] = {}
-        self._samples: deque[_Sample] = deque()
-
-    @property
-    def store(self) -> Mapping[str, Histogram]:
+        self.store: dict[str, Histogram] = {}
         """Durations of store operations in seconds, by name."""
-        return self._store
+        self._samples: deque[_Sample] = deque()
 
     def operated(self, operation: str, seconds: float) -> None:
         """Count an operation of the store."""
-        if operation in self._store or len(self._store) < OPERATIONS:
-            self._store.setdefault(operation, Histogram()).observe(seconds)
+        if operation in self.store or len(self.store) < OPERATIONS:
+            self.store.setdefault(operation, Histogram()).observe(seconds)
 
     def sample(self, now_s: float, manager_s: float, slots_s: float) -> None:
         """Note the CPU time so far. A slot runs on one core, so its busy time counts as CPU time."""
@@ -85,7 +80,8 @@ class Meter:
         """Completed rollouts by worker, connected or not."""
         self.failures: deque[FailureNote] = deque(maxlen=FAILURES_KEPT)
         self._latency_s: deque[float] = deque(maxlen=SAMPLES)
-        self._per_second: deque[tuple[int, int]] = deque(maxlen=THROUGHPUT_S)
+        self._per_second: Counter[int] = Counter()
+        """Completed rollouts of each of the last seconds that had any."""
 
     def observe(self, run_id: str, result: RolloutResult, now_s: float) -> None:
         match result.outcome:
@@ -96,7 +92,9 @@ class Meter:
                     del self.completed_by[next(iter(self.completed_by))]
                 lease_s = timings.lease_s + timings.load_s + timings.execute_s
                 self._latency_s.append(timings.queued_s + lease_s)
-                self._count(int(now_s))
+                self._per_second[int(now_s)] += 1
+                if len(self._per_second) > THROUGHPUT_S:
+                    del self._per_second[next(iter(self._per_second))]
             case InfraFailure(code, message, worker_id):
                 self.outcomes[code.value] += 1
                 note = FailureNote(time.time(), code.value, message, worker_id, run_id, result.rollout_id)
@@ -106,15 +104,8 @@ class Meter:
 
     def throughput(self, now_s: float) -> list[int]:
         """Return the completed rollouts of each of the last ``THROUGHPUT_S`` whole seconds, oldest first."""
-        counts = dict(self._per_second)
-        return [counts.get(second, 0) for second in range(int(now_s) - THROUGHPUT_S, int(now_s))]
+        return [self._per_second[second] for second in range(int(now_s) - THROUGHPUT_S, int(now_s))]
 
     def latency_s(self, share: float) -> float:
         """Return the latency in seconds that this share of recent rollouts does not exceed; 0 before the first."""
         return quantile(sorted(self._latency_s), share)
-
-    def _count(self, second: int) -> None:
-        if self._per_second and self._per_second[-1][0] == second:
-            self._per_second[-1] = (second, self._per_second[-1][1] + 1)
-        else:
-            self._per_second.append((second, 1))

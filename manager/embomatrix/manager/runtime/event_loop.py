@@ -94,13 +94,14 @@ class ManagerRuntime:
         self._lapsed_s = lapsed_s
         self._unrenewed = unrenewed
         self._suspended = False
-        self._paused = False
+        self.paused = False
+        """True if an operator paused dispatch."""
         self._warned_unaudited = False
 
     async def start(self) -> None:
         """Restore the state of a former manager."""
-        self._carry_out(self._intake.feed(await self._journal.reputations(), now_s=time.monotonic()))
-        self._paused = await self._journal.paused()
+        self._carry_out(self.cluster.handle(await self._journal.reputations(), now_s=time.monotonic()))
+        self.paused = await self._journal.paused()
         self._update_dispatch()
         await self.runs.restore()
 
@@ -186,26 +187,21 @@ class ManagerRuntime:
         events = self.registry.end(session, reason, standing)
         if events:
             logger.info("session ended worker=%s: %s", session.worker_id, reason)
-            self._carry_out(self._intake.feed(*events, now_s=time.monotonic()))
+            self._carry_out(self.cluster.handle(*events, now_s=time.monotonic()))
             self._close_link(session.worker_id, error)
 
     def drain_worker(self, worker_id: str) -> None:
         """Give the worker no new leases, and have it leave after its last one."""
-        self._carry_out(self._intake.feed(*self.registry.drain(worker_id), now_s=time.monotonic()))
+        self._carry_out(self.cluster.handle(*self.registry.drain(worker_id), now_s=time.monotonic()))
         if worker_id in self._links:
             self._links[worker_id].drain()
 
     def resume_worker(self, worker_id: str) -> None:
         """Cancel the drain, or lift the quarantine, of a worker that has not left."""
-        self._carry_out(self._intake.feed(*self.registry.resume(worker_id), now_s=time.monotonic()))
+        self._carry_out(self.cluster.handle(*self.registry.resume(worker_id), now_s=time.monotonic()))
         if worker_id in self._links:
             self._links[worker_id].resume()
         self._journal.flush()
-
-    @property
-    def paused(self) -> bool:
-        """True if an operator paused dispatch."""
-        return self._paused
 
     @property
     def store_problem(self) -> str:
@@ -219,19 +215,19 @@ class ManagerRuntime:
 
         Raises UnavailableError if the pause can't be stored for later managers.
         """
-        self._paused = True
+        self.paused = True
         self._update_dispatch()
         await self._journal.note_pause(True)
 
     async def resume_dispatch(self) -> None:
         """Give leases again, unless the store is away. Raises UnavailableError like ``pause_dispatch``."""
-        self._paused = False
+        self.paused = False
         self._update_dispatch()
         await self._journal.note_pause(False)
 
     def _update_dispatch(self) -> None:
-        event = DispatchPaused() if self._paused or self._suspended else DispatchResumed()
-        self._carry_out(self._intake.feed(event, now_s=time.monotonic()))
+        event = DispatchPaused() if self.paused or self._suspended else DispatchResumed()
+        self._carry_out(self.cluster.handle(event, now_s=time.monotonic()))
 
     def _carry_out(self, commands: Sequence[Command], *, more: bool = False) -> None:
         now_s = time.monotonic()

@@ -47,10 +47,6 @@ class Intake:
         self.cluster = cluster
         self.registry = registry
 
-    def feed(self, *events: Event, now_s: float) -> list[Command]:
-        """Pass events to the state machines in order. Free slots are leased after the last event."""
-        return self.cluster.handle(*events, now_s=now_s)
-
     def register(
         self,
         worker_id: str,
@@ -61,7 +57,7 @@ class Intake:
     ) -> tuple[WorkerSession, list[Command]]:
         """Open a session for a worker."""
         session, events = self.registry.register(worker_id, boot_id, resources, now_s=now_s)
-        return session, self.feed(*events, now_s=now_s)
+        return session, self.cluster.handle(*events, now_s=now_s)
 
     def report(
         self,
@@ -85,7 +81,7 @@ class Intake:
             )
             # The first state precedes its results: leases given on the strength of those results were not in it yet.
             events.insert(0 if resync else len(events), reported)
-        return self.feed(*events, now_s=now_s)
+        return self.cluster.handle(*events, now_s=now_s)
 
     def heartbeat(
         self, session_id: str, epoch: int, beat: Heartbeat, *, now_s: float
@@ -95,11 +91,11 @@ class Intake:
         session.load, session.memory_used_mb = beat.load, beat.memory_mb
         events = self.registry.heard(session, now_s=now_s)
         renewed = LeasesRenewed(session.worker_id, beat.held, beat.progress)
-        commands = self.feed(*events, renewed, now_s=now_s)
+        commands = self.cluster.handle(*events, renewed, now_s=now_s)
         return self.registry.interval_s, commands
 
     def tick(self, *, now_s: float) -> tuple[list[WorkerLost], list[Command]]:
         """Process the passage of time. Return lost workers and commands."""
         events = self.registry.tick(now_s=now_s)
         lost = [event for event in events if isinstance(event, WorkerLost)]
-        return lost, self.feed(*events, Tick(), now_s=now_s)
+        return lost, self.cluster.handle(*events, Tick(), now_s=now_s)

@@ -8,8 +8,8 @@ import contextlib
 import logging
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Final, NamedTuple
+from dataclasses import dataclass, field
+from typing import Final
 
 from embomatrix.manager.control.commands import AcknowledgeLease, DeliverResult, FinishBatch
 from embomatrix.manager.control.dispatch.batches import GroupEnds
@@ -163,7 +163,8 @@ class ResultDelivery:
         self._logs = logs
         self._acknowledge = acknowledge
         self._on_logged = on_logged
-        self._waiting: list[_Waiting] = []
+        self._waiting: list[tuple[DeliverResult | FinishBatch, float]] = []
+        """Queued commands with their arrival times on the monotonic clock."""
         self._acknowledgements: list[AcknowledgeLease] = []
         self._fresh = asyncio.Event()
         self.problem = ""
@@ -171,7 +172,7 @@ class ResultDelivery:
 
     def put(self, command: DeliverResult | FinishBatch) -> None:
         """Queue a result, or the end of a batch. The queue is bounded by the number of rollouts in the cluster."""
-        self._waiting.append(_Waiting(command, time.monotonic()))
+        self._waiting.append((command, time.monotonic()))
 
     def put_acknowledgement(self, command: AcknowledgeLease) -> None:
         """Queue an acknowledgement, which is sent after everything queued before it is stored."""
@@ -189,13 +190,15 @@ class ResultDelivery:
             self._fresh.clear()
             waiting, self._waiting = self._waiting, []
             acknowledgements, self._acknowledgements = self._acknowledgements, []
-            by_batch: dict[tuple[str, str], list[_Waiting]] = {}
-            for entry in waiting:
-                by_batch.setdefault((entry.command.run_id, entry.command.batch_id), []).append(entry)
-            logs = {key: log for key in by_batch if (log := self._logs.get(*key)) is not None}
-            pages = [_page(log, by_batch[key]) for key, log in logs.items()]
-            await self._write(pages)
-            for page in pages:
+            pages: dict[tuple[str, str], _Page] = {}
+            for command, arrived_s in waiting:
+                key = (command.run_id, command.batch_id)
+                log = self._logs.get(*key)
+                if log is not None:
+                    page = pages.get(key) or pages.setdefault(key, _Page(log))
+                    page.add(command, arrived_s)
+            await self._write(tuple(pages.values()))
+            for page in pages.values():
                 self._show(page)
             for acknowledgement in acknowledgements:
                 self._acknowledge(acknowledgement)
@@ -239,30 +242,23 @@ class ResultDelivery:
             page.log.finish(now_s)
 
 
-class _Waiting(NamedTuple):
-    """Queued command and its arrival time on the monotonic clock."""
-
-    command: DeliverResult | FinishBatch
-    arrived_s: float
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Page:
     """New results of one batch with their arrival times; ``last`` if the batch ends with them."""
 
     log: BatchLog
-    results: Sequence[tuple[RolloutResult, float]]
-    rows: Sequence[ResultRow]
-    last: bool
+    results: list[tuple[RolloutResult, float]] = field(default_factory=list)
+    rows: list[ResultRow] = field(default_factory=list)
+    last: bool = False
+
+    def add(self, command: DeliverResult | FinishBatch, arrived_s: float) -> None:
+        match command:
+            case DeliverResult(_, _, result):
+                self.results.append((result, arrived_s))
+                self.rows.append(result_row(result))
+            case FinishBatch():
+                self.last = True
 
     @property
     def part(self) -> BatchResults:
         return BatchResults(self.log.run_id, self.log.batch_id, self.rows)
-
-
-def _page(log: BatchLog, ended: Sequence[_Waiting]) -> _Page:
-    results = [
-        (command.result, arrived_s) for command, arrived_s in ended if isinstance(command, DeliverResult)
-    ]
-    last = any(isinstance(command, FinishBatch) for command, _ in ended)
-    return _Page(log, results, [result_row(result) for result, _ in results], last)

@@ -44,12 +44,9 @@ class Standby:
         app = FastAPI(title="EmboMatrix manager", docs_url=None, redoc_url=None, openapi_url=None)
 
         @app.get("/")
+        @app.get("/healthz")
         async def page() -> dict[str, str]:
             return {"status": "standing by", "leader": self.leader}
-
-        @app.get("/healthz")
-        async def health_check() -> dict[str, str]:
-            return {"status": "standing by"}
 
         return app
 

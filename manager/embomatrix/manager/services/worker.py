@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import AsyncIterator, Coroutine, Sequence
+from collections.abc import AsyncIterator, Coroutine
 from typing import TYPE_CHECKING, Final
 
 from grpc.aio import ServicerContext as Context
@@ -25,7 +25,7 @@ from embomatrix.rpc.status import (
 )
 from embomatrix.rpc.versions import SPOKEN, VersionRange, agree
 from embomatrix.rpc.wire.codec import each, inside
-from embomatrix.rpc.wire.leases import Lease, LeaseResult
+from embomatrix.rpc.wire.leases import LeaseResult
 from embomatrix.rpc.wire.session import (
     lease_progress_from_proto,
     lease_ref_from_proto,
@@ -65,14 +65,14 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
             # Versions are checked first: a refused version must not use up a join token.
             protocol = _agreed(request)
             resources = inside("resources", resources_from_proto, request.resources)
-            admission = await self._gate.admit(
+            token_id, credential = await self._gate.admit(
                 context, request.join_token, request.worker_id, request.boot_id
             )
             session, interval_s = await self._runtime.register(
                 request.worker_id,
                 request.boot_id,
                 resources,
-                credential_id=admission.token_id,
+                credential_id=token_id,
             )
         return pb.RegisterResponse(
             session_id=session.session_id,
@@ -80,7 +80,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
             heartbeat_interval_s=interval_s,
             lease_ttl_s=self._lease_ttl_s,
             protocol_version=protocol,
-            credential=admission.credential,
+            credential=credential,
         )
 
     async def Session(  # type: ignore[override]  # gRPC also takes a coroutine that writes by the context
@@ -163,9 +163,11 @@ async def _speak(link: WorkerLink, context: Context) -> None:
 
 def _messages(outbox: OutgoingMessage) -> list[pb.SessionResponse]:
     """Split the outbox into messages of bounded size, since leases carry plans."""
-    leases = outbox.leases
-    parts = [leases[at : at + LEASES_PER_MESSAGE] for at in range(0, len(leases), LEASES_PER_MESSAGE)]
-    messages = [_with_leases(part) for part in parts] or [pb.SessionResponse()]
+    messages: list[pb.SessionResponse] = []
+    for at in range(0, max(len(outbox.leases), 1), LEASES_PER_MESSAGE):
+        messages.append(pb.SessionResponse())
+        for lease in outbox.leases[at : at + LEASES_PER_MESSAGE]:
+            write_lease(lease, messages[-1].leases.add())
     head = messages[0]
     for ref in outbox.acknowledged:
         write_lease_ref(ref, head.acknowledged.add())
@@ -175,13 +177,6 @@ def _messages(outbox: OutgoingMessage) -> list[pb.SessionResponse]:
     if outbox.desired is not None:
         head.desired.CopyFrom(pb.DesiredResidents(bundle_digests=outbox.desired))
     return messages
-
-
-def _with_leases(leases: Sequence[Lease]) -> pb.SessionResponse:
-    message = pb.SessionResponse()
-    for lease in leases:
-        write_lease(lease, message.leases.add())
-    return message
 
 
 async def _first_state(requests: AsyncIterator[pb.SessionRequest]) -> pb.SessionRequest:

@@ -89,7 +89,7 @@ class SimulatedManager:
     def drain(self, worker_id: str) -> None:
         """Drain the worker, as an operator would."""
         events = self._intake.registry.drain(worker_id)
-        self._carry_out(self._intake.feed(*events, now_s=self._queue.now_s))
+        self._carry_out(self._intake.cluster.handle(*events, now_s=self._queue.now_s))
 
     def attach(self, session: WorkerSession, state: WorkerState, stream: Stream) -> None:
         """Open a stream with the worker's full state. Raise SupersededError."""
@@ -137,18 +137,18 @@ class SimulatedManager:
         """Open a run; ``take`` receives its results."""
         self._trainers[run_id] = take
         self._checker.open_run(run_id, terms.group_policy)
-        self._carry_out(self._intake.feed(RunOpened(run_id, terms), now_s=self._queue.now_s))
+        self._carry_out(self._intake.cluster.handle(RunOpened(run_id, terms), now_s=self._queue.now_s))
 
     def announce(self, run_id: str, version: int, entries: tuple[LookaheadEntry, ...]) -> None:
         with self._report.deciding():
             event = LookaheadAnnounced(run_id, version, entries)
-            commands = self._intake.feed(event, now_s=self._queue.now_s)
+            commands = self._intake.cluster.handle(event, now_s=self._queue.now_s)
         self._carry_out(commands)
 
     def submit(self, batch: Batch) -> None:
         self._checker.submit(batch)
         with self._report.deciding():
-            commands = self._intake.feed(BatchSubmitted(batch), now_s=self._queue.now_s)
+            commands = self._intake.cluster.handle(BatchSubmitted(batch), now_s=self._queue.now_s)
         self._carry_out(commands)
 
     def _end_stream(self, worker_id: str) -> None:

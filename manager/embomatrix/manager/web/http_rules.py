@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
@@ -26,12 +25,8 @@ STATIC: Final = "/static/"
 OPEN_PATHS: Final = frozenset({"/", "/healthz"})
 """Page and health check, which need no token."""
 READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
-SUFFICIENT_ROLES: Final[Mapping[AccessRole, frozenset[AccessRole]]] = {
-    AccessRole.VIEWER: frozenset({AccessRole.VIEWER, AccessRole.TRAINER, AccessRole.ADMIN}),
-    AccessRole.TRAINER: frozenset({AccessRole.TRAINER, AccessRole.ADMIN}),
-    AccessRole.ADMIN: frozenset({AccessRole.ADMIN}),
-}
-"""Roles that may send a request, by the lowest role that it needs."""
+RANKS: Final = (AccessRole.VIEWER, AccessRole.TRAINER, AccessRole.ADMIN)
+"""Roles that may send requests. Each may do everything that the roles before it may."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +57,7 @@ class HttpRules:
             sentence = f"{error}; HTTP requests send it as `Authorization: Bearer TOKEN`"
             return PlainTextResponse(sentence, 401, {"www-authenticate": "Bearer"})
         needed = _needed_role(path, changes=changes)
-        if role not in SUFFICIENT_ROLES[needed]:
+        if role not in RANKS[RANKS.index(needed) :]:
             return PlainTextResponse(f"a token of the role {role} may not do this: it needs {needed}", 403)
         return None
 

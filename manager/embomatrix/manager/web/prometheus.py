@@ -60,9 +60,7 @@ class _Cluster(Collector):
         found = {state.value: residents[state.value] for state in ResidentState}
         yield _gauge("embo_residents", "Scenes on workers by state.", found, "state")
         loads = self._runtime.event_log.scene_load
-        yield _histograms(
-            "embo_scene_load_seconds", "Time that workers took to load a scene.", "", {"": loads}
-        )
+        yield _histograms("embo_scene_load_seconds", "Time that workers took to load a scene.", loads)
 
     def _work(self) -> Iterator[Metric]:
         runtime, event_log = self._runtime, self._runtime.event_log
@@ -73,7 +71,7 @@ class _Cluster(Collector):
         outcomes = {name: runtime.meter.outcomes[name] for name in OUTCOMES}
         yield _counter("embo_rollouts", "Rollouts by outcome.", outcomes, "outcome")
         phases = {phase.value: histogram for phase, histogram in event_log.phases().items()}
-        yield _histograms("embo_rollout_seconds", "Time of completed rollouts by phase.", "phase", phases)
+        yield _histograms("embo_rollout_seconds", "Time of completed rollouts by phase.", phases, "phase")
         yield _attempts(event_log.attempts)
         yield _counter("embo_redispatched", "Re-dispatched leases.", totals.redispatched)
         yield _counter("embo_lease_expired", "Expired leases.", dispatcher.state.leases.expired)
@@ -89,9 +87,9 @@ class _Cluster(Collector):
         yield _counter("embo_prewarm_hits", "Scenes that were warm when their batch arrived.", hits)
         yield _counter("embo_prewarm_misses", "Scenes that were not warm when their batch arrived.", misses)
         yield _counter("embo_prewarm_wasted", "Preloaded scenes that were not used.", totals.prewarm_wasted)
-        leads = {"": self._runtime.cluster.scheduler.prewarm.leads}
+        leads = self._runtime.cluster.scheduler.prewarm.leads
         yield _histograms(
-            "embo_prewarm_lead_seconds", "Time between a scene being warm and its demand.", "", leads
+            "embo_prewarm_lead_seconds", "Time between a scene being warm and its demand.", leads
         )
 
     def _manager(self) -> Iterator[Metric]:
@@ -99,10 +97,9 @@ class _Cluster(Collector):
         share = runtime.load.overhead()
         text = "CPU time of the manager over that of the manager and the slots, in the last minute."
         yield _gauge("embo_manager_overhead_ratio", text, share)
-        lag = {"": runtime.load.lag}
-        yield _histograms("embo_manager_lag_seconds", "Lag of the manager's clock ticks.", "", lag)
+        yield _histograms("embo_manager_lag_seconds", "Lag of the manager's clock ticks.", runtime.load.lag)
         operations = runtime.load.store
-        yield _histograms("embo_store_op_seconds", "Time of the state store's operations.", "op", operations)
+        yield _histograms("embo_store_op_seconds", "Time of the state store's operations.", operations, "op")
         dropped = sum(run.ring.dropped for run in runtime.event_log.runs.values())
         dropped += runtime.event_log.dropped + runtime.event_log.fleet.dropped
         yield _counter("embo_events_dropped", "Events discarded from full logs.", dropped)
@@ -145,10 +142,11 @@ _gauge = functools.partial(_family, GaugeMetricFamily)
 _counter = functools.partial(_family, CounterMetricFamily)
 
 
-def _histograms(name: str, text: str, label: str, values: Mapping[str, Histogram]) -> Metric:
-    """Return a family with one histogram per label value; without a label, the one under the empty name."""
+def _histograms(name: str, text: str, values: Histogram | Mapping[str, Histogram], label: str = "") -> Metric:
+    """Return a family with one histogram, or with a histogram per label value."""
     family = HistogramMetricFamily(name, text, labels=[label] if label else [])
-    for key, histogram in values.items():
+    every = {"": values} if isinstance(values, Histogram) else values
+    for key, histogram in every.items():
         counts = zip(BOUNDS_S, histogram.cumulative(), strict=True)
         buckets = [(f"{bound_s:.6g}", float(count)) for bound_s, count in counts]
         family.add_metric([key] if label else [], [*buckets, ("+Inf", histogram.count)], histogram.sum_s)

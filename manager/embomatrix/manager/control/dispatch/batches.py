@@ -2,9 +2,8 @@
 
 import heapq
 import itertools
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Final
 
 from embomatrix.manager.control.dispatch.records import (
     BatchRecord,
@@ -157,10 +156,6 @@ def failed_with(
             return [group, *others], list(batch.open.values())
 
 
-_COLUMN: Final[Mapping[type[Outcome], int]] = {Completed: 0, InfraFailure: 1, Cancelled: 2}
-"""Column of each kind of outcome among the counts of `GroupDone`."""
-
-
 def group_sizes(batch: Batch) -> dict[str, int]:
     """Return the number of rollouts of each group."""
     return dict(Counter(rollout.group_id for rollout in batch.rollouts))
@@ -174,20 +169,20 @@ class GroupEnds:
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
         self._sizes = sizes
-        self._counts: dict[str, list[int]] = {}
-        """Counts of groups that have begun and not ended."""
+        self._counts: dict[str, Counter[type[Outcome]]] = defaultdict(Counter)
+        """Outcomes of groups that have begun and not ended, by kind."""
         self._ended: dict[int, GroupDone] = {}
         """Ended groups, by the cursor of their last result."""
 
     def take(self, cursor: int, group_id: str, outcome: type[Outcome]) -> None:
         """Count the next result in cursor order."""
-        counts = self._counts.get(group_id)
-        if counts is None:
-            counts = self._counts[group_id] = [0, 0, 0]
-        counts[_COLUMN[outcome]] += 1
-        if sum(counts) == self._sizes.get(group_id):
+        counts = self._counts[group_id]
+        counts[outcome] += 1
+        if counts.total() == self._sizes.get(group_id):
             del self._counts[group_id]
-            self._ended[cursor] = GroupDone(group_id, *counts)
+            self._ended[cursor] = GroupDone(
+                group_id, counts[Completed], counts[InfraFailure], counts[Cancelled]
+            )
 
     def among(self, rows: Iterable[ResultRow]) -> list[GroupDone]:
         """Return the groups that end with one of these results."""

@@ -179,8 +179,7 @@ class DispatchState:
         )
 
     def emit(self, command: Command) -> None:
-        """Add a command and mark it with the event that caused it."""
-        object.__setattr__(command, "caused_by", self.cause)
+        """Add a command to those of the event."""
         self._commands.append(command)
 
     def take_commands(self) -> list[Command]:
