@@ -8,7 +8,7 @@ are only checked by admission.
 from collections.abc import Callable, Sequence
 from typing import Final, Self
 
-from embomatrix.factory.scenes.view import SceneView
+from embomatrix.factory.scenes.view import CapableRobot, SceneView
 from embomatrix.sim.actions import HANDLINGS
 from embomatrix.sim.planner.calls import StuckError
 from embomatrix.sim.planner.script import PlanScript
@@ -29,7 +29,7 @@ SEED: Final = 0
 """Seed of the trials."""
 
 
-class SimulatedRobot:
+class SimulatedRobot(CapableRobot):
     """Feasibility checks in the simulator. Each check runs once. Close after use; not thread-safe."""
 
     def __init__(self, scene: Scene, blocks: ArmLimits = lambda _: False) -> None:

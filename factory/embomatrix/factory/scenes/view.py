@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Final, Protocol
+from typing import Final
 
 from embomatrix.factory.assets.solids import Solids
 from embomatrix.factory.furnish.roles import FurnitureRole, role_of
@@ -16,46 +16,30 @@ from embomatrix.world.scene import Scene, SceneObject
 from embomatrix.world.state import OPEN_FRACTION, Relation, State
 
 
-class RobotFeasibility(Protocol):
-    """Feasibility of single actions from the start of a scene. Names are those of scene objects."""
+class CapableRobot:
+    """Feasibility of single actions from the start of a scene. Every action is possible; subclasses check it.
+
+    Names are those of scene objects.
+    """
 
     def can_pick_up(self, object_name: str) -> bool:
         """True if the robot can pick the object up."""
-        ...
+        return True
 
     def can_place(self, object_name: str, relation: Relation, host: str) -> bool:
         """True if the robot can place the object on or in the host."""
-        ...
+        return True
 
     def can_swing(self, name: str, *, shut: bool) -> bool:
         """True if the robot can open, or close, all doors and drawers of the object."""
-        ...
+        return True
 
     def can_switch(self, name: str, *, on: bool) -> bool:
         """True if the robot can switch the object on, or off."""
-        ...
+        return True
 
     def can_treat(self, object_name: str, source: str, state: State) -> bool:
         """True if the object can become hot, cooked or frozen at the source and is not so yet."""
-        ...
-
-
-class CapableRobot:
-    """Feasibility without a check: every action is possible."""
-
-    def can_pick_up(self, object_name: str) -> bool:
-        return True
-
-    def can_place(self, object_name: str, relation: Relation, host: str) -> bool:
-        return True
-
-    def can_swing(self, name: str, *, shut: bool) -> bool:
-        return True
-
-    def can_switch(self, name: str, *, on: bool) -> bool:
-        return True
-
-    def can_treat(self, object_name: str, source: str, state: State) -> bool:
         return True
 
 
@@ -72,9 +56,9 @@ HUNG_M: Final = 0.05
 class SceneView:
     """Scene indexed for task writing, by the names of scene objects."""
 
-    def __init__(self, scene: Scene, robot: RobotFeasibility | None = None) -> None:
+    def __init__(self, scene: Scene, robot: CapableRobot | None = None) -> None:
         self.scene = scene
-        self.robot: RobotFeasibility = robot if robot is not None else CapableRobot()
+        self.robot = robot or CapableRobot()
         """Feasibility checks of the robot. By default everything is feasible."""
         self._opens: dict[str, bool] = {}
 
