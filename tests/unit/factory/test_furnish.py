@@ -21,7 +21,7 @@ from embomatrix.factory.furnish.pieces import (
 )
 from embomatrix.factory.furnish.roles import HUNG_BOTTOM_M, FurnitureRole, role_of
 from embomatrix.factory.furnish.rooms import MAX_EQUAL, furnish
-from embomatrix.factory.furnish.space import LOW_M, RoomSpace, Target
+from embomatrix.factory.furnish.space import LOW_M, RoomSpace
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.floor import box_of
 from embomatrix.world.asset import Asset, Joint, JointKind, Link, SupportSurface
@@ -115,7 +115,7 @@ def test_door_panel_needs_its_width_of_free_floor() -> None:
 
 def test_room_cut_in_two_is_not_passable() -> None:
     space = RoomSpace(ROOM, [DOOR])
-    beyond = Target((1.0, 2.4, 3.0, 3.0))
+    beyond = (1.0, 2.4, 3.0, 3.0)
     assert space.reachable(targets=[beyond])
     assert space.reachable([(0.0, 1.5, 0.0, 3.0, 1.7, 0.9)], [beyond])
     assert not space.reachable([(0.0, 1.5, 0.0, 4.0, 1.7, 0.9)], [beyond])
@@ -305,7 +305,7 @@ def test_collisions_match_a_comparison_box_by_box() -> None:
         any(all(b[k] < s[k + 3] and s[k] < b[k + 3] for k in range(3)) for s in solids) for b in boxes
     ]
     assert any(expected)
-    assert space.collides(boxes).tolist() == expected
+    assert space.solids.meets(boxes).tolist() == expected
 
 
 def test_crockery_goes_behind_doors_and_milk_into_the_fridge() -> None:

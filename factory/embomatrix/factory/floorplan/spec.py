@@ -1,13 +1,10 @@
 """Input of the floor planner: rooms with their floor sizes, doors and windows, and preferred neighbours by room type."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-if TYPE_CHECKING:
-    from embomatrix.world.geometry import Vec2
+from embomatrix.world.geometry import Vec2
 
 MIN_DOOR_M: Final = 0.8
 MAX_DOOR_HEIGHT_M: Final = 2.1

@@ -10,18 +10,16 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from embomatrix.factory.furnish.roles import FurnitureRole, importance_of
+from embomatrix.factory.furnish.space import Box, Rect4
 from embomatrix.sim.geometry.bounds import joint_motion
 from embomatrix.world.asset import Asset, Link
 from embomatrix.world.geometry import ConvexPart, Pose, Vec3
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from embomatrix.factory.furnish.space import Box
 
 CORNER_SOFA_M: Final = 1.4
 """A sofa larger than this along both sides is a corner sofa with its second arm on the right; its nook is open floor."""
@@ -30,8 +28,6 @@ REST_GAP_M: Final = 0.0005
 FRONT_M: Final = 0.6
 _UPENDED: Final = Pose((0.0, 0.0, 0.0), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)))
 """Rotation that turns the face of a flat model from +z of its asset frame to +x."""
-
-Rect4 = tuple[float, float, float, float]
 
 
 class Access(StrEnum):

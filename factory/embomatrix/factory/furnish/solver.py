@@ -24,13 +24,12 @@ from embomatrix.factory.furnish.pieces import (
     FurniturePiece,
     Member,
     Placed,
-    Rect4,
     Rows,
     access_of,
     front_depth_m,
 )
 from embomatrix.factory.furnish.roles import FurnitureRole
-from embomatrix.factory.furnish.space import LOW_M, BoolArray, Box, FloatArray, RoomSpace, Target
+from embomatrix.factory.furnish.space import LOW_M, BoolArray, Box, FloatArray, Rect4, RoomSpace
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.state import Relation
 
@@ -128,14 +127,14 @@ class RoomSolver:
         free = np.ones(len(options), dtype=bool)
         for member in group.members:
             for boxes in _boxes(member, options):
-                free &= ~self.space.collides(_grown(_seen(member, boxes), group.clear_m))
+                free &= ~self.space.solids.meets(_grown(_seen(member, boxes), group.clear_m))
                 if _hangs(member):
-                    free &= ~self.space.hangs_in_zone(boxes)
+                    free &= ~self.space.zones.meets(boxes)
                 elif len(boxes) and boxes[0, 5] > LOW_M:
                     free &= ~self.space.blocks_zone(boxes)
             front = _front(member, options)
             if front is not None:
-                free &= ~self.space.collides(front)
+                free &= ~self.space.solids.meets(front)
         return free
 
     def _items(self, group: FurnitureGroup, x: float, y: float, turns: int) -> list[Placed]:
@@ -161,9 +160,9 @@ def _hangs(member: Member) -> bool:
     return member.piece.role is FurnitureRole.WALL and member.piece.size_m[0] <= _FLAT_M
 
 
-def _access(items: Sequence[Placed]) -> tuple[list[Target], list[Box], list[Box]]:
+def _access(items: Sequence[Placed]) -> tuple[list[Rect4], list[Box], list[Box]]:
     """Return the targets of these pieces, the zones in which their doors swing, and the fronts where nothing may stand."""
-    targets: list[Target] = []
+    targets: list[Rect4] = []
     zones: list[Box] = []
     fronts: list[Box] = []
     for item in items:
@@ -174,7 +173,7 @@ def _access(items: Sequence[Placed]) -> tuple[list[Target], list[Box], list[Box]
         if kind in (Access.BESIDE, Access.HUNG):
             # Less than the full reach: the grid is coarse, and objects may lie further in.
             wide = ROBOT.reach_m - 0.15
-            targets.append(Target((x0 - wide, y0 - wide, x1 + wide, y1 + wide)))
+            targets.append((x0 - wide, y0 - wide, x1 + wide, y1 + wide))
             if kind is Access.BESIDE:
                 continue
         depth = front_depth_m(item.piece.asset)
@@ -183,13 +182,13 @@ def _access(items: Sequence[Placed]) -> tuple[list[Target], list[Box], list[Box]
         if kind is Access.HUNG:
             zones.append((fx0, fy0, item.box[2], fx1, fy1, item.box[5]))
             continue
-        targets.append(Target(_before(item.box, ax, ay, 0.2, depth + 0.45)))
+        targets.append(_before(item.box, ax, ay, 0.2, depth + 0.45))
         opens = zones if item.piece.asset.joints else fronts
         opens.append((fx0, fy0, 0.0, fx1, fy1, _ACCESS_TOP_M))
     return targets, zones, fronts
 
 
-def _before(box: Box, ax: int, ay: int, near: float, far: float) -> tuple[float, float, float, float]:
+def _before(box: Box, ax: int, ay: int, near: float, far: float) -> Rect4:
     """Return the strip from ``near`` to ``far`` metres before the face of the box that looks along (ax, ay)."""
     x0, y0, _, x1, y1, _ = box
     if ax:

@@ -3,7 +3,6 @@
 import functools
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -18,6 +17,8 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 Box = tuple[float, float, float, float, float, float]
 """(x0, y0, z0, x1, y1, z1) in the world frame, in metres."""
+Rect4 = tuple[float, float, float, float]
+"""(x0, y0, x1, y1) in metres."""
 
 CELL_M: Final = 0.05
 DOOR_CLEAR_M: Final = 0.8
@@ -66,13 +67,6 @@ class BoxStack:
         return np.asarray(meets.any(axis=1))
 
 
-@dataclass(frozen=True, slots=True)
-class Target:
-    """Strip of floor (x0, y0, x1, y1) that must keep a cell where the robot can stand."""
-
-    strip: tuple[float, float, float, float]
-
-
 class RoomSpace:
     """Occupancy of one room by axis-aligned boxes: furniture on the floor stands at quarter turns.
 
@@ -99,11 +93,12 @@ class RoomSpace:
         boxes: Sequence[Box],
         zones: Sequence[Box] = (),
         fronts: Sequence[Box] = (),
-        targets: Sequence[Target] = (),
+        targets: Sequence[Rect4] = (),
     ) -> None:
         """Add furniture: its boxes, the space it needs free, and the floor from which the robot uses it.
 
-        Nothing may be in ``zones``, where doors swing. Nothing may stand in ``fronts``. Each target keeps a reachable cell.
+        Nothing may be in ``zones``, where doors swing. Nothing may stand in ``fronts``. Each target, a strip of floor, keeps
+        a reachable cell.
         """
         self._stand, self._reach = self._after(boxes)
         self.solids.extend(boxes)
@@ -111,19 +106,11 @@ class RoomSpace:
         self.fronts.extend(fronts)
         self._targets += [self._cells_of(t) for t in targets]
 
-    def collides(self, boxes: FloatArray) -> BoolArray:
-        """Mark the candidates that overlap a solid. boxes: (n, 6); result: (n,)."""
-        return self.solids.meets(boxes)
-
     def blocks_zone(self, boxes: FloatArray) -> BoolArray:
         """Mark the candidates that would stand in a zone or front that must stay free. boxes: (n, 6); result: (n,)."""
         return self.zones.meets(boxes) | self.fronts.meets(boxes)
 
-    def hangs_in_zone(self, boxes: FloatArray) -> BoolArray:
-        """Mark the candidates that would hang in a zone that must stay free. boxes: (n, 6); result: (n,)."""
-        return self.zones.meets(boxes)
-
-    def reachable(self, extra: Sequence[Box] = (), targets: Sequence[Target] = ()) -> bool:
+    def reachable(self, extra: Sequence[Box] = (), targets: Sequence[Rect4] = ()) -> bool:
         """True if doorways, targets and nearly all floor stay connected with the extra solids in place."""
         if not self._joined:
             return False
@@ -132,7 +119,7 @@ class RoomSpace:
             return False
         if reach is not self._reach and int(stand.sum()) - int(reach.sum()) > _ISLAND_CELLS:
             return False
-        if not all(self._touches(reach, t) for t in targets):
+        if not all(reach[a:b, c:d].any() for a, b, c, d in map(self._cells_of, targets)):
             return False
         lost = self._window_of(extra)
         if lost is None or reach is self._reach:
@@ -187,13 +174,9 @@ class RoomSpace:
         near = reach[max(0, i0 - _AROUND) : i1 + _AROUND, max(0, j0 - _AROUND) : j1 + _AROUND]
         return bool(ndimage.label(near)[1] == 1)
 
-    def _touches(self, reach: BoolArray, target: Target) -> bool:
-        i0, i1, j0, j1 = self._cells_of(target)
-        return bool(reach[i0:i1, j0:j1].any())
-
-    def _cells_of(self, target: Target) -> _Cells:
+    def _cells_of(self, strip: Rect4) -> _Cells:
         """Return the cells with their centres in the strip."""
-        x0, y0, x1, y1 = target.strip
+        x0, y0, x1, y1 = strip
         return self._cells((x0, x1), (y0, y1))
 
     def _touched(self, box: Box) -> _Cells:
@@ -226,7 +209,7 @@ class RoomSpace:
         x0, y0, x1, y1 = self._before(window, WINDOW_CLEAR_M)
         return (x0, y0, max(window.sill_m, WINDOW_FROM_M), x1, y1, window.head_m)
 
-    def _before(self, opening: Doorway | Window, clear_m: float) -> tuple[float, float, float, float]:
+    def _before(self, opening: Doorway | Window, clear_m: float) -> Rect4:
         """Return the strip (x0, y0, x1, y1) that stays free before an opening, from the middle of its wall."""
         x, y = opening.center_m
         half, far = opening.width_m / 2, min(clear_m, 0.7 * min(self.room.size_m)) + WALL_M / 2
