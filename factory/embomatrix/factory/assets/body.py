@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Final
+from typing import Final, Self
 
 from embomatrix.factory.assets.shapes import box, box_of, rounded
 from embomatrix.world.asset import Interior, Joint, JointKind, Link, SupportSurface
@@ -34,9 +34,10 @@ class Body:
 
     def add_support(
         self, name: str, low: Vec2, high: Vec2, z: float, clearance_m: float = OPEN_ABOVE_M
-    ) -> None:
-        """Add an open surface between two corners at height ``z``."""
+    ) -> Self:
+        """Add an open surface between two corners at height ``z``; return the body."""
         self.supports.append(_surface(name, low, high, z, clearance_m))
+        return self
 
     def add_interior(
         self,
@@ -45,8 +46,8 @@ class Body:
         closed_by: tuple[str, ...] = (),
         clearance_m: float = 0.0,
         link: str = "",
-    ) -> None:
-        """Add a cavity and its floor; both move with ``link`` if it is named.
+    ) -> Self:
+        """Add a cavity and its floor, which both move with ``link`` if it is named; return the body.
 
         Set ``clearance_m`` above the cavity's height if objects may stick out of its top.
         """
@@ -57,6 +58,7 @@ class Body:
         clearance = max(clearance_m, z1 - z0)
         surface = _surface(f"{name}_floor", (x0, y0), (x1, y1), z0, clearance)
         self.supports.append(replace(surface, interior=name, link=link))
+        return self
 
 
 def _surface(name: str, low: Vec2, high: Vec2, z: float, clearance_m: float) -> SupportSurface:
@@ -74,6 +76,13 @@ def centred(size_m: Vec3) -> Aabb:
 def region(x: Vec2, y: Vec2, z: Vec2) -> Aabb:
     """Return the box with these intervals along x, y and z."""
     return Aabb((x[0], y[0], z[0]), (x[1], y[1], z[1]))
+
+
+def spanning(box: Aabb, axis: int, span: Vec2) -> Aabb:
+    """Return the box with another interval along one axis."""
+    spans = [*zip(box.low_m, box.high_m, strict=True)]
+    spans[axis] = span
+    return region(*spans)
 
 
 def proportioned(size_m: Vec3, rows: Sequence[Proportions]) -> list[ConvexPart]:
@@ -115,20 +124,15 @@ def shell(outer: Aabb, walls: Walls) -> tuple[list[ConvexPart], Aabb]:
         (z0 + walls.bottom, z1 - walls.top),
     )
     (ix0, iy0, iz0), (ix1, iy1, iz1) = inner.low_m, inner.high_m
-    parts = []
-    if walls.bottom:
-        parts.append(box((x0, y0, z0), (x1, y1, iz0)))
-    if walls.top:
-        parts.append(box((x0, y0, iz1), (x1, y1, z1)))
-    if walls.right:
-        parts.append(box((x0, y0, iz0), (x1, iy0, iz1)))
-    if walls.left:
-        parts.append(box((x0, iy1, iz0), (x1, y1, iz1)))
-    if walls.back:
-        parts.append(box((x0, iy0, iz0), (ix0, iy1, iz1)))
-    if walls.front:
-        parts.append(box((ix1, iy0, iz0), (x1, iy1, iz1)))
-    return parts, inner
+    boards = (
+        (walls.bottom, (x0, y0, z0), (x1, y1, iz0)),
+        (walls.top, (x0, y0, iz1), (x1, y1, z1)),
+        (walls.right, (x0, y0, iz0), (x1, iy0, iz1)),
+        (walls.left, (x0, iy1, iz0), (x1, y1, iz1)),
+        (walls.back, (x0, iy0, iz0), (ix0, iy1, iz1)),
+        (walls.front, (ix1, iy0, iz0), (x1, iy1, iz1)),
+    )
+    return [box(low, high) for thickness, low, high in boards if thickness], inner
 
 
 class Hinge(StrEnum):

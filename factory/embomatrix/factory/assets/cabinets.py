@@ -16,11 +16,12 @@ from embomatrix.factory.assets.body import (
     hinged,
     region,
     shell,
+    spanning,
 )
 from embomatrix.factory.assets.drawers import add_drawers
 from embomatrix.factory.assets.furniture import slab
 from embomatrix.factory.assets.shapes import box, box_of
-from embomatrix.world.geometry import Aabb, ConvexPart, Vec2, Vec3
+from embomatrix.world.geometry import Aabb, Vec2, Vec3
 
 MAX_PARTS: Final = 16
 """Upper limit for the parts of a link: Bullet silently drops further ones."""
@@ -95,7 +96,7 @@ def cabinet(size_m: Vec3, style: CabinetStyle) -> Body:
         body.parts.append(box(low, outer.high_m))
     spans = _bays(cavity, style, max(wall, 2 * door_m))
     for (_, before), (after, _) in itertools.pairwise(spans):
-        body.parts.append(_upright(cavity, before, after))
+        body.parts.append(box_of(spanning(cavity, 1, (before, after))))
     opening = region(
         (outer.high_m[0] - door_m, outer.high_m[0]),
         (outer.low_m[1], outer.high_m[1] - (walls.left if style.panel_share else 0.0)),
@@ -105,11 +106,8 @@ def cabinet(size_m: Vec3, style: CabinetStyle) -> Body:
     boards = (MAX_PARTS - len(body.parts)) // len(spans)
     for number, (span, reach) in enumerate(zip(spans, itertools.pairwise(edges), strict=True), start=1):
         prefix = f"bay{number}_" if len(spans) > 1 else ""
-        bay = region((cavity.low_m[0], cavity.high_m[0]), span, (cavity.low_m[2], cavity.high_m[2]))
-        front = region((opening.low_m[0], opening.high_m[0]), reach, (opening.low_m[2], opening.high_m[2]))
-        _fill(body, style, bay, front, boards, prefix)
-    body.add_support("top", frame.low_m[:2], frame.high_m[:2], frame.high_m[2])
-    return body
+        _fill(body, style, spanning(cavity, 1, span), spanning(opening, 1, reach), boards, prefix)
+    return body.add_support("top", frame.low_m[:2], frame.high_m[:2], frame.high_m[2])
 
 
 def _fill(body: Body, style: CabinetStyle, bay: Aabb, front: Aabb, boards: int, prefix: str) -> None:
@@ -121,12 +119,11 @@ def _fill(body: Body, style: CabinetStyle, bay: Aabb, front: Aabb, boards: int, 
             add_drawers(body, bay, panels, prefix, most=2 if prefix else 4)
             return
         z = bay.high_m[2] - style.drawer_share * bay.size_m[2]
-        board = region((bay.low_m[0], bay.high_m[0]), (bay.low_m[1], bay.high_m[1]), (z - _BOARD_M, z))
-        body.parts.append(box_of(board))
-        upper = Aabb((*panels.low_m[:2], z), panels.high_m)
-        add_drawers(body, Aabb((*bay.low_m[:2], z), bay.high_m), upper, prefix)
-        bay = Aabb(bay.low_m, (*bay.high_m[:2], z - _BOARD_M))
-        front = Aabb(front.low_m, (*front.high_m[:2], z))
+        body.parts.append(box_of(spanning(bay, 2, (z - _BOARD_M, z))))
+        upper = spanning(panels, 2, (z, panels.high_m[2]))
+        add_drawers(body, spanning(bay, 2, (z, bay.high_m[2])), upper, prefix)
+        bay = spanning(bay, 2, (bay.low_m[2], z - _BOARD_M))
+        front = spanning(front, 2, (front.low_m[2], z))
         boards -= 1
     doors = _doors(body, style, front, prefix)
     _add_tiers(body, bay, style.tier_m, boards, prefix, doors)
@@ -166,26 +163,22 @@ def _bays(cavity: Aabb, style: CabinetStyle, divider_m: float) -> list[Vec2]:
     return [(low + k * (width + divider_m), low + k * (width + divider_m) + width) for k in range(count)]
 
 
-def _upright(cavity: Aabb, before: float, after: float) -> ConvexPart:
-    return box((cavity.low_m[0], before, cavity.low_m[2]), (cavity.high_m[0], after, cavity.high_m[2]))
-
-
 def _doors(body: Body, style: CabinetStyle, front: Aabb, prefix: str) -> tuple[str, ...]:
     """Add the doors of one bay and return their names."""
     if style.front is FrontKind.OPEN:
         return ()
-    (x0, y0, z0), (x1, y1, z1) = front.low_m, front.high_m
+    (x0, y0, _), (x1, y1, _) = front.low_m, front.high_m
     gap = min(FIT_M, 0.2 * (x1 - x0))
-    x = (x0 + gap, x1)
+    panel = spanning(front, 0, (x0 + gap, x1))
     if style.front is FrontKind.DROP_DOWN:
-        doors = [hinged(f"{prefix}door", region(x, (y0, y1), (z0, z1)), Hinge.BOTTOM)]
+        doors = [hinged(f"{prefix}door", panel, Hinge.BOTTOM)]
     elif y1 - y0 <= style.single_door_m:
-        doors = [hinged(f"{prefix}door", region(x, (y0, y1), (z0, z1)), Hinge.RIGHT)]
+        doors = [hinged(f"{prefix}door", panel, Hinge.RIGHT)]
     else:
         middle = (y0 + y1) / 2
         doors = [
-            hinged(f"{prefix}right_door", region(x, (y0, middle - gap / 2), (z0, z1)), Hinge.RIGHT),
-            hinged(f"{prefix}left_door", region(x, (middle + gap / 2, y1), (z0, z1)), Hinge.LEFT),
+            hinged(f"{prefix}right_door", spanning(panel, 1, (y0, middle - gap / 2)), Hinge.RIGHT),
+            hinged(f"{prefix}left_door", spanning(panel, 1, (middle + gap / 2, y1)), Hinge.LEFT),
         ]
     body.moving.extend(doors)
     return tuple(door.name for door in doors)
@@ -202,24 +195,21 @@ def _add_tiers(
     for tier in range(count):
         floor = z0 + tier * (height + board)
         name = f"{prefix}shelf{tier + 1}" if count > 1 else f"{prefix}inside"
-        body.add_interior(name, region((x0, x1), (y0, y1), (floor, floor + height)), doors)
+        body.add_interior(name, spanning(bay, 2, (floor, floor + height)), doors)
         if tier:
             body.parts.append(box((x0, y0, floor - board), (x1 - FIT_M, y1, floor)))
 
 
 def chest(size_m: Vec3, lid_share: float = 0.12) -> Body:
     """A box with a lid that is hinged at the back and opens by a quarter turn."""
-    body = Body()
     outer = centred(size_m)
     wall = clamp(0.05 * min(size_m[:2]), 0.003, 0.025)
     lid = min(wall, lid_share * size_m[2])
     z1 = outer.high_m[2] - lid
-    carcass = Aabb(outer.low_m, (*outer.high_m[:2], z1))
-    body.parts, cavity = shell(carcass, Walls(wall, wall, wall, wall, min(wall, 0.1 * size_m[2]), 0.0))
-    gap = min(FIT_M, 0.2 * lid)
-    body.moving.append(hinged("lid", Aabb((*outer.low_m[:2], z1 + gap), outer.high_m), Hinge.BACK))
-    body.add_interior("inside", cavity, ("lid",))
-    return body
+    carcass = spanning(outer, 2, (outer.low_m[2], z1))
+    parts, cavity = shell(carcass, Walls(wall, wall, wall, wall, min(wall, 0.1 * size_m[2]), 0.0))
+    panel = spanning(outer, 2, (z1 + min(FIT_M, 0.2 * lid), outer.high_m[2]))
+    return Body(parts, [hinged("lid", panel, Hinge.BACK)]).add_interior("inside", cavity, ("lid",))
 
 
 SHALLOW_M: Final = 0.025
@@ -228,12 +218,9 @@ SHALLOW_M: Final = 0.025
 
 def open_box(size_m: Vec3) -> Body:
     """A box without a lid: baskets, crates, bins, tubs, trays."""
-    body = Body()
     wall = clamp(0.04 * min(size_m[:2]), 0.003, 0.05)
     floor = clamp(0.06 * size_m[2], 0.002, 0.04)
-    body.parts, cavity = shell(centred(size_m), Walls(wall, wall, wall, wall, floor, 0.0))
+    parts, cavity = shell(centred(size_m), Walls(wall, wall, wall, wall, floor, 0.0))
     if cavity.size_m[2] >= SHALLOW_M:
-        body.add_interior("inside", cavity, clearance_m=OPEN_ABOVE_M)
-    else:
-        body.add_support("floor", cavity.low_m[:2], cavity.high_m[:2], cavity.low_m[2])
-    return body
+        return Body(parts).add_interior("inside", cavity, clearance_m=OPEN_ABOVE_M)
+    return Body(parts).add_support("floor", cavity.low_m[:2], cavity.high_m[:2], cavity.low_m[2])

@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from embomatrix.factory.assets.body import Body, Walls, clamp, region, shell
+from embomatrix.factory.assets.body import Body, Walls, clamp, region, shell, spanning
 from embomatrix.factory.assets.shapes import box_of, rounded
 from embomatrix.world.asset import Joint, JointKind, Link
 from embomatrix.world.geometry import Aabb, Vec2
@@ -30,9 +30,10 @@ def add_drawers(body: Body, bay: Aabb, front: Aabb, prefix: str = "", most: int 
     fronts = _divided((front.low_m[2], front.high_m[2]), count)
     for number, (low, high) in enumerate(fronts, start=1):
         room = (max(low, bay.low_m[2]), min(high, bay.high_m[2]))
-        panel = region(_x(front), _y(front), (low + PLAY_M / 4, high - PLAY_M / 4))
+        panel = spanning(front, 2, (low + PLAY_M / 4, high - PLAY_M / 4))
         name = f"{prefix}drawer{number}" if count > 1 else f"{prefix}drawer"
-        _add_drawer(body, name, panel, region((bay.low_m[0], panel.low_m[0]), _y(bay), room))
+        behind = spanning(bay, 0, (bay.low_m[0], panel.low_m[0]))
+        _add_drawer(body, name, panel, spanning(behind, 2, room))
 
 
 def _add_drawer(body: Body, name: str, panel: Aabb, room: Aabb) -> None:
@@ -49,8 +50,7 @@ def _add_drawer(body: Body, name: str, panel: Aabb, room: Aabb) -> None:
         round(min(TRAVEL_SHARE * (panel.high_m[0] - outer.low_m[0]), TRAVEL_M), 6),
     )
     body.moving.append(Link(name, (box_of(panel), *boards), joint))
-    free = Aabb(cavity.low_m, (*cavity.high_m[:2], top))
-    body.add_interior(name, free, (name,), link=name)
+    body.add_interior(name, spanning(cavity, 2, (cavity.low_m[2], top)), (name,), link=name)
 
 
 def _divided(span: Vec2, count: int) -> list[Vec2]:
@@ -58,11 +58,3 @@ def _divided(span: Vec2, count: int) -> list[Vec2]:
     low, high = span
     pitch = (high - low) / count
     return [(high - (k + 1) * pitch, high - k * pitch) for k in range(count)]
-
-
-def _x(box: Aabb) -> Vec2:
-    return (box.low_m[0], box.high_m[0])
-
-
-def _y(box: Aabb) -> Vec2:
-    return (box.low_m[1], box.high_m[1])

@@ -16,9 +16,10 @@ from embomatrix.factory.assets.body import (
     region,
     shell,
     sliding,
+    spanning,
 )
-from embomatrix.factory.assets.furniture import legs
-from embomatrix.factory.assets.shapes import box, lump, octagon
+from embomatrix.factory.assets.furniture import legs, slab
+from embomatrix.factory.assets.shapes import box, box_of, lump, octagon
 from embomatrix.world.geometry import Aabb, ConvexPart, Vec2, Vec3
 
 _ON_LEGS_M: Final = 0.6
@@ -39,19 +40,19 @@ def multi_sink(size_m: Vec3) -> Body:
 
 def _sink(size_m: Vec3, basins: int, basin_width_m: float) -> Body:
     """A block from the floor to the worktop with basins let in; the worktop carries objects."""
-    outer = centred(size_m)
-    (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     deck = z1 - min(_TAP_M, 0.3 * size_m[2])
     depth = min(_BASIN_DEPTH_M, 0.6 * (deck - z0))
     back, front = x0 + 0.2 * size_m[0], x1 - 0.08 * size_m[0]
     pitch = size_m[1] / basins
     half = min(basin_width_m, 0.8 * pitch) / 2
-    body = Body()
-    body.parts = [
-        box((x0, y0, z0), (x1, y1, deck - depth)),
-        box((x0, y0, deck - depth), (back, y1, deck)),
-        box((front, y0, deck - depth), (x1, y1, deck)),
-    ]
+    body = Body(
+        [
+            box((x0, y0, z0), (x1, y1, deck - depth)),
+            box((x0, y0, deck - depth), (back, y1, deck)),
+            box((front, y0, deck - depth), (x1, y1, deck)),
+        ]
+    )
     centres = [y0 + (k + 0.5) * pitch for k in range(basins)]
     edges = [y0, *(y for centre in centres for y in (centre - half, centre + half)), y1]
     for number, (low, high) in enumerate(zip(edges[::2], edges[1::2], strict=True), start=1):
@@ -86,35 +87,28 @@ def _under_tap(z: Vec2) -> float:
 
 def pedestal_sink(size_m: Vec3) -> Body:
     """A single basin on a column; on a bracket if it hangs on a wall."""
-    outer = centred(size_m)
-    (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     deck = z1 - min(_TAP_M, 0.3 * size_m[2])
     depth = min(_BASIN_DEPTH_M, 0.5 * (deck - z0))
     wall = clamp(0.07 * min(size_m[:2]), 0.02, 0.05)
-    body = Body()
     bowl = Aabb((x0, y0, deck - depth), (x1, y1, deck))
-    body.parts, cavity = shell(bowl, Walls(0.22 * size_m[0], wall, wall, wall, 0.03, 0.0))
-    body.parts.append(
-        box((x0, -0.12 * size_m[1], z0), (x0 + 0.65 * size_m[0], 0.12 * size_m[1], deck - depth))
-    )
-    body.parts.extend(_tap((x0 + 0.1 * size_m[0], 0.0), cavity.center_m[0], (deck, z1)))
-    body.add_interior("basin", cavity, clearance_m=_under_tap((deck, z1)) - cavity.low_m[2])
+    parts, cavity = shell(bowl, Walls(0.22 * size_m[0], wall, wall, wall, 0.03, 0.0))
+    parts.append(box((x0, -0.12 * size_m[1], z0), (x0 + 0.65 * size_m[0], 0.12 * size_m[1], deck - depth)))
+    parts += _tap((x0 + 0.1 * size_m[0], 0.0), cavity.center_m[0], (deck, z1))
+    clearance_m = _under_tap((deck, z1)) - cavity.low_m[2]
+    body = Body(parts).add_interior("basin", cavity, clearance_m=clearance_m)
     edge, tap = x0 + 0.22 * size_m[0], 2 * _tap_radius((deck, z1))
     body.add_support("right_rim", (x0, y0), (edge, -tap), deck)
-    body.add_support("left_rim", (x0, tap), (edge, y1), deck)
-    return body
+    return body.add_support("left_rim", (x0, tap), (edge, y1), deck)
 
 
 def tub(size_m: Vec3) -> Body:
     """Bath, pool: a block with a deep basin and thick rims."""
     outer = centred(size_m)
     wall = clamp(0.1 * min(size_m[:2]), 0.03, 0.3)
-    body = Body()
-    body.parts, cavity = shell(outer, Walls(wall, wall, wall, wall, clamp(0.15 * size_m[2], 0.02, 0.2), 0.0))
-    body.add_interior("basin", cavity, clearance_m=OPEN_ABOVE_M)
-    (x0, y0, _), (x1, _, z1) = outer.low_m, outer.high_m
-    body.add_support("rim", (x0, y0), (x1, cavity.low_m[1]), z1)
-    return body
+    parts, cavity = shell(outer, Walls(wall, wall, wall, wall, clamp(0.15 * size_m[2], 0.02, 0.2), 0.0))
+    body = Body(parts).add_interior("basin", cavity, clearance_m=OPEN_ABOVE_M)
+    return body.add_support("rim", outer.low_m[:2], (outer.high_m[0], cavity.low_m[1]), outer.high_m[2])
 
 
 def toilet(size_m: Vec3) -> Body:
@@ -124,39 +118,30 @@ def toilet(size_m: Vec3) -> Body:
     tank = x0 + 0.28 * size_m[0]
     body = Body(parts=[box((tank, y0, z0), (x1, y1, seat)), box((x0, y0, z0), (tank, y1, z1))])
     body.add_support("seat", (tank, y0), (x1, y1), seat)
-    body.add_support("cistern", (x0, y0), (tank, y1), z1)
-    return body
+    return body.add_support("cistern", (x0, y0), (tank, y1), z1)
 
 
 def shower_stall(size_m: Vec3) -> Body:
     """Tray with walls on three sides and an open front."""
-    outer = centred(size_m)
-    body = Body()
     tray = clamp(0.03 * size_m[2], 0.02, 0.08)
-    body.parts, cavity = shell(outer, Walls(0.04, 0.0, 0.04, 0.04, tray, 0.0))
-    body.add_support("tray", cavity.low_m[:2], cavity.high_m[:2], cavity.low_m[2])
-    return body
+    parts, cavity = shell(centred(size_m), Walls(0.04, 0.0, 0.04, 0.04, tray, 0.0))
+    return Body(parts).add_support("tray", cavity.low_m[:2], cavity.high_m[:2], cavity.low_m[2])
 
 
 def cooktop(size_m: Vec3) -> Body:
     """A stove, grill plate or burner: a block whose whole top is the hot surface."""
-    outer = centred(size_m)
-    body = Body(parts=[box(outer.low_m, outer.high_m)])
-    body.add_support("cooktop", outer.low_m[:2], outer.high_m[:2], outer.high_m[2])
-    return body
+    return slab(size_m, "cooktop")
 
 
 def grill(size_m: Vec3) -> Body:
     """A fire box on four legs, whose whole top is the hot surface; a low one stands on the ground."""
     if size_m[2] < _ON_LEGS_M:
         return cooktop(size_m)
-    outer = centred(size_m)
-    (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     fire = z1 - 0.4 * size_m[2]
     thick = clamp(0.08 * min(size_m[:2]), 0.02, 0.06)
     body = Body(parts=[box((x0, y0, fire), (x1, y1, z1)), *legs((x0, y0), (x1, y1), (z0, fire), thick)])
-    body.add_support("cooktop", (x0, y0), (x1, y1), z1)
-    return body
+    return body.add_support("cooktop", (x0, y0), (x1, y1), z1)
 
 
 _COFFEE_MACHINE: Final = (
@@ -168,13 +153,11 @@ _COFFEE_MACHINE: Final = (
 
 def coffee_machine(size_m: Vec3) -> Body:
     """A back with a head, over a tray for cups."""
-    outer = centred(size_m)
-    (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     foot, head, back = z0 + 0.08 * size_m[2], z1 - 0.3 * size_m[2], x0 + 0.4 * size_m[0]
     body = Body(parts=proportioned(size_m, _COFFEE_MACHINE))
     body.add_interior("bay", region((back, x1), (y0, y1), (foot, head)))
-    body.add_support("top", (x0, y0), (x1, y1), z1)
-    return body
+    return body.add_support("top", (x0, y0), (x1, y1), z1)
 
 
 def door(size_m: Vec3) -> Body:
@@ -186,8 +169,7 @@ def door(size_m: Vec3) -> Body:
 
 def sliding_door(size_m: Vec3) -> Body:
     """A frame with a fixed pane in its right half and a pane in its left half that slides in front of it."""
-    outer = centred(size_m)
-    body, gap = _frame(outer)
+    body, gap = _frame(centred(size_m))
     (x0, y0, z0), (x1, y1, z1) = gap.low_m, gap.high_m
     third = (x1 - x0) / 3
     body.parts.append(box((x0, y0, z0), (x0 + third, 0.0, z1)))
@@ -230,12 +212,9 @@ def _frame(outer: Aabb, sill_m: float = 0.0) -> tuple[Body, Aabb]:
 def laptop(size_m: Vec3) -> Body:
     """A keyboard with a screen that folds up."""
     outer = centred(size_m)
-    half = 0.55 * size_m[2]
-    z = outer.low_m[2] + half
-    gap = 0.05 * size_m[2]
-    body = Body(parts=[box(outer.low_m, (*outer.high_m[:2], z))])
-    body.moving.append(hinged("screen", Aabb((*outer.low_m[:2], z + gap), outer.high_m), Hinge.BACK))
-    return body
+    z = outer.low_m[2] + 0.55 * size_m[2]
+    lid = spanning(outer, 2, (z + 0.05 * size_m[2], outer.high_m[2]))
+    return Body([box_of(spanning(outer, 2, (outer.low_m[2], z)))], [hinged("screen", lid, Hinge.BACK)])
 
 
 def screen(size_m: Vec3) -> Body:
@@ -275,17 +254,13 @@ def car(size_m: Vec3) -> Body:
 
     The boot is at +x, like the doors of furniture: furnishing keeps that side free and puts the bonnet to the wall.
     """
-    outer = centred(size_m)
-    (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     waist, boot = z0 + 0.62 * size_m[2], x1 - 0.22 * size_m[0]
     lid = 0.04
-    body = Body()
-    body.parts, cavity = shell(
+    parts, cavity = shell(
         Aabb((boot, y0, z0 + 0.12 * size_m[2]), (x1, y1, waist - lid)), Walls(0.1, 0.1, 0.1, 0.1, 0.15, 0.0)
     )
-    body.parts.append(box((x0, y0, z0), (boot, y1, waist)))
-    body.parts.append(box((x1 - 0.7 * size_m[0], 0.9 * y0, waist), (boot, 0.9 * y1, z1)))
+    parts.append(box((x0, y0, z0), (boot, y1, waist)))
+    parts.append(box((x1 - 0.7 * size_m[0], 0.9 * y0, waist), (boot, 0.9 * y1, z1)))
     panel = Aabb((boot + FIT_M, y0, waist - lid + FIT_M), (x1, y1, waist))
-    body.moving.append(hinged("boot_lid", panel, Hinge.BACK))
-    body.add_interior("boot", cavity, ("boot_lid",))
-    return body
+    return Body(parts, [hinged("boot_lid", panel, Hinge.BACK)]).add_interior("boot", cavity, ("boot_lid",))

@@ -4,7 +4,7 @@ from typing import Final
 
 from embomatrix.factory.assets.body import Body, Walls, centred, clamp, raised, region, shell
 from embomatrix.factory.assets.drawers import add_drawers
-from embomatrix.factory.assets.shapes import box, octagon
+from embomatrix.factory.assets.shapes import box, box_of, octagon
 from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
 
 
@@ -24,14 +24,12 @@ def leg_thickness(size_m: Vec3) -> float:
     return clamp(0.07 * min(size_m[:2]), 0.008, 0.07)
 
 
-def table(size_m: Vec3) -> Body:
-    """A top on four legs."""
+def table(size_m: Vec3, surface: str = "top") -> Body:
+    """A top, named ``surface``, on four legs."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    body = Body()
     top, leg = top_thickness(size_m), leg_thickness(size_m)
-    body.parts = [box((x0, y0, z1 - top), (x1, y1, z1)), *legs((x0, y0), (x1, y1), (z0, z1 - top), leg)]
-    body.add_support("top", (x0, y0), (x1, y1), z1)
-    return body
+    parts = [box((x0, y0, z1 - top), (x1, y1, z1)), *legs((x0, y0), (x1, y1), (z0, z1 - top), leg)]
+    return Body(parts).add_support(surface, (x0, y0), (x1, y1), z1)
 
 
 def table_with_shelf(size_m: Vec3) -> Body:
@@ -42,49 +40,40 @@ def table_with_shelf(size_m: Vec3) -> Body:
     z = z0 + 0.25 * size_m[2]
     body.parts.append(box((x0, y0, z - board), (x1, y1, z)))
     inset, under_top = leg_thickness(size_m), z1 - top_thickness(size_m)
-    body.add_support("shelf", (x0 + inset, y0 + inset), (x1 - inset, y1 - inset), z, under_top - z)
-    return body
+    return body.add_support("shelf", (x0 + inset, y0 + inset), (x1 - inset, y1 - inset), z, under_top - z)
 
 
 def pedestal_table(size_m: Vec3) -> Body:
     """A round or oval top on a column with a broad foot."""
     (_, _, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    body = Body()
     top, foot = clamp(0.05 * size_m[2], 0.006, 0.04), clamp(0.04 * size_m[2], 0.006, 0.03)
-    body.parts = [
+    parts = [
         *octagon((0.0, 0.0), (x1, y1), (z1 - top, z1)),
         box((-0.12 * x1, -0.12 * y1, z0 + foot), (0.12 * x1, 0.12 * y1, z1 - top)),
         *octagon((0.0, 0.0), (0.6 * x1, 0.6 * y1), (z0, z0 + foot)),
     ]
     # Inscribed square of the octagon: a larger rectangle would hang over.
-    body.add_support("top", (-0.7 * x1, -0.7 * y1), (0.7 * x1, 0.7 * y1), z1)
-    return body
+    return Body(parts).add_support("top", (-0.7 * x1, -0.7 * y1), (0.7 * x1, 0.7 * y1), z1)
 
 
 def counter(size_m: Vec3) -> Body:
     """A closed block with a working top: bars, desks of a reception, display cases."""
-    outer = centred(size_m)
-    body = Body()
-    (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     top = clamp(0.05 * size_m[2], 0.006, 0.05)
     overhang = 0.06 * size_m[0]
-    body.parts = [box((x0, y0, z0), (x1 - overhang, y1, z1 - top)), box((x0, y0, z1 - top), (x1, y1, z1))]
-    body.add_support("top", (x0, y0), (x1, y1), z1)
-    return body
+    parts = [box((x0, y0, z0), (x1 - overhang, y1, z1 - top)), box((x0, y0, z1 - top), (x1, y1, z1))]
+    return Body(parts).add_support("top", (x0, y0), (x1, y1), z1)
 
 
-def slab(size_m: Vec3) -> Body:
-    """A solid board or block with a flat top: counters' plates, mattresses, books, boards, boxes."""
+def slab(size_m: Vec3, surface: str = "top") -> Body:
+    """A solid board or block with a flat top, named ``surface``: worktops, mattresses, books, boards, boxes."""
     outer = centred(size_m)
-    body = Body(parts=[box(outer.low_m, outer.high_m)])
-    body.add_support("top", outer.low_m[:2], outer.high_m[:2], outer.high_m[2])
-    return body
+    return block(size_m).add_support(surface, outer.low_m[:2], outer.high_m[:2], outer.high_m[2])
 
 
 def block(size_m: Vec3) -> Body:
     """A solid box that carries nothing."""
-    outer = centred(size_m)
-    return Body(parts=[box(outer.low_m, outer.high_m)])
+    return Body([box_of(centred(size_m))])
 
 
 def _seat_height(height_m: float) -> float:
@@ -95,42 +84,34 @@ def _seat_height(height_m: float) -> float:
 def chair(size_m: Vec3) -> Body:
     """Seat on four legs with a back."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    body = Body()
     z = z0 + _seat_height(size_m[2])
     leg, seat, back = clamp(0.08 * min(size_m[:2]), 0.008, 0.045), 0.04, clamp(0.1 * size_m[0], 0.01, 0.05)
-    body.parts = [
+    parts = [
         box((x0, y0, z - seat), (x1, y1, z)),
         box((x0, y0, z), (x0 + back, y1, z1)),
         *legs((x0, y0), (x1, y1), (z0, z - seat), leg),
     ]
-    body.add_support("seat", (x0 + back, y0), (x1, y1), z)
-    return body
+    return Body(parts).add_support("seat", (x0 + back, y0), (x1, y1), z)
 
 
 def swivel_chair(size_m: Vec3) -> Body:
     """Seat and back on a column with a cross of feet."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    body = Body()
     z, seat, foot = z0 + _seat_height(size_m[2]), 0.06, 0.06
     back, arm = 0.12 * size_m[0], 0.05
-    body.parts = [
+    parts = [
         box((x0, y0, z - seat), (x1, y1, z)),
         box((x0, y0, z), (x0 + back, y1, z1)),
         box((-0.04, -0.04, z0 + foot), (0.04, 0.04, z - seat)),
         box((x0, -arm, z0), (x1, arm, z0 + foot)),
         box((-arm, y0, z0), (arm, y1, z0 + foot)),
     ]
-    body.add_support("seat", (x0 + back, y0), (x1, y1), z)
-    return body
+    return Body(parts).add_support("seat", (x0 + back, y0), (x1, y1), z)
 
 
 def stool(size_m: Vec3) -> Body:
     """Seat on four legs without a back: stools, benches, footrests."""
-    body = table(size_m)
-    body.supports.clear()
-    outer = centred(size_m)
-    body.add_support("seat", outer.low_m[:2], outer.high_m[:2], outer.high_m[2])
-    return body
+    return table(size_m, "seat")
 
 
 CORNER_FROM_M: Final = 1.4
@@ -142,20 +123,18 @@ def sofa(size_m: Vec3) -> Body:
     if size_m[0] > CORNER_FROM_M and size_m[1] > CORNER_FROM_M:
         return _corner_sofa(size_m)
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    body = Body()
     z, feet = z0 + _seat_height(size_m[2]), 0.1 * size_m[2]
     back = clamp(0.22 * size_m[0], 0.05, 0.3)
     arm = clamp(0.12 * size_m[1], 0.05, 0.2)
     rest = z + 0.4 * (z1 - z)
-    body.parts = [
+    parts = [
         box((x0, y0, z0 + feet), (x1, y1, z)),
         box((x0, y0, z), (x0 + back, y1, z1)),
         box((x0 + back, y0, z), (x1, y0 + arm, rest)),
         box((x0 + back, y1 - arm, z), (x1, y1, rest)),
         *legs((x0, y0), (x1, y1), (z0, z0 + feet), clamp(0.08 * min(size_m[:2]), 0.02, 0.08)),
     ]
-    body.add_support("seat", (x0 + back, y0 + arm), (x1, y1 - arm), z)
-    return body
+    return Body(parts).add_support("seat", (x0 + back, y0 + arm), (x1, y1 - arm), z)
 
 
 def _corner_sofa(size_m: Vec3) -> Body:
@@ -163,8 +142,7 @@ def _corner_sofa(size_m: Vec3) -> Body:
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     z, feet = z0 + _seat_height(size_m[2]), 0.1 * size_m[2]
     deep, back = 0.95, 0.22
-    body = Body()
-    body.parts = [
+    parts = [
         box((x0, y0, z0 + feet), (x0 + deep, y1, z)),
         box((x0 + deep, y0, z0 + feet), (x1, y0 + deep, z)),
         box((x0, y0, z), (x0 + back, y1, z1)),
@@ -173,34 +151,30 @@ def _corner_sofa(size_m: Vec3) -> Body:
         box((x1 - 0.08, y0, z0), (x1, y0 + 0.08, z0 + feet)),
         box((x1 - 0.08, y0 + deep - 0.08, z0), (x1, y0 + deep, z0 + feet)),
     ]
-    body.add_support("seat", (x0 + back, y0 + back), (x0 + deep, y1), z)
-    body.add_support("long_seat", (x0 + deep, y0 + back), (x1, y0 + deep), z)
-    return body
+    body = Body(parts).add_support("seat", (x0 + back, y0 + back), (x0 + deep, y1), z)
+    return body.add_support("long_seat", (x0 + deep, y0 + back), (x1, y0 + deep), z)
 
 
 def bed(size_m: Vec3) -> Body:
     """Mattress on a frame with legs and a headboard at the back; the foot of the bed is its front."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    body = Body()
     z = z0 + clamp(0.55, 0.3 * size_m[2], 0.72 * size_m[2])
     feet = 0.3 * (z - z0)
     head = clamp(0.03 * size_m[0], 0.02, 0.08)
-    body.parts = [
+    parts = [
         box((x0 + head, y0, z0 + feet), (x1, y1, z)),
         box((x0, y0, z0), (x0 + head, y1, z1)),
         *legs((x0 + head, y0), (x1, y1), (z0, z0 + feet), clamp(0.06 * min(size_m[:2]), 0.03, 0.1)),
     ]
-    body.add_support("mattress", (x0 + head, y0), (x1, y1), z)
-    return body
+    return Body(parts).add_support("mattress", (x0 + head, y0), (x1, y1), z)
 
 
 def bunk_bed(size_m: Vec3) -> Body:
     """Two mattresses between four posts."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    body = Body()
     post, thickness = 0.06, 0.18
     lower, upper = z0 + 0.28 * size_m[2], z0 + 0.8 * size_m[2]
-    body.parts = legs((x0, y0), (x1, y1), (z0, z1), post)
+    body = Body(legs((x0, y0), (x1, y1), (z0, z1), post))
     for name, z, clearance in (("lower", lower, upper - thickness - lower), ("upper", upper, 2.0)):
         body.parts.append(box((x0 + post, y0, z - thickness), (x1 - post, y1, z)))
         body.add_support(name, (x0 + post, y0), (x1 - post, y1), z, clearance)
@@ -293,5 +267,4 @@ def _with_hutch(lower: Body, size_m: Vec3) -> Body:
     body.supports = [surface for surface in body.supports if surface.interior]
     body.add_support("worktop", (x0 + depth, y0), (-x0, y1), deck)
     body.add_support("under_hutch", (x0, y0 + board), (x0 + depth, y1 - board), deck, z1 - board - deck)
-    body.add_support("top", (x0, y0), (x0 + depth, y1), z1)
-    return body
+    return body.add_support("top", (x0, y0), (x0 + depth, y1), z1)

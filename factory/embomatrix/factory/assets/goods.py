@@ -59,10 +59,9 @@ def cloth(size_m: Vec3) -> Body:
     outer = centred(size_m)
     share = 0.84
     thick = min(size_m) >= LEAST_ROUND_M
-    body = Body(parts=[frustum(outer, share) if thick else box(outer.low_m, outer.high_m)])
+    body = Body([frustum(outer, share) if thick else box_of(outer)])
     (x0, y0, _), (x1, y1, z1) = outer.low_m, outer.high_m
-    body.add_support("top", (share * x0, share * y0), (share * x1, share * y1), z1)
-    return body
+    return body.add_support("top", (share * x0, share * y0), (share * x1, share * y1), z1)
 
 
 def bar(size_m: Vec3) -> Body:
@@ -111,9 +110,8 @@ def _of(shape: Callable[[Aabb], ConvexPart], size_m: Vec3) -> Body:
 def disc(size_m: Vec3) -> Body:
     """Slices, patties, biscuits, lids: flat and round, and flat on top."""
     (_, _, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    body = Body(parts=[prism((0.0, 0.0), (x1, y1), (z0, z1))])
-    body.add_support("top", (-0.7 * x1, -0.7 * y1), (0.7 * x1, 0.7 * y1), z1)
-    return body
+    body = Body([prism((0.0, 0.0), (x1, y1), (z0, z1))])
+    return body.add_support("top", (-0.7 * x1, -0.7 * y1), (0.7 * x1, 0.7 * y1), z1)
 
 
 def soft(size_m: Vec3) -> Body:

@@ -14,7 +14,7 @@ from embomatrix.factory.assets.body import (
 )
 from embomatrix.factory.assets.furniture import legs
 from embomatrix.factory.assets.shapes import box, octagon
-from embomatrix.world.geometry import Aabb, ConvexPart, Vec3
+from embomatrix.world.geometry import Aabb, ConvexPart, Vec2, Vec3
 
 COUNTER_M: Final = 0.9
 """Height of a stall's counter."""
@@ -49,26 +49,25 @@ def fence(size_m: Vec3) -> Body:
     along = 0 if size_m[0] > size_m[1] else 1
     low, high = (x0, y0)[along], (x1, y1)[along]
     count = int(clamp(round((high - low) / 2.0), 1, 6)) + 1
-    thick = min(0.12, 0.2 * (high - low))
     rail = 0.08 * size_m[2]
-    body = Body()
-    for number in range(count):
-        start = low + (high - low - thick) * number / (count - 1)
-        body.parts.append(_across(along, (start, start + thick), (x0, y0), (x1, y1), (z0, z1)))
+    parts = _spaced(size_m, count, min(0.12, 0.2 * (high - low)), (z0, z1))
     inner = (0.4 * x0, 0.4 * y0), (0.4 * x1, 0.4 * y1)  # rails are thinner than posts
     for share in (0.15, 0.5, 0.86):
         foot = z0 + share * size_m[2]
-        body.parts.append(_across(along, (low, high), *inner, (foot, foot + rail)))
-    return body
+        parts.append(_across(along, (low, high), *inner, (foot, foot + rail)))
+    return Body(parts)
 
 
-def _across(
-    along: int,
-    span: tuple[float, float],
-    low: tuple[float, float],
-    high: tuple[float, float],
-    z: tuple[float, float],
-) -> ConvexPart:
+def _spaced(size_m: Vec3, count: int, thickness_m: float, z: Vec2) -> list[ConvexPart]:
+    """Return bars across the model, evenly spaced along its longer side."""
+    (x0, y0, _), (x1, y1, _) = centred(size_m).low_m, centred(size_m).high_m
+    along = 0 if size_m[0] > size_m[1] else 1
+    low, high = (x0, y0)[along], (x1, y1)[along]
+    starts = [low + (high - low - thickness_m) * number / (count - 1) for number in range(count)]
+    return [_across(along, (start, start + thickness_m), (x0, y0), (x1, y1), z) for start in starts]
+
+
+def _across(along: int, span: Vec2, low: Vec2, high: Vec2, z: Vec2) -> ConvexPart:
     """Return a box over ``span`` along one horizontal axis, and from ``low`` to ``high`` along the other."""
     if along == 0:
         return box((span[0], low[1], z[0]), (span[1], high[1], z[1]))
@@ -92,23 +91,16 @@ def stall(size_m: Vec3) -> Body:
     z = z0 + min(COUNTER_M, 0.5 * size_m[2])
     board = clamp(0.03 * size_m[2], 0.006, 0.04)
     body.parts.append(box((x0, y0, z - board), (x1, y1, z)))
-    body.add_support("counter", (x0, y0), (x1, y1), z, z1 - roof_thickness(size_m) - z)
-    return body
+    return body.add_support("counter", (x0, y0), (x1, y1), z, z1 - roof_thickness(size_m) - z)
 
 
 def rungs(size_m: Vec3) -> Body:
     """Two bars on four posts, with rungs between them along the longer side: bicycle racks."""
     (x0, y0, _), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    body = bars(size_m)
-    along = 0 if size_m[0] > size_m[1] else 1
     thick = bar_thickness(size_m)
-    low, high = (x0, y0)[along], (x1, y1)[along]
-    count = int(clamp(round((high - low) / RUNG_M), 2, MOST_RUNGS))
-    for number in range(count):
-        start = low + (high - low - thick) * number / (count - 1)
-        body.parts.append(_across(along, (start, start + thick), (x0, y0), (x1, y1), (z1 - thick, z1)))
-    body.add_support("rungs", (x0, y0), (x1, y1), z1)
-    return body
+    count = int(clamp(round(max(x1 - x0, y1 - y0) / RUNG_M), 2, MOST_RUNGS))
+    parts = [*bars(size_m).parts, *_spaced(size_m, count, thick, (z1 - thick, z1))]
+    return Body(parts).add_support("rungs", (x0, y0), (x1, y1), z1)
 
 
 def bar_thickness(size_m: Vec3) -> float:
@@ -134,13 +126,11 @@ def staircase(size_m: Vec3) -> Body:
     (x0, y0, z0), (x1, y1, _) = centred(size_m).low_m, centred(size_m).high_m
     steps = int(clamp(round(size_m[2] / 0.18), 2, 16))
     tread, rise = size_m[0] / steps, size_m[2] / steps
-    body = Body()
-    for number in range(steps):
-        body.parts.append(
-            box((x0, y0, z0 + number * rise), (x1 - number * tread, y1, z0 + (number + 1) * rise))
-        )
-    body.add_support("step1", (x1 - tread, y0), (x1, y1), z0 + rise)
-    return body
+    parts = [
+        box((x0, y0, z0 + number * rise), (x1 - number * tread, y1, z0 + (number + 1) * rise))
+        for number in range(steps)
+    ]
+    return Body(parts).add_support("step1", (x1 - tread, y0), (x1, y1), z0 + rise)
 
 
 def ladder(size_m: Vec3) -> Body:
@@ -163,16 +153,13 @@ def treadmill(size_m: Vec3) -> Body:
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     deck, console = z0 + 0.16 * size_m[2], z1 - 0.15 * size_m[2]
     rear, arm = x1 - 0.12 * size_m[0], 0.1 * size_m[1]
-    body = Body(
-        parts=[
-            box((x0, y0, z0), (x1, y1, deck)),
-            box((rear, y0, deck), (x1, y0 + arm, console)),
-            box((rear, y1 - arm, deck), (x1, y1, console)),
-            box((x1 - 0.22 * size_m[0], y0, console), (x1, y1, z1)),
-        ]
-    )
-    body.add_support("deck", (x0, y0), (x1 - 0.22 * size_m[0], y1), deck)
-    return body
+    parts = [
+        box((x0, y0, z0), (x1, y1, deck)),
+        box((rear, y0, deck), (x1, y0 + arm, console)),
+        box((rear, y1 - arm, deck), (x1, y1, console)),
+        box((x1 - 0.22 * size_m[0], y0, console), (x1, y1, z1)),
+    ]
+    return Body(parts).add_support("deck", (x0, y0), (x1 - 0.22 * size_m[0], y1), deck)
 
 
 def lorry(size_m: Vec3) -> Body:
@@ -186,9 +173,8 @@ def lorry(size_m: Vec3) -> Body:
         for x in (x0 + 0.06 * size_m[0], x1 - 0.06 * size_m[0] - wheel)
         for y in (y0, y1 - tyre)
     ]
-    body = Body(parts=[box((x0, y0, axle), (x1, y1, deck)), box((cab, y0, deck), (x1, y1, z1)), *wheels])
-    body.add_support("bed", (x0, y0), (cab, y1), deck)
-    return body
+    body = Body([box((x0, y0, axle), (x1, y1, deck)), box((cab, y0, deck), (x1, y1, z1)), *wheels])
+    return body.add_support("bed", (x0, y0), (cab, y1), deck)
 
 
 _SLIM: Final = (-0.12, 0.12)
@@ -226,31 +212,26 @@ def urinal(size_m: Vec3) -> Body:
     back, rim = x0 + 0.25 * size_m[0], z0 + 0.5 * size_m[2]
     wall = clamp(0.08 * min(size_m), 0.005, 0.03)
     parts, cavity = shell(Aabb((back, y0, z0), (x1, y1, rim)), Walls(0.0, wall, wall, wall, wall, 0.0))
-    body = Body(parts=[box((x0, y0, z0), (back, y1, z1)), *parts])
-    body.add_interior("bowl", cavity, clearance_m=OPEN_ABOVE_M)
-    return body
+    body = Body([box((x0, y0, z0), (back, y1, z1)), *parts])
+    return body.add_interior("bowl", cavity, clearance_m=OPEN_ABOVE_M)
 
 
 def workstation(size_m: Vec3) -> Body:
     """Walls on three sides of an open front: cubicles, booths, stalls."""
-    outer = centred(size_m)
     wall = clamp(0.04 * min(size_m[:2]), 0.01, 0.06)
-    parts, _ = shell(outer, Walls(wall, 0.0, wall, wall, 0.0, 0.0))
-    return Body(parts=parts)
+    return Body(shell(centred(size_m), Walls(wall, 0.0, wall, wall, 0.0, 0.0))[0])
 
 
 def microscope(size_m: Vec3) -> Body:
     """A foot, an arm behind and a head that reaches forward."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     foot, head, arm = z0 + 0.15 * size_m[2], z1 - 0.3 * size_m[2], x0 + 0.35 * size_m[0]
-    body = Body(parts=proportioned(size_m, _MICROSCOPE))
-    body.add_support("stage", (arm, y0), (x1, y1), foot, head - foot)
-    return body
+    body = Body(proportioned(size_m, _MICROSCOPE))
+    return body.add_support("stage", (arm, y0), (x1, y1), foot, head - foot)
 
 
 def wheeled_board(size_m: Vec3) -> Body:
     """A board on two axles: skateboards, scooters."""
     outer = centred(size_m)
-    body = Body(parts=proportioned(size_m, _WHEELED_BOARD))
-    body.add_support("deck", outer.low_m[:2], outer.high_m[:2], outer.high_m[2])
-    return body
+    body = Body(proportioned(size_m, _WHEELED_BOARD))
+    return body.add_support("deck", outer.low_m[:2], outer.high_m[:2], outer.high_m[2])

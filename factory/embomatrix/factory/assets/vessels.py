@@ -13,10 +13,11 @@ from embomatrix.factory.assets.body import (
     clamp,
     hinged,
     region,
+    spanning,
     stacked,
 )
 from embomatrix.factory.assets.cabinets import SHALLOW_M
-from embomatrix.factory.assets.shapes import box, inscribed, octagon, prism, ring, shouldered
+from embomatrix.factory.assets.shapes import box, box_of, inscribed, octagon, prism, ring, shouldered
 from embomatrix.world.geometry import Aabb, ConvexPart, Vec2, Vec3
 
 
@@ -133,14 +134,13 @@ def _stem(body: Body, shape: _Round, z: Vec2, share: float) -> float:
 def lidded_vessel(size_m: Vec3) -> Body:
     """A pot or jar with a lid that is hinged at the back."""
     outer = centred(size_m)
-    body = Body()
     shape = _Round((0.0, 0.0), outer.high_m[:2])
     lid = clamp(0.1 * size_m[2], 0.004, 0.04)
     style = VesselStyle(wall_share=max(0.06, 2 * lid / min(size_m[:2])))
     z1 = outer.high_m[2] - lid
+    panel = spanning(outer, 2, (z1 + min(FIT_M, 0.2 * lid), outer.high_m[2]))
+    body = Body(moving=[hinged("lid", panel, Hinge.BACK)])
     _cup(body, shape, (outer.low_m[2], z1), style, ("lid",))
-    panel = Aabb((*outer.low_m[:2], z1 + min(FIT_M, 0.2 * lid)), outer.high_m)
-    body.moving.append(hinged("lid", panel, Hinge.BACK))
     return body
 
 
@@ -149,16 +149,15 @@ def blender(size_m: Vec3) -> Body:
     outer = centred(size_m)
     motor = 0.35 * size_m[2]
     jar = lidded_vessel((size_m[0], size_m[1], size_m[2] - motor))
-    body = Body(parts=[box(outer.low_m, (*outer.high_m[:2], outer.low_m[2] + motor))])
-    return stacked(body, jar, motor / 2)
+    block = box_of(spanning(outer, 2, (outer.low_m[2], outer.low_m[2] + motor)))
+    return stacked(Body([block]), jar, motor / 2)
 
 
 def plate(size_m: Vec3) -> Body:
     """A flat disc without a rim, so that food may reach over its edge: a steak is larger than most plates."""
     (_, _, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    body = Body(parts=octagon((0.0, 0.0), (x1, y1), (z0, z1)))
-    body.add_support("top", (-0.7 * x1, -0.7 * y1), (0.7 * x1, 0.7 * y1), z1)
-    return body
+    body = Body(octagon((0.0, 0.0), (x1, y1), (z0, z1)))
+    return body.add_support("top", (-0.7 * x1, -0.7 * y1), (0.7 * x1, 0.7 * y1), z1)
 
 
 def bottle(size_m: Vec3) -> Body:
