@@ -36,26 +36,11 @@ class TreeError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class RelationNode:
-    """Children of an object in one relation."""
-
-    relation: LayoutRelation
-    children: tuple[ObjectNode, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class ObjectNode:
-    """Object, or the floor at the root, with its relations."""
-
-    name: str
-    relations: tuple[RelationNode, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
 class LayoutTree:
-    """Layout tree of a room. Every object has one parent; the root has none."""
+    """Layout tree of a room: the children of each object by relation. Every object has one parent; the root has none."""
 
-    root: ObjectNode
+    root: str
+    children: Mapping[str, Mapping[LayoutRelation, Sequence[str]]]
 
     @staticmethod
     def of(root: str, branches: Iterable[Branch]) -> LayoutTree:
@@ -70,39 +55,35 @@ class LayoutTree:
                 )
             parents[branch.child] = branch.parent
             children[branch.parent].setdefault(branch.relation, []).append(branch.child)
-        reached: set[str] = set()
-
-        def node(name: str) -> ObjectNode:
-            reached.add(name)
-            return ObjectNode(
-                name,
-                tuple(
-                    RelationNode(relation, tuple(node(child) for child in names))
-                    for relation, names in children[name].items()
-                ),
-            )
-
-        made = node(root)
+        tree = LayoutTree(root, children)
+        reached = {branch.child for branch in tree.branches()}
         if loose := [name for name in parents if name not in reached]:
             raise TreeError(
                 f"{loose[0]!r} has the parent {parents[loose[0]]!r}, which is not connected to the root {root!r}: name an "
                 "object of the room as its parent"
             )
-        return LayoutTree(made)
+        return tree
 
     def branches(self) -> Iterator[Branch]:
         """Yield all edges, parents before children."""
         waiting = [self.root]
-        while waiting:
-            parent = waiting.pop(0)
-            for node in parent.relations:
-                for child in node.children:
-                    yield Branch(parent.name, node.relation, child.name)
+        for parent in waiting:  # grows during the iteration
+            for relation, names in self.children.get(parent, {}).items():
+                for child in names:
+                    yield Branch(parent, relation, child)
                     waiting.append(child)
 
     def nested(self) -> dict[str, Any]:
         """Return nested mappings of object and relation names, in the form of the paper's trees."""
-        return {self.root.name: _nested(self.root)}
+
+        def below(name: str) -> dict[str, Any]:
+            relations = self.children.get(name, {})
+            return {
+                relation.value: {child: below(child) for child in names}
+                for relation, names in relations.items()
+            }
+
+        return {self.root: below(self.root)}
 
     def pruned(self, names: Iterable[str]) -> LayoutTree:
         """Return the part of the tree that leads to these objects."""
@@ -112,20 +93,18 @@ class LayoutTree:
             while name in above and name not in kept:
                 kept.add(name)
                 name = above[name].parent
-        return LayoutTree.of(self.root.name, [branch for branch in self.branches() if branch.child in kept])
+        return LayoutTree.of(self.root, [branch for branch in self.branches() if branch.child in kept])
 
     def drawn(self, labels: Mapping[str, str] | None = None) -> str:
         """Return the tree as indented lines. ``labels`` are appended to object names."""
-        lines = [self.root.name]
+        lines = [self.root]
 
-        def add(node: ObjectNode, indent: str) -> None:
-            for group in node.relations:
-                for child in group.children:
-                    label = (labels or {}).get(child.name, "")
-                    lines.append(
-                        f"{indent}{group.relation.value}: {child.name}{f'  ({label})' if label else ''}"
-                    )
-                    add(child, indent + "  ")
+        def add(parent: str, indent: str) -> None:
+            for relation, names in self.children.get(parent, {}).items():
+                for name in names:
+                    label = (labels or {}).get(name, "")
+                    lines.append(f"{indent}{relation.value}: {name}{f'  ({label})' if label else ''}")
+                    add(name, indent + "  ")
 
         add(self.root, "  ")
         return "\n".join(lines)
@@ -144,13 +123,6 @@ def tree_in(objects: Iterable[SceneObject], room: str, names: Iterable[str]) -> 
     ]
     known = {branch.child for branch in branches} | {room}
     return LayoutTree.of(room, [branch for branch in branches if branch.parent in known]).pruned(names)
-
-
-def _nested(node: ObjectNode) -> dict[str, Any]:
-    return {
-        group.relation.value: {child.name: _nested(child) for child in group.children}
-        for group in node.relations
-    }
 
 
 MAX_ATTEMPTS: Final = 3
