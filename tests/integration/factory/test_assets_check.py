@@ -8,10 +8,10 @@ import pytest
 from typer.testing import CliRunner
 
 from embomatrix.factory.assets.check import EXCUSED_FROM_PROBE, PROBE_M, AssetFinding, AssetRule, check_asset
-from embomatrix.factory.assets.contact_sheet import TILE_PX, draw_sheet
 from embomatrix.factory.assets.families import Family
 from embomatrix.factory.assets.library import build_asset, family_of
 from embomatrix.factory.commands.assets import app
+from embomatrix.factory.pictures.assets import TILE_PX, draw_sheet
 from embomatrix.world.asset import Asset, Interior, Joint, JointKind, Link
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import ConvexPart, Pose, Shape

@@ -11,12 +11,12 @@ from rich.console import Console
 from rich.table import Table
 
 from embomatrix.factory.assets.check import GLANCE_STEPS, STEPS, AssetRule, check_asset, check_standing
-from embomatrix.factory.assets.contact_sheet import draw_sheet
 from embomatrix.factory.assets.library import build_asset, family_of
 from embomatrix.factory.importers.assemble import ImportedAsset, import_model, read_model
 from embomatrix.factory.importers.convex import Coacd, by_components
 from embomatrix.factory.importers.model import AxisConvention, ModelFileError
 from embomatrix.factory.importers.shelf import save_asset
+from embomatrix.factory.pictures.assets import draw_sheet
 from embomatrix.sim.engine import EngineError
 from embomatrix.world.asset import Asset, Credit
 from embomatrix.world.catalog import Catalog, CatalogError

@@ -4,8 +4,6 @@ The page needs no other file. All text of a dataset is untrusted: it is escaped 
 close its element.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 import json
@@ -13,22 +11,19 @@ import re
 from html import escape
 from importlib import resources
 from string import Template
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
-from PIL import Image
 
 from embomatrix.factory.inspection.plan_view import inspection_view
+from embomatrix.factory.inspection.playing import OraclePlayback, PlayMoment
+from embomatrix.factory.pictures.sheet import draw_oblique
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.pages.head import page_head
 from embomatrix.pages.plan_view import PlanView
-from embomatrix.sim.bullet.camera import render_oblique
+from embomatrix.world.dataset import TaskRecord
 from embomatrix.world.evaluate import objects_of
 from embomatrix.world.scene import Scene
-
-if TYPE_CHECKING:
-    from embomatrix.factory.inspection.playing import OraclePlayback, PlayMoment
-    from embomatrix.world.dataset import TaskRecord
 
 TEMPLATE: Final = "page.html"
 PICTURE_PX: Final = (960, 720)
@@ -151,12 +146,9 @@ def _tree(node: object) -> str:
 
 
 def scene_jpeg(scene: Scene, size_px: tuple[int, int] = PICTURE_PX) -> bytes:
-    """Return an oblique view as JPEG. It is rendered at twice the size, since Bullet's renderer leaves jagged edges."""
-    width, height = size_px
-    pixels = np.asarray(render_oblique(scene, width_px=2 * width, height_px=2 * height))
-    picture = Image.fromarray(pixels).convert("RGB").resize(size_px, Image.Resampling.LANCZOS)
+    """Return an oblique view as JPEG."""
     data = io.BytesIO()
-    picture.save(data, "JPEG", quality=82)
+    draw_oblique(scene, size_px).save(data, "JPEG", quality=82)
     return data.getvalue()
 
 

@@ -1,5 +1,6 @@
 """Pictures of every relation: small rendered scenes, each with the simulator's verdict."""
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -8,6 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from embomatrix.factory.assets.library import build_asset
+from embomatrix.factory.pictures.sheet import in_rows
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.visual_scene import VisualScene
 from embomatrix.sim.geometry.bounds import AssetBounds
@@ -103,25 +105,17 @@ PANELS: Final = (
 
 def draw_relations() -> Image.Image:
     """Return all panels in rows of four. Raises EngineError if pybullet is missing."""
-    width, height = PANEL_PX[0], PANEL_PX[1] + LABEL_PX
-    sheet = Image.new("RGB", (COLUMNS * width, -(-len(PANELS) // COLUMNS) * height), "white")
-    for number, panel in enumerate(PANELS):
-        row, column = divmod(number, COLUMNS)
-        sheet.paste(_drawn(panel), (column * width, row * height))
-    return sheet
+    return in_rows([(_drawn(panel), "") for panel in PANELS], COLUMNS)
 
 
 def verdict(panel: RelationPicture) -> bool:
     """Return the simulator's verdict on a panel's relation."""
     scene = panel_scene(panel)
-    engine = BulletEngine(scene)
-    try:
+    with contextlib.closing(BulletEngine(scene)) as engine:
         relations = Relations(engine)
         if panel.predicate == State.OPEN:
             return relations.open(panel.b)
         return relations.holds(Relation(panel.predicate), panel.a, panel.b)
-    finally:
-        engine.close()
 
 
 def panel_scene(panel: RelationPicture) -> Scene:

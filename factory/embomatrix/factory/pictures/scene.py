@@ -2,11 +2,11 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageOps
 
 from embomatrix.factory.pictures.labels import GAP, Box, Labels, boxes
 from embomatrix.factory.pictures.legend import counted, draw_legend, in_order
@@ -64,30 +64,20 @@ def draw_plan(scene: Scene) -> Image.Image:
     plan.small_things()
     plan.robot()
     lines = plan.label()
-    legend = draw_legend(
-        [(FILL[kind], words) for kind, words in _LEGEND], [*_SIGNS, "", *lines], plan.image.height
-    )
-    whole = Image.new("RGB", (plan.image.width + legend.width, plan.image.height), "white")
+    height = max(plan.image.height, _LEAST_HEIGHT_PX)
+    legend = draw_legend([(FILL[kind], words) for kind, words in _LEGEND], [*_SIGNS, "", *lines], height)
+    whole = Image.new("RGB", (plan.image.width + legend.width, height), "white")
     whole.paste(plan.image, (0, 0))
     whole.paste(legend, (plan.image.width, 0))
     return whole
 
 
-def draw_building(
-    draw: ImageDraw.ImageDraw, scene: Scene, box: Callable[[float, float, float, float], Box]
-) -> None:
-    """Draw rooms, walls and windows. ``box`` converts a rectangle (x0, y0, x1, y1) in metres to pixels."""
-    for number, room in enumerate(scene.rooms):
-        draw.rectangle(box(*room.low_m, *room.high_m), fill=PALE[number % len(PALE)])
-    for wall in scene.walls:
-        around = wall.aabb(IDENTITY)
-        if around.low_m[2] <= 0.1:
-            panel = min(wall.size_m[:2]) < 0.1
-            draw.rectangle(box(*around.low_m[:2], *around.high_m[:2]), fill="#b5522b" if panel else "#3a3a3a")
-    for window in scene.windows:
-        a, b = (window.width_m / 2, _PANE_M) if window.along == "x" else (_PANE_M, window.width_m / 2)
-        x, y = window.center_m
-        draw.rectangle(box(x - a, y - b, x + a, y + b), fill="#6fc3e8")
+def draw_thumbnail(scene: Scene, side_px: int) -> Image.Image:
+    """Return rooms, walls, openings and furniture from above without text, fitted into a square."""
+    plan = _Plan(scene)
+    plan.building()
+    plan.furniture()
+    return ImageOps.pad(plan.image, (side_px, side_px), color="white")
 
 
 def is_overhead(box: Aabb) -> bool:
@@ -122,7 +112,7 @@ class _Plan:
             max(_LONG_SIDE_PX / longest, min(_COARSEST_PX_PER_M, _LONGEST_SIDE_PX / longest)),
         )
         width, height = (int(side * self._scale) + 2 * _MARGIN_PX for side in extent)
-        self.image = Image.new("RGB", (width, max(height, _LEAST_HEIGHT_PX)), "white")
+        self.image = Image.new("RGB", (width, height), "white")
         self._draw = ImageDraw.Draw(self.image)
         self._small = [o for o in scene.objects if self._is_small(o)]
         self._named: list[tuple[SceneObject, Box, str]] = []
@@ -131,12 +121,19 @@ class _Plan:
         """Boxes that text avoids if possible: dots, fronts, lights, the robot."""
 
     def building(self) -> None:
-        def box(x0: float, y0: float, x1: float, y1: float) -> Box:
-            # In the plan of a single room, walls are clipped to the room.
-            low, high = (np.clip(each, self._low, self._high).tolist() for each in ((x0, y0), (x1, y1)))
-            return _ordered([self._px(*low), self._px(*high)])
-
-        draw_building(self._draw, self._scene, box)
+        for number, room in enumerate(self._scene.rooms):
+            self._draw.rectangle(self._box(room.low_m, room.high_m), fill=PALE[number % len(PALE)])
+        for wall in self._scene.walls:
+            around = wall.aabb(IDENTITY)
+            if around.low_m[2] <= 0.1:
+                fill = "#b5522b" if min(wall.size_m[:2]) < 0.1 else "#3a3a3a"
+                # In the plan of a single room, walls are clipped to the room.
+                low, high = np.clip([around.low_m[:2], around.high_m[:2]], self._low, self._high)
+                self._draw.rectangle(self._box(low, high), fill=fill)
+        for window in self._scene.windows:
+            a, b = (window.width_m / 2, _PANE_M) if window.along == "x" else (_PANE_M, window.width_m / 2)
+            x, y = window.center_m
+            self._draw.rectangle(self._box((x - a, y - b), (x + a, y + b)), fill="#6fc3e8")
         for door in self._scene.doorways:
             a, b = (door.width_m / 2, 0.0) if door.along == "x" else (0.0, door.width_m / 2)
             x, y = door.center_m
@@ -152,7 +149,7 @@ class _Plan:
                 continue
             kind = kind_of(self._scene, item, box)
             outline = "#7a5fa8" if kind == "hung" else "#555555"
-            corners = _ordered([self._px(*box.low_m[:2]), self._px(*box.high_m[:2])])
+            corners = self._box(box.low_m, box.high_m)
             self._draw.rectangle(
                 corners, fill=None if kind == "hung" else FILL[kind], outline=outline, width=2
             )
@@ -202,7 +199,7 @@ class _Plan:
     def _label_rooms(self, labels: Labels) -> None:
         standing = boxes([*(box for _, box, _ in self._named), *self._marks])
         for room in self._scene.rooms:
-            box = _ordered([self._px(*room.low_m), self._px(*room.high_m)])
+            box = self._box(room.low_m, room.high_m)
             size = f"{room.size_m[0]:.1f} x {room.size_m[1]:.1f} m"
             if not any(
                 labels.inside(words, box, _ROOM_COLOR, standing)
@@ -256,6 +253,11 @@ class _Plan:
         x, y = zip(*corners, strict=True)
         self._marks.append((min(x), min(y), max(x), max(y)))
 
+    def _box(self, low_m: Sequence[float], high_m: Sequence[float]) -> Box:
+        """Return a rectangle of the floor in pixels."""
+        (left, bottom), (right, top) = self._px(*low_m[:2]), self._px(*high_m[:2])
+        return (left, top, right, bottom)
+
     def _px(self, x: float, y: float) -> tuple[int, int]:
         return (
             int(_MARGIN_PX + (x - self._low[0]) * self._scale),
@@ -273,8 +275,3 @@ def _area(box: Box) -> int:
 
 def _middle(box: Box) -> tuple[int, int]:
     return (box[0] + box[2]) // 2, (box[1] + box[3]) // 2
-
-
-def _ordered(corners: Sequence[tuple[int, int]]) -> Box:
-    (a, b), (c, d) = corners
-    return (min(a, c), min(b, d), max(a, c), max(b, d))

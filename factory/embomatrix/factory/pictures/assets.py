@@ -5,9 +5,10 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
 from embomatrix.factory.assets.shapes import mesh_of
+from embomatrix.factory.pictures.sheet import in_rows
 from embomatrix.sim.geometry.bounds import joint_motion
 from embomatrix.world.asset import Asset
 from embomatrix.world.geometry import IDENTITY, FloatArray
@@ -29,20 +30,20 @@ def draw_sheet(assets: Sequence[Asset], columns: int = _COLUMNS) -> Image.Image:
     tiles = [(asset, 0.0) for asset in assets]
     tiles += [(asset, OPEN_SHARE) for asset in assets if asset.joints]
     tiles.sort(key=lambda tile: tile[0].asset_id)
-    rows = math.ceil(len(tiles) / columns)
-    sheet = Image.new("RGB", (columns * TILE_PX, rows * (TILE_PX + _TEXT_PX)), "white")
-    draw = ImageDraw.Draw(sheet)
-    font = ImageFont.load_default(size=10)
-    for number, (asset, share) in enumerate(tiles):
-        x, y = number % columns * TILE_PX, number // columns * (TILE_PX + _TEXT_PX)
-        _draw_asset(draw, asset, share, (x, y))
-        size = " x ".join(f"{extent:.2f}" for extent in asset.size_m)
-        draw.text((x + 4, y + TILE_PX), f"{asset.category[:30]}\n{size}", fill="black", font=font, spacing=1)
-    return sheet
+    named = [
+        (_draw_asset(asset, share), f"{asset.category[:30]}\n{_metres(asset)}") for asset, share in tiles
+    ]
+    return in_rows(named, columns, caption_px=_TEXT_PX)
 
 
-def _draw_asset(draw: ImageDraw.ImageDraw, asset: Asset, share: float, corner: tuple[int, int]) -> None:
+def _metres(asset: Asset) -> str:
+    return " x ".join(f"{extent:.2f}" for extent in asset.size_m)
+
+
+def _draw_asset(asset: Asset, share: float) -> Image.Image:
     """Draw faces from back to front: parts are convex and do not interlock, so this order is nearly right."""
+    tile = Image.new("RGB", (TILE_PX, TILE_PX), "white")
+    draw = ImageDraw.Draw(tile)
     faces, colors = _faces(asset, share)
     right, up, toward = _camera()
     flat = np.stack((faces @ right, faces @ up), axis=-1)  # (n, 3, 2)
@@ -51,8 +52,9 @@ def _draw_asset(draw: ImageDraw.ImageDraw, asset: Asset, share: float, corner: t
     middle = (low + high) / 2
     for k in np.argsort((faces @ toward).mean(axis=1)):
         points = (flat[k] - middle) * scale
-        polygon = [(corner[0] + TILE_PX / 2 + x, corner[1] + TILE_PX / 2 - y) for x, y in points.tolist()]
+        polygon = [(TILE_PX / 2 + x, TILE_PX / 2 - y) for x, y in points.tolist()]
         draw.polygon(polygon, fill=tuple(colors[k]))
+    return tile
 
 
 def _camera() -> tuple[FloatArray, FloatArray, FloatArray]:
