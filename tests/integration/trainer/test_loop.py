@@ -13,17 +13,16 @@ from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 from embomatrix.trainer.cluster.gateway import Gateway
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import OnLost, read_settings
-from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.grpo.update import Updater
-from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, read_state
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
 from embomatrix.trainer.lifecycle.stopwatch import Activity
 from embomatrix.trainer.logging.display import LineDisplay, LiveDisplay
 from embomatrix.trainer.logging.outcome import read_outcome
 from embomatrix.trainer.logging.recorder import read_metrics
 from embomatrix.trainer.logging.report import success_rows, time_rows
 from embomatrix.trainer.policy.loading import new_policy, saved_policy
-from embomatrix.trainer.policy.prompts import PromptBuilder
-from embomatrix.trainer.run.loop import REFERENCE, RunComponents, TrainingRun
+from embomatrix.trainer.run.loop import TrainingRun
+from embomatrix.trainer.run.starting import REFERENCE, RunStart
 
 TINY = {"tiny.layers": 2, "tiny.width": 32, "tiny.heads": 2, "tiny.inner": 64}
 SHORT = {
@@ -36,6 +35,8 @@ SHORT = {
     "grpo.chunk": 2,
     "grpo.max_new": 24,
     "evaluation.samples": 2,
+    "prompt.rename_share": 0.5,
+    "prompt.drop_share": 0.5,
     "checkpoint_every": 3,
     "samples_every": 1,
 }
@@ -46,21 +47,20 @@ SAMPLING, WAITING, UPDATE = Activity.SAMPLING, Activity.WAITING, Activity.UPDATE
 def run(out, cluster=None, tasks=TASKS, resume=False, display=None, **changes):
     settings = read_settings(None, {**TINY, **SHORT, **{k.replace("__", "."): v for k, v in changes.items()}})
     cluster = cluster or SymbolicCluster(tasks)
-    progress = reference = None
+    progress, reference = TrainingProgress(), None
     policy = new_policy(settings, tasks)
     if resume:
         newest = CheckpointStore(out / CHECKPOINTS, keep=9).latest()
         progress, settings = read_state(newest)
         policy = saved_policy(newest / "policy", settings)
         reference = saved_policy(out / REFERENCE, settings).frozen_copy()
-    prompt_builder = PromptBuilder(policy, settings.prompt.rows, Variation(tasks.kinds, 0.5, 0.5))
+    start = RunStart(settings, tasks, policy, progress, reference)
     display = display or LineDisplay(Console(quiet=True))
     with (
         Gateway(lambda: cluster, tasks.bundle_bytes, run_name="test", run_seed=0) as gateway,
         display,
     ):
-        parts = RunComponents(policy, prompt_builder, tasks, gateway, display, reference)
-        return TrainingRun(parts, settings, out, progress).run(), policy
+        return TrainingRun(start, gateway, display, out).run(), policy
 
 
 def weights(policy):
@@ -101,7 +101,9 @@ def test_run_writes_report_metrics_samples_and_the_newest_checkpoints(tmp_path):
     assert {"step", "task", "instruction", "text", "reward", "advantage"} <= set(sample)
     assert [path.name for path in (tmp_path / CHECKPOINTS).iterdir()] == ["step-000006"]
     assert summary.checkpoint.name == "step-000006"
-    assert sum(seconds for _, seconds, _ in time_rows(summary)) == pytest.approx(summary.wall_s)
+    assert sum(seconds for _, seconds, _ in time_rows(summary.outcome)) == pytest.approx(
+        summary.outcome.wall_s
+    )
     assert success_rows(summary)[0][0] == "all tasks"
     outcome = read_outcome(tmp_path)
     assert (outcome.steps, outcome.rollouts, len(outcome.before), len(outcome.after)) == (6, 96, 4, 4)
@@ -148,7 +150,7 @@ def test_every_step_announces_its_window(tmp_path):
 def test_group_with_a_lost_rollout_is_left_out_of_the_update(tmp_path):
     summary, policy = run(tmp_path / "a", SymbolicCluster(TASKS, lose_first=True))
     reference = saved_policy(tmp_path / "a" / REFERENCE, read_settings(None, {}))
-    assert summary.lost > 0
+    assert summary.outcome.lost > 0
     assert torch.equal(weights(policy), weights(reference))
     _, moved = run(tmp_path / "b", SymbolicCluster(TASKS, lose_first=True), grpo__on_lost=OnLost.PARTIAL)
     assert not torch.equal(weights(moved), weights(reference))

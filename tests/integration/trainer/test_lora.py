@@ -17,15 +17,14 @@ from embomatrix.trainer.config.settings import (
     LoraSettings,
     read_settings,
 )
-from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.evaluation.models import load_model
-from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, read_state
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
 from embomatrix.trainer.logging.display import LineDisplay
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.loading import new_policy, saved_policy
 from embomatrix.trainer.policy.lora import ADAPTERS
-from embomatrix.trainer.policy.prompts import PromptBuilder
-from embomatrix.trainer.run.loop import REFERENCE, RunComponents, TrainingRun
+from embomatrix.trainer.run.loop import TrainingRun
+from embomatrix.trainer.run.starting import REFERENCE, RunStart
 
 TASKS = make_tasks(6, 2, objects=8)
 SHAPE = LoraSettings(rank=4, alpha=8.0)
@@ -95,7 +94,7 @@ def scored(policy, *, rows=4):
 
 def train(out, changes, *, resume=False):
     settings = read_settings(None, {**SHORT, **changes}, LANGUAGE_MODEL_DEFAULTS)
-    progress = reference = None
+    progress, reference = TrainingProgress(), None
     if resume:
         newest = CheckpointStore(out / CHECKPOINTS, keep=9).latest()
         progress, settings = read_state(newest)
@@ -103,11 +102,10 @@ def train(out, changes, *, resume=False):
         reference = saved_policy(out / REFERENCE, settings).frozen_copy()
     else:
         policy = new_policy(settings, TASKS)
-    prompt_builder = PromptBuilder(policy, settings.prompt.rows, Variation(TASKS.kinds, 0.0, 0.5))
+    start = RunStart(settings, TASKS, policy, progress, reference)
     display = LineDisplay(Console(quiet=True))
     with Gateway(lambda: SymbolicCluster(TASKS), TASKS.bundle_bytes, run_name="lora", run_seed=0) as gateway:
-        parts = RunComponents(policy, prompt_builder, TASKS, gateway, display, reference)
-        summary = TrainingRun(parts, settings, out, progress).run()
+        summary = TrainingRun(start, gateway, display, out).run()
     return policy, summary
 
 

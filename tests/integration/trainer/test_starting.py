@@ -13,7 +13,7 @@ from embomatrix.trainer.data.tasks import load_tasks
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.run import starting
-from embomatrix.trainer.run.starting import resume_run, start_run
+from embomatrix.trainer.run.starting import REFERENCE, resume_run, start_run
 
 SMALL = {"tiny.layers": 1, "tiny.width": 16, "tiny.heads": 2, "tiny.inner": 16, "threads": 1}
 
@@ -31,6 +31,8 @@ def begun(kitchen, tmp_path):
         start = start_run(kitchen, tmp_path, "tiny", None, SMALL)
         start.progress.grpo_ready = grpo_ready
         start.progress.imitation.step = start.progress.step = 1
+        if grpo_ready:
+            start.policy.save(tmp_path / REFERENCE)
         store = CheckpointStore(tmp_path / CHECKPOINTS, keep=1)
         return store.save(start.policy, {}, start.progress, start.settings)
 
@@ -118,6 +120,7 @@ def test_resume_accepts_the_same_saved_policy(kitchen, tmp_path, begun):
     policy, arm = str(begun() / "policy"), tmp_path / "arm"
     start = start_run(kitchen, arm, policy, None, SMALL)
     start.progress.grpo_ready = True
+    start.policy.save(arm / REFERENCE)
     CheckpointStore(arm / CHECKPOINTS, keep=1).save(start.policy, {}, start.progress, start.settings)
     assert resume_run(kitchen, arm, {"imitation.seconds": 0.0}, model=policy).settings.model == policy
 

@@ -11,19 +11,24 @@ from tests.fakes.symbolic_household import make_tasks
 
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import read_settings
-from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.imitation.optimiser import ImitationOptimiser
 from embomatrix.trainer.imitation.teacher_forcing import Imitation
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
 from embomatrix.trainer.logging.display import LineDisplay, LiveDisplay
 from embomatrix.trainer.logging.recorder import IMITATION, Recorder
 from embomatrix.trainer.policy.loading import new_policy, saved_policy
-from embomatrix.trainer.policy.prompts import PromptBuilder
 from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.run.imitation import run_imitation
+from embomatrix.trainer.run.starting import RunStart
 
 TINY = {"tiny.layers": 1, "tiny.width": 32, "tiny.heads": 2, "tiny.inner": 64}
-SHORT = {"imitation.steps": 12, "imitation.batch": 4, "imitation.learning_rate": 8e-3}
+SHORT = {
+    "imitation.steps": 12,
+    "imitation.batch": 4,
+    "imitation.learning_rate": 8e-3,
+    "prompt.rename_share": 0.5,
+    "prompt.drop_share": 0.5,
+}
 STOPPING = {"imitation.patience": 2, "imitation.validate_every": 4, "imitation.validation_share": 0.2}
 TASKS = make_tasks(20, 0, objects=7)
 
@@ -41,7 +46,6 @@ def imitate(out, settings, cut_after=None, tasks=TASKS, display=None):
     newest = store.latest()
     progress = read_state(newest)[0] if newest else TrainingProgress()
     policy = saved_policy(newest / "policy", settings) if newest else new_policy(settings, tasks)
-    prompt_builder = PromptBuilder(policy, 16, Variation(tasks.kinds, 0.5, 0.5))
     steps = []
 
     def report(step):
@@ -51,7 +55,7 @@ def imitate(out, settings, cut_after=None, tasks=TASKS, display=None):
         if cut_after == step.step:
             raise CutError
 
-    run_imitation(policy, prompt_builder, tasks.train, settings, out, progress, Recorder(out), report)
+    run_imitation(RunStart(settings, tasks, policy, progress), out, Recorder(out), report)
     return policy, progress.imitation, steps
 
 

@@ -29,7 +29,7 @@ def test_step_ahead_is_sampled_from_weights_one_step_old(tmp_path):
     summary, policy = trained(tmp_path / "ahead", grpo__overlap=Overlap.AHEAD, grpo__learning_rate=1e-2)
     _, streamed = trained(tmp_path / "stream", grpo__learning_rate=1e-2)
     rows = read_metrics(tmp_path / "ahead")
-    assert summary.steps == 4
+    assert summary.outcome.steps == 4
     assert not torch.equal(weights(policy), weights(streamed))
     assert rows[0]["kl_to_old"] == pytest.approx(0, abs=1e-6)
     assert max(row["kl_to_old"] for row in rows[1:]) > 1e-6
@@ -42,7 +42,7 @@ def test_zero_variance_groups_are_replaced_from_the_reserve(tmp_path):
     rows = read_metrics(tmp_path / "a")
     assert all(4 <= row["groups"] <= 10 for row in rows)
     assert any(row["groups"] > 4 for row in rows)
-    assert sum(row["rollouts"] for row in rows) > without.rollouts
+    assert sum(row["rollouts"] for row in rows) > without.outcome.rollouts
 
 
 def test_step_without_a_signal_has_no_token_means(tmp_path):

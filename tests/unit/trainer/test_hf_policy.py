@@ -17,7 +17,6 @@ from embomatrix.skills.prompt import Codec, prompt_for
 from embomatrix.trainer.cluster.gateway import Gateway
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, LoraSettings, read_settings
-from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.evaluation.models import load_model
 from embomatrix.trainer.lifecycle.checkpoint import CheckpointStore, TrainingProgress
 from embomatrix.trainer.logging.display import LineDisplay
@@ -26,9 +25,8 @@ from embomatrix.trainer.policy.compute_dtype import use_compute_dtype
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.import_gguf import import_gguf
 from embomatrix.trainer.policy.loading import saved_policy
-from embomatrix.trainer.policy.prompts import PromptBuilder
-from embomatrix.trainer.run.loop import RunComponents, TrainingRun
-from embomatrix.trainer.run.starting import default_threads
+from embomatrix.trainer.run.loop import TrainingRun
+from embomatrix.trainer.run.starting import RunStart, default_threads
 
 TASKS = make_tasks(6, 2, objects=8)
 
@@ -181,12 +179,10 @@ def train(policy, out, **changes):
     settings = read_settings(
         None, {k.replace("__", "."): v for k, v in changes.items()}, LANGUAGE_MODEL_DEFAULTS
     )
-    prompt_builder = PromptBuilder(policy, settings.prompt.rows, Variation(TASKS.kinds, 0.0, 0.5))
+    start = RunStart(settings, TASKS, policy, TrainingProgress())
     display = LineDisplay(Console(quiet=True))
     with Gateway(lambda: SymbolicCluster(TASKS), TASKS.bundle_bytes, run_name="hf", run_seed=0) as gateway:
-        return TrainingRun(
-            RunComponents(policy, prompt_builder, TASKS, gateway, display), settings, out
-        ).run()
+        return TrainingRun(start, gateway, display, out).run()
 
 
 def weights(policy):
@@ -205,7 +201,7 @@ def test_random_llama_completes_a_run(policy, tmp_path):
         grpo__max_new=8,
         evaluation__samples=1,
     )
-    assert summary.steps == 2
+    assert summary.outcome.steps == 2
     assert not torch.equal(before, weights(policy))
     assert (summary.checkpoint / "policy" / "config.json").exists()
 
@@ -254,7 +250,7 @@ def test_smollm2_takes_real_grpo_steps(smollm2, tmp_path):
     learnt = [row for row in rows if row["zero_variance_groups"] < 1]
     assert learnt
     assert all(math.isfinite(row[name]) for row in learnt for name in ("gradient_norm", "kl", "reward"))
-    assert summary.rollouts == 18
+    assert summary.outcome.rollouts == 18
     assert not torch.equal(before, weights(policy))
 
 

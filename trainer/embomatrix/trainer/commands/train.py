@@ -197,24 +197,20 @@ def _run(start: RunStart, connect: Connect, out: Path) -> TrainingSummary:
     from embomatrix.trainer.config.settings import OnLost
     from embomatrix.trainer.logging.display import display_on
     from embomatrix.trainer.logging.trackers import trackers_of
-    from embomatrix.trainer.policy.loading import saved_policy
-    from embomatrix.trainer.run.loop import REFERENCE, RunComponents, TrainingRun
+    from embomatrix.trainer.run.loop import TrainingRun
 
-    settings, tasks, policy = start.settings, start.tasks, start.policy
-    grpo_ready = start.progress.grpo_ready
-    reference = saved_policy(out / REFERENCE, settings).frozen_copy() if grpo_ready else None
+    settings = start.settings
     fails_group = settings.grpo.on_lost is OnLost.GROUP
     policy_on_loss = GroupPolicy.RETRY_THEN_FAIL_GROUP if fails_group else GroupPolicy.PARTIAL
     terms = RunTerms(policy_on_loss, reward=settings.reward.settings())
     with (
         Gateway(
-            connect, tasks.bundle_bytes, run_name=out.name, run_seed=settings.seed, terms=terms
+            connect, start.tasks.bundle_bytes, run_name=out.name, run_seed=settings.seed, terms=terms
         ) as gateway,
         trackers_of(settings, out) as trackers,
         display_on(Console()) as display,
     ):
-        parts = RunComponents(policy, start.prompt_builder, tasks, gateway, display, reference)
-        return TrainingRun(parts, settings, out, start.progress, trackers).run()
+        return TrainingRun(start, gateway, display, out, trackers).run()
 
 
 def _imitated(start: RunStart, out: Path) -> ImitationState:
@@ -223,7 +219,7 @@ def _imitated(start: RunStart, out: Path) -> ImitationState:
     from embomatrix.trainer.logging.recorder import Recorder
     from embomatrix.trainer.logging.trackers import trackers_of
     from embomatrix.trainer.run.imitation import run_imitation
-    from embomatrix.trainer.run.loop import REFERENCE
+    from embomatrix.trainer.run.starting import REFERENCE
 
     progress = start.progress
     if progress.grpo_ready:
@@ -231,17 +227,7 @@ def _imitated(start: RunStart, out: Path) -> ImitationState:
             f"imitation of the run in {out} is finished: continue with `embomatrix train --resume`"
         )
     with trackers_of(start.settings, out) as trackers, display_on(Console()) as display:
-        recorder = Recorder(out, trackers)
-        run_imitation(
-            start.policy,
-            start.prompt_builder,
-            start.tasks.train,
-            start.settings,
-            out,
-            progress,
-            recorder,
-            display.imitation,
-        )
+        run_imitation(start, out, Recorder(out, trackers), display.imitation)
     with atomic_folder(out / REFERENCE) as folder:
         start.policy.save(folder)
     return progress.imitation
@@ -269,14 +255,14 @@ def _show_summary(summary: TrainingSummary) -> None:
         _table(
             console, "held-out success, 95 % intervals", ("tasks", "before GRPO", "after", "difference"), rows
         )
-    times = [(name, f"{spent:.0f} s", f"{share:.0%}") for name, spent, share in time_rows(summary)]
+    times = [(name, f"{spent:.0f} s", f"{share:.0%}") for name, spent, share in time_rows(summary.outcome)]
     _table(console, "time by activity", ("activity", "time", "share"), times)
-    stats = summary.stats
+    outcome, stats = summary.outcome, summary.stats
     console.print(
-        f"{summary.imitation_steps} imitation steps, {summary.steps} GRPO steps, {summary.rollouts} rollouts, "
-        f"{summary.lost} lost and masked, {stats.redispatched} re-dispatched; "
+        f"{outcome.imitation_steps} imitation steps, {outcome.steps} GRPO steps, {outcome.rollouts} rollouts, "
+        f"{outcome.lost} lost and masked, {stats.redispatched} re-dispatched; "
         f"{stats.warm_starts} warm and {stats.cold_starts} cold starts, prewarm hits {prewarm_share(stats):.0%}; "
-        f"peak memory {summary.peak_mb:,.0f} MB",
+        f"peak memory {outcome.peak_mb:,.0f} MB",
         highlight=False,
     )
     console.print(f"report      {summary.report}\ncheckpoint  {summary.checkpoint}", highlight=False)

@@ -2,7 +2,7 @@
 
 import html
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,27 +25,19 @@ _CURVES = (
 class TrainingSummary:
     """Results of a finished run. ``checkpoint`` is the newest; ``before`` and ``after`` are None without held-out tasks."""
 
-    model: str
-    steps: int
-    rollouts: int
-    lost: int
-    imitation_steps: int
-    wall_s: float
-    grpo_s: float
-    spent_s: Mapping[str, float]
+    outcome: RunOutcome
     before: HeldOutEvaluation | None
     after: HeldOutEvaluation | None
     stats: RunStats
     checkpoint: Path
     report: Path
-    peak_mb: float = 0.0
 
 
-def time_rows(summary: TrainingSummary) -> list[tuple[str, float, float]]:
+def time_rows(outcome: RunOutcome) -> list[tuple[str, float, float]]:
     """Rows of activity, seconds and share of the wall clock, including a row for the remaining time."""
-    total = max(summary.wall_s, 1e-9)
-    rows = [(name, spent, spent / total) for name, spent in summary.spent_s.items()]
-    rest = max(0.0, summary.wall_s - sum(summary.spent_s.values()))
+    total = max(outcome.wall_s, 1e-9)
+    rows = [(name, spent, spent / total) for name, spent in outcome.spent_s.items()]
+    rest = max(0.0, outcome.wall_s - sum(outcome.spent_s.values()))
     return [*rows, ("other", rest, rest / total)]
 
 
@@ -67,13 +59,8 @@ def success_rows(summary: TrainingSummary) -> list[tuple[str, str, str, str]]:
     return rows
 
 
-def outcome_of(summary: TrainingSummary) -> RunOutcome:
-    """Return the machine-readable part of the summary."""
-    numbers = {field.name: getattr(summary, field.name) for field in fields(RunOutcome)}
-    return RunOutcome(**{**numbers, "before": _rates(summary.before), "after": _rates(summary.after)})
-
-
-def _rates(evaluation: HeldOutEvaluation | None) -> tuple[TaskRate, ...]:
+def rates_of(evaluation: HeldOutEvaluation | None) -> tuple[TaskRate, ...]:
+    """Success rate of each task, none without an evaluation."""
     scores = evaluation.scores if evaluation is not None else ()
     return tuple(
         TaskRate(score.task_id, score.category, score.rate if score.samples else None) for score in scores
@@ -91,10 +78,11 @@ def prewarm_share(stats: RunStats) -> float:
 
 
 def write_report(summary: TrainingSummary, metrics: Sequence[Mapping[str, Any]], machine: str) -> Path:
+    outcome = summary.outcome
     parts = [
-        f"<h1>Training of {html.escape(summary.model)}</h1>",
-        f"<p>{summary.imitation_steps} imitation steps, {summary.steps} GRPO steps, {summary.rollouts} rollouts; "
-        f"{summary.lost} rollouts lost to the infrastructure and masked; "
+        f"<h1>Training of {html.escape(outcome.model)}</h1>",
+        f"<p>{outcome.imitation_steps} imitation steps, {outcome.steps} GRPO steps, {outcome.rollouts} rollouts; "
+        f"{outcome.lost} rollouts lost to the infrastructure and masked; "
         f"{prewarm_share(summary.stats):.0%} of announced scenes warm in time. Machine: {html.escape(machine)}.</p>",
         "<h2>Success on held-out tasks</h2>",
         _table(("tasks", "before GRPO", "after", "difference"), success_rows(summary))
@@ -105,7 +93,7 @@ def write_report(summary: TrainingSummary, metrics: Sequence[Mapping[str, Any]],
         "<h2>Where the time went</h2>",
         _table(
             ("activity", "seconds", "share"),
-            [(name, f"{spent:.1f}", f"{share:.0%}") for name, spent, share in time_rows(summary)],
+            [(name, f"{spent:.1f}", f"{share:.0%}") for name, spent, share in time_rows(outcome)],
         ),
         f"<p>Checkpoint: <code>{html.escape(str(summary.checkpoint))}</code></p>",
     ]

@@ -3,41 +3,29 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from embomatrix.trainer.config.settings import TrainSettings
 from embomatrix.trainer.imitation.teacher_forcing import Imitation, ImitationProgress
-from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, restore
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, restore
 from embomatrix.trainer.logging.recorder import IMITATION, Recorder
-from embomatrix.trainer.policy.prompts import PromptBuilder
-from embomatrix.trainer.policy.protocol import Policy
-
-if TYPE_CHECKING:
-    from embomatrix.trainer.data.tasks import TrainingTask
+from embomatrix.trainer.run.starting import RunStart
 
 LOG_EVERY: Final = 10
 """Steps between two lines of the log. Steps with a validation loss are always logged."""
 
 
 def run_imitation(
-    policy: Policy,
-    prompt_builder: PromptBuilder,
-    tasks: Sequence[TrainingTask],
-    settings: TrainSettings,
-    out: Path,
-    progress: TrainingProgress,
-    recorder: Recorder,
-    report: Callable[[ImitationProgress], None],
+    start: RunStart, out: Path, recorder: Recorder, report: Callable[[ImitationProgress], None]
 ) -> None:
-    """Use up the imitation budget and keep ``progress.imitation`` current. A checkpoint is always left. Raises TrainerError.
-
-    If ``progress`` comes from a checkpoint, the policy must be that checkpoint's.
-    """
+    """Use up the imitation budget and keep the progress current. A checkpoint is always left. Raises TrainerError."""
+    policy, progress, settings = start.policy, start.progress, start.settings
     store = CheckpointStore(out / CHECKPOINTS, keep=settings.keep_checkpoints)
     state = progress.imitation
-    imitation = Imitation(policy, prompt_builder, tasks, settings.imitation, seed=settings.seed, state=state)
+    imitation = Imitation(
+        policy, start.prompt_builder, start.tasks.train, settings.imitation, seed=settings.seed, state=state
+    )
     if state.done:
         return
     newest = store.latest() if state.step else None

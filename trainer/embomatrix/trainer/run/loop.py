@@ -9,7 +9,6 @@ import platform
 import resource
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +17,7 @@ import torch
 
 from embomatrix.host.limits import usable_cores
 from embomatrix.trainer.cluster.gateway import Gateway
-from embomatrix.trainer.config.settings import TrainSettings
-from embomatrix.trainer.data.tasks import Curriculum, Schedule, TaskSet
+from embomatrix.trainer.data.tasks import Curriculum, Schedule
 from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation, evaluate_policy
 from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers
 from embomatrix.trainer.grpo.learner import Learner
@@ -28,84 +26,72 @@ from embomatrix.trainer.grpo.update import StepPlan, Updater
 from embomatrix.trainer.lifecycle.checkpoint import (
     CHECKPOINTS,
     CheckpointStore,
-    TrainingProgress,
     atomic_folder,
     restore,
 )
 from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
 from embomatrix.trainer.lifecycle.stopwatch import Activity, Stopwatch
 from embomatrix.trainer.logging.dashboard import DashboardReporter
-from embomatrix.trainer.logging.outcome import write_outcome
+from embomatrix.trainer.logging.outcome import RunOutcome, write_outcome
 from embomatrix.trainer.logging.recorder import METRICS, SAMPLES, Recorder, read_metrics
-from embomatrix.trainer.logging.report import REPORT, TrainingSummary, outcome_of, write_report
+from embomatrix.trainer.logging.report import REPORT, TrainingSummary, rates_of, write_report
 from embomatrix.trainer.logging.trackers import Tracker
-from embomatrix.trainer.policy.prompts import PromptBuilder
 from embomatrix.trainer.policy.protocol import Policy
 from embomatrix.trainer.run.imitation import run_imitation
+from embomatrix.trainer.run.starting import REFERENCE, RunStart
 
 if TYPE_CHECKING:
     from embomatrix.trainer.logging.display import LineDisplay
 
 logger = logging.getLogger(__name__)
-REFERENCE = "reference"
 RESERVE_STREAM = 1
 
 
-@dataclass(frozen=True)
-class RunComponents:
-    """Objects that a run works with. ``reference`` is given on resume; else it is a copy of the policy after imitation."""
-
-    policy: Policy
-    prompt_builder: PromptBuilder
-    tasks: TaskSet
-    gateway: Gateway
-    display: LineDisplay
-    reference: Policy | None = None
-
-
 class TrainingRun:
-    """One run in one folder. ``progress`` comes from the checkpoint of a resumed run."""
+    """One run in the folder ``out``."""
 
     def __init__(
         self,
-        parts: RunComponents,
-        settings: TrainSettings,
+        start: RunStart,
+        gateway: Gateway,
+        display: LineDisplay,
         out: Path,
-        progress: TrainingProgress | None = None,
         trackers: Sequence[Tracker] = (),
     ) -> None:
-        self._parts = parts
-        self._settings = settings
+        self._start = start
+        self._gateway = gateway
+        self._display = display
+        self._settings = start.settings
         self._out = out
-        self._progress = progress or TrainingProgress()
+        self._progress = start.progress
         self._resumed = self._progress.grpo_ready
         self._stopwatch = Stopwatch()
         self._stopwatch.spent_s.update(self._progress.spent_s)
-        self._store = CheckpointStore(out / CHECKPOINTS, keep=settings.keep_checkpoints)
-        self._reporter = DashboardReporter(parts.gateway.report)
+        self._store = CheckpointStore(out / CHECKPOINTS, keep=start.settings.keep_checkpoints)
+        self._reporter = DashboardReporter(gateway.report)
         self._recorder = Recorder(out, (*trackers, self._reporter))
-        device = next(iter(parts.policy.parameters())).device
-        self._generator = torch.Generator(device).manual_seed(settings.seed)
+        device = next(iter(start.policy.parameters())).device
+        self._generator = torch.Generator(device).manual_seed(start.settings.seed)
 
     def run(self) -> TrainingSummary:
         """Run all phases. Ctrl-C saves a checkpoint for ``--resume`` and is raised again."""
         began_s = time.monotonic()
         earlier_s = sum(self._progress.spent_s.values())
-        reference = self._parts.reference or self._prepare()
+        reference = self._start.reference or self._prepare()
         checkpoint = self._grpo(reference)
         after = self._evaluate("after GRPO")
         summary = self._summary(checkpoint, after, earlier_s + time.monotonic() - began_s)
         write_report(summary, read_metrics(self._out), machine_description())
-        write_outcome(self._out, outcome_of(summary))
+        write_outcome(self._out, summary.outcome)
         return summary
 
     def _grpo(self, reference: Policy) -> Path:
         """Run GRPO on all data-parallel workers. Return the last checkpoint."""
-        parts, settings = self._parts, self._settings
-        local = Learner(parts.policy, reference, settings.grpo)
-        with DataParallelWorkers.start(local, parts.policy, settings, self._out / REFERENCE) as workers:
+        policy, settings = self._start.policy, self._settings
+        local = Learner(policy, reference, settings.grpo)
+        with DataParallelWorkers.start(local, policy, settings, self._out / REFERENCE) as workers:
             updater = Updater(
-                parts.policy, workers, parts.prompt_builder, parts.gateway, settings.grpo, self._stopwatch
+                policy, workers, self._start.prompt_builder, self._gateway, settings.grpo, self._stopwatch
             )
             newest = self._store.latest() if self._resumed else None
             if newest is not None:
@@ -123,49 +109,40 @@ class TrainingRun:
 
     def _prepare(self) -> Policy:
         """Run imitation and the first evaluation. Return the reference policy, a copy of the policy."""
-        parts, progress = self._parts, self._progress
+        policy, progress = self._start.policy, self._progress
         with self._stopwatch.track(Activity.IMITATION):
-            run_imitation(
-                parts.policy,
-                parts.prompt_builder,
-                parts.tasks.train,
-                self._settings,
-                self._out,
-                progress,
-                self._recorder,
-                parts.display.imitation,
-            )
+            run_imitation(self._start, self._out, self._recorder, self._display.imitation)
         before = self._evaluate("before GRPO")
         progress.before = before.as_json() if before else []
         with atomic_folder(self._out / REFERENCE) as folder:
-            parts.policy.save(folder)
+            policy.save(folder)
         progress.grpo_ready = True
-        return parts.policy.frozen_copy()
+        return policy.frozen_copy()
 
     def _evaluate(self, label: str) -> HeldOutEvaluation | None:
-        parts, settings = self._parts, self._settings
-        if not parts.tasks.heldout:
+        start, settings = self._start, self._settings
+        if not start.tasks.heldout:
             return None
         with self._stopwatch.track(Activity.EVALUATION):
             result = evaluate_policy(
-                parts.policy,
-                parts.prompt_builder,
-                parts.tasks.heldout,
-                parts.gateway,
+                start.policy,
+                start.prompt_builder,
+                start.tasks.heldout,
+                self._gateway,
                 settings.evaluation,
                 max_new=settings.grpo.max_new,
                 seed=settings.seed,
                 label=label.replace(" ", "-"),
-                report=lambda done, total: parts.display.evaluating(label, done, total),
+                report=lambda done, total: self._display.evaluating(label, done, total),
             )
-        parts.display.evaluated(label, result)
+        self._display.evaluated(label, result)
         self._recorder.evaluation(label, result)
         return result
 
     def _optimise(self, updater: Updater) -> None:
         settings = self._settings.grpo
         progress = self._progress
-        tasks, seed = self._parts.tasks.train, self._settings.seed
+        tasks, seed = self._start.tasks.train, self._settings.seed
         curriculum = Curriculum(settings.curriculum_tasks, settings.curriculum_start)
         schedule = Schedule(tasks, seed=seed, cursor=progress.cursor, curriculum=curriculum)
         reserve = Schedule(tasks, seed=seed, cursor=progress.reserve_cursor, stream=RESERVE_STREAM)
@@ -236,7 +213,7 @@ class TrainingRun:
         if settings.reserve and settings.lookahead:
             # A reserve may be needed in this step already, but it ranks behind the certain tasks.
             window[step + 1 + settings.lookahead] += reserve.peek(settings.reserve)
-        self._parts.gateway.announce(window, settings.group)
+        self._gateway.announce(window, settings.group)
 
     def _record(self, record: StepRecord, logs: list[GroupLog], seconds: float) -> None:
         self._progress.rollouts += record.rollouts
@@ -254,7 +231,7 @@ class TrainingRun:
             record.success,
             seconds,
         )
-        self._parts.display.stepped(record, self._share(), record.rollouts / max(seconds, 1e-9))
+        self._display.stepped(record, self._share(), record.rollouts / max(seconds, 1e-9))
 
     def _save(self, updater: Updater) -> Path:
         with self._stopwatch.track(Activity.SAVING):
@@ -263,12 +240,13 @@ class TrainingRun:
                 "optimiser": updater.optimiser.state_dict(),
                 "generator": self._generator.get_state(),
             }
-            return self._store.save(self._parts.policy, tensors, self._progress, self._settings)
+            return self._store.save(self._start.policy, tensors, self._progress, self._settings)
 
     def _summary(self, checkpoint: Path, after: HeldOutEvaluation | None, wall_s: float) -> TrainingSummary:
         progress = self._progress
-        return TrainingSummary(
-            model=self._parts.policy.name,
+        before = HeldOutEvaluation.from_json(progress.before) if progress.before else None
+        outcome = RunOutcome(
+            model=self._start.policy.name,
             steps=progress.step,
             rollouts=progress.rollouts,
             lost=progress.lost,
@@ -276,13 +254,12 @@ class TrainingRun:
             wall_s=wall_s,
             grpo_s=progress.grpo_s,
             spent_s=dict(self._stopwatch.spent_s),
-            before=HeldOutEvaluation.from_json(progress.before) if progress.before else None,
-            after=after,
-            stats=self._parts.gateway.close_run(),
-            checkpoint=checkpoint,
-            report=self._out / REPORT,
+            before=rates_of(before),
+            after=rates_of(after),
             peak_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,  # Linux counts in kB
         )
+        stats = self._gateway.close_run()
+        return TrainingSummary(outcome, before, after, stats, checkpoint, self._out / REPORT)
 
 
 def machine_description() -> str:

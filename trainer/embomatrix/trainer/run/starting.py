@@ -22,6 +22,8 @@ from embomatrix.trainer.policy.loading import TINY, configure_torch, is_word_lev
 from embomatrix.trainer.policy.prompts import PromptBuilder
 from embomatrix.trainer.policy.protocol import Policy
 
+REFERENCE: Final = "reference"
+"""Folder of the policy after imitation in a run's folder."""
 CHANGEABLE: Final = frozenset(
     {
         *("device", "threads", "processes", "track", "checkpoint_every", "keep_checkpoints", "samples_every"),
@@ -35,12 +37,16 @@ AFTER_IMITATION: Final = ("grpo.", "reward.", "evaluation.")
 
 @dataclass(frozen=True)
 class RunStart:
-    """Everything a run starts with. ``progress`` comes from the checkpoint of a resumed run."""
+    """Everything a run starts with.
+
+    ``progress`` comes from the checkpoint of a resumed run. ``reference`` is the policy after imitation, None until then.
+    """
 
     settings: TrainSettings
     tasks: TaskSet
     policy: Policy
     progress: TrainingProgress
+    reference: Policy | None = None
 
     @property
     def prompt_builder(self) -> PromptBuilder:
@@ -121,7 +127,9 @@ def resume_run(
             f"the run in {out} was started with other tasks than those of {dataset}: pass its original --dataset, "
             "or start a new run with another --out"
         )
-    return RunStart(settings, tasks, saved_policy(newest / "policy", settings), progress)
+    policy = saved_policy(newest / "policy", settings)
+    reference = saved_policy(out / REFERENCE, settings).frozen_copy() if progress.grpo_ready else None
+    return RunStart(settings, tasks, policy, progress, reference)
 
 
 def _check_unchanged(out: Path, original: TrainSettings, now: TrainSettings, *, grpo_ready: bool) -> None:
