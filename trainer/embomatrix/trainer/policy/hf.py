@@ -51,12 +51,12 @@ class HfPolicy:
     def __init__(
         self, model: Any, tokenizer: Any, codec: Codec, name: str, *, gradient_checkpointing: bool = False
     ) -> None:
-        self._model = model.eval()
+        self.name = name
+        self.codec = codec
+        self.module = model.eval()
         self._gradient_checkpointing = gradient_checkpointing
         self._has_adapters = False
         self._tokenizer = tokenizer
-        self._codec = codec
-        self._name = name
         self._end = _end_tokens(model, tokenizer)
         self._pad = self._end[0] if tokenizer.pad_token_id is None else int(tokenizer.pad_token_id)
 
@@ -102,22 +102,10 @@ class HfPolicy:
 
     def adapt(self, lora: LoraSettings, *, seed: int, saved: Path | None = None) -> None:
         """Freeze the model and train low-rank adapters, new ones or those in the folder ``saved``. Raises TrainerError."""
-        self._model = add_adapters(self._model, lora, seed=seed)
+        self.module = add_adapters(self.module, lora, seed=seed)
         self._has_adapters = True
         if saved is not None:
-            load_adapters(self._model, saved)
-
-    @property
-    def name(self) -> str:
-        return self._name
-
-    @property
-    def codec(self) -> Codec:
-        return self._codec
-
-    @property
-    def module(self) -> nn.Module:
-        return self._model  # type: ignore[no-any-return]
+            load_adapters(self.module, saved)
 
     def parameters(self) -> Iterator[nn.Parameter]:
         """Trainable parameters. For a frozen copy: all parameters."""
@@ -151,7 +139,7 @@ class HfPolicy:
         max_new: int,
         generator: torch.Generator,
     ) -> Samples:
-        with frozen_weights(self._model):
+        with frozen_weights(self.module):
             cache, mask, scores = self._read(prompts, group)
             rows = scores.shape[0]
             lengths = mask.sum(dim=1)  # (rows,)
@@ -196,13 +184,13 @@ class HfPolicy:
 
     def _scores_recomputed(self, prompts: Sequence[Tokens], tokens: Tensor, group: int) -> Tensor:
         """The same scores without a cache, storing only each layer's input."""
-        ids, padding = pad_left(prompts, self._pad, self._model.device)
+        ids, padding = pad_left(prompts, self._pad, self.module.device)
         mask = (~padding).long()
         rest = tokens[:, :-1]
         whole = torch.cat([ids.repeat_interleave(group, dim=0), rest], dim=1)  # (rows, P + T - 1)
         seen = torch.cat([mask.repeat_interleave(group, dim=0), mask.new_ones(rest.shape)], dim=1)
-        with _checkpointed_layers(self._model):
-            result = self._model(
+        with _checkpointed_layers(self.module):
+            result = self.module(
                 whole,
                 attention_mask=seen,
                 position_ids=(seen.cumsum(dim=1) - 1).clamp(min=0),
@@ -215,10 +203,10 @@ class HfPolicy:
         """Run the prompts once. Return cache, mask (rows, P) and next-token scores (rows, V), repeated for the samples."""
         from transformers import DynamicCache
 
-        ids, padding = pad_left(prompts, self._pad, self._model.device)
+        ids, padding = pad_left(prompts, self._pad, self.module.device)
         mask = (~padding).long()
-        cache = DynamicCache(config=self._model.config)
-        result = self._model(
+        cache = DynamicCache(config=self.module.config)
+        result = self.module(
             ids,
             attention_mask=mask,
             position_ids=(mask.cumsum(dim=1) - 1).clamp(min=0),
@@ -232,7 +220,7 @@ class HfPolicy:
 
     def _extend(self, tokens: Tensor, mask: Tensor, positions: Tensor, cache: Any) -> Tensor:
         """Scores (rows, T, V) after tokens (rows, T) that continue the cache."""
-        result = self._model(
+        result = self.module(
             tokens, attention_mask=mask, position_ids=positions, past_key_values=cache, use_cache=True
         )
         return result.logits.float()  # type: ignore[no-any-return]
@@ -247,8 +235,8 @@ class HfPolicy:
     def frozen_copy(self) -> HfPolicy:
         """Return a frozen copy that shares all frozen parameters: with adapters, the whole base model."""
         twin = copy.copy(self)
-        still = {id(each): each for each in self._model.parameters() if not each.requires_grad}
-        twin._model = copy.deepcopy(self._model, still).requires_grad_(False)
+        still = {id(each): each for each in self.module.parameters() if not each.requires_grad}
+        twin.module = copy.deepcopy(self.module, still).requires_grad_(False)
         return twin
 
     def save(self, folder: Path) -> None:
@@ -259,9 +247,9 @@ class HfPolicy:
         from safetensors import SafetensorError
 
         folder.mkdir(parents=True, exist_ok=True)
-        setattr(self._model.config, CODEC_KEY, self._codec.value)
+        setattr(self.module.config, CODEC_KEY, self.codec.value)
         try:
-            model = self._model
+            model = self.module
             if self._has_adapters:
                 model = copy.deepcopy(model).merge_and_unload()
             model.save_pretrained(folder)
@@ -269,7 +257,7 @@ class HfPolicy:
             raise OSError(str(error)) from error
         self._tokenizer.save_pretrained(folder)
         if self._has_adapters:
-            save_adapters(self._model, folder)
+            save_adapters(self.module, folder)
 
     @staticmethod
     def is_saved_in(folder: Path) -> bool:

@@ -74,6 +74,9 @@ class _SamplingState:
 class TinyPolicy:
     """Policy with a ``Decoder`` over a ``Vocabulary``. It writes plans in the ``names`` codec."""
 
+    name = "tiny"
+    codec = Codec.NAMES
+
     def __init__(
         self,
         vocabulary: Vocabulary,
@@ -84,29 +87,17 @@ class TinyPolicy:
         compute_dtype: torch.dtype = torch.float32,
     ) -> None:
         self.vocabulary = vocabulary
-        self.network = Decoder(shape, torch.Generator().manual_seed(seed), compute_dtype).to(device)
+        self.module = Decoder(shape, torch.Generator().manual_seed(seed), compute_dtype).to(device)
         self.device = torch.device(device)
         self._grammar = PlanGrammar(vocabulary, self.device)
 
-    @property
-    def name(self) -> str:
-        return "tiny"
-
-    @property
-    def codec(self) -> Codec:
-        return Codec.NAMES
-
-    @property
-    def module(self) -> nn.Module:
-        return self.network
-
     def parameters(self) -> Iterator[nn.Parameter]:
-        return self.network.parameters()
+        return self.module.parameters()
 
     def encode(self, prompt: Prompt) -> Tokens:
         """Return the prompt's tokens. Prompts beyond three quarters of the context lose their beginning."""
         tokens = self.vocabulary.encode(prompt.user)
-        longest = self.network.shape.longest * 3 // 4
+        longest = self.module.shape.longest * 3 // 4
         return (*tokens[-longest:], GO)
 
     def encode_plan(self, text: str) -> Tokens:
@@ -128,10 +119,10 @@ class TinyPolicy:
         logprobs = torch.zeros(count, max_new, device=self.device)
         mask = torch.zeros(count, max_new, dtype=torch.bool, device=self.device)
         length = 0
-        with frozen_weights(self.network):
+        with frozen_weights(self.module):
             for at in range(max_new):
                 token_mask = self._grammar.token_mask(state.grammar_state, state.names)[:, None]
-                scores = self.network.scores(hidden, state.prompts, state.plan, token_mask)[:, 0]
+                scores = self.module.scores(hidden, state.prompts, state.plan, token_mask)[:, 0]
                 choice, logprob = draw(scores, temperature, generator)
                 rows, active = state.rows, state.active
                 tokens[rows, at] = torch.where(active, choice, PAD)
@@ -144,7 +135,7 @@ class TinyPolicy:
                     break
                 if len(kept) <= _COMPACTION_THRESHOLD * len(state.active):
                     state, choice = state.select(kept), choice[kept]
-                hidden, plan = self.network.extend(state.prompts, choice[:, None], state.plan)
+                hidden, plan = self.module.extend(state.prompts, choice[:, None], state.plan)
                 state = replace(state, plan=plan)
         tokens = tokens[:, :length]
         texts = tuple(self.vocabulary.decode(row) for row in tokens.tolist())
@@ -152,7 +143,7 @@ class TinyPolicy:
 
     def _initial_state(self, prompts: Sequence[Tokens], group: int) -> _SamplingState:
         """Start ``group`` empty plans per prompt."""
-        cache = self.network.encode_prompts(*pad_left(prompts, PAD, self.device))
+        cache = self.module.encode_prompts(*pad_left(prompts, PAD, self.device))
         rows = torch.arange(len(prompts) * group, device=self.device)
         names = self._grammar.prompt_names(cache.tokens).select(rows // group)
         active = torch.ones(len(rows), dtype=torch.bool, device=self.device)
@@ -161,7 +152,7 @@ class TinyPolicy:
     def logprobs(
         self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor, group: int, temperature: float
     ) -> TokenScores:
-        cache = self.network.encode_prompts(*pad_left(prompts, PAD, self.device))
+        cache = self.module.encode_prompts(*pad_left(prompts, PAD, self.device))
         prompt_of_row = torch.arange(len(tokens), device=self.device) // group
         names = self._grammar.prompt_names(cache.tokens).select(prompt_of_row)
         token_masks = self._grammar.token_masks(tokens, names)  # (rows, T, V)
@@ -186,10 +177,10 @@ class TinyPolicy:
         """Return log-probability and entropy (rows, T) of tokens (rows, T). token_masks: (rows, T, V)."""
         hidden, plan = prompts.last, None  # (rows, 1, C)
         if tokens.shape[1] > 1:
-            rest, plan = self.network.extend(prompts, tokens[:, :-1], None)
+            rest, plan = self.module.extend(prompts, tokens[:, :-1], None)
             hidden = torch.cat([hidden, rest], dim=1)  # (rows, T, C)
         scores = torch.log_softmax(
-            self.network.scores(hidden, prompts, plan, token_masks) / (temperature or 1.0), dim=-1
+            self.module.scores(hidden, prompts, plan, token_masks) / (temperature or 1.0), dim=-1
         )  # (rows, T, V)
         chosen = scores.gather(-1, tokens[..., None])[..., 0]
         bounded = scores.clamp(min=_MIN_LOGPROB)
@@ -198,14 +189,14 @@ class TinyPolicy:
 
     def frozen_copy(self) -> TinyPolicy:
         twin = copy.copy(self)
-        twin.network = copy.deepcopy(self.network).requires_grad_(False)
+        twin.module = copy.deepcopy(self.module).requires_grad_(False)
         return twin
 
     def save(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        torch.save(self.network.state_dict(), folder / _WEIGHTS)
+        torch.save(self.module.state_dict(), folder / _WEIGHTS)
         description = {
-            "shape": asdict(self.network.shape),
+            "shape": asdict(self.module.shape),
             "words": self.vocabulary.words,
             "objects": self.vocabulary.object_words,
             "rooms": self.vocabulary.room_words,
@@ -221,7 +212,7 @@ class TinyPolicy:
         policy = cls(
             Vocabulary(words, objects, rooms), shape, seed=0, device=device, compute_dtype=compute_dtype
         )
-        policy.network.load_state_dict(torch.load(folder / _WEIGHTS, map_location=device, weights_only=True))
+        policy.module.load_state_dict(torch.load(folder / _WEIGHTS, map_location=device, weights_only=True))
         return policy
 
     @staticmethod
