@@ -189,20 +189,20 @@ def until(condition, seconds=20.0):
 
 
 async def test_verl_gets_the_same_keys_for_valid_and_invalid_plans(on_cluster):
-    good = await verl.scored(on_cluster, FIRST.task.task_id, oracle(FIRST))
-    none = await verl.scored(on_cluster, FIRST.task.task_id, "hm")
+    good = verl.reward_payload(await on_cluster.reward_of(FIRST.task.task_id, oracle(FIRST)))
+    none = verl.reward_payload(await on_cluster.reward_of(FIRST.task.task_id, "hm"))
     assert good.keys() == none.keys()
     assert (good["score"] > 30, good["success"], none["score"]) == (True, 1.0, -1.0)
 
 
-async def test_lost_plan_is_retried_for_verl_and_then_raises():
+async def test_lost_plan_is_retried_for_a_number_and_then_raises():
     with scorer(SymbolicCluster(TASKS, lost=frozenset({"score-0/"}))) as opened:
-        assert (await verl.scored(opened, FIRST.task.task_id, oracle(FIRST)))["success"] == 1.0
+        assert (await opened.reward_of(FIRST.task.task_id, oracle(FIRST))).success
     with (
         scorer(SymbolicCluster(TASKS, lose_first=True)) as opened,
         pytest.raises(TrainerError, match="lost a plan of the task 'task-0' 3 times"),
     ):
-        await verl.scored(opened, FIRST.task.task_id, oracle(FIRST))
+        await opened.reward_of(FIRST.task.task_id, oracle(FIRST))
 
 
 async def test_openrlhf_gets_tensors_and_lost_plans_are_retried():

@@ -18,7 +18,7 @@ from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.reward_label import RewardLabel, answer_in
 from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.trainer.adapters.rows import messages, tasks_of
-from embomatrix.trainer.adapters.scorer import ATTEMPTS, PlanScorer, retries_exhausted, scorer_for
+from embomatrix.trainer.adapters.scorer import PlanScorer, scorer_for
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.data.tasks import group_seed, load_tasks
 
@@ -72,20 +72,9 @@ def reward_func(queries: Sequence[str], prompts: Sequence[str], labels: Sequence
 async def rewards_of(
     scorer: PlanScorer, task_ids: Sequence[str], answers: Sequence[str]
 ) -> list[RewardBreakdown]:
-    """Return the reward of each answer. Lost rollouts are repeated up to ``ATTEMPTS`` times."""
-    found: dict[int, RewardBreakdown] = {}
-    missing = list(range(len(answers)))
-    for _attempt in range(ATTEMPTS):
-        outcomes = await scorer.score([task_ids[at] for at in missing], [answers[at] for at in missing])
-        found |= {
-            at: outcome.reward
-            for at, outcome in zip(missing, outcomes, strict=True)
-            if outcome.reward is not None
-        }
-        missing = [at for at in missing if at not in found]
-        if not missing:
-            return [found[at] for at in range(len(answers))]
-    raise retries_exhausted(task_ids[missing[0]])
+    """Return the reward of each answer. Lost rollouts are repeated."""
+    pairs = zip(task_ids, answers, strict=True)
+    return await asyncio.gather(*(scorer.reward_of(task_id, answer) for task_id, answer in pairs))
 
 
 def reward_payload(rewards: Sequence[RewardBreakdown]) -> dict[str, Any]:

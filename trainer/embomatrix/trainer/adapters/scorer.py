@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Self
 
+from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.client import ClusterClient
@@ -118,8 +119,13 @@ class PlanScorer:
             atexit.unregister(self.close)
             opened.gateway.__exit__()
 
-    def submit(self, task_ids: Sequence[str], texts: Sequence[str]) -> list[PendingScores]:
-        """Start the rollouts of these texts, one batch per task. Raises TrainerError for an unknown task."""
+    def submit(
+        self, task_ids: Sequence[str], texts: Sequence[str]
+    ) -> list[tuple[list[int], Future[tuple[PlanOutcome, ...]]]]:
+        """Start the rollouts of these texts, one batch per task. Raises TrainerError for an unknown task.
+
+        Return the indices of each batch's texts, and the future of their outcomes.
+        """
         opened = self.open()
         members: dict[str, list[int]] = {}
         for index, task_id in enumerate(task_ids):
@@ -133,19 +139,19 @@ class PlanScorer:
             future = opened.gateway.submit(
                 f"score-{number}", number, task, task.situation, chosen, Codec.JSON
             )
-            pending.append(PendingScores(tuple(indices), future))
+            pending.append((indices, future))
         return pending
 
     async def score(self, task_ids: Sequence[str], texts: Sequence[str]) -> list[PlanOutcome]:
         """Score texts and keep their order. Can be awaited on any event loop. Raises TrainerError."""
         pending = await asyncio.to_thread(self.submit, task_ids, texts)
         outcomes: dict[int, PlanOutcome] = {}
-        for scores in pending:
+        for indices, future in pending:
             try:
-                found = await asyncio.wrap_future(scores.future)
+                found = await asyncio.wrap_future(future)
             except ClusterError as error:
                 raise TrainerError(str(error)) from error
-            outcomes |= zip(scores.indices, found, strict=True)
+            outcomes |= zip(indices, found, strict=True)
         return [outcomes[index] for index in range(len(texts))]
 
     async def score_one(self, task_id: str, text: str) -> PlanOutcome:
@@ -159,9 +165,24 @@ class PlanScorer:
         group.texts.append(text)
         return (await asyncio.shield(group.work))[index]
 
+    async def reward_of(self, task_id: str, text: str) -> RewardBreakdown:
+        """Return the reward of one text, for trainers that need a number. Texts of a task are grouped as in ``score_one``.
+
+        A lost rollout is repeated; after ``ATTEMPTS``, a TrainerError is raised.
+        """
+        for _attempt in range(ATTEMPTS):
+            outcome = await self.score_one(task_id, text)
+            if outcome.reward is not None:
+                return outcome.reward
+        raise TrainerError(
+            f"the cluster lost a plan of the task {task_id!r} {ATTEMPTS} times: check its workers with `embomatrix status`"
+        )
+
     async def _score_pending(self, task_id: str) -> list[PlanOutcome]:
-        await asyncio.sleep(GROUPING_S)
-        texts = self._pending.pop(task_id).texts
+        try:
+            await asyncio.sleep(GROUPING_S)
+        finally:
+            texts = self._pending.pop(task_id).texts
         return await self.score([task_id] * len(texts), texts)
 
     def announce(self, steps: Sequence[Sequence[str]], group: int) -> None:
@@ -181,26 +202,11 @@ class PlanScorer:
 
 
 @dataclass(frozen=True, slots=True)
-class PendingScores:
-    """Texts of one task: their indices, and the future of their outcomes."""
-
-    indices: tuple[int, ...]
-    future: Future[tuple[PlanOutcome, ...]]
-
-
-@dataclass(frozen=True, slots=True)
 class _PendingGroup:
     """Texts of one task that wait to be sent together."""
 
     texts: list[str]
     work: asyncio.Task[list[PlanOutcome]]
-
-
-def retries_exhausted(task_id: str) -> TrainerError:
-    """Error for a plan that was lost in every attempt."""
-    return TrainerError(
-        f"the cluster lost a plan of the task {task_id!r} {ATTEMPTS} times: check its workers with `embomatrix status`"
-    )
 
 
 def scorer_for(

@@ -11,7 +11,7 @@ import verifiers.v1 as vf
 
 from embomatrix.skills.prompt import Codec, prompt_for
 from embomatrix.trainer.adapters.rows import tasks_of
-from embomatrix.trainer.adapters.scorer import PlanScorer, retries_exhausted, scorer_for
+from embomatrix.trainer.adapters.scorer import PlanScorer, scorer_for
 
 __all__ = ["HouseholdTaskset"]
 NO_DATASET = "no dataset: pass its folder with --env.taskset.dataset"
@@ -32,17 +32,13 @@ class HouseholdData(vf.TaskData):  # type: ignore[misc]
 
 
 class HouseholdTask(vf.Task[HouseholdData, vf.State, vf.TaskConfig]):  # type: ignore[misc]
-    """Task with one plan as its answer. A lost rollout is an error of the rollout, never a number."""
+    """Task with one plan as its answer. A rollout that is lost repeatedly is an error of the rollout, never a number."""
 
     @vf.reward  # type: ignore[untyped-decorator]
     async def tiers(self, trace: vf.Trace) -> dict[str, float]:
         """Return the three tiers, which add up to the reward. Success is a separate metric."""
-        task_id = str(self.data.id)
-        outcome = await _scorer(self.data.dataset).score_one(task_id, trace.last_reply)
-        if outcome.reward is None:
-            raise retries_exhausted(task_id)
-        trace.record_metrics({"success": float(outcome.success)})
-        reward = outcome.reward
+        reward = await _scorer(self.data.dataset).reward_of(str(self.data.id), trace.last_reply)
+        trace.record_metrics({"success": float(reward.success)})
         return {"format": reward.format, "relevance": reward.relevance, "goal": reward.goal}
 
 

@@ -8,7 +8,7 @@ import functools
 from collections.abc import Mapping
 
 from embomatrix.reward.breakdown import RewardBreakdown
-from embomatrix.trainer.adapters.scorer import ATTEMPTS, PlanScorer, retries_exhausted, scorer_for
+from embomatrix.trainer.adapters.scorer import PlanScorer, scorer_for
 
 
 @functools.cache
@@ -31,22 +31,11 @@ async def compute_score(
 ) -> dict[str, float]:
     """Score one answer.
 
-    ``ground_truth`` is the task's id; the keyword arguments are ``custom_reward_function.reward_kwargs``.
+    ``ground_truth`` is the task's id; the keyword arguments are ``custom_reward_function.reward_kwargs``. verl has no mark for
+    a missing reward, and NaN would spoil its step, so lost rollouts are repeated.
     """
-    return await scored(scorer_of(dataset, manager, token, ca), ground_truth, solution_str)
-
-
-async def scored(scorer: PlanScorer, task_id: str, text: str) -> dict[str, float]:
-    """Return the tiers of one answer.
-
-    verl has no mark for a missing reward, and NaN would spoil its step. Lost rollouts are repeated; after ``ATTEMPTS``, a
-    TrainerError is raised.
-    """
-    for _attempt in range(ATTEMPTS):
-        outcome = await scorer.score_one(task_id, text)
-        if outcome.reward is not None:
-            return reward_payload(outcome.reward)
-    raise retries_exhausted(task_id)
+    scorer = scorer_of(dataset, manager, token, ca)
+    return reward_payload(await scorer.reward_of(ground_truth, solution_str))
 
 
 def reward_payload(reward: RewardBreakdown) -> dict[str, float]:
