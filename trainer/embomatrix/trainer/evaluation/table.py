@@ -33,6 +33,14 @@ INTERVALS: Final = (
 
 
 @dataclass(frozen=True, slots=True)
+class ReportTable:
+    """Table of a report, for text and HTML. The first row holds the column titles."""
+
+    title: str
+    rows: Sequence[tuple[str, ...]]
+
+
+@dataclass(frozen=True, slots=True)
 class ScoreRow:
     """Table row: a model's name, and its figures as in a report."""
 
@@ -128,33 +136,50 @@ def cause_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     return rows
 
 
-def text_report(report: Mapping[str, Any], beside: Sequence[ScoreRow] = ()) -> str:
-    """Whole evaluation as plain text."""
+def score_tables(report: Mapping[str, Any], beside: Sequence[ScoreRow] = ()) -> tuple[ReportTable, ...]:
+    """Tables of success, partial credit and pass@k. ``beside`` are the rows of other reports on the same tasks."""
+    rows, titles = [ScoreRow(report["setup"]["model"], report), *beside], head(report)
+    partial = "partial credit (share of subgoals that hold at the end), %"
+    passes = [("", *titles[1:]), *pass_rows(report)]
+    return (
+        ReportTable("success, %", [titles, *table(rows, "success")]),
+        ReportTable(partial, [titles, *table(rows, "partial")]),
+        ReportTable("probability that at least one of k samples succeeds, %", passes),
+    )
+
+
+def cause_tables(report: Mapping[str, Any]) -> tuple[ReportTable, ...]:
+    """Table of the causes of failure, none if no plan failed."""
+    rows = cause_rows(report)
+    return (ReportTable("why plans failed", [("cause", "plans", "share", "meaning"), *rows]),) if rows else ()
+
+
+def about(report: Mapping[str, Any]) -> str:
+    """Benchmark and sampling of an evaluation in one line."""
     setup = report["setup"]
-    rows = [ScoreRow(setup["model"], report), *beside]
-    parts = [
+    return (
         f"{setup['bench']} ({setup['split']}): {report['tasks']} tasks, {setup['samples']} samples each, temperature "
-        f"{setup['temperature']:g}, {report['lost']} of {report['samples']} plans lost to the infrastructure",
-        _grid("success, %", [head(report), *table(rows, "success")]),
-        _grid(
-            "partial credit (share of subgoals that hold at the end), %",
-            [head(report), *table(rows, "partial")],
-        ),
-        _grid(
-            "probability that at least one of k samples succeeds, %",
-            [("", *head(report)[1:]), *pass_rows(report)],
-        ),
-    ]
+        f"{setup['temperature']:g}, {report['lost']} of {report['samples']} plans lost to the infrastructure"
+    )
+
+
+def notes(report: Mapping[str, Any]) -> list[str]:
+    """Additional figures: success over all tasks, and the exam's own figures."""
+    found = []
     if report["tasks_failed_by_rule"]:
-        parts.append(
+        found.append(
             f"{report['tasks_failed_by_rule']} more tasks can't be expressed with these skills, or were rejected; if they "
             f"count as failed: {percent(report['success_over_all'])} %"
         )
     if report["others"]:
-        parts.append("\n".join(f"{name}, %: {percent(found)}" for name, found in report["others"].items()))
-    if report["overall"]["causes"]:
-        parts.append(_grid("why plans failed", [("cause", "plans", "share", "meaning"), *cause_rows(report)]))
-    return "\n\n".join([*parts, INTERVALS]) + "\n"
+        found.append("\n".join(f"{name}, %: {percent(value)}" for name, value in report["others"].items()))
+    return found
+
+
+def text_report(report: Mapping[str, Any], beside: Sequence[ScoreRow] = ()) -> str:
+    """Whole evaluation as plain text."""
+    scores, causes = map(_grid, score_tables(report, beside)), map(_grid, cause_tables(report))
+    return "\n\n".join([about(report), *scores, *notes(report), *causes, INTERVALS]) + "\n"
 
 
 def _tasks(figures: Mapping[str, Any], category: TaskCategory) -> int:
@@ -162,9 +187,10 @@ def _tasks(figures: Mapping[str, Any], category: TaskCategory) -> int:
     return int(found["tasks"]) if found else 0
 
 
-def _grid(title: str, rows: Sequence[Sequence[str]]) -> str:
-    widths = [max(len(row[at]) for row in rows) for at in range(len(rows[0]))]
+def _grid(table: ReportTable) -> str:
+    widths = [max(map(len, column)) for column in zip(*table.rows, strict=True)]
     lines = [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in table.rows
     ]
-    return "\n".join([title, *(f"  {line}" for line in lines)])
+    return "\n".join([table.title, *(f"  {line}" for line in lines)])
