@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -131,13 +131,3 @@ def _with_reference(chunk: SampledChunk, learner: SamplingLearner) -> SampledChu
     prompts = [prompt.tokens for prompt in chunk.prompts]
     logprobs = learner.reference_logprobs(prompts, chunk.samples.tokens, chunk.samples.mask)
     return replace(chunk, reference=logprobs)
-
-
-def wait_for_next(chunks: Sequence[SampledChunk]) -> SampledChunk:
-    """Wait until one of the chunks is complete, and return the first complete one."""
-    while True:
-        for chunk in chunks:
-            if chunk.is_complete:
-                return chunk
-        pending = [future for chunk in chunks for future in chunk.futures if not future.done()]
-        wait(pending, return_when=FIRST_COMPLETED)

@@ -24,18 +24,15 @@ from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import GrpoSettings, LossKind, OnLost, Overlap
 from embomatrix.trainer.data.tasks import TrainingTask
 from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers, RemoteLearner
-from embomatrix.trainer.grpo.gradients import GradientSum
 from embomatrix.trainer.grpo.learner import Microbatch
 from embomatrix.trainer.grpo.objective import LossMetrics, LossTotals, group_advantages, loss_divisor
 from embomatrix.trainer.grpo.records import GroupLog, StepRecord, record_of
-from embomatrix.trainer.grpo.sampling import SampledChunk, Sampler, wait_for_next
+from embomatrix.trainer.grpo.sampling import SampledChunk, Sampler
 from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
 from embomatrix.trainer.lifecycle.stopwatch import Activity, Stopwatch
 from embomatrix.trainer.policy.prompts import PromptBuilder
 from embomatrix.trainer.policy.protocol import Policy
 
-MAX_STORED_GRADIENTS = 2
-"""Microbatches back-propagated before their turn. Each stores a gradient as large as the policy."""
 MAX_BAD_GRADIENTS = 5
 """Consecutive steps with a non-finite gradient before the run ends: it has diverged."""
 
@@ -90,7 +87,8 @@ class Updater:
         """
         with self._stopwatch.track(Activity.SAMPLING):
             chunks = self._chunks(plan)
-        state = _StepState(plan, self._totals(chunks), GradientSum(self._policy.parameters()))
+        state = _StepState(plan, self._totals(chunks))
+        self.optimiser.zero_grad()
         self._learn_all(chunks, state)
         self._replace_zero_variance(len(chunks), state)
         with self._stopwatch.track(Activity.UPDATE):
@@ -123,7 +121,10 @@ class Updater:
         )
 
     def _learn_all(self, chunks: Sequence[SampledChunk], state: _StepState) -> None:
-        """Back-propagate every chunk, as its rewards arrive unless ``Overlap.NONE``."""
+        """Back-propagate the chunks in order, each as soon as its rewards are there unless ``Overlap.NONE``.
+
+        Floating-point sums depend on their order. A fixed order makes a step bit-identical whichever worker was faster.
+        """
         if self._settings.overlap is Overlap.NONE:
             with self._stopwatch.track(Activity.WAITING):
                 for chunk in chunks:
@@ -133,46 +134,42 @@ class Updater:
             for chunk in chunks
             if (remote := self._workers.remote(chunk.index)) is not None
         }
-        logs = self._learn_locally([chunk for chunk in chunks if chunk.index not in remote_chunks], state)
         for chunk in chunks:
-            if chunk.index in remote_chunks:
-                with self._stopwatch.track(Activity.WAITING):
-                    chunk.outcomes()
-                with self._stopwatch.track(Activity.UPDATE):
-                    result = remote_chunks[chunk.index].result()
-                    state.gradients.put(chunk.index, result.gradient)
-                    if result.metrics is not None:
-                        state.count(result.metrics, result.plans)
-                    logs[chunk.index] = result.logs
-        for index in sorted(logs):
-            state.logs += logs[index]
-
-    def _learn_locally(self, chunks: Sequence[SampledChunk], state: _StepState) -> dict[int, list[GroupLog]]:
-        """Back-propagate this process's chunks in the order in which their rewards arrive."""
-        logs: dict[int, list[GroupLog]] = {}
-        waiting = list(chunks)
-        while waiting:
-            # With enough gradients stored, only the next chunk in the sum may proceed.
-            candidates = waiting[:1] if state.gradients.stored >= MAX_STORED_GRADIENTS else waiting
             with self._stopwatch.track(Activity.WAITING):
-                chunk = wait_for_next(candidates)
-                outcomes = chunk.outcomes()
-            waiting.remove(chunk)
+                chunk.outcomes()
             with self._stopwatch.track(Activity.UPDATE):
-                microbatch, logs[chunk.index] = self._microbatch(chunk, outcomes, state)
-                state.gradients.add(chunk.index, functools.partial(self._learn, microbatch, state))
-        return logs
+                remote_chunk = remote_chunks.get(chunk.index)
+                learnt = self._learn_locally(chunk, state) if remote_chunk is None else remote_chunk.result()
+                state.count(learnt)
+                if learnt.gradient is not None:
+                    self._add_gradient(learnt.gradient)
 
-    def _learn(self, microbatch: Microbatch | None, state: _StepState) -> None:
-        if microbatch is not None:
-            state.count(self._workers.local.learn(microbatch), len(microbatch.tokens))
-
-    def _learn_remotely(self, chunk: SampledChunk, state: _StepState, remote: RemoteLearner) -> _RemoteResult:
+    def _learn_locally(self, chunk: SampledChunk, state: _StepState) -> _LearntChunk:
+        """Add the chunk's gradient to the parameters' gradients, which hold the step's sum."""
         microbatch, logs = self._microbatch(chunk, chunk.outcomes(), state)
         if microbatch is None:
-            return _RemoteResult(logs, None, 0, None)
+            return _LearntChunk(logs)
+        return _LearntChunk(logs, self._workers.local.learn(microbatch), len(microbatch.tokens))
+
+    def _learn_remotely(self, chunk: SampledChunk, state: _StepState, remote: RemoteLearner) -> _LearntChunk:
+        microbatch, logs = self._microbatch(chunk, chunk.outcomes(), state)
+        if microbatch is None:
+            return _LearntChunk(logs)
         metrics, gradient = remote.learn(microbatch)
-        return _RemoteResult(logs, metrics, len(microbatch.tokens), gradient)
+        return _LearntChunk(logs, metrics, len(microbatch.tokens), gradient)
+
+    def _add_gradient(self, gradient: Sequence[torch.Tensor | None]) -> None:
+        """Add a gradient by parameter from another process to the step's sum."""
+        for parameter, part in zip(self._policy.parameters(), gradient, strict=True):
+            if parameter.grad is None:
+                parameter.grad = part
+            elif part is not None:
+                parameter.grad.add_(part)
+
+    def _scale_gradient(self, factor: float) -> None:
+        for parameter in self._policy.parameters():
+            if parameter.grad is not None:
+                parameter.grad.mul_(factor)
 
     def _replace_zero_variance(self, next_index: int, state: _StepState) -> None:
         """Replace zero-variance groups from the reserve, then rescale the gradient to the groups with a signal."""
@@ -198,9 +195,9 @@ class Updater:
                 microbatches=len(state.metrics),
             )
             if kind is LossKind.BNPO:
-                state.gradients.scale(state.totals.microbatches / final.microbatches)
+                self._scale_gradient(state.totals.microbatches / final.microbatches)
             else:
-                state.gradients.scale(loss_divisor(kind, state.totals) / loss_divisor(kind, final))
+                self._scale_gradient(loss_divisor(kind, state.totals) / loss_divisor(kind, final))
 
     def _microbatch(
         self, chunk: SampledChunk, outcomes: Sequence[tuple[PlanOutcome, ...]], state: _StepState
@@ -267,13 +264,13 @@ class Updater:
 
 
 @dataclass(frozen=True, slots=True)
-class _RemoteResult:
-    """Result of a chunk in another process. ``metrics`` and ``gradient`` are None for a chunk without a signal."""
+class _LearntChunk:
+    """Back-propagated chunk. ``metrics`` is None without a learning signal, ``gradient`` is given by other processes only."""
 
     logs: list[GroupLog]
-    metrics: LossMetrics | None
-    plans: int
-    gradient: Sequence[torch.Tensor | None] | None
+    metrics: LossMetrics | None = None
+    plans: int = 0
+    gradient: Sequence[torch.Tensor | None] | None = None
 
 
 class _RemoteChunk:
@@ -283,13 +280,13 @@ class _RemoteChunk:
         self,
         chunk: SampledChunk,
         remote: RemoteLearner,
-        job: Callable[[RemoteLearner], _RemoteResult],
+        job: Callable[[RemoteLearner], _LearntChunk],
     ) -> None:
         self._chunk = chunk
         self._remote = remote
         self._job = job
         self._lock = threading.Lock()
-        self._future: Future[_RemoteResult] | None = None
+        self._future: Future[_LearntChunk] | None = None
         for future in chunk.futures:
             future.add_done_callback(self._on_reward)
 
@@ -298,29 +295,29 @@ class _RemoteChunk:
         if self._chunk.is_complete and not self._remote.closed:
             self._send()
 
-    def _send(self) -> Future[_RemoteResult]:
+    def _send(self) -> Future[_LearntChunk]:
         with self._lock:
             if self._future is None:
                 self._future = self._remote.run(self._job)
             return self._future
 
-    def result(self) -> _RemoteResult:
+    def result(self) -> _LearntChunk:
         """Wait for the result. The chunk's rewards must be complete."""
         return self._send().result()
 
 
 class _StepState:
-    """Accumulated groups and gradients of a step, and the metrics and plans of its microbatches with a learning signal."""
+    """Accumulated groups of a step, and the metrics and plans of its microbatches with a learning signal."""
 
-    def __init__(self, plan: StepPlan, totals: LossTotals, gradients: GradientSum) -> None:
+    def __init__(self, plan: StepPlan, totals: LossTotals) -> None:
         self.plan = plan
         self.totals = totals
-        self.gradients = gradients
         self.logs: list[GroupLog] = []
         self.metrics: list[LossMetrics] = []
         self.signal_plans = 0
 
-    def count(self, metrics: LossMetrics, plans: int) -> None:
-        """Count one more microbatch with a learning signal."""
-        self.metrics.append(metrics)
-        self.signal_plans += plans
+    def count(self, learnt: _LearntChunk) -> None:
+        self.logs += learnt.logs
+        if learnt.metrics is not None:
+            self.metrics.append(learnt.metrics)
+            self.signal_plans += learnt.plans
