@@ -13,7 +13,7 @@ from embomatrix.bench.peers.contenders import ContenderSetup, Lost, own_cluster,
 from embomatrix.bench.peers.contest import (
     PeerSizes,
     PeerSystem,
-    _tuned,
+    _measured,
     await_processes,
     bench_peers,
     chunks_of,
@@ -34,7 +34,7 @@ SCENES = 2
 PER_SCENE = 4
 MEASURED = SCENES * (PER_SCENE - 1)
 LIMIT_S = 60.0
-SIZES = PeerSizes((PeerSystem.POOL,), chunk=2, warm=1, plain=2, alone=1, waves=1, wave=2, limit_s=LIMIT_S)
+SIZES = PeerSizes((PeerSystem.POOL,), chunk=2, warm=1, alone=1, waves=1, wave=2, limit_s=LIMIT_S)
 
 pytestmark = pytest.mark.timeout(240)
 
@@ -56,14 +56,12 @@ def test_chunks_hold_rollouts_of_one_scene(work):
     assert all(len({rollout.bundle_digest for rollout in chunk}) == 1 for chunk in chunks)
 
 
-@pytest.mark.parametrize("tuned", [True, False])
-def test_processes_of_a_pool_execute_as_our_simulator_does(work, tmp_path, tuned):
+def test_processes_of_a_pool_execute_as_our_simulator_does(work, tmp_path):
     write_bundles(tmp_path, work.bundles)
     theirs = []
-    setup = ContenderSetup(tmp_path, 1, tuple(work.bundles) if tuned else ())
+    setup = ContenderSetup(tmp_path, 1, tuple(work.bundles))
     with process_pool(setup) as contender:
-        chunks = chunks_of(work.rollouts, 2) if tuned else singles(work.rollouts)
-        contender.run(chunks, lambda news: theirs.extend(news.results), LIMIT_S)
+        contender.run(chunks_of(work.rollouts, 2), lambda news: theirs.extend(news.results), LIMIT_S)
     assert sorted(result.trace_digest for result in theirs) == sorted(traces(work))
     assert executed_twice(tmp_path) == 0
 
@@ -83,26 +81,25 @@ def test_killed_slot_costs_our_cluster_nothing(work, tmp_path):
     write_bundles(tmp_path, work.bundles)
     setup = ContenderSetup(tmp_path, 2, tuple(work.bundles))
     with own_cluster(setup, work) as contender:
-        killed = _tuned(contender, setup, work, SIZES).killed
+        killed = _measured(contender, setup, work, SIZES).killed
     assert (killed.lost, killed.hung) == (0, 0)
     assert len(killed.latency_s) == MEASURED
 
 
 @pytest.mark.slow
 def test_rollouts_that_a_pool_gives_up_are_counted(work):
-    plain, tuned = measure_peer(PeerSystem.POOL, work, SIZES)
-    assert len(plain.latency_s) == 2
-    assert len(tuned.all_at_once.latency_s) == MEASURED
-    killed = tuned.killed
+    found = measure_peer(PeerSystem.POOL, work, SIZES)
+    assert len(found.all_at_once.latency_s) == MEASURED
+    killed = found.killed
     assert len(killed.latency_s) + killed.lost + killed.hung == MEASURED
     assert set(killed.reasons) <= {"BrokenProcessPool"}
 
 
 @pytest.mark.slow
-def test_contest_compares_ours_with_a_tuned_peer(work):
+def test_contest_compares_ours_with_a_peer(work):
     found = bench_peers(work, SIZES, lambda _: None)
     figures = {figure.name: figure for figure in found}
-    ours, peer = (figures[f"contest, {name}: tuned, 1/s"].value for name in ("ours", "process_pool"))
+    ours, peer = (figures[f"contest, {name}: rollouts, 1/s"].value for name in ("ours", "process_pool"))
     assert figures["vs_process_pool"].value == pytest.approx(ours / peer)
     assert "vs_ray" not in figures
     assert [line.split(" | ")[0] for line in peer_lines(found)[2:]] == ["| ours", "| process pool"]

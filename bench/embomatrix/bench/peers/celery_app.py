@@ -9,22 +9,21 @@ from typing import Final
 
 from celery import Celery
 
-from embomatrix.bench.peers.scene_process import execute_fresh, execute_held
+from embomatrix.bench.peers.scene_process import execute_chunk
 
 BROKER: Final = "EMBOMATRIX_BENCH_BROKER"
 """Environment variable that names the broker to the worker."""
 
 
 def application(broker: str | None) -> Celery:
-    """Register the tasks on this broker, which keeps the results as well."""
+    """Register the task on this broker, which keeps the results as well."""
     made = Celery("bench", broker=broker, backend=broker)
     made.conf.update(
         worker_disable_rate_limits=True,
         worker_hijack_root_logger=False,
         broker_connection_retry_on_startup=True,
     )
-    made.task(name=execute_fresh.__name__)(execute_fresh)
-    made.task(name=execute_held.__name__, acks_late=True, reject_on_worker_lost=True)(execute_held)
+    made.task(name=execute_chunk.__name__, acks_late=True, reject_on_worker_lost=True)(execute_chunk)
     return made
 
 

@@ -1,7 +1,6 @@
 """Contenders: our cluster, a process pool, Ray and Celery on Redis, all behind one protocol.
 
-A plain library gets one call for each rollout, which loads its scene, as its tutorial shows. A tuned one runs processes that
-have loaded every scene and take chunks of rollouts from one queue.
+A library runs processes that have loaded every scene and take chunks of rollouts from one queue.
 """
 
 import asyncio
@@ -23,7 +22,7 @@ from embomatrix.bench.cluster.cpu import running_slot
 from embomatrix.bench.cluster.load_generator import LoadGenerator, load_generator
 from embomatrix.bench.cluster.processes import BenchCluster, bench_cluster, redis_server, running_program
 from embomatrix.bench.engine.workload import Workload
-from embomatrix.bench.peers.scene_process import Answer, execute_fresh, execute_held
+from embomatrix.bench.peers.scene_process import Answer, execute_chunk
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.rpc.wire.outcome import completed_from_proto
 from embomatrix.rpc.wire.rollout import rollout_to_proto
@@ -44,18 +43,16 @@ CELERY_POLL_S: Final = 0.001
 
 @dataclass(frozen=True, slots=True)
 class ContenderSetup:
-    """Processes to start. ``folder`` holds the bundles; processes load ``preload`` first, and are plain without any."""
+    """Processes to start. ``folder`` holds the bundles; processes load ``preload`` first."""
 
     folder: Path
     slots: int
-    preload: tuple[str, ...] = ()
+    preload: tuple[str, ...]
 
-    def call(self, chunk: RolloutChunk) -> tuple[Callable[..., Answer], tuple[Any, ...]]:
-        """The function that executes the chunk in a process, and its arguments."""
+    def arguments(self, chunk: RolloutChunk) -> tuple[Any, ...]:
+        """Arguments of ``execute_chunk`` for the chunk."""
         requests = [rollout_to_proto(rollout).SerializeToString() for rollout in chunk]
-        if self.preload:
-            return execute_held, (str(self.folder), self.preload, requests)
-        return execute_fresh, (str(self.folder), *requests)
+        return str(self.folder), self.preload, requests
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,8 +115,7 @@ def process_pool(setup: ContenderSetup) -> Iterator[Contender]:
     with concurrent.futures.ProcessPoolExecutor(setup.slots, mp_context=context) as pool:
 
         def submit(chunk: RolloutChunk) -> concurrent.futures.Future[Answer]:
-            function, arguments = setup.call(chunk)
-            return pool.submit(function, *arguments)
+            return pool.submit(execute_chunk, *setup.arguments(chunk))
 
         yield FuturesContender(submit)
 
@@ -139,11 +135,10 @@ def ray_tasks(setup: ContenderSetup) -> Iterator[Contender]:
         logging_level=logging.ERROR,
         _temp_dir=str(setup.folder),
     )
-    remote = {function: ray.remote(num_cpus=1)(function) for function in (execute_fresh, execute_held)}
+    remote = ray.remote(num_cpus=1)(execute_chunk)
 
     def submit(chunk: RolloutChunk) -> concurrent.futures.Future[Answer]:
-        function, arguments = setup.call(chunk)
-        future: concurrent.futures.Future[Answer] = remote[function].remote(*arguments).future()
+        future: concurrent.futures.Future[Answer] = remote.remote(*setup.arguments(chunk)).future()
         return future
 
     try:
@@ -183,8 +178,7 @@ class CeleryContender:
 
         submitted = {}
         for chunk in chunks:
-            function, arguments = self._setup.call(chunk)
-            result = self._app.tasks[function.__name__].apply_async(arguments)
+            result = self._app.tasks[execute_chunk.__name__].apply_async(self._setup.arguments(chunk))
             submitted[result.id] = (result, chunk)
         answers = ResultSet([result for result, _ in submitted.values()])
         with contextlib.suppress(CeleryTimeoutError):

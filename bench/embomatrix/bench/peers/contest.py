@@ -1,6 +1,6 @@
 """Contest of our cluster with its peers: one engine, one workload and the same cores in one run.
 
-Tuned processes have loaded the scenes before the clock starts. No plan is executed twice in a process before throughput has
+The processes have loaded the scenes before the clock starts. No plan is executed twice in a process before throughput has
 been measured.
 """
 
@@ -73,8 +73,7 @@ class PeerSizes:
     chunk: int = 10
     """Rollouts of one scene in a chunk: some 25 ms of work."""
     warm: int = 10
-    """Plans of each scene that tuned processes execute before the others are measured."""
-    plain: int = 40
+    """Plans of each scene that are executed before the others are measured."""
     alone: int = 40
     """Rollouts with no other rollout in flight."""
     waves: int = 10
@@ -112,8 +111,8 @@ class ContestPass:
 
 
 @dataclass(frozen=True, slots=True)
-class TunedMeasurement:
-    """Measurements of a contender that holds its scenes. ``cpu_s`` is of all its processes and of this one."""
+class PeerMeasurement:
+    """Measurements of a contender. ``cpu_s`` is of all its processes and of this one."""
 
     all_at_once: ContestPass
     cpu_s: float
@@ -130,21 +129,19 @@ def bench_peers(workload: Workload, sizes: PeerSizes, on_step: Callable[[str], N
     with _folder(workload) as folder:
         setup = ContenderSetup(folder, sizes.slots, tuple(workload.bundles))
         with own_cluster(setup, workload) as contender:
-            ours = _tuned(contender, setup, workload, sizes)
+            ours = _measured(contender, setup, workload, sizes)
     rate = ours.all_at_once.rate
     leads: list[Figure] = []
-    figures = [*_tuned_figures("ours", ours)]
+    figures = [*_figures("ours", ours)]
     for peer in sizes.peers:
         on_step(f"contest: {peer.value}")
         found = missing(peer) or run_apart(measure_peer, (peer, workload, sizes), sizes.peer_s)
         if isinstance(found, str):
             logger.warning("the contest goes without %s: %s", peer.value, found)
             continue
-        plain, tuned = found
-        lead = rate / tuned.all_at_once.rate
+        lead = rate / found.all_at_once.rate
         leads.append(_figure(f"vs_{peer.value}", lead, "×", ours.all_at_once, LEAD_GOAL))
-        figures.append(_figure(f"{CONTEST}{peer.value}: plain, 1/s", plain.rate, "1/s", plain))
-        figures += _tuned_figures(peer.value, tuned)
+        figures += _figures(peer.value, found)
     return (*leads, *figures)
 
 
@@ -173,20 +170,13 @@ def run_apart(measure: Callable[..., Any], arguments: tuple[Any, ...], limit_s: 
             kill_tree(pid)
 
 
-def measure_peer(
-    peer: PeerSystem, workload: Workload, sizes: PeerSizes
-) -> tuple[ContestPass, TunedMeasurement]:
-    """Measure the peer, plain and tuned. Raises what the library raises."""
-    start = LIBRARIES[peer][0]
-    with _folder(workload) as folder, start(ContenderSetup(folder, sizes.slots)) as contender:
-        # The first calls start the processes.
-        execute(contender, singles(workload.sample(2 * sizes.slots)), sizes.limit_s)
-        plain = execute(contender, singles(workload.sample(sizes.plain)), sizes.limit_s)
+def measure_peer(peer: PeerSystem, workload: Workload, sizes: PeerSizes) -> PeerMeasurement:
+    """Raises what the library raises."""
     with _folder(workload) as folder:
         setup = ContenderSetup(folder, sizes.slots, tuple(workload.bundles))
-        with start(setup) as contender:
+        with LIBRARIES[peer][0](setup) as contender:
             await_processes(contender, sizes.slots, sizes.start_s)
-            return plain, _tuned(contender, setup, workload, sizes)
+            return _measured(contender, setup, workload, sizes)
 
 
 def execute(
@@ -245,9 +235,9 @@ def singles(rollouts: Sequence[Rollout]) -> list[RolloutChunk]:
     return [(rollout,) for rollout in rollouts]
 
 
-def _tuned(
+def _measured(
     contender: Contender, setup: ContenderSetup, workload: Workload, sizes: PeerSizes
-) -> TunedMeasurement:
+) -> PeerMeasurement:
     execute(contender, chunks_of(workload.first(sizes.warm).rollouts, sizes.chunk), sizes.limit_s)
     chunks = chunks_of(workload.after(sizes.warm).rollouts, sizes.chunk)
     before_s, own_s = descendants_cpu_s(), time.process_time()
@@ -263,7 +253,7 @@ def _tuned(
     forget_executions(setup.folder)
     killed = _killed(contender, chunks, sizes)
     repeated = max(killed.repeated, executed_twice(setup.folder))
-    return TunedMeasurement(all_at_once, cpu_s, alone_s, wave_s, killed, repeated)
+    return PeerMeasurement(all_at_once, cpu_s, alone_s, wave_s, killed, repeated)
 
 
 def _killed(contender: Contender, chunks: Sequence[RolloutChunk], sizes: PeerSizes) -> ContestPass:
@@ -287,12 +277,12 @@ def _folder(workload: Workload) -> Iterator[Path]:
         yield Path(name)
 
 
-def _tuned_figures(system: str, found: TunedMeasurement) -> Iterator[Figure]:
+def _figures(system: str, found: PeerMeasurement) -> Iterator[Figure]:
     prefix, lower = f"{CONTEST}{system}: ", Better.LOWER
     everything, killed = found.all_at_once, found.killed
     count, waves = len(everything.latency_s), len(found.wave_s)
     submitted = len(killed.latency_s) + killed.lost + killed.hung
-    yield _figure(f"{prefix}tuned, 1/s", everything.rate, "1/s", everything)
+    yield _figure(f"{prefix}rollouts, 1/s", everything.rate, "1/s", everything)
     yield Figure(f"{prefix}CPU, ms", found.cpu_s / count * 1e3, "ms", lower, count)
     yield Figure(f"{prefix}alone, ms", quantile(found.alone_s, 0.5) * 1e3, "ms", lower, len(found.alone_s))
     yield Figure(f"{prefix}under load, ms", float(np.mean(found.wave_s)) * 1e3, "ms", lower, waves)

@@ -1,12 +1,11 @@
-"""Code that runs in a peer's processes: our simulator, with scenes that stay loaded or are loaded for every rollout.
+"""Code that runs in a peer's processes: our simulator, with scenes that stay loaded.
 
-A process that holds scenes behaves like a slot: deferred work is completed ahead, the heap is frozen, and garbage is collected
+A process behaves like a slot: deferred work is completed ahead, the heap is frozen, and garbage is collected
 between rollouts. Plans and results travel as protobuf bytes, which cost half as much as pickles.
 """
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import gc
 import os
@@ -16,14 +15,11 @@ from pathlib import Path
 from typing import Final
 
 from embomatrix.proto.v1 import types_pb2
-from embomatrix.reward.hierarchy import score
 from embomatrix.rpc.wire.outcome import completed_to_proto
 from embomatrix.rpc.wire.rollout import rollout_from_proto
-from embomatrix.rpc.wire.values import Completed, Rollout, Timings
-from embomatrix.sim.simulation import load_simulator
+from embomatrix.rpc.wire.values import Rollout
 from embomatrix.worker.slots.physics import Physics
 from embomatrix.worker.slots.slot_program import COLLECT_EVERY
-from embomatrix.world.bundle import read_bundle
 
 Answer = tuple[int, list[bytes]]
 """Process id and results."""
@@ -51,20 +47,7 @@ def executed_twice(folder: Path) -> int:
     return len(begun) - len(set(begun))
 
 
-def execute_fresh(folder: str, request: bytes) -> Answer:
-    """Load the scene, execute and score the plan, and drop the scene."""
-    rollout = rollout_from_proto(types_pb2.Rollout.FromString(request))
-    _log_execution(folder, rollout)
-    bundle = read_bundle(Path(folder) / _file(rollout.bundle_digest), digest=rollout.bundle_digest)
-    task = bundle.tasks[rollout.task_id]
-    with contextlib.closing(load_simulator(bundle)) as simulator:
-        trace = simulator.execute(task, rollout.plan, rollout.seed)
-        reward = score(task, trace.touched, simulator.facts)
-    completed = Completed(reward, trace.steps, trace.final, trace.digest, "", Timings(), warm=False)
-    return os.getpid(), [completed_to_proto(completed).SerializeToString()]
-
-
-def execute_held(folder: str, digests: Sequence[str], requests: Sequence[bytes]) -> Answer:
+def execute_chunk(folder: str, digests: Sequence[str], requests: Sequence[bytes]) -> Answer:
     """Execute in the scenes of this process. The first call loads the scenes ``digests``."""
     return _scene_process(folder, tuple(digests)).execute(requests)
 
