@@ -1,4 +1,4 @@
-"""`bench fidelity`: a dead process costs one trial, an interrupted suite resumes, disagreements are replayed."""
+"""`bench fidelity`: a dead process costs one trial, an interrupted suite resumes."""
 
 import json
 
@@ -8,7 +8,7 @@ from tests.fakes.fidelity import clumsy, dying, hanging, raising
 from typer.testing import CliRunner
 
 from embomatrix.bench.cli import app
-from embomatrix.bench.fidelity.page import figures_of, read_disagreement, replay_trial
+from embomatrix.bench.fidelity.page import figures_of
 from embomatrix.bench.fidelity.pool import LOST, FidelityPool, Modes, TrialJob
 from embomatrix.bench.fidelity.suite import (
     DISAGREEMENTS_FILE,
@@ -160,39 +160,10 @@ def test_failing_process_costs_only_its_current_trial(dataset, physical, reason,
     assert reason in values[1][LOST]
 
 
-def test_disagreement_is_replayed_step_by_step(suite, dataset):
-    folder, _ = suite
-    path = folder / DISAGREEMENTS_FILE
-    number = next(
-        n
-        for n, line in enumerate(path.read_text().splitlines(), 1)
-        if "toggle_on" in line and '"step"' in line
-    )
-    lines = list(replay_trial(dataset, read_disagreement(f"{path}:{number}"), Modes(load_simulator, clumsy)))
-    assert any(line.startswith("≠") and "toggle_on" in line for line in lines)
-    assert any("blocks it" in line for line in lines)
-    assert any(line.strip().startswith("cached only:") for line in lines)
-
-
-@pytest.mark.parametrize("spot", ["nowhere", "file:0", "file:x"])
-def test_malformed_line_reference_is_refused(spot):
-    with pytest.raises(BenchError, match="FILE:N"):
-        read_disagreement(spot)
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        (["--dataset", "nowhere"], "there is no dataset in nowhere"),
-        (["--replay", "nowhere"], "expected FILE:N"),
-        (["--replay", "nowhere:3"], "nowhere"),
-    ],
-)
-def test_wrong_option_is_one_sentence(dataset, options, sentence):
-    given = options if "--dataset" in options else ["--dataset", str(dataset.folder), *options]
-    answer = CliRunner().invoke(app, ["fidelity", *given])
+def test_wrong_dataset_is_one_sentence():
+    answer = CliRunner().invoke(app, ["fidelity", "--dataset", "nowhere"])
     assert answer.exit_code == 2
-    assert sentence in answer.output
+    assert "there is no dataset in nowhere" in answer.output
     assert "Traceback" not in answer.output
 
 

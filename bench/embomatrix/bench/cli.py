@@ -14,7 +14,7 @@ from embomatrix.bench.cluster.prewarm import PrewarmSizes, bench_prewarm
 from embomatrix.bench.engine.engine import bench_engine
 from embomatrix.bench.engine.plan_writer import save_workload, write_workload
 from embomatrix.bench.engine.workload import PINNED, SIZES, Workload, load_workload
-from embomatrix.bench.fidelity.page import figures_of, read_disagreement, replay_trial
+from embomatrix.bench.fidelity.page import figures_of
 from embomatrix.bench.fidelity.pool import Modes
 from embomatrix.bench.fidelity.suite import (
     DISAGREEMENTS_FILE,
@@ -197,17 +197,10 @@ def fidelity(
         bool,
         typer.Option("--quick", help=f"Run {QUICK.plans} plans: a check that takes minutes, not a result."),
     ] = False,
-    replay: Annotated[
-        str, typer.Option(help="FILE:N, a line of the disagreements, to be shown step by step.")
-    ] = "",
 ) -> None:
     """Run the same plans in cached and in physical mode and compare; resumes an interrupted suite."""
     with refusals():
         found = Dataset.load(dataset or (PINNED if quick else FULL_SUITE))
-        if replay:
-            for line in replay_trial(found, read_disagreement(replay), MODES):
-                console.print(line, highlight=False, markup=False, soft_wrap=True)
-            return
         settings = QUICK if quick else FidelitySettings(plans, calls, seed)
         folder = out or Path("build/fidelity-quick" if quick else "build/fidelity")
         hand_in(_fidelity(found, settings, folder, jobs), json_file)
@@ -355,8 +348,7 @@ def _fidelity(dataset: Dataset, settings: FidelitySettings, out: Path, jobs: int
         return figures_of(outcome, (time.monotonic() - started_s) / 60 if fresh else None)
 
     result = _measured("fidelity", measure, jobs=jobs, plans_asked=settings.plans, seed=settings.seed)
-    path = out / DISAGREEMENTS_FILE
-    console.print(f"disagreements: {path}; show the first with --replay {path}:1", highlight=False)
+    console.print(f"disagreements: {out / DISAGREEMENTS_FILE}", highlight=False)
     return result
 
 
