@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from embomatrix.bench.cli import app
 from embomatrix.bench.report.figures import BenchError
-from embomatrix.bench.trainer.measure import StepShares, bench_trainer
+from embomatrix.bench.trainer.measure import measure_steps, shares_of
 from embomatrix.bench.trainer.steps import load_of, own_step_s, parse_step_s, policy_of
 
 TASKS = make_tasks(3, 0, objects=6).train
@@ -44,17 +44,17 @@ def test_step_times_are_read_from_the_last_line():
 def test_shares_are_of_the_given_steps_and_the_time_since_earlier_ones():
     def record(seconds, sampling, update, waiting):
         spent_s = {"sampling": sampling, "update": update, "waiting for simulation": waiting}
-        return {"seconds": seconds, "rollouts": 6, "spent_s": spent_s}
+        return {"seconds": seconds, "spent_s": spent_s}
 
     steps = [record(4.0, 1.0, 1.0, 2.0), record(2.0, 2.0, 1.5, 2.2), record(2.0, 3.0, 2.0, 2.4)]
-    first, later = StepShares.of(steps[:1], {}), StepShares.of(steps[1:], steps[0]["spent_s"])
-    assert (first.steps, first.waiting, first.overhead, first.rollouts_per_s) == (1, 0.5, 0.5, 1.5)
-    assert (later.steps, later.rollouts_per_s) == (2, 3.0)
+    first, later = shares_of(steps[:1], {}), shares_of(steps[1:], steps[0]["spent_s"])
+    assert (first.seconds, first.waiting, first.overhead) == (4.0, 0.5, 0.5)
+    assert later.seconds == 4.0
     assert (later.waiting, later.overhead) == pytest.approx((0.1, 0.25))
 
 
 def test_missing_dataset_is_one_sentence():
-    result = CliRunner().invoke(app, ["trainer", "--dataset=nowhere", "--part=step"])
+    result = CliRunner().invoke(app, ["trainer", "--dataset=nowhere"])
     assert result.exit_code == 2
     assert "no dataset at nowhere" in " ".join(result.output.split())
 
@@ -66,6 +66,6 @@ def test_steps_are_compared_with_those_of_the_named_interpreter(tmp_path):
     stand_in = tmp_path / "python"
     stand_in.write_text(f"#!{sys.executable}\nprint('{{\"step_s\": [1000.0]}}')\n")
     stand_in.chmod(0o755)
-    figures = bench_trainer(folder, stand_in, ["step"], lambda _: None)
+    figures = measure_steps(folder, stand_in, tmp_path, lambda _: None)
     found = {figure.name: figure for figure in figures}
     assert found["grpo_step_vs_trl"].value == pytest.approx(1000.0 / found["grpo_step_cpu_s"].value)

@@ -23,7 +23,7 @@ from embomatrix.bench.fidelity.suite import (
     SuiteProgress,
     run_fidelity,
 )
-from embomatrix.bench.peers.contest import PeerSizes, PeerSystem, bench_peers
+from embomatrix.bench.peers.contest import PeerSizes, bench_peers
 from embomatrix.bench.report.figures import (
     BenchResult,
     commit_here,
@@ -57,23 +57,6 @@ class ClusterPart(StrEnum):
     PEERS = "peers"
 
 
-class TrainerPart(StrEnum):
-    """Parts of the trainer's benchmark."""
-
-    STEP = "step"
-    RUN = "run"
-    EVAL = "eval"
-
-
-class OperationsPart(StrEnum):
-    """Parts of the benchmark of operations."""
-
-    IMAGES = "images"
-    COMPOSE = "compose"
-    JOIN = "join"
-    DASHBOARD = "dashboard"
-
-
 PINNED_HELP = "Dataset with a workload; by default the small one that the package ships."
 DataSet = Annotated[Path, typer.Option("--dataset", help=PINNED_HELP, show_default=False)]
 Json = Annotated[Path | None, typer.Option("--json", help="File for the figures.")]
@@ -105,15 +88,11 @@ def cluster(
     json_file: Json = None,
     part: Parts = None,
     naive: Naive = 16,
-    peer: Annotated[
-        list[PeerSystem] | None, typer.Option("--peer", help="Peer to measure; repeatable. [default: all]")
-    ] = None,
     limit_s: LimitS = 120.0,
 ) -> None:
     """Measure the paper's ablation, the manager under load, look-ahead, and other libraries on the same work."""
     with refusals():
-        peers = PeerSizes(peers=tuple(peer or PeerSystem))
-        hand_in(_cluster(load_workload(dataset), part, naive, limit_s, peers), json_file)
+        hand_in(_cluster(load_workload(dataset), part, naive, limit_s), json_file)
 
 
 @app.command()
@@ -145,37 +124,26 @@ def trainer(
             envvar="EMBOMATRIX_TRL",
         ),
     ] = None,
-    part: Annotated[
-        list[TrainerPart] | None, typer.Option("--part", help="Part to measure; repeatable. [default: all]")
-    ] = None,
 ) -> None:
     """Measure a GRPO step, the time shares of a short run, and an evaluation of stored answers."""
     from embomatrix.bench.trainer.measure import bench_trainer
 
-    parts = tuple(part or TrainerPart)
     with refusals():
-        hand_in(_measured("trainer", lambda step: bench_trainer(dataset, trl, parts, step)), json_file)
+        hand_in(_measured("trainer", lambda on_step: bench_trainer(dataset, trl, on_step)), json_file)
 
 
 @app.command()
 def operations(
     dataset: DataSet = PINNED,
     json_file: Json = None,
-    part: Annotated[
-        list[OperationsPart] | None,
-        typer.Option("--part", help="Part to measure; repeatable. [default: all]"),
-    ] = None,
-    checkout: Annotated[Path, typer.Option(help="Folder of the compose file.")] = Path(),
 ) -> None:
     """Measure image sizes, `docker compose up` to its first rollout, joining, and the dashboard.
 
     Parts that need Docker or Chromium are left out with a note if these are missing.
     """
-    parts = tuple(part or OperationsPart)
     with refusals():
         workload = load_workload(dataset)
-        result = _measured("operations", lambda step: _operations(workload, checkout, parts, step))
-        hand_in(result, json_file)
+        hand_in(_measured("operations", lambda on_step: _operations(workload, on_step)), json_file)
 
 
 @app.command()
@@ -249,7 +217,7 @@ def everything(
         # A page that can't be updated is refused before minutes are spent.
         check_page(_text_of(out))
         found = load_workload(dataset)
-        results = [_engine(found, cycles), _cluster(found, part, naive, limit_s, PeerSizes())]
+        results = [_engine(found, cycles), _cluster(found, part, naive, limit_s)]
         for result in results:
             hand_in(result, json_dir / f"{result.bench}.json" if json_dir is not None else None)
         write(out, render_page(results, _text_of(out)))
@@ -280,9 +248,7 @@ def _engine(found: Workload, cycles: int) -> BenchResult:
     return _measured("engine", lambda on_step: bench_engine(found, cycles, on_step))
 
 
-def _cluster(
-    found: Workload, parts: list[ClusterPart] | None, naive: int, limit_s: float, peers: PeerSizes
-) -> BenchResult:
+def _cluster(found: Workload, parts: list[ClusterPart] | None, naive: int, limit_s: float) -> BenchResult:
     def measure(on_step: OnStep) -> list[Figure]:
         measures: dict[ClusterPart, Callable[[], Sequence[Figure]]] = {
             ClusterPart.ABLATION: lambda: bench_ablation(
@@ -290,7 +256,7 @@ def _cluster(
             ),
             ClusterPart.FLOW: lambda: bench_flow(found.main, FlowSizes(limit_s=limit_s), on_step),
             ClusterPart.PREWARM: lambda: bench_prewarm(found, PrewarmSizes(limit_s=limit_s), on_step),
-            ClusterPart.PEERS: lambda: bench_peers(found.main, peers, on_step),
+            ClusterPart.PEERS: lambda: bench_peers(found.main, PeerSizes(), on_step),
         }
         return [
             figure for part in ClusterPart if part in (parts or ClusterPart) for figure in measures[part]()
@@ -299,9 +265,7 @@ def _cluster(
     return _measured("cluster", measure)
 
 
-def _operations(
-    found: Workload, checkout: Path, parts: Sequence[OperationsPart], on_step: OnStep
-) -> list[Figure]:
+def _operations(found: Workload, on_step: OnStep) -> list[Figure]:
     from embomatrix.bench.operations.compose import (
         compose_at,
         image_sizes,
@@ -312,25 +276,16 @@ def _operations(
     from embomatrix.bench.operations.joining import measure_joining
 
     figures: list[Figure] = []
-    if {OperationsPart.IMAGES, OperationsPart.COMPOSE} & set(parts):
-        compose = compose_at(checkout)
-        if compose is None:
-            _note("images and compose are left out: they need a Docker engine and a checkout (--checkout)")
-        elif missing := missing_images():
-            _note(
-                f"images and compose are left out: build {' and '.join(missing)} with `docker compose build`"
-            )
-        else:
-            figures += image_sizes() if OperationsPart.IMAGES in parts else ()
-            if OperationsPart.COMPOSE in parts:
-                figures += measure_first_rollout(compose, found, on_step)
-    if OperationsPart.JOIN in parts:
-        figures += measure_joining(on_step)
-    if OperationsPart.DASHBOARD in parts:
-        if browser_path() is None:
-            _note("dashboard_paint_s is left out: it needs Chromium and `pip install 'embomatrix[bench]'`")
-        figures += measure_dashboard(on_step)
-    return figures
+    compose = compose_at(Path())
+    if compose is None:
+        _note("images and compose are left out: they need a Docker engine and the checkout as working folder")
+    elif missing := missing_images():
+        _note(f"images and compose are left out: build {' and '.join(missing)} with `docker compose build`")
+    else:
+        figures += [*image_sizes(), *measure_first_rollout(compose, found, on_step)]
+    if browser_path() is None:
+        _note("dashboard_paint_s is left out: it needs Chromium and `pip install 'embomatrix[bench]'`")
+    return [*figures, *measure_joining(on_step), *measure_dashboard(on_step)]
 
 
 def _fidelity(dataset: Dataset, settings: FidelitySettings, out: Path, jobs: int) -> BenchResult:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 import tempfile
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -38,25 +37,20 @@ TASKS: Final = 100
 SAMPLES: Final = 10
 
 
-def bench_trainer(
-    dataset: Path, trl: Path | None, parts: Collection[str], on_step: Callable[[str], None]
-) -> tuple[Figure, ...]:
-    """Measure the parts ``step``, ``run`` and ``eval``.
+def bench_trainer(dataset: Path, trl: Path | None, on_step: Callable[[str], None]) -> tuple[Figure, ...]:
+    """Measure steps, a run and an evaluation.
 
     ``trl`` is the interpreter of an environment with TRL. Raise BenchError.
     """
-    figures: list[Figure] = []
     with tempfile.TemporaryDirectory(prefix="embo-") as name:
-        if "step" in parts:
-            figures += _steps(dataset, trl, Path(name), on_step)
-        if "run" in parts:
-            figures += _run(dataset, Path(name), on_step)
-        if "eval" in parts:
-            figures += _evaluation(dataset, Path(name), on_step)
-    return tuple(figures)
+        folder = Path(name)
+        steps = measure_steps(dataset, trl, folder, on_step)
+        return (*steps, *_run(dataset, folder, on_step), *_evaluation(dataset, folder, on_step))
 
 
-def _steps(dataset: Path, trl: Path | None, folder: Path, on_step: Callable[[str], None]) -> list[Figure]:
+def measure_steps(
+    dataset: Path, trl: Path | None, folder: Path, on_step: Callable[[str], None]
+) -> list[Figure]:
     """CPU seconds of a step, of both trainers one after the other."""
     try:
         tasks = load_tasks(dataset).train[:PROMPTS]
@@ -94,34 +88,22 @@ def _run(dataset: Path, folder: Path, on_step: Callable[[str], None]) -> list[Fi
             f"--manager={cluster.address}",
         )
     steps = read_metrics(out)
-    first = StepShares.of(steps[:FIRST_STEPS], {})
-    warm = StepShares.of(steps[UNMEASURED_STEPS:], steps[UNMEASURED_STEPS - 1]["spent_s"])
+    first, warm = steps[:FIRST_STEPS], steps[UNMEASURED_STEPS:]
+    shares = shares_of(warm, steps[UNMEASURED_STEPS - 1]["spent_s"])
+    rate = sum(record["rollouts"] for record in warm) / shares.seconds
     return [
-        Figure("sim_wait_share", warm.waiting, "", Better.LOWER, warm.steps, 0.05),
-        Figure("overhead_ratio", warm.overhead, "", Better.LOWER, warm.steps, 0.10),
-        Figure("first_steps_wait_share", first.waiting, "", Better.LOWER, first.steps),
-        Figure("training_rollouts_per_s", warm.rollouts_per_s, "1/s", Better.HIGHER, warm.steps),
+        Figure("sim_wait_share", shares.waiting, "", Better.LOWER, len(warm), 0.05),
+        Figure("overhead_ratio", shares.overhead, "", Better.LOWER, len(warm), 0.10),
+        Figure("first_steps_wait_share", shares_of(first, {}).waiting, "", Better.LOWER, len(first)),
+        Figure("training_rollouts_per_s", rate, "1/s", Better.HIGHER, len(warm)),
     ]
 
 
-@dataclass(frozen=True, slots=True)
-class StepShares:
-    """Shares of the time of consecutive steps: waiting for simulation, and neither sampling nor update."""
-
-    steps: int
-    waiting: float
-    overhead: float
-    rollouts_per_s: float
-
-    @classmethod
-    def of(cls, records: Sequence[Mapping[str, Any]], earlier_s: Mapping[str, float]) -> StepShares:
-        """``earlier_s`` is the time that the run had spent before these steps, by activity."""
-        seconds = float(sum(record["seconds"] for record in records))
-        spent_s: Mapping[str, float] = records[-1]["spent_s"]
-        since = {activity: spent - earlier_s.get(activity, 0.0) for activity, spent in spent_s.items()}
-        shares = TimeShares(seconds, since)
-        rollouts = sum(record["rollouts"] for record in records)
-        return cls(len(records), shares.waiting, shares.overhead, rollouts / seconds)
+def shares_of(records: Sequence[Mapping[str, Any]], earlier_s: Mapping[str, float]) -> TimeShares:
+    """Time shares of consecutive steps. ``earlier_s`` is the run's time before them by activity."""
+    spent_s: Mapping[str, float] = records[-1]["spent_s"]
+    since = {activity: spent - earlier_s.get(activity, 0.0) for activity, spent in spent_s.items()}
+    return TimeShares(float(sum(record["seconds"] for record in records)), since)
 
 
 def _evaluation(dataset: Path, folder: Path, on_step: Callable[[str], None]) -> list[Figure]:
