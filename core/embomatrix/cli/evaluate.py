@@ -23,7 +23,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from embomatrix.host.failure import INTERRUPTED, fail
 from embomatrix.host.limits import usable_cores
-from embomatrix.rpc.options import add_settings, given_options
+from embomatrix.rpc.options import Ca, Token, add_settings, given_options
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.cluster.executor import Executor
@@ -33,10 +33,10 @@ from embomatrix.trainer.eai.exam import CODEC as EAI_CODEC
 from embomatrix.trainer.eai.exam import NAME as NATIVE
 from embomatrix.trainer.eai.exam import NativeExam
 from embomatrix.trainer.evaluation.answer_sources import (
-    AnswerSource,
-    EndpointSource,
-    PolicySource,
-    ScriptSource,
+    OnProgress,
+    ask_endpoint,
+    ask_policy,
+    ask_script,
     questions_digest,
 )
 from embomatrix.trainer.evaluation.answers import (
@@ -49,9 +49,9 @@ from embomatrix.trainer.evaluation.answers import (
     ordered,
     read_answers,
 )
-from embomatrix.trainer.evaluation.baselines import BaselineName, baseline_for
+from embomatrix.trainer.evaluation.baselines import PLANNERS, BaselineName
 from embomatrix.trainer.evaluation.benchmark import Benchmark, find_benchmark
-from embomatrix.trainer.evaluation.exam import Exam, WorldExam
+from embomatrix.trainer.evaluation.exam import Exam, Question, WorldExam
 from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.table import ScoreRow, read_row, report_of, text_report
 from embomatrix.world.task import MAX_TABLE, Profile
@@ -113,7 +113,7 @@ class Subject:
 class OpenSubject:
     """Subject that is ready to answer, with its codec, maximum table rows and maximum tokens."""
 
-    source: AnswerSource
+    ask: Callable[[Sequence[Question], AnswerSheet, OnProgress], None]
     codec: Codec = Codec.JSON
     rows: int = MAX_TABLE
     max_tokens: int = 1
@@ -162,12 +162,8 @@ def evaluate(
             _EXECUTION, envvar="EMBOMATRIX_MANAGER", help="HOST:PORT of a manager. Default: this machine."
         ),
     ] = "",
-    token: Annotated[
-        str, _option(_EXECUTION, envvar="EMBOMATRIX_TOKEN", help="Token of the trainer role, or @FILE.")
-    ] = "",
-    ca: Annotated[
-        Path | None, _option(_EXECUTION, envvar="EMBOMATRIX_CA", help="ca.pem of a manager with TLS.")
-    ] = None,
+    token: Token = "",
+    ca: Ca = None,
     out: Annotated[
         Path | None,
         _option(_OUTPUT, help=f"Folder of answers and report. Default: {DEFAULT_OUT}/BENCH-MODEL."),
@@ -274,7 +270,10 @@ def _open_subject(exam: Exam, subject: Subject, settings: EvalSettings, folder: 
                 f"{subject.model} is a word-level policy, which can't read {NATIVE}'s prompts: pass another model"
             )
         return OpenSubject(
-            PolicySource(loaded.policy), codec, loaded.rows, settings.max_tokens or loaded.max_tokens
+            functools.partial(ask_policy, loaded.policy),
+            codec,
+            loaded.rows,
+            settings.max_tokens or loaded.max_tokens,
         )
     if subject.endpoint:
         if not subject.model_name:
@@ -287,11 +286,12 @@ def _open_subject(exam: Exam, subject: Subject, settings: EvalSettings, folder: 
         connect = functools.partial(
             Endpoint, subject.endpoint, subject.model_name, api_key=subject.key, limits=limits
         )
-        source = EndpointSource(connect, folder / "ledger.jsonl")
+        ask = functools.partial(ask_endpoint, connect, folder / "ledger.jsonl")
         return OpenSubject(
-            source, settings.codec or Codec.JSON, max_tokens=settings.max_tokens or ENDPOINT_TOKENS
+            ask, settings.codec or Codec.JSON, max_tokens=settings.max_tokens or ENDPOINT_TOKENS
         )
-    return OpenSubject(ScriptSource(_baseline(exam, subject.baseline or BaselineName.ORACLE)))
+    baseline = _baseline(exam, subject.baseline or BaselineName.ORACLE)
+    return OpenSubject(functools.partial(ask_script, baseline))
 
 
 def _baseline(exam: Exam, name: BaselineName) -> Callable[[str, np.random.Generator], str]:
@@ -304,7 +304,7 @@ def _baseline(exam: Exam, name: BaselineName) -> Callable[[str, np.random.Genera
         return lambda task_id, rng: exam.human(task_id)
     if name is BaselineName.HUMAN or not isinstance(exam, WorldExam):
         raise TrainerError(f"the human plans are of {NATIVE}: pass --bench {NATIVE}, or --baseline oracle")
-    plan, tasks = baseline_for(name), exam.bench.tasks
+    plan, tasks = PLANNERS[name], exam.bench.tasks
     return lambda task_id, rng: json.dumps(plan_to_json(plan(tasks[task_id], rng)))
 
 
@@ -335,7 +335,7 @@ def _ask(
         if len(sheet):
             console.print(f"{len(sheet)} answers are already stored")
         with _bar("answers") as on_progress:
-            opened.source.ask(questions, sheet, on_progress)
+            opened.ask(questions, sheet, on_progress)
         given = sheet.ordered(exam.task_ids)
     console.print(f"{len(given)} answers in {time.monotonic() - began_s:.1f} s: {folder / FILE}")
     return setup, given

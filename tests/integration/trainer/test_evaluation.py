@@ -1,5 +1,6 @@
 """Evaluation from answers to tables: stored, resumed, judged by the engine, and reproduced from the stored answers."""
 
+import functools
 import json
 from dataclasses import replace
 
@@ -13,9 +14,9 @@ from embomatrix.llm.endpoint import Endpoint, EndpointLimits
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.evaluation.answer_sources import EndpointSource, ScriptSource, questions_digest
+from embomatrix.trainer.evaluation.answer_sources import ask_endpoint, ask_script, questions_digest
 from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, EvaluationSetup, read_answers
-from embomatrix.trainer.evaluation.baselines import BaselineName, baseline_for
+from embomatrix.trainer.evaluation.baselines import PLANNERS, BaselineName
 from embomatrix.trainer.evaluation.benchmark import find_benchmark
 from embomatrix.trainer.evaluation.exam import WorldExam
 from embomatrix.trainer.evaluation.judging import judge_answers
@@ -63,8 +64,10 @@ def categories(bench):
 
 
 def written(bench, name):
-    plan = baseline_for(name)
-    return ScriptSource(lambda task_id, rng: json.dumps(plan_to_json(plan(bench.tasks[task_id], rng))))
+    plan = PLANNERS[name]
+    return functools.partial(
+        ask_script, lambda task_id, rng: json.dumps(plan_to_json(plan(bench.tasks[task_id], rng)))
+    )
 
 
 def asked(bench, name, samples=1):
@@ -72,7 +75,7 @@ def asked(bench, name, samples=1):
         Answer(
             task_id,
             sample,
-            json.dumps(plan_to_json(baseline_for(name)(task, np.random.default_rng((sample, 7))))),
+            json.dumps(plan_to_json(PLANNERS[name](task, np.random.default_rng((sample, 7))))),
         )
         for task_id, task in bench.tasks.items()
         for sample in range(samples)
@@ -127,7 +130,7 @@ def test_process_pool_gives_the_same_outcomes_as_one_process(bench):
 def test_report_from_stored_answers_is_bit_identical(bench, tmp_path):
     setup = setup_of(bench, codec="json")
     with AnswerSheet(tmp_path / "answers.jsonl", setup) as sheet:
-        written(bench, BaselineName.RANDOM).ask(questions(bench), sheet, lambda *_: None)
+        written(bench, BaselineName.RANDOM)(questions(bench), sheet, lambda *_: None)
         first = report(bench, sheet.ordered(bench.tasks), setup)
     kept, answers = read_answers(tmp_path / "answers.jsonl")
     again = report(
@@ -233,14 +236,16 @@ def test_truncated_line_is_asked_again(bench, tmp_path):
 
 def endpoint_asker(url, tmp_path, attempts=1):
     limits = EndpointLimits(attempts=attempts, first_wait_s=0.01, concurrent=3)
-    return EndpointSource(lambda: Endpoint(url, "scripted", limits=limits), tmp_path / "ledger.jsonl")
+    return functools.partial(
+        ask_endpoint, lambda: Endpoint(url, "scripted", limits=limits), tmp_path / "ledger.jsonl"
+    )
 
 
 def test_endpoint_is_asked_once_per_sample_and_usage_is_recorded(bench, tmp_path):
     server = ChatServer("move 10")
     with server.serving() as url, AnswerSheet(tmp_path / "answers.jsonl", setup_of(bench)) as sheet:
-        endpoint_asker(url, tmp_path).ask(questions(bench), sheet, lambda *_: None)
-        endpoint_asker(url, tmp_path).ask(questions(bench), sheet, lambda *_: None)
+        endpoint_asker(url, tmp_path)(questions(bench), sheet, lambda *_: None)
+        endpoint_asker(url, tmp_path)(questions(bench), sheet, lambda *_: None)
         assert len(sheet) == len(server.requests) == 2 * len(bench.records)
     assert server.most_at_once <= 3
     assert len({request["seed"] for request in server.requests}) == len(server.requests)
@@ -253,11 +258,11 @@ def test_failing_endpoint_loses_no_earlier_answer(bench, tmp_path):
     path = tmp_path / "answers.jsonl"
     with server.serving() as url, AnswerSheet(path, setup_of(bench)) as sheet:
         with pytest.raises(TrainerError, match=r"answered 500.*; [123] of 8 answers are kept in"):
-            endpoint_asker(url, tmp_path).ask(questions(bench), sheet, lambda *_: None)
+            endpoint_asker(url, tmp_path)(questions(bench), sheet, lambda *_: None)
         kept = len(sheet)
     again = ChatServer("move 10")
     with again.serving() as url, AnswerSheet(path, setup_of(bench)) as sheet:
-        endpoint_asker(url, tmp_path).ask(questions(bench), sheet, lambda *_: None)
+        endpoint_asker(url, tmp_path)(questions(bench), sheet, lambda *_: None)
         assert len(sheet) == 8
     assert len(again.requests) == 8 - kept
 

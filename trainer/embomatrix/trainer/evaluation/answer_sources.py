@@ -1,4 +1,7 @@
-"""Sources of answers: a policy in this process, a model behind an endpoint, or a script."""
+"""Sources of answers: a policy in this process, a model behind an endpoint, or a script.
+
+Each fills an answer sheet; stored answers are not requested again.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import asyncio
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -22,20 +25,12 @@ if TYPE_CHECKING:
 
 
 OnProgress = Callable[[int, int], None]
+"""Gets the number of stored answers and the total."""
 
 PURPOSE: Final = "eval"
 CHUNK: Final = 8
 """Tasks that a policy samples together."""
 MAX_SEED: Final = 2**31
-
-
-class AnswerSource(Protocol):
-    """Fills an answer sheet. Stored answers are not requested again.
-
-    ``on_progress`` gets the number of stored answers and the total.
-    """
-
-    def ask(self, questions: Sequence[Question], sheet: AnswerSheet, on_progress: OnProgress) -> None: ...
 
 
 def questions_digest(questions: Iterable[Question]) -> str:
@@ -52,72 +47,56 @@ def seed_of(seed: int, task_id: str, sample: int) -> int:
     return int.from_bytes(digest[:4], "big") % MAX_SEED
 
 
-class PolicySource:
-    """Policy in this process. Each chunk of tasks has its own seed, so a resumed evaluation draws the same plans."""
+def ask_policy(
+    policy: Policy, questions: Sequence[Question], sheet: AnswerSheet, on_progress: OnProgress
+) -> None:
+    """Ask a policy in this process. Each chunk of tasks has its own seed, so a resumed evaluation draws the same plans."""
+    import torch
 
-    def __init__(self, policy: Policy) -> None:
-        self._policy = policy
-
-    def ask(self, questions: Sequence[Question], sheet: AnswerSheet, on_progress: OnProgress) -> None:
-        import torch
-
-        setup = sheet.setup
-        device = next(iter(self._policy.parameters())).device
-        for at in range(0, len(questions), CHUNK):
-            chunk = questions[at : at + CHUNK]
-            keys = [(question.task_id, sample) for question in chunk for sample in range(setup.samples)]
-            if any(key not in sheet for key in keys):
-                seed = seed_of(setup.seed, chunk[0].task_id, 0)
-                drawn = self._policy.sample(
-                    [self._policy.encode(question.prompt) for question in chunk],
-                    setup.samples,
-                    setup.temperature,
-                    setup.max_tokens,
-                    torch.Generator(device).manual_seed(seed),
-                )
-                tokens = drawn.mask.sum(dim=1).tolist()
-                sheet.add(
-                    Answer(task_id, sample, text, completion_tokens=int(count))
-                    for (task_id, sample), text, count in zip(keys, drawn.texts, tokens, strict=True)
-                )
-            on_progress(len(sheet), len(questions) * setup.samples)
+    setup = sheet.setup
+    device = next(iter(policy.parameters())).device
+    for at in range(0, len(questions), CHUNK):
+        chunk = questions[at : at + CHUNK]
+        keys = [(question.task_id, sample) for question in chunk for sample in range(setup.samples)]
+        if any(key not in sheet for key in keys):
+            seed = seed_of(setup.seed, chunk[0].task_id, 0)
+            drawn = policy.sample(
+                [policy.encode(question.prompt) for question in chunk],
+                setup.samples,
+                setup.temperature,
+                setup.max_tokens,
+                torch.Generator(device).manual_seed(seed),
+            )
+            tokens = drawn.mask.sum(dim=1).tolist()
+            sheet.add(
+                Answer(task_id, sample, text, completion_tokens=int(count))
+                for (task_id, sample), text, count in zip(keys, drawn.texts, tokens, strict=True)
+            )
+        on_progress(len(sheet), len(questions) * setup.samples)
 
 
-class EndpointSource:
-    """Model behind an OpenAI-compatible endpoint. Token usage goes to ``ledger_file``, one line per call.
+def ask_endpoint(
+    open_endpoint: Callable[[], Endpoint],
+    ledger_file: Path,
+    questions: Sequence[Question],
+    sheet: AnswerSheet,
+    on_progress: OnProgress,
+) -> None:
+    """Ask a model behind an OpenAI-compatible endpoint. Token usage goes to ``ledger_file``, one line per call.
 
-    A failed question ends the evaluation with an error. Earlier answers stay on the sheet.
+    A failed question raises TrainerError with the number of stored answers. Earlier answers stay on the sheet.
     """
+    total = len(questions) * sheet.setup.samples
 
-    def __init__(self, open_endpoint: Callable[[], Endpoint], ledger_file: Path) -> None:
-        self._open_endpoint = open_endpoint
-        self._ledger_file = ledger_file
-
-    def ask(self, questions: Sequence[Question], sheet: AnswerSheet, on_progress: OnProgress) -> None:
-        """Raises TrainerError with the number of stored answers."""
-        total = len(questions) * sheet.setup.samples
-        try:
-            asyncio.run(self._ask_all(questions, sheet, lambda: on_progress(len(sheet), total)))
-        except ExceptionGroup as errors:
-            first = errors.exceptions[0]
-            if not isinstance(first, LlmError):
-                raise first from errors
-            message = str(first).removeprefix(f"{PURPOSE}: ")  # the command prints its own name
-            raise TrainerError(
-                f"{message}; {len(sheet)} of {total} answers are kept in {sheet.path}: the same command continues from there"
-            ) from errors
-
-    async def _ask_all(
-        self, questions: Sequence[Question], sheet: AnswerSheet, on_answer: Callable[[], None]
-    ) -> None:
-        async with self._open_endpoint() as endpoint:
-            model = Ledger(endpoint, path=self._ledger_file)
+    async def ask_all() -> None:
+        async with open_endpoint() as endpoint:
+            model = Ledger(endpoint, path=ledger_file)
 
             async def ask_one(question: Question, sample: int) -> None:
                 reply = await model.complete(_request(question, sheet.setup, sample))
                 used = (reply.usage.prompt_tokens, reply.usage.completion_tokens)
                 sheet.add([Answer(question.task_id, sample, reply.text, reply.finish, *used)])
-                on_answer()
+                on_progress(len(sheet), total)
 
             async with asyncio.TaskGroup() as group:
                 for question in questions:
@@ -125,20 +104,33 @@ class EndpointSource:
                         if (question.task_id, sample) not in sheet:
                             group.create_task(ask_one(question, sample))
 
+    try:
+        asyncio.run(ask_all())
+    except ExceptionGroup as errors:
+        first = errors.exceptions[0]
+        if not isinstance(first, LlmError):
+            raise first from errors
+        message = str(first).removeprefix(f"{PURPOSE}: ")  # the command prints its own name
+        raise TrainerError(
+            f"{message}; {len(sheet)} of {total} answers are kept in {sheet.path}: the same command continues from there"
+        ) from errors
 
-class ScriptSource:
-    """Source without prompts: a baseline, or a benchmark's human plans."""
 
-    def __init__(self, write: Callable[[str, np.random.Generator], str]) -> None:
-        """``write`` returns the text for a task's id. Equal generators give equal texts."""
-        self._write = write
+def ask_script(
+    write: Callable[[str, np.random.Generator], str],
+    questions: Sequence[Question],
+    sheet: AnswerSheet,
+    on_progress: OnProgress,
+) -> None:
+    """Ask a baseline, or take a benchmark's human plans. ``write`` returns the text for a task's id.
 
-    def ask(self, questions: Sequence[Question], sheet: AnswerSheet, on_progress: OnProgress) -> None:
-        for question in questions:
-            for sample in range(sheet.setup.samples):
-                rng = np.random.default_rng(seed_of(sheet.setup.seed, question.task_id, sample))
-                sheet.add([Answer(question.task_id, sample, self._write(question.task_id, rng))])
-            on_progress(len(sheet), len(questions) * sheet.setup.samples)
+    Equal generators must give equal texts.
+    """
+    for question in questions:
+        for sample in range(sheet.setup.samples):
+            rng = np.random.default_rng(seed_of(sheet.setup.seed, question.task_id, sample))
+            sheet.add([Answer(question.task_id, sample, write(question.task_id, rng))])
+        on_progress(len(sheet), len(questions) * sheet.setup.samples)
 
 
 def _request(question: Question, setup: EvaluationSetup, sample: int) -> ChatRequest:

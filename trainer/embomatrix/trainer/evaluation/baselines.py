@@ -58,11 +58,6 @@ class BaselineName(StrEnum):
     """Plans that EAI publishes; not for our own tasks."""
 
 
-def baseline_for(name: BaselineName) -> Baseline:
-    """Return the function that writes a task's plan. Equal generators give equal plans. Not for ``HUMAN``."""
-    return PLANNERS[name]
-
-
 def oracle_plan(task: TrainingTask, rng: np.random.Generator) -> Plan:
     """Return the dataset's plan. Raises TrainerError for a task without one."""
     if not task.oracle:
@@ -218,4 +213,4 @@ PLANNERS: Final[Mapping[BaselineName, Baseline]] = {
     BaselineName.GREEDY: greedy_plan,
     BaselineName.RANDOM: random_plan,
 }
-"""Baselines for our own tasks."""
+"""Functions that write a task's plan. Equal generators give equal plans. Human plans are not for our own tasks."""

@@ -56,7 +56,7 @@ class Remedy:
     any_object: bool = False
 
 
-_PLAN_CAUSES: Final[Mapping[PlanReason, Cause]] = {
+PLAN_CAUSES: Final[Mapping[PlanReason, Cause]] = {
     PlanReason.TOO_LONG: Cause.UNPARSABLE,
     PlanReason.NO_PLAN: Cause.UNPARSABLE,
     PlanReason.TOO_MANY_STEPS: Cause.UNPARSABLE,
@@ -64,6 +64,7 @@ _PLAN_CAUSES: Final[Mapping[PlanReason, Cause]] = {
     PlanReason.MISSING_ARGUMENT: Cause.WRONG_ARGUMENT,
     PlanReason.WRONG_ARGUMENT: Cause.WRONG_ARGUMENT,
 }
+"""Causes for a text without a valid plan."""
 
 REMEDIES: Final[Mapping[FailureReason, Remedy]] = {
     FailureReason.NOT_THERE: Remedy(Skill.SLICE, any_object=True),
@@ -133,11 +134,6 @@ STEP_CAUSES: Final[Mapping[FailureReason, Cause]] = {
     ),
 }
 """Causes that follow from the failure reason alone."""
-
-
-def cause_of_text(reason: PlanReason) -> Cause:
-    """Cause for a text without a valid plan."""
-    return _PLAN_CAUSES[reason]
 
 
 def cause_of_trace(plan: Plan, steps: Sequence[Step], table: Sequence[str]) -> Cause:

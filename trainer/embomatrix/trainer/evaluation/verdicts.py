@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from embomatrix.rpc.wire.values import Completed, Outcome
 from embomatrix.skills.parse import PlanError
 from embomatrix.skills.syntax import Plan
-from embomatrix.trainer.evaluation.taxonomy import Cause, cause_of_text, cause_of_trace
+from embomatrix.trainer.evaluation.taxonomy import PLAN_CAUSES, Cause, cause_of_trace
 from embomatrix.world.task import Task
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def unparsable_verdict(answer: Answer, error: PlanError) -> AnswerVerdict:
         answer.sample,
         success=False,
         partial=0.0,
-        cause=cause_of_text(error.reason),
+        cause=PLAN_CAUSES[error.reason],
         reason=error.reason.value,
         sentence=str(error),
     )
