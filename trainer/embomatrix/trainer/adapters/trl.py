@@ -3,12 +3,12 @@
 TRL itself is not imported: the reward is a callable, and the mixin overrides one method of the trainer class.
 """
 
-import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from torch.utils.data import BatchSampler
 
 from embomatrix.trainer.adapters.scorer import PlanScorer, scorer_for
 from embomatrix.trainer.cluster.gateway import PlanOutcome
@@ -93,7 +93,7 @@ class AnnouncedSampler:
         announce: Callable[[list[list[int]]], None],
     ) -> None:
         self._sampler = sampler
-        self._portions = Lookahead(_Portions(sampler, portion), steps=steps)
+        self._portions = Lookahead(BatchSampler(sampler, portion, drop_last=False), steps=steps)
         self._announce = announce
 
     def __iter__(self) -> Iterator[int]:
@@ -103,19 +103,6 @@ class AnnouncedSampler:
 
     def __len__(self) -> int:
         return len(self._sampler)  # type: ignore[arg-type]  # TRL's sampler has a length
-
-
-class _Portions:
-    """Indices of a sampler in portions, anew in each epoch."""
-
-    def __init__(self, sampler: Iterable[int], size: int) -> None:
-        self._sampler = sampler
-        self._size = size
-
-    def __iter__(self) -> Iterator[tuple[int, ...]]:
-        indices = iter(self._sampler)
-        while portion := tuple(itertools.islice(indices, self._size)):
-            yield portion
 
 
 def text_of(completion: object) -> str:

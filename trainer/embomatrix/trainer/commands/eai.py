@@ -1,6 +1,7 @@
 """`embomatrix eai`: install EAI's judge, and judge files of answers."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -87,12 +88,4 @@ def _result(judge: NativeJudge, known: set[str], entry: dict[str, str]) -> dict[
     found = judge.judge(name, entry["llm_output"])
     if found is None:
         return {"identifier": name, "official": False, "exact": False, "executed": False, "lost": True}
-    return {
-        "identifier": name,
-        "official": found.official,
-        "exact": found.exact,
-        "executed": found.executed,
-        "lost": False,
-        "goals": list(found.goals),
-        "errors": dict(found.errors),
-    }
+    return {"identifier": name, **asdict(found), "lost": False}

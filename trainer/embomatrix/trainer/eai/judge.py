@@ -52,10 +52,8 @@ class NativeResult:
 class NativeJudge:
     """Context manager over the judge's process, which is restarted after a crash."""
 
-    def __init__(self, environment: JudgeEnvironment, *, published: bool = True) -> None:
-        """``published``: use the initial state of the real simulator, as far as the package publishes it."""
+    def __init__(self, environment: JudgeEnvironment) -> None:
         self._environment = environment
-        self._arguments = () if published else ("--withhold-published",)
         self._stack = contextlib.ExitStack()
         self._process: subprocess.Popen[bytes] | None = None
 
@@ -114,7 +112,7 @@ class NativeJudge:
     def _start(self) -> subprocess.Popen[bytes]:
         program = ".".join((*INSIDE, "program"))
         self._process = subprocess.Popen(
-            [str(self._environment.python), "-s", "-m", program, *self._arguments],
+            [str(self._environment.python), "-s", "-m", program],
             cwd=self._folder,
             env={"PYTHONPATH": str(self._folder), "PYTHONDONTWRITEBYTECODE": "1", "PYTHONUTF8": "1"},
             stdin=subprocess.PIPE,

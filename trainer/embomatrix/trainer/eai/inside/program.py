@@ -33,8 +33,7 @@ def main() -> None:
     install()
     from embomatrix.trainer.eai.inside.demo import Package
 
-    package = Package(published="--withhold-published" not in sys.argv)
-    judge = PublishedJudge(package)
+    judge = PublishedJudge(Package())
     sys.addaudithook(_audit)
     for line in sys.stdin:
         order = json.loads(line)
@@ -120,7 +119,7 @@ class PublishedJudge:
         demo: Demo = self._evaluator(name).task
         return {
             "here": demo.check_success()[1]["satisfied"],
-            "there": self._package.record[name]["subgoal_success"],
+            "there": self._package.first_truths[name]["subgoal_success"],
         }
 
     def _evaluator(self, name: str) -> Any:
