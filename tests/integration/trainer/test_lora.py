@@ -15,6 +15,7 @@ from embomatrix.trainer.config.settings import (
     LANGUAGE_MODEL_DEFAULTS,
     ComputeDtype,
     LoraSettings,
+    TrainSettings,
     read_settings,
 )
 from embomatrix.trainer.evaluation.models import load_model
@@ -141,7 +142,7 @@ def test_merged_model_equals_the_adapted_one(tokenizer, tmp_path):
     assert torch.equal(scored(policy).logprobs, expected)  # saving leaves the adapters where they are
     assert not torch.allclose(before, expected, atol=1e-2)
     assert torch.allclose(
-        scored(HfPolicy.load(tmp_path, Codec.LINES, compute_dtype=ComputeDtype.FLOAT32)).logprobs,
+        scored(HfPolicy.load(tmp_path, TrainSettings(compute_dtype=ComputeDtype.FLOAT32))).logprobs,
         expected,
         atol=1e-4,
     )

@@ -16,7 +16,12 @@ from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 from embomatrix.skills.prompt import Codec, prompt_for
 from embomatrix.trainer.cluster.gateway import Gateway
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, LoraSettings, read_settings
+from embomatrix.trainer.config.settings import (
+    LANGUAGE_MODEL_DEFAULTS,
+    LoraSettings,
+    TrainSettings,
+    read_settings,
+)
 from embomatrix.trainer.evaluation.models import load_model
 from embomatrix.trainer.lifecycle.checkpoint import CheckpointStore, TrainingProgress
 from embomatrix.trainer.logging.display import LineDisplay
@@ -147,7 +152,7 @@ def test_damaged_weights_give_a_one_sentence_error(policy, tmp_path):
     weights_file = tmp_path / "model.safetensors"
     weights_file.write_bytes(weights_file.read_bytes()[:-40])
     with pytest.raises(TrainerError, match=r"can't be loaded \(.*\): pass `tiny`"):
-        HfPolicy.load(tmp_path, Codec.LINES)
+        HfPolicy.load(tmp_path, TrainSettings())
 
 
 def test_full_disk_leaves_the_previous_checkpoint_intact(policy, tmp_path, small_files):
@@ -165,7 +170,7 @@ def test_full_disk_leaves_the_previous_checkpoint_intact(policy, tmp_path, small
 
 def test_missing_model_gives_a_one_sentence_error(tmp_path):
     with pytest.raises(TrainerError, match=r"is not a folder.*pass `tiny`"):
-        HfPolicy.load(tmp_path / "nothing", Codec.LINES)
+        HfPolicy.load(tmp_path / "nothing", TrainSettings())
 
 
 @pytest.mark.parametrize(("name", "content"), [("a.txt", b"x"), ("a.gguf", b"no gguf at all")])
@@ -231,7 +236,7 @@ def smollm2(tmp_path_factory):
 @pytest.mark.timeout(900)
 def test_smollm2_takes_real_grpo_steps(smollm2, tmp_path):
     torch.set_num_threads(default_threads())
-    policy = HfPolicy.load(smollm2, Codec.LINES)
+    policy = HfPolicy.load(smollm2, TrainSettings())
     before = weights(policy)
     summary = train(
         policy,
@@ -257,7 +262,7 @@ def test_smollm2_takes_real_grpo_steps(smollm2, tmp_path):
 def test_model_folder_without_a_tokenizer_is_rejected(tmp_path):
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(TrainerError, match=r"has no tokenizer: copy the model's tokenizer\.json"):
-        HfPolicy.load(tmp_path, Codec.LINES)
+        HfPolicy.load(tmp_path, TrainSettings())
 
 
 def test_missing_folder_is_reported_before_missing_transformers(tmp_path, monkeypatch):
@@ -265,9 +270,9 @@ def test_missing_folder_is_reported_before_missing_transformers(tmp_path, monkey
         monkeypatch.setitem(sys.modules, library, None)
     (tmp_path / "tokenizer.json").write_text("{}")
     with pytest.raises(TrainerError, match=rf"the model '{tmp_path}' needs transformers: `pip install"):
-        HfPolicy.load(tmp_path, Codec.LINES)
+        HfPolicy.load(tmp_path, TrainSettings())
     with pytest.raises(TrainerError, match="'runs/nowhere' is not a folder, and a Hugging Face model needs"):
-        HfPolicy.load("runs/nowhere", Codec.LINES)
+        HfPolicy.load("runs/nowhere", TrainSettings())
 
 
 def test_trained_policy_keeps_its_codec_and_other_models_use_json(policy, tokenizer, tmp_path):

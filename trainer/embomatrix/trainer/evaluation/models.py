@@ -42,9 +42,6 @@ def load_model(named: str, codec: Codec | None, *, threads: int | None, device: 
         raise TrainerError(
             f"{folder} is not a model: expected runs/NAME/checkpoints/step-000050, or a folder with config.json"
         )
-    settings = read_settings(None, {"device": device}, LANGUAGE_MODEL_DEFAULTS)
-    return LoadedModel(
-        HfPolicy.load(named, codec or HfPolicy.codec_in(folder) or Codec.JSON, device=device),
-        settings.prompt.rows,
-        settings.grpo.max_new,
-    )
+    written = codec or HfPolicy.codec_in(folder) or Codec.JSON
+    settings = read_settings(None, {"device": device, "codec": written}, LANGUAGE_MODEL_DEFAULTS)
+    return LoadedModel(HfPolicy.load(named, settings), settings.prompt.rows, settings.grpo.max_new)

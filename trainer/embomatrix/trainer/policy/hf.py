@@ -20,7 +20,7 @@ from torch.utils.checkpoint import checkpoint
 
 from embomatrix.skills.prompt import Codec, Prompt
 from embomatrix.trainer.config.errors import TrainerError, reason_of
-from embomatrix.trainer.config.settings import ComputeDtype, LoraSettings
+from embomatrix.trainer.config.settings import LoraSettings, TrainSettings
 from embomatrix.trainer.policy.compute_dtype import frozen_weights, torch_dtype, use_compute_dtype
 from embomatrix.trainer.policy.lora import add_adapters, load_adapters, save_adapters
 from embomatrix.trainer.policy.protocol import Samples, Tokens, TokenScores, draw, pad_left
@@ -61,20 +61,12 @@ class HfPolicy:
         self._pad = self._end[0] if tokenizer.pad_token_id is None else int(tokenizer.pad_token_id)
 
     @classmethod
-    def load(
-        cls,
-        name: str | Path,
-        codec: Codec,
-        *,
-        device: str = "cpu",
-        compute_dtype: ComputeDtype = ComputeDtype.AUTO,
-        label: str = "",
-        gradient_checkpointing: bool = False,
-    ) -> HfPolicy:
-        """Load a model by name or folder. On a CPU its linear layers multiply in ``compute_dtype``.
+    def load(cls, name: str | Path, settings: TrainSettings, *, label: str = "") -> HfPolicy:
+        """Load a model by name or folder, without adapters. Raises TrainerError with a remedy.
 
-        Raises TrainerError with a remedy.
+        On a CPU its linear layers multiply in the ``compute_dtype`` of the settings.
         """
+        device = settings.device
         try:
             _check_available(str(name))
             from transformers import AutoModelForCausalLM, AutoTokenizer
@@ -95,10 +87,16 @@ class HfPolicy:
             raise TrainerError(
                 f"the model {str(name)!r} can't be loaded ({reason_of(error)}): {REMEDY}"
             ) from error
-        cast_to = torch_dtype(compute_dtype, device)
+        cast_to = torch_dtype(settings.compute_dtype, device)
         if cast_to is not dtype and device == "cpu":
             use_compute_dtype(model, cast_to, model.get_output_embeddings())
-        return cls(model, tokenizer, codec, label or str(name), gradient_checkpointing=gradient_checkpointing)
+        return cls(
+            model,
+            tokenizer,
+            settings.codec,
+            label or str(name),
+            gradient_checkpointing=settings.gradient_checkpointing,
+        )
 
     def adapt(self, lora: LoraSettings, *, seed: int, saved: Path | None = None) -> None:
         """Freeze the model and train low-rank adapters, new ones or those in the folder ``saved``. Raises TrainerError."""

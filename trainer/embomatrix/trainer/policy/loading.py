@@ -74,14 +74,7 @@ def saved_policy(folder: Path, settings: TrainSettings) -> Policy:
     if settings.lora.rank and has_adapters(folder):
         return _language_model(settings.model, settings, folder)
     if HfPolicy.is_saved_in(folder):
-        return HfPolicy.load(
-            folder,
-            settings.codec,
-            device=settings.device,
-            compute_dtype=settings.compute_dtype,
-            label=settings.model,
-            gradient_checkpointing=settings.gradient_checkpointing,
-        )
+        return HfPolicy.load(folder, settings, label=settings.model)
     raise TrainerError(
         f"no policy found in {folder}: pass a checkpoint folder such as runs/NAME/checkpoints/step-000050"
     )
@@ -89,13 +82,7 @@ def saved_policy(folder: Path, settings: TrainSettings) -> Policy:
 
 def _language_model(named: str, settings: TrainSettings, adapters: Path | None = None) -> HfPolicy:
     """Load a Hugging Face model, with new or saved adapters if the settings ask for them."""
-    policy = HfPolicy.load(
-        named,
-        settings.codec,
-        device=settings.device,
-        compute_dtype=settings.compute_dtype,
-        gradient_checkpointing=settings.gradient_checkpointing,
-    )
+    policy = HfPolicy.load(named, settings)
     if settings.lora.rank:
         policy.adapt(settings.lora, seed=settings.seed, saved=adapters)
     return policy
