@@ -7,7 +7,7 @@ from importlib.resources import files
 from pathlib import PurePath
 from typing import Any
 
-from embomatrix.pages.head import page_head
+from embomatrix.pages.head import html_table, page_head
 from embomatrix.trainer.evaluation.pictures import Picture
 from embomatrix.trainer.evaluation.plan_view import ExecutedPlan, plan_view
 from embomatrix.trainer.evaluation.table import (
@@ -39,27 +39,14 @@ def evaluation_page(
         causes="".join(map(_section, cause_tables(report))),
         pictures="".join(_picture(picture) for picture in pictures),
         count=report["tasks"],
-        tasks=_table([("task", "category", "succeeded", "partial", "causes"), *tasks]),
+        tasks=html_table([("task", "category", "succeeded", "partial", "causes"), *tasks]),
         intervals=html.escape(INTERVALS),
         digest=html.escape(setup["bench_digest"].removeprefix("sha256:")[:16]),
     )
 
 
 def _section(table: ReportTable) -> str:
-    return f"<section><h2>{html.escape(table.title.capitalize())}</h2>{_table(table.rows)}</section>"
-
-
-def _table(rows: Sequence[tuple[str, ...]]) -> str:
-    """HTML table. The first row holds the column titles."""
-    top = "".join(f"<th>{html.escape(title)}</th>" for title in rows[0])
-    body = "".join("<tr>" + "".join(f"<td>{_cell(cell)}</td>" for cell in row) + "</tr>" for row in rows[1:])
-    return f'<div class="scroll"><table><tr>{top}</tr>{body}</table></div>'
-
-
-def _cell(text: str) -> str:
-    """Highlight the estimate against its interval."""
-    value, bracket, rest = html.escape(text).partition(" [")
-    return f"<b>{value}</b> <span>[{rest}</span>" if bracket else value
+    return f"<section><h2>{html.escape(table.title.capitalize())}</h2>{html_table(table.rows)}</section>"
 
 
 def _task_row(task: Mapping[str, Any]) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from embomatrix.pages.head import html_table, page_head
 from embomatrix.rpc.wire.values import RunStats
 from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation, improvement
 from embomatrix.trainer.logging.outcome import RunOutcome, TaskRate
@@ -79,42 +80,27 @@ def prewarm_share(stats: RunStats) -> float:
 
 def write_report(summary: TrainingSummary, metrics: Sequence[Mapping[str, Any]], machine: str) -> Path:
     outcome = summary.outcome
+    times = [(name, f"{spent:.1f}", f"{share:.0%}") for name, spent, share in time_rows(outcome)]
     parts = [
         f"<h1>Training of {html.escape(outcome.model)}</h1>",
         f"<p>{outcome.imitation_steps} imitation steps, {outcome.steps} GRPO steps, {outcome.rollouts} rollouts; "
         f"{outcome.lost} rollouts lost to the infrastructure and masked; "
         f"{prewarm_share(summary.stats):.0%} of announced scenes warm in time. Machine: {html.escape(machine)}.</p>",
         "<h2>Success on held-out tasks</h2>",
-        _table(("tasks", "before GRPO", "after", "difference"), success_rows(summary))
-        or "<p>The dataset has no held-out tasks.</p>",
+        html_table([("tasks", "before GRPO", "after", "difference"), *success_rows(summary)])
+        if summary.after
+        else "<p>The dataset has no held-out tasks.</p>",
         "<p>95 % bootstrap intervals over tasks.</p>",
         "<h2>Learning curves</h2>",
         *(_curve([row[key] for row in metrics], title, colour) for key, title, colour in _CURVES),
         "<h2>Where the time went</h2>",
-        _table(
-            ("activity", "seconds", "share"),
-            [(name, f"{spent:.1f}", f"{share:.0%}") for name, spent, share in time_rows(outcome)],
-        ),
+        html_table([("activity", "seconds", "share"), *times]),
         f"<p>Checkpoint: <code>{html.escape(str(summary.checkpoint))}</code></p>",
     ]
-    page = (
-        '<!doctype html><html lang="en"><meta charset="utf-8"><title>Training report</title><style>'
-        "body{font:15px/1.5 system-ui,sans-serif;max-width:720px;margin:2rem auto;padding:0 1rem;color:#222}"
-        "table{border-collapse:collapse}td,th{padding:.2rem .8rem;border-bottom:1px solid #ddd;text-align:left}"
-        f"svg{{display:block;margin:.5rem 0}}</style>{''.join(parts)}</html>"
-    )
+    style = "body { max-width: 720px; margin: 2rem auto; padding: 0 1rem; } svg { display: block; fill: currentColor; }"
+    page = f"{page_head('Training report')}<style>{style}</style></head><body>{''.join(parts)}</body></html>"
     summary.report.write_text(page, encoding="utf-8")
     return summary.report
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    if not rows:
-        return ""
-    cells = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
-    body = "".join(
-        "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows
-    )
-    return f"<table><tr>{cells}</tr>{body}</table>"
 
 
 def _curve(series: Sequence[float | None], title: str, colour: str) -> str:
@@ -136,7 +122,7 @@ def _curve(series: Sequence[float | None], title: str, colour: str) -> str:
             for at, value in zip(steps, line, strict=True)
         )
 
-    text = 'font-size="12" fill="#555"'
+    text = 'font-size="12" opacity=".7"'
     return (
         f'<svg width="{_WIDTH}" height="{_HEIGHT}" role="img" aria-label="{html.escape(title)}">'
         f'<text x="{_MARGIN}" y="24" font-size="14">{html.escape(title)}</text>'
