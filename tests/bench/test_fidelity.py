@@ -9,13 +9,12 @@ from typer.testing import CliRunner
 
 from embomatrix.bench.cli import app
 from embomatrix.bench.fidelity.page import figures_of
-from embomatrix.bench.fidelity.pool import LOST, FidelityPool, Modes, TrialJob
+from embomatrix.bench.fidelity.pool import LOST, FidelityPool, Modes
 from embomatrix.bench.fidelity.suite import (
     DISAGREEMENTS_FILE,
     PLANS_FILE,
     RESULTS_FILE,
     FidelitySettings,
-    SuiteProgress,
     run_fidelity,
     write_all_trials,
 )
@@ -26,7 +25,11 @@ from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import parse_plan
 from embomatrix.world.dataset import Dataset
 
-QUIET = SuiteProgress(written=lambda done, of: None, executed=lambda done, of: None)
+
+def quiet(step):
+    """Ignore the progress."""
+
+
 SMALL = FidelitySettings(plans=20, calls=0, seed=0)
 LIMIT_S = 60.0
 
@@ -40,7 +43,7 @@ def dataset(tmp_path_factory):
 def suite(dataset, tmp_path_factory):
     """A suite against a mode that can't press switches: its folder and its outcome."""
     folder = tmp_path_factory.mktemp("suite")
-    return folder, run_fidelity(dataset, SMALL, folder, 2, Modes(load_simulator, clumsy), QUIET)
+    return folder, run_fidelity(dataset, SMALL, folder, 2, Modes(load_simulator, clumsy), quiet)
 
 
 def test_suite_compares_every_plan_and_writes_the_disagreements(suite):
@@ -71,9 +74,10 @@ def test_interrupted_suite_resumes(suite, dataset, tmp_path):
     lines = (folder / RESULTS_FILE).read_text().splitlines()
     (tmp_path / RESULTS_FILE).write_text("\n".join(lines[:-2]) + "\n" + lines[-2][:40])
     executed = []
-    progress = SuiteProgress(written=QUIET.written, executed=lambda done, of: executed.append(done))
-    again = run_fidelity(dataset, SMALL, tmp_path, 1, Modes(load_simulator, clumsy), progress)
-    assert executed == [len(lines) - 1, len(lines)]
+    again = run_fidelity(dataset, SMALL, tmp_path, 1, Modes(load_simulator, clumsy), executed.append)
+    assert executed == [
+        f"{number} of {len(lines)} plans in both modes" for number in (len(lines) - 1, len(lines))
+    ]
     assert [item.cached.atoms for item in again.comparisons] == [
         item.cached.atoms for item in outcome.comparisons
     ]
@@ -87,8 +91,8 @@ def test_lost_trial_is_repeated_on_resume(suite, dataset, tmp_path):
     gone = {**trial_to_json(trial_from_json(json.loads(last))), LOST: "no answer in 180 s"}
     (tmp_path / RESULTS_FILE).write_text("\n".join([*lines, json.dumps(gone)]) + "\n")
     modes = Modes(load_simulator, clumsy)
-    assert len(run_fidelity(dataset, SMALL, tmp_path, 0, modes, QUIET).lost) == 1
-    again = run_fidelity(dataset, SMALL, tmp_path, 1, modes, QUIET)
+    assert len(run_fidelity(dataset, SMALL, tmp_path, 0, modes, quiet).lost) == 1
+    again = run_fidelity(dataset, SMALL, tmp_path, 1, modes, quiet)
     assert (len(again.comparisons), again.lost) == (len(outcome.comparisons), ())
 
 
@@ -98,23 +102,23 @@ def test_zero_processes_sum_up_the_results_so_far(suite, dataset, tmp_path):
         (tmp_path / name).write_text((folder / name).read_text())
     modes = Modes(load_simulator, clumsy)
     with pytest.raises(BenchError, match="no result to sum up"):
-        run_fidelity(dataset, SMALL, tmp_path, 0, modes, QUIET)
+        run_fidelity(dataset, SMALL, tmp_path, 0, modes, quiet)
     lines = (folder / RESULTS_FILE).read_text().splitlines()
     (tmp_path / RESULTS_FILE).write_text("\n".join(lines[:3]) + "\n" + lines[3][:40])
     with (tmp_path / RESULTS_FILE).open("a") as running:  # a suite that is still running
-        assert len(run_fidelity(dataset, SMALL, tmp_path, 0, modes, QUIET).comparisons) == 3
+        assert len(run_fidelity(dataset, SMALL, tmp_path, 0, modes, quiet).comparisons) == 3
         running.write(lines[3][40:] + "\n")
     assert (tmp_path / RESULTS_FILE).read_text().splitlines() == lines[:4]
 
 
 def test_folder_with_other_settings_is_refused(suite, dataset):
     with pytest.raises(BenchError, match="other settings"):
-        run_fidelity(dataset, FidelitySettings(21, 0, 0), suite[0], 1, Modes(load_simulator, clumsy), QUIET)
+        run_fidelity(dataset, FidelitySettings(21, 0, 0), suite[0], 1, Modes(load_simulator, clumsy), quiet)
 
 
 def test_plans_reach_the_quota_of_every_skill(dataset):
     settings = FidelitySettings(plans=20, calls=8, seed=1)
-    trials = write_all_trials(dataset, settings, Modes(load_simulator, clumsy), QUIET)
+    trials = write_all_trials(dataset, settings, Modes(load_simulator, clumsy), quiet)
     calls = [
         call.skill
         for trial in trials
@@ -122,7 +126,7 @@ def test_plans_reach_the_quota_of_every_skill(dataset):
         for call in trial.plan
     ]
     assert all(calls.count(skill) >= settings.calls for skill in SKILLS)
-    assert trials == write_all_trials(dataset, settings, Modes(load_simulator, clumsy), QUIET)
+    assert trials == write_all_trials(dataset, settings, Modes(load_simulator, clumsy), quiet)
 
 
 def trials_of(dataset, *texts):
@@ -154,7 +158,7 @@ def test_failing_process_costs_only_its_current_trial(dataset, physical, reason,
     trials = trials_of(dataset, "move fridge", "move fridge\nopen fridge", "turn 1.0")
     values = []
     pool = FidelityPool(dataset.folder, Modes(load_simulator, physical), 1, limit_s)
-    pool.run([TrialJob(trials[0].bundle_digest, trials)], values.append)
+    pool.run([trials], values.append)
     assert [value["trial"] for value in values] == ["t-0", "t-1", "t-2"]
     assert [LOST in value for value in values] == [False, True, False]
     assert reason in values[1][LOST]
@@ -172,4 +176,4 @@ def test_damaged_suite_is_refused_with_its_folder(dataset, suite, tmp_path):
         (tmp_path / name).write_text((suite[0] / name).read_text())
     (tmp_path / RESULTS_FILE).write_text("not JSON\n{}\n")
     with pytest.raises(BenchError, match="damaged"):
-        run_fidelity(dataset, SMALL, tmp_path, 1, Modes(load_simulator, clumsy), QUIET)
+        run_fidelity(dataset, SMALL, tmp_path, 1, Modes(load_simulator, clumsy), quiet)

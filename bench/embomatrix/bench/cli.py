@@ -20,7 +20,6 @@ from embomatrix.bench.fidelity.suite import (
     DISAGREEMENTS_FILE,
     RESULTS_FILE,
     FidelitySettings,
-    SuiteProgress,
     run_fidelity,
 )
 from embomatrix.bench.peers.contest import PeerSizes, bench_peers
@@ -293,11 +292,7 @@ def _fidelity(dataset: Dataset, settings: FidelitySettings, out: Path, jobs: int
     fresh = not (out / RESULTS_FILE).exists()
 
     def measure(on_step: OnStep) -> tuple[Figure, ...]:
-        progress = SuiteProgress(
-            written=lambda done, of: on_step(f"plans for {done} of {of} scenes"),
-            executed=lambda done, of: on_step(f"{done} of {of} plans in both modes"),
-        )
-        outcome = run_fidelity(dataset, settings, out, jobs, MODES, progress)
+        outcome = run_fidelity(dataset, settings, out, jobs, MODES, on_step)
         for sentence in outcome.lost:
             _note(f"lost: {sentence}")
         return figures_of(outcome, (time.monotonic() - started_s) / 60 if fresh else None)

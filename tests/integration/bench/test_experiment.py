@@ -8,7 +8,7 @@ from datetime import date
 import pytest
 from typer.testing import CliRunner
 
-from embomatrix.bench.experiments.benchmarks import PolicyStage, bench_rows, benchmark_section
+from embomatrix.bench.experiments.benchmarks import PolicyStage, bench_table, benchmark_section
 from embomatrix.bench.experiments.cli import app
 from embomatrix.bench.experiments.conduct import IMITATED, Conductor, Venue
 from embomatrix.bench.experiments.design import (
@@ -260,7 +260,7 @@ def test_benchmark_has_a_line_for_each_stage(tmp_path, bench, figure):
         path = stage.report(tmp_path, bench)
         path.parent.mkdir(parents=True)
         path.write_text(json.dumps({"overall": overall, "categories": {}, "samples": 40}))
-    found = bench_rows(tmp_path, bench, stages)
-    assert [(each.name, each.value) for each in found.figures] == [(f"{figure}_before", 0.25), (figure, 0.5)]
-    text = benchmark_section(tmp_path, [found], "abc", TODAY)
+    lines, figures = bench_table(tmp_path, bench, stages)
+    assert [(each.name, each.value) for each in figures] == [(f"{figure}_before", 0.25), (figure, 0.5)]
+    text = benchmark_section(tmp_path, lines, "abc", TODAY)
     assert "| GRPO | 50.0 [10.0, 80.0] |" in text

@@ -30,18 +30,13 @@ class PolicyStage:
         return run / "benchmarks" / file_name(bench) / file_name(self.label) / "report.json"
 
 
-@dataclass(frozen=True, slots=True)
-class BenchRows:
-    """Part of the table for one benchmark: column titles, one line for each stage, and the figures."""
+def bench_table(
+    run: Path, bench: str, stages: Sequence[PolicyStage]
+) -> tuple[tuple[str, ...], tuple[Figure, ...]]:
+    """Return lines of Markdown with one row for each stage, and the figures.
 
-    bench: str
-    head: tuple[str, ...]
-    lines: tuple[tuple[str, ...], ...]
-    figures: tuple[Figure, ...]
-
-
-def bench_rows(run: Path, bench: str, stages: Sequence[PolicyStage]) -> BenchRows:
-    """Read the reports of a benchmark. Raise TrainerError if one is missing or damaged."""
+    Raise TrainerError if a report is missing or damaged.
+    """
     reports = []
     for stage in stages:
         path = stage.report(run, bench)
@@ -53,7 +48,7 @@ def bench_rows(run: Path, bench: str, stages: Sequence[PolicyStage]) -> BenchRow
             ) from error
     rows = [ScoreRow(stage.label, report) for stage, report in zip(stages, reports, strict=True)]
     name = re.sub(r"[^a-z0-9]+", "_", file_name(bench).lower())
-    figures = [
+    figures = tuple(
         Figure(
             f"{_FIGURE_NAMES.get(name, name)}_success{when}",
             report["overall"]["success"]["value"],
@@ -62,22 +57,14 @@ def bench_rows(run: Path, bench: str, stages: Sequence[PolicyStage]) -> BenchRow
             report["samples"],
         )
         for when, report in zip(("_before", ""), reports, strict=True)
-    ]
-    return BenchRows(file_name(bench), head(reports[0]), tuple(table_rows(rows, "success")), tuple(figures))
+    )
+    return (f"`{file_name(bench)}`", "", *table(head(reports[0]), table_rows(rows, "success")), ""), figures
 
 
-def benchmark_section(run: Path, found: Sequence[BenchRows], commit: str, today: date) -> str:
-    """Section in Markdown."""
-    lines = [f"## {today.isoformat()}: benchmarks before and after GRPO", ""]
-    lines += [
-        f"The run `{run.name}`, evaluated at commit `{commit}`. Success in percent, 95 % intervals over tasks.",
-        "",
-    ]
-    for each in found:
-        lines += [f"`{each.bench}`", ""]
-        lines += table(each.head, each.lines)
-        lines.append("")
-    return "\n".join(lines)
+def benchmark_section(run: Path, tables: Sequence[str], commit: str, today: date) -> str:
+    """Section in Markdown with the lines of all tables."""
+    about = f"The run `{run.name}`, evaluated at commit `{commit}`. Success in percent, 95 % intervals over tasks."
+    return "\n".join([f"## {today.isoformat()}: benchmarks before and after GRPO", "", about, "", *tables])
 
 
 def file_name(text: str) -> str:

@@ -14,7 +14,7 @@ from typing import Annotated, Final
 import typer
 from rich.console import Console
 
-from embomatrix.bench.experiments.benchmarks import PolicyStage, bench_rows, benchmark_section
+from embomatrix.bench.experiments.benchmarks import PolicyStage, bench_table, benchmark_section
 from embomatrix.bench.experiments.conduct import Conductor, Venue, own_venue
 from embomatrix.bench.experiments.design import (
     RELEVANCE_ARMS,
@@ -193,7 +193,8 @@ def table(
     """Success before and after GRPO on benchmarks, as in the paper's table."""
     with _refusals():
         stages = _stages(run)
-        found = []
+        lines: list[str] = []
+        figures: list[Figure] = []
         where = f"--manager={manager}" if manager else f"--jobs={jobs or usable_cores()}"
         for name in bench:
             for stage in stages:
@@ -206,10 +207,11 @@ def table(
                     f"--out={out}",
                 )
                 run_command("experiment", no_problem, "eval", *options, where)
-            found.append(bench_rows(run, name, stages))
-        figures = tuple(figure for rows in found for figure in rows.figures)
+            table_lines, success = bench_table(run, name, stages)
+            lines += table_lines
+            figures += success
         _hand_in("table", figures, json_file)
-        _publish(benchmark_section(run, found, commit_here(), date.today()), run / "benchmarks.md", page)
+        _publish(benchmark_section(run, lines, commit_here(), date.today()), run / "benchmarks.md", page)
 
 
 def _stages(run: Path) -> tuple[PolicyStage, ...]:

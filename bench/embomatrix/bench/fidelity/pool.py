@@ -42,14 +42,6 @@ class Modes:
     physical: Load
 
 
-@dataclass(frozen=True, slots=True)
-class TrialJob:
-    """Trials of one bundle."""
-
-    bundle_digest: str
-    trials: tuple[FidelityTrial, ...]
-
-
 class FidelityPool:
     """Runs jobs in dedicated processes. ``limit_s`` bounds the time for loading a scene and running a trial."""
 
@@ -60,8 +52,11 @@ class FidelityPool:
         self._limit_s = limit_s
         self._stopped = False
 
-    def run(self, jobs: Sequence[TrialJob], on_result: OnResult) -> None:
-        """Execute every trial once. ``on_result`` gets a JSON value for each: a comparison, or a lost trial."""
+    def run(self, jobs: Sequence[Sequence[FidelityTrial]], on_result: OnResult) -> None:
+        """Execute every trial once; the trials of a job are of one bundle.
+
+        ``on_result`` gets a JSON value for each: a comparison, or a lost trial.
+        """
         lock = threading.Lock()
 
         def deliver(value: Mapping[str, Any]) -> None:
@@ -76,8 +71,8 @@ class FidelityPool:
                 self._stopped = True
                 threads.shutdown(wait=False, cancel_futures=True)
 
-    def _run_job(self, job: TrialJob, deliver: OnResult) -> None:
-        waiting = deque(job.trials)
+    def _run_job(self, trials: Sequence[FidelityTrial], deliver: OnResult) -> None:
+        waiting = deque(trials)
         while waiting and not self._stopped:
             with process_pool(1) as pool:
                 pid = pool.submit(os.getpid).result()

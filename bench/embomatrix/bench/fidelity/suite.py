@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from embomatrix.bench.fidelity.pool import LOST, FidelityPool, Modes, TrialJob
+from embomatrix.bench.fidelity.pool import LOST, FidelityPool, Modes
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.sim.fidelity.compare import (
     Comparison,
@@ -64,21 +64,13 @@ class SuiteResult:
     lost: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class SuiteProgress:
-    """Progress callbacks with a count and its total: scenes with written trials, and executed trials."""
-
-    written: Callable[[int, int], None]
-    executed: Callable[[int, int], None]
-
-
 def run_fidelity(
     dataset: Dataset,
     settings: FidelitySettings,
     folder: Path,
     processes: int,
     modes: Modes,
-    progress: SuiteProgress,
+    on_step: Callable[[str], None],
 ) -> SuiteResult:
     """Write or read the trials, execute those without a result, and save the disagreements.
 
@@ -88,7 +80,7 @@ def run_fidelity(
     """
     with _readable(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        trials = _trials(dataset, settings, folder, modes, progress)
+        trials = _trials(dataset, settings, folder, modes, on_step)
         path = folder / RESULTS_FILE
         done = {value["trial"]: value for value in _lines(path)}
         lost = {name for name, value in done.items() if LOST in value}
@@ -99,7 +91,7 @@ def run_fidelity(
                 def keep(value: Mapping[str, Any]) -> None:
                     append(value)
                     done[value["trial"]] = dict(value)
-                    progress.executed(len(done), len(trials))
+                    on_step(f"{len(done)} of {len(trials)} plans in both modes")
 
                 FidelityPool(dataset.folder, modes, processes, LIMIT_S).run(jobs, keep)
         if not done:
@@ -120,7 +112,7 @@ def examples_of(dataset: Dataset) -> dict[str, list[SolvedTask]]:
 
 
 def write_all_trials(
-    dataset: Dataset, settings: FidelitySettings, modes: Modes, progress: SuiteProgress
+    dataset: Dataset, settings: FidelitySettings, modes: Modes, on_step: Callable[[str], None]
 ) -> tuple[FidelityTrial, ...]:
     """Write trials over all bundles of the dataset; equal arguments give equal trials."""
     examples = examples_of(dataset)
@@ -133,7 +125,7 @@ def write_all_trials(
             request = TrialRequest(plans, wanted, settings.seed + turn, extra, first=len(trials))
             with contextlib.closing(modes.cached(dataset.read_bundle(digest))) as simulator:
                 trials += write_trials(simulator, digest, items, request)
-            progress.written(number, len(examples))
+            on_step(f"plans for {number} of {len(examples)} scenes")
         lacking = {skill: settings.calls - count for skill, count in _calls(trials).items()}
         if all(count <= 0 for count in lacking.values()):
             break
@@ -160,7 +152,11 @@ def _example(record: TaskRecord) -> SolvedTask:
 
 
 def _trials(
-    dataset: Dataset, settings: FidelitySettings, folder: Path, modes: Modes, progress: SuiteProgress
+    dataset: Dataset,
+    settings: FidelitySettings,
+    folder: Path,
+    modes: Modes,
+    on_step: Callable[[str], None],
 ) -> tuple[FidelityTrial, ...]:
     """Read the trials of the folder; write them first if it is empty."""
     bundles = sorted({record.bundle_digest for record in dataset.records})
@@ -172,20 +168,19 @@ def _trials(
                 f"{folder} holds a suite of other settings or another dataset: name another folder with --out"
             )
         return tuple(trial_from_json(value) for value in _lines(folder / PLANS_FILE))
-    trials = write_all_trials(dataset, settings, modes, progress)
+    trials = write_all_trials(dataset, settings, modes, on_step)
     text = "".join(json.dumps(trial_to_json(trial)) + "\n" for trial in trials)
     write_whole(folder / PLANS_FILE, text.encode("utf-8"))
     write_whole(path, (json.dumps(wanted) + "\n").encode("utf-8"))
     return trials
 
 
-def _jobs(trials: Iterable[FidelityTrial]) -> list[TrialJob]:
-    """One job for each bundle, the longest first, so that processes end at about the same time."""
+def _jobs(trials: Iterable[FidelityTrial]) -> list[list[FidelityTrial]]:
+    """Trials of each bundle, the longest job first, so that processes end at about the same time."""
     by_bundle: dict[str, list[FidelityTrial]] = {}
     for trial in trials:
         by_bundle.setdefault(trial.bundle_digest, []).append(trial)
-    jobs = [TrialJob(digest, tuple(items)) for digest, items in by_bundle.items()]
-    return sorted(jobs, key=lambda job: -len(job.trials))
+    return sorted(by_bundle.values(), key=len, reverse=True)
 
 
 def _outcome(
