@@ -71,10 +71,8 @@ def _picture(picture: Picture) -> str:
     drawn = ExecutedPlan(picture.plan, verdict.done, failed=verdict.step > 0)
     items = []
     for number, line in enumerate(picture.lines, start=1):
-        failed = number == verdict.step
-        kind = "bad" if failed else "ok" if number <= verdict.done else "not"
-        why = f"<small>{html.escape(verdict.sentence)}</small>" if failed else ""
-        items.append(f'<li class="{kind}">{html.escape(line)}{why}</li>')
+        why = f"<small>{html.escape(verdict.sentence)}</small>" if number == verdict.step else ""
+        items.append(f'<li class="{drawn.css_class(number)}">{html.escape(line)}{why}</li>')
     kind = "ok" if verdict.success else "bad"
     return (
         f'<section class="half plan"><h3>{html.escape(task.task_id)}</h3>'

@@ -24,7 +24,7 @@ from torch import Tensor
 from embomatrix.host.anonymous_memory import nameless_file
 from embomatrix.trainer.config.errors import DAMAGE, TrainerError
 from embomatrix.trainer.config.settings import TrainSettings
-from embomatrix.trainer.grpo.learner import Learner, Microbatch, SamplingLearner
+from embomatrix.trainer.grpo.learner import Learner, Microbatch
 from embomatrix.trainer.grpo.objective import LossMetrics
 from embomatrix.trainer.policy.loading import saved_policy
 from embomatrix.trainer.policy.protocol import Policy, Samples, Tokens
@@ -212,7 +212,7 @@ class DataParallelWorkers:
         owner = index % (len(self._remotes) + 1)
         return self._remotes[owner - 1] if owner else None
 
-    def map(self, jobs: Sequence[tuple[int, Callable[[SamplingLearner], T]]]) -> list[T]:
+    def map(self, jobs: Sequence[tuple[int, Callable[[Learner | RemoteLearner], T]]]) -> list[T]:
         """Run (microbatch index, job) pairs on the learners that own them. Results keep the order of the jobs."""
         futures = {
             at: remote.run(job)

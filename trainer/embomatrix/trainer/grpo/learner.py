@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -29,18 +28,6 @@ class Microbatch:
     totals: LossTotals
 
 
-class SamplingLearner(Protocol):
-    """Sampling half of a learner, in this process or a remote one."""
-
-    def sample(self, prompts: Sequence[Tokens], seed: int) -> Samples:
-        """Draw a group of plans per prompt with a generator of this seed."""
-        ...
-
-    def reference_logprobs(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:
-        """Return log-probabilities (plans, tokens) under the reference policy."""
-        ...
-
-
 class Learner:
     """A policy and its reference policy in this process."""
 
@@ -50,6 +37,7 @@ class Learner:
         self._settings = settings
 
     def sample(self, prompts: Sequence[Tokens], seed: int) -> Samples:
+        """Draw a group of plans per prompt with a generator of this seed."""
         settings = self._settings
         device = next(iter(self._policy.parameters())).device
         generator = torch.Generator(device).manual_seed(seed)
@@ -57,6 +45,7 @@ class Learner:
 
     @torch.no_grad()
     def reference_logprobs(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:
+        """Return log-probabilities (plans, tokens) under the reference policy."""
         settings = self._settings
         return self._reference.logprobs(prompts, tokens, mask, settings.group, settings.temperature).logprobs
 

@@ -20,8 +20,8 @@ from embomatrix.trainer.policy.protocol import Samples
 
 if TYPE_CHECKING:
     from embomatrix.trainer.config.settings import GrpoSettings
-    from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers
-    from embomatrix.trainer.grpo.learner import SamplingLearner
+    from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers, RemoteLearner
+    from embomatrix.trainer.grpo.learner import Learner
 
 _SEEDS: Final = 2**62
 
@@ -108,7 +108,7 @@ class Sampler:
         index: int,
         prompts: Sequence[tuple[TrainingTask, TaskPrompt]],
         seed: int,
-        learner: SamplingLearner,
+        learner: Learner | RemoteLearner,
     ) -> SampledChunk:
         group = self._settings.group
         samples = learner.sample([prompt.tokens for _, prompt in prompts], seed)
@@ -127,7 +127,7 @@ class Sampler:
         return SampledChunk(index, tasks, task_prompts, samples, futures, None)
 
 
-def _with_reference(chunk: SampledChunk, learner: SamplingLearner) -> SampledChunk:
+def _with_reference(chunk: SampledChunk, learner: Learner | RemoteLearner) -> SampledChunk:
     prompts = [prompt.tokens for prompt in chunk.prompts]
     logprobs = learner.reference_logprobs(prompts, chunk.samples.tokens, chunk.samples.mask)
     return replace(chunk, reference=logprobs)
