@@ -1,8 +1,9 @@
 """One optimiser step of GRPO that hides simulation behind sampling and back-propagation.
 
 Microbatches (chunks of tasks) are sampled one after the other, and each one's plans go to the cluster at once. With
-``Overlap.STREAM`` they are back-propagated as their rewards arrive, followed by one optimiser step. The gradient is
-on-policy, covers the whole batch, and is summed in sampling order, so it does not depend on which worker was faster.
+``Overlap.STREAM`` each is back-propagated as soon as its rewards and all microbatches before it are there, followed by one
+optimiser step. The gradient is on-policy and covers the whole batch. Its order of summation is fixed, so it does not
+depend on which worker was faster.
 ``Overlap.AHEAD`` also samples the next step's plans before this step's rewards are needed, from weights that are one step
 old.
 """
