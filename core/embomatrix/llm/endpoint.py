@@ -79,8 +79,8 @@ class Endpoint:
             began_s = time.monotonic()
             for attempt in range(self._limits.attempts):
                 failure = await self._attempt(body)
-                if isinstance(failure, _Answer):
-                    return _reply(failure.value, self.model, time.monotonic() - began_s, attempt)
+                if not isinstance(failure, _Failure):
+                    return _reply(failure, self.model, time.monotonic() - began_s, attempt)
                 wait_s = backoff.next_s()
                 if failure.retry_after_s is not None:
                     wait_s = min(failure.retry_after_s, MAX_RETRY_AFTER_S)
@@ -102,7 +102,7 @@ class Endpoint:
             body["seed"] = request.seed
         return body
 
-    async def _attempt(self, body: dict[str, Any]) -> _Answer | _Failure:
+    async def _attempt(self, body: dict[str, Any]) -> dict[str, Any] | _Failure:
         try:
             async with self._http.stream("POST", self._url, json=body) as response:
                 data = bytearray()
@@ -126,11 +126,6 @@ class Endpoint:
 
 
 @dataclass(frozen=True, slots=True)
-class _Answer:
-    value: dict[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
 class _Failure:
     found: str
     transient: bool
@@ -138,7 +133,7 @@ class _Failure:
     remedy: str = "check its address, its model's name and its key"
 
 
-def _judged(response: httpx.Response, data: bytes) -> _Answer | _Failure:
+def _judged(response: httpx.Response, data: bytes) -> dict[str, Any] | _Failure:
     if response.status_code in RETRIED:
         return _Failure(
             f"it answered {response.status_code} ({_quoted(data)})",
@@ -151,7 +146,8 @@ def _judged(response: httpx.Response, data: bytes) -> _Answer | _Failure:
     try:
         value = json.loads(data)
         if isinstance(value["choices"][0]["message"], dict):
-            return _Answer(value)
+            completion: dict[str, Any] = value
+            return completion
     except (ValueError, KeyError, IndexError, TypeError):
         pass
     # A proxy that is starting up may send anything with status 200.

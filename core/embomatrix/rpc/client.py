@@ -167,7 +167,7 @@ class ClusterClient(AdminClient):
         raises ``DeadlineError``.
         """
         within_s = self._limits.batch_s if deadline_s is None else deadline_s
-        attached = _AttachedBatch(batch, time.monotonic() + within_s)
+        attached = _AttachedBatch(batch, within_s)
         backoff = Backoff(self._limits.retry_first_s, self._limits.retry_longest_s)
         while attached.missing:
             before, cursor = len(attached.missing), attached.cursor
@@ -195,13 +195,13 @@ class ClusterClient(AdminClient):
             if len(attached.missing) < before:
                 backoff.reset()
             if attached.missing:
-                await asyncio.sleep(min(backoff.next_s(), attached.time_left(within_s)))
+                await asyncio.sleep(min(backoff.next_s(), attached.time_left()))
 
     async def _stream(
         self, attached: _AttachedBatch
     ) -> AsyncGenerator[tuple[Sequence[RolloutResult], Sequence[GroupDone]]]:
         """Read one stream of the batch. The first stream submits the batch, later ones continue after the cursor."""
-        timeout_s = attached.time_left(self._limits.batch_s)
+        timeout_s = attached.time_left()
         call: grpc.aio.UnaryStreamCall
         if attached.submitted:
             call = self._rollouts.WaitExecution(attached.wait_request(), timeout=timeout_s)
@@ -243,13 +243,14 @@ class ClusterClient(AdminClient):
 class _AttachedBatch:
     """State of a batch between two streams."""
 
-    def __init__(self, batch: Batch, ends_s: float) -> None:
+    def __init__(self, batch: Batch, within_s: float) -> None:
         self.batch = batch
         self.missing = {rollout.rollout_id for rollout in batch.rollouts}
         self.submitted = False
         self.cursor = 0
         self._groups: set[str] = set()
-        self._ends_s = ends_s
+        self._within_s = within_s
+        self._ends_s = time.monotonic() + within_s
 
     def new(self, results: Sequence[RolloutResult]) -> Iterable[RolloutResult]:
         """Yield the results that were not seen before."""
@@ -271,24 +272,23 @@ class _AttachedBatch:
             run_id=self.batch.run_id, batch_id=self.batch.batch_id, after_cursor=self.cursor
         )
 
-    def time_left(self, within_s: float) -> float:
+    def time_left(self) -> float:
         """Return the seconds until the caller's deadline. Raise DeadlineError after it."""
         left_s = self._ends_s - time.monotonic()
         if left_s <= 0:
-            raise self._late(within_s)
+            raise self._late()
         return left_s
 
     def explain(self, error: ClusterError) -> ClusterError:
         """Return the error of a stream. For the caller's own deadline, list what is missing."""
         if isinstance(error, DeadlineError) and time.monotonic() >= self._ends_s - 0.05:
-            return self._late(None)
+            return self._late()
         return error
 
-    def _late(self, within_s: float | None) -> DeadlineError:
-        within = "within its deadline" if within_s is None else f"within {within_s:g} s"
+    def _late(self) -> DeadlineError:
         return DeadlineError(
             f"batch {self.batch.batch_id}: {len(self.missing)} of {len(self.batch.rollouts)} rollouts "
-            f"had no outcome {within}: are workers connected? (`embomatrix status`)"
+            f"had no outcome within {self._within_s:g} s: are workers connected? (`embomatrix status`)"
         )
 
 

@@ -2,7 +2,6 @@
 
 import functools
 import math
-from collections.abc import Mapping
 
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
@@ -130,7 +129,7 @@ def checked_completed(message: types_pb2.Completed) -> Completed:
     _steps_in(wire)
     return Completed.unread(
         wire,
-        _completed_fields,
+        _read_completed,
         timings=inside("timings", timings_from_proto, message.timings),
         warm=message.warm,
         worker_id=message.worker_id,
@@ -149,12 +148,11 @@ def _reward_in(message: types_pb2.Completed) -> types_pb2.Reward:
 
 def unread_completed(wire: bytes, *, timings: Timings, warm: bool) -> Completed:
     """Return the result in these bytes unchecked. The first access to a value parses it."""
-    return Completed.unread(wire, _completed_fields, timings=timings, warm=warm, worker_id="")
+    return Completed.unread(wire, _read_completed, timings=timings, warm=warm, worker_id="")
 
 
-def _completed_fields(wire: bytes) -> Mapping[str, object]:
-    completed = completed_from_proto(types_pb2.Completed.FromString(wire))
-    return {name: getattr(completed, name) for name in ("reward", "steps", "final", "trace_digest")}
+def _read_completed(wire: bytes) -> Completed:
+    return completed_from_proto(types_pb2.Completed.FromString(wire))
 
 
 def rollout_result_to_proto(result: RolloutResult) -> types_pb2.RolloutResult:

@@ -138,17 +138,13 @@ def unread_rollout(message: types_pb2.Rollout) -> Rollout:
     """Return the rollout without parsing its plan. The first access to the plan parses it."""
     return Rollout.unread(
         message.SerializeToString(),
-        _rollout_fields,
+        _read_rollout,
         bundle_digest=required("bundle_digest", message.bundle_digest),
     )
 
 
-def _rollout_fields(wire: bytes) -> Mapping[str, object]:
-    rollout = rollout_from_proto(types_pb2.Rollout.FromString(wire))
-    return {
-        name: getattr(rollout, name)
-        for name in ("rollout_id", "group_id", "task_id", "plan", "seed", "render")
-    }
+def _read_rollout(wire: bytes) -> Rollout:
+    return rollout_from_proto(types_pb2.Rollout.FromString(wire))
 
 
 def batch_to_proto(batch: Batch) -> rollout_service_pb2.ExecuteRequest:

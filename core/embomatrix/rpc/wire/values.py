@@ -15,7 +15,7 @@ from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.skills.syntax import Plan
 from embomatrix.skills.trace import Step
 
-Reader = Callable[[bytes], Mapping[str, object]]
+Reader = Callable[[bytes], object]
 
 
 class _ReadWhenAsked:
@@ -41,8 +41,9 @@ class _ReadWhenAsked:
         def __getattr__(self, name: str) -> object:
             if name not in self._left:
                 raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-            for field_name, content in self.read(self.wire).items():
-                object.__setattr__(self, field_name, content)
+            whole = self.read(self.wire)
+            for field_name in self._left:
+                object.__setattr__(self, field_name, getattr(whole, field_name))
             return object.__getattribute__(self, name)
 
 
