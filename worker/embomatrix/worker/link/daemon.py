@@ -7,9 +7,10 @@ import contextlib
 import functools
 import logging
 import math
+import os
 import secrets
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
@@ -35,7 +36,7 @@ from embomatrix.worker.link.cache import BundleCache
 from embomatrix.worker.link.membership import Membership, MembershipFile
 from embomatrix.worker.link.outbox import ResultOutbox
 from embomatrix.worker.link.session import ManagerSession, Registration, register
-from embomatrix.worker.link.status import StatusReport, daemon_pids
+from embomatrix.worker.link.status import StatusFile, WorkerStatus, daemon_pids
 from embomatrix.worker.slots.pool import SlotPool
 from embomatrix.worker.slots.processes import SIMULATOR_PROGRAM
 from embomatrix.worker.slots.residents import LoadError, SlotLimits
@@ -95,9 +96,11 @@ class Daemon:
             on_pause=self._pause,
             on_hand_back=self._hand_back,
         )
-        self._report = StatusReport(
-            self._membership, settings, resources, self._pool, self._cache, self._outbox
-        )
+        self._started_s = time.time()
+        self._connected_since_s = 0.0
+        """Wall time of the connection to the manager; 0 without one."""
+        self._counts: Counter[type] = Counter()
+        """Results by the type of their outcome."""
         self._session: ManagerSession | None = None
         self._renewed_s = time.monotonic()
         self._lease_ttl_s = math.inf
@@ -140,7 +143,6 @@ class Daemon:
             return
         logger.info("draining held_leases=%d", self.held)
         self._draining.set()
-        self._report.update(draining=True)
         if self._session is not None:
             self._session.drain()
 
@@ -156,7 +158,7 @@ class Daemon:
             self._fence(),
             self._owner_watch.run(),
             MemoryWatch(self._pool).run(),
-            self._report.run(),
+            StatusFile(self._settings.state_dir, name).update(self._status),
             self._until_left(),
         )
         tasks = [asyncio.create_task(activity) for activity in activities]
@@ -169,6 +171,30 @@ class Daemon:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
         logger.info("left")
+
+    async def _status(self) -> WorkerStatus:
+        cache_used_mb = await asyncio.to_thread(self._cache.used_mb)
+        running = len(self._pool.progress())
+        return WorkerStatus(
+            self._membership.name,
+            os.getpid(),
+            self._started_s,
+            manager=self._managers.current,
+            connected_since_s=self._connected_since_s,
+            paused=self._owner_watch.reason,
+            draining=self._draining.is_set(),
+            slots=self._resources.slots,
+            running=running,
+            waiting=self.held - running,
+            completed=self._counts[Completed],
+            failed=self._counts[InfraFailure],
+            unacknowledged=len(self._outbox),
+            scenes=len(self._pool.residents()),
+            memory_used_mb=round(self._pool.memory_used_mb),
+            memory_mb=self._resources.memory_mb,
+            cache_used_mb=cache_used_mb,
+            cache_mb=self._settings.cache_mb,
+        )
 
     async def _until_left(self) -> None:
         """Return after a drain took too long or was forced."""
@@ -260,11 +286,11 @@ class Daemon:
             await session.serve()
         finally:
             attached.cancel()
-            self._report.update(connected_since_s=0.0)
+            self._connected_since_s = 0.0
 
     async def _note_attached(self, session: ManagerSession) -> None:
         await session.attached.wait()
-        self._report.update(manager=self._managers.current, connected_since_s=time.time())
+        self._connected_since_s = time.time()
         self._backoff.reset()
 
     async def _fence(self) -> None:
@@ -301,13 +327,12 @@ class Daemon:
 
     def _take_result(self, result: LeaseResult) -> None:
         """Queue a result for the manager, with this worker's name."""
-        self._report.count(result)
+        self._counts[type(result.outcome)] += 1
         self._outbox.put(signed(result, self._membership.name))
         if self._session is not None:
             self._session.notify()
 
     def _pause(self, reason: str) -> None:
-        self._report.update(paused=reason)
         if self._session is not None:
             self._session.pause(reason)
 

@@ -7,24 +7,14 @@ import contextlib
 import json
 import logging
 import os
-import time
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Final
 
 import psutil
 
-from embomatrix.rpc.wire.leases import LeaseResult
-from embomatrix.rpc.wire.values import Completed, Resources
-from embomatrix.worker.link.cache import BundleCache
-from embomatrix.worker.link.outbox import ResultOutbox
 from embomatrix.world.whole_file import write_whole
-
-if TYPE_CHECKING:
-    from embomatrix.worker.host.settings import WorkerSettings
-    from embomatrix.worker.link.membership import Membership
-    from embomatrix.worker.slots.pool import SlotPool
 
 logger = logging.getLogger(__name__)
 
@@ -75,6 +65,15 @@ class StatusFile:
                 write_whole(self._path, json.dumps(asdict(status)).encode("utf-8"))
                 self._last = status
 
+    async def update(self, current: Callable[[], Awaitable[WorkerStatus]]) -> None:
+        """Write the current status until cancelled; then remove the file."""
+        try:
+            while True:
+                self.write(await current())
+                await asyncio.sleep(STATUS_S)
+        finally:
+            self.remove()
+
     def remove(self) -> None:
         """Remove the file after the daemon has left."""
         with self._errors_logged():
@@ -86,63 +85,6 @@ class StatusFile:
             yield
         except OSError as error:
             logger.debug("status file not updated path=%s: %s", self._path, error)
-
-
-class StatusReport:
-    """Keeps the file of a daemon up to date: some values are read from its parts, others are reported by it."""
-
-    def __init__(
-        self,
-        membership: Membership,
-        settings: WorkerSettings,
-        resources: Resources,
-        pool: SlotPool,
-        cache: BundleCache,
-        outbox: ResultOutbox,
-    ) -> None:
-        self._file = StatusFile(settings.state_dir, membership.name)
-        self._status = WorkerStatus(
-            membership.name,
-            os.getpid(),
-            time.time(),
-            membership.manager,
-            slots=resources.slots,
-            memory_mb=resources.memory_mb,
-            cache_mb=settings.cache_mb,
-        )
-        self._pool = pool
-        self._cache = cache
-        self._outbox = outbox
-
-    async def run(self) -> None:
-        """Write the file until cancelled; then remove it."""
-        try:
-            while True:
-                self._file.write(self._current(await asyncio.to_thread(self._cache.used_mb)))
-                await asyncio.sleep(STATUS_S)
-        finally:
-            self._file.remove()
-
-    def update(self, **changes: Any) -> None:
-        """Set fields of the status."""
-        self._status = replace(self._status, **changes)
-
-    def count(self, result: LeaseResult) -> None:
-        """Count a result as completed or failed."""
-        field = "completed" if isinstance(result.outcome, Completed) else "failed"
-        self.update(**{field: getattr(self._status, field) + 1})
-
-    def _current(self, cache_used_mb: float) -> WorkerStatus:
-        running = len(self._pool.progress())
-        return replace(
-            self._status,
-            running=running,
-            waiting=len(self._pool.held()) - running,
-            unacknowledged=len(self._outbox),
-            scenes=len(self._pool.residents()),
-            memory_used_mb=round(self._pool.memory_used_mb),
-            cache_used_mb=cache_used_mb,
-        )
 
 
 def running_daemons(state_dir: Path) -> list[WorkerStatus]:
