@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Final
+import asyncio
+import functools
+import time
+from collections.abc import Awaitable, Callable, Coroutine
+from typing import Any, Concatenate, Final, ParamSpec, Self, TypeVar
+
+import grpc
 
 from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.proto.v1 import admin_service_pb2_grpc
-from embomatrix.rpc.channel import DEFAULT_ADDRESS
-from embomatrix.rpc.managers import FAILOVER_S, LeaderClient, of_the_leader
+from embomatrix.rpc.channel import DEFAULT_ADDRESS, open_channel
+from embomatrix.rpc.managers import FAILOVER_S, Managers
+from embomatrix.rpc.status import UnavailableError, cluster_errors
 from embomatrix.rpc.wire.codec import each, inside
 from embomatrix.rpc.wire.run_log import (
     EventPage,
@@ -24,10 +31,40 @@ from embomatrix.rpc.wire.values import FleetStatus, PlanCell, RunInfo, WorkerInf
 
 CALL_S: Final = 10.0
 """Default time limit of one call."""
+PAUSE_S: Final = 0.2
+"""Pause between calls to two managers."""
+P = ParamSpec("P")
+T = TypeVar("T")
+C = TypeVar("C", bound="AdminClient")
 
 
-class AdminClient(LeaderClient):
-    """Calls that need no run. The role of the token decides which of them are allowed."""
+def of_the_leader(
+    method: Callable[Concatenate[C, P], Awaitable[T]],
+) -> Callable[Concatenate[C, P], Coroutine[Any, Any, T]]:
+    """Translate the errors of a client's call, and repeat it at the next manager while the current one is unavailable."""
+
+    @functools.wraps(method)
+    async def call(self: C, /, *args: P.args, **options: P.kwargs) -> T:
+        ends_s = time.monotonic() + self.failover_s
+        while True:
+            try:
+                with cluster_errors(self._address):
+                    return await method(self, *args, **options)
+            except UnavailableError as error:
+                if self.managers.count == 1 or time.monotonic() >= ends_s:
+                    raise
+                self.managers.move(error)
+            await asyncio.sleep(PAUSE_S)
+
+    return call
+
+
+class AdminClient:
+    """Async context manager over calls that need no run, to the leading manager of a cluster.
+
+    ``address`` is HOST:PORT, or several with commas between them. ``ca`` (PEM) turns TLS on. The role of the token decides
+    which calls are allowed. Every failure is a ClusterError.
+    """
 
     def __init__(
         self,
@@ -38,8 +75,31 @@ class AdminClient(LeaderClient):
         call_s: float = CALL_S,
         failover_s: float = FAILOVER_S,
     ) -> None:
-        super().__init__(address, token, ca=ca, failover_s=failover_s)
+        self.managers = Managers(address)
+        self.failover_s = failover_s
         self._call_s = call_s
+        self._token = token
+        self._ca = ca
+        self._channels: dict[str, grpc.aio.Channel] = {}
+
+    async def __aenter__(self) -> Self:
+        _ = self._channel  # a token that cannot be sent is refused here, not at the first call
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        for channel in self._channels.values():
+            await channel.close()
+
+    @property
+    def _address(self) -> str:
+        return self.managers.current
+
+    @property
+    def _channel(self) -> grpc.aio.Channel:
+        """Channel to the current manager. Earlier channels stay open, since calls may still use them."""
+        if self._address not in self._channels:
+            self._channels[self._address] = open_channel(self._address, self._token, self._ca)
+        return self._channels[self._address]
 
     @property
     def _admin(self) -> admin_service_pb2_grpc.AdminServiceAsyncStub:

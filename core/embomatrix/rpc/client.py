@@ -19,9 +19,9 @@ from embomatrix.proto.v1 import (
     scene_service_pb2,
     scene_service_pb2_grpc,
 )
-from embomatrix.rpc.admin_client import AdminClient
+from embomatrix.rpc.admin_client import AdminClient, of_the_leader
 from embomatrix.rpc.channel import DEFAULT_ADDRESS, chunks_of
-from embomatrix.rpc.managers import FAILOVER_S, of_the_leader
+from embomatrix.rpc.managers import FAILOVER_S
 from embomatrix.rpc.status import (
     ClusterError,
     DeadlineError,
