@@ -4,20 +4,16 @@ Each object is tried in the simulator from the start state. Doors in front of it
 are not picked up.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from embomatrix.factory.scenes.view import SceneView
+from embomatrix.sim.executor import Simulator
 from embomatrix.skills.limits import ROBOT
 from embomatrix.skills.syntax import Plan, Skill, SkillCall
 from embomatrix.world.state import Relation
 from embomatrix.world.task import Task
-
-if TYPE_CHECKING:
-    from embomatrix.factory.scenes.view import SceneView
-    from embomatrix.sim.executor import Simulator
 
 SEED: Final = 0
 

@@ -1,22 +1,18 @@
 """Cluster as a second check: its slots execute the oracle's plans before their tasks are admitted."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.admission import SEED, RefusalReason
 from embomatrix.factory.pipeline.store import Rejection
+from embomatrix.factory.pipeline.variants import VariantYield
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.wire.values import Batch, Completed, Rollout, RolloutResult
 from embomatrix.skills.parse import plan_from_json
 from embomatrix.world.dataset import DatasetError, TaskRecord
-
-if TYPE_CHECKING:
-    from embomatrix.factory.pipeline.variants import VariantYield
 
 RUN: Final = "factory"
 """Name of the run on the manager's pages."""

@@ -1,18 +1,14 @@
 """Rule-based Role-Playing Agent: roles by kind of place, and a seeded cast with a schedule that covers every room."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
+
+import numpy as np
 
 from embomatrix.factory.social.occasions import ELSEWHERE, Occasion, occasions_in
 from embomatrix.factory.social.values import Cast, DaySlot, Person
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from embomatrix.world.scene import Room, Scene
+from embomatrix.world.scene import Room, Scene
 
 
 @dataclass(frozen=True, slots=True)

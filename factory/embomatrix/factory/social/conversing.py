@@ -4,12 +4,13 @@ The final requests are conjuncts of a feasible goal. The conversation is derived
 reason, a question, an answer that may change, a request that the robot refuses, and further requests.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+import numpy as np
+
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.fitting import themes_of
 from embomatrix.factory.social.phrases import (
     AGREEMENTS,
@@ -25,12 +26,6 @@ from embomatrix.factory.social.values import ROBOT, Act, Cast, Conversation, Day
 from embomatrix.factory.writer.goals import GoalConjunct, GoalContext, placed_elsewhere
 from embomatrix.factory.writer.words import Voice
 from embomatrix.skills.limits import ROBOT as ROBOT_LIMITS
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from embomatrix.factory.scenes.view import SceneView
-
 
 _ANYWHERE: Final = (
     ("vacuum the floor", "I have one arm with a gripper, and no vacuum cleaner"),

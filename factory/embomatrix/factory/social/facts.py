@@ -1,15 +1,11 @@
 """Scene information extraction: description of a scene for a language model, from its inventory."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.writer.words import spoken
-
-if TYPE_CHECKING:
-    from embomatrix.factory.scenes.view import SceneView
 
 MAX_OBJECTS_IN_ROOM: Final = 40
 """Maximum number of objects described per room. Objects that a task can be about come first."""

@@ -1,17 +1,13 @@
 """Plausibility of requests: a request must suit an activity of the cast and household conventions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.furnish.small_objects import COOKWARE, FOR_DRINKS, MEMBERS, ItemKind
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.occasions import Occasion, Theme, occasion_of
 from embomatrix.factory.social.values import Cast, DaySlot
 from embomatrix.factory.writer.goals import GoalConjunct
-
-if TYPE_CHECKING:
-    from embomatrix.factory.scenes.view import SceneView
 
 _GROUP_OF: Final[Mapping[str, ItemKind]] = {
     category: group for group, members in MEMBERS.items() for category in members

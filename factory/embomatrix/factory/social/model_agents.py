@@ -4,12 +4,11 @@ Each agent requests a typed answer and checks it against the scene. Problems are
 The scene's description is marked as data, so that instructions in names are ignored.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 from pydantic import Field
 
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.facts import SceneFacts
 from embomatrix.factory.social.prompts import (
     CAST_SYSTEM,
@@ -37,9 +36,6 @@ from embomatrix.factory.social.values import (
 from embomatrix.llm.structured import ask
 from embomatrix.llm.values import ChatModel, ChatRequest, Message, Speaker
 from embomatrix.world.task import TaskCategory
-
-if TYPE_CHECKING:
-    from embomatrix.factory.scenes.view import SceneView
 
 SIGHT: Final = "scene information extraction"
 CAST: Final = "role-playing agent"

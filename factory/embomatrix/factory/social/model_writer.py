@@ -1,14 +1,13 @@
 """Task writer by social simulation with a language model. The scene decides which requests become drafts."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.factory.admission import RefusalReason, TaskRefusal
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.conversing import starting_slots
 from embomatrix.factory.social.facts import SceneFacts, facts_of, with_sights
 from embomatrix.factory.social.model_agents import SocialModelAgents
@@ -17,13 +16,10 @@ from embomatrix.factory.social.summary import transcript_of
 from embomatrix.factory.social.values import Cast
 from embomatrix.factory.writer.goals import GoalContext
 from embomatrix.factory.writer.tasks import Draft, DraftOrder, draft_of
+from embomatrix.factory.writer.variant import Variant
 from embomatrix.llm.batch import FailureLimit, OnOneLoop
 from embomatrix.llm.values import EndpointError, LlmError, UnusableReplyError
 from embomatrix.world.scene import Scene
-
-if TYPE_CHECKING:
-    from embomatrix.factory.scenes.view import SceneView
-    from embomatrix.factory.writer.variant import Variant
 
 logger = logging.getLogger(__name__)
 SEEDS = 2**31

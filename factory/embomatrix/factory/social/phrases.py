@@ -1,17 +1,12 @@
 """Sentence templates of people and robot by speech act. The vocabulary is wider than that of the plain task writer."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.values import Act
 from embomatrix.factory.writer.words import room_words, spoken
-
-if TYPE_CHECKING:
-    from embomatrix.factory.scenes.view import SceneView
-
 
 CLAUSES: Final[Mapping[str, tuple[str, ...]]] = {
     "ontop": (

@@ -1,19 +1,15 @@
 """Typed result of a conversation: an instruction and the atoms that must hold, about existing objects."""
 
-from __future__ import annotations
-
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from pydantic import Field
 
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.values import StrictModel
 from embomatrix.factory.writer.goals import GoalConjunct
 from embomatrix.world.goal import Atom, Formula, Not
 from embomatrix.world.state import Relation
-
-if TYPE_CHECKING:
-    from embomatrix.factory.scenes.view import SceneView
 
 
 class RequestPredicate(StrEnum):

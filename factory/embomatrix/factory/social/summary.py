@@ -1,10 +1,8 @@
 """Rule-based Summarization Agent: instruction and transcript of a conversation."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.phrases import (
     CONJUNCTIONS,
     INSTRUCTIONS,
@@ -15,9 +13,6 @@ from embomatrix.factory.social.phrases import (
 from embomatrix.factory.social.values import ROBOT, Cast, Conversation
 from embomatrix.factory.writer.goals import GoalConjunct
 from embomatrix.factory.writer.words import Voice
-
-if TYPE_CHECKING:
-    from embomatrix.factory.scenes.view import SceneView
 
 
 def instruction_of(conversation: Conversation, cast: Cast, view: SceneView, voice: Voice, why: str) -> str:

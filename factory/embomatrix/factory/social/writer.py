@@ -1,16 +1,15 @@
 """Task writer by rule-based social simulation: a cast for each scene, a conversation for each task."""
 
-from __future__ import annotations
-
 import dataclasses
 import zlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.casting import draw_cast
 from embomatrix.factory.social.conversing import ConversationScenario, GrammarConversation
 from embomatrix.factory.social.fitting import best_slot, reasons_for
@@ -26,13 +25,10 @@ from embomatrix.factory.social.summary import instruction_of, transcript_of
 from embomatrix.factory.social.values import Cast, Conversation, DaySlot
 from embomatrix.factory.writer.goals import GoalConjunct, GoalContext
 from embomatrix.factory.writer.tasks import Draft, DraftOrder, draft_of, draw_conjuncts
+from embomatrix.factory.writer.variant import Variant
 from embomatrix.factory.writer.words import FreshVoice
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import TaskCategory
-
-if TYPE_CHECKING:
-    from embomatrix.factory.scenes.view import SceneView
-    from embomatrix.factory.writer.variant import Variant
 
 MAX_EQUAL_WISHES: Final = 2
 """Maximum number of equal requests in one variant."""

@@ -1,12 +1,11 @@
 """Fields of an imported task: instruction, category, signature, and appliances that the goal needs."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.reach import REAL
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.skills.appliances import liquids_given
@@ -16,10 +15,6 @@ from embomatrix.world.goal import Formula
 from embomatrix.world.state import Relation, State, SubstanceRelation
 from embomatrix.world.substances import MEANINGS, WATER
 from embomatrix.world.task import TaskCategory
-
-if TYPE_CHECKING:
-    from embomatrix.factory.scenes.view import SceneView
-
 
 KITCHEN: Final = frozenset({State.COOKED, State.FROZEN, State.HOT, State.SLICED, REAL})
 SWITCHED: Final = frozenset({State.OPEN, State.TOGGLED_ON})

@@ -1,24 +1,20 @@
 """Goal conjuncts: each kind of request with its words."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
+
+import numpy as np
 
 from embomatrix.factory.furnish.small_objects import FOR_DRINKS, suits
+from embomatrix.factory.scenes.view import SceneView
+from embomatrix.factory.writer.variant import Variant
 from embomatrix.factory.writer.words import PHRASES, Voice, phrase, refer, room_words, spoken
 from embomatrix.world.asset import JointKind
 from embomatrix.world.goal import And, Atom, Exists, Formula, Not
 from embomatrix.world.state import Relation
 from embomatrix.world.substances import flows_from
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from embomatrix.factory.scenes.view import SceneView
-    from embomatrix.factory.writer.variant import Variant
 
 TAP_MANNER: Final = "tap"
 DRAWER_MANNER: Final = "drawers"

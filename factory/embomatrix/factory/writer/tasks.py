@@ -1,13 +1,15 @@
 """Task writer: seeded tasks about the objects of a scene variant, in the paper's four categories."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
+from typing import Final, Protocol, runtime_checkable
 
+import numpy as np
+
+from embomatrix.factory.admission import TaskRefusal
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.writer.goals import (
     GoalConjunct,
     GoalContext,
@@ -16,18 +18,11 @@ from embomatrix.factory.writer.goals import (
     switch_goal,
     thermal_goal,
 )
+from embomatrix.factory.writer.variant import Variant
 from embomatrix.factory.writer.words import sentence
 from embomatrix.world.evaluate import render
 from embomatrix.world.goal import And, Formula
 from embomatrix.world.task import MAX_TABLE, Task, TaskCategory
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from embomatrix.factory.admission import TaskRefusal
-    from embomatrix.factory.scenes.view import SceneView
-    from embomatrix.factory.writer.variant import Variant
-
 
 Maker = Callable[[GoalContext], GoalConjunct | None]
 

@@ -1,17 +1,13 @@
 """Instructions in a bounded vocabulary with natural variation: references to objects and phrases for goals."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+import numpy as np
+
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.world.bddl import is_room_instance
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from embomatrix.factory.scenes.view import SceneView
 
 PHRASES: Final[Mapping[str, tuple[str, ...]]] = {
     "ontop": (
