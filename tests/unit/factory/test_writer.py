@@ -16,9 +16,10 @@ from embomatrix.factory.furnish.small_objects import (
     suits,
 )
 from embomatrix.factory.scenes.view import SceneView, is_liftable
+from embomatrix.factory.writer.goals import GoalContext
 from embomatrix.factory.writer.tasks import Draft, DraftOrder, PlainWriter, is_heldout_signature, object_table
 from embomatrix.factory.writer.variant import Variant
-from embomatrix.factory.writer.words import Voice, refer, room_words, sentence
+from embomatrix.factory.writer.words import room_words, sentence
 from embomatrix.world.bddl import ROOM_TYPES, parse_formula
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.evaluate import objects_of
@@ -140,13 +141,10 @@ def test_table_includes_supports_and_its_order_reveals_nothing(view: SceneView) 
     assert len(first_rows) > 4
 
 
-def test_room_is_named_if_the_category_is_ambiguous(view: SceneView) -> None:
-    words = {refer(view, "apple_1", Voice(np.random.default_rng(seed))) for seed in range(10)}
-    assert words == {"the apple in the kitchen"}
-    assert {refer(view, "bowl_1", Voice(np.random.default_rng(seed))) for seed in range(20)} == {
-        "the bowl",
-        "the bowl in the kitchen",
-    }
+def test_room_is_named_if_the_category_is_ambiguous(view: SceneView, variant: Variant) -> None:
+    contexts = [GoalContext(view, variant, np.random.default_rng(seed)) for seed in range(20)]
+    assert {context.refer("apple_1") for context in contexts} == {"the apple in the kitchen"}
+    assert {context.refer("bowl_1") for context in contexts} == {"the bowl", "the bowl in the kitchen"}
 
 
 def test_one_of_several_rooms_of_a_type_has_its_own_name(scene: Scene) -> None:

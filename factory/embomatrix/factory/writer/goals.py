@@ -10,7 +10,7 @@ import numpy as np
 from embomatrix.factory.furnish.small_objects import FOR_DRINKS, suits
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.writer.variant import Variant
-from embomatrix.factory.writer.words import PHRASES, Voice, phrase, refer, room_words, spoken
+from embomatrix.factory.writer.words import PHRASES, Voice, room_words, spoken
 from embomatrix.world.asset import JointKind
 from embomatrix.world.goal import And, Atom, Exists, Formula, Not
 from embomatrix.world.state import Relation
@@ -63,20 +63,24 @@ class GoalContext:
     voice: Voice | None = None
 
     def phrase(self, kind: str, *, thing: str, place: str = "", manner: str = "") -> str:
-        """Return one imperative clause."""
-        options = self.phrases.get(f"{kind} {manner}", self.phrases[kind])
-        return phrase(options, self._voice, thing=thing, place=place)
+        """Return one imperative clause. Without a place, only phrases without one are used."""
+        phrases = self.phrases.get(f"{kind} {manner}", self.phrases[kind])
+        options = [text for text in phrases if place or "{place}" not in text]
+        return self._voice.choose(options).format(thing=thing, place=place)
 
-    def refer(self, name: str) -> str:
-        """Return a noun phrase for an object."""
-        return self._referred(name, self.where)
+    def refer(self, name: str, *, taken: bool = False) -> str:
+        """Return a noun phrase for an object, or for any object of its category in its room.
 
-    def refer_taken(self, name: str) -> str:
-        """Return a noun phrase for an object that is taken away."""
-        return self._referred(name, self.whence)
-
-    def _referred(self, name: str, where: Sequence[str]) -> str:
-        return refer(self.view, name, self._voice, where, self.noun(name), self.room_called)
+        The room is named if the category alone is ambiguous, and sometimes otherwise. ``taken`` objects leave it.
+        """
+        view, noun = self.view, self.noun(name)
+        article = "the" if len(view.alike(name)) == 1 else "an" if noun[0] in "aeiou" else "a"
+        words = f"{article} {noun}"
+        ambiguous = len(view.rooms_with(view.category(name))) > 1
+        if ambiguous or self.rng.random() < 0.35:
+            where = self._voice.choose(self.whence if taken else self.where)
+            words += " " + where.format(room=self.room_called(view, view.room(name)))
+        return words
 
     def noun(self, name: str) -> str:
         """Return the noun for an object."""
@@ -116,7 +120,7 @@ def placement_goal(context: GoalContext) -> GoalConjunct | None:
     )
     if thing is None:
         return None
-    return _place_goal(context, thing, context.refer_taken(thing))
+    return _place_goal(context, thing, context.refer(thing, taken=True))
 
 
 def _place_goal(context: GoalContext, thing: str, called: str) -> GoalConjunct | None:
@@ -175,12 +179,7 @@ def _any_alike(
         return atom(target), {}, (target,), context.refer(target)
     synset = view.asset(target).synset
     variable = f"?{synset}"
-    return (
-        Exists(variable, synset, atom(variable)),
-        {synset: alike},
-        alike,
-        context.refer(target),
-    )
+    return Exists(variable, synset, atom(variable)), {synset: alike}, alike, context.refer(target)
 
 
 def switch_goal(context: GoalContext) -> GoalConjunct | None:
@@ -257,7 +256,7 @@ def _thermal(context: GoalContext, food: str, source: str, predicate: str) -> Go
     goal: Formula = Atom(predicate, (food,))
     objects: tuple[str, ...] = (food,)
     signs: tuple[str, ...] = (f"{predicate}({view.category(food)})",)
-    called = context.refer_taken(food)
+    called = context.refer(food, taken=True)
     clause = context.phrase(predicate, thing=called, place=place)
     if view.is_container(source) and len(view.alike(source)) == 1 and rng.random() < 0.35:
         goal = And((goal, Atom("inside", (food, source))))

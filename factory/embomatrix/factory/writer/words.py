@@ -1,7 +1,7 @@
 """Instructions in a bounded vocabulary with natural variation: references to objects and phrases for goals."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -75,34 +75,6 @@ class FreshVoice(Voice):
         chosen = super().choose([option for option in options if self._said[option] == least])
         self._said[chosen] += 1
         return chosen
-
-
-def refer(
-    view: SceneView,
-    name: str,
-    voice: Voice,
-    where: Sequence[str] = ("in {room}",),
-    noun: str = "",
-    room_called: Callable[[SceneView, str], str] = room_words,
-) -> str:
-    """Return a noun phrase for an object, or for any object of its category in its room.
-
-    The room is named if the category alone is ambiguous, with a phrase of ``where`` and the name from
-    ``room_called``. ``noun`` replaces the category's name.
-    """
-    noun = noun or spoken(view.category(name))
-    article = "the" if len(view.alike(name)) == 1 else "an" if noun[0] in "aeiou" else "a"
-    words = f"{article} {noun}"
-    ambiguous = len(view.rooms_with(view.category(name))) > 1
-    if ambiguous or voice.rng.random() < 0.35:
-        words += " " + voice.choose(where).format(room=room_called(view, view.room(name)))
-    return words
-
-
-def phrase(phrases: Sequence[str], voice: Voice, *, thing: str, place: str = "") -> str:
-    """Return one imperative clause. Without a place, only phrases without one are used."""
-    options = [text for text in phrases if place or "{place}" not in text]
-    return voice.choose(options).format(thing=thing, place=place)
 
 
 def sentence(phrases: Sequence[str], rng: np.random.Generator) -> str:
