@@ -77,14 +77,6 @@ class PlanExecutor(Protocol):
 S = TypeVar("S", bound=PlanExecutor)
 
 
-@dataclass(frozen=True, slots=True)
-class Admitted:
-    """Plan that reaches the goal, and the atoms that already hold at the start."""
-
-    plan: Plan
-    held_at_start: tuple[str, ...]
-
-
 def admit(
     executor: S,
     task: Task,
@@ -93,9 +85,10 @@ def admit(
     *,
     most_held: float = MAX_HELD_SHARE,
     physics: PlanExecutor | None = None,
-) -> Admitted | TaskRefusal:
-    """Judge a task by execution. ``init`` lists atoms that must hold at the start according to the task's source.
+) -> Plan | TaskRefusal:
+    """Judge a task by execution. Return a plan that reaches its goal, or a refusal.
 
+    ``init`` lists atoms that must hold at the start according to the task's source.
     At most the share ``most_held`` of the goal's atoms may hold at the start; 1 means all but one. If ``physics`` is
     given, the plan must also reach the goal there.
     """
@@ -128,7 +121,7 @@ def admit(
         return TaskRefusal(
             RefusalReason.PHYSICS_FAILED, f"the oracle's plan fails in stepped physics: {failure}"
         )
-    return Admitted(plan, held)
+    return plan
 
 
 @dataclass(frozen=True, slots=True)

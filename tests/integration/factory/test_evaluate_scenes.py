@@ -13,11 +13,11 @@ from embomatrix.factory.evaluate.scenes import (
     LIST,
     LayoutMethod,
     LayoutOutcome,
-    OutcomeLog,
     SceneTask,
     evaluate_scenes,
     evaluation_of,
     fixed_tasks,
+    outcome_log,
 )
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.request import RequestedObject
@@ -25,6 +25,7 @@ from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.factory.scenes.editor import SceneEditor
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.world.catalog import Catalog
+from embomatrix.world.dataset import DatasetError
 from embomatrix.world.geometry import Pose
 from embomatrix.world.state import Relation
 
@@ -130,27 +131,27 @@ UNICORN = """(define (problem unicorn)
 
 def test_resumed_run_makes_only_the_missing_trials(tmp_path: "Path") -> None:
     path = tmp_path / "outcomes.jsonl"
-    log = OutcomeLog.open(path, 0)
+    log = outcome_log(path, 0)
     for outcome in KNOWN:
         log.add(outcome)
     tasks = [SceneTask(SourceText(name, UNICORN, "embomatrix"), "Rs_int") for name in ("known", "new")]
     counts: list[int] = []
-    _, outcomes = evaluate_scenes(tasks, list(LayoutMethod), 0, 1, counts.append, OutcomeLog.open(path, 0))
+    _, outcomes = evaluate_scenes(tasks, list(LayoutMethod), 0, 1, counts.append, outcome_log(path, 0))
     assert outcomes[:3] == KNOWN
     assert [(each.task, each.method) for each in outcomes[3:]] == [("new", method) for method in LayoutMethod]
     assert all("unicorn" in each.detail for each in outcomes[3:])
     assert counts == [3, 4, 5, 6]
-    assert OutcomeLog.open(path, 0).outcomes == outcomes
+    assert outcome_log(path, 0).outcomes == outcomes
 
 
 def test_truncated_last_line_is_repeated(tmp_path: "Path") -> None:
     path = tmp_path / "outcomes.jsonl"
-    log = OutcomeLog.open(path, 0)
+    log = outcome_log(path, 0)
     for outcome in KNOWN[:2]:
         log.add(outcome)
     whole = path.read_text(encoding="utf-8")
     path.write_text(whole[:-30], encoding="utf-8")
-    taken_up = OutcomeLog.open(path, 0)
+    taken_up = outcome_log(path, 0)
     assert taken_up.outcomes == KNOWN[:1]
     taken_up.add(KNOWN[1])
     assert path.read_text(encoding="utf-8") == whole
@@ -159,14 +160,14 @@ def test_truncated_last_line_is_repeated(tmp_path: "Path") -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ('{"seed": 1}\n', "of seed 1, not of seed 0: name another file"),
-        ("", "not a log of outcomes"),
+        ('{"seed": 1}\n', "other settings \\(seed 1, now 0\\): give the same"),
+        ("", "is damaged: expected the settings"),
         ('{"seed": 0}\n{"task": 3}\n{}\n', ":2 is not an outcome"),
     ],
 )
 def test_outcomes_of_another_seed_are_rejected(tmp_path: "Path", content: str, message: str) -> None:
     path = tmp_path / "outcomes.jsonl"
     path.write_text(content, encoding="utf-8")
-    with pytest.raises(EvaluationError, match=message):
-        OutcomeLog.open(path, 0)
+    with pytest.raises(DatasetError, match=message):
+        outcome_log(path, 0)
     assert path.read_text(encoding="utf-8") == content

@@ -158,7 +158,7 @@ def test_interrupted_import_resumes_with_the_same_result(tmp_path: Path) -> None
     assert imported("--report", str(report)).exit_code == 0
     assert outcomes.read_text() == whole
     assert [each["name"] for each in json.loads(report.read_text())["outcomes"]] == ["a", "b", "b"]
-    assert "holds outcomes of" in " ".join(imported("--seed", "1").output.split())
+    assert "other settings (seed 0, now 1)" in " ".join(imported("--seed", "1").output.split())
     jsonl.write_text("\n".join(reversed(lines)))
     other = imported()
     assert other.exit_code == 2

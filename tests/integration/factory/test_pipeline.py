@@ -120,7 +120,7 @@ def test_interrupted_build_resumes_to_the_same_result(folder: Path, dataset: Dat
 
 def test_build_records_cpu_time_of_every_variant(folder: Path, dataset: Dataset) -> None:
     times = [json.loads(line) for line in (folder / "times.jsonl").read_text().splitlines()]
-    made = BuildStore.open(folder, asdict(SETTINGS)).results
+    made = BuildStore(folder, asdict(SETTINGS)).results
     assert [(line["split"], line["variant"]) for line in times if "variant" in line] == [
         (result.split, result.number) for result in made
     ]
@@ -131,7 +131,7 @@ def test_build_records_cpu_time_of_every_variant(folder: Path, dataset: Dataset)
 
 
 def test_full_disk_in_the_middle_of_a_line_costs_one_variant(tmp_path: Path) -> None:
-    store = BuildStore.open(tmp_path, {"seed": 1})
+    store = BuildStore(tmp_path, {"seed": 1})
     store.add(VariantResult("train", 0, (), ()), b"", {}, {}, 1.0)
     kept, before = [*store.results], (tmp_path / "build.jsonl").read_bytes()
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -142,28 +142,26 @@ def test_full_disk_in_the_middle_of_a_line_costs_one_variant(tmp_path: Path) -> 
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert len((tmp_path / "build.jsonl").read_bytes()) == len(before) + 40
-    assert BuildStore.open(tmp_path, {"seed": 1}).results == kept
+    assert BuildStore(tmp_path, {"seed": 1}).results == kept
     assert (tmp_path / "build.jsonl").read_bytes() == before
 
 
 def test_folder_of_another_build_is_not_changed(folder: Path, dataset: Dataset) -> None:
     with pytest.raises(DatasetError, match="other settings"):
-        BuildStore.open(folder, {"seed": 99})
+        BuildStore(folder, {"seed": 99})
 
 
 def test_different_settings_are_listed(tmp_path: Path) -> None:
-    BuildStore.open(tmp_path, {"seed": 1, "train": 8})
+    BuildStore(tmp_path, {"seed": 1, "train": 8})
     with pytest.raises(DatasetError, match=r"other settings \(seed 1, now 2\): give the same settings again"):
-        BuildStore.open(tmp_path, {"seed": 2, "train": 8})
+        BuildStore(tmp_path, {"seed": 2, "train": 8})
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[1]\n", "not json"])
 def test_build_file_without_settings_is_damaged(tmp_path: Path, content: str) -> None:
     (tmp_path / "build.jsonl").write_text(content)
-    with pytest.raises(
-        DatasetError, match="is damaged: expected the settings of the build in its first line"
-    ):
-        BuildStore.open(tmp_path, {"seed": 2})
+    with pytest.raises(DatasetError, match="is damaged: expected the settings of the run in its first line"):
+        BuildStore(tmp_path, {"seed": 2})
 
 
 def test_every_task_has_a_layout_tree_on_its_page(folder: Path, dataset: Dataset, tmp_path: Path) -> None:
@@ -202,7 +200,7 @@ def test_layout_agents_are_part_of_the_settings(tmp_path: Path) -> None:
     assert set(asked) <= {room.name for room in build_base_scene("Rs_int", seed=4).rooms}
     assert asked
     with pytest.raises(DatasetError, match=r"modelled \['room-organizer'\], now \[\]"):
-        BuildStore.open(tmp_path, asdict(replace(settings, modelled=())))
+        BuildStore(tmp_path, asdict(replace(settings, modelled=())))
 
 
 def test_attempt_log_has_a_line_with_a_reason_for_every_draft(folder: Path, summary: BuildSummary) -> None:
@@ -217,7 +215,7 @@ def test_truncated_attempt_log_is_restored_on_resume(folder: Path, dataset: Data
     whole = (folder / "attempts.jsonl").read_text()
     shutil.copy(folder / "build.jsonl", tmp_path)
     (tmp_path / "attempts.jsonl").write_text(whole[: len(whole) // 2])
-    BuildStore.open(tmp_path, json.loads((folder / "build.jsonl").read_text().splitlines()[0])["settings"])
+    BuildStore(tmp_path, json.loads((folder / "build.jsonl").read_text().splitlines()[0])["settings"])
     assert (tmp_path / "attempts.jsonl").read_text() == whole
 
 
@@ -372,7 +370,7 @@ def test_dataset_does_not_depend_on_the_number_of_processes(folder, dataset, tmp
 def test_cluster_check_keeps_solved_tasks_and_reports_the_reward_of_others(
     folder: Path, summary: BuildSummary
 ) -> None:
-    first = BuildStore.open(folder, asdict(SETTINGS)).results[0]
+    first = BuildStore(folder, asdict(SETTINGS)).results[0]
     made = VariantYield(first, b"", {})
     tasks = [record.task.task_id for record in first.records]
 

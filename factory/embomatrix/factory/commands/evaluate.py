@@ -17,7 +17,7 @@ from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admi
 from embomatrix.factory.evaluate.aesthetics import evaluate_aesthetics
 from embomatrix.factory.evaluate.judges import evaluate_looks, judged
 from embomatrix.factory.evaluate.page import with_factory
-from embomatrix.factory.evaluate.scenes import LayoutMethod, OutcomeLog, evaluate_scenes, fixed_tasks
+from embomatrix.factory.evaluate.scenes import LayoutMethod, evaluate_scenes, fixed_tasks, outcome_log
 from embomatrix.factory.evaluate.side_by_side import draw_side_by_side, named
 from embomatrix.factory.evaluate.tasks import DraftFeatures, asked_of, evaluate_tasks, panel, people_of
 from embomatrix.factory.metrics.figures import (
@@ -111,7 +111,7 @@ def scenes(
     with user_errors(outcomes, kept):
         chosen = fixed_tasks(sample)[::only]
         used_methods = methods or list(LayoutMethod)
-        log = OutcomeLog.open(outcomes, seed) if outcomes is not None else None
+        log = outcome_log(outcomes, seed)
         with progress(Console(stderr=True)) as bars:
             bar = bars.add_task("trials", total=len(chosen) * len(used_methods))
             evaluation, _ = evaluate_scenes(

@@ -13,7 +13,7 @@ from rich.table import Table
 from embomatrix.factory.admission import TaskRefusal
 from embomatrix.factory.commands.options import Jobs, LookAhead, Scenes, Seed, processes
 from embomatrix.factory.commands.terminal import fail, progress, user_errors
-from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures, write_evaluation
+from embomatrix.factory.metrics.figures import EvaluationFigures, write_evaluation
 from embomatrix.factory.pipeline.settings import scene_ids
 from embomatrix.factory.pipeline.store import ResumableLog
 from embomatrix.factory.task_import.batch import Verified
@@ -39,7 +39,7 @@ from embomatrix.factory.task_import.sources import (
 )
 from embomatrix.factory.task_import.task import ImportedTask
 from embomatrix.world.bddl import BddlError
-from embomatrix.world.dataset import TASKS_FILE, write_dataset
+from embomatrix.world.dataset import TASKS_FILE, DatasetError, write_dataset
 from embomatrix.world.substances import is_substance
 from embomatrix.world.task import Profile
 from embomatrix.world.whole_file import check_writable, write_whole
@@ -138,7 +138,7 @@ def _resumed_log(
     sources: Sequence[SourceText],
     settings: ImportSettings,
 ) -> ResumableLog[ProblemOutcome]:
-    """Return the log of the problems done so far. Raise EvaluationError if the file is about other problems."""
+    """Return the log of the problems done so far. Raise DatasetError if the file is about other problems."""
     log = ResumableLog[ProblemOutcome](path)
     decisive_settings = {
         "seed": settings.seed,
@@ -149,7 +149,7 @@ def _resumed_log(
     log.resume(decisive_settings, outcome_from_json)
     known = [outcome.name for outcome in log.outcomes]
     if known != [source.name for source in sources[: len(known)]]:
-        raise EvaluationError(f"{path} is about other problems than this import: name another file")
+        raise DatasetError(f"{path} is about other problems than this import: name another file")
     return log
 
 

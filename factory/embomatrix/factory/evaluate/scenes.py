@@ -8,20 +8,22 @@ share of tasks that the oracle solves is a separate figure, because it also depe
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import math
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from embomatrix.factory.admission import Admitted, RefusalReason, TaskRefusal, admit
+from embomatrix.factory.admission import RefusalReason, TaskRefusal, admit
 from embomatrix.factory.evaluate.aesthetics import Calibration, score_room
 from embomatrix.factory.evaluate.manipulation import out_of_hand
 from embomatrix.factory.evaluate.room_plans import plan_of
@@ -40,7 +42,7 @@ from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, Lay
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.planner.oracle import find_plan
-from embomatrix.sim.process_pool import process_pool
+from embomatrix.sim.process_pool import shared_work
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.scene import Scene
@@ -177,7 +179,7 @@ def _executed(
     with contextlib.closing(load_simulator(Bundle(imported.scene, {}, poses))) as simulator:
         verdict = admit(simulator, imported.task, find_plan, imported.init)
         lost = out_of_hand(simulator, imported.task, view, imported.about)
-    return (None if isinstance(verdict, Admitted) else verdict), lost
+    return (verdict if isinstance(verdict, TaskRefusal) else None), lost
 
 
 def _beauty(imported: ImportedTask) -> float:
@@ -253,15 +255,11 @@ def _figures(outcomes: Sequence[LayoutOutcome], method: LayoutMethod) -> Iterabl
 Trial = tuple[SceneTask, LayoutMethod]
 
 
-class OutcomeLog(ResumableLog[LayoutOutcome]):
-    """Outcomes of trials with one seed."""
-
-    @staticmethod
-    def open(path: Path, seed: int) -> OutcomeLog:
-        """Start or resume a log; a truncated last line is dropped. Raises EvaluationError, OSError."""
-        log = OutcomeLog(path)
-        log.resume({"seed": seed}, _outcome)
-        return log
+def outcome_log(path: Path | None, seed: int) -> ResumableLog[LayoutOutcome]:
+    """Start or resume the log of trials with one seed; a truncated last line is dropped. Raises DatasetError, OSError."""
+    log = ResumableLog[LayoutOutcome](path)
+    log.resume({"seed": seed}, _outcome)
+    return log
 
 
 def _outcome(value: dict[str, Any]) -> LayoutOutcome:
@@ -275,13 +273,13 @@ def evaluate_scenes(
     seed: int,
     jobs: int,
     progress: Callable[[int], None] = lambda _done: None,
-    log: OutcomeLog | None = None,
+    log: ResumableLog[LayoutOutcome] | None = None,
 ) -> tuple[EvaluationFigures, list[LayoutOutcome]]:
     """Run every task with every method and call ``progress`` with the number of finished trials.
 
     Trials in the ``log`` are skipped, new ones are appended to it. Equal arguments give equal outcomes.
     """
-    log = log if log is not None else OutcomeLog()
+    log = log or ResumableLog[LayoutOutcome]()
     trials = [(task, method) for task in tasks for method in methods]
     known = {(each.task, each.scene, each.method) for each in log.outcomes}
     by_scene: defaultdict[str, list[Trial]] = defaultdict(list)
@@ -289,8 +287,11 @@ def evaluate_scenes(
         if (task.source.name, task.scene, method) not in known:
             by_scene[task.scene].append((task, method))
     progress(len(trials) - sum(map(len, by_scene.values())))
-    with contextlib.ExitStack() as stack:
-        for outcome in _made([(group, seed) for group in by_scene.values()], jobs, stack):
+    died = EvaluationError(
+        "a process that judges layouts died, possibly for lack of memory: run the same command with fewer --jobs"
+    )
+    with shared_work(jobs, PlacementLibrary, partial(_judged, seed), died=died) as judge_all:
+        for outcome in itertools.chain.from_iterable(judge_all(by_scene.values())):
             log.add(outcome)
             progress(len(log.outcomes))
     found = {(each.task, each.scene, each.method): each for each in log.outcomes}
@@ -305,26 +306,7 @@ def evaluate_scenes(
     return evaluation_of(outcomes, conditions), outcomes
 
 
-def _made(
-    orders: Sequence[tuple[Sequence[Trial], int]], jobs: int, stack: contextlib.ExitStack
-) -> Iterator[LayoutOutcome]:
-    """Yield outcomes: trial by trial in this process, scene by scene with several processes."""
-    if jobs == 1:
-        for order in orders:
-            yield from _judged(order)
-        return
-    pool = stack.enter_context(process_pool(jobs))
-    for group in pool.map(_all_judged, orders):
-        yield from group
-
-
-def _all_judged(order: tuple[Sequence[Trial], int]) -> list[LayoutOutcome]:
-    return list(_judged(order))
-
-
-def _judged(order: tuple[Sequence[Trial], int]) -> Iterator[LayoutOutcome]:
-    trials, seed = order
+def _judged(seed: int, library: PlacementLibrary, trials: Sequence[Trial]) -> list[LayoutOutcome]:
+    """Return the outcomes of the trials in one base scene."""
     base = build_base_scene(trials[0][0].scene)
-    with contextlib.closing(PlacementLibrary()) as library:
-        for task, method in trials:
-            yield judge(task, method, base, library, seed=seed)
+    return [judge(task, method, base, library, seed=seed) for task, method in trials]

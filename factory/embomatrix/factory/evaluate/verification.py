@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from embomatrix.factory.admission import SEED, Admitted, PlanFailure, admit, plan_failure
+from embomatrix.factory.admission import SEED, PlanFailure, TaskRefusal, admit, plan_failure
 from embomatrix.factory.metrics.figures import EvaluationFigures
 from embomatrix.factory.task_import.batch import max_held_share
 from embomatrix.pages.figures import Better, Figure
@@ -131,10 +131,10 @@ def _judge_bundle(folder: Path, tasks: tuple[str, list[str]], *, physical: bool)
 def _cached(simulator: Simulator, record: TaskRecord) -> Judgement:
     """Judge a task as admission does and execute the plan found."""
     verdict = admit(simulator, record.task, find_plan, most_held=max_held_share(record.task))
-    if not isinstance(verdict, Admitted):
+    if isinstance(verdict, TaskRefusal):
         return Judgement(record.task.task_id, f"{verdict.reason}: {verdict.sentence}", "", same_plan=False)
-    trace = simulator.execute(record.task, verdict.plan, SEED)
-    same = plan_to_json(verdict.plan) == [dict(call) for call in record.oracle]
+    trace = simulator.execute(record.task, verdict, SEED)
+    same = plan_to_json(verdict) == [dict(call) for call in record.oracle]
     return Judgement(record.task.task_id, SUCCESS, trace.digest, same)
 
 

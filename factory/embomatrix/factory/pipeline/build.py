@@ -4,7 +4,6 @@ Variants are made in rounds. The variants of a round know the tasks of earlier r
 round. Therefore the dataset does not depend on the number of processes.
 """
 
-import contextlib
 import dataclasses
 import time
 from collections import Counter, defaultdict
@@ -31,10 +30,6 @@ from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import DatasetError, TaskRecord, write_dataset
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import TaskCategory
-
-MakeVariants = Callable[[Sequence[VariantOrder]], Iterator[VariantYield]]
-"""Function that makes variants and yields the results in the order of the orders."""
-
 
 VariantCheck = Callable[[VariantYield], VariantYield]
 """Second check of a variant: removes tasks and adds their rejections."""
@@ -153,22 +148,26 @@ def build_dataset(
     the settings and the rule-based layout agents; they run in this process. Otherwise ``jobs`` processes are used.
 
     Raise CatalogError for an unknown scene. Raise DatasetError if no room can be held out, if the folder holds a
-    build with other settings, or if a process dies.
+    build with other settings, or if a process dies. Raise OSError if the folder can't be written.
     """
     _check_rooms(settings)  # checked before anything is written, so that an error leaves no folder behind
-    store = BuildStore.open(folder, dataclasses.asdict(settings))
+    store = BuildStore(folder, dataclasses.asdict(settings))
     began = time.process_time()
     bases = [build_base_scene(scene_id, seed=settings.seed) for scene_id in settings.scenes]
     store.spent_on_scenes(len(bases), time.process_time() - began)
     rooms = split_rooms(bases, settings.seed) if settings.train else _all_held_out(bases)
-    with contextlib.ExitStack() as stack:
-        make: MakeVariants | None = None
+    died = DatasetError(
+        "a process that makes scene variants died, possibly for lack of memory: finished variants are kept; run the "
+        "same command again with fewer --jobs"
+    )
+    here = writer is not None or layout is not None
+    with shared_work(
+        1 if here else jobs, VariantMaker, VariantMaker.make, settings, writer, layout, died=died
+    ) as make:
         for split, target in (("heldout", settings.heldout), ("train", settings.train)):
             orders = _SplitOrders(store, bases, rooms[split], split, target)
             while round_orders := orders.next_round():
                 progress(split, orders.admitted)
-                if make is None:
-                    make = stack.enter_context(variant_makers(settings, writer, layout, jobs))
                 for variant in make(round_orders):
                     orders.add(variant if check is None else check(variant))
                     progress(split, orders.admitted)
@@ -293,23 +292,3 @@ def _summary(store: BuildStore, rooms: Mapping[str, Mapping[str, tuple[str, ...]
         variants=len(store.results),
         rooms=rooms,
     )
-
-
-@contextlib.contextmanager
-def variant_makers(
-    settings: BuildSettings, writer: TaskWriter | None, layout: LayoutAgents | None, jobs: int
-) -> Iterator[MakeVariants]:
-    """Yield a function that makes variants.
-
-    ``writer`` and ``layout`` stay in this process, since they may hold a connection.
-    """
-    if writer is not None or layout is not None:
-        with contextlib.closing(VariantMaker(settings, writer, layout)) as maker:
-            yield lambda orders: map(maker.make, orders)
-        return
-    died = DatasetError(
-        "a process that makes scene variants died, possibly for lack of memory: finished variants are kept; run the "
-        "same command again with fewer --jobs"
-    )
-    with shared_work(jobs, VariantMaker, VariantMaker.make, settings, died=died) as make:
-        yield make

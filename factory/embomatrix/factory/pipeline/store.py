@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from embomatrix.factory.admission import RefusalReason
-from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.world.dataset import (
     BUNDLES_FOLDER,
     DatasetError,
@@ -32,47 +31,43 @@ class ResumableLog(Generic[T]):
     """Outcomes of a long run as JSON lines, preceded by the settings that decide them. Without a path, memory only."""
 
     path: Path | None = None
+    encode: Callable[[T], Mapping[str, Any]] = asdict
     outcomes: list[T] = field(default_factory=list)
 
     def resume(self, settings: Mapping[str, Any], read: Callable[[Any], T]) -> None:
-        """Read the outcomes of an earlier run, or start the file. Raise EvaluationError or OSError.
+        """Read the outcomes of an earlier run, or start the file. Raise DatasetError or OSError.
 
         ``read`` converts the JSON value of a line. It raises ValueError, TypeError or KeyError for an invalid value.
         """
         if self.path is None:
             return
-        lines = _read_or_start(self.path, settings)
+        if not self.path.exists():
+            write_whole(self.path, (json.dumps(settings) + "\n").encode("ascii"))
+        lines = self.path.read_text(encoding="utf-8").splitlines()
         wanted = json.loads(json.dumps(settings))
         try:
             found = json.loads(lines[0])
-        except (ValueError, IndexError) as error:
-            raise EvaluationError(
-                f"{self.path} is not a log of outcomes: expected its settings in the first line; name another file"
-            ) from error
-        if found != wanted:
-            raise EvaluationError(
-                f"{self.path} holds outcomes of {_in_words(found)}, not of {_in_words(wanted)}: name another file"
+        except (ValueError, IndexError):
+            found = None
+        if not isinstance(found, dict) or found.keys() != wanted.keys():
+            raise DatasetError(
+                f"{self.path} is damaged: expected the settings of the run in its first line; name another file or folder"
             )
-        self.outcomes += _read_outcomes(self.path, lines, read, EvaluationError)
+        if found != wanted:
+            raise DatasetError(
+                f"{self.path} holds a run with other settings ({_differences(found, wanted)}): give the same settings "
+                "again, or name another file or folder"
+            )
+        self.outcomes += _read_outcomes(self.path, lines, read)
 
     def add(self, outcome: T) -> None:
         """Append an outcome. Raise OSError."""
         if self.path is not None:
-            with self.path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(asdict(outcome)) + "\n")
+            _append(self.path, json.dumps(self.encode(outcome)) + "\n")
         self.outcomes.append(outcome)
 
 
-def _read_or_start(path: Path, head: Mapping[str, Any]) -> list[str]:
-    """Return the lines of a log. A missing log is created with ``head`` as its first line."""
-    if not path.exists():
-        write_whole(path, (json.dumps(head) + "\n").encode("ascii"))
-    return path.read_text(encoding="utf-8").splitlines()
-
-
-def _read_outcomes(
-    path: Path, lines: list[str], read: Callable[[Any], T], error_type: type[Exception]
-) -> list[T]:
+def _read_outcomes(path: Path, lines: list[str], read: Callable[[Any], T]) -> list[T]:
     """Return the outcomes after the first line. A truncated last line is removed from the file."""
     outcomes: list[T] = []
     for number, line in enumerate(lines[1:], start=2):
@@ -80,18 +75,27 @@ def _read_outcomes(
             outcomes.append(read(json.loads(line)))
         except (ValueError, TypeError, KeyError) as error:
             if number != len(lines):
-                raise error_type(
+                raise DatasetError(
                     f"{path}:{number} is not an outcome ({error}): remove the line, or name another path"
                 ) from error
             write_whole(path, "".join(f"{kept}\n" for kept in lines[:-1]).encode("utf-8"))
     return outcomes
 
 
-def _in_words(settings: object) -> str:
-    """Return settings as text, such as ``seed 0, method tree``."""
-    if not isinstance(settings, dict):
-        return repr(settings)
-    return ", ".join(f"{name} {value}" for name, value in settings.items())
+def _append(path: Path, text: str) -> None:
+    with path.open("a", encoding="utf-8") as file:
+        file.write(text)
+
+
+def _differences(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
+    """Return the settings that differ, such as ``seed 1, now 2``."""
+    return ", ".join(
+        _differences(found[name], value)
+        if isinstance(value, dict)
+        else f"{name} {found.get(name)}, now {value}"
+        for name, value in wanted.items()
+        if found.get(name) != value
+    )
 
 
 BUILD_FILE: Final = "build.jsonl"
@@ -126,38 +130,22 @@ class VariantResult:
     rejections: tuple[Rejection, ...]
 
 
-@dataclass
 class BuildStore:
     """Folder of a build. Its log holds the settings in the first line and one variant in each further line."""
 
-    folder: Path
-    results: list[VariantResult] = field(default_factory=list)
+    def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
+        """Start a build or resume one. Raise DatasetError if the folder holds a build with other settings; OSError."""
+        self._folder = folder
+        (folder / BUNDLES_FOLDER).mkdir(parents=True, exist_ok=True)
+        self._log = ResumableLog[VariantResult](folder / BUILD_FILE, _to_json)
+        self._log.resume({"settings": settings}, _from_json)
+        # An interrupted build may lack the last lines of the ledger, so it is written anew.
+        text = "".join(_attempt_lines(result) for result in self.results)
+        write_whole(folder / ATTEMPTS_FILE, text.encode("utf-8"))
 
-    @staticmethod
-    def open(folder: Path, settings: Mapping[str, Any]) -> BuildStore:
-        """Start a build or resume one. Raise DatasetError if the folder holds a build with other settings."""
-        path = folder / BUILD_FILE
-        try:
-            (folder / BUNDLES_FOLDER).mkdir(parents=True, exist_ok=True)
-            lines = _read_or_start(path, {"settings": settings})
-            wanted, found = json.loads(json.dumps(settings)), json.loads(lines[0])["settings"]
-            store = BuildStore(folder)
-        except OSError as error:
-            raise DatasetError(
-                f"the folder {folder} can't be written ({error.strerror}): choose another one"
-            ) from error
-        except (ValueError, LookupError, TypeError) as error:
-            raise DatasetError(
-                f"{path} is damaged: expected the settings of the build in its first line; choose another folder"
-            ) from error
-        if found != wanted:
-            raise DatasetError(
-                f"{folder} holds a build with other settings ({_differences(found, wanted)}): give the same settings "
-                "again, or choose another folder"
-            )
-        store.results += _read_outcomes(path, lines, _from_json, DatasetError)
-        store._write_attempts()
-        return store
+    @property
+    def results(self) -> list[VariantResult]:
+        return self._log.outcomes
 
     def has(self, split: str, number: int) -> bool:
         return any(result.split == split and result.number == number for result in self.results)
@@ -176,32 +164,23 @@ class BuildStore:
         """Store a variant's result. Its other files are written before its line in the log."""
         self._spent({"split": result.split, "variant": result.number, "cpu_s": round(cpu_s, 3)})
         if result.records:
-            path = self.folder / BUNDLES_FOLDER / bundle_file(result.records[0].bundle_digest)
+            path = self._folder / BUNDLES_FOLDER / bundle_file(result.records[0].bundle_digest)
             write_whole(path, bundle)
         drawn = {task_id: json.dumps(tree, indent=1) + "\n" for task_id, tree in trees.items() if tree}
         for name, suffix, texts in ((TRANSCRIPTS_FOLDER, "md", transcripts), (TREES_FOLDER, "json", drawn)):
             if texts:
-                (self.folder / name).mkdir(exist_ok=True)
+                (self._folder / name).mkdir(exist_ok=True)
             for task_id, text in texts.items():
-                write_whole(self.folder / name / f"{task_id}.{suffix}", text.encode("utf-8"))
-        with (self.folder / BUILD_FILE).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(_to_json(result)) + "\n")
-        self.results.append(result)
-        with (self.folder / ATTEMPTS_FILE).open("a", encoding="utf-8") as file:
-            file.write(_attempt_lines(result))
+                write_whole(self._folder / name / f"{task_id}.{suffix}", text.encode("utf-8"))
+        self._log.add(result)
+        _append(self._folder / ATTEMPTS_FILE, _attempt_lines(result))
 
     def spent_on_scenes(self, scenes: int, cpu_s: float) -> None:
         """Record the CPU time of the base scenes of one call. Raise OSError."""
         self._spent({"base_scenes": scenes, "cpu_s": round(cpu_s, 3)})
 
     def _spent(self, line: Mapping[str, str | int | float]) -> None:
-        with (self.folder / TIMES_FILE).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(line) + "\n")
-
-    def _write_attempts(self) -> None:
-        """Rewrite the whole log, because an interrupted build may lack its last lines."""
-        text = "".join(_attempt_lines(result) for result in self.results)
-        write_whole(self.folder / ATTEMPTS_FILE, text.encode("utf-8"))
+        _append(self._folder / TIMES_FILE, json.dumps(line) + "\n")
 
 
 def _attempt_lines(result: VariantResult) -> str:
@@ -233,13 +212,6 @@ def _attempt_lines(result: VariantResult) -> str:
         for item in result.rejections
     ]
     return "".join(json.dumps(line) + "\n" for line in lines)
-
-
-def _differences(found: object, wanted: Mapping[str, Any]) -> str:
-    known = found if isinstance(found, dict) else {}
-    return ", ".join(
-        f"{name} {known.get(name)}, now {value}" for name, value in wanted.items() if known.get(name) != value
-    )
 
 
 def _to_json(result: VariantResult) -> dict[str, Any]:

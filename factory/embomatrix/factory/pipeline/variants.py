@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from embomatrix.factory.admission import Admitted, TaskRefusal, admit
+from embomatrix.factory.admission import TaskRefusal, admit
 from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
 from embomatrix.factory.pipeline.store import Rejection, VariantResult
@@ -255,11 +255,11 @@ class _VariantWork:
 
     def _judge(self, simulator: Simulator, physics: Simulator | None, draft: Draft) -> bool:
         verdict = admit(simulator, draft.task, find_plan, physics=physics)
-        if isinstance(verdict, Admitted):
-            self._admitted.append((draft, verdict.plan))
-            return True
-        self._reject(draft.task.category, verdict, draft.task.instruction, draft.task.goal_bddl)
-        return False
+        if isinstance(verdict, TaskRefusal):
+            self._reject(draft.task.category, verdict, draft.task.instruction, draft.task.goal_bddl)
+            return False
+        self._admitted.append((draft, verdict))
+        return True
 
     def _reject(
         self, category: TaskCategory, refusal: TaskRefusal, instruction: str = "", goal: str = ""

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
-from embomatrix.factory.admission import MAX_HELD_SHARE, Admitted, RefusalReason, TaskRefusal, admit
+from embomatrix.factory.admission import MAX_HELD_SHARE, RefusalReason, TaskRefusal, admit
 from embomatrix.factory.pipeline.task_poses import PoseNeeds, SceneSurvey, cache_poses
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.dialects import read_problem
@@ -174,7 +174,7 @@ def verify(
         verdict = admit(
             simulator, imported.task, find_plan, imported.init, most_held=max_held_share(imported.task)
         )
-        if not isinstance(verdict, Admitted):
+        if isinstance(verdict, TaskRefusal):
             return verdict
         bundle = Bundle(imported.scene, {imported.task.task_id: imported.task}, poses)
         data = encode_bundle(prepare(bundle, simulator.world))
@@ -182,7 +182,7 @@ def verify(
         task=imported.task,
         bundle_digest=bundle_digest(data),
         split="heldout" if imported.is_held_out else "train",
-        oracle=tuple(plan_to_json(verdict.plan)),
+        oracle=tuple(plan_to_json(verdict)),
         rooms=imported.rooms,
         signature=imported.signature,
     )
