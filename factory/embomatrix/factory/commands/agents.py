@@ -10,6 +10,7 @@ from typing import Annotated, Any, Final
 import typer
 
 from embomatrix.factory.commands.language_model import (
+    MODEL_ERRORS,
     Key,
     Llm,
     Model,
@@ -55,7 +56,7 @@ def agent(
             f"{name} ({interface.about}) needs a brief: give --in FILE; `factory lay --out` writes briefs, "
             "`--schema` prints their schema"
         )
-    with user_errors():
+    with user_errors(more=MODEL_ERRORS):
         value = interface.read(sys.stdin.read() if str(brief) == "-" else brief.read_text(encoding="utf-8"))
         use_model = bool(llm) or cassette is not None
         answer = _ask_model(name, value, llm, model, key, cassette) if use_model else interface.rules(value)

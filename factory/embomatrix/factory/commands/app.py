@@ -5,15 +5,16 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Column, Table
+from rich.table import Column
 
 from embomatrix.factory.commands.agents import agent
 from embomatrix.factory.commands.assets import app as assets_app
+from embomatrix.factory.commands.build import make_dataset
 from embomatrix.factory.commands.corpus import app as corpus_app
 from embomatrix.factory.commands.evaluate import app as evaluate_app
 from embomatrix.factory.commands.inspection import app as inspect_app
 from embomatrix.factory.commands.language_model import (
+    MODEL_ERRORS,
     Forms,
     Key,
     Llm,
@@ -24,21 +25,18 @@ from embomatrix.factory.commands.language_model import (
     model_task_writer,
 )
 from embomatrix.factory.commands.layout import lay
-from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Scenes, Seed, in_physics, processes
+from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Scenes, Seed, in_physics
 from embomatrix.factory.commands.task_import import app as import_app
-from embomatrix.factory.commands.terminal import fail, progress, user_errors
+from embomatrix.factory.commands.terminal import fail, say, show_table, user_errors
 from embomatrix.factory.commands.verification import app as verify_app
-from embomatrix.factory.layout.request import LayoutAgents
-from embomatrix.factory.pipeline.build import BuildSummary, VariantCheck, build_dataset
+from embomatrix.factory.pipeline.build import VariantCheck
 from embomatrix.factory.pipeline.cluster import cluster_check
 from embomatrix.factory.pipeline.export import dataset_card, encode_rows, export_rows
 from embomatrix.factory.pipeline.settings import SCENE_EXTRACTOR, BuildSettings, WriterKind, scene_ids
-from embomatrix.factory.writer.tasks import TaskWriter
 from embomatrix.llm.batch import FailureLimit
 from embomatrix.llm.ledger import Ledger, Price
 from embomatrix.rpc.options import Ca, Token
 from embomatrix.world.dataset import Dataset
-from embomatrix.world.task import TaskCategory
 from embomatrix.world.whole_file import write_whole
 
 app = typer.Typer(
@@ -106,8 +104,11 @@ def build(
         physical=in_physics(physical, look_ahead=look_ahead),
         modelled=tuple(sorted(model_backed)),
     )
-    with user_errors(out), layout_agents(model_backed, llm, model, key, cassette, FailureLimit()) as layout:
-        _make(out, settings, jobs=jobs, layout=layout)
+    with (
+        user_errors(out, more=MODEL_ERRORS),
+        layout_agents(model_backed, llm, model, key, cassette, FailureLimit()) as layout,
+    ):
+        make_dataset(out, settings, jobs=jobs, layout=layout)
 
 
 @app.command()
@@ -133,8 +134,6 @@ def generate(
 ) -> None:
     """Simulate conversations of a scene's people with the robot, and turn their requests into verified tasks."""
     kind = WriterKind.MODEL if llm or cassette is not None else WriterKind.SOCIAL
-    if llm and not model:
-        fail("--llm needs the name of a model at the endpoint: give --model")
     if look and kind is WriterKind.SOCIAL:
         fail("--look needs a language model: give --llm URL and --model NAME, or --cassette FILE")
     model_backed = model_backed_agents(forms)
@@ -149,74 +148,42 @@ def generate(
         modelled=tuple(sorted([*model_backed, *[SCENE_EXTRACTOR] * look])),
     )
     with contextlib.ExitStack() as stack:
-        stack.enter_context(user_errors(out))
+        stack.enter_context(user_errors(out, more=MODEL_ERRORS))
         check: VariantCheck | None = None
         if manager:
             trusted = ca.read_bytes() if ca is not None else b""
             check = stack.enter_context(cluster_check(manager, token, trusted))
         layout = stack.enter_context(layout_agents(model_backed, llm, model, key, cassette, FailureLimit()))
         if kind is WriterKind.SOCIAL:
-            _make(out, settings, jobs=jobs, check=check, layout=layout)
+            make_dataset(out, settings, jobs=jobs, check=check, layout=layout)
             return
         writer, ledger = stack.enter_context(
             model_task_writer(
                 llm, model, key, cassette, price=Price(*price), accounts=out / "ledger.jsonl", look=look
             )
         )
-        _make(out, settings, writer, check=check, layout=layout)
+        make_dataset(out, settings, writer, check=check, layout=layout)
         _print_account(ledger)
 
 
 def _print_account(ledger: Ledger) -> None:
     """Print the model's calls, tokens and cost by agent."""
-    table = Table("agent", "calls", "failed", "retries", "tokens in", "tokens out", "seconds", "cost")
-    for purpose, account in (*ledger.accounts.items(), ("all", ledger.total())):
-        counts = (
-            account.calls,
-            account.failed,
-            account.retries,
-            account.prompt_tokens,
-            account.completion_tokens,
-        )
-        table.add_row(purpose, *map(str, counts), f"{account.seconds:.1f}", f"{account.cost:.4f}")
-    Console().print(table)
-
-
-def _make(
-    out: Path,
-    settings: BuildSettings,
-    writer: TaskWriter | None = None,
-    jobs: int | None = None,
-    check: VariantCheck | None = None,
-    layout: LayoutAgents | None = None,
-) -> None:
-    """Build the dataset with progress bars, then print a summary."""
-    console = Console()
-    kept = f": finished tasks are kept in {out}; run the same command again to resume"
-    with user_errors(out, kept), progress(console) as bars:
-        tasks = {
-            "heldout": bars.add_task("held-out tasks", total=settings.heldout),
-            "train": bars.add_task("training tasks", total=settings.train),
-        }
-        summary = build_dataset(
-            out,
-            settings,
-            lambda split, admitted: bars.update(tasks[split], completed=admitted),
-            writer,
-            processes(jobs),
-            check,
-            layout,
-        )
-        for split, bar in tasks.items():
-            bars.update(bar, completed=summary.total(split))
-    _print_summary(console, summary)
-    console.print(f"dataset: {out}", highlight=False)
-    for split, wanted in (("train", settings.train), ("heldout", settings.heldout)):
-        if summary.total(split) < wanted:
-            fail(
-                f"only {summary.total(split)} of {wanted} {split} tasks were admitted: see {out}/attempts.jsonl, "
-                "or add scenes"
+    show_table(
+        ("agent", "calls", "failed", "retries", "tokens in", "tokens out", "seconds", "cost"),
+        (
+            (
+                purpose,
+                account.calls,
+                account.failed,
+                account.retries,
+                account.prompt_tokens,
+                account.completion_tokens,
+                f"{account.seconds:.1f}",
+                f"{account.cost:.4f}",
             )
+            for purpose, account in (*ledger.accounts.items(), ("all", ledger.total()))
+        ),
+    )
 
 
 @app.command("list")
@@ -225,18 +192,13 @@ def list_(folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")]) 
     with user_errors():
         dataset = Dataset.load(folder)
     # Other commands take the task's id as an argument, so the column never truncates it.
-    table = Table(Column("task", no_wrap=True), "split", "category", "rows", "steps", "instruction")
-    for record in dataset.records:
-        task = record.task
-        table.add_row(
-            task.task_id,
-            record.split,
-            task.category.value,
-            str(len(task.table)),
-            str(len(record.oracle)),
-            task.instruction,
-        )
-    Console().print(table)
+    columns = (Column("task", no_wrap=True), "split", "category", "rows", "steps", "instruction")
+    rows = (
+        (task.task_id, record.split, task.category, len(task.table), len(record.oracle), task.instruction)
+        for record in dataset.records
+        for task in (record.task,)
+    )
+    show_table(columns, rows)
 
 
 @app.command()
@@ -252,24 +214,4 @@ def export(
         data = encode_rows(export_rows(dataset), out.suffix)
         write_whole(out, data)
         write_whole(out.with_name("README.md"), dataset_card(dataset, out.name, data).encode("utf-8"))
-    Console().print(
-        f"{len(dataset.records)} tasks: {out}, card: {out.with_name('README.md')}", highlight=False
-    )
-
-
-def _print_summary(console: Console, summary: BuildSummary) -> None:
-    table = Table("category", "train", "held out")
-    for category in TaskCategory:
-        table.add_row(
-            category.value,
-            *(str(summary.admitted.get((split, category.value), 0)) for split in ("train", "heldout")),
-        )
-    table.add_row("all", str(summary.total("train")), str(summary.total("heldout")))
-    console.print(table)
-    scenes = Table("scene", "train", "held out", "held-out rooms")
-    for scene in summary.rooms["train"]:
-        counts = (str(summary.scenes.get((split, scene), 0)) for split in ("train", "heldout"))
-        scenes.add_row(scene, *counts, ", ".join(summary.rooms["heldout"][scene]))
-    console.print(scenes)
-    refused = ", ".join(f"{count} {reason}" for reason, count in sorted(summary.rejected.items())) or "none"
-    console.print(f"{summary.variants} scene variants; drafts not admitted: {refused}", highlight=False)
+    say(f"{len(dataset.records)} tasks: {out}, card: {out.with_name('README.md')}")

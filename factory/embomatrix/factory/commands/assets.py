@@ -4,22 +4,20 @@ from collections import Counter
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Final, NoReturn
+from typing import Annotated, Final
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from embomatrix.factory.assets.check import GLANCE_STEPS, STEPS, AssetRule, check_asset, check_standing
 from embomatrix.factory.assets.library import build_asset, family_of
+from embomatrix.factory.commands.terminal import say, show_table, user_errors
 from embomatrix.factory.importers.assemble import ImportedAsset, import_model, read_model
 from embomatrix.factory.importers.convex import Coacd, by_components
 from embomatrix.factory.importers.model import AxisConvention, ModelFileError
 from embomatrix.factory.importers.shelf import save_asset
 from embomatrix.factory.pictures.assets import draw_sheet
-from embomatrix.sim.engine import EngineError
 from embomatrix.world.asset import Asset, Credit
-from embomatrix.world.catalog import Catalog, CatalogError
+from embomatrix.world.catalog import Catalog
 from embomatrix.world.records import SceneInvalidError
 
 app = typer.Typer(
@@ -55,24 +53,19 @@ def check(
 ) -> None:
     """Check size, cavities, doors and stability of all assets in use; exit status 1 if one breaks a rule."""
     catalog = Catalog.load()
-    assets = _assets(catalog, category, every_model=every_model)
-    try:
+    with user_errors():
+        assets = _assets(catalog, category, every_model=every_model)
         findings = [finding for asset in assets for finding in check_asset(catalog, asset)]
         findings += check_standing(catalog, assets, GLANCE_STEPS if glance else STEPS)
-    except EngineError as error:
-        _fail(str(error))
-    console = Console()
     for finding in findings:
         if not finding.excused:
-            console.print(f"{finding.asset_id}: {finding.rule}: {finding.detail}", highlight=False)
-    table = Table("rule", "wrong", "excused", title=f"{len(assets)} models")
+            say(f"{finding.asset_id}: {finding.rule}: {finding.detail}")
     counts = Counter((finding.rule, finding.excused) for finding in findings)
-    for rule in AssetRule:
-        table.add_row(rule, str(counts[rule, False]), str(counts[rule, True]))
-    console.print(table)
+    rows = ((rule, counts[rule, False], counts[rule, True]) for rule in AssetRule)
+    show_table(("rule", "wrong", "excused"), rows, f"{len(assets)} models")
     reasons = Counter(f"{finding.rule}: {finding.detail}" for finding in findings if finding.excused)
     for reason, number in sorted(reasons.items()):
-        console.print(f"excused {number} x {reason}", highlight=False)
+        say(f"excused {number} x {reason}")
     if any(not finding.excused for finding in findings):
         raise typer.Exit(1)
 
@@ -82,10 +75,7 @@ def families() -> None:
     """Count the categories in use by family."""
     catalog = Catalog.load()
     counts = Counter(family_of(catalog, name) for name in catalog.used_categories)
-    table = Table("family", "categories", title=f"{len(catalog.used_categories)} categories")
-    for family, number in counts.most_common():
-        table.add_row(family, str(number))
-    Console().print(table)
+    show_table(("family", "categories"), counts.most_common(), f"{len(catalog.used_categories)} categories")
 
 
 @app.command()
@@ -97,12 +87,9 @@ def draw(
     """Draw assets side by side, closed and open. Default: all categories that open, heat or cool."""
     catalog = Catalog.load()
     chosen = category or [name for name in catalog.used_categories if _is_worth_a_look(catalog, name)]
-    picture = draw_sheet(_assets(catalog, chosen, every_model=every_model))
-    try:
-        picture.save(out)
-    except (OSError, ValueError) as error:
-        _fail(f"can't write {out}: {error}")
-    Console().print(str(out), highlight=False)
+    with user_errors(out, more=(ValueError,)):
+        draw_sheet(_assets(catalog, chosen, every_model=every_model)).save(out)
+    say(out)
 
 
 @app.command("import")
@@ -126,39 +113,33 @@ def import_(
 ) -> None:
     """Import a model file as an asset that replaces one of the catalog's models in `scene build --assets`."""
     credit = Credit(creator, licence, source or file.name)
-    try:
+    with user_errors(out, more=(ModelFileError, SceneInvalidError)):
         raw = read_model(file, up)
         decompose = Coacd() if cut is Cut.COACD else by_components
         imported = import_model(Catalog.load(), raw, category, model, credit, decompose)
         path = save_asset(out, imported.asset)
-    except (ModelFileError, CatalogError, SceneInvalidError) as error:
-        _fail(str(error))
-    except OSError as error:
-        _fail(f"{error.filename or out} can't be written ({error.strerror}): name another folder with --out")
     _tell(imported, path)
-    Console(soft_wrap=True).print(_stands_in(imported.asset.asset_id), highlight=False)
+    say(_stands_in(imported.asset.asset_id))
 
 
 def _tell(imported: ImportedAsset, path: Path) -> None:
     """Print contents, missing abilities, and broken rules of the imported asset."""
-    asset, console = imported.asset, Console(soft_wrap=True)
+    asset = imported.asset
     parts = sum(len(link.parts) for link in asset.links)
-    console.print(
+    say(
         f"{asset.asset_id}: {parts} convex parts in {len(asset.links)} links, {len(asset.supports)} surfaces, "
-        f"{len(asset.interiors)} cavities: {path}",
-        highlight=False,
+        f"{len(asset.interiors)} cavities: {path}"
     )
     for lack in imported.lacks:
-        console.print(lack, highlight=False)
+        say(lack)
     for finding in check_asset(Catalog.load(), asset):
         # Missing parts were already reported above.
         if not finding.excused and not imported.lacks:
-            console.print(f"{finding.rule.value}: {finding.detail}", highlight=False)
+            say(f"{finding.rule.value}: {finding.detail}")
     if imported.stretch > WORTH_TELLING:
-        console.print(
+        say(
             f"its proportions are changed by a factor of {imported.stretch:.2f} to fit {asset.size_m} m: "
-            "another --model may be more similar",
-            highlight=False,
+            "another --model may be more similar"
         )
 
 
@@ -186,17 +167,8 @@ def _is_worth_a_look(catalog: Catalog, name: str) -> bool:
 
 
 def _assets(catalog: Catalog, categories: Sequence[str] | None, *, every_model: bool) -> list[Asset]:
-    try:
-        return [
-            build_asset(catalog, name, model.model_id)
-            for name in categories or catalog.used_categories
-            for model in catalog.models_of(name)[: None if every_model else 1]
-        ]
-    except CatalogError as error:
-        _fail(str(error))
-
-
-def _fail(sentence: str) -> NoReturn:
-    console = Console(stderr=True)
-    console.print(f"embomatrix factory assets: {sentence}", highlight=False, markup=False, soft_wrap=True)
-    raise typer.Exit(2) from None
+    return [
+        build_asset(catalog, name, model.model_id)
+        for name in categories or catalog.used_categories
+        for model in catalog.models_of(name)[: None if every_model else 1]
+    ]

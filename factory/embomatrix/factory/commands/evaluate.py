@@ -9,10 +9,9 @@ from typing import Annotated, TypeVar
 
 import numpy as np
 import typer
-from rich.console import Console
 
-from embomatrix.factory.commands.language_model import Key, Tape, chat_model
-from embomatrix.factory.commands.terminal import progress, report_evaluation, user_errors
+from embomatrix.factory.commands.language_model import MODEL_ERRORS, Key, Tape, chat_model
+from embomatrix.factory.commands.terminal import counter, report_evaluation, say, user_errors
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
 from embomatrix.factory.evaluate.aesthetics import evaluate_aesthetics
 from embomatrix.factory.evaluate.judges import evaluate_looks, judged
@@ -68,18 +67,15 @@ def tasks(
     cassette: Tape = None,
 ) -> None:
     """Measure the diversity of instructions and goals, with and without social simulation."""
-    with user_errors():
+    with user_errors(more=MODEL_ERRORS):
         if llm and not model:
             raise EvaluationError("--llm needs the name of a model there: give --model")
         if dataset is not None:
             groups, evaluation = _of_dataset(dataset, each)
         else:
             chosen = tuple(dict.fromkeys(scenes or training_scenes()))
-            with progress(Console(stderr=True)) as bars:
-                bar = bars.add_task("scenes", total=len(chosen))
-                groups, evaluation = evaluate_tasks(
-                    chosen, each, seed, lambda done: bars.update(bar, completed=done)
-                )
+            with counter("scenes", len(chosen)) as count:
+                groups, evaluation = evaluate_tasks(chosen, each, seed, count)
         if llm or cassette is not None:
             verdicts = asyncio.run(
                 _asked(lambda judge: _judged(judge, groups, seed), llm, model, key, cassette)
@@ -112,11 +108,8 @@ def scenes(
         chosen = fixed_tasks(sample)[::only]
         used_methods = methods or list(LayoutMethod)
         log = outcome_log(outcomes, seed)
-        with progress(Console(stderr=True)) as bars:
-            bar = bars.add_task("trials", total=len(chosen) * len(used_methods))
-            evaluation, _ = evaluate_scenes(
-                chosen, used_methods, seed, jobs, lambda done: bars.update(bar, completed=done), log
-            )
+        with counter("trials", len(chosen) * len(used_methods)) as count:
+            evaluation, _ = evaluate_scenes(chosen, used_methods, seed, jobs, count, log)
         if only > 1:
             taken = {"taken": f"one in {only} of the fixed tasks", **evaluation.conditions}
             evaluation = replace(evaluation, conditions=taken)
@@ -134,7 +127,7 @@ def picture(
     with user_errors(out):
         drawn = draw_side_by_side(named(fixed_tasks(sample), task), seed)
         drawn.save(out)
-    Console().print(f"picture: {out}", highlight=False, markup=False)
+    say(f"picture: {out}")
 
 
 @app.command()
@@ -150,15 +143,12 @@ def looks(
     cassette: Tape = None,
 ) -> None:
     """Score layouts with the paper's judge: a vision-language model sees the plan of each room and its layout tree."""
-    with user_errors():
+    with user_errors(more=MODEL_ERRORS):
         chosen, used_methods = fixed_tasks(sample)[::only], methods or list(LayoutMethod)
 
         async def looked(judge: ChatModel) -> EvaluationFigures:
-            with progress(Console(stderr=True)) as bars:
-                bar = bars.add_task("trials", total=len(chosen) * len(used_methods))
-                return await evaluate_looks(
-                    judge, chosen, used_methods, seed, lambda done: bars.update(bar, completed=done)
-                )
+            with counter("trials", len(chosen) * len(used_methods)) as count:
+                return await evaluate_looks(judge, chosen, used_methods, seed, count)
 
         evaluation = asyncio.run(_asked(looked, llm, model, key, cassette))
     report_evaluation(evaluation, json_file)
@@ -202,7 +192,7 @@ def page(
         evaluations = [read_evaluation(file) for file in files]
         before = out.read_text(encoding="utf-8") if out.exists() else ""
         write_whole(out, with_factory(before, evaluations).encode("utf-8"))
-    Console().print(f"page: {out}", highlight=False)
+    say(f"page: {out}")
 
 
 def _of_dataset(folder: Path, each: int) -> tuple[Mapping[str, Sequence[DraftFeatures]], EvaluationFigures]:

@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
-from embomatrix.factory.commands.terminal import progress, user_errors
+from embomatrix.factory.commands.terminal import progress, say, user_errors
 from embomatrix.factory.inspection.page import scene_jpeg, scene_picture, task_page
 from embomatrix.factory.inspection.playing import play_oracle
 from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER, TREES_FOLDER
@@ -46,7 +45,7 @@ def inspect(
             scene_picture(bundle.scene) if picture else "",
         )
         write_whole(file, page.encode("utf-8"))
-    Console().print(f"page: {file}", highlight=False, markup=False)
+    say(f"page: {file}")
 
 
 @app.command()
@@ -54,7 +53,6 @@ def pictures(
     dataset: Annotated[Path, typer.Argument(help="Folder of the dataset.")],
 ) -> None:
     """Render the scene of each bundle for the dashboard's gallery. Existing pictures are kept."""
-    console = Console()
     folder = dataset / PICTURES_FOLDER
     with user_errors(folder, kept=": finished pictures are kept"):
         loaded = Dataset.load(dataset)
@@ -64,10 +62,10 @@ def pictures(
             if not (file := (folder / bundle_file(digest)).with_suffix(".jpg")).exists()
         }
         folder.mkdir(exist_ok=True)
-        with progress(console) as bars:
+        with progress() as bars:
             for digest, file in bars.track(missing.items(), description="pictures"):
                 write_whole(file, scene_jpeg(loaded.read_bundle(digest).scene, CARD_PX))
-    console.print(f"{len(missing)} pictures: {folder}", highlight=False, markup=False)
+    say(f"{len(missing)} pictures: {folder}")
 
 
 def _text(path: Path) -> str:

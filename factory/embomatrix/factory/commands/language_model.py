@@ -3,12 +3,13 @@
 import contextlib
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
 from embomatrix.factory.commands.terminal import fail
-from embomatrix.factory.layout.agent_interfaces import MODEL_BACKED, AgentName
+from embomatrix.factory.layout.agent_interfaces import MODEL_BACKED, AgentName, BriefError
+from embomatrix.factory.layout.distribution import DistributionError
 from embomatrix.factory.layout.model_agents import ModelLayoutAgents
 from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pictures.sights import sights_of
@@ -18,7 +19,8 @@ from embomatrix.llm.batch import FailureLimit
 from embomatrix.llm.cassette import Cassette
 from embomatrix.llm.endpoint import Endpoint
 from embomatrix.llm.ledger import Ledger, Price
-from embomatrix.llm.values import ChatModel, EndpointError
+from embomatrix.llm.values import ChatModel, EndpointError, LlmError
+from embomatrix.rpc.status import ClusterError
 
 Forms = Annotated[
     list[str] | None,
@@ -37,26 +39,34 @@ Tape = Annotated[
 ]
 
 
-def _chat_model(url: str, model: str, key: str, cassette: Path | None) -> tuple[ChatModel, Endpoint | None]:
-    """Return the chat model and its endpoint, which the caller opens.
+MODEL_ERRORS: Final = (BriefError, ClusterError, DistributionError, LlmError)
+"""Errors of agents, language models and clusters whose message is a sentence for the user."""
 
-    Without a URL, the cassette replays. Raise EndpointError if neither is given, or if the URL has no model name.
-    Raise CassetteError if the cassette can't be read.
-    """
+
+def _endpoint(url: str, model: str, key: str) -> Endpoint | None:
+    """Return the endpoint, which the caller opens. Raise EndpointError if the URL has no model name."""
     if url and not model:
         raise EndpointError("--llm needs the name of a model at the endpoint: give --model")
-    endpoint = Endpoint(url, model, api_key=key) if url else None
+    return Endpoint(url, model, api_key=key) if url else None
+
+
+def _recorded(model: ChatModel | None, cassette: Path | None) -> ChatModel:
+    """Return the model with its cassette. Without a model, the cassette replays.
+
+    Raise EndpointError if neither is given. Raise CassetteError if the cassette can't be read.
+    """
     if cassette is not None:
-        return Cassette(cassette, endpoint), endpoint
-    if endpoint is None:
+        return Cassette(cassette, model)
+    if model is None:
         raise EndpointError("no language model is given: add --llm URL and --model NAME, or --cassette FILE")
-    return endpoint, endpoint
+    return model
 
 
 @contextlib.asynccontextmanager
 async def chat_model(url: str, model: str, key: str, cassette: Path | None) -> AsyncIterator[ChatModel]:
     """Yield an open chat model. Raise EndpointError or CassetteError."""
-    chat, endpoint = _chat_model(url, model, key, cassette)
+    endpoint = _endpoint(url, model, key)
+    chat = _recorded(endpoint, cassette)
     async with endpoint or contextlib.nullcontext():
         yield chat
 
@@ -66,8 +76,8 @@ def model_layout_agents(
     url: str, model: str, key: str, cassette: Path | None, failure_limit: FailureLimit | None = None
 ) -> Iterator[ModelLayoutAgents]:
     """Yield layout agents that run on a language model. Raise LlmError."""
-    chat, endpoint = _chat_model(url, model, key, cassette)
-    with ModelLayoutAgents(chat, endpoint, failure_limit=failure_limit) as agents:
+    endpoint = _endpoint(url, model, key)
+    with ModelLayoutAgents(_recorded(endpoint, cassette), endpoint, failure_limit=failure_limit) as agents:
         yield agents
 
 
@@ -94,18 +104,17 @@ def model_task_writer(
 ) -> Iterator[tuple[ModelWriter, Ledger]]:
     """Yield a task writer on a language model, and the ledger of its costs.
 
-    ``accounts`` is the ledger's file. With ``look``, the model sees pictures of each scene. Raise CassetteError.
+    ``accounts`` is the ledger's file. With ``look``, the model sees pictures of each scene. Raise EndpointError or
+    CassetteError.
     """
-    endpoint = Endpoint(url, model, api_key=key) if url else None
+    endpoint = _endpoint(url, model, key)
     if endpoint is None:
-        if cassette is None:
-            raise ValueError("found neither an endpoint nor a cassette: expected one of them")
-        chat: ChatModel = Cassette(cassette)
-        ledger = chat = Ledger(chat)
+        ledger = Ledger(_recorded(None, cassette))
+        chat: ChatModel = ledger
     else:
         # The ledger sits behind the cassette: replayed answers cost nothing.
         ledger = Ledger(endpoint, price=price, path=accounts)
-        chat = ledger if cassette is None else Cassette(cassette, ledger)
+        chat = _recorded(ledger, cassette)
     with ModelWriter(SocialModelAgents(chat), endpoint, sights_of if look else None) as writer:
         yield writer, ledger
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from embomatrix.factory.admission import TaskRefusal
 from embomatrix.factory.commands.language_model import (
+    MODEL_ERRORS,
     Forms,
     Key,
     Llm,
@@ -18,7 +18,7 @@ from embomatrix.factory.commands.language_model import (
     layout_agents,
     model_backed_agents,
 )
-from embomatrix.factory.commands.terminal import fail, user_errors
+from embomatrix.factory.commands.terminal import fail, say, user_errors
 from embomatrix.factory.layout.agent_interfaces import LAYOUT_AGENTS, AgentName
 from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.generator import lay as lay_by_tree
@@ -58,7 +58,7 @@ def lay(
         fail(f"there is no method {method!r}: expected one of {', '.join(METHODS)}")
     if (bddl is None) is (not activity):
         fail("expected exactly one of --bddl FILE and --activity NAME")
-    with user_errors(), contextlib.ExitStack() as stack:
+    with user_errors(more=MODEL_ERRORS), contextlib.ExitStack() as stack:
         source = read_file(bddl) if bddl is not None else read_activity(activity)
         agents = stack.enter_context(layout_agents(names, llm, model, key, cassette))
         layouts: list[Layout] = []
@@ -83,7 +83,7 @@ def lay(
             fail(f"{source.name} is refused ({imported.reason}): {imported.sentence}")
         if out is not None:
             draw_plan(imported.scene).save(out / "plan.png")
-            Console().print(f"pictures and briefs: {out}", highlight=False)
+            say(f"pictures and briefs: {out}")
 
 
 def _show(layout: Layout) -> None:

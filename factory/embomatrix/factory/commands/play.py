@@ -1,9 +1,7 @@
 """``embomatrix play``: execute a plan in a task and explain every step and the reward."""
 
-import contextlib
 import os
 import sys
-from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Final
@@ -11,13 +9,12 @@ from typing import Annotated, Final
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import Progress
 from rich.table import Table
 
+from embomatrix.factory.commands.terminal import counter, fail, user_errors
 from embomatrix.factory.pictures.film import Caption, FilmError, check_suffix, draw_film, write_film
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import score, unparsable
-from embomatrix.sim.engine import EngineError
 from embomatrix.sim.film import Film, film_cached
 from embomatrix.sim.physical.actor import PhysicalActor
 from embomatrix.sim.physical.film import film_physical
@@ -29,13 +26,12 @@ from embomatrix.skills.parse import PlanError, parse_plan
 from embomatrix.skills.syntax import MAX_PLAN_BYTES, Plan
 from embomatrix.skills.trace import Trace
 from embomatrix.world.bundle import Bundle
-from embomatrix.world.dataset import Dataset, DatasetError
+from embomatrix.world.dataset import Dataset
 from embomatrix.world.evaluate import GoalError
 from embomatrix.world.task import Task
 from embomatrix.world.whole_file import check_writable
 
 DEFAULT_DATASET: Final = "build/dataset"
-BAD_INPUT: Final = 2
 NO_PLAN: Final = 1
 
 console = Console(highlight=False)
@@ -46,10 +42,6 @@ class PlayMode(StrEnum):
 
     CACHED = "cached"
     PHYSICAL = "physical"
-
-
-class PlayError(Exception):
-    """Bad input that the user can fix. The message is one sentence."""
 
 
 def play(
@@ -78,18 +70,12 @@ def play(
 
     Exit status: 0 if the plan was executed, 1 if the text is not a plan, 2 for other bad input.
     """
-    try:
+    with user_errors(film, more=(FactError, FilmError, GoalError)):
         if film is not None:
             # Drawing takes minutes, so an unwritable path fails before anything is executed.
             check_suffix(film)
-            with _film_errors(film):
-                check_writable(film)
-        status = _play(task, plan, oracle, dataset, mode, seed, film)
-    except (PlayError, DatasetError, EngineError, FactError, FilmError, GoalError) as error:
-        Console(stderr=True, highlight=False).print(f"embomatrix play: {error}", markup=False, soft_wrap=True)
-        raise SystemExit(BAD_INPUT) from None
-    if status:
-        raise SystemExit(status)
+            check_writable(film)
+        _play(task, plan, oracle, dataset, mode, seed, film)
 
 
 def _play(
@@ -100,9 +86,9 @@ def _play(
     mode: PlayMode,
     seed: int,
     film: Path | None,
-) -> int:
+) -> None:
     if oracle == bool(plan):
-        raise PlayError("expected either --plan FILE or --oracle: give one of them")
+        fail("expected either --plan FILE or --oracle: give one of them")
     root = folder if folder is not None else Path(os.environ.get("EMBOMATRIX_DATASET", DEFAULT_DATASET))
     data = Dataset.load(root)
     record = data.find(task_id)
@@ -112,7 +98,7 @@ def _play(
     if oracle:
         found = find_plan(load_simulator(bundle), record.task)
         if isinstance(found, PlanNotFound):
-            raise PlayError(f"the oracle finds no plan for {task_id!r}: {found.reason}")
+            fail(f"the oracle finds no plan for {task_id!r}: {found.reason}")
     else:
         try:
             found = parse_plan(text, record.task.profile)
@@ -121,9 +107,8 @@ def _play(
                 f"[red]✗[/red] the text can't be parsed ({error.reason.value}): {escape(str(error))}"
             )
             _show_reward(unparsable())
-            return NO_PLAN
+            raise typer.Exit(NO_PLAN) from None
     _run(bundle, record.task, found, mode, seed, film)
-    return 0
 
 
 def _text_of(plan: str) -> str:
@@ -131,13 +116,13 @@ def _text_of(plan: str) -> str:
     try:
         if plan == "-":
             if sys.stdin is None:
-                raise PlayError("standard input is closed: expected --plan FILE")
+                fail("standard input is closed: expected --plan FILE")
             raw = sys.stdin.buffer.read(MAX_PLAN_BYTES + 1)
         else:
             with Path(plan).open("rb") as file:
                 raw = file.read(MAX_PLAN_BYTES + 1)
     except OSError as error:
-        raise PlayError(f"the plan {plan!r} can't be read ({error.strerror}): expected a text file") from None
+        fail(f"the plan {plan!r} can't be read ({error.strerror}): expected a text file")
     # The parser judges the text, so invalid bytes are replaced here and not refused.
     return raw.decode("utf-8", errors="replace")
 
@@ -166,24 +151,10 @@ def _draw(film: Film, path: Path) -> None:
         Caption(call_in_words(call, film.task.table), done[number] if number < len(done) else None)
         for number, call in enumerate(film.plan)
     ]
-    with Progress(console=console, transient=True) as progress:
-        bar = progress.add_task("drawing", total=len(film.frames))
-        pictures = draw_film(
-            film, captions, on_frame=lambda done, count: progress.update(bar, completed=done, total=count)
-        )
-    with _film_errors(path):
-        write_film(path, pictures)
+    with counter("drawing", len(film.frames)) as count:
+        pictures = draw_film(film, captions, on_frame=lambda drawn, _: count(drawn))
+    write_film(path, pictures)
     console.print(f"\nfilm of {len(pictures)} frames: {path}", markup=False)
-
-
-@contextlib.contextmanager
-def _film_errors(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise PlayError(
-            f"{path} can't be written ({error.strerror}): free disk space, or name another file with --film"
-        ) from None
 
 
 def _show_task(task: Task) -> None:

@@ -1,10 +1,10 @@
 """``embomatrix scene``: build, list, show, draw and check base scenes."""
 
-import contextlib
 import io
 import json
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -12,9 +12,8 @@ import numpy as np
 import typer
 from PIL import Image
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
+from embomatrix.factory.commands.terminal import fail, progress, say, show_table, user_errors
 from embomatrix.factory.floorplan.spec import FloorPlanError
 from embomatrix.factory.importers.model import ModelFileError
 from embomatrix.factory.importers.shelf import read_assets
@@ -25,11 +24,9 @@ from embomatrix.factory.scenes.batch import SceneBuildJob, run_batch
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.report import TABLE_COLUMNS, SceneReport, problem_lines, report_table
 from embomatrix.factory.scenes.scene_file import SUFFIX, SceneFileError, read_scene
-from embomatrix.host.failure import fail
 from embomatrix.host.limits import usable_cores
 from embomatrix.sim.bullet.camera import render_oblique
-from embomatrix.sim.engine import EngineError
-from embomatrix.world.catalog import Catalog, CatalogError
+from embomatrix.world.catalog import Catalog
 from embomatrix.world.scene import Scene
 from embomatrix.world.whole_file import check_writable, write_whole
 
@@ -61,6 +58,7 @@ Report = Annotated[
 ]
 Assets = Annotated[Path | None, typer.Option(help="Folder of imported assets that replace generated ones.")]
 CORES = usable_cores()
+_user_errors = partial(user_errors, more=(FloorPlanError, ModelFileError, SceneFileError))
 LEFT_OUT = "for objects that were left out, and why: `embomatrix scene show NAME`, or --report FILE"
 
 
@@ -69,7 +67,7 @@ def list_scenes() -> None:
     """List the scenes of the catalog."""
     catalog = Catalog.load()
     for scene_id in catalog.scene_ids:
-        Console().print(catalog.inventory(scene_id).description, highlight=False)
+        say(catalog.inventory(scene_id).description)
 
 
 @app.command()
@@ -99,7 +97,7 @@ def build(
         for seed in dict.fromkeys(seeds or (0,))
     ]
     reports = _run(orders, jobs)
-    Console().print(str(orders[0].path if len(orders) == 1 else out), highlight=False)
+    say(orders[0].path if len(orders) == 1 else out)
     _print_reports(reports, report)
 
 
@@ -130,8 +128,7 @@ def show(scene: SceneSource, seed: Seed = 0) -> None:
     """Print rooms, doorways, objects, and what was left out."""
     with _user_errors():
         built = _built(scene, seed)
-    console = Console()
-    table = Table("room", "size (m)", "doors to", "windows", "objects")
+    rows = []
     for room in built.rooms:
         doors = [d for d in built.doorways if room.name in d.rooms]
         beyond = [next((r or "outside" for r in d.rooms if r != room.name), "outside") for d in doors]
@@ -139,10 +136,10 @@ def show(scene: SceneSource, seed: Seed = 0) -> None:
         counts = Counter(built.assets[o.asset_id].category for o in built.objects if o.room == room.name)
         listed = ", ".join(f"{n} {c}" if n > 1 else c for c, n in sorted(counts.items()))
         size = f"{room.size_m[0]:.2f} x {room.size_m[1]:.2f}"
-        table.add_row(room.name, size, ", ".join(beyond), str(windows), listed)
-    console.print(table)
+        rows.append((room.name, size, ", ".join(beyond), windows, listed))
+    show_table(("room", "size (m)", "doors to", "windows", "objects"), rows)
     for sentence in built.left_out:
-        console.print(f"left out: {sentence}", highlight=False, markup=False)
+        say(f"left out: {sentence}")
 
 
 @app.command()
@@ -195,49 +192,39 @@ def _built_all(names: Sequence[str], seed: int, out: Path) -> list[Scene]:
     """Build the scenes with a progress bar, after checking all names and the output file."""
     _check_sources(names)
     _check_writable(out)
-    scenes = []
-    with _user_errors(), _progress(len(names)) as bar:
-        for name in names:
-            bar.update(bar.task_ids[0], description=name)
-            scenes.append(_built(name, seed))
-            bar.advance(bar.task_ids[0])
-    return scenes
+    with _user_errors(), progress() as bars:
+        return [_built(name, seed) for name in bars.track(names, description="scenes")]
 
 
 def _run(orders: Sequence[SceneBuildJob], jobs: int) -> list[SceneReport]:
-    reports = []
-    with _user_errors(), _progress(len(orders)) as bar:
-        for report in run_batch(orders, processes=jobs):
-            reports.append(report)
-            bar.update(bar.task_ids[0], advance=1, description=report.scene_id)
-    return sorted(reports, key=lambda r: (r.scene_id, r.seed))
+    with _user_errors(), progress() as bars:
+        reports = bars.track(run_batch(orders, processes=jobs), total=len(orders), description="scenes")
+        return sorted(reports, key=lambda r: (r.scene_id, r.seed))
 
 
 def _print_reports(reports: Sequence[SceneReport], path: Path | None) -> None:
     console = Console()
     Console(width=max(console.width, TABLE_COLUMNS)).print(report_table(reports))
     for line in problem_lines(reports):
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        say(line)
     if any(report.left_out for report in reports):
-        console.print(LEFT_OUT, highlight=False, soft_wrap=True)
+        say(LEFT_OUT)
     if path is not None:
         with _user_errors(path):
             write_whole(path, (json.dumps([r.to_json() for r in reports], indent=1) + "\n").encode("utf-8"))
-        console.print(str(path), highlight=False)
+        say(path)
     wrong = sum(not report.sound for report in reports)
     if wrong:
-        console.print(f"{wrong} of {len(reports)} scenes have problems", highlight=False)
+        say(f"{wrong} of {len(reports)} scenes have problems")
         raise typer.Exit(1)
-    console.print(
-        f"{len(reports)} scenes, nothing wrong" if len(reports) > 1 else "nothing wrong", highlight=False
-    )
+    say(f"{len(reports)} scenes, nothing wrong" if len(reports) > 1 else "nothing wrong")
 
 
 def _chosen(names: Sequence[str] | None, every: bool) -> tuple[str, ...]:
     if every and names:
-        fail("scene", f"found both --all and {names[0]!r}: give names or --all")
+        fail(f"found both --all and {names[0]!r}: give names or --all")
     if not every and not names:
-        fail("scene", "no scene is named: give a name that `embomatrix scene list` shows, or --all")
+        fail("no scene is named: give a name that `embomatrix scene list` shows, or --all")
     return Catalog.load().scene_ids if every else tuple(dict.fromkeys(names or ()))
 
 
@@ -253,13 +240,6 @@ def _check_sources(names: Sequence[str]) -> None:
 
 def _built(name: str, seed: int) -> Scene:
     return read_scene(Path(name)) if name.endswith(SUFFIX) else build_base_scene(name, seed=seed)
-
-
-def _progress(total: int) -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    progress = Progress(*columns, console=Console(stderr=True), transient=True)
-    progress.add_task("scenes", total=total)
-    return progress
 
 
 def _check_writable(path: Path | None) -> None:
@@ -279,19 +259,4 @@ def _write_png(path: Path, image: Image.Image) -> None:
     image.save(buffer, format="PNG", optimize=True)
     with _user_errors(path):
         write_whole(path, buffer.getvalue())
-    Console().print(str(path), highlight=False)
-
-
-@contextlib.contextmanager
-def _user_errors(path: Path | None = None) -> Iterator[None]:
-    """Print errors that the user can fix as one sentence and exit with status 2. ``path`` is the output path."""
-    try:
-        yield
-    except (CatalogError, EngineError, FloorPlanError, ModelFileError, SceneFileError) as error:
-        fail("scene", str(error))
-    except OSError as error:
-        fail(
-            "scene",
-            f"{path or error.filename or '.'} can't be written ({error.strerror}): free disk space, or name another "
-            "folder with --out",
-        )
+    say(path)

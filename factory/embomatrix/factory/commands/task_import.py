@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from embomatrix.factory.admission import TaskRefusal
 from embomatrix.factory.commands.options import Jobs, LookAhead, Scenes, Seed, processes
-from embomatrix.factory.commands.terminal import fail, progress, user_errors
+from embomatrix.factory.commands.terminal import counter, fail, say, show_table, user_errors
 from embomatrix.factory.metrics.figures import EvaluationFigures, write_evaluation
 from embomatrix.factory.pipeline.settings import scene_ids
 from embomatrix.factory.pipeline.store import ResumableLog
@@ -93,7 +91,6 @@ def import_(
     jobs: Jobs = None,
 ) -> None:
     """Bind BDDL problems to base scenes and verify them. Refusals are reported with a reason."""
-    console = Console()
     depth = Depth.INSTANTIATE if instantiate else Depth.BIND if bind_only else Depth.VERIFY
     kept = (
         "; finished outcomes are kept; run the same command again to resume" if outcomes is not None else ""
@@ -106,7 +103,7 @@ def import_(
         sources = _selected(_sources(bddl, activity, jsonl, eai), reached_by, solids=solids)
         settings = ImportSettings(scene_ids(scenes), seed, depth, look_ahead)
         log = _resumed_log(outcomes, sources, settings)
-        made = _import_all(console, sources[len(log.outcomes) :], settings, processes(jobs), log)
+        made = _import_all(sources[len(log.outcomes) :], settings, processes(jobs), log)
         admitted = out is None or _written(out, made)
         all_outcomes = log.outcomes
         verified = depth is Depth.VERIFY
@@ -115,9 +112,9 @@ def import_(
         )
         _write(all_outcomes, evaluation, report, json_file)
     if len(sources) == len(made) == 1:
-        _print_one(console, sources[0], made[0])
+        _print_one(sources[0], made[0])
         return
-    _print_outcomes(console, all_outcomes, depth)
+    _print_outcomes(all_outcomes, depth)
     if not admitted:
         fail(
             f"no problem was admitted, so {out} was not written: use --bind-only to see which problems can be bound"
@@ -231,7 +228,6 @@ def _given(bddl: Path | None, activity: str, jsonl: Path | None, eai: Path | Non
 
 
 def _import_all(
-    console: Console,
     sources: Sequence[SourceText],
     settings: ImportSettings,
     jobs: int,
@@ -243,34 +239,32 @@ def _import_all(
     """
     made: list[ImportedTask | Verified | TaskRefusal] = []
     done = len(log.outcomes)
-    with progress(console) as bars, importing(settings, min(jobs, len(sources) or 1)) as import_many:
-        bar = bars.add_task("problems", total=done + len(sources), completed=done)
+    with (
+        counter("problems", done + len(sources)) as count,
+        importing(settings, min(jobs, len(sources) or 1)) as import_many,
+    ):
+        count(done)
         for imported in import_many(sources):
             log.add(imported.outcome)
             if imported.item is not None:
                 made.append(imported.item)
-            bars.advance(bar)
+            count(len(log.outcomes))
     return made
 
 
-def _print_one(console: Console, source: SourceText, outcome: ImportedTask | Verified | TaskRefusal) -> None:
+def _print_one(source: SourceText, outcome: ImportedTask | Verified | TaskRefusal) -> None:
     if isinstance(outcome, TaskRefusal):
         fail(f"{source.name} is refused ({outcome.reason}): {outcome.sentence}")
     for note in outcome.notes:
-        console.print(note, highlight=False, markup=False)
+        say(note)
     task = outcome.record.task if isinstance(outcome, Verified) else outcome.task
-    console.print(
-        f"{task.task_id}: {task.instruction}\n  goal: {task.goal_bddl}", highlight=False, markup=False
-    )
+    say(f"{task.task_id}: {task.instruction}\n  goal: {task.goal_bddl}")
     if isinstance(outcome, Verified):
         for call in outcome.record.oracle:
-            console.print("  " + " ".join(map(str, call.values())), highlight=False, markup=False)
+            say("  " + " ".join(map(str, call.values())))
 
 
-def _print_outcomes(console: Console, outcomes: Sequence[ProblemOutcome], depth: Depth) -> None:
+def _print_outcomes(outcomes: Sequence[ProblemOutcome], depth: Depth) -> None:
     done = "verified" if depth is Depth.VERIFY else "imported"
     counts = Counter(f"refused: {each.reason}" if each.reason else done for each in outcomes)
-    table = Table("outcome", "problems")
-    for outcome, count in counts.most_common():
-        table.add_row(outcome, str(count))
-    console.print(table)
+    show_table(("outcome", "problems"), counts.most_common())

@@ -1,9 +1,10 @@
-"""Terminal output of the factory's commands: progress bars, user errors and tables of figures."""
+"""Terminal output of the factory's commands: lines, tables, progress bars and user errors."""
 
 import contextlib
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Final
 
 from rich.console import Console
 from rich.progress import (
@@ -14,10 +15,8 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table
+from rich.table import Column, Table
 
-from embomatrix.factory.layout.agent_interfaces import BriefError
-from embomatrix.factory.layout.distribution import DistributionError
 from embomatrix.factory.metrics.figures import (
     EvaluationError,
     EvaluationFigures,
@@ -26,19 +25,39 @@ from embomatrix.factory.metrics.figures import (
 )
 from embomatrix.factory.task_import.sources import ProblemSourceError
 from embomatrix.host import failure
-from embomatrix.llm.values import LlmError
-from embomatrix.rpc.status import ClusterError
-from embomatrix.sim.engine import EngineMissingError
+from embomatrix.sim.engine import EngineError
 from embomatrix.world.bddl import BddlError
 from embomatrix.world.catalog import CatalogError
 from embomatrix.world.dataset import DatasetError
 
-fail = functools.partial(failure.fail, "factory")
+fail = functools.partial(failure.fail, "")
 """Print a sentence on standard error and exit the command."""
+USER_ERRORS: Final = (
+    BddlError,
+    CatalogError,
+    DatasetError,
+    EngineError,
+    EvaluationError,
+    ProblemSourceError,
+)
+"""Errors whose message is a sentence for the user."""
 
 
-def progress(console: Console) -> Progress:
-    """Return progress bars with count, elapsed time and remaining time."""
+def say(line: object) -> None:
+    """Print a line as it is, on one line of output however long it is."""
+    Console(soft_wrap=True).print(str(line), highlight=False, markup=False)
+
+
+def show_table(columns: Iterable[str | Column], rows: Iterable[Iterable[object]], title: str = "") -> None:
+    """Print a table of values."""
+    table = Table(*columns, title=title or None)
+    for row in rows:
+        table.add_row(*map(str, row))
+    Console().print(table)
+
+
+def progress() -> Progress:
+    """Return progress bars with count, elapsed time and remaining time on standard error."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -46,31 +65,33 @@ def progress(console: Console) -> Progress:
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
-        console=console,
+        console=Console(stderr=True),
     )
 
 
 @contextlib.contextmanager
-def user_errors(out: Path | None = None, kept: str = "") -> Iterator[None]:
+def counter(description: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Show a progress bar. Yield a function that takes the number of finished items."""
+    with progress() as bars:
+        bar = bars.add_task(description, total=total)
+        yield lambda done: bars.update(bar, completed=done)
+
+
+@contextlib.contextmanager
+def user_errors(
+    out: Path | None = None, kept: str = "", more: tuple[type[Exception], ...] = ()
+) -> Iterator[None]:
     """Print errors that the user can fix as one sentence and exit with status 2; an interrupt exits with 130.
 
-    ``out`` is the output path. ``kept`` is appended after an interrupt, a full disk or a lost connection.
+    ``out`` is the output path. ``more`` are further errors of the command. ``kept`` is appended after these, an
+    interrupt or a full disk.
     """
     try:
         yield
-    except (
-        BddlError,
-        BriefError,
-        CatalogError,
-        DatasetError,
-        DistributionError,
-        EngineMissingError,
-        EvaluationError,
-        ProblemSourceError,
-    ) as error:
-        fail(str(error))
-    except (ClusterError, LlmError) as error:
+    except more as error:
         fail(f"{error}{kept}")
+    except USER_ERRORS as error:
+        fail(str(error))
     except OSError as error:
         if out is None and error.filename is None:
             raise
@@ -83,13 +104,15 @@ def user_errors(out: Path | None = None, kept: str = "") -> Iterator[None]:
 
 def report_evaluation(evaluation: EvaluationFigures, json_file: Path | None) -> None:
     """Print a table of the figures and their notes, and write them to ``json_file`` if one is given."""
-    table = Table("figure", "value", "goal", "", "n")
-    for figure in evaluation.figures:
-        value = f"{figure.value:.3g} {figure.unit}".strip()
-        table.add_row(figure.name, value, figure.bound, verdict_on(figure), str(figure.n))
-    Console().print(table)
+    show_table(
+        ("figure", "value", "goal", "", "n"),
+        (
+            (each.name, f"{each.value:.3g} {each.unit}".strip(), each.bound, verdict_on(each), each.n)
+            for each in evaluation.figures
+        ),
+    )
     for note in evaluation.notes:
-        Console().print(note, highlight=False, markup=False)
+        say(note)
     if json_file is not None:
         with user_errors(json_file):
             write_evaluation(json_file, evaluation)

@@ -4,10 +4,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from embomatrix.factory.commands.options import Jobs, processes
-from embomatrix.factory.commands.terminal import fail, progress, report_evaluation, user_errors
+from embomatrix.factory.commands.terminal import counter, fail, report_evaluation, say, user_errors
 from embomatrix.factory.evaluate.verification import evaluation_of, objections, sampled, verify_again
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.whole_file import check_writable
@@ -41,19 +40,11 @@ def verify(
         records = sampled(Dataset.load(folder).records, sample, seed)
         if not records:
             fail(f"{folder} contains no task: name a dataset with tasks")
-        with progress(Console(stderr=True)) as bars:
-            bar = bars.add_task("judgements", total=2 * len(records))
-            verdicts = verify_again(
-                folder,
-                records,
-                physical=physical,
-                jobs=processes(jobs),
-                progress=lambda done: bars.update(bar, completed=done),
-            )
+        with counter("judgements", 2 * len(records)) as count:
+            verdicts = verify_again(folder, records, physical=physical, jobs=processes(jobs), progress=count)
     conditions = {"dataset": folder.name, "tasks": len(verdicts), "seed": seed}
-    console = Console()
     for line in objections(verdicts):
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        say(line)
     report_evaluation(evaluation_of(verdicts, conditions), json_file)
     if any(verdict.cached or not verdict.equal for verdict in verdicts):
         raise typer.Exit(1)
