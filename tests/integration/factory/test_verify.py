@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 SLIPPED = PlanFailure("grasp_slipped", "step 2, pick_up: it fell")
-FINE = Judgement("fetch", "", "sha256:1", same_plan=True)
+FINE = Judgement("fetch", "", "sha256:1", agrees=True)
 
 
 @pytest.fixture(scope="module")
@@ -26,9 +26,9 @@ def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 def test_equal_judgements_agree_with_the_dataset() -> None:
-    assert compared(FINE, FINE).equal
-    assert not compared(FINE, dataclasses.replace(FINE, digest="sha256:2")).equal
-    assert not compared(FINE, dataclasses.replace(FINE, same_plan=False)).equal
+    assert compared(FINE, FINE).agrees
+    assert not compared(FINE, dataclasses.replace(FINE, digest="sha256:2")).agrees
+    assert not compared(FINE, dataclasses.replace(FINE, agrees=False)).agrees
     refused = dataclasses.replace(FINE, cached="no_plan: none", digest="")
     assert compared(FINE, refused).cached == "no_plan: none"
 

@@ -46,5 +46,5 @@ def verify(
     for line in objections(verdicts):
         say(line)
     report_evaluation(evaluation_of(verdicts, conditions), json_file)
-    if any(verdict.cached or not verdict.equal for verdict in verdicts):
+    if any(verdict.cached or not verdict.agrees for verdict in verdicts):
         raise typer.Exit(1)

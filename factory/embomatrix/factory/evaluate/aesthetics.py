@@ -1,6 +1,6 @@
 """Geometric score of a room's layout, from 0 to 10, with weights fitted to hand-made rooms.
 
-The score follows the paper's rubric. Correspondence gives up to 2 points: the share of a task's objects that are present.
+The score follows the paper's rubric. Correspondence gives 2 points, since every finished layout has all of a task's objects.
 Clutter and placement give up to 4 points each: weighted means of features in [0, 1]. A logistic regression, with weights
 bounded below by 0, fits the weights so that hand-made rooms score higher than corrupted copies of them.
 """
@@ -65,29 +65,11 @@ class Calibration:
         return Calibration(value["weights"], value["hosts"])
 
 
-@dataclass(frozen=True, slots=True)
-class Score:
-    """Points out of 2, 4 and 4, and the features that apply to the room."""
-
-    correspondence: float
-    clutter: float
-    placement: float
-    features: Mapping[str, float]
-
-    @property
-    def total(self) -> float:
-        return self.correspondence + self.clutter + self.placement
-
-
-def score_room(plan: RoomPlan, calibration: Calibration, correspondence: float = 1.0) -> Score:
-    """Score a room. ``correspondence`` is the share of requested objects that are present, 1 if none were requested."""
+def score_room(plan: RoomPlan, calibration: Calibration) -> float:
+    """Return the score of a room in which all requested objects are present."""
     features = features_of(plan, calibration.hosts)
-    return Score(
-        2 * correspondence,
-        4 * _weighted(features, CLUTTER, calibration.weights),
-        4 * _weighted(features, PLACEMENT, calibration.weights),
-        features,
-    )
+    clutter = _weighted(features, CLUTTER, calibration.weights)
+    return 2 + 4 * clutter + 4 * _weighted(features, PLACEMENT, calibration.weights)
 
 
 def _weighted(features: Mapping[str, float], names: Sequence[str], weights: Mapping[str, float]) -> float:
@@ -333,4 +315,4 @@ def _spoilt(rooms: Sequence[RoomPlan], rng: np.random.Generator) -> list[RoomPla
 def _totals(
     rooms: Sequence[RoomPlan], calibration: Calibration
 ) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    return np.array([score_room(room, calibration).total for room in rooms])
+    return np.array([score_room(room, calibration) for room in rooms])

@@ -10,11 +10,10 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
-import math
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
 from importlib import resources
@@ -139,35 +138,34 @@ def judge(
     timed = RecordedMethod(METHODS[method])
     began = time.process_time()
     imported = import_problem(task.source, base, seed=seed, options=ImportOptions(timed))
-    spent = time.process_time() - began
-
-    def outcome(
-        reason: str,
-        detail: str,
-        *,
-        generated: bool = False,
-        verified: bool = False,
-        solved: bool = False,
-        beauty: float | None = None,
-    ) -> LayoutOutcome:
-        facts = (task.source.name, task.scene, method, generated, verified, solved, reason)
-        return LayoutOutcome(*facts, spent, timed.planar_s, beauty, detail)
-
+    refused = LayoutOutcome(
+        task=task.source.name,
+        scene=task.scene,
+        method=method,
+        generated=False,
+        verified=False,
+        solved=False,
+        reason="",
+        scene_s=time.process_time() - began,
+        planar_s=timed.planar_s,
+        aesthetics=None,
+    )
     if isinstance(imported, TaskRefusal):
-        return outcome(imported.reason, imported.sentence)
-    beauty = _beauty(imported)
+        return replace(refused, reason=imported.reason.value, detail=imported.sentence)
+    refused = replace(refused, aesthetics=_beauty(imported))
     refusal, lost = _executed(imported, library, seed)
     if refusal is not None and refusal.reason is RefusalReason.INIT_NOT_MET:
-        return outcome(refusal.reason, refusal.sentence, beauty=beauty)
-    solved = refusal is None
-    flaws = flaws_of(imported.scene, timed.names)
-    if flaws:
+        return replace(refused, reason=refusal.reason.value, detail=refusal.sentence)
+    generated = replace(refused, generated=True, solved=refusal is None)
+    if flaws := flaws_of(imported.scene, timed.names):
         words = ", ".join(f"{name} {flaw}" for name, flaw in flaws)
-        return outcome("geometry", words, generated=True, solved=solved, beauty=beauty)
+        return replace(generated, reason="geometry", detail=words)
     if lost:
-        return outcome("out_of_hand", ", ".join(lost), generated=True, solved=solved, beauty=beauty)
-    reason, detail = ("", "") if refusal is None else (refusal.reason.value, refusal.sentence)
-    return outcome(reason, detail, generated=True, verified=True, solved=solved, beauty=beauty)
+        return replace(generated, reason="out_of_hand", detail=", ".join(lost))
+    verified = replace(generated, verified=True)
+    if refusal is None:
+        return verified
+    return replace(verified, reason=refusal.reason.value, detail=refusal.sentence)
 
 
 def _executed(
@@ -185,7 +183,7 @@ def _executed(
 def _beauty(imported: ImportedTask) -> float:
     """Return the mean geometric score of the task's rooms."""
     calibration = Calibration.load()
-    return float(np.mean([score_room(plan_of(imported.scene, r), calibration).total for r in imported.rooms]))
+    return float(np.mean([score_room(plan_of(imported.scene, r), calibration) for r in imported.rooms]))
 
 
 def evaluation_of(outcomes: Sequence[LayoutOutcome], conditions: Mapping[str, Any]) -> EvaluationFigures:
@@ -195,61 +193,47 @@ def evaluation_of(outcomes: Sequence[LayoutOutcome], conditions: Mapping[str, An
     for method in LayoutMethod:
         mine = [outcome for outcome in outcomes if outcome.method is method]
         if mine:
-            figures += _figures(mine, method)
-            figures += _shared_aesthetics(outcomes, method)
+            figures += _figures(mine, method, _shared_scores(outcomes, method))
             reasons = Counter(outcome.reason for outcome in mine if outcome.reason)
             counts = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common(5)) or "none"
             notes.append(f"Most common reasons for rejection, {method}: {counts}.")
     return EvaluationFigures("scenes", conditions, tuple(figures), tuple(notes))
 
 
-def _shared_aesthetics(outcomes: Sequence[LayoutOutcome], method: LayoutMethod) -> Iterable[Figure]:
-    """Yield the score over tasks that every method laid out: tasks on which a method fails are hard to lay out well."""
+def _shared_scores(outcomes: Sequence[LayoutOutcome], method: LayoutMethod) -> list[float]:
+    """Return the scores of tasks that every method laid out: tasks on which a method fails are hard to lay out well."""
     scores: defaultdict[tuple[str, str], dict[LayoutMethod, float]] = defaultdict(dict)
     for each in outcomes:
         if each.aesthetics is not None:
             scores[each.task, each.scene][each.method] = each.aesthetics
     measured = {each.method for each in outcomes}
     shared = [found[method] for found in scores.values() if measured <= found.keys()]
-    if len(measured) > 1 and shared:
-        name = f"aesthetics_shared{_label(method)}"
-        yield Figure(name, float(np.mean(shared)), "of 10", Better.HIGHER, len(shared))
+    return shared if len(measured) > 1 else []
 
 
-def _label(method: LayoutMethod) -> str:
-    return "" if method is LayoutMethod.TREE else f" {method}"
-
-
-def _figures(outcomes: Sequence[LayoutOutcome], method: LayoutMethod) -> Iterable[Figure]:
-    goals = method is LayoutMethod.TREE
-    label = _label(method)
+def _figures(
+    outcomes: Sequence[LayoutOutcome], method: LayoutMethod, shared: Sequence[float]
+) -> Iterable[Figure]:
+    """Yield the figures of a method that have values. Only the tree method has goals."""
+    is_tree = method is LayoutMethod.TREE
     generated = [outcome for outcome in outcomes if outcome.generated]
-    planar = [second for outcome in outcomes for second in outcome.planar_s]
-    verified = sum(outcome.verified for outcome in generated)
-    n = len(outcomes)
-    yield Figure(
-        f"generation_rate{label}", 100 * len(generated) / n, "%", Better.HIGHER, n, 95.0 if goals else None
-    )
-    if generated:
-        rate = 100 * verified / len(generated)
-        yield Figure(
-            f"verification_pass_rate{label}",
-            rate,
-            "%",
-            Better.HIGHER,
-            len(generated),
-            99.0 if goals else None,
-        )
-        solved = 100 * sum(outcome.solved for outcome in generated) / len(generated)
-        yield Figure(f"oracle_solved_rate{label}", solved, "%", Better.HIGHER, len(generated))
-    middle = float(np.median([outcome.scene_s for outcome in outcomes]))
-    yield Figure(f"scene_s_p50{label}", middle, "s", Better.LOWER, n, 2.0 if goals else None)
-    if planar:
-        solve = 1000 * float(np.median(planar))
-        yield Figure(f"planar_ms_p50{label}", solve, "ms", Better.LOWER, len(planar), 50.0 if goals else None)
+    planar_ms = [1000 * second for outcome in outcomes for second in outcome.planar_s]
     scores = [outcome.aesthetics for outcome in outcomes if outcome.aesthetics is not None]
-    if scores and math.isfinite(sum(scores)):
-        yield Figure(f"aesthetics{label}", float(np.mean(scores)), "of 10", Better.HIGHER, len(scores))
+    up, down = Better.HIGHER, Better.LOWER
+    rows = (
+        ("generation_rate", np.mean, [100.0 * each.generated for each in outcomes], "%", up, 95.0),
+        ("verification_pass_rate", np.mean, [100.0 * each.verified for each in generated], "%", up, 99.0),
+        ("oracle_solved_rate", np.mean, [100.0 * each.solved for each in generated], "%", up, None),
+        ("scene_s_p50", np.median, [each.scene_s for each in outcomes], "s", down, 2.0),
+        ("planar_ms_p50", np.median, planar_ms, "ms", down, 50.0),
+        ("aesthetics", np.mean, scores, "of 10", up, None),
+        ("aesthetics_shared", np.mean, shared, "of 10", up, None),
+    )
+    for name, average, values, unit, better, goal in rows:
+        if values:
+            label = name if is_tree else f"{name} {method}"
+            value = float(average(values))
+            yield Figure(label, value, unit, better, len(values), goal if is_tree else None)
 
 
 Trial = tuple[SceneTask, LayoutMethod]

@@ -116,7 +116,7 @@ def asked_in(base: Scene, writer: TaskWriter, count: int, seed: int) -> list[Dra
     found: dict[str, DraftFeatures] = {}
     for number in range(MOST_VARIANTS):
         for draft in _drafts(base, writer, number, seed):
-            found.setdefault(uniqueness_key(draft.signature, draft.task.instruction), _asked(draft))
+            found.setdefault(uniqueness_key(draft.signature, draft.task.instruction), _features(draft))
             if len(found) == count:
                 return list(found.values())
     return list(found.values())
@@ -140,8 +140,8 @@ def _drafts(base: Scene, writer: TaskWriter, number: int, seed: int) -> Iterator
             return
 
 
-def _asked(draft: Draft) -> DraftFeatures:
-    return DraftFeatures(draft.task.instruction, draft.signature, draft.rooms, bool(draft.task.types))
+def _features(item: Draft | TaskRecord) -> DraftFeatures:
+    return DraftFeatures(item.task.instruction, item.signature, item.rooms, bool(item.task.types))
 
 
 def asked_of(records: Sequence[TaskRecord], count: int) -> dict[str, list[DraftFeatures]]:
@@ -149,10 +149,7 @@ def asked_of(records: Sequence[TaskRecord], count: int) -> dict[str, list[DraftF
     groups: dict[str, list[DraftFeatures]] = {}
     for record in records:
         base = base_scene_of(record.task.scene_id)
-        asked = DraftFeatures(
-            record.task.instruction, record.signature, record.rooms, bool(record.task.types)
-        )
-        groups.setdefault(base, []).append(asked)
+        groups.setdefault(base, []).append(_features(record))
     return {base: group[:count] for base, group in groups.items() if len(group) >= count}
 
 

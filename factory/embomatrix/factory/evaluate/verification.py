@@ -38,26 +38,15 @@ PHYSICAL_GOAL_PERCENT: Final = 97.0
 class Judgement:
     """Result of one process: an objection in cached mode, "" for none, and a failure in physics if ``in_physics``.
 
-    ``digest`` covers every pose and state after every step of the plan. ``same_plan`` means that the plan is the dataset's.
+    ``digest`` covers every pose and state after every step of the plan. ``agrees`` means that the plan is the dataset's.
     """
 
     task: str
     cached: str
     digest: str
-    same_plan: bool
+    agrees: bool
     in_physics: bool = False
     physical: PlanFailure | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class VerificationOutcome:
-    """Objections to a task in both modes, and whether two processes agree with each other and the dataset."""
-
-    task: str
-    cached: str
-    equal: bool
-    in_physics: bool
-    physical: PlanFailure | None
 
 
 def sampled(records: Sequence[TaskRecord], most: int | None, seed: int) -> list[TaskRecord]:
@@ -75,7 +64,7 @@ def verify_again(
     physical: bool,
     jobs: int,
     progress: Callable[[int], None] = lambda _done: None,
-) -> list[VerificationOutcome]:
+) -> list[Judgement]:
     """Judge records of a dataset twice and call ``progress`` with the number of judgements so far.
 
     Raises DatasetError if a bundle can't be read or a process dies.
@@ -104,13 +93,11 @@ def verify_again(
     return [compared(first[task], second[task]) for task in (record.task.task_id for record in records)]
 
 
-def compared(first: Judgement, second: Judgement) -> VerificationOutcome:
-    """Combine two judgements of one task."""
+def compared(first: Judgement, second: Judgement) -> Judgement:
+    """Combine two judgements of one task. The result agrees if both agree with the dataset and with each other."""
     same = (first.cached, first.digest) == (second.cached, second.digest)
-    equal = same and first.same_plan and second.same_plan
-    return VerificationOutcome(
-        first.task, first.cached or second.cached, equal, second.in_physics, second.physical
-    )
+    agrees = same and first.agrees and second.agrees
+    return replace(second, cached=first.cached or second.cached, agrees=agrees)
 
 
 def _judge_bundle(folder: Path, tasks: tuple[str, list[str]], *, physical: bool) -> list[Judgement]:
@@ -132,7 +119,7 @@ def _cached(simulator: Simulator, record: TaskRecord) -> Judgement:
     """Judge a task as admission does and execute the plan found."""
     verdict = admit(simulator, record.task, find_plan, most_held=max_held_share(record.task))
     if isinstance(verdict, TaskRefusal):
-        return Judgement(record.task.task_id, f"{verdict.reason}: {verdict.sentence}", "", same_plan=False)
+        return Judgement(record.task.task_id, f"{verdict.reason}: {verdict.sentence}", "", agrees=False)
     trace = simulator.execute(record.task, verdict, SEED)
     same = plan_to_json(verdict) == [dict(call) for call in record.oracle]
     return Judgement(record.task.task_id, SUCCESS, trace.digest, same)
@@ -145,14 +132,12 @@ def _physical(bundle: Bundle, record: TaskRecord) -> PlanFailure | None:
         return plan_failure(simulator, record.task, plan)
 
 
-def evaluation_of(
-    verdicts: Sequence[VerificationOutcome], conditions: Mapping[str, Any]
-) -> EvaluationFigures:
+def evaluation_of(verdicts: Sequence[Judgement], conditions: Mapping[str, Any]) -> EvaluationFigures:
     """Return shares of the tasks in percent, and the reasons why plans failed in physics, most frequent first."""
     physical = [verdict.physical for verdict in verdicts if verdict.in_physics]
     figures = [
         _figure("oracle_cached", [not verdict.cached for verdict in verdicts], GOAL_PERCENT),
-        _figure("reverified_bit_equal", [verdict.equal for verdict in verdicts], GOAL_PERCENT),
+        _figure("reverified_bit_equal", [verdict.agrees for verdict in verdicts], GOAL_PERCENT),
     ]
     if physical:
         figures.append(
@@ -164,12 +149,12 @@ def evaluation_of(
     return EvaluationFigures("verification", conditions, tuple(figures), notes)
 
 
-def objections(verdicts: Sequence[VerificationOutcome]) -> Iterator[str]:
+def objections(verdicts: Sequence[Judgement]) -> Iterator[str]:
     """Yield a line for each objection to a task."""
     for verdict in verdicts:
         if verdict.cached:
             yield f"{verdict.task}: {verdict.cached}"
-        elif not verdict.equal:
+        elif not verdict.agrees:
             yield f"{verdict.task}: two processes, or one of them and the dataset, differ in plan or trace"
         if verdict.physical:
             yield f"{verdict.task}, in physics: {verdict.physical}"
