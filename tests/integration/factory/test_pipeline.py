@@ -24,8 +24,7 @@ from embomatrix.factory.layout.values import RoomBrief
 from embomatrix.factory.pipeline.build import BuildSummary, build_dataset, split_rooms
 from embomatrix.factory.pipeline.cluster import admitted_by
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
-from embomatrix.factory.pipeline.store import BuildStore, VariantResult
-from embomatrix.factory.pipeline.variants import VariantYield
+from embomatrix.factory.pipeline.store import BuildStore, VariantResult, VariantYield
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.writer.tasks import is_heldout_signature
@@ -132,13 +131,13 @@ def test_build_records_cpu_time_of_every_variant(folder: Path, dataset: Dataset)
 
 def test_full_disk_in_the_middle_of_a_line_costs_one_variant(tmp_path: Path) -> None:
     store = BuildStore(tmp_path, {"seed": 1})
-    store.add(VariantResult("train", 0, (), ()), b"", {}, {}, 1.0)
+    store.add(VariantYield(VariantResult("train", 0, (), ()), b"", {}))
     kept, before = [*store.results], (tmp_path / "build.jsonl").read_bytes()
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 40, hard))
     try:
         with pytest.raises(OSError, match="too large"):
-            store.add(VariantResult("train", 1, (), ()), b"", {}, {}, 1.0)
+            store.add(VariantYield(VariantResult("train", 1, (), ()), b"", {}))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert len((tmp_path / "build.jsonl").read_bytes()) == len(before) + 40

@@ -14,12 +14,11 @@ from typing import Final
 
 from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pipeline.settings import BuildSettings
-from embomatrix.factory.pipeline.store import BuildStore, Rejection
+from embomatrix.factory.pipeline.store import BuildStore, Rejection, VariantYield
 from embomatrix.factory.pipeline.variants import (
     TASKS_PER_VARIANT,
     VariantMaker,
     VariantOrder,
-    VariantYield,
     uniqueness_key,
 )
 from embomatrix.factory.scenes.build import base_scene_of, build_base_scene
@@ -233,15 +232,13 @@ class _SplitOrders:
                 left[record.task.category] -= 1
                 kept.append(record)
         names = {record.task.task_id for record in kept}
-        transcripts = {name: text for name, text in variant.transcripts.items() if name in names}
-        trees = {name: tree for name, tree in variant.trees.items() if name in names}
-        self._store.add(
-            dataclasses.replace(variant.result, records=tuple(kept)),
-            variant.bundle,
-            transcripts,
-            trees,
-            variant.cpu_s,
+        kept_variant = dataclasses.replace(
+            variant,
+            result=dataclasses.replace(variant.result, records=tuple(kept)),
+            transcripts={name: text for name, text in variant.transcripts.items() if name in names},
+            trees={name: tree for name, tree in variant.trees.items() if name in names},
         )
+        self._store.add(kept_variant)
 
     def _missing(self, before: int) -> dict[TaskCategory, int]:
         """Return the number of tasks of each category that are missing before this variant."""

@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Final
 
 from embomatrix.factory.admission import SEED, RefusalReason
-from embomatrix.factory.pipeline.store import Rejection
-from embomatrix.factory.pipeline.variants import VariantYield
+from embomatrix.factory.pipeline.store import Rejection, VariantYield
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.wire.values import Batch, Completed, Rollout, RolloutResult
 from embomatrix.skills.parse import plan_from_json
@@ -66,11 +65,21 @@ def admitted_by(variant: VariantYield, results: Mapping[str, RolloutResult]) -> 
     kept: list[TaskRecord] = []
     rejected: list[Rejection] = []
     for record in variant.result.records:
-        sentence = _cluster_objection(results[record.task.task_id])
-        if sentence:
-            rejected.append(_rejection(record, sentence))
-        else:
+        task = record.task
+        sentence = _cluster_objection(results[task.task_id])
+        if not sentence:
             kept.append(record)
+            continue
+        rejected.append(
+            Rejection(
+                task.scene_id,
+                task.category.value,
+                task.instruction,
+                task.goal_bddl,
+                RefusalReason.ORACLE_FAILED,
+                sentence,
+            )
+        )
     rejections = (*variant.result.rejections, *rejected)
     result = dataclasses.replace(variant.result, records=tuple(kept), rejections=rejections)
     return dataclasses.replace(variant, result=result)
@@ -87,15 +96,3 @@ def _cluster_objection(result: RolloutResult) -> str:
     if reward.success:
         return ""
     return f"on the cluster's worker {result.outcome.worker_id} the oracle's plan earns {reward.total:.1f}"
-
-
-def _rejection(record: TaskRecord, sentence: str) -> Rejection:
-    task = record.task
-    return Rejection(
-        task.scene_id,
-        task.category.value,
-        task.instruction,
-        task.goal_bddl,
-        RefusalReason.ORACLE_FAILED,
-        sentence,
-    )

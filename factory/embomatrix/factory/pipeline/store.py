@@ -130,6 +130,20 @@ class VariantResult:
     rejections: tuple[Rejection, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class VariantYield:
+    """Result of a variant: records, their bundle, and transcripts and layout trees by task id.
+
+    ``cpu_s`` is the CPU time and does not affect equality.
+    """
+
+    result: VariantResult
+    bundle: bytes
+    transcripts: Mapping[str, str]
+    trees: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    cpu_s: float = field(default=0.0, compare=False)
+
+
 class BuildStore:
     """Folder of a build. Its log holds the settings in the first line and one variant in each further line."""
 
@@ -153,21 +167,18 @@ class BuildStore:
     def records_of(self, split: str) -> list[TaskRecord]:
         return [record for result in self.results if result.split == split for record in result.records]
 
-    def add(
-        self,
-        result: VariantResult,
-        bundle: bytes,
-        transcripts: Mapping[str, str],
-        trees: Mapping[str, Mapping[str, Any]],
-        cpu_s: float,
-    ) -> None:
+    def add(self, variant: VariantYield) -> None:
         """Store a variant's result. Its other files are written before its line in the log."""
-        self._spent({"split": result.split, "variant": result.number, "cpu_s": round(cpu_s, 3)})
+        result = variant.result
+        self._spent({"split": result.split, "variant": result.number, "cpu_s": round(variant.cpu_s, 3)})
         if result.records:
             path = self._folder / BUNDLES_FOLDER / bundle_file(result.records[0].bundle_digest)
-            write_whole(path, bundle)
-        drawn = {task_id: json.dumps(tree, indent=1) + "\n" for task_id, tree in trees.items() if tree}
-        for name, suffix, texts in ((TRANSCRIPTS_FOLDER, "md", transcripts), (TREES_FOLDER, "json", drawn)):
+            write_whole(path, variant.bundle)
+        drawn = {
+            task_id: json.dumps(tree, indent=1) + "\n" for task_id, tree in variant.trees.items() if tree
+        }
+        files = ((TRANSCRIPTS_FOLDER, "md", variant.transcripts), (TREES_FOLDER, "json", drawn))
+        for name, suffix, texts in files:
             if texts:
                 (self._folder / name).mkdir(exist_ok=True)
             for task_id, text in texts.items():
@@ -185,10 +196,10 @@ class BuildStore:
 
 def _attempt_lines(result: VariantResult) -> str:
     """Return one line per draft of a variant: the admitted drafts, then the rejected ones."""
+    variant: dict[str, str | int] = {"split": result.split, "variant": result.number}
     lines: list[dict[str, str | int]] = [
         {
-            "split": result.split,
-            "variant": result.number,
+            **variant,
             "scene": record.task.scene_id,
             "category": record.task.category.value,
             "instruction": record.task.instruction,
@@ -200,8 +211,7 @@ def _attempt_lines(result: VariantResult) -> str:
     ]
     lines += [
         {
-            "split": result.split,
-            "variant": result.number,
+            **variant,
             "scene": item.scene,
             "category": item.category,
             "instruction": item.instruction,

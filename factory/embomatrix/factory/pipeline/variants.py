@@ -5,7 +5,7 @@ import itertools
 import time
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from embomatrix.factory.admission import TaskRefusal, admit
 from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
-from embomatrix.factory.pipeline.store import Rejection, VariantResult
+from embomatrix.factory.pipeline.store import Rejection, VariantResult, VariantYield
 from embomatrix.factory.pipeline.task_poses import PoseNeeds, SceneSurvey, cache_poses
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.feasibility import SimulatedRobot
@@ -65,20 +65,6 @@ class VariantOrder:
     known: frozenset[str]
 
 
-@dataclass(frozen=True, slots=True)
-class VariantYield:
-    """Result of a variant: records, their bundle, and transcripts and layout trees by task id.
-
-    ``cpu_s`` is the CPU time and does not affect equality.
-    """
-
-    result: VariantResult
-    bundle: bytes
-    transcripts: Mapping[str, str]
-    trees: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    cpu_s: float = field(default=0.0, compare=False)
-
-
 class VariantMaker:
     """Maker of variants in this process. Placement results are reused between variants.
 
@@ -94,15 +80,17 @@ class VariantMaker:
     ) -> None:
         if writer is None:
             writer = SocialWriter(settings.seed) if settings.writer is WriterKind.SOCIAL else PlainWriter()
-        foresight = ReachabilitySurvey() if settings.look_ahead else None
-        self._tools = _SharedTools(settings, writer, PlacementLibrary(), foresight)
+        self.settings = settings
+        self.writer = writer
+        self.library = PlacementLibrary()
+        self.foresight = ReachabilitySurvey() if settings.look_ahead else None
         self._layout = layout
         self._bases: dict[str, Scene] = {}
 
     def make(self, order: VariantOrder) -> VariantYield:
         """Write and judge the tasks of one variant."""
         began = time.process_time()
-        seed = self._tools.settings.seed
+        seed = self.settings.seed
         if order.base not in self._bases:
             self._bases[order.base] = build_base_scene(order.base, seed=seed)
         base = self._bases[order.base]
@@ -113,26 +101,16 @@ class VariantMaker:
         variant = build_variant(
             base, focus, f"{base.base}-{order.split}-{order.number:03d}", rng, self._layout
         )
-        result = _VariantWork(variant, order, self._tools).run(rng)
+        result = _VariantWork(variant, order, self).run(rng)
         return replace(result, cpu_s=time.process_time() - began)
 
     def close(self) -> None:
-        self._tools.library.close()
+        self.library.close()
 
 
 def uniqueness_key(signature: str, instruction: str) -> str:
     """Return the key that must be unique among the tasks of a dataset."""
     return f"{signature}|{instruction}"
-
-
-@dataclass(frozen=True)
-class _SharedTools:
-    """Objects shared by all variants of a build."""
-
-    settings: BuildSettings
-    writer: TaskWriter
-    library: PlacementLibrary
-    foresight: ReachabilitySurvey | None
 
 
 def _focus(
@@ -149,14 +127,10 @@ def _focus(
 class _VariantWork:
     """Writing and judging of one variant's tasks."""
 
-    def __init__(self, variant: Variant, order: VariantOrder, tools: _SharedTools) -> None:
+    def __init__(self, variant: Variant, order: VariantOrder, maker: VariantMaker) -> None:
         self._variant = variant
         self._order = order
-        self._seed = tools.settings.seed
-        self._writer = tools.writer
-        self._library = tools.library
-        self._foresight = tools.foresight
-        self._physical = tools.settings.physical
+        self._maker = maker
         self._known = set(order.known)
         self._admitted: list[tuple[Draft, Plan]] = []
         self._rejections: list[Rejection] = []
@@ -165,18 +139,20 @@ class _VariantWork:
         """Return the variant's records with their bundle. The missing categories take turns."""
         missing = self._order.missing
         scene = self._variant.scene
-        with SceneSurvey(scene, self._foresight) as survey:
+        with SceneSurvey(scene, self._maker.foresight) as survey:
             with SimulatedRobot(scene, survey.blocks) as robot:
                 drafts = self._write(missing, SceneView(scene, robot), rng)
             needs = [PoseNeeds(draft.about, draft.task.table) for draft in drafts]
-            poses = cache_poses(SceneView(scene), needs, self._library, survey, self._seed)
+            poses = cache_poses(
+                SceneView(scene), needs, self._maker.library, survey, self._maker.settings.seed
+            )
         left = dict(missing)
         bundle = Bundle(scene, {}, poses)
         with contextlib.ExitStack() as stack:
             simulator = stack.enter_context(contextlib.closing(load_simulator(bundle)))
             physics = (
                 stack.enter_context(contextlib.closing(physical_simulator(bundle)))
-                if self._physical
+                if self._maker.settings.physical
                 else None
             )
             for draft in drafts:
@@ -209,22 +185,20 @@ class _VariantWork:
         self, turns: Iterator[TaskCategory], view: SceneView, known: int, rng: np.random.Generator
     ) -> list[tuple[TaskCategory, Draft | TaskRefusal | None]]:
         """Write the next draft, or several at once if the writer waits for answers. Empty after the last turn."""
-        if not isinstance(self._writer, BatchTaskWriter):
+        writer = self._maker.writer
+        if not isinstance(writer, BatchTaskWriter):
             return [
-                (
-                    category,
-                    self._writer.write(self._variant, view, DraftOrder(category, self._task_id(known), rng)),
-                )
+                (category, writer.write(self._variant, view, DraftOrder(category, self._task_id(known), rng)))
                 for category in itertools.islice(turns, 1)
             ]
-        categories = list(itertools.islice(turns, min(self._writer.at_once, MAX_DRAFTS - known)))
+        categories = list(itertools.islice(turns, min(writer.at_once, MAX_DRAFTS - known)))
         orders = [
             DraftOrder(category, self._task_id(known + number), each)
             for number, (category, each) in enumerate(
                 zip(categories, rng.spawn(len(categories)), strict=True)
             )
         ]
-        found = self._writer.write_all(self._variant, view, orders) if orders else ()
+        found = writer.write_all(self._variant, view, orders) if orders else ()
         return list(zip(categories, found, strict=False))
 
     def _task_id(self, number: int) -> str:
@@ -250,7 +224,9 @@ class _VariantWork:
     def _is_new(self, draft: Draft) -> bool:
         """True if the signature belongs to this split and the task is not known yet."""
         key = uniqueness_key(draft.signature, draft.task.instruction)
-        in_split = is_heldout_signature(draft.signature, self._seed) is (self._order.split == "heldout")
+        in_split = is_heldout_signature(draft.signature, self._maker.settings.seed) is (
+            self._order.split == "heldout"
+        )
         return in_split and key not in self._known
 
     def _judge(self, simulator: Simulator, physics: Simulator | None, draft: Draft) -> bool:

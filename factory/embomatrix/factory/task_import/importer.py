@@ -1,7 +1,7 @@
 """Importer of problems in this process or in several processes."""
 
-import contextlib
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -74,16 +74,13 @@ class ProblemImporter:
                 return verify_first(source, self._bases, self._library, self._foresight, seed=seed)
 
 
-@contextlib.contextmanager
-def importing(settings: ImportSettings, jobs: int) -> Iterator[ImportMany]:
-    """Yield a function that imports problems. Raise EvaluationError if a process dies."""
+def importing(settings: ImportSettings, jobs: int) -> AbstractContextManager[ImportMany]:
+    """Return a context with a function that imports problems. Raise EvaluationError if a process dies."""
     died = EvaluationError(
         "a process that imports problems died, possibly for lack of memory: run the same command with fewer --jobs"
     )
-    with shared_work(
-        jobs, ProblemImporter, ProblemImporter.run if jobs == 1 else _picklable_import, settings, died=died
-    ) as import_many:
-        yield import_many
+    work = ProblemImporter.run if jobs == 1 else _picklable_import
+    return shared_work(jobs, ProblemImporter, work, settings, died=died)
 
 
 def _picklable_import(importer: ProblemImporter, source: SourceText) -> ImportOutcome:
