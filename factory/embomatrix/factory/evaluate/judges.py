@@ -54,7 +54,7 @@ class DiversityScores(BaseModel):
     explanation: str = Field(min_length=1)
 
 
-async def judged(model: ChatModel, commands: Sequence[str], seed: int, attempts: int = 3) -> DiversityScores:
+async def judged(model: ChatModel, commands: Sequence[str], seed: int) -> DiversityScores:
     """Return the model's scores for the commands of one scene. Raises LlmError."""
     listed = "\n".join(f"{number}. {command}" for number, command in enumerate(commands, start=1))
     request = ChatRequest(
@@ -63,7 +63,7 @@ async def judged(model: ChatModel, commands: Sequence[str], seed: int, attempts:
         temperature=0.0,
         seed=seed,
     )
-    return await ask(model, request, DiversityScores, attempts=attempts)
+    return await ask(model, request, DiversityScores)
 
 
 SCENE_JUDGE: Final = "scene judge"
@@ -120,9 +120,7 @@ class Impression(BaseModel):
         return 10.0 - self.correspondence - self.clutter - self.placement
 
 
-async def impression_of(
-    model: ChatModel, scene: Scene, added: Sequence[str], seed: int, attempts: int = 3
-) -> Impression:
+async def impression_of(model: ChatModel, scene: Scene, added: Sequence[str], seed: int) -> Impression:
     """Return the model's deductions for the rooms that contain added objects. Raises LlmError."""
     rooms = list(dict.fromkeys(scene.by_name[name].room for name in added))[:MOST_ROOMS]
     trees: dict[str, object] = {}
@@ -131,7 +129,7 @@ async def impression_of(
     pictures = tuple(sight_of_room(scene, room) for room in rooms)
     message = Message(Speaker.USER, SCENE_PROMPT.format(tree=json.dumps(trees)), pictures)
     request = ChatRequest(SCENE_JUDGE, (message,), temperature=0.0, seed=seed)
-    return await ask(model, request, Impression, attempts=attempts)
+    return await ask(model, request, Impression)
 
 
 async def evaluate_looks(

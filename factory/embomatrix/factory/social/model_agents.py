@@ -42,6 +42,8 @@ CAST: Final = "role-playing agent"
 TALK: Final = "social simulation agent"
 SUMMARY: Final = "summarization agent"
 """Purposes of the requests, for ledgers and errors."""
+TEMPERATURE: Final = 0.9
+"""Sampling temperature of invented content."""
 
 
 class RoomSighting(StrictModel):
@@ -59,14 +61,10 @@ class ConversationAnswer(StrictModel):
 
 
 class SocialModelAgents:
-    """Social agents on one model. ``temperature`` applies to invented content; ``max_tokens`` limits an answer."""
+    """Social agents on one model. ``max_tokens`` limits an answer."""
 
-    def __init__(
-        self, model: ChatModel, *, temperature: float = 0.9, attempts: int = 3, max_tokens: int = 2048
-    ) -> None:
+    def __init__(self, model: ChatModel, *, max_tokens: int = 2048) -> None:
         self._model = model
-        self._temperature = temperature
-        self._attempts = attempts
         self._max_tokens = max_tokens
 
     async def describe(self, facts: SceneFacts, pictures: tuple[bytes, ...], seed: int) -> RoomSighting:
@@ -82,23 +80,20 @@ class SocialModelAgents:
         user = Message(Speaker.USER, SIGHT_USER.format(scene=facts.described()), pictures)
         messages = (Message(Speaker.SYSTEM, SIGHT_SYSTEM), user)
         request = ChatRequest(SIGHT, messages, self._max_tokens, 0.2, seed)
-        return await ask(self._model, request, RoomSighting, check=check, attempts=self._attempts)
+        return await ask(self._model, request, RoomSighting, check=check)
 
     async def cast(self, facts: SceneFacts, seed: int) -> Cast:
         """Invent people who suit the scene and cover every room. Raise LlmError."""
-        rooms = tuple(room.name for room in facts.rooms)
+        rooms = [room.name for room in facts.rooms]
 
         def check(cast: Cast) -> None:
-            named = {room for person in cast.people for room in person.rooms} | {
-                slot.room for slot in cast.day
-            }
-            if unknown := sorted(named - set(rooms)):
+            if unknown := sorted(cast.rooms - set(rooms)):
                 raise ValueError(f"there is no room {unknown[0]!r}: the rooms are {', '.join(rooms)}")
-            if empty := cast.rooms_without_anyone(rooms):
+            if empty := [room for room in rooms if room not in cast.rooms]:
                 raise ValueError(f"nobody is ever in {', '.join(empty)}: give each of these rooms somebody")
 
         request = self._request(CAST, CAST_SYSTEM.format(), CAST_USER.format(scene=facts.described()), seed)
-        return await ask(self._model, request, Cast, check=check, attempts=self._attempts)
+        return await ask(self._model, request, Cast, check=check)
 
     async def converse(
         self, facts: SceneFacts, cast: Cast, slot: DaySlot, category: TaskCategory, seed: int
@@ -130,7 +125,7 @@ class SocialModelAgents:
             hint=CATEGORY_HINTS[category.value],
         )
         request = self._request(TALK, TALK_SYSTEM.format(limits=ROBOT_LIMITS), user, seed)
-        talk = await ask(self._model, request, ConversationAnswer, check=check, attempts=self._attempts)
+        talk = await ask(self._model, request, ConversationAnswer, check=check)
         return Conversation(
             slot=slot, turns=talk.turns, first_wish=talk.first_wish, last_wishes=talk.last_wishes
         )
@@ -143,16 +138,12 @@ class SocialModelAgents:
         said = "\n".join(f"{turn.speaker}: {turn.text}" for turn in conversation.turns)
         user = SUMMARY_USER.format(scene=facts.described(), conversation=said)
         request = self._request(SUMMARY, SUMMARY_SYSTEM, user, seed)
-        return await ask(
-            self._model,
-            request,
-            TaskRequest,
-            check=lambda value: check_request(value, view, known),
-            attempts=self._attempts,
-        )
+
+        def check(request: TaskRequest) -> None:
+            check_request(request, view, known)
+
+        return await ask(self._model, request, TaskRequest, check=check)
 
     def _request(self, purpose: str, system: str, user: str, seed: int) -> ChatRequest:
         messages = (Message(Speaker.SYSTEM, system), Message(Speaker.USER, user))
-        return ChatRequest(
-            purpose, messages, self._max_tokens, self._temperature, seed, answer_schema(purpose)
-        )
+        return ChatRequest(purpose, messages, self._max_tokens, TEMPERATURE, seed, answer_schema(purpose))

@@ -74,12 +74,11 @@ class Cast(StrictModel):
     def names(self) -> tuple[str, ...]:
         return tuple(person.name for person in self.people)
 
-    def rooms_without_anyone(self, rooms: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the rooms without an owner or visitor."""
-        lived_in = {room for person in self.people for room in person.rooms} | {
-            slot.room for slot in self.day
-        }
-        return tuple(room for room in rooms if room not in lived_in)
+    @property
+    def rooms(self) -> frozenset[str]:
+        """Rooms with an owner or a visitor."""
+        own = (room for person in self.people for room in person.rooms)
+        return frozenset((*own, *(slot.room for slot in self.day)))
 
 
 class Act(StrEnum):
@@ -108,19 +107,6 @@ class Conversation(StrictModel):
     turns: tuple[DialogueTurn, ...] = Field(min_length=2)
     first_wish: str
     last_wishes: tuple[str, ...] = Field(min_length=1)
-
-    @property
-    def rounds(self) -> int:
-        """Number of turns spoken by cast members."""
-        return sum(
-            turn.speaker != ROBOT and (number == 0 or self.turns[number - 1].speaker == ROBOT)
-            for number, turn in enumerate(self.turns)
-        )
-
-    @property
-    def changed(self) -> bool:
-        """True if the final request differs from the initial one."""
-        return self.last_wishes != (self.first_wish,)
 
 
 class SceneBrief(StrictModel):
