@@ -154,22 +154,22 @@ def _selected(
     sources: Sequence[SourceText], profile: Profile | None, *, solids: bool
 ) -> Sequence[SourceText]:
     """Return the problems that pass the filters. Raise ProblemSourceError if none does."""
-    found = [(source, read_problem(source)[0]) for source in sources] if profile or solids else []
+    chosen = sources
     if profile is not None:
-        found = [(source, problem) for source, problem in found if not unreachable_atoms(problem, profile)]
-        if not found:
+        chosen = [source for source in chosen if not unreachable_atoms(read_problem(source)[0], profile)]
+        if not chosen:
             raise ProblemSourceError(
                 f"no goal of {len(sources)} problems is reached by the profile {profile.value!r}: leave out --reached-by"
             )
     if solids:
-        found = [
-            (source, problem)
-            for source, problem in found
-            if not any(map(is_substance, problem.objects.values()))
+        chosen = [
+            source
+            for source in chosen
+            if not any(map(is_substance, read_problem(source)[0].objects.values()))
         ]
-        if not found:
+        if not chosen:
             raise ProblemSourceError("each of the problems names a liquid or a powder: leave out --solids")
-    return [source for source, _ in found] if profile or solids else sources
+    return chosen
 
 
 def _write(

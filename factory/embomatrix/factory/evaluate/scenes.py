@@ -36,7 +36,7 @@ from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.editor import SceneEditor
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.batch import poses_for
-from embomatrix.factory.task_import.sources import SourceText, read_activity
+from embomatrix.factory.task_import.sources import SourceText, read_activity, read_jsonl
 from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, Lay, import_problem
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
@@ -96,7 +96,7 @@ def fixed_tasks(sample: Path) -> list[SceneTask]:
     """Return 70 tasks of the paper's sample file and 70 tasks of BEHAVIOR-1K. Raise EvaluationError or ProblemSourceError."""
     text = (resources.files("embomatrix.factory.evaluate") / LIST).read_text(encoding="utf-8")
     names = json.loads(text)
-    known = _sample(sample)
+    known = {source.name: source for source in read_jsonl(sample)}
     missing = [name for name, _ in names["sample"] if name not in known]
     if missing:
         raise EvaluationError(
@@ -104,16 +104,6 @@ def fixed_tasks(sample: Path) -> list[SceneTask]:
         )
     paper = [SceneTask(known[name], scene) for name, scene in names["sample"]]
     return paper + [SceneTask(read_activity(name), scene) for name, scene in names["behavior"]]
-
-
-def _sample(path: Path) -> dict[str, SourceText]:
-    try:
-        records = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-        return {each["name"]: SourceText(each["name"], each["bddl"], "embomatrix") for each in records}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise EvaluationError(
-            f"{path} can't be read as the paper's sample ({error}): expected JSON lines with 'name' and 'bddl'"
-        ) from error
 
 
 class RecordedMethod:

@@ -13,7 +13,7 @@ import numpy as np
 
 from embomatrix.factory.admission import RefusalReason, RefusedError
 from embomatrix.factory.scenes.view import SceneView
-from embomatrix.factory.task_import.expressible import AGENT, FLOORS, check_evaluable, check_expressible
+from embomatrix.factory.task_import.expressible import AGENT, FLOORS, check_expressible
 from embomatrix.factory.task_import.reach import pieces_of
 from embomatrix.factory.task_import.search import abilities_needed, search
 from embomatrix.world.bddl import BddlProblem
@@ -76,7 +76,7 @@ def bind(
     skill reaches is refused. With ``renumbering``, room numbers don't count. Scene objects in ``excluded`` are not
     used.
     """
-    (check_expressible if reachable else check_evaluable)(problem)
+    check_expressible(problem, reachable=reachable)
     inroom = {
         item.atom.args[0]: item.atom.args[1]
         for item in problem.init

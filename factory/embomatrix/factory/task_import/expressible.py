@@ -17,18 +17,16 @@ FLOORS: Final = frozenset({"floor.n.01", "driveway.n.01", "lawn.n.01"})
 AGENT: Final = "agent.n.01"
 
 
-def check_expressible(problem: BddlProblem) -> None:
-    """Raise RefusedError if no scene can represent the problem or no skill can reach its goal."""
-    _check_types(problem)
-    _check_goal(problem)
-    _check_start(problem)
+def check_expressible(problem: BddlProblem, *, reachable: bool = True) -> None:
+    """Raise RefusedError if no scene can represent the problem or no skill can reach its goal.
 
-
-def check_evaluable(problem: BddlProblem) -> None:
-    """Raise RefusedError if no scene can represent the problem or its goal can't be evaluated. Reach is not checked."""
+    Without ``reachable``, the goal must only be evaluable.
+    """
     _check_types(problem)
+    if reachable:
+        _check_reach(problem)
     for atom in atoms_of(problem.goal):
-        if atom.predicate not in HELD:
+        if not reachable and atom.predicate not in HELD:
             raise RefusedError(
                 RefusalReason.INEXPRESSIBLE,
                 f"the goal needs {render(atom)}, which scenes can't represent",
@@ -58,7 +56,7 @@ def _close_synsets(type_name: str) -> str:
     return f": did you mean {', '.join(close)}?" if close else ""
 
 
-def _check_goal(problem: BddlProblem) -> None:
+def _check_reach(problem: BddlProblem) -> None:
     unreachable_part = Reachability(problem).unreachable_part(problem.goal)
     if unreachable_part is not None:
         solid = not any(
@@ -68,8 +66,6 @@ def _check_goal(problem: BddlProblem) -> None:
             RefusalReason.INEXPRESSIBLE if solid else RefusalReason.SUBSTANCE,
             f"the goal needs {render(unreachable_part)}, which no skill achieves",
         )
-    for atom in atoms_of(problem.goal):
-        _check_goal_args(problem, atom)
 
 
 def _check_start(problem: BddlProblem) -> None:

@@ -60,15 +60,11 @@ def outcome_of(source: SourceText, imported: ImportedTask | Verified | TaskRefus
     problem, notes = read_problem(source)
     unreachable = {profile.value: unreachable_atoms(problem, profile) for profile in Profile}
     if isinstance(imported, TaskRefusal):
-        return ProblemOutcome(
-            source.name, source.source, "", imported.reason.value, imported.sentence, unreachable, notes
-        )
-    if isinstance(imported, Verified):
-        scene = base_scene_of(imported.record.task.scene_id)
-        return ProblemOutcome(source.name, source.source, scene, "", "", unreachable, imported.notes)
-    return ProblemOutcome(
-        source.name, source.source, imported.scene.base, "", "", unreachable, imported.notes
-    )
+        scene, reason, sentence = "", imported.reason.value, imported.sentence
+    else:
+        task = imported.record.task if isinstance(imported, Verified) else imported.task
+        scene, reason, sentence, notes = base_scene_of(task.scene_id), "", "", imported.notes
+    return ProblemOutcome(source.name, source.source, scene, reason, sentence, unreachable, notes)
 
 
 def report_to_json(outcomes: Sequence[ProblemOutcome]) -> dict[str, Any]:

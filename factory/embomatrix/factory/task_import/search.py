@@ -80,10 +80,7 @@ def search(
 
 
 def _rooms_for(scene: Scene, word: str, rng: np.random.Generator) -> list[str]:
-    if is_room_instance(word):
-        names = [room.name for room in scene.rooms if room.name == word]
-    else:
-        names = [room.name for room in scene.rooms if room.type == word]
+    names = [room.name for room in scene.rooms if word in (room.name, room.type)]
     if not names:
         raise RefusedError(
             RefusalReason.ROOM_MISSING,
