@@ -14,7 +14,7 @@ from embomatrix.factory.commands.terminal import counter, fail, say, show_table,
 from embomatrix.factory.metrics.figures import EvaluationFigures, write_evaluation
 from embomatrix.factory.pipeline.settings import scene_ids
 from embomatrix.factory.pipeline.store import ResumableLog
-from embomatrix.factory.task_import.batch import Verified
+from embomatrix.factory.task_import.batch import Imported, Verified
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.importer import Depth, ImportSettings, importing
 from embomatrix.factory.task_import.reach import unreachable_atoms
@@ -35,7 +35,6 @@ from embomatrix.factory.task_import.sources import (
     read_file,
     read_jsonl,
 )
-from embomatrix.factory.task_import.task import ImportedTask
 from embomatrix.world.bddl import BddlError
 from embomatrix.world.dataset import TASKS_FILE, DatasetError, write_dataset
 from embomatrix.world.substances import is_substance
@@ -121,7 +120,7 @@ def import_(
         )
 
 
-def _written(out: Path, made: Sequence[ImportedTask | Verified | TaskRefusal]) -> bool:
+def _written(out: Path, made: Sequence[Imported]) -> bool:
     """Write the admitted tasks as a dataset. Return False if there are none."""
     verified = [item for item in made if isinstance(item, Verified)]
     if verified:
@@ -232,27 +231,27 @@ def _import_all(
     settings: ImportSettings,
     jobs: int,
     log: ResumableLog[ProblemOutcome],
-) -> list[ImportedTask | Verified | TaskRefusal]:
+) -> list[Imported]:
     """Import the problems and append each outcome to the log.
 
     Return the imported tasks and refusals. Tasks that another process only bound are left out.
     """
-    made: list[ImportedTask | Verified | TaskRefusal] = []
+    made: list[Imported] = []
     done = len(log.outcomes)
     with (
         counter("problems", done + len(sources)) as count,
         importing(settings, min(jobs, len(sources) or 1)) as import_many,
     ):
         count(done)
-        for imported in import_many(sources):
-            log.add(imported.outcome)
-            if imported.item is not None:
-                made.append(imported.item)
+        for outcome, item in import_many(sources):
+            log.add(outcome)
+            if item is not None:
+                made.append(item)
             count(len(log.outcomes))
     return made
 
 
-def _print_one(source: SourceText, outcome: ImportedTask | Verified | TaskRefusal) -> None:
+def _print_one(source: SourceText, outcome: Imported) -> None:
     if isinstance(outcome, TaskRefusal):
         fail(f"{source.name} is refused ({outcome.reason}): {outcome.sentence}")
     for note in outcome.notes:

@@ -62,6 +62,10 @@ class Verified:
     """Notes of the import."""
 
 
+Imported = ImportedTask | Verified | TaskRefusal
+"""Result of an import."""
+
+
 def bind_first(
     source: SourceText, bases: Sequence[Scene], *, seed: int = 0, options: ImportOptions | None = None
 ) -> ImportedTask | TaskRefusal:

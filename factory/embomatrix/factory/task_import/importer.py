@@ -5,10 +5,9 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import StrEnum
 
-from embomatrix.factory.admission import TaskRefusal
 from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.task_import.batch import Verified, bind_first, verify_first
+from embomatrix.factory.task_import.batch import Imported, bind_first, verify_first
 from embomatrix.factory.task_import.report import ProblemOutcome, outcome_of
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.factory.task_import.task import ImportedTask, ImportOptions
@@ -16,7 +15,9 @@ from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.process_pool import shared_work
 
-ImportMany = Callable[[Sequence[SourceText]], Iterator["ImportOutcome"]]
+ImportOutcome = tuple[ProblemOutcome, Imported | None]
+"""Outcome of a problem, for the report and as a value. Bound tasks stay in the process that made them."""
+ImportMany = Callable[[Sequence[SourceText]], Iterator[ImportOutcome]]
 """Function that imports problems and yields the outcomes in order."""
 
 
@@ -38,14 +39,6 @@ class ImportSettings:
     look_ahead: bool
 
 
-@dataclass(frozen=True, slots=True)
-class ImportOutcome:
-    """Outcome of a problem, for the report and as a value. Bound tasks stay in the process that made them."""
-
-    outcome: ProblemOutcome
-    item: ImportedTask | Verified | TaskRefusal | None
-
-
 class ProblemImporter:
     """Importer with loaded base scenes and a placement library. Close it after use."""
 
@@ -57,21 +50,19 @@ class ProblemImporter:
 
     def run(self, source: SourceText) -> ImportOutcome:
         """Import one problem. Raise BddlError."""
-        item = self._imported(source)
-        return ImportOutcome(outcome_of(source, item), item)
+        seed = self._settings.seed
+        item: Imported
+        match self._settings.depth:
+            case Depth.INSTANTIATE:
+                item = bind_first(source, self._bases, seed=seed, options=ImportOptions(reachable=False))
+            case Depth.BIND:
+                item = bind_first(source, self._bases, seed=seed)
+            case Depth.VERIFY:
+                item = verify_first(source, self._bases, self._library, self._foresight, seed=seed)
+        return outcome_of(source, item), item
 
     def close(self) -> None:
         self._library.close()
-
-    def _imported(self, source: SourceText) -> ImportedTask | Verified | TaskRefusal:
-        seed = self._settings.seed
-        match self._settings.depth:
-            case Depth.INSTANTIATE:
-                return bind_first(source, self._bases, seed=seed, options=ImportOptions(reachable=False))
-            case Depth.BIND:
-                return bind_first(source, self._bases, seed=seed)
-            case Depth.VERIFY:
-                return verify_first(source, self._bases, self._library, self._foresight, seed=seed)
 
 
 def importing(settings: ImportSettings, jobs: int) -> AbstractContextManager[ImportMany]:
@@ -85,5 +76,5 @@ def importing(settings: ImportSettings, jobs: int) -> AbstractContextManager[Imp
 
 def _picklable_import(importer: ProblemImporter, source: SourceText) -> ImportOutcome:
     """Import one problem in another process, and drop bound tasks from the outcome."""
-    outcome = importer.run(source)
-    return ImportOutcome(outcome.outcome, None) if isinstance(outcome.item, ImportedTask) else outcome
+    outcome, item = importer.run(source)
+    return outcome, None if isinstance(item, ImportedTask) else item

@@ -9,11 +9,10 @@ from typing import Any, Final
 from embomatrix.factory.admission import TaskRefusal
 from embomatrix.factory.metrics.figures import EvaluationFigures
 from embomatrix.factory.scenes.build import base_scene_of
-from embomatrix.factory.task_import.batch import Verified
+from embomatrix.factory.task_import.batch import Imported, Verified
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.reach import unreachable_atoms
 from embomatrix.factory.task_import.sources import BEHAVIOR, EAI, SourceText
-from embomatrix.factory.task_import.task import ImportedTask
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.task import Profile
 
@@ -55,7 +54,7 @@ def outcome_from_json(value: dict[str, Any]) -> ProblemOutcome:
     return ProblemOutcome(**{**value, "unreachable": unreachable, "notes": tuple(value["notes"])})
 
 
-def outcome_of(source: SourceText, imported: ImportedTask | Verified | TaskRefusal) -> ProblemOutcome:
+def outcome_of(source: SourceText, imported: Imported) -> ProblemOutcome:
     """Return the outcome of a problem for the report. Raise BddlError."""
     problem, notes = read_problem(source)
     unreachable = {profile.value: unreachable_atoms(problem, profile) for profile in Profile}
