@@ -19,8 +19,8 @@ from embomatrix.factory.commands.language_model import (
     model_backed_agents,
 )
 from embomatrix.factory.commands.terminal import fail, say, user_errors
+from embomatrix.factory.evaluate.scenes import METHODS, LayoutMethod
 from embomatrix.factory.layout.agent_interfaces import LAYOUT_AGENTS, AgentName
-from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.generator import lay as lay_by_tree
 from embomatrix.factory.layout.request import Layout, LayoutRecord, RequestedObject
 from embomatrix.factory.pictures.scene import draw_plan
@@ -29,11 +29,6 @@ from embomatrix.factory.scenes.editor import SceneEditor
 from embomatrix.factory.task_import.sources import read_activity, read_file
 from embomatrix.factory.task_import.task import ImportOptions, import_problem
 
-BASELINES = {"random": lay_at_random, "poses": lay_by_poses}
-METHODS = ("tree", *BASELINES)
-MethodName = Annotated[
-    str, typer.Option(help="Layout method: tree, or one of the baselines random and poses.")
-]
 Out = Annotated[
     Path | None, typer.Option(help="Folder for a picture of the plan and for the brief of each agent.")
 ]
@@ -43,7 +38,7 @@ def lay(
     scene: Annotated[str, typer.Option(help="Base scene.")],
     bddl: Annotated[Path | None, typer.Option(help="A BDDL problem file.")] = None,
     activity: Annotated[str, typer.Option(help="An activity of the bddl package.")] = "",
-    method: MethodName = "tree",
+    method: Annotated[LayoutMethod, typer.Option(help="Layout method.")] = LayoutMethod.TREE,
     forms: Forms = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed. Equal seeds give equal scenes.")] = 0,
     out: Out = None,
@@ -54,8 +49,6 @@ def lay(
 ) -> None:
     """Lay the objects of one task out in a base scene and print the layout trees. Nothing is executed."""
     names = model_backed_agents(forms)
-    if method not in METHODS:
-        fail(f"there is no method {method!r}: expected one of {', '.join(METHODS)}")
     if (bddl is None) is (not activity):
         fail("expected exactly one of --bddl FILE and --activity NAME")
     with user_errors(more=MODEL_ERRORS), contextlib.ExitStack() as stack:
@@ -64,10 +57,10 @@ def lay(
         layouts: list[Layout] = []
 
         def lay_and_keep(editor: SceneEditor, items: Sequence[RequestedObject], seed: int) -> Layout:
-            baseline = BASELINES.get(method)
-            layouts.append(
-                baseline(editor, items, seed) if baseline else lay_by_tree(editor, items, seed, agents)
-            )
+            if method is LayoutMethod.TREE:
+                layouts.append(lay_by_tree(editor, items, seed, agents))
+            else:
+                layouts.append(METHODS[method](editor, items, seed))
             return layouts[-1]
 
         imported = import_problem(
