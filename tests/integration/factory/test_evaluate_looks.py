@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from embomatrix.factory.commands.app import app
 from embomatrix.factory.evaluate.judges import Impression, evaluate_looks, impression_of
 from embomatrix.factory.evaluate.page import with_factory
-from embomatrix.factory.evaluate.scenes import LIST, LayoutMethod, SceneTask
+from embomatrix.factory.evaluate.scenes import LIST, LayoutMethod
 from embomatrix.factory.evaluate.side_by_side import LEAST_PX, draw_side_by_side, named
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.request import RequestedObject
@@ -81,7 +81,7 @@ def test_single_room_keeps_its_objects_and_walls(flat: Scene) -> None:
 
 async def test_every_method_has_its_mean_and_unusable_answers_are_counted() -> None:
     server = ChatServer(json.dumps(POINTS), *["no"] * 3)
-    task = SceneTask(SourceText("apple", APPLE, "embomatrix"), "Rs_int")
+    task = SourceText("apple", APPLE, "embomatrix", scene="Rs_int")
     done: list[int] = []
     with server.serving() as url:
         async with Endpoint(url, "sees-1") as endpoint:
@@ -97,14 +97,14 @@ async def test_every_method_has_its_mean_and_unusable_answers_are_counted() -> N
 def test_picture_has_a_panel_for_each_method_or_the_reason_of_its_failure() -> None:
     huge = APPLE.replace("breakfast_table", "unicorn")
     one, none = (
-        draw_side_by_side(SceneTask(SourceText("apple", text, "embomatrix"), "Rs_int"), 0)
+        draw_side_by_side(SourceText("apple", text, "embomatrix", scene="Rs_int"), 0)
         for text in (APPLE, huge)
     )
     assert none.width == LEAST_PX * len(LayoutMethod)
     assert one.width > none.width
     assert len(none.getcolors(1 << 16)) > 1
     with pytest.raises(EvaluationError, match="is not a fixed task"):
-        named([SceneTask(SourceText("apple", APPLE, "embomatrix"), "Rs_int")], "pear")
+        named([SourceText("apple", APPLE, "embomatrix", scene="Rs_int")], "pear")
 
 
 def _fixed() -> list[tuple[str, str]]:

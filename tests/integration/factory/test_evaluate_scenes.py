@@ -13,7 +13,6 @@ from embomatrix.factory.evaluate.scenes import (
     LIST,
     LayoutMethod,
     LayoutOutcome,
-    SceneTask,
     evaluate_scenes,
     evaluation_of,
     fixed_tasks,
@@ -134,7 +133,7 @@ def test_resumed_run_makes_only_the_missing_trials(tmp_path: "Path") -> None:
     log = outcome_log(path, 0)
     for outcome in KNOWN:
         log.add(outcome)
-    tasks = [SceneTask(SourceText(name, UNICORN, "embomatrix"), "Rs_int") for name in ("known", "new")]
+    tasks = [SourceText(name, UNICORN, "embomatrix", scene="Rs_int") for name in ("known", "new")]
     counts: list[int] = []
     _, outcomes = evaluate_scenes(tasks, list(LayoutMethod), 0, 1, counts.append, outcome_log(path, 0))
     assert outcomes[:3] == KNOWN

@@ -25,8 +25,7 @@ def admitted_share(folder: Path, label: str = "") -> tuple[Figure, ...]:
     if not attempts:
         return ()
     share = 100 * sum(each["outcome"] == ADMITTED for each in attempts) / len(attempts)
-    name, goal = _named("admitted_share", label), None if label else GOAL_PERCENT
-    return (Figure(name, share, "%", Better.HIGHER, len(attempts), goal),)
+    return (_figure("admitted_share", label, share, "%", len(attempts), GOAL_PERCENT),)
 
 
 def evaluate_admissions(folder: Path) -> EvaluationFigures:
@@ -63,8 +62,7 @@ def _per_hour(folder: Path, attempts: Sequence[dict[str, Any]], label: str) -> t
     if not spent_s or not timed:
         return ()
     pace = CORES * 3600 * admitted / spent_s
-    name, goal = _named("admitted_per_hour", label), None if label else GOAL_PER_HOUR
-    return (Figure(name, pace, "tasks", Better.HIGHER, admitted, goal),)
+    return (_figure("admitted_per_hour", label, pace, "tasks", admitted, GOAL_PER_HOUR),)
 
 
 def _times(path: Path) -> Iterator[dict[str, Any]]:
@@ -106,5 +104,6 @@ def _settings(folder: Path) -> dict[str, Any]:
         ) from error
 
 
-def _named(name: str, label: str) -> str:
-    return f"{name} {label}".strip()
+def _figure(name: str, label: str, value: float, unit: str, n: int, goal: float) -> Figure:
+    """Return a figure. Only builds without a label have goals."""
+    return Figure(f"{name} {label}".strip(), value, unit, Better.HIGHER, n, None if label else goal)

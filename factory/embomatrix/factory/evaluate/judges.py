@@ -11,11 +11,12 @@ from typing import Final
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from embomatrix.factory.evaluate.scenes import METHODS, LayoutMethod, RecordedMethod, SceneTask
+from embomatrix.factory.evaluate.scenes import METHODS, LayoutMethod, RecordedMethod
 from embomatrix.factory.layout.organization import tree_in
 from embomatrix.factory.metrics.figures import EvaluationFigures
 from embomatrix.factory.pictures.sights import sight_of_room
 from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
 from embomatrix.llm.structured import ask
 from embomatrix.llm.values import ChatModel, ChatRequest, Message, Speaker, UnusableReplyError
@@ -134,7 +135,7 @@ async def impression_of(model: ChatModel, scene: Scene, added: Sequence[str], se
 
 async def evaluate_looks(
     model: ChatModel,
-    tasks: Sequence[SceneTask],
+    tasks: Sequence[SourceText],
     methods: Sequence[LayoutMethod],
     seed: int,
     progress: Callable[[int], None] = lambda _done: None,
@@ -146,7 +147,7 @@ async def evaluate_looks(
         base = build_base_scene(task.scene)
         for number, method in enumerate(methods):
             laid = RecordedMethod(METHODS[method])
-            imported = import_problem(task.source, base, seed=seed, options=ImportOptions(laid))
+            imported = import_problem(task, base, seed=seed, options=ImportOptions(laid))
             if isinstance(imported, ImportedTask) and laid.names:
                 try:
                     impression = await impression_of(model, imported.scene, laid.names, seed)

@@ -65,14 +65,6 @@ METHODS: Final[Mapping[LayoutMethod, Lay]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class SceneTask:
-    """Task of the fixed list and its base scene."""
-
-    source: SourceText
-    scene: str
-
-
-@dataclass(frozen=True, slots=True)
 class LayoutOutcome:
     """Outcome of one task with one method; ``solved`` means that the oracle's plan reaches the goal.
 
@@ -92,8 +84,10 @@ class LayoutOutcome:
     detail: str = ""
 
 
-def fixed_tasks(sample: Path) -> list[SceneTask]:
-    """Return 70 tasks of the paper's sample file and 70 tasks of BEHAVIOR-1K. Raise EvaluationError or ProblemSourceError."""
+def fixed_tasks(sample: Path) -> list[SourceText]:
+    """Return 70 tasks of the paper's sample file and 70 tasks of BEHAVIOR-1K with their base scenes.
+
+    Raise EvaluationError or ProblemSourceError."""
     text = (resources.files("embomatrix.factory.evaluate") / LIST).read_text(encoding="utf-8")
     names = json.loads(text)
     known = {source.name: source for source in read_jsonl(sample)}
@@ -102,8 +96,8 @@ def fixed_tasks(sample: Path) -> list[SceneTask]:
         raise EvaluationError(
             f"{sample} lacks {len(missing)} of the fixed tasks, {missing[0]!r} first: expected the sample of 400 tasks"
         )
-    paper = [SceneTask(known[name], scene) for name, scene in names["sample"]]
-    return paper + [SceneTask(read_activity(name), scene) for name, scene in names["behavior"]]
+    paper = [replace(known[name], scene=scene) for name, scene in names["sample"]]
+    return paper + [replace(read_activity(name), scene=scene) for name, scene in names["behavior"]]
 
 
 class RecordedMethod:
@@ -122,14 +116,14 @@ class RecordedMethod:
 
 
 def judge(
-    task: SceneTask, method: LayoutMethod, base: Scene, library: PlacementLibrary, *, seed: int = 0
+    task: SourceText, method: LayoutMethod, base: Scene, library: PlacementLibrary, *, seed: int = 0
 ) -> LayoutOutcome:
     """Lay a task out with a method, check the scene, and execute the oracle's plan in it."""
     timed = RecordedMethod(METHODS[method])
     began = time.process_time()
-    imported = import_problem(task.source, base, seed=seed, options=ImportOptions(timed))
+    imported = import_problem(task, base, seed=seed, options=ImportOptions(timed))
     refused = LayoutOutcome(
-        task=task.source.name,
+        task=task.name,
         scene=task.scene,
         method=method,
         generated=False,
@@ -226,7 +220,7 @@ def _figures(
             yield Figure(label, value, unit, better, len(values), goal if is_tree else None)
 
 
-Trial = tuple[SceneTask, LayoutMethod]
+Trial = tuple[SourceText, LayoutMethod]
 
 
 def outcome_log(path: Path | None, seed: int) -> ResumableLog[LayoutOutcome]:
@@ -242,7 +236,7 @@ def _outcome(value: dict[str, Any]) -> LayoutOutcome:
 
 
 def evaluate_scenes(
-    tasks: Sequence[SceneTask],
+    tasks: Sequence[SourceText],
     methods: Sequence[LayoutMethod],
     seed: int,
     jobs: int,
@@ -258,7 +252,7 @@ def evaluate_scenes(
     known = {(each.task, each.scene, each.method) for each in log.outcomes}
     by_scene: defaultdict[str, list[Trial]] = defaultdict(list)
     for task, method in trials:
-        if (task.source.name, task.scene, method) not in known:
+        if (task.name, task.scene, method) not in known:
             by_scene[task.scene].append((task, method))
     progress(len(trials) - sum(map(len, by_scene.values())))
     died = EvaluationError(
@@ -269,7 +263,7 @@ def evaluate_scenes(
             log.add(outcome)
             progress(len(log.outcomes))
     found = {(each.task, each.scene, each.method): each for each in log.outcomes}
-    outcomes = [found[task.source.name, task.scene, method] for task, method in trials]
+    outcomes = [found[task.name, task.scene, method] for task, method in trials]
     conditions = {
         "tasks": len(tasks),
         "base scenes": len({task.scene for task in tasks}),

@@ -7,11 +7,12 @@ from typing import Final
 from PIL import Image, ImageDraw, ImageFont
 
 from embomatrix.factory.admission import TaskRefusal
-from embomatrix.factory.evaluate.scenes import METHODS, SceneTask
+from embomatrix.factory.evaluate.scenes import METHODS
 from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.factory.pictures.scene import draw_plan
 from embomatrix.factory.pictures.sights import alone
 from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.factory.task_import.task import ImportOptions, import_problem
 
 CAPTION_PX: Final = 26
@@ -21,22 +22,22 @@ WIDTH: Final = 48
 """Characters per line of the reason in such a panel."""
 
 
-def named(tasks: Sequence[SceneTask], name: str) -> SceneTask:
+def named(tasks: Sequence[SourceText], name: str) -> SourceText:
     """Return the fixed task of this name. Raises EvaluationError."""
     for task in tasks:
-        if task.source.name == name:
+        if task.name == name:
             return task
     raise EvaluationError(
-        f"{name!r} is not a fixed task: expected one of {len(tasks)}, such as {tasks[0].source.name!r}"
+        f"{name!r} is not a fixed task: expected one of {len(tasks)}, such as {tasks[0].name!r}"
     )
 
 
-def draw_side_by_side(task: SceneTask, seed: int) -> Image.Image:
+def draw_side_by_side(task: SourceText, seed: int) -> Image.Image:
     """Return an RGB image with a panel for each method: the plan of the goal's first room, or the reason against a layout."""
     base = build_base_scene(task.scene)
     panels = []
     for method, lay in METHODS.items():
-        imported = import_problem(task.source, base, seed=seed, options=ImportOptions(lay))
+        imported = import_problem(task, base, seed=seed, options=ImportOptions(lay))
         if isinstance(imported, TaskRefusal):
             panels.append(_reason(method, imported))
         else:
