@@ -88,12 +88,12 @@ def test_sets_of_flat_supports_hold_eight_poses_or_more(cache) -> None:
 def test_every_small_object_has_a_standing_pose(engine, cache) -> None:
     for item in engine.scene.objects:
         if not item.fixed:
-            assert PlacementKey(item.asset_id, LEVEL_FLOOR.asset_id, Relation.ONTOP) in cache.placements
+            assert PlacementKey(item.asset_id, LEVEL_FLOOR, Relation.ONTOP) in cache.placements
 
 
 def class_poses(engine, cache, held, target, relation) -> list[Pose]:
     asset, support = engine.scene.asset_of(held), engine.scene.asset_of(target)
-    (standing,) = cache.placements[PlacementKey(asset.asset_id, LEVEL_FLOOR.asset_id, Relation.ONTOP)]
+    (standing,) = cache.placements[PlacementKey(asset.asset_id, LEVEL_FLOOR, Relation.ONTOP)]
     footprint = footprint_of(asset, standing)
     key = PlacementKey(footprint.name, support.asset_id, relation)
     pose_box_held = pose_box_asset(footprint, asset, standing)

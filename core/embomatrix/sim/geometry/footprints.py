@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from embomatrix.sim.geometry.bounds import bounds_of
-from embomatrix.world.asset import Asset, Link, SupportSurface
+from embomatrix.world.asset import Asset, Link
 from embomatrix.world.geometry import IDENTITY, ConvexPart, Pose, Shape
 
 SIDES_M: Final = (0.06, 0.09, 0.13, 0.19, 0.27, 0.38, 0.54)
@@ -17,7 +17,8 @@ SIDES_M: Final = (0.06, 0.09, 0.13, 0.19, 0.27, 0.38, 0.54)
 HEIGHTS_M: Final = (0.06, 0.12, 0.24, 0.48)
 DENSITY_KG_M3: Final = 300.0
 """Density of the boxes; weight has no influence on stability."""
-FLOOR_SIZE_M: Final = (4.0, 4.0, 0.1)
+LEVEL_FLOOR: Final = "level-floor"
+"""Name of a level floor as a support in a pose cache: the poses in which objects stand by themselves."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,14 +65,3 @@ def pose_box_asset(footprint: Footprint, asset: Asset, pose_floor_asset: Pose) -
     turn = Pose.from_xyz_yaw(0.0, 0.0, -footprint.height_m / 2, 0.0 if width >= depth else math.pi / 2)
     x, y, _ = box.center_m
     return turn @ Pose((-x, -y, -box.low_m[2])) @ pose_floor_asset
-
-
-def level_floor() -> Asset:
-    """Slab whose name in a pose cache marks the poses in which objects stand by themselves."""
-    size = FLOOR_SIZE_M
-    slab = ConvexPart(Shape.BOX, IDENTITY, size)
-    top = SupportSurface("top", (0.0, 0.0, size[2] / 2), (size[0], size[1]), math.inf)
-    return Asset("level-floor", "floor", "", size, 100.0, (Link("base", (slab,)),), (top,))
-
-
-LEVEL_FLOOR: Final = level_floor()

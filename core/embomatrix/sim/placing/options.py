@@ -131,7 +131,7 @@ class PlacementOptions:
 
     def _find_footprint(self, asset_id: str) -> tuple[str, Pose]:
         asset = self._scene.assets[asset_id]
-        standing = self._cache.placements.get(PlacementKey(asset_id, LEVEL_FLOOR.asset_id, Relation.ONTOP))
+        standing = self._cache.placements.get(PlacementKey(asset_id, LEVEL_FLOOR, Relation.ONTOP))
         footprint = footprint_of(asset, standing[0]) if standing else None
         if not standing or footprint is None:
             return "", IDENTITY

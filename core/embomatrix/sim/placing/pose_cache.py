@@ -186,7 +186,7 @@ def footprint_placements(
         pose = library.standing(asset)
         footprint = footprint_of(asset, pose) if pose is not None else None
         if pose is not None and footprint is not None:
-            found[PlacementKey(asset_id, LEVEL_FLOOR.asset_id, Relation.ONTOP)] = (pose,)
+            found[PlacementKey(asset_id, LEVEL_FLOOR, Relation.ONTOP)] = (pose,)
             classes[footprint] = None
     under = sorted({scene.by_name[name].asset_id for name in supports})
     for footprint, support_id, relation in itertools.product(classes, under, PLACE_RELATIONS):
