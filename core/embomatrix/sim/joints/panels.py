@@ -166,12 +166,3 @@ class DoorPanels:
             pose = self._engine.pose(other)
             yield CarriedObject(other, link, pose, frame.inverse() @ pose)
             waiting += [(item, link) for item in relations.resting_on(other)]
-
-
-def measure_swing(engine: PhysicsEngine, name: str, shares: Iterable[float]) -> None:
-    """Cache an object's boxes with all its joints at each of these shares of their travel."""
-    asset, pose = engine.scene.asset_of(name), engine.pose(name)
-    for share in shares:
-        fractions = (share,) * len(asset.joints)
-        bounds_of(asset).box(pose, fractions)
-        parts_of(asset).panels(pose, fractions)

@@ -7,7 +7,7 @@ from typing import Final
 from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.geometry.bounds import bounds_of, parts_of
 from embomatrix.sim.geometry.surfaces import links_with_surfaces
-from embomatrix.sim.joints.panels import PANEL_SLACK_M, DoorPanels, measure_swing
+from embomatrix.sim.joints.panels import PANEL_SLACK_M, DoorPanels
 from embomatrix.sim.state.relations import Relations
 from embomatrix.world.geometry import Aabb, Pose
 
@@ -59,7 +59,6 @@ class Swings:
         """
         for item in self._engine.scene.objects:
             if item.joints and not item.absent and not self._engine.state_bytes():
-                measure_swing(self._engine, item.name, (0.0, *SWING))
                 self._predict(item.name)
                 yield
 
