@@ -7,8 +7,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from embomatrix.sim.caches import BoundedCache
 from embomatrix.sim.engine import PhysicsEngine
-from embomatrix.sim.geometry.bounds import bounds_of, square_box
+from embomatrix.sim.geometry.bounds import ASSETS_KEPT, bounds_of, square_box
 from embomatrix.sim.geometry.surfaces import (
     REST_M,
     interior_around,
@@ -82,11 +83,10 @@ class SupportTracker:
     def __init__(self, engine: PhysicsEngine) -> None:
         self._engine = engine
         self._scene = engine.scene
-        self._at_start: dict[str, SupportState] = {}
-        self._now: dict[str, SupportState] = {}
-        self._middles_m: dict[str, float] = {}
-        """Middle one of an asset's three extents: in every orientation, one axis of the plane is at least this wide."""
-        self._cavities: dict[str, AssetCavities] = {}
+        count = len(engine.scene.objects)
+        self._at_start = BoundedCache(count, self._find)
+        self._now = BoundedCache(count, self._find)
+        self._cavities = BoundedCache(ASSETS_KEPT, self._find_cavities)
         self._stale: set[str] = set()
         """Objects with a change in their surroundings, whose support may differ since."""
         self._round = engine.journal.rounds
@@ -94,13 +94,9 @@ class SupportTracker:
 
     def of(self, name: str) -> SupportState:
         """Support of an object."""
-        known = self._cache_of(name)
-        state = known.get(name)
-        if state is None:
-            state = known[name] = self._find(name)
-        return state
+        return self._cache_of(name)[name]
 
-    def _cache_of(self, name: str) -> dict[str, SupportState]:
+    def _cache_of(self, name: str) -> BoundedCache[str, SupportState]:
         """Cache for the object's state, after the journal is read."""
         journal = self._engine.journal
         if len(journal.entries) != self._read or journal.rounds != self._round:
@@ -145,14 +141,10 @@ class SupportTracker:
     def _fits(self, name: str, place: Aabb) -> bool:
         """Return True if an object may fit into something of this size."""
         width, depth, _ = place.size_m
-        return self._middle_m(self._scene.asset_of(name)) <= math.hypot(width, depth) + SLACK_M
+        return _middle_m(self._scene.asset_of(name)) <= math.hypot(width, depth) + SLACK_M
 
-    def _middle_m(self, asset: Asset) -> float:
-        known = self._middles_m.get(asset.asset_id)
-        if known is None:
-            _, known, _ = sorted(asset.size_m)
-            self._middles_m[asset.asset_id] = known
-        return known
+    def _find_cavities(self, asset_id: str) -> AssetCavities:
+        return AssetCavities.of(self._scene.assets[asset_id])
 
     def _find(self, name: str) -> SupportState:
         engine, scene = self._engine, self._scene
@@ -218,10 +210,8 @@ class SupportTracker:
     def _interior(self, name: str, asset: Asset, pose: Pose, fractions: tuple[float, ...]) -> Interior | None:
         """Smallest cavity of an asset at a pose that contains the object."""
         engine, own = self._engine, self._scene.asset_of(name)
-        cavities = self._cavities.get(asset.asset_id)
-        if cavities is None:
-            cavities = self._cavities[asset.asset_id] = AssetCavities.of(asset)
-        if self._middle_m(own) > cavities.too_wide_m:
+        cavities = self._cavities[asset.asset_id]
+        if _middle_m(own) > cavities.too_wide_m:
             return None
         box = engine.aabb(name)
         # In every orientation the centre of the object's box moves less than this.
@@ -248,6 +238,11 @@ def _is_over(box: Aabb, other: Aabb) -> bool:
     x, y, _ = box.center_m
     (low_x, low_y, _), (high_x, high_y, _) = other.low_m, other.high_m
     return low_x - SLACK_M <= x <= high_x + SLACK_M and low_y - SLACK_M <= y <= high_y + SLACK_M
+
+
+def _middle_m(asset: Asset) -> float:
+    """Middle one of the three extents: in every orientation, one axis of the plane is at least this wide."""
+    return sorted(asset.size_m)[1]
 
 
 def _may_be_in(center: Vec3, interiors: Sequence[Interior], slack: float) -> bool:
