@@ -9,7 +9,6 @@ import numpy as np
 from embomatrix.sim.actions import CachedActor
 from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.live_world import LiveWorld
-from embomatrix.sim.state.facts import EngineFacts
 from embomatrix.sim.state.sources import Change
 from embomatrix.skills.check import check
 from embomatrix.skills.describe import ObjectDescription, done, final_lines, gained
@@ -93,7 +92,10 @@ class Simulator:
 
         The simulator closes both.
         """
-        self._world = LiveWorld(bundle, engine)
+        self.world = LiveWorld(bundle, engine)
+        """Current state, live until the next reset. Read-only."""
+        self.facts = self.world.facts
+        """Facts of the current state, live until the next reset."""
         self._tables = [task.table for task in bundle.tasks.values()]
         self._actor: Actor = actor if actor is not None else CachedActor()
         self._draws = StepRandom()
@@ -103,36 +105,26 @@ class Simulator:
         self._touched: set[str] = set()
 
     @property
-    def facts(self) -> EngineFacts:
-        """Facts of the current state, live until the next reset."""
-        return self._world.facts
-
-    @property
-    def world(self) -> LiveWorld:
-        """Current state, live until the next reset. Read-only."""
-        return self._world
-
-    @property
     def touched(self) -> frozenset[str]:
         """Objects on which a call succeeded since the last reset."""
         return frozenset(self._touched)
 
     def reset(self, task: Task, seed: int) -> None:
         """Return to the scene's start. ``seed`` (not negative) decides between equally good outcomes."""
-        self._world.reset(task)
-        self._actor.reset(self._world)
+        self.world.reset(task)
+        self._actor.reset(self.world)
         self._seed = seed
         self._count = 0
         self._touched = set()
-        self._hash = hashlib.sha256(self._world.scene.scene_id.encode())
-        self._hash.update(self._world.state_bytes())
+        self._hash = hashlib.sha256(self.world.scene.scene_id.encode())
+        self._hash.update(self.world.state_bytes())
 
     def run_step(self, call: SkillCall) -> Step:
         """Execute one call in the current state; the caller decides whether to continue after a failure.
 
         A call that its preconditions refuse changes nothing, nor does a failed call in cached mode.
         """
-        world = self._world
+        world = self.world
         self._count += 1
         held = world.carried[:1]
         refusal = check(world, call)
@@ -183,7 +175,7 @@ class Simulator:
 
         An idle process runs this before it forks slots, which then share the values.
         """
-        world = self._world
+        world = self.world
         yield from world.relations.supports.warm_up()
         yield from world.placer.warm_up()
         yield from world.navigator.warm_up()
@@ -194,11 +186,11 @@ class Simulator:
     def close(self) -> None:
         """Close the engine and the actor and end the simulator's use."""
         self._actor.close()
-        self._world.engine.close()
+        self.world.engine.close()
 
     def _message(self, call: SkillCall, held: Sequence[str], changes: Sequence[Change]) -> str:
-        cargo = self._world.carried[1:] if call.skill is Skill.PICK_UP else ()
-        sentence = done(call, target=target_of(self._world, call), held=held[0] if held else "", cargo=cargo)
+        cargo = self.world.carried[1:] if call.skill is Skill.PICK_UP else ()
+        sentence = done(call, target=target_of(self.world, call), held=held[0] if held else "", cargo=cargo)
         if not changes:
             return sentence
         by_object: dict[str, list[str]] = {}
@@ -207,7 +199,7 @@ class Simulator:
         return f"{sentence}; {gained(by_object)}"
 
     def _description(self, name: str) -> ObjectDescription:
-        world = self._world
+        world = self.world
         host = world.relations.host_of(name)
         asset = world.asset(name)
         states: list[str] = []
