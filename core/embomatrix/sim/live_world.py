@@ -28,14 +28,10 @@ class Hand:
 
     def __init__(self, engine: PhysicsEngine) -> None:
         self._engine = engine
-        self._pose_held_item: Mapping[str, Pose] = {}
+        self.offsets: Mapping[str, Pose] = {}
+        """Poses of the held object and its contents in the frame of the held object."""
         self.carried: tuple[str, ...] = ()
         """Held object, then its contents; empty for an empty hand."""
-
-    @property
-    def offsets(self) -> Mapping[str, Pose]:
-        """Poses of the held object and its contents in the frame of the held object."""
-        return self._pose_held_item
 
     def forget(self) -> None:
         """Empty the hand without placing anything, after a reset of the world."""
@@ -52,7 +48,7 @@ class Hand:
         """Place the held object with its contents. Return False and change nothing if the contents do not fit."""
         held, *contents = self.carried
         for item in contents:
-            self._engine.set_pose(item, pose @ self._pose_held_item[item])
+            self._engine.set_pose(item, pose @ self.offsets[item])
         # Set directly instead of multiplied by the identity: the placer's pose stays exact to the last bit.
         self._engine.set_pose(held, pose)
         group = frozenset(self.carried)
@@ -64,7 +60,7 @@ class Hand:
         return True
 
     def _hold(self, offsets: Mapping[str, Pose]) -> None:
-        self._pose_held_item, self.carried = offsets, tuple(offsets)
+        self.offsets, self.carried = offsets, tuple(offsets)
 
 
 class LiveWorld:
@@ -205,6 +201,6 @@ class LiveWorld:
 def prepare(bundle: Bundle, world: LiveWorld) -> Bundle:
     """Bundle with the arrays that the simulator derives from its scene. ``world`` holds that scene and is reset."""
     world.engine.reset()
-    obstacles, grid = world.navigator.ground.at_start
-    arrays = prepared_arrays(world.engine, obstacles, grid)
+    start = world.navigator.ground.at_start
+    arrays = prepared_arrays(world.engine, start.obstacles, start.grid)
     return replace(bundle, prepared=arrays) if arrays else bundle

@@ -13,9 +13,9 @@ from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.caches import RecentCache
 from embomatrix.sim.floor.grid import CELL_M, FloorGrid
 from embomatrix.sim.floor.navigation import Navigator
-from embomatrix.sim.floor.paths import FLOORS_KEPT, RecentDistances
 from embomatrix.sim.state.relations import Relations
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Pose
@@ -60,6 +60,13 @@ def walled_off(scene):
     return dataclasses.replace(scene, walls=(*scene.walls, box((5.05, 2, 1.2), (0.1, 0.9, 2.4))))
 
 
+def metres_between(navigator: Navigator, start: StandPose, end: StandPose) -> float | None:
+    """Length of the shortest free path between two poses, None for no path."""
+    grid = navigator.ground.grid
+    first, last = (grid.cell(pose.x_m, pose.y_m) for pose in (start, end))
+    return grid.distance(first, last) if first is not None and last is not None else None
+
+
 def test_every_object_has_standing_poses_within_reach_that_face_it(engine, navigator) -> None:
     for name in engine.scene.by_name:
         stands = navigator.stands(name, navigator.start)
@@ -70,7 +77,7 @@ def test_every_object_has_standing_poses_within_reach_that_face_it(engine, navig
             offset = np.clip(at, low, high) - at
             assert ROBOT.shoulder_m <= np.linalg.norm(offset) <= ROBOT.reach_m
             assert math.atan2(offset[1], offset[0]) == pytest.approx(stand.yaw)
-            assert navigator.reachable(navigator.start, stand)
+            assert metres_between(navigator, navigator.start, stand) is not None
 
 
 def test_robot_never_stands_within_its_radius_of_a_part_or_wall(engine, navigator) -> None:
@@ -121,11 +128,11 @@ def test_arm_does_not_pass_through_walls(engine, navigator) -> None:
 
 def test_path_leads_around_furniture_and_through_the_doorway(navigator) -> None:
     start, target = navigator.start, navigator.stands("mug_1", navigator.start)[0]
-    length = navigator.path_length(start, target)
+    length = metres_between(navigator, start, target)
     straight = math.dist((start.x_m, start.y_m), (target.x_m, target.y_m))
     assert length is not None
     assert straight <= length <= 1.4 * straight
-    assert navigator.path_length(target, start) == pytest.approx(length, abs=1e-4)
+    assert metres_between(navigator, target, start) == pytest.approx(length, abs=1e-4)
 
 
 def test_straight_drives_between_path_corners_have_about_its_length(navigator) -> None:
@@ -134,7 +141,7 @@ def test_straight_drives_between_path_corners_have_about_its_length(navigator) -
     points = [(start.x_m, start.y_m), *corners, (end.x_m, end.y_m)]
     driven = sum(math.dist(a, b) for a, b in itertools.pairwise(points))
     assert corners
-    assert driven <= navigator.path_length(start, end) + 0.2
+    assert driven <= metres_between(navigator, start, end) + 0.2
     for (ax, ay), (bx, by) in itertools.pairwise(corners):
         yaw, length = math.atan2(by - ay, bx - ax), math.dist((ax, ay), (bx, by))
         assert navigator.forward(StandPose(ax, ay, yaw), yaw, length) == pytest.approx(length)
@@ -145,8 +152,7 @@ def test_no_path_leads_through_a_bricked_up_doorway(pool) -> None:
     navigator = Navigator(engine, Relations(engine))
     assert navigator.stands("mug_1", navigator.start) == ()
     assert navigator.room_entry("living_room_0", navigator.start) is None
-    assert navigator.path_length(navigator.start, StandPose(7.0, 1.2, 0.0)) is None
-    assert not navigator.reachable(navigator.start, StandPose(7.0, 1.2, 0.0))
+    assert metres_between(navigator, navigator.start, StandPose(7.0, 1.2, 0.0)) is None
     engine.close()
 
 
@@ -207,8 +213,7 @@ def test_robot_drives_to_the_first_standing_pose_with_any_open_doors(engine, nav
 
 def test_place_off_the_map_is_not_reachable(navigator) -> None:
     for x, y in ((-50.0, 0.0), (math.nan, 1.0), (2.0, 1.3)):
-        assert not navigator.reachable(navigator.start, StandPose(x, y, 0.0))
-        assert navigator.path_length(navigator.start, StandPose(x, y, 0.0)) is None
+        assert metres_between(navigator, navigator.start, StandPose(x, y, 0.0)) is None
 
 
 @settings(max_examples=40, deadline=None)
@@ -285,15 +290,11 @@ def test_robot_beside_free_cells_snaps_to_the_nearest(x, y) -> None:
         assert float(np.linalg.norm(np.array(grid.center(cell)) - (x, y))) <= nearest + CELL_M
 
 
-def test_only_recently_used_floors_keep_their_distances():
-    free = np.zeros((5, 5), dtype=np.bool_)
-    free[1:4, 1:4] = True
-    recent = RecentDistances(CELL_M)
-    floors = [object() for _ in range(FLOORS_KEPT + 1)]
-    first = recent.over(floors[0], lambda: free)
-    assert recent.over(floors[0], lambda: free) is first
-    for floor in floors[1:]:
-        recent.over(floor, lambda: free)
-    again = recent.over(floors[0], lambda: free)
-    assert again is not first
-    assert again.to((1, 1))[3, 3] == first.to((1, 1))[3, 3]
+def test_only_recently_used_values_are_cached():
+    recent: RecentCache[int, object] = RecentCache(3)
+    first = recent.get(0, object)
+    assert recent.get(0, object) is first
+    for key in range(1, 4):
+        recent.get(key, object)
+    assert recent.get(3, object) is recent.get(3, object)
+    assert recent.get(0, object) is not first

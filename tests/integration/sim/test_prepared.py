@@ -44,14 +44,12 @@ def test_prepared_arrays_equal_derived_ones(bundle):
     bare = replace(bundle, prepared={})
     with _loaded(bare) as derived, _loaded(bundle) as carried:
         boxes = tuple(derived.world.engine.aabb(item.name) for item in bundle.scene.objects)
-        (obstacles, grid), (others, other) = (
-            world.world.navigator.ground.at_start for world in (derived, carried)
-        )
+        one, other = (world.world.navigator.ground.at_start for world in (derived, carried))
     assert boxes == found.object_boxes
-    assert np.array_equal(grid.covered, other.covered)
-    assert np.array_equal(grid.free, other.free)
+    assert np.array_equal(one.grid.covered, other.grid.covered)
+    assert np.array_equal(one.grid.free, other.grid.free)
     for column in ("boxes", "owners", "is_panel"):
-        assert np.array_equal(getattr(obstacles, column), getattr(others, column))
+        assert np.array_equal(getattr(one.obstacles, column), getattr(other.obstacles, column))
 
 
 @pytest.mark.parametrize("plan", PLANS)

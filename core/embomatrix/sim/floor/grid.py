@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from embomatrix.sim.caches import RecentCache
 from embomatrix.sim.floor.components import FloorParts, Window, overlap
-from embomatrix.sim.floor.paths import Cell, Distances, RecentDistances, cheapest_path
+from embomatrix.sim.floor.paths import Cell, Distances, cheapest_path
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import FloatArray, Vec2
 from embomatrix.world.scene import Scene
@@ -25,6 +26,8 @@ Changes = tuple[tuple[FloatArray, int], ...]
 CELL_M: Final = 0.05
 SNAP_CELLS: Final = 6
 """A robot within 30 cm of a free cell counts as standing on it."""
+FLOORS_KEPT: Final = 3
+"""Most recently used floors with distances in memory: those of a house with a garden take 20 MB."""
 DOORWAY_DEPTH_M: Final = 0.4
 """Depth of a doorway's floor, centred on the wall: more than any wall's thickness."""
 
@@ -35,31 +38,30 @@ class FloorGrid:
     A scene's grid is built once; ``changed`` derives the next grid at the cost of the changed region.
     """
 
-    def __init__(self, scene: Scene, boxes: FloatArray) -> None:
-        """Rasterise obstacles, shape (n, 6), and inflate them by the robot's radius."""
-        self._lay_out(scene)
+    def __init__(
+        self, scene: Scene, boxes: FloatArray, stored: tuple[NDArray[np.int16], BoolArray] | None = None
+    ) -> None:
+        """Rasterise obstacles, shape (n, 6), and inflate them by the robot's radius.
+
+        ``stored`` are ``covered`` and ``free`` of an earlier grid of these boxes, of shape ``grid_shape``.
+        """
+        self._origin = _origin_of(scene)
+        self._origin_m = (float(self._origin[0]), float(self._origin[1]))
+        self._shape = grid_shape(scene)
+        self._changes: Changes = ()
+        self._recent: RecentCache[object, Distances] = RecentCache(FLOORS_KEPT)
+        self._own = object()
+        covered, free = stored or (self._rasterised(scene, boxes), None)
+        self._covered = covered
+        self._free: BoolArray | None = _clear(covered) if free is None else free
+
+    def _rasterised(self, scene: Scene, boxes: FloatArray) -> NDArray[np.int16]:
         covered = (~_floor_of(scene, self._shape, self._window)).astype(np.int16)
         for box in boxes.tolist():
             covered[self._window(box[:2], box[2:4])] += 1
         for edge in (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]):
             covered[edge] += 1
-        self._covered = covered
-        self._free: BoolArray | None = _clear(covered)
-
-    @classmethod
-    def restored(cls, scene: Scene, covered: NDArray[np.int16], free: BoolArray) -> FloorGrid:
-        """Grid of the scene from stored arrays, of shape ``grid_shape``."""
-        grid = cls.__new__(cls)
-        grid._lay_out(scene)
-        grid._covered, grid._free = covered, free
-        return grid
-
-    def _lay_out(self, scene: Scene) -> None:
-        self._origin = _origin_of(scene)
-        self._origin_m = (float(self._origin[0]), float(self._origin[1]))
-        self._shape = grid_shape(scene)
-        self._changes: Changes = ()
-        self._recent, self._own = RecentDistances(CELL_M), object()
+        return covered
 
     @property
     def covered(self) -> NDArray[np.int16]:
@@ -261,7 +263,7 @@ class FloorGrid:
 
     @property
     def _distances(self) -> Distances:
-        return self._recent.over(self._own, lambda: self.free)
+        return self._recent.get(self._own, lambda: Distances(self.free, CELL_M))
 
     def _cell_at(self, x_m: float, y_m: float) -> Cell:
         low_x, low_y = self._origin_m

@@ -1,7 +1,7 @@
 """Obstacles on the floor and the free space between them, in the scene as loaded and now."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from embomatrix.sim.caches import RecentCache
@@ -30,7 +30,7 @@ class FloorLayout:
 
     obstacles: Obstacles
     grid: FloorGrid
-    narrowed: RecentCache[OpenJoints, FloorGrid]
+    narrowed: RecentCache[OpenJoints, FloorGrid] = field(default_factory=lambda: RecentCache(NARROWED_KEPT))
 
 
 class Ground:
@@ -45,14 +45,13 @@ class Ground:
         blocking = [item for item in self._scene.objects if item.fixed or self._on_floor(item.name)]
         self._on_floor_at_start = {self.numbers[item.name] for item in blocking if not item.fixed}
         if prepared is not None:
-            obstacles = prepared.obstacles
-            grid = FloorGrid.restored(self._scene, prepared.covered, prepared.free)
+            obstacles, arrays = prepared.obstacles, (prepared.covered, prepared.free)
         else:
-            obstacles = Obstacles.joined(
-                [self._walls(), *(self._parts_of(item.name, engine.pose(item.name)) for item in blocking)]
-            )
-            grid = FloorGrid(self._scene, obstacles.blocking)
-        self._at_start = FloorLayout(obstacles, grid, RecentCache(NARROWED_KEPT))
+            parts = [self._parts_of(item.name, engine.pose(item.name)) for item in blocking]
+            obstacles, arrays = Obstacles.joined([self._walls(), *parts]), None
+        grid = FloorGrid(self._scene, obstacles.blocking, arrays)
+        self.at_start = FloorLayout(obstacles, grid)
+        """Floor in the scene as loaded. Read-only."""
         self._layouts: RecentCache[Floor, FloorLayout] = RecentCache(GRIDS_KEPT)
         self._moved: dict[int, Pose | None] = {}
         """Unsorted entries of ``floor``."""
@@ -88,7 +87,7 @@ class Ground:
     def _layout(self) -> FloorLayout:
         """Current layout, built on demand: the robot does not drive after a plan's last placement."""
         if self._current is None:
-            self._current = self._layouts.get(self.floor, self._make_layout) if self.floor else self._at_start
+            self._current = self._layouts.get(self.floor, self._make_layout) if self.floor else self.at_start
         return self._current
 
     @property
@@ -112,8 +111,10 @@ class Ground:
         if self._now is None and not self.open_joints:
             self._now = self._layout.grid
         if self._now is None:
-            known = self._with_one_open.get(self.open_joints) if self._layout is self._at_start else None
-            self._now = known or self._narrowed()
+            known = self._with_one_open.get(self.open_joints) if self._layout is self.at_start else None
+            self._now = known or self._layout.narrowed.get(
+                self.open_joints, lambda: self.shut.narrowed(self.open_panels.blocking)
+            )
         return self._now
 
     def warm_up(self) -> Iterator[None]:
@@ -123,19 +124,8 @@ class Ground:
         """
         for joints in self._open_panels.each_open():
             panels = self._open_panels.obstacles(joints)
-            self._with_one_open[joints] = self._at_start.grid.narrowed(panels.blocking)
+            self._with_one_open[joints] = self.at_start.grid.narrowed(panels.blocking)
             yield
-
-    def _narrowed(self) -> FloorGrid:
-        """Grid with the panels that are open now."""
-        return self._layout.narrowed.get(
-            self.open_joints, lambda: self.shut.narrowed(self.open_panels.blocking)
-        )
-
-    @property
-    def at_start(self) -> tuple[Obstacles, FloorGrid]:
-        """``obstacles`` and ``shut`` in the scene as loaded. Read-only."""
-        return self._at_start.obstacles, self._at_start.grid
 
     def with_shut(self, number: int) -> FloorGrid:
         """Grid if one object's panels were shut."""
@@ -159,11 +149,9 @@ class Ground:
             if pose is not None
         ]
         come = Obstacles.joined([Obstacles.of([], WALLS, []), *parts])
-        obstacles, grid = self.at_start
+        obstacles = self.at_start.obstacles
         now = Obstacles.joined([obstacles.without(moved), come])
-        return FloorLayout(
-            now, grid.changed(obstacles.only(moved).blocking, come.blocking), RecentCache(NARROWED_KEPT)
-        )
+        return FloorLayout(now, self.at_start.grid.changed(obstacles.only(moved).blocking, come.blocking))
 
     def _on_floor(self, name: str) -> bool:
         return not self._engine.is_parked(name) and self._engine.aabb(name).low_m[2] < ON_FLOOR_M

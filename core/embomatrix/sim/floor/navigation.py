@@ -80,22 +80,6 @@ class Navigator:
         robot = self._scene.robot
         return StandPose(robot.x_m, robot.y_m, robot.yaw)
 
-    def reachable(self, origin: StandPose, target: StandPose) -> bool:
-        """Return True if a free path leads from one pose to the other."""
-        first, last = self._cell(origin), self._cell(target)
-        return (
-            first is not None
-            and last is not None
-            and self.ground.grid.label(first) == self.ground.grid.label(last)
-        )
-
-    def path_length(self, origin: StandPose, target: StandPose) -> float | None:
-        """Length in metres of the shortest path; None for no path. Distance fields are cached by target: use few targets."""
-        first, last = self._cell(origin), self._cell(target)
-        if first is None or last is None:
-            return None
-        return self.ground.grid.distance(first, last)
-
     def path(self, origin: StandPose, target: StandPose) -> tuple[Vec2, ...]:
         """Corners of a short free path between two poses, both excluded; empty for no path."""
         first, last = self._cell(origin), self._cell(target)
@@ -188,12 +172,11 @@ class Navigator:
         """Return True if changes on the floor left the object's standing area and the arm's access unchanged."""
         if self.ground.floor == ():
             return True
-        before, grid = self.ground.at_start
-        area = self.standing_area(name)
-        if not self.ground.shut.is_like(grid, *area.window):
+        before, area = self.ground.at_start, self.standing_area(name)
+        if not self.ground.shut.is_like(before.grid, *area.window):
             return False
-        own = [self.ground.numbers[item] for item in (name, *self._relations.hosts_of(name))]
-        return np.array_equal(_within_reach(before.blockers(area.box, own), area.box), area.blockers)
+        blockers = before.obstacles.blockers(area.box, self._own(name))
+        return np.array_equal(_within_reach(blockers, area.box), area.blockers)
 
     def _find_stands(self, key: tuple[Surroundings, OpenJoints, int]) -> tuple[StandPose, ...]:
         """Standing poses on one component of the current grid, or of the grid with all panels shut."""
@@ -264,8 +247,11 @@ class Navigator:
         return _within_reach(self._all_blockers_of(name), self._relations.body(name))
 
     def _all_blockers_of(self, name: str) -> FloatArray:
-        own = [self.ground.numbers[item] for item in (name, *self._relations.hosts_of(name))]
-        return self.ground.obstacles.blockers(self._relations.body(name), own)
+        return self.ground.obstacles.blockers(self._relations.body(name), self._own(name))
+
+    def _own(self, name: str) -> list[int]:
+        """Numbers of the object and its hosts."""
+        return [self.ground.numbers[item] for item in (name, *self._relations.hosts_of(name))]
 
     def _key(self, name: str) -> Surroundings:
         """Cache key of standing poses and lines of approach, without the robot's position."""
@@ -274,7 +260,7 @@ class Navigator:
     @functools.cached_property
     def _part_of_start(self) -> int:
         """Component of the initial floor at the robot's start; 0 for none."""
-        _, grid = self.ground.at_start
+        grid = self.ground.at_start.grid
         start = grid.cell(self.start.x_m, self.start.y_m)
         return grid.label(start) if start is not None else 0
 

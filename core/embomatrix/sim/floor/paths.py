@@ -3,7 +3,6 @@
 import functools
 import heapq
 import math
-from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -19,7 +18,6 @@ BoolArray = NDArray[np.bool_]
 
 Cell = tuple[int, int]
 
-FLOORS_KEPT: Final = 3
 CROSSING_COST: Final = 100.0
 """Cost of a blocked cell in free cells: driving through an object is as bad as a detour of this many per cell."""
 FIELDS_KEPT: Final = 64
@@ -32,18 +30,16 @@ class Distances:
     def __init__(self, free: BoolArray, cell_m: float) -> None:
         self._free = free
         self._cell_m = cell_m
-        self._fields: dict[Cell, FloatArray] = {}
+        self._fields: RecentCache[Cell, FloatArray] = RecentCache(FIELDS_KEPT)
 
     def to(self, cell: Cell) -> FloatArray:
         """Metres from every cell to this one, in the floor's shape; infinity for no path."""
-        field = self._fields.get(cell)
-        if field is None:
-            if len(self._fields) == FIELDS_KEPT:
-                del self._fields[next(iter(self._fields))]
-            source = cell[0] * self._free.shape[1] + cell[1]
-            field = np.asarray(csgraph.dijkstra(self._graph, indices=source), dtype=np.float32)
-            field = self._fields[cell] = field.reshape(self._free.shape)
-        return field
+        return self._fields.get(cell, lambda: self._find_field(cell))
+
+    def _find_field(self, cell: Cell) -> FloatArray:
+        source = cell[0] * self._free.shape[1] + cell[1]
+        field = np.asarray(csgraph.dijkstra(self._graph, indices=source), dtype=np.float32)
+        return np.asarray(field.reshape(self._free.shape))
 
     def descent(self, start: Cell, end: Cell) -> list[Cell]:
         """Cells of a shortest path between two connected cells, both included."""
@@ -84,18 +80,6 @@ class Distances:
         size = rows * columns
         one_way = sparse.coo_matrix((weight, (source, target)), shape=(size, size))
         return (one_way + one_way.T).tocsr()
-
-
-class RecentDistances:
-    """Distances over the most recently used floors: a house with a garden takes 20 MB."""
-
-    def __init__(self, cell_m: float) -> None:
-        self._cell_m = cell_m
-        self._kept: RecentCache[object, Distances] = RecentCache(FLOORS_KEPT)
-
-    def over(self, floor: object, free: Callable[[], BoolArray]) -> Distances:
-        """Distances over a floor; ``free`` returns its free cells if they are needed."""
-        return self._kept.get(floor, lambda: Distances(free(), self._cell_m))
 
 
 def cheapest_path(free: BoolArray, floor: BoolArray, start: Cell, goal: Window) -> list[Cell]:
