@@ -73,7 +73,7 @@ class PhysicsScene:
     def complete(self) -> Iterator[None]:
         """Complete deferred work of later executions."""
         navigator = self._simulator.world.navigator
-        navigator.reachable(navigator.start, navigator.start)
+        navigator.ground.grid.is_free(navigator.start.x_m, navigator.start.y_m)  # connects the free cells
         yield
         yield from self._engine.warm_up()
         yield from self._simulator.warm_up()
