@@ -19,7 +19,7 @@ from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.floor.prepared import PreparedScene
 from embomatrix.worker.slots.slot_program import BundleCorruptError, run_program
-from embomatrix.worker.slots.warm_up import PLANS, TIMES, WARM_UP, warm_up_bundle
+from embomatrix.worker.slots.warm_up import PLAN, TIMES, WARM_UP, warm_up_bundle
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle, read_bundle
 from embomatrix.world.inflation import BundleError, bundle_digest
 
@@ -51,10 +51,9 @@ class Physics:
         data = encode_bundle(warm_up_bundle())
         for _ in range(TIMES):
             scene = PhysicsScene(decode_bundle(data), self._clients)
-            for plan in PLANS:
-                rollout = Rollout(WARM_UP, WARM_UP, bundle_digest(data), WARM_UP, plan, 0)
-                completed = scene.execute(rollout_from_proto(rollout_to_proto(rollout)))
-                completed_to_proto(completed).SerializeToString()
+            rollout = Rollout(WARM_UP, WARM_UP, bundle_digest(data), WARM_UP, PLAN, 0)
+            completed = scene.execute(rollout_from_proto(rollout_to_proto(rollout)))
+            completed_to_proto(completed).SerializeToString()
             scene.close()
 
 
