@@ -61,8 +61,10 @@ def add_settings(
             if name in parameters or name in skip:
                 continue
             default = None if field.is_required() or field.default_factory else field.default
+            word = name.replace("_", "-")
+            is_switch = field.annotation == bool | None
             option = typer.Option(
-                f"--{name.replace('_', '-')}",
+                f"--{word}/--no-{word}" if is_switch else f"--{word}",
                 help=(field.description or "").replace("``", "`"),
                 show_default=bool(default),
                 rich_help_panel=panel,

@@ -17,7 +17,7 @@ LOOPBACK_NAMES: Final = ("localhost", "127.0.0.1", "::1")
 class ManagerSettings(BaseModel):
     """Settings of a manager. Outside loopback it needs certificates and tokens: see ``access.protection``."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     host: str = "127.0.0.1"
     """Address of the gRPC services."""

@@ -8,13 +8,14 @@ from pathlib import Path  # typer evaluates the annotation
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
+from pydantic import ValidationError
 
 from embomatrix.host.failure import fail
+from embomatrix.manager.settings import ManagerSettings
 from embomatrix.rpc.logs import LogFormat, hide, log_to_stderr, without_secrets
-from embomatrix.rpc.options import Ca, LogLines, Manager, Token
+from embomatrix.rpc.options import Ca, LogLines, Manager, Token, add_settings
 
 if TYPE_CHECKING:
-    from embomatrix.manager.settings import ManagerSettings
     from embomatrix.rpc.admin_client import AdminClient
     from embomatrix.rpc.wire.tokens import AccessRole, TokenInfo
 
@@ -33,74 +34,24 @@ T = TypeVar("T")
 _refuse = functools.partial(fail, "manager")
 """Print one sentence and exit with status 2."""
 
-DataDir = Annotated[
-    Path | None, typer.Option(help="Folder of bundles and the state file.", show_default=False)
-]
-ShownDataset = Annotated[
-    Path | None, typer.Option(help="Dataset whose tasks the dashboard shows.", show_default=False)
-]
-State = Annotated[
-    str,
-    typer.Option(help="memory: | sqlite:PATH | redis://HOST:PORT/DB. Default: a file in the data folder."),
-]
-Advertise = Annotated[
-    str,
-    typer.Option(
-        help="HOST:PORT under which others reach this manager, if different from the serving address."
-    ),
-]
-SharedToken = Annotated[
-    str,
-    typer.Option(
-        envvar="EMBOMATRIX_TOKEN",
-        help="Shared secret with the role of an admin, in addition to issued tokens; or @FILE.",
-        show_default=False,
-    ),
-]
-TlsCert = Annotated[
-    Path | None, typer.Option(help="Certificate chain (PEM). Default: the one of `init`.", show_default=False)
-]
-TlsKey = Annotated[
-    Path | None, typer.Option(help="Private key of the certificate (PEM).", show_default=False)
-]
-TlsCa = Annotated[
-    Path | None, typer.Option(help="Certificate of the signing authority (PEM).", show_default=False)
-]
-InsecureBind = Annotated[
-    bool, typer.Option("--insecure-bind", help="Serve beyond loopback without TLS or tokens.")
-]
-Audit = Annotated[
-    bool | None,
-    typer.Option(
-        "--audit/--no-audit",
-        help="Audit the results of all runs on other workers. Default: if other machines may join.",
-        show_default=False,
-    ),
-]
-
 
 @app.command()
 def serve(
     context: typer.Context,
-    host: Annotated[str, typer.Option(help="Address of the gRPC services.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="gRPC port; 0 takes a free one.")] = 50070,
-    http_host: Annotated[str, typer.Option(help="Address of the dashboard.")] = "127.0.0.1",
-    http_port: Annotated[int, typer.Option(help="Port of the dashboard; 0 takes a free one.")] = 8070,
-    state: State = "",
-    advertise: Advertise = "",
-    data_dir: DataDir = None,
-    dataset: ShownDataset = None,
-    token: SharedToken = "",
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
-    tls_ca: TlsCa = None,
-    insecure_bind: InsecureBind = False,
-    audit: Audit = None,
+    token: Annotated[
+        str,
+        typer.Option(
+            envvar="EMBOMATRIX_TOKEN",
+            help="Shared secret with the role of an admin, in addition to issued tokens; or @FILE.",
+            show_default=False,
+        ),
+    ] = "",
     log_level: Annotated[
         str,
         typer.Option(help="debug, info, warning or error; debug also checks invariants."),
     ] = "info",
     log_format: LogLines = LogFormat.HUMAN,
+    **_: object,
 ) -> None:
     """Serve until interrupted."""
     _log_to_stderr(log_level, log_format)
@@ -109,9 +60,14 @@ def serve(
     _serve(settings)
 
 
+add_settings(serve, ManagerSettings)
+
+
 @app.command()
 def init(
-    data_dir: DataDir = None,
+    data_dir: Annotated[
+        Path | None, typer.Option(help="Folder of bundles and the state file.", show_default=False)
+    ] = None,
     san: Annotated[
         list[str] | None,
         typer.Option(help="Additional name or address of this machine; may be repeated.", show_default=False),
@@ -165,10 +121,6 @@ def _token(text: str) -> str:
 
 def _settings(options: Mapping[str, object]) -> ManagerSettings:
     """Return the settings of the same names as the given options, or exit with a sentence about a wrong one."""
-    from pydantic import ValidationError
-
-    from embomatrix.manager.settings import ManagerSettings
-
     known = ManagerSettings.model_fields
     given = {name: value for name, value in options.items() if name in known and value is not None}
     try:
