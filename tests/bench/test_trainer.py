@@ -56,7 +56,7 @@ def test_shares_are_of_the_given_steps_and_the_time_since_earlier_ones():
 def test_missing_dataset_is_one_sentence():
     result = CliRunner().invoke(app, ["trainer", "--dataset=nowhere"])
     assert result.exit_code == 2
-    assert "no dataset at nowhere" in " ".join(result.output.split())
+    assert "there is no dataset in nowhere" in " ".join(result.output.split())
 
 
 @pytest.mark.slow

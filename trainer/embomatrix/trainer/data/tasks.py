@@ -44,10 +44,6 @@ class TaskSet:
 
 def load_tasks(folder: Path) -> TaskSet:
     """Load a dataset folder. Raises TrainerError if it is missing or damaged."""
-    if not folder.is_dir():
-        raise TrainerError(
-            f"no dataset at {folder}: build one with `embomatrix factory build --out={folder}`, or pass --dataset"
-        )
     kinds = KindTable()
     try:
         dataset = Dataset.load(folder)

@@ -17,15 +17,11 @@ from embomatrix.world.task import Profile
 ALL: Final = "all"
 IMPORT_REPORT: Final = "import.json"
 """Report of `embomatrix factory import --report` in the dataset's folder. Rejected problems count as failed."""
-NAMED: Final[Mapping[str, Path]] = {
-    "internal-verified": Path("build/internal-verified"),
-    "eai": Path("build/eai"),
+NAMED: Final[Mapping[str, str]] = {
+    "internal-verified": "embomatrix factory",
+    "eai": "embomatrix factory import",
 }
-"""Benchmarks by name, and their dataset folders."""
-_BUILD_IT: Final[Mapping[str, str]] = {
-    "internal-verified": "create it with `embomatrix factory`, or pass its folder",
-    "eai": "create it with `embomatrix factory import`, or pass its folder",
-}
+"""Benchmarks in folders of their names below ``build``, and the commands that create them."""
 
 
 @dataclass(frozen=True)
@@ -79,11 +75,11 @@ def find_benchmark(
     takes the first tasks only. With the profile ``PAPER``, tasks that need another household skill fail by rule. Raises
     TrainerError.
     """
-    path = NAMED.get(named, Path(named))
+    path = Path("build", named) if named in NAMED else Path(named)
     if not path.exists():
-        remedy = _BUILD_IT.get(
-            named, f"pass a dataset folder, its {TASKS_FILE}, or one of {', '.join(NAMED)}"
-        )
+        remedy = f"pass a dataset folder, its {TASKS_FILE}, or one of {', '.join(NAMED)}"
+        if named in NAMED:
+            remedy = f"create it with `{NAMED[named]}`, or pass its folder"
         raise TrainerError(f"no benchmark at {path}: {remedy}")
     folder = path if path.is_dir() else path.parent
     records = _read_records(path)

@@ -2,6 +2,7 @@
 
 import html
 import string
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import PurePath
@@ -9,7 +10,7 @@ from typing import Any
 
 from embomatrix.pages.head import html_table, page_head
 from embomatrix.trainer.evaluation.pictures import Picture
-from embomatrix.trainer.evaluation.plan_view import ExecutedPlan, plan_view
+from embomatrix.trainer.evaluation.plan_view import css_class, plan_view
 from embomatrix.trainer.evaluation.table import (
     INTERVALS,
     NONE,
@@ -51,10 +52,7 @@ def _section(table: ReportTable) -> str:
 
 def _task_row(task: Mapping[str, Any]) -> tuple[str, ...]:
     known = [sample for sample in task["samples"] if not sample.get("lost")]
-    causes: dict[str, int] = {}
-    for sample in known:
-        if "cause" in sample:
-            causes[sample["cause"]] = causes.get(sample["cause"], 0) + 1
+    causes = Counter(sample["cause"] for sample in known if "cause" in sample)
     partial = sum(sample["partial"] for sample in known) / len(known) if known else 0.0
     return (
         task["task"],
@@ -68,14 +66,13 @@ def _task_row(task: Mapping[str, Any]) -> tuple[str, ...]:
 def _picture(picture: Picture) -> str:
     verdict, task = picture.verdict, picture.task
     title = "success" if verdict.success else (verdict.cause or "").replace("_", " ")
-    drawn = ExecutedPlan(picture.plan, verdict.done, failed=verdict.step > 0)
     items = []
     for number, line in enumerate(picture.lines, start=1):
         why = f"<small>{html.escape(verdict.sentence)}</small>" if number == verdict.step else ""
-        items.append(f'<li class="{drawn.css_class(number)}">{html.escape(line)}{why}</li>')
+        items.append(f'<li class="{css_class(verdict, number)}">{html.escape(line)}{why}</li>')
     kind = "ok" if verdict.success else "bad"
     return (
         f'<section class="half plan"><h3>{html.escape(task.task_id)}</h3>'
         f'<p><span class="verdict {kind}">{html.escape(title)}</span> {html.escape(task.instruction)}</p>'
-        f"{plan_view(picture.scene, task, drawn)}<ol>{''.join(items)}</ol></section>"
+        f"{plan_view(picture.scene, task, picture.plan, verdict)}<ol>{''.join(items)}</ol></section>"
     )

@@ -1,10 +1,10 @@
 """Executed plan on the plan view of its scene. Each step is marked at its object's initial position."""
 
-from dataclasses import dataclass
 from typing import Final
 
 from embomatrix.pages.plan_view import OVERHEAD_M, PlanView
 from embomatrix.skills.syntax import Plan, SkillCall
+from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
 from embomatrix.world.geometry import Vec2
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import Task
@@ -15,26 +15,18 @@ MIN_FURNITURE_M: Final = 0.3
 MARK_PX: Final = 9
 
 
-@dataclass(frozen=True, slots=True)
-class ExecutedPlan:
-    """Plan of which the first ``done`` steps succeeded. ``failed``: the next step failed."""
-
-    plan: Plan
-    done: int
-    failed: bool
-
-    def css_class(self, number: int) -> str:
-        """CSS class of a step, counted from 1."""
-        if number <= self.done:
-            return "ok"
-        return "bad" if self.failed and number == self.done + 1 else "not"
+def css_class(verdict: AnswerVerdict, number: int) -> str:
+    """CSS class of a step, counted from 1."""
+    if number <= verdict.done:
+        return "ok"
+    return "bad" if number == verdict.step else "not"
 
 
-def plan_view(scene: Scene, task: Task, executed: ExecutedPlan) -> str:
+def plan_view(scene: Scene, task: Task, plan: Plan, verdict: AnswerVerdict) -> str:
     """Return inline SVG. The page's CSS colours the classes room, piece, used, route, ok, bad and not."""
-    view = PlanView(scene, _rooms(scene, task, executed.plan), margin_m=0.25, fit=FIT_PX)
-    used = {name for call in executed.plan for name in _names(task, call)} & scene.by_name.keys()
-    marks = _marks(scene, task, executed.plan)
+    view = PlanView(scene, _rooms(scene, task, plan), margin_m=0.25, fit=FIT_PX)
+    used = {name for call in plan for name in _names(task, call)} & scene.by_name.keys()
+    marks = _marks(scene, task, plan)
     start = (scene.robot.x_m, scene.robot.y_m)
     x, y = view.at(*start)
     parts = [
@@ -53,7 +45,7 @@ def plan_view(scene: Scene, task: Task, executed: ExecutedPlan) -> str:
         x, y = view.at(*point)
         x += offset * 2 * MARK_PX
         parts.append(
-            f'<circle class="{executed.css_class(number)}" cx="{x}" cy="{y}" r="{MARK_PX}"/>'
+            f'<circle class="{css_class(verdict, number)}" cx="{x}" cy="{y}" r="{MARK_PX}"/>'
             f'<text class="number" x="{x}" y="{y + 4}" text-anchor="middle">{number}</text>'
         )
     return view.svg(parts, f"plan of {task.task_id} on the plan view")
