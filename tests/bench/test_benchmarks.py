@@ -72,7 +72,7 @@ def test_benchmarks_share_one_format_and_print_their_file(everything, bench):
     assert written["bench"] == bench
     assert COMMIT.fullmatch(written["commit"])
     assert {"cpu", "cores", "memory_gb", "load_before", "python", "pybullet"} <= set(written["machine"])
-    assert f"bench {bench} at" in printed
+    assert f"{bench} at" in printed
     for figure in written["figures"]:
         assert set(figure) == FIGURE_KEYS
         assert figure["better"] in ("higher", "lower")

@@ -1,10 +1,9 @@
 """`embomatrix experiment`: the paper's experiments. Each is one command; repeating it resumes its runs."""
 
 import contextlib
-import json
 import os
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import date
@@ -30,12 +29,12 @@ from embomatrix.bench.experiments.design import (
 )
 from embomatrix.bench.experiments.findings import figures_of, findings_of, read_runs
 from embomatrix.bench.experiments.section import add_section, learning_section
-from embomatrix.bench.report.figures import BenchResult, commit_here, describe_machine, result_to_json
-from embomatrix.bench.report.output import write
+from embomatrix.bench.report.figures import BenchResult, commit_here, describe_machine
+from embomatrix.bench.report.output import hand_in, write
 from embomatrix.cli.local_cluster import no_problem, run_command
 from embomatrix.host.failure import fail
 from embomatrix.host.limits import usable_cores
-from embomatrix.pages.figures import Figure, shown
+from embomatrix.pages.figures import Figure
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import checked_settings
 from embomatrix.trainer.logging.outcome import read_outcome
@@ -210,7 +209,7 @@ def table(
             table_lines, success = bench_table(run, name, stages)
             lines += table_lines
             figures += success
-        _hand_in("table", figures, json_file)
+        hand_in(BenchResult("experiment table", commit_here(), describe_machine(), tuple(figures)), json_file)
         _publish(benchmark_section(run, lines, commit_here(), date.today()), run / "benchmarks.md", page)
 
 
@@ -257,16 +256,8 @@ def _conduct(
     arms = [findings_of(name, of_arm) for name, of_arm in runs.items() if of_arm]
     if not arms:
         raise TrainerError(f"no run in {out} is finished: give the command without --so-far")
-    _hand_in(design.name, figures_of(arms), json_file)
+    hand_in(BenchResult(f"experiment {design.name}", commit, machine, figures_of(arms)), json_file)
     _publish(learning_section(design, arms, machine, commit, date.today()), out / "section.md", page)
-
-
-def _hand_in(name: str, figures: Sequence[Figure], json_file: Path | None) -> None:
-    for figure in figures:
-        console.print(f"{figure.name:32} {shown(figure.value):>8} {figure.bound:>8} {figure.verdict}")
-    if json_file is not None:
-        result = BenchResult(f"experiment {name}", commit_here(), describe_machine(), tuple(figures))
-        write(json_file, json.dumps(result_to_json(result), indent=2) + "\n")
 
 
 def _publish(section: str, own: Path, page: Path | None) -> None:

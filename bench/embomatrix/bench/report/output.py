@@ -24,7 +24,7 @@ errors = Console(stderr=True, soft_wrap=True)
 def hand_in(result: BenchResult, json_file: Path | None) -> None:
     """Print the table, and write the JSON file if requested."""
     cores, load = result.machine["cores"], result.machine["load_before"]
-    title = f"bench {result.bench} at {result.commit}, {cores} cores, load before {load}"
+    title = f"{result.bench} at {result.commit}, {cores} cores, load before {load}"
     table = Table(title=title, title_justify="left")
     for heading in ("figure", "value", "goal", "", "n"):
         table.add_column(heading, justify="right" if heading in ("value", "goal", "n") else "left")

@@ -247,16 +247,15 @@ def _show_imitation(state: ImitationState, out: Path) -> None:
 
 
 def _show_summary(summary: TrainingSummary) -> None:
-    from embomatrix.trainer.logging.report import prewarm_share, success_rows, time_rows
+    from embomatrix.trainer.logging.report import prewarm_share, success_rows
 
     console = Console()
-    rows = success_rows(summary)
-    if rows:
-        _table(
-            console, "held-out success, 95 % intervals", ("tasks", "before GRPO", "after", "difference"), rows
-        )
-    times = [(name, f"{spent:.0f} s", f"{share:.0%}") for name, spent, share in time_rows(summary.outcome)]
-    _table(console, "time by activity", ("activity", "time", "share"), times)
+    title = "held-out success, 95 % intervals"
+    table = Table("tasks", "before GRPO", "after", "difference", title=title, title_justify="left")
+    for row in success_rows(summary):
+        table.add_row(*row)
+    if table.rows:
+        console.print(table)
     outcome, stats = summary.outcome, summary.stats
     console.print(
         f"{outcome.imitation_steps} imitation steps, {outcome.steps} GRPO steps, {outcome.rollouts} rollouts, "
@@ -266,10 +265,3 @@ def _show_summary(summary: TrainingSummary) -> None:
         highlight=False,
     )
     console.print(f"report      {summary.report}\ncheckpoint  {summary.checkpoint}", highlight=False)
-
-
-def _table(console: Console, title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    table = Table(*head, title=title, title_justify="left")
-    for row in rows:
-        table.add_row(*row)
-    console.print(table)
