@@ -5,6 +5,7 @@ trainer waits only when it needs the rewards.
 """
 
 import asyncio
+import contextlib
 import logging
 import math
 import threading
@@ -155,13 +156,10 @@ class Gateway:
         return self
 
     async def _open(self) -> None:
-        self._context = self._open_cluster()
-        self._cluster = await self._context.__aenter__()
-        try:
+        async with contextlib.AsyncExitStack() as stack:
+            self._cluster = await stack.enter_async_context(self._open_cluster())
             self.run_id = await self._cluster.open_run(self._run_name, terms=self._terms)
-        except BaseException:
-            await self._context.__aexit__(None, None, None)
-            raise
+            self._connection = stack.pop_all()
 
     def __exit__(self, *_: object) -> None:
         try:
@@ -169,7 +167,7 @@ class Gateway:
         except TrainerError as error:
             logger.warning("run not closed at the manager: %s", error)
         finally:
-            self._run_on_loop(self._disconnect())
+            self._run_on_loop(self._connection.aclose())
             self._stop_thread()
 
     def close_run(self) -> RunStats:
@@ -177,9 +175,6 @@ class Gateway:
         if self._stats is None:
             self._stats = self._run_on_loop(self._close())
         return self._stats
-
-    async def _disconnect(self) -> None:
-        await self._context.__aexit__(None, None, None)
 
     async def _close(self) -> RunStats:
         own = asyncio.current_task()

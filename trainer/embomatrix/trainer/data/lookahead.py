@@ -30,28 +30,20 @@ class Lookahead(Generic[T]):
         self._batches = batches
         self._steps = steps
         self._window: deque[T] = deque()
-        self._consumed = 0
 
     def __iter__(self) -> Iterator[T]:
         source = iter(self._batches)
         self._window.clear()
-        self._consumed = 0
         self._fill(source)
         while self._window:
             # The batch stays in the window while it is worked on.
             yield self._window[0]
             self._window.popleft()
-            self._consumed += 1
             self._fill(source)
 
     def __len__(self) -> int:
         """Batches of an epoch. Raises TypeError if ``batches`` has no length."""
         return len(self._batches)  # type: ignore[arg-type]  # a sampler without length raises as len() does
-
-    @property
-    def step(self) -> int:
-        """Index of the current batch within the epoch, from 0."""
-        return self._consumed
 
     def window(self) -> tuple[T, ...]:
         """The current batch and up to ``steps`` after it; fewer at the end of the epoch."""
