@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -17,7 +17,7 @@ from typing import Final
 import psutil
 
 from embomatrix.bench.report.figures import BenchError
-from embomatrix.cli.local_cluster import free_port
+from embomatrix.cli.local_cluster import free_port, without_membership
 from embomatrix.host.parent import with_this_process
 
 GRACE_S: Final = 10.0
@@ -25,6 +25,8 @@ GRACE_S: Final = 10.0
 REDIS_START_S: Final = 20.0
 POLL_S: Final = 0.05
 LOG_LINES: Final = 5
+COMMAND_S: Final = 3600.0
+"""Limit for one command. A few training steps take minutes, and many times as long on a shared machine."""
 SERVES: Final = re.compile(r"manager serves at (\S+:\d+), status page (\S+),")
 
 
@@ -143,6 +145,28 @@ def running_program(folder: Path, name: str, *command: str) -> Iterator[Process]
         except subprocess.TimeoutExpired:
             child.kill()
             child.wait()
+
+
+def output_of(*command: str, environment: Mapping[str, str] | None = None, folder: Path | None = None) -> str:
+    """Return the standard output of a program. Raise BenchError with its last line if it fails."""
+    try:
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            timeout=COMMAND_S,
+            check=False,
+            cwd=folder,
+            env=without_membership(environment or os.environ),
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise BenchError(
+            f"{command[0]} can't be run ({error}): name another interpreter, or measure on an idle machine"
+        ) from error
+    if done.returncode:
+        words = (done.stderr.strip() or done.stdout.strip()).splitlines()[-1:] or ["no output"]
+        raise BenchError(f"`{' '.join(command[:4])} …` failed ({words[0][:300]}): fix that and measure again")
+    return done.stdout
 
 
 def kill_tree(pid: int) -> None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.bench.cluster.processes import output_of
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.cli.local_cluster import free_port
 from embomatrix.pages.figures import Better, Figure
@@ -43,20 +44,8 @@ class Compose:
     def run(self, *arguments: str) -> str:
         """Run a subcommand and return its output. Raise BenchError if it fails."""
         ports = {"MANAGER_PORT": str(self.port), "PAGE_PORT": str(self.page_port)}
-        done = subprocess.run(
-            (*self.command, "-p", PROJECT, "-f", str(self.folder / "docker-compose.yml"), *arguments),
-            cwd=self.folder,
-            env={**os.environ, **ports},
-            capture_output=True,
-            text=True,
-            timeout=COMMAND_S,
-            check=False,
-        )
-        if done.returncode:
-            raise BenchError(
-                f"docker compose {arguments[0]} failed: {' / '.join(done.stderr.splitlines()[-3:])}"
-            )
-        return done.stdout
+        command = (*self.command, "-p", PROJECT, "-f", str(self.folder / "docker-compose.yml"), *arguments)
+        return output_of(*command, environment={**os.environ, **ports}, folder=self.folder)
 
 
 def compose_at(folder: Path) -> Compose | None:

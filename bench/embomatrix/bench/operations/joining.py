@@ -1,16 +1,14 @@
 """Time for a spare PC to join: from the join command to the worker's registration."""
 
 import re
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from embomatrix.bench.cluster.processes import SERVES, running_manager, running_process
-from embomatrix.bench.report.figures import BenchError
+from embomatrix.bench.cluster.processes import SERVES, output_of, running_manager, running_process
+from embomatrix.cli.supervisor import embomatrix_command
 from embomatrix.pages.figures import Better, Figure
 
 JOIN_GOAL_S: Final = 30.0
@@ -24,14 +22,13 @@ def measure_joining(on_step: Callable[[str], None]) -> tuple[Figure, ...]:
         folder = Path(name)
         data, access = f"--data-dir={folder / 'manager'}", folder / "manager" / "access"
         on_step("certificates and a manager")
-        _output("manager", "init", data, "--san=localhost")
+        output_of(*embomatrix_command("manager", "init", data, "--san=localhost"))
         deadline_s = time.monotonic() + LIMIT_S
         with running_manager(folder, "--state=memory:", data) as manager:
             port = manager.wait_for(SERVES, deadline_s)[1].rpartition(":")[2]
-            invitation = _output(
-                *("manager", "token", "issue", "--role=join", f"--manager=localhost:{port}"),
-                *(f"--token=@{access / 'tokens' / 'admin'}", f"--ca={access / 'ca.pem'}"),
-            ).strip()
+            issue = embomatrix_command("manager", "token", "issue", "--role=join")
+            admin = (f"--token=@{access / 'tokens' / 'admin'}", f"--ca={access / 'ca.pem'}")
+            invitation = output_of(*issue, f"--manager=localhost:{port}", *admin).strip()
             on_step("a worker joins")
             started_s = time.monotonic()
             join = ("worker", "run", "--join", invitation, "--nice=0", f"--state-dir={folder / 'state'}")
@@ -40,11 +37,3 @@ def measure_joining(on_step: Callable[[str], None]) -> tuple[Figure, ...]:
                 worker.wait_for(_REGISTERED, deadline_s)
                 taken_s = time.monotonic() - started_s
     return (Figure("join_s", taken_s, "s", Better.LOWER, 1, JOIN_GOAL_S),)
-
-
-def _output(*arguments: str) -> str:
-    command = (sys.executable, "-m", "embomatrix.cli", *arguments)
-    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False)
-    if done.returncode:
-        raise BenchError(f"embomatrix {' '.join(arguments[:2])} failed: {done.stderr.strip()}")
-    return done.stdout

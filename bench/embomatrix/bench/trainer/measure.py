@@ -12,8 +12,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from embomatrix.bench.cluster.processes import output_of
 from embomatrix.bench.report.figures import BenchError
-from embomatrix.bench.trainer.steps import load_of, own_step_s, run_command, trl_step_s
+from embomatrix.bench.trainer.steps import load_of, own_step_s, trl_step_s
 from embomatrix.cli.local_cluster import local_cluster
 from embomatrix.cli.supervisor import embomatrix_command
 from embomatrix.host.limits import usable_cores
@@ -82,7 +83,7 @@ def _run(dataset: Path, folder: Path, on_step: Callable[[str], None]) -> list[Fi
     cluster = local_cluster(folder / "cluster", workers=2, slots=1)
     on_step(f"{IMITATION_STEPS} steps of imitation and {GRPO_STEPS} of GRPO on a cluster")
     with cluster.supervisor:
-        run_command(
+        output_of(
             *embomatrix_command("train", f"--dataset={dataset}", f"--out={out}", f"--settings={settings}"),
             f"--steps={GRPO_STEPS}",
             f"--manager={cluster.address}",
@@ -112,11 +113,11 @@ def _evaluation(dataset: Path, folder: Path, on_step: Callable[[str], None]) -> 
     asked = ("--split=all", f"--tasks={TASKS}", f"--samples={SAMPLES}", "--baseline=random")
     on_step(f"random plans for {TASKS} tasks at most")
     command = embomatrix_command("eval", f"--bench={dataset}", *asked, jobs, f"--out={folder / 'asked'}")
-    run_command(*command)
+    output_of(*command)
     answers = folder / "asked" / "answers.jsonl"
     on_step("an evaluation of stored answers")
     began_s = time.monotonic()
-    run_command(*embomatrix_command("eval", f"--answers={answers}", jobs, f"--out={folder / 'judged'}"))
+    output_of(*embomatrix_command("eval", f"--answers={answers}", jobs, f"--out={folder / 'judged'}"))
     spent_s = time.monotonic() - began_s
     with answers.open(encoding="utf-8") as file:
         count = sum(1 for _ in file) - 1  # the first line is the header

@@ -5,9 +5,8 @@ Our steps run in this process; TRL's run in an environment with its own pins, as
 
 import json
 import os
-import subprocess
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass
 from importlib.util import find_spec
@@ -17,9 +16,9 @@ from typing import Any, Final
 import numpy as np
 import torch
 
+from embomatrix.bench.cluster.processes import output_of
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.bench.trainer.trl_steps import model_of, tokenizer_of
-from embomatrix.cli.local_cluster import without_membership
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.skills.prompt import Codec, Situation, limited, prompt_for
 from embomatrix.skills.syntax import PROFILES, PlaceRelation
@@ -38,8 +37,6 @@ from embomatrix.world.task import Profile
 END: Final = "<end>"
 UNKNOWN: Final = "<unknown>"
 ROWS: Final = 16
-LIMIT_S: Final = 3600.0
-"""Limit for one command. A few steps take minutes, and many times as long on a shared machine."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +126,7 @@ def trl_step_s(load: Load, python: Path, folder: Path) -> list[float]:
     # An environment with its own pins must not import our packages.
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     return parse_step_s(
-        run_command(str(python), str(spec.origin if spec else ""), str(path), environment=environment)
+        output_of(str(python), str(spec.origin if spec else ""), str(path), environment=environment)
     )
 
 
@@ -143,24 +140,3 @@ def parse_step_s(output: str) -> list[float]:
         raise BenchError(
             f"a program printed no step times ({last[:100]!r}): expected JSON with step_s"
         ) from error
-
-
-def run_command(*command: str, environment: Mapping[str, str] | None = None) -> str:
-    """Return the standard output of a program. Raise BenchError with its last line if it fails."""
-    try:
-        done = subprocess.run(
-            command,
-            capture_output=True,
-            text=True,
-            timeout=LIMIT_S,
-            check=False,
-            env=without_membership(environment or os.environ),
-        )
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise BenchError(
-            f"{command[0]} can't be run ({error}): name another interpreter, or measure on an idle machine"
-        ) from error
-    if done.returncode:
-        words = (done.stderr.strip() or done.stdout.strip()).splitlines()[-1:] or ["no output"]
-        raise BenchError(f"`{' '.join(command[:4])} …` failed ({words[0][:300]}): fix that and measure again")
-    return done.stdout
