@@ -5,7 +5,6 @@
 """
 
 import asyncio
-import functools
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.reward_label import RewardLabel, answer_in
 from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.trainer.adapters.rows import messages, tasks_of
-from embomatrix.trainer.adapters.scorer import PlanScorer, scorer_for
+from embomatrix.trainer.adapters.scorer import PlanScorer, shared_scorer
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.data.tasks import group_seed, load_tasks
 
@@ -51,14 +50,6 @@ async def give_bundles(dataset: str | Path, client: ClusterClient) -> int:
     return sent
 
 
-@functools.cache
-def _scorer() -> PlanScorer:
-    dataset = os.environ.get(DATASET, "")
-    if not dataset:
-        raise TrainerError(f"{DATASET} is not set: set it to the dataset's folder")
-    return scorer_for(dataset)
-
-
 def reward_func(queries: Sequence[str], prompts: Sequence[str], labels: Sequence[str]) -> dict[str, Any]:
     """OpenRLHF's hook. Dataset and cluster come from the environment. Raises TrainerError."""
     try:
@@ -66,7 +57,10 @@ def reward_func(queries: Sequence[str], prompts: Sequence[str], labels: Sequence
         task_ids = [RewardLabel.parse(label).task_id for label in labels]
     except InvalidRequestError as error:
         raise TrainerError(str(error)) from error
-    return reward_payload(asyncio.run(rewards_of(_scorer(), task_ids, answers)))
+    dataset = os.environ.get(DATASET, "")
+    if not dataset:
+        raise TrainerError(f"{DATASET} is not set: set it to the dataset's folder")
+    return reward_payload(asyncio.run(rewards_of(shared_scorer(dataset), task_ids, answers)))
 
 
 async def rewards_of(

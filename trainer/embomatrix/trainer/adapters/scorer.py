@@ -231,3 +231,7 @@ def scorer_for(
         raise TrainerError(str(error)) from error
     connect = functools.partial(ClusterClient, address, secret, ca=trusted)
     return PlanScorer(functools.partial(load_tasks, Path(dataset)), connect, seed=seed, reward=reward)
+
+
+shared_scorer = functools.cache(scorer_for)
+"""The process's scorer for a dataset and a cluster, created by the first call."""

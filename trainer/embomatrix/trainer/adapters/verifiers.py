@@ -4,14 +4,13 @@ Commands of verifiers load a taskset from a single-word module such as `docs/exa
 environment configures the cluster.
 """
 
-import functools
 from collections.abc import Iterator
 
 import verifiers.v1 as vf
 
 from embomatrix.skills.prompt import Codec, prompt_for
 from embomatrix.trainer.adapters.rows import tasks_of
-from embomatrix.trainer.adapters.scorer import PlanScorer, scorer_for
+from embomatrix.trainer.adapters.scorer import shared_scorer
 
 __all__ = ["HouseholdTaskset"]
 NO_DATASET = "no dataset: pass its folder with --env.taskset.dataset"
@@ -37,7 +36,7 @@ class HouseholdTask(vf.Task[HouseholdData, vf.State, vf.TaskConfig]):  # type: i
     @vf.reward  # type: ignore[untyped-decorator]
     async def tiers(self, trace: vf.Trace) -> dict[str, float]:
         """Return the three tiers, which add up to the reward. Success is a separate metric."""
-        reward = await _scorer(self.data.dataset).reward_of(str(self.data.id), trace.last_reply)
+        reward = await shared_scorer(self.data.dataset).reward_of(str(self.data.id), trace.last_reply)
         trace.record_metrics({"success": float(reward.success)})
         return {"format": reward.format, "relevance": reward.relevance, "goal": reward.goal}
 
@@ -59,8 +58,3 @@ class HouseholdTaskset(vf.Taskset[HouseholdTask, HouseholdConfig]):  # type: ign
                 category=task.task.category.value,
             )
             yield HouseholdTask(data, self.config.task)
-
-
-@functools.cache
-def _scorer(dataset: str) -> PlanScorer:
-    return scorer_for(dataset)

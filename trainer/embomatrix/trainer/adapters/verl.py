@@ -4,17 +4,10 @@ Set ``custom_reward_function.path`` to this file and ``custom_reward_function.na
 sample as soon as it is generated, so simulation and generation overlap.
 """
 
-import functools
 from collections.abc import Mapping
 
 from embomatrix.reward.breakdown import RewardBreakdown
-from embomatrix.trainer.adapters.scorer import PlanScorer, scorer_for
-
-
-@functools.cache
-def scorer_of(dataset: str, manager: str, token: str, ca: str) -> PlanScorer:
-    """Return the process's scorer for a cluster."""
-    return scorer_for(dataset, manager, token, ca)
+from embomatrix.trainer.adapters.scorer import shared_scorer
 
 
 async def compute_score(
@@ -34,7 +27,7 @@ async def compute_score(
     ``ground_truth`` is the task's id; the keyword arguments are ``custom_reward_function.reward_kwargs``. verl has no mark for
     a missing reward, and NaN would spoil its step, so lost rollouts are repeated.
     """
-    scorer = scorer_of(dataset, manager, token, ca)
+    scorer = shared_scorer(dataset, manager, token, ca)
     return reward_payload(await scorer.reward_of(ground_truth, solution_str))
 
 
