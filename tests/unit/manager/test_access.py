@@ -148,11 +148,11 @@ def test_worker_name_belongs_to_its_first_machine():
 def test_revoked_worker_must_join_again():
     book = CredentialBook()
     _, token = joined(book, issued(book, AccessRole.JOIN)[0])
-    book.keep(*book.revoke_worker("w1", "its results were wrong"))
+    book.keep(book.revoke_worker("w1", "its results were wrong"))
     with pytest.raises(NotSignedInError, match="its results were wrong"):
         book.find(token, now_s=0.0)
     fleet, _ = issued(book, AccessRole.WORKER)
-    book.keep(*book.revoke_worker("pod-7", "no reason"))
+    book.keep(book.revoke_worker("pod-7", "no reason"))
     for name in ("w1", "pod-7"):
         with pytest.raises(NotAllowedError, match="join again"):
             book.check_name(fleet.token_id, "", name)

@@ -13,6 +13,7 @@ from embomatrix.manager.control.dispatch.state import DispatchLimits
 from embomatrix.manager.control.events import (
     BatchCancelled,
     BatchSubmitted,
+    DrainChanged,
     LeaseFinished,
     LeasesRenewed,
     RunClosed,
@@ -21,7 +22,6 @@ from embomatrix.manager.control.events import (
     WorkerJoined,
     WorkerLost,
     WorkerReported,
-    WorkerResumed,
 )
 from embomatrix.manager.control.reputation import AuditRules
 from embomatrix.manager.simulation.run import simulate
@@ -162,7 +162,7 @@ def test_quarantine_survives_a_new_session_and_ends_by_an_operator():
     bench.join(liar)
     bench.submit(9, "b2")
     assert liar not in {lease.worker_id for lease in bench.live.values()}
-    bench.apply(WorkerResumed(liar))
+    bench.apply(DrainChanged(liar, drained=False))
     bench.apply(Tick(), after_s=0.2)
     assert liar in {lease.worker_id for lease in bench.live.values()}
 

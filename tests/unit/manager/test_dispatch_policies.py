@@ -10,17 +10,15 @@ from embomatrix.manager.control.dispatch.dispatcher import Dispatcher
 from embomatrix.manager.control.dispatch.state import DispatchLimits
 from embomatrix.manager.control.events import (
     BatchSubmitted,
-    DispatchPaused,
-    DispatchResumed,
+    DrainChanged,
     LeaseFinished,
     LeasesRenewed,
+    PauseChanged,
     RunOpened,
+    SuspicionChanged,
     Tick,
-    WorkerDrained,
     WorkerJoined,
     WorkerReported,
-    WorkerResumed,
-    WorkerSuspected,
 )
 from embomatrix.manager.control.schedule.placement import Need, RunShare, in_turns, quotas
 from embomatrix.rpc.wire.leases import LeaseProgress
@@ -251,7 +249,7 @@ def test_only_worker_gets_a_failed_rollout_again_after_a_pause(bench):
     bench.submit(1)
     bench.finish("b1.0.0", CRASH)
     assert not bench.held["b1.0.0"]
-    bench.apply(WorkerSuspected("w2"))
+    bench.apply(SuspicionChanged("w2", suspect=True))
     bench.apply(Tick(), after_s=LIMITS.elsewhere_s + 0.1)
     assert list(bench.held["b1.0.0"]) == ["w1"]
 
@@ -300,12 +298,12 @@ def test_third_stall_fails_a_rollout(bench):
 
 def test_paused_dispatch_grants_no_leases_until_it_is_resumed(bench):
     bench.worker("w1", slots=2)
-    bench.apply(DispatchPaused())
+    bench.apply(PauseChanged(paused=True))
     bench.submit(2)
     bench.apply(Tick(), after_s=100.0)
     assert bench.held == {}
     assert bench.results == {}
-    bench.apply(DispatchResumed())
+    bench.apply(PauseChanged(paused=False))
     assert set(bench.held) == {"b1.0.0", "b1.0.1"}
 
 
@@ -321,11 +319,11 @@ def test_paused_worker_finishes_its_leases_and_gets_no_new_ones(bench):
 
 def test_resumed_worker_gets_work_unless_it_is_leaving(bench):
     bench.worker("w1")
-    bench.apply(WorkerDrained("w1"))
+    bench.apply(DrainChanged("w1", drained=True))
     bench.submit(1)
     assert bench.held == {}
     bench.report("w1", draining=True)
-    bench.apply(WorkerResumed("w1"))
+    bench.apply(DrainChanged("w1", drained=False))
     assert bench.held == {}
     bench.report("w1", draining=False)
     assert "b1.0.0" in bench.held

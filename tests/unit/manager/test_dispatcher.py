@@ -8,16 +8,15 @@ from embomatrix.manager.control.commands import AcknowledgeLease, CancelLease, F
 from embomatrix.manager.control.events import (
     BatchCancelled,
     BatchSubmitted,
+    DrainChanged,
     LeaseFinished,
     LeasesRenewed,
     RunClosed,
     ScenesUnplaceable,
+    SuspicionChanged,
     Tick,
-    WorkerDrained,
     WorkerJoined,
     WorkerLost,
-    WorkerRecovered,
-    WorkerSuspected,
 )
 from embomatrix.rpc.wire.leases import LeaseRef
 from embomatrix.rpc.wire.values import (
@@ -216,15 +215,15 @@ def test_unknown_lease_of_a_former_manager_is_cancelled(table):
 
 def test_suspected_worker_gets_no_lease_until_it_is_heard(table):
     table.worker()
-    table.apply(WorkerSuspected("w1"))
+    table.apply(SuspicionChanged("w1", suspect=True))
     assert leases(table.submit()) == []
-    assert len(leases(table.apply(WorkerRecovered("w1")))) == 1
+    assert len(leases(table.apply(SuspicionChanged("w1", suspect=False)))) == 1
 
 
 def test_drained_worker_finishes_its_leases_and_gets_no_new_ones(table):
     table.worker()
     first, second = leases(table.submit(5))
-    table.apply(WorkerDrained("w1"))
+    table.apply(DrainChanged("w1", drained=True))
     assert leases(table.finish(first)) == leases(table.finish(second)) == []
     assert len(table.results) == 2
 

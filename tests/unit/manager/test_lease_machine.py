@@ -26,20 +26,17 @@ from embomatrix.manager.control.events import (
     BatchCancelled,
     BatchContinued,
     BatchSubmitted,
-    DispatchPaused,
-    DispatchResumed,
+    DrainChanged,
     LeaseFinished,
     LeasesRenewed,
     LookaheadAnnounced,
+    PauseChanged,
     RunOpened,
+    SuspicionChanged,
     Tick,
-    WorkerDrained,
     WorkerJoined,
     WorkerLost,
-    WorkerRecovered,
     WorkerReported,
-    WorkerResumed,
-    WorkerSuspected,
 )
 from embomatrix.rpc.wire.leases import LeaseProgress
 from embomatrix.rpc.wire.values import (
@@ -79,7 +76,15 @@ TERMS = st.builds(
     st.sampled_from([0.0, 30.0]),
     st.booleans(),
 )
-STANDINGS = (WorkerSuspected, WorkerRecovered, WorkerRecovered, WorkerDrained, WorkerResumed, WorkerResumed)
+STANDINGS = (
+    (SuspicionChanged, True),
+    (SuspicionChanged, False),
+    (SuspicionChanged, False),
+    (DrainChanged, True),
+    (DrainChanged, False),
+    (DrainChanged, False),
+)
+"""Kinds of events with their flag; recoveries are twice as frequent."""
 workers = st.sampled_from(WORKERS)
 
 
@@ -164,14 +169,15 @@ class LeaseMachine(RuleBasedStateMachine):
 
     @rule(
         worker=workers,
-        event=st.sampled_from(STANDINGS),
+        standing=st.sampled_from(STANDINGS),
     )
-    def standing_of_a_worker_changes(self, worker, event):
-        self.apply(event(worker))
+    def standing_of_a_worker_changes(self, worker, standing):
+        event, flag = standing
+        self.apply(event(worker, flag))
 
     @rule(paused=st.sampled_from([True, False, False, False]))
     def operator_pauses_or_resumes(self, paused):
-        self.apply(DispatchPaused() if paused else DispatchResumed())
+        self.apply(PauseChanged(paused))
 
     @rule(run=st.sampled_from(RUNS), terms=TERMS)
     def run_is_opened(self, run, terms):
@@ -310,7 +316,7 @@ class LeaseMachine(RuleBasedStateMachine):
         """Check that every rollout gets its outcome with one healthy worker and enough time."""
         if not hasattr(self, "cluster"):
             return
-        self.apply(DispatchResumed())
+        self.apply(PauseChanged(paused=False))
         for worker in WORKERS:
             self.worker_is_killed(worker)
         self.worker_joins("w1", 3, 1000)

@@ -3,11 +3,10 @@
 import pytest
 
 from embomatrix.manager.control.events import (
-    WorkerDrained,
+    DrainChanged,
+    SuspicionChanged,
     WorkerJoined,
     WorkerLost,
-    WorkerRecovered,
-    WorkerSuspected,
 )
 from embomatrix.manager.runtime.registry import LivenessLimits, Registry, WorkerStanding
 from embomatrix.rpc.status import NotFoundError, SupersededError
@@ -59,9 +58,9 @@ def test_session_with_a_wrong_epoch_is_refused(registry):
 def test_three_missed_heartbeats_make_a_suspect_until_the_next_message(registry):
     session, _ = join(registry)
     assert registry.tick(now_s=2.9) == []
-    assert registry.tick(now_s=3.0) == [WorkerSuspected("w1")]
+    assert registry.tick(now_s=3.0) == [SuspicionChanged("w1", suspect=True)]
     assert registry.tick(now_s=3.1) == []
-    assert registry.heard(session, now_s=4.0) == [WorkerRecovered("w1")]
+    assert registry.heard(session, now_s=4.0) == [SuspicionChanged("w1", suspect=False)]
 
 
 def test_worker_is_lost_after_ten_silent_seconds(registry):
@@ -99,7 +98,7 @@ def test_silence_during_a_manager_stall_is_excused(registry):
     registry.excuse_silence(30.0, now_s=31.6)
     assert registry.tick(now_s=31.6) == []
     assert [event.worker_id for event in registry.tick(now_s=32.0)] == ["w2"]
-    assert registry.tick(now_s=34.6) == [WorkerSuspected("w1")]
+    assert registry.tick(now_s=34.6) == [SuspicionChanged("w1", suspect=True)]
     registry.excuse_silence(30.0, now_s=35.0)
     assert session.last_seen_s == 35.0, "no worker was heard in the future"
 
@@ -147,7 +146,7 @@ def test_lost_worker_may_register_again(registry):
 
 def test_draining_an_unknown_worker_names_the_connected_ones(registry):
     join(registry)
-    assert registry.drain("w1") == [WorkerDrained("w1")]
+    assert registry.drain("w1") == [DrainChanged("w1", drained=True)]
     with pytest.raises(NotFoundError, match="connected: w1"):
         registry.drain("w2")
 
@@ -163,4 +162,4 @@ def test_one_silent_worker_among_many_is_found(registry):
     for at_s in (2.0, 4.0):
         for session in sessions[1:]:
             registry.heard(session, now_s=at_s)
-    assert registry.tick(now_s=4.0) == [WorkerSuspected("w0")]
+    assert registry.tick(now_s=4.0) == [SuspicionChanged("w0", suspect=True)]

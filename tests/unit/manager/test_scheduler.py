@@ -11,15 +11,15 @@ from embomatrix.manager.control.commands import SetDesired
 from embomatrix.manager.control.events import (
     BatchSubmitted,
     DemandObserved,
+    DrainChanged,
     LeaseFinished,
     LookaheadAnnounced,
     RunClosed,
+    SuspicionChanged,
     Tick,
-    WorkerDrained,
     WorkerJoined,
     WorkerLost,
     WorkerReported,
-    WorkerSuspected,
 )
 from embomatrix.manager.control.schedule.placement import Need, Site, needs_of, place
 from embomatrix.manager.control.schedule.scheduler import ScheduleLimits, Scheduler
@@ -67,7 +67,7 @@ class Cluster:
                 self.pool.join(worker_id, resources)
             case WorkerLost(worker_id):
                 self.pool.leave(worker_id)
-            case WorkerReported() | WorkerDrained() | WorkerSuspected():
+            case WorkerReported() | DrainChanged() | SuspicionChanged():
                 worker = self.pool.workers[event.worker_id]
                 worker.apply(event)
                 self.pool.update_standing(worker)
@@ -266,7 +266,10 @@ def test_failed_load_moves_to_another_worker_and_is_retried_later(cluster):
     assert "a" in cluster.desired[first] + cluster.desired[other]
 
 
-@pytest.mark.parametrize("event", [WorkerDrained("w1"), WorkerSuspected("w1"), WorkerLost("w1", "killed")])
+@pytest.mark.parametrize(
+    "event",
+    [DrainChanged("w1", drained=True), SuspicionChanged("w1", suspect=True), WorkerLost("w1", "killed")],
+)
 def test_scenes_move_away_from_an_unusable_worker(cluster, event):
     cluster.worker("w1")
     cluster.announce(["a"])

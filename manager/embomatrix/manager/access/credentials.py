@@ -193,12 +193,12 @@ class CredentialBook:
             )
         return replace(credential, revoked=credential.revoked or reason)
 
-    def revoke_worker(self, worker_id: str, reason: str) -> tuple[Credential, ...]:
-        """Return the worker's revoked credentials. A worker with a shared token has none: only its name is blocked."""
-        own = self._credentials_of(worker_id)
-        if own:
-            return tuple(replace(c, revoked=reason) for c in own)
-        return (Credential(_new_id(), AccessRole.WORKER, _NOTHING, worker_id=worker_id, revoked=reason),)
+    def revoke_worker(self, worker_id: str, reason: str) -> Credential:
+        """Return the worker's revoked credential. For a worker with a shared token, it only blocks the name."""
+        own = self._holder(worker_id)
+        if own is not None:
+            return replace(own, revoked=reason)
+        return Credential(_new_id(), AccessRole.WORKER, _NOTHING, worker_id=worker_id, revoked=reason)
 
     def knows_worker(self, worker_id: str) -> bool:
         """Return True if a credential, valid or revoked, belongs to this name."""
@@ -214,12 +214,9 @@ class CredentialBook:
             and not (c.role is AccessRole.JOIN and c.worker_id)
         )
 
-    def _credentials_of(self, worker_id: str) -> list[Credential]:
-        """Return the valid credentials of this name, one at most."""
-        return [c for c in self._of_worker.get(worker_id, {}).values() if not c.revoked]
-
     def _holder(self, worker_id: str) -> Credential | None:
-        return next(iter(self._credentials_of(worker_id)), None)
+        """Return the one valid credential of this name."""
+        return next((c for c in self._of_worker.get(worker_id, {}).values() if not c.revoked), None)
 
 
 def _new_id() -> str:

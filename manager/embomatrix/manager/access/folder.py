@@ -24,7 +24,7 @@ from embomatrix.rpc.trust import fingerprint_of
 from embomatrix.rpc.wire.tokens import AccessRole
 
 FIRST_ROLES: Final = (AccessRole.ADMIN, AccessRole.TRAINER, AccessRole.VIEWER, AccessRole.JOIN)
-_PRIVATE: Final = 0o600
+_PUBLIC: Final = 0o644
 
 
 class AccessError(Exception):
@@ -108,9 +108,9 @@ def hand_out_to(data_dir: Path, role: AccessRole, target: Path) -> None:
     folder = AccessFolder(data_dir)
     try:
         target.mkdir(parents=True, exist_ok=True)
-        write_public(target / "ca.pem", folder.ca.read_bytes())
+        _write(target / "ca.pem", folder.ca.read_bytes(), _PUBLIC)
         if not (target / "token").exists():
-            write_private(target / "token", folder.token(role).read_bytes())
+            _write(target / "token", folder.token(role).read_bytes())
     except FileNotFoundError as error:
         raise AccessError(
             f"{error.filename} no longer exists: issue a token with `embomatrix manager token issue --role {role}`"
@@ -119,16 +119,8 @@ def hand_out_to(data_dir: Path, role: AccessRole, target: Path) -> None:
         raise AccessError(f"{error.filename or target} can't be written ({error.strerror})") from error
 
 
-def write_private(path: Path, content: bytes) -> None:
-    """Write atomically, readable by the owner only."""
-    _write(path, content, _PRIVATE)
-
-
-def write_public(path: Path, content: bytes) -> None:
-    _write(path, content, 0o644)
-
-
-def _write(path: Path, content: bytes, mode: int) -> None:
+def _write(path: Path, content: bytes, mode: int = 0o600) -> None:
+    """Write atomically, by default readable by the owner only."""
     part = path.with_name(f"{path.name}.part")
     part.unlink(missing_ok=True)
     with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
@@ -142,8 +134,8 @@ def _authority(folder: AccessFolder, now: datetime, done: PreparedAccess) -> Key
         return KeyPair(folder.ca.read_bytes(), folder.ca_key.read_bytes() if folder.ca_key.exists() else b"")
     authority = make_authority(f"EmboMatrix authority of {socket.gethostname()}", now)
     # The key is written first: a certificate without a key means an authority that is kept elsewhere.
-    write_private(folder.ca_key, authority.key)
-    write_public(folder.ca, authority.certificate)
+    _write(folder.ca_key, authority.key)
+    _write(folder.ca, authority.certificate, _PUBLIC)
     done.made.append(f"the authority {folder.ca}: clients pass it as --ca")
     return authority
 
@@ -167,8 +159,8 @@ def _certify(
         pair = make_server_certificate(authority, names, now)
     except ValueError as error:
         raise AccessError(f"--san: {error}") from error
-    write_private(folder.server_key, pair.key)
-    write_public(folder.server, pair.certificate)
+    _write(folder.server_key, pair.key)
+    _write(folder.server, pair.certificate, _PUBLIC)
     done.made.append(f"the certificate {folder.server}, for {', '.join(names)}")
 
 
@@ -193,11 +185,11 @@ def _first_tokens(
             role, valid_s=valid_s, label="made by manager init", now_s=now.timestamp()
         )
         pinned = f".{fingerprint_of(folder.ca.read_text())}" if role is AccessRole.JOIN else ""
-        write_private(path, f"{token}{pinned}\n".encode())
+        _write(path, f"{token}{pinned}\n".encode())
         credentials.append(credential)
         done.made.append(
             f"a token of the role {role}: {path}" + (", valid for one worker and one day" if valid_s else "")
         )
     if len(credentials) > len(known):
         rows = [asdict(credential) for credential in credentials]
-        write_private(folder.hashes, json.dumps(rows, indent=1).encode())
+        _write(folder.hashes, json.dumps(rows, indent=1).encode())

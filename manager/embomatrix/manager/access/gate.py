@@ -161,7 +161,7 @@ class Gate:
     async def revoke_worker(self, worker_id: str, reason: str) -> None:
         self._need_guard()
         async with self._lock:
-            await self._keep(*self._book.revoke_worker(worker_id, reason))
+            await self._keep(self._book.revoke_worker(worker_id, reason))
         logger.info("worker revoked worker=%s: %s", worker_id, reason)
 
     def infos(self) -> tuple[TokenInfo, ...]:

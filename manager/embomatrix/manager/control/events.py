@@ -17,7 +17,12 @@ from embomatrix.rpc.wire.values import (
 
 
 @dataclass(frozen=True, slots=True)
-class WorkerJoined:
+class Event:
+    """Fact that the state machines react to."""
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerJoined(Event):
     """A worker registered. It gets work after its first report."""
 
     worker_id: str
@@ -25,7 +30,7 @@ class WorkerJoined:
 
 
 @dataclass(frozen=True, slots=True)
-class WorkerReported:
+class WorkerReported(Event):
     """Full state of a worker."""
 
     worker_id: str
@@ -41,21 +46,15 @@ class WorkerReported:
 
 
 @dataclass(frozen=True, slots=True)
-class WorkerSuspected:
-    """Heartbeats are missing: the worker gets no new leases until it is heard again."""
+class SuspicionChanged(Event):
+    """Heartbeats are missing, so that a ``suspect`` worker gets no new leases, or it was heard again."""
 
     worker_id: str
+    suspect: bool
 
 
 @dataclass(frozen=True, slots=True)
-class WorkerRecovered:
-    """A suspected worker was heard again."""
-
-    worker_id: str
-
-
-@dataclass(frozen=True, slots=True)
-class WorkerLost:
+class WorkerLost(Event):
     """The worker crashed, was silent for too long, or was replaced by a newer session."""
 
     worker_id: str
@@ -63,21 +62,15 @@ class WorkerLost:
 
 
 @dataclass(frozen=True, slots=True)
-class WorkerDrained:
-    """An operator drains the worker: it finishes its leases and gets nothing new."""
+class DrainChanged(Event):
+    """An operator drains the worker, which finishes its leases and gets nothing new, or ends its drain and quarantine."""
 
     worker_id: str
+    drained: bool
 
 
 @dataclass(frozen=True, slots=True)
-class WorkerResumed:
-    """An operator ended the drain, or the quarantine, of the worker."""
-
-    worker_id: str
-
-
-@dataclass(frozen=True, slots=True)
-class LeasesRenewed:
+class LeasesRenewed(Event):
     """A heartbeat listed the leases that the worker holds, and the progress of the running ones."""
 
     worker_id: str
@@ -86,7 +79,7 @@ class LeasesRenewed:
 
 
 @dataclass(frozen=True, slots=True)
-class LeaseFinished:
+class LeaseFinished(Event):
     """A worker reported the end of a lease. Late and repeated reports have an epoch that is not live."""
 
     worker_id: str
@@ -95,7 +88,7 @@ class LeaseFinished:
 
 
 @dataclass(frozen=True, slots=True)
-class RunOpened:
+class RunOpened(Event):
     """A run was opened with these terms. Runs that were never opened have the defaults."""
 
     run_id: str
@@ -103,7 +96,7 @@ class RunOpened:
 
 
 @dataclass(frozen=True, slots=True)
-class BatchSubmitted:
+class BatchSubmitted(Event):
     """A trainer submitted a batch. The first ``count`` rollouts are queued now, the others by ``BatchContinued``."""
 
     batch: Batch
@@ -112,7 +105,7 @@ class BatchSubmitted:
 
 
 @dataclass(frozen=True, slots=True)
-class BatchContinued:
+class BatchContinued(Event):
     """Queue the next ``count`` rollouts of a large batch. Other events are handled in between."""
 
     run_id: str
@@ -121,7 +114,7 @@ class BatchContinued:
 
 
 @dataclass(frozen=True, slots=True)
-class BatchRestored:
+class BatchRestored(Event):
     """A batch of a former manager. Its other rollouts may still run on workers, so they wait for claims first."""
 
     batch: Batch
@@ -132,34 +125,34 @@ class BatchRestored:
 
 
 @dataclass(frozen=True, slots=True)
-class WorkersExpected:
+class WorkersExpected(Event):
     """Workers of the former manager. After all of them have reported, no other worker can hold a lease of it."""
 
     worker_ids: frozenset[str]
 
 
 @dataclass(frozen=True, slots=True)
-class ReputationsKnown:
+class ReputationsKnown(Event):
     """Reputations from former managers, by worker id."""
 
     reputations: Mapping[str, Reputation]
 
 
 @dataclass(frozen=True, slots=True)
-class BatchCancelled:
+class BatchCancelled(Event):
     run_id: str
     batch_id: str
 
 
 @dataclass(frozen=True, slots=True)
-class RunClosed:
+class RunClosed(Event):
     """The run ended: its open batches are cancelled and its look-ahead is dropped."""
 
     run_id: str
 
 
 @dataclass(frozen=True, slots=True)
-class LookaheadAnnounced:
+class LookaheadAnnounced(Event):
     """The whole look-ahead window of a run. A version at or below the last one is ignored."""
 
     run_id: str
@@ -168,7 +161,7 @@ class LookaheadAnnounced:
 
 
 @dataclass(frozen=True, slots=True)
-class DemandObserved:
+class DemandObserved(Event):
     """Demand of the Task-Dispatcher for scenes."""
 
     pending: Mapping[str, int]
@@ -190,49 +183,19 @@ class DemandObserved:
 
 
 @dataclass(frozen=True, slots=True)
-class ScenesUnplaceable:
+class ScenesUnplaceable(Event):
     """Scenes that the Resource-Scheduler finds no worker for, each with the reason."""
 
     reasons: Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True)
-class DispatchPaused:
-    """An operator paused dispatch: no new leases."""
+class PauseChanged(Event):
+    """Dispatch is ``paused``, so that there are no new leases, or resumed."""
+
+    paused: bool
 
 
 @dataclass(frozen=True, slots=True)
-class DispatchResumed:
-    """An operator resumed dispatch."""
-
-
-@dataclass(frozen=True, slots=True)
-class Tick:
+class Tick(Event):
     """Time has passed: deadlines and expiries are checked."""
-
-
-Event = (
-    WorkerJoined
-    | WorkerReported
-    | WorkerSuspected
-    | WorkerRecovered
-    | WorkerLost
-    | WorkerDrained
-    | WorkerResumed
-    | LeasesRenewed
-    | LeaseFinished
-    | RunOpened
-    | BatchSubmitted
-    | BatchContinued
-    | BatchRestored
-    | WorkersExpected
-    | ReputationsKnown
-    | BatchCancelled
-    | RunClosed
-    | LookaheadAnnounced
-    | DemandObserved
-    | ScenesUnplaceable
-    | DispatchPaused
-    | DispatchResumed
-    | Tick
-)

@@ -8,13 +8,7 @@ from typing import Final
 
 from embomatrix.manager.control.dispatch.fair_share import SlotTimes
 from embomatrix.manager.control.dispatch.records import LeaseRecord, RolloutRecord
-from embomatrix.manager.control.events import (
-    WorkerDrained,
-    WorkerRecovered,
-    WorkerReported,
-    WorkerResumed,
-    WorkerSuspected,
-)
+from embomatrix.manager.control.events import DrainChanged, SuspicionChanged, WorkerReported
 from embomatrix.rpc.wire.values import Resources
 
 AHEAD_S: Final = 0.2
@@ -40,7 +34,7 @@ CANDIDATES: Final = 64
 """Most busy workers, idle workers and holders of a scene examined at once, in rotation: large clusters cost no more."""
 
 
-Standing = WorkerReported | WorkerSuspected | WorkerRecovered | WorkerDrained | WorkerResumed
+Standing = WorkerReported | SuspicionChanged | DrainChanged
 """Events that change whether a worker may take leases and scenes."""
 
 
@@ -94,10 +88,10 @@ class WorkerRecord:
         match event:
             case WorkerReported():
                 self.reported, self.leaving, self.paused = True, event.draining, event.paused
-            case WorkerDrained() | WorkerResumed():
-                self.drained = isinstance(event, WorkerDrained)
-            case WorkerSuspected() | WorkerRecovered():
-                self.suspect = isinstance(event, WorkerSuspected)
+            case DrainChanged():
+                self.drained = event.drained
+            case SuspicionChanged():
+                self.suspect = event.suspect
 
     @property
     def draining(self) -> bool:

@@ -21,7 +21,7 @@ from embomatrix.manager.control.commands import (
     QuarantineWorker,
     SetDesired,
 )
-from embomatrix.manager.control.events import DispatchPaused, DispatchResumed
+from embomatrix.manager.control.events import PauseChanged
 from embomatrix.manager.observe.event_log import RunEventLog
 from embomatrix.manager.observe.metrics import ManagerLoad, Meter
 from embomatrix.manager.observe.run_archive import RunArchive, RunHistory
@@ -226,7 +226,7 @@ class ManagerRuntime:
         await self._journal.note_pause(False)
 
     def _update_dispatch(self) -> None:
-        event = DispatchPaused() if self.paused or self._suspended else DispatchResumed()
+        event = PauseChanged(self.paused or self._suspended)
         self._carry_out(self.cluster.handle(event, now_s=time.monotonic()))
 
     def _carry_out(self, commands: Sequence[Command], *, more: bool = False) -> None:

@@ -10,13 +10,11 @@ from enum import StrEnum
 from typing import Final
 
 from embomatrix.manager.control.events import (
+    DrainChanged,
     Event,
-    WorkerDrained,
+    SuspicionChanged,
     WorkerJoined,
     WorkerLost,
-    WorkerRecovered,
-    WorkerResumed,
-    WorkerSuspected,
 )
 from embomatrix.rpc.status import NotFoundError, SupersededError, UnknownSessionError
 from embomatrix.rpc.wire.values import Resources
@@ -215,18 +213,18 @@ class Registry:
         if session.standing is not WorkerStanding.SUSPECT:
             return []
         session.standing = WorkerStanding.READY
-        return [WorkerRecovered(session.worker_id)]
+        return [SuspicionChanged(session.worker_id, suspect=False)]
 
     def drain(self, worker_id: str) -> list[Event]:
         session = self._session_of(worker_id)
         session.drained, session.standing = True, WorkerStanding.DRAINING
-        return [WorkerDrained(worker_id)]
+        return [DrainChanged(worker_id, drained=True)]
 
     def resume(self, worker_id: str) -> list[Event]:
         """Cancel an operator's drain. The worker's next state says whether it drains on its own."""
         session = self._session_of(worker_id)
         session.drained, session.standing = False, WorkerStanding.READY
-        return [WorkerResumed(worker_id)]
+        return [DrainChanged(worker_id, drained=False)]
 
     def note_state(self, session: WorkerSession, *, draining: bool, paused: str) -> None:
         """Note the worker's own report that it drains or is paused."""
@@ -255,7 +253,7 @@ class Registry:
                 events.append(self._lose(session, f"silent for {silent_s:.1f} s"))
             elif session.standing is WorkerStanding.READY:
                 session.standing = WorkerStanding.SUSPECT
-                events.append(WorkerSuspected(session.worker_id))
+                events.append(SuspicionChanged(session.worker_id, suspect=True))
         for session in list(self._detached.values()):
             if session.detached_s is not None and now_s - session.detached_s >= self._limits.stream_grace_s:
                 if session.standing is WorkerStanding.DRAINING:

@@ -18,13 +18,9 @@ from embomatrix.manager.services.scene import SceneServicer
 from embomatrix.manager.services.standby import refusing
 from embomatrix.manager.services.worker import WorkerServicer
 from embomatrix.proto.v1 import (
-    admin_service_pb2,
     admin_service_pb2_grpc,
-    rollout_service_pb2,
     rollout_service_pb2_grpc,
-    scene_service_pb2,
     scene_service_pb2_grpc,
-    worker_service_pb2,
     worker_service_pb2_grpc,
 )
 from embomatrix.rpc.channel import SERVER_OPTIONS, TOKEN_KEY
@@ -35,13 +31,8 @@ if TYPE_CHECKING:
     from embomatrix.manager.settings import ManagerSettings
 
 SERVICES: Final = tuple(
-    module.DESCRIPTOR.services_by_name[name].full_name
-    for module, name in (
-        (worker_service_pb2, "WorkerService"),
-        (rollout_service_pb2, "RolloutService"),
-        (scene_service_pb2, "SceneService"),
-        (admin_service_pb2, "AdminService"),
-    )
+    f"embomatrix.proto.v1.{name}"
+    for name in ("WorkerService", "RolloutService", "SceneService", "AdminService")
 )
 
 

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import sqlite3
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -211,7 +211,7 @@ class SqliteStore:
         On a thread, a slow disk or another writing process does not delay heartbeats.
         """
         async with self._lock:
-            with self._errors():
+            try:
                 if written <= BRIEF_BYTES and self._journal_bytes() < CHECKPOINT_BYTES:
                     try:
                         return self._transaction(work, fenced)
@@ -219,17 +219,12 @@ class SqliteStore:
                         if not _is_busy(error):
                             raise
                 return await self._on_thread(lambda: self._checkpointed(work, fenced))
-
-    @contextlib.contextmanager
-    def _errors(self) -> Iterator[None]:
-        try:
-            yield
-        except sqlite3.Error as error:
-            if getattr(error, "sqlite_errorcode", None) in _FULL:
-                raise StateFullError(
-                    f"the state file {self._path} can't be written ({error}): make room on its disk"
-                ) from error
-            raise StateError(f"the state file {self._path} failed: {error}") from error
+            except sqlite3.Error as error:
+                if getattr(error, "sqlite_errorcode", None) in _FULL:
+                    raise StateFullError(
+                        f"the state file {self._path} can't be written ({error}): make room on its disk"
+                    ) from error
+                raise StateError(f"the state file {self._path} failed: {error}") from error
 
     async def _on_thread(self, work: Callable[[], T]) -> T:
         thread = asyncio.ensure_future(asyncio.to_thread(work))

@@ -39,24 +39,21 @@ from embomatrix.manager.control.events import (
     BatchRestored,
     BatchSubmitted,
     DemandObserved,
-    DispatchPaused,
-    DispatchResumed,
+    DrainChanged,
     Event,
     LeaseFinished,
     LeasesRenewed,
+    PauseChanged,
     ReputationsKnown,
     RunClosed,
     RunOpened,
     ScenesUnplaceable,
+    SuspicionChanged,
     Tick,
-    WorkerDrained,
     WorkerJoined,
     WorkerLost,
-    WorkerRecovered,
     WorkerReported,
-    WorkerResumed,
     WorkersExpected,
-    WorkerSuspected,
 )
 from embomatrix.manager.control.workers import WorkerRecord
 
@@ -95,8 +92,8 @@ class Dispatcher:
                 renew_leases(state, event)
             case RunOpened(run_id, terms):
                 state.runs.of(run_id).terms = terms
-            case DispatchPaused() | DispatchResumed():
-                state.paused = isinstance(event, DispatchPaused)
+            case PauseChanged(paused):
+                state.paused = paused
                 fill_workers(state, list(state.pool.workers))
             case BatchSubmitted(batch, count):
                 queue_next(state, open_batch(state, batch, {}), count)
@@ -120,7 +117,7 @@ class Dispatcher:
                 worker_reported(state, event)
             case WorkerLost():
                 worker_lost(state, event)
-            case WorkerSuspected() | WorkerRecovered() | WorkerDrained() | WorkerResumed():
+            case SuspicionChanged() | DrainChanged():
                 standing_changed(state, event)
             case ScenesUnplaceable(reasons):
                 note_unplaceable(state, reasons)

@@ -9,14 +9,14 @@ from embomatrix.manager.control.dispatch.audits import restore_quarantine
 from embomatrix.manager.control.dispatch.lease_ends import give_back, judge_scene
 from embomatrix.manager.control.dispatch.leasing import fill_workers, offer_scene, queue_rollouts, revoke
 from embomatrix.manager.control.dispatch.outcomes import open_batch
-from embomatrix.manager.control.dispatch.records import DispatchPhase, RolloutRecord
+from embomatrix.manager.control.dispatch.records import DispatchPhase
 from embomatrix.manager.control.dispatch.state import DispatchState
 from embomatrix.manager.control.events import (
     BatchRestored,
+    DrainChanged,
     WorkerJoined,
     WorkerLost,
     WorkerReported,
-    WorkerResumed,
 )
 from embomatrix.manager.control.workers import Standing, WorkerRecord
 from embomatrix.rpc.wire.leases import LeaseOrigin, LeaseRef
@@ -72,7 +72,7 @@ def standing_changed(state: DispatchState, event: Standing) -> None:
     if worker is None:
         return
     worker.apply(event)
-    if isinstance(event, WorkerResumed):
+    if isinstance(event, DrainChanged) and not event.drained:
         state.auditor.pardon(worker.worker_id)
         restore_quarantine(state, worker)
     state.pool.update_standing(worker)
@@ -137,15 +137,11 @@ def _adopt(state: DispatchState, worker: WorkerRecord, ref: LeaseRef, origin: Le
         revoke(state, other, f"{worker.worker_id} holds a later lease")
     if record.phase is DispatchPhase.PENDING:
         state.queues.take(record)
-    _claimed(state, record)
-    record.attempts = max(record.attempts, origin.attempt - 1)
-    state.log(RolloutStepKind.LEASED, record.key, worker.worker_id, "adopted from a former manager")
-    state.leases.enter(ref, record, worker, state.now_s)
-    return True
-
-
-def _claimed(state: DispatchState, record: RolloutRecord) -> None:
     if state.awaited.pop(record.key, None) is not None:
         state.awaited_scenes[record.scene] -= 1
         if not state.awaited_scenes[record.scene]:
             del state.awaited_scenes[record.scene]
+    record.attempts = max(record.attempts, origin.attempt - 1)
+    state.log(RolloutStepKind.LEASED, record.key, worker.worker_id, "adopted from a former manager")
+    state.leases.enter(ref, record, worker, state.now_s)
+    return True

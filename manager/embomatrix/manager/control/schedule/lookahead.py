@@ -1,6 +1,6 @@
 """Look-ahead windows of runs, and what loading scenes ahead was worth."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from embomatrix.manager.histogram import Histogram
@@ -33,15 +33,6 @@ class LookaheadWindow:
             del self._steps[step]
         for scene in {rollout.bundle_digest for rollout in batch.rollouts}:
             self._steps.get(batch.step, {}).pop(scene, None)
-
-
-def announcers(windows: Mapping[str, LookaheadWindow]) -> dict[str, str]:
-    """Return the first run that announced each scene."""
-    found: dict[str, str] = {}
-    for run_id, window in windows.items():
-        for scene in window.scenes:
-            found.setdefault(scene, run_id)
-    return found
 
 
 @dataclass(slots=True)

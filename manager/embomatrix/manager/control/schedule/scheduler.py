@@ -15,21 +15,19 @@ from embomatrix.manager.control.events import (
     BatchRestored,
     BatchSubmitted,
     DemandObserved,
+    DrainChanged,
     Event,
     LeaseFinished,
     LookaheadAnnounced,
     RunClosed,
     RunOpened,
+    SuspicionChanged,
     Tick,
-    WorkerDrained,
     WorkerJoined,
     WorkerLost,
-    WorkerRecovered,
     WorkerReported,
-    WorkerResumed,
-    WorkerSuspected,
 )
-from embomatrix.manager.control.schedule.lookahead import LookaheadWindow, PrewarmLedger, announcers
+from embomatrix.manager.control.schedule.lookahead import LookaheadWindow, PrewarmLedger
 from embomatrix.manager.control.schedule.placement import Need, RunShare, needs_of, place
 from embomatrix.manager.control.schedule.readiness import ReadinessForecast, SceneCosts, refusal_reason
 from embomatrix.manager.control.schedule.residency import Residencies, ResidencySites
@@ -110,7 +108,7 @@ class Scheduler:
                 return Urgency.NONE
             case WorkerJoined() | WorkerLost():
                 return self._on_presence(event)
-            case WorkerDrained() | WorkerResumed() | WorkerSuspected() | WorkerRecovered():
+            case SuspicionChanged() | DrainChanged():
                 return self.standing_changed(event.worker_id)
             case Tick():
                 return Urgency.LATER if self._demand.pending or self._residencies.failing else Urgency.NONE
@@ -122,7 +120,9 @@ class Scheduler:
         """Place every needed scene; return the desired sets that changed."""
         self._now_s = now_s
         needs = needs_of(self._peaks, [window.entries for window in self.windows.values()])
-        owners = {**announcers(self.windows), **self._demand.runs}
+        # The run whose turn is next owns a scene, else the first run that announced it.
+        owners = {scene: run for run, window in reversed(self.windows.items()) for scene in window.scenes}
+        owners |= self._demand.runs
         turns = {scene: turn for turn, scene in enumerate(self._demand.waited_s)}
         needs = [
             self._spread(
