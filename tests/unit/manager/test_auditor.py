@@ -51,7 +51,7 @@ def test_changed_reputation_is_stored_without_open_disputes():
     successor = Auditor(AuditRules(probation=2), b"key")
     successor.know({row.key: reputation_of(row) for row in written})
     assert successor.of("w1") == Reputation(taken=1, agreed=1, audited=1)
-    assert successor.quarantined("w2") == "it contradicts w1 and w3"
+    assert successor.of("w2").quarantine == "it contradicts w1 and w3"
     assert successor.take_changed() == []
 
 

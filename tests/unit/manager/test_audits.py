@@ -78,7 +78,7 @@ class Bench:
         for command in self.cluster.handle(event, now_s=self.now_s):
             match command:
                 case GiveLease(worker_id, ref):
-                    assert not self.cluster.dispatcher.auditor.quarantined(worker_id)
+                    assert not self.cluster.dispatcher.auditor.of(worker_id).quarantine
                     self.live[ref] = command
                 case CancelLease(_, ref):
                     self.live.pop(ref, None)

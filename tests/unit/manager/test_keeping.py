@@ -13,10 +13,15 @@ from tests.fakes.worker import completed
 from typer.testing import CliRunner
 
 from embomatrix.manager.commands.app import app
+from embomatrix.manager.control.dispatch.state import DispatchLimits
+from embomatrix.manager.control.reputation import AuditRules
+from embomatrix.manager.control.schedule.scheduler import ScheduleLimits
 from embomatrix.manager.observe.metrics import Meter, quantile
 from embomatrix.manager.runtime.bundles import BundleStore
+from embomatrix.manager.runtime.registry import LivenessLimits
 from embomatrix.manager.runtime.results import PER_MESSAGE, BatchLog, ResultLogs
 from embomatrix.manager.runtime.serialization import group_and_kind, result_row, timed_row
+from embomatrix.manager.services.app import limits_of
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.manager.store.protocol import ResultRow
 from embomatrix.proto.v1.types_pb2 import RolloutResult as RolloutResultMessage
@@ -203,6 +208,15 @@ def test_unknown_settings_are_refused_and_the_token_is_never_shown():
     with pytest.raises(ValidationError, match="Extra inputs"):
         ManagerSettings(prot=1)
     assert "secret" not in repr(ManagerSettings(token="secret"))
+
+
+def test_limits_have_the_values_of_the_settings_of_the_same_names():
+    audit = AuditRules()
+    assert limits_of(DispatchLimits, ManagerSettings(), audit=audit) == DispatchLimits()
+    limits = limits_of(DispatchLimits, ManagerSettings(lease_ttl_s=7.0, max_attempts=5), audit=audit)
+    assert limits == DispatchLimits(lease_ttl_s=7.0, max_attempts=5)
+    assert limits_of(ScheduleLimits, ManagerSettings()) == ScheduleLimits()
+    assert limits_of(LivenessLimits, ManagerSettings(lost_after_s=3.0)) == LivenessLimits(lost_after_s=3.0)
 
 
 def test_state_file_is_in_the_data_folder_by_default():

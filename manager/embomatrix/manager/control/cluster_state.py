@@ -10,7 +10,6 @@ from embomatrix.manager.control.dispatch.dispatcher import Dispatcher
 from embomatrix.manager.control.dispatch.state import DispatchLimits
 from embomatrix.manager.control.events import Event, RunClosed, ScenesUnplaceable
 from embomatrix.manager.control.schedule.scheduler import ScheduleLimits, Scheduler, Urgency
-from embomatrix.rpc.wire.run_log import RolloutStep
 from embomatrix.rpc.wire.values import RunStats
 
 UNIT_COST_S: Final = 1e-5
@@ -103,10 +102,6 @@ class ClusterState:
         """Return the summed counters of all runs, closed ones included."""
         open_runs = [self.stats(run_id) for run_id in self.dispatcher.state.runs]
         return _sum([self._closed, *open_runs])
-
-    def explain(self, rollout_id: str) -> tuple[list[RolloutStep], str]:
-        """Return the history of a rollout and its present place in words, which is empty for a delivered one."""
-        return self.dispatcher.state.explain(rollout_id), self.dispatcher.state.where(rollout_id)
 
     def check_invariants(self) -> None:
         """Raise AssertionError if parts of the state contradict each other."""

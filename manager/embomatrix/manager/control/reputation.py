@@ -138,11 +138,6 @@ class Auditor:
     def of(self, worker_id: str) -> Reputation:
         return self._reputations.setdefault(worker_id, Reputation())
 
-    def quarantined(self, worker_id: str) -> str:
-        """Return the reason of the worker's quarantine; empty if it is in none."""
-        found = self._reputations.get(worker_id)
-        return found.quarantine if found is not None else ""
-
     def wants(self, worker_id: str, lease_id: str, *, verified: bool) -> bool:
         """True if this result should be audited; in a ``verified`` run before its delivery."""
         if not (verified or self.rules.background):

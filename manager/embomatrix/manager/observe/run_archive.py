@@ -100,7 +100,8 @@ class RunHistory:
 
     def explain(self, rollout_id: str) -> RolloutExplanation:
         """Return the recent decisions about a rollout. Raises ``NotFoundError``."""
-        steps, place = self._cluster.explain(rollout_id)
+        state = self._cluster.dispatcher.state
+        steps, place = state.explain(rollout_id), state.where(rollout_id)
         if not steps and not place:
             raise NotFoundError(
                 f"there is no trace of rollout {rollout_id!r}: this manager never had it, or its history made room for "

@@ -1,7 +1,7 @@
 """Figures of an open run in bounded memory: durations by phase, work by worker, outcomes over time, latest failures."""
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Final
 
 from embomatrix.manager.histogram import Histogram
@@ -85,10 +85,7 @@ class RunFigures:
 
     def worker_rows(self) -> tuple[RunWorker, ...]:
         """Return the work of each worker, sorted by name."""
-        return tuple(
-            RunWorker(name, found.completed, found.failed, found.execute_s, found.load_s)
-            for name, found in sorted(self.workers.items())
-        )
+        return tuple(RunWorker(name, *astuple(found)) for name, found in sorted(self.workers.items()))
 
 
 def summary_of(histogram: Histogram) -> PhaseSummary:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import gc
 import logging
 import secrets
 import signal
 import socket
 from collections.abc import AsyncIterator, Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import grpc
 import uvicorn
@@ -51,9 +51,10 @@ STOP_GRACE_S: Final = 0.5
 MEGABYTE: Final = 1_000_000
 YOUNG_OBJECTS: Final = 5_000
 """Objects allocated between two collections of the youngest generation, which take 2 ms."""
+LimitsT = TypeVar("LimitsT", DispatchLimits, ScheduleLimits, LivenessLimits)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclasses.dataclass(frozen=True, slots=True)
 class Endpoints:
     """Addresses that a manager serves."""
 
@@ -197,20 +198,10 @@ async def _win(
             await server.stop(None)
 
 
-def _dispatch_limits(settings: ManagerSettings) -> DispatchLimits:
-    return DispatchLimits(
-        lease_ttl_s=settings.lease_ttl_s,
-        lease_limit_s=settings.lease_limit_s,
-        execute_deadline_s=settings.execute_deadline_s,
-        rollout_deadline_s=settings.rollout_deadline_s,
-        no_capacity_s=settings.no_capacity_s,
-        max_attempts=settings.max_attempts,
-        hedge_after_s=settings.hedge_after_s,
-        hedge_share=settings.hedge_share,
-        stall_after_s=settings.stall_after_s,
-        restart_grace_s=settings.restart_grace_s,
-        audit=AuditRules(settings.audit_probation, settings.audit_share, settings.audits_all_runs),
-    )
+def limits_of(kind: type[LimitsT], settings: ManagerSettings, **others: Any) -> LimitsT:
+    """Return limits with the values of the settings of the same names, and ``others``; the rest has its defaults."""
+    names = {field.name for field in dataclasses.fields(kind)} - others.keys()
+    return kind(**settings.model_dump(include=names), **others)
 
 
 async def _start_runtime(
@@ -218,18 +209,13 @@ async def _start_runtime(
 ) -> ManagerRuntime:
     with _folder_errors(settings):
         await note_folder(store, settings.data_dir)
-    schedule = ScheduleLimits(affinity_wait_s=settings.affinity_wait_s)
-    liveness = LivenessLimits(
-        heartbeat_s=settings.heartbeat_s,
-        lost_after_s=settings.lost_after_s,
-        stream_grace_s=settings.stream_grace_s,
-    )
+    audit = AuditRules(settings.audit_probation, settings.audit_share, settings.audits_all_runs)
     # Epochs of sessions and leases exceed those of all earlier managers.
     first_epoch = (epoch << 32) + 1
-    registry = Registry(liveness, first_epoch=first_epoch)
+    registry = Registry(limits_of(LivenessLimits, settings), first_epoch=first_epoch)
     cluster = ClusterState(
-        _dispatch_limits(settings),
-        schedule,
+        limits_of(DispatchLimits, settings, audit=audit),
+        limits_of(ScheduleLimits, settings),
         boot_id=secrets.token_hex(4),
         first_epoch=first_epoch,
         audit_key=secrets.token_bytes(32),

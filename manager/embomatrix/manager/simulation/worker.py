@@ -198,15 +198,10 @@ class SimulatedWorker:
 
     def _wait(self) -> None:
         """Reconnect with exponential backoff; drop leases that can no longer be renewed."""
-        self._fence()
-        self._later(self._backoff.next_s(), self._attach)
-
-    def _fence(self) -> None:
-        if (
-            self.slots is not None
-            and self._queue.now_s - self._renewed_s > self._scenario.dispatch.lease_ttl_s
-        ):
+        lapsed = self._queue.now_s - self._renewed_s > self._scenario.dispatch.lease_ttl_s
+        if self.slots is not None and lapsed:
             self.slots.cancel(set(self.slots.held()))
+        self._later(self._backoff.next_s(), self._attach)
 
     def _disconnect(self, *, silent: bool) -> None:
         session, stream = self._session, self._stream

@@ -283,7 +283,7 @@ def _standing(runtime: ManagerRuntime, session: WorkerSession) -> WorkerStanding
     """Return the state to show: quarantine and drain override the worker's own report."""
     if session.standing.is_gone:
         return session.standing
-    if runtime.cluster.dispatcher.auditor.quarantined(session.worker_id):
+    if runtime.cluster.dispatcher.auditor.of(session.worker_id).quarantine:
         return WorkerStanding.QUARANTINED
     record = runtime.cluster.dispatcher.workers.get(session.worker_id)
     return WorkerStanding.DRAINING if record is not None and record.draining else session.standing

@@ -75,7 +75,7 @@ def drop_run(state: DispatchState, run_id: str) -> None:
 
 def restore_quarantine(state: DispatchState, worker: WorkerRecord) -> None:
     """Apply what is known of the worker from earlier sessions."""
-    worker.quarantined = bool(state.auditor.quarantined(worker.worker_id))
+    worker.quarantined = bool(state.auditor.of(worker.worker_id).quarantine)
     state.pool.update_standing(worker)
 
 
@@ -150,7 +150,7 @@ def _convict(state: DispatchState, worker_id: str, case: AuditCase) -> None:
     """Quarantine a worker, and re-dispatch its rollouts without a confirmed result."""
     others = " and ".join(o.worker_id for o in case.opinions if o.worker_id != worker_id)
     reason = f"its result of rollout {case.key.rollout_id} of run {case.key.run_id} contradicts {others}"
-    known = state.auditor.quarantined(worker_id)
+    known = state.auditor.of(worker_id).quarantine
     state.auditor.convict(worker_id, known or reason)
     if known:
         return  # a second wrong result that was under way
