@@ -203,18 +203,11 @@ class FloorGrid:
         cell = wider.cell(x_m, y_m)
         return self.parts.largest_in(wider.parts, wider.label(cell)) if cell is not None else 0
 
-    def free_centers(self, low_m: Vec2, high_m: Vec2, label: int) -> FloatArray:
-        """World coordinates of the component's cells in a rectangle, shape (n, 2)."""
+    def free_centers(self, low_m: Vec2, high_m: Vec2, label: int | None = None) -> FloatArray:
+        """World coordinates of the component's cells in a rectangle, or of all free ones without a label; shape (n, 2)."""
         window = self._window(low_m, high_m)
-        return self._centers(window, (self.parts.within(window) == label) & (label > 0))
-
-    def all_free_centers(self, low_m: Vec2, high_m: Vec2) -> FloatArray:
-        """World coordinates of all free cells in a rectangle, shape (n, 2)."""
-        window = self._window(low_m, high_m)
-        return self._centers(window, self.parts.within(window) > 0)
-
-    def _centers(self, window: Window, chosen: BoolArray) -> FloatArray:
-        """World coordinates of the chosen cells of a window, shape (n, 2)."""
+        numbers = self.parts.within(window)
+        chosen = numbers > 0 if label is None else (numbers == label) & (label > 0)
         corner = np.array([window[0].start, window[1].start])
         return np.asarray(self._origin + (np.argwhere(chosen) + corner + 0.5) * CELL_M, dtype=np.float64)
 

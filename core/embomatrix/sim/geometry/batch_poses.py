@@ -140,15 +140,10 @@ class PoseSet:
         """
         positions, rotations = np.ascontiguousarray(rows[:, :3]), _rotations(rows[:, 3:])
         if then is not IDENTITY:
-            positions, rotations = (
-                positions + rotations @ np.array(then.position_m),
-                rotations @ then.rotation,
-            )
+            positions = positions + rotations @ np.array(then.position_m)
+            rotations = rotations @ then.rotation
         names = tuple(dict.fromkeys(links))
-        if len(names) > 1:
-            link_of = np.array([names.index(link) for link in links], dtype=np.int64)
-        else:
-            link_of = np.zeros(len(links), dtype=np.int64)
+        link_of = np.array([names.index(link) for link in links], dtype=np.int64)
 
         def extents(turned: Turned) -> tuple[FloatArray, FloatArray]:
             quat_xyzw, fractions = turned
@@ -189,8 +184,5 @@ def _rotations(quats_xyzw: FloatArray) -> FloatArray:
     xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
     xy, xz, yz = 2 * x * y, 2 * x * z, 2 * y * z
     wx, wy, wz = 2 * w * x, 2 * w * y, 2 * w * z
-    found = np.empty((len(x), 3, 3))
-    found[:, 0, 0], found[:, 0, 1], found[:, 0, 2] = 1 - yy - zz, xy - wz, xz + wy
-    found[:, 1, 0], found[:, 1, 1], found[:, 1, 2] = xy + wz, 1 - xx - zz, yz - wx
-    found[:, 2, 0], found[:, 2, 1], found[:, 2, 2] = xz - wy, yz + wx, 1 - xx - yy
-    return found
+    rows = [[1 - yy - zz, xy - wz, xz + wy], [xy + wz, 1 - xx - zz, yz - wx], [xz - wy, yz + wx, 1 - xx - yy]]
+    return np.ascontiguousarray(np.moveaxis(np.array(rows), 2, 0))

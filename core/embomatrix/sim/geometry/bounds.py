@@ -74,11 +74,9 @@ class AssetBounds:
         x, y, z = pose.position_m
         return Aabb((x + a, y + b, z + c), (x + d, y + e, z + f))
 
-    def extents(
-        self, rotations: FloatArray, fractions: Sequence[float] = ()
-    ) -> tuple[FloatArray, FloatArray]:
+    def extents(self, rotations: FloatArray, fractions: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
         """Corners of the boxes relative to the origin at rotations of shape (n, 3, 3); each of shape (n, 3)."""
-        points, radii = self._points_at[tuple(fractions)]
+        points, radii = self._points_at[fractions]
         turned = rotations @ points  # (n, 3, m)
         if radii is None:
             return turned.min(axis=2), turned.max(axis=2)
@@ -140,22 +138,13 @@ class AssetParts:
 
     def within(self, pose: Pose, fractions: Sequence[float], box: Aabb) -> list[ConvexPart]:
         """Parts whose boxes overlap a world box, each at its world pose."""
-        x, y, z = pose.position_m
-        (low_x, low_y, low_z), (high_x, high_y, high_z) = box.low_m, box.high_m
-        extents = iter(self._extents[pose.quat_xyzw, tuple(fractions)])
-        found: list[ConvexPart] = []
-        for frame, parts in self._frames(pose, fractions):
-            for part, ((a, b, c), (d, e, f)) in zip(parts, extents, strict=False):
-                if (
-                    x + a <= high_x
-                    and y + b <= high_y
-                    and z + c <= high_z
-                    and x + d >= low_x
-                    and y + e >= low_y
-                    and z + f >= low_z
-                ):
-                    found.append(ConvexPart(part.shape, frame @ part.pose, part.size_m, part.vertices_m))
-        return found
+        boxes = iter(self.boxes(pose, fractions))
+        return [
+            ConvexPart(part.shape, frame @ part.pose, part.size_m, part.vertices_m)
+            for frame, parts in self._frames(pose, fractions)
+            for part, part_box in zip(parts, boxes, strict=False)
+            if part_box.overlaps(box)
+        ]
 
     def _find_panels(self, turned_as: Turned) -> list[Corners]:
         extents = iter(self._extents[turned_as])

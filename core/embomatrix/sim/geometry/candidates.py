@@ -93,19 +93,11 @@ def patches(bounds: AssetBounds, support: Asset, relation: Relation) -> tuple[Pa
     return tuple(found)
 
 
-def proposals(found: Sequence[Patch], shift: Vec2, tries: int) -> Iterator[tuple[Patch, Pose]]:
-    """Yield up to ``tries`` poses in the frame of a support's link, the patches taken in turn.
+def proposed_places(found: Sequence[Patch], shift: Vec2, tries: int) -> FloatArray:
+    """Positions of ``tries`` poses on the links of a support, shape (n, 3), the patches taken in turn; empty without a patch.
 
     ``shift`` in the unit square moves the whole pattern: equal shifts give equal poses. The relation is not checked.
     """
-    for patch, (x, y, z) in zip(
-        itertools.cycle(found), proposed_places(found, shift, tries).tolist(), strict=False
-    ):
-        yield patch, Pose.from_xyz_yaw(x, y, z, patch.yaw)
-
-
-def proposed_places(found: Sequence[Patch], shift: Vec2, tries: int) -> FloatArray:
-    """Positions of ``proposals``, shape (n, 3); empty without a patch."""
     if not found:
         return np.zeros((0, 3))
     rows = np.arange(tries) % len(found)
@@ -117,9 +109,12 @@ def proposed_places(found: Sequence[Patch], shift: Vec2, tries: int) -> FloatArr
 
 
 def candidates(held: Asset, support: Asset, relation: Relation, shift: Vec2, tries: int) -> Iterator[Pose]:
-    """Proposals at which the relation holds."""
+    """Poses at proposed places at which the relation holds."""
     bounds = bounds_of(held)
-    for _, pose in proposals(patches(bounds, support, relation), shift, tries):
+    found = patches(bounds, support, relation)
+    places = proposed_places(found, shift, tries).tolist()
+    for patch, (x, y, z) in zip(itertools.cycle(found), places, strict=False):
+        pose = Pose.from_xyz_yaw(x, y, z, patch.yaw)
         if _stands(bounds.box(pose), support, relation):
             yield pose
 

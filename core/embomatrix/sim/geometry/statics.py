@@ -163,17 +163,15 @@ def _bears(point: Vec2, corners: Sequence[Vec2], base: Sequence[Vec2]) -> bool:
 
 def _underside(part: ConvexPart) -> list[Vec3]:
     """Candidates for the lowest points of a part, in the asset's frame. A sphere has none: it rests on a point."""
-    x, y, z = (extent / 2 for extent in part.size_m)
     match part.shape:
-        case Shape.BOX:
-            local = [(u, v, t) for u in (-x, x) for v in (-y, y) for t in (-z, z)]
+        case Shape.BOX | Shape.HULL:
+            local = part.corners().tolist()
         case Shape.CYLINDER:
+            x, _, z = (extent / 2 for extent in part.size_m)
             local = [(x * u, x * v, t) for u, v in _circle() for t in (-z, z)]
-        case Shape.HULL:
-            local = list(part.vertices_m)
         case Shape.SPHERE:
             local = []
-    return [part.pose.apply(point) for point in local]
+    return [part.pose.apply((x, y, z)) for x, y, z in local]
 
 
 @functools.cache

@@ -78,7 +78,7 @@ class Floor:
         if grid.is_free(*start):
             return grid.cell(*start)
         low, high = (start[0] - OUT_M, start[1] - OUT_M), (start[0] + OUT_M, start[1] + OUT_M)
-        spots = grid.all_free_centers(low, high)
+        spots = grid.free_centers(low, high)
         here = np.array(start)
         air = self._air(here[None])[0]
         for number in np.argsort(np.linalg.norm(spots - here, axis=1), kind="stable")[:OUT_TRIED].tolist():
