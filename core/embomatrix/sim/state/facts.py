@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 from embomatrix.world.state import Relation, State, SubstanceFact, SubstanceRelation
@@ -18,6 +19,8 @@ STATES = {state.value: state for state in State}
 SUBSTANCES = {relation.value: relation for relation in SubstanceRelation}
 REAL, FUTURE = "real", "future"
 """Predicates of BDDL: the object is in the world; the object was absent at the start and still is."""
+ARGUMENTS = dict.fromkeys((*RELATIONS, *SUBSTANCES), 2) | dict.fromkeys((*STATES, REAL, FUTURE), 1)
+"""Number of arguments of each predicate."""
 
 
 class TrackedSets(dict[str, set[T]]):
@@ -62,59 +65,44 @@ class FactError(ValueError):
     """Goal that asks for a fact which the simulator can't answer."""
 
 
+@dataclass(frozen=True, slots=True)
 class EngineFacts:
-    """Facts of the present moment; they change with the engine and the states."""
+    """Facts of the present moment; they change with the engine and the states.
 
-    def __init__(
-        self,
-        relations: Relations,
-        states: Mapping[str, Set[State]],
-        substances: Mapping[str, Set[SubstanceFact]],
-        absent: Set[str],
-        future: Set[str],
-    ) -> None:
-        """``states`` and ``substances`` map each object to its states and facts; ``absent`` are the objects outside the world.
+    ``states`` and ``substances`` map each object to its states and facts; ``absent`` are the objects outside the world. All
+    are read at every query, not copied. ``future`` are the objects that were absent at the start.
+    """
 
-        All are read at every query, not copied. ``future`` are the objects that were absent at the start.
-        """
-        self._relations = relations
-        self._states = states
-        self._substances = substances
-        self._absent = absent
-        self._future = future
+    relations: Relations
+    states: Mapping[str, Set[State]]
+    substances: Mapping[str, Set[SubstanceFact]]
+    absent: Set[str]
+    future: Set[str]
 
     def holds(self, predicate: str, args: tuple[str, ...]) -> bool:
-        """Return True if ``predicate(args)`` holds. Raises FactError for unknown predicates, objects or argument counts."""
-        if predicate in RELATIONS and len(args) == 2:
-            first, second = args
-            relation = RELATIONS[predicate]
-            self._check_objects(args[:1] if relation is Relation.INROOM else args)
-            return self._relations.holds(relation, first, second)
-        if predicate in STATES and len(args) == 1:
-            self._check_objects(args)
-            return self._state(args[0], STATES[predicate])
-        if predicate in SUBSTANCES and len(args) == 2:
-            self._check_objects(args[:1])
-            there = args[0] not in self._absent
-            return there and fact_holds(SUBSTANCES[predicate], args[1], self._substances[args[0]])
-        if predicate in (REAL, FUTURE) and len(args) == 1:
-            self._check_objects(args)
-            absent = args[0] in self._absent
-            return (absent and args[0] in self._future) if predicate == FUTURE else not absent
-        raise FactError(
-            f"found ({' '.join((predicate, *args))}): expected one of {', '.join((*RELATIONS, *SUBSTANCES))} with "
-            f"two arguments or one of {', '.join((*STATES, REAL, FUTURE))} with one"
-        )
+        """Return True if ``predicate(args)`` holds. Raises FactError for unknown predicates, objects or argument counts.
 
-    def _state(self, name: str, state: State) -> bool:
-        """An object outside the world has no state."""
-        if name in self._absent:
-            return False
+        An object outside the world has no state and no substances.
+        """
+        if ARGUMENTS.get(predicate) != len(args):
+            raise FactError(
+                f"found ({' '.join((predicate, *args))}): expected one of {', '.join((*RELATIONS, *SUBSTANCES))} with "
+                f"two arguments or one of {', '.join((*STATES, REAL, FUTURE))} with one"
+            )
+        relation = RELATIONS.get(predicate)
+        for item in args[:1] if relation in (None, Relation.INROOM) else args:
+            if item not in self.states:
+                raise FactError(f"there is no object {item!r} in the scene: expected one of its objects")
+        if relation is not None:
+            return self.relations.holds(relation, *args)
+        name, absent = args[0], args[0] in self.absent
+        if predicate in SUBSTANCES:
+            return not absent and fact_holds(SUBSTANCES[predicate], args[1], self.substances[name])
+        if predicate in STATES:
+            return not absent and self._has_state(name, STATES[predicate])
+        return (absent and name in self.future) if predicate == FUTURE else not absent
+
+    def _has_state(self, name: str, state: State) -> bool:
         if state in MEANINGS:
-            return MEANINGS[state] in self._substances[name]
-        return self._relations.open(name) if state is State.OPEN else state in self._states[name]
-
-    def _check_objects(self, names: tuple[str, ...]) -> None:
-        for name in names:
-            if name not in self._states:
-                raise FactError(f"there is no object {name!r} in the scene: expected one of its objects")
+            return MEANINGS[state] in self.substances[name]
+        return self.relations.open(name) if state is State.OPEN else state in self.states[name]
