@@ -181,7 +181,7 @@ class Simulator:
         yield from world.navigator.warm_up()
         yield from world.swings.warm_up()
         # Least useful, so last: a slot that is forked early misses it the least.
-        yield from world.placer.look_up(self._tables)
+        yield from world.placer.options.warm_up(self._tables)
 
     def close(self) -> None:
         """Close the engine and the actor and end the simulator's use."""

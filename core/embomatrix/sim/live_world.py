@@ -81,7 +81,7 @@ class LiveWorld:
         self.states: TrackedSets[State] = TrackedSets()
         self.substances: TrackedSets[SubstanceFact] = TrackedSets()
         self._future = frozenset(item.name for item in self.scene.objects if item.absent)
-        self.absent: set[str] = set()
+        self.absent: set[str] = set(self._future)
         self._changes_since = ChangeReader(engine)
         self.thermal = Thermal(engine, self.relations, self.states)
         self.water = Water(engine, self.relations, self.states, self.substances)
@@ -90,8 +90,9 @@ class LiveWorld:
         self.rooms = tuple(room.name for room in self.scene.rooms)
         self.robot = self.navigator.start
         self.hand = Hand(engine)
-        self._take_states_from_scene()
-        self.absent |= self._future
+        for item in self.scene.objects:
+            self.states[item.name] = set(item.states & SYMBOLIC)
+            self.substances[item.name] = set(facts_of(item.states, item.substances))
         self.let_sources_act()
         self.states.snapshot()
         self.substances.snapshot()
@@ -191,11 +192,6 @@ class LiveWorld:
         if self.absent:
             lines += sorted(self.absent)
         return self.engine.state_bytes() + "\n".join(lines).encode()
-
-    def _take_states_from_scene(self) -> None:
-        for item in self.scene.objects:
-            self.states[item.name] = set(item.states & SYMBOLIC)
-            self.substances[item.name] = set(facts_of(item.states, item.substances))
 
 
 def prepare(bundle: Bundle, world: LiveWorld) -> Bundle:

@@ -1,7 +1,7 @@
 """Placement of a held object: the first verified pose that is still free and in reach."""
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from typing import Final, TypeVar
 
 import numpy as np
@@ -44,7 +44,7 @@ class Placer:
         self._relations = relations
         self._navigator = navigator
         self._scene = engine.scene
-        self._options = PlacementOptions(engine.scene, cache)
+        self.options = PlacementOptions(engine.scene, cache)
         self._reached = cache.reached
 
     def warm_up(self) -> Iterator[None]:
@@ -52,15 +52,11 @@ class Placer:
         movable = {item.asset_id for item in self._scene.objects if not item.fixed}
         for asset_id, asset in self._scene.assets.items():
             if asset_id in movable:
-                self._options.footprints[asset_id]
-                self._options.bases[asset_id]
+                self.options.footprints[asset_id]
+                self.options.bases[asset_id]
                 yield
             parts_of(asset).boxes(IDENTITY, (0.0,) * len(asset.joints))
             yield
-
-    def look_up(self, tables: Iterable[Sequence[str]]) -> Iterator[None]:
-        """Look up placements of the objects of each table on its supports, one pair per step. Changes no answer."""
-        return self._options.warm_up(tables)
 
     def find(
         self,
@@ -106,13 +102,13 @@ class Placer:
 
     def has_verified(self, held: str, target: str, relation: Relation) -> bool:
         """Return True if any pose was verified for this pair and relation."""
-        return held != target and any(True for _ in self._options.verified(held, target, relation))
+        return held != target and any(True for _ in self.options.verified(held, target, relation))
 
     def verified(
         self, held: str, target: str, relation: Relation, robot: StandPose, most: int
     ) -> tuple[tuple[int, Pose], ...]:
         """Apply ``choices`` to the first non-empty set of verified poses; each pose comes with its number in the set."""
-        options = next(self._options.verified(held, target, relation), None)
+        options = next(self.options.verified(held, target, relation), None)
         if options is None or held == target or not is_upright(self._engine.pose(target)):
             return ()
         search = self._search(held, target, relation, robot)
@@ -127,7 +123,7 @@ class Placer:
         excluded_stands: tuple[StandPose, ...] = (),
     ) -> PlacementSearch:
         return PlacementSearch(
-            self._engine, self._relations, self._options, held, target, relation, robot, excluded_stands
+            self._engine, self._relations, self.options, held, target, relation, robot, excluded_stands
         )
 
     def _first(self, most: int, held: str, found: Iterator[T]) -> tuple[T, ...]:
