@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
+from trimesh.util import append_faces
 
 from embomatrix.factory.assets.body import OPEN_ABOVE_M, Body
 from embomatrix.factory.assets.shapes import box, hull, mesh_of, rounded
@@ -159,17 +160,12 @@ def _link(number: int, raw: RawModel, transform: _Transform, decompose: Decompos
     pieces = [mesh.vertices for mesh in link.meshes if mesh.convex]
     meshes = [mesh for mesh in link.meshes if not mesh.convex]
     if meshes:
-        pieces += decompose(_together(meshes), max(1, MAX_HULLS - len(pieces)))
+        # Joined meshes share the hulls that a link may have.
+        joined = append_faces([mesh.vertices for mesh in meshes], [mesh.faces for mesh in meshes])
+        pieces += decompose(Mesh(*joined), max(1, MAX_HULLS - len(pieces)))
     parts = tuple(convex_part(transform.points(piece)) for piece in merged(pieces, MAX_HULLS))
     name = "base" if number == 0 else link.name
     return Link(name, parts, transform.joint(raw, number))
-
-
-def _together(meshes: Sequence[Mesh]) -> Mesh:
-    """Combine meshes into one, so that they share the hulls that a link may have."""
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
-    return Mesh(np.vstack([mesh.vertices for mesh in meshes]), np.vstack(faces))
 
 
 def convex_part(points: FloatArray) -> ConvexPart:

@@ -3,11 +3,10 @@
 import hashlib
 import json
 import os
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 import trimesh
@@ -23,10 +22,16 @@ MAX_VERTICES: Final = 64
 margin."""
 
 
-class Decomposer(Protocol):
-    """Function that cuts a mesh into at most ``most`` convex pieces, each given by points (n, 3)."""
-
-    def __call__(self, mesh: Mesh, most: int) -> list[FloatArray]: ...
+Decomposer = Callable[[Mesh, int], list[FloatArray]]
+"""Function that cuts a mesh into at most so many convex pieces, each given by points (n, 3)."""
+COACD_SETTINGS: Final = {
+    "threshold": 0.08,
+    "resolution": 1000,
+    "mcts_iterations": 60,
+    "max_ch_vertex": MAX_VERTICES,
+    "seed": 0,
+}
+"""Parameters of CoACD under its own names. A higher threshold (of concavity) gives fewer pieces."""
 
 
 def by_components(mesh: Mesh, most: int) -> list[FloatArray]:
@@ -52,23 +57,11 @@ def merged(pieces: Sequence[FloatArray], most: int) -> list[FloatArray]:
     return left
 
 
-@dataclass(frozen=True, slots=True)
-class CoacdSettings:
-    """Parameters of CoACD under its own names. A higher threshold (of concavity) gives fewer pieces."""
-
-    threshold: float = 0.08
-    resolution: int = 1000
-    mcts_iterations: int = 60
-    max_ch_vertex: int = MAX_VERTICES
-    seed: int = 0
-
-
 class Coacd:
     """CoACD with a cache on disk: cutting a mesh takes 0.1 to 30 s."""
 
-    def __init__(self, folder: Path | None = None, settings: CoacdSettings | None = None) -> None:
+    def __init__(self, folder: Path | None = None) -> None:
         self._folder = folder or default_cache()
-        self._settings = settings or CoacdSettings()
 
     def __call__(self, mesh: Mesh, most: int) -> list[FloatArray]:
         """Return the pieces of the mesh, cached if possible. Raises ModelFileError if coacd is not installed."""
@@ -86,7 +79,7 @@ class Coacd:
         digest = hashlib.sha256()
         for array in (mesh.vertices.astype("<f8"), mesh.faces.astype("<i8")):
             digest.update(str(array.shape).encode() + array.tobytes())
-        digest.update(json.dumps([asdict(self._settings), most, _version()]).encode())
+        digest.update(json.dumps([COACD_SETTINGS, most, _version()]).encode())
         return digest.hexdigest()
 
     def _cut(self, mesh: Mesh, most: int) -> list[FloatArray]:
@@ -104,7 +97,7 @@ class Coacd:
             coacd.Mesh((mesh.vertices - low) / scale, mesh.faces.astype(np.int32)),
             max_convex_hull=most,
             decimate=True,
-            **asdict(self._settings),
+            **COACD_SETTINGS,
         )
         return merged([np.asarray(points, dtype=np.float64) * scale + low for points, _ in pieces], most)
 

@@ -23,11 +23,14 @@ def read_groups(path: Path) -> Mapping[str, Mesh]:
     data = read_bytes(path)
     match path.suffix.lower():
         case ".obj":
-            return _obj(data, path)
+            meshes = _obj(data, path)
         case ".glb" | ".stl" as suffix:
-            return _binary(data, suffix[1:], path)
+            meshes = _binary(data, suffix[1:], path)
         case suffix:
             raise ModelFileError(f"{path} ends in {suffix!r}: expected one of {', '.join(sorted(GROUPED))}")
+    if not meshes:
+        raise ModelFileError(f"{path} contains no face: expected a triangle mesh")
+    return meshes
 
 
 def _obj(data: bytes, path: Path) -> Mapping[str, Mesh]:
@@ -52,12 +55,9 @@ def _obj(data: bytes, path: Path) -> Mapping[str, Mesh]:
                 f"{path}, line {number}: found {line[:60]!r}: expected a vertex such as `v 0 0 1` or a face such as `f 1 2 3`"
             ) from None
     points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
-    meshes = {
+    return {
         name: _cut(points, np.array(faces, dtype=np.int64), path) for name, faces in groups.items() if faces
     }
-    if not meshes:
-        raise ModelFileError(f"{path} contains no face: expected a triangle mesh")
-    return meshes
 
 
 def _corner(word: str, count: int) -> int:
@@ -79,14 +79,11 @@ def _binary(data: bytes, kind: str, path: Path) -> Mapping[str, Mesh]:
         }
     except Exception as error:  # noqa: BLE001 - a damaged file fails anywhere in the reader, with any exception
         raise ModelFileError(f"{path} can't be read as {kind}: {error}") from None
-    meshes = {
+    return {
         name: _cut(np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64), path)
         for name, mesh in found.items()
         if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)
     }
-    if not meshes:
-        raise ModelFileError(f"{path} contains no face: expected a triangle mesh")
-    return meshes
 
 
 def _cut(points: FloatArray, faces: IntArray, path: Path) -> Mesh:

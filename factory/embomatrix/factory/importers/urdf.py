@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 import trimesh
+from trimesh.transformations import euler_matrix
 
 from embomatrix.factory.importers.meshes import read_groups
 from embomatrix.factory.importers.model import (
@@ -33,11 +34,7 @@ MAX_LINKS: Final = 100
 MAX_EXTENT_M: Final = 100.0
 _FORBIDDEN: Final = re.compile(r"<!\s*(DOCTYPE|ENTITY)", re.IGNORECASE)
 _PACKAGE: Final = "package://"
-_KINDS: Final = {
-    "fixed": None,
-    "revolute": JointKind.REVOLUTE,
-    "prismatic": JointKind.PRISMATIC,
-}
+_KINDS: Final = {"fixed": None, "revolute": JointKind.REVOLUTE, "prismatic": JointKind.PRISMATIC}
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +160,7 @@ def _joint(element: ET.Element, links: dict[str, ET.Element]) -> _Joint:
     upper = 0.0
     if _KINDS[kind] is not None:
         limit = element.find("limit")
-        low, high = (_number(limit, key, 0.0, name) for key in ("lower", "upper"))
+        low, high = (_number(limit, key, name) for key in ("lower", "upper"))
         upper = high if abs(high) >= abs(low) else low
         if upper == 0.0:
             raise ModelFileError(f"the joint {name!r} has no travel: expected limits other than 0")
@@ -174,7 +171,7 @@ def _shapes(link: ET.Element, frame: FloatArray, folder: Path) -> list[Mesh]:
     """Return the collision shapes of a link, or its visual shapes if it has none, in the root's frame."""
     name = _name(link)
     inertial = link.find("inertial/mass")
-    if inertial is not None and _number(inertial, "value", 0.0, name) < 0:
+    if inertial is not None and _number(inertial, "value", name) < 0:
         raise ModelFileError(f"the mass of the link {name!r} is negative")
     found = []
     for element in link.findall("collision") or link.findall("visual"):
@@ -220,16 +217,9 @@ def _mesh_path(filename: str, name: str, folder: Path) -> Path:
 def _origin(element: ET.Element, name: str) -> FloatArray:
     """Return the (4, 4) transform of an ``origin`` child: translation, and roll, pitch, yaw about fixed axes."""
     origin = element.find("origin")
-    roll, pitch, yaw = _numbers(origin, "rpy", (0.0, 0.0, 0.0), name)
-    (cr, cp, cy), (sr, sp, sy) = (tuple(map(f, (roll, pitch, yaw))) for f in (math.cos, math.sin))
-    transform = np.eye(4)
-    transform[:3, :3] = (
-        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-        (-sp, cp * sr, cp * cr),
-    )
+    transform = euler_matrix(*_numbers(origin, "rpy", (0.0, 0.0, 0.0), name))
     transform[:3, 3] = _numbers(origin, "xyz", (0.0, 0.0, 0.0), name)
-    return transform
+    return np.asarray(transform)
 
 
 def _name(element: ET.Element) -> str:
@@ -239,9 +229,9 @@ def _name(element: ET.Element) -> str:
     return name
 
 
-def _number(element: ET.Element | None, key: str, default: float | None, name: str) -> float:
-    (value,) = _numbers(element, key, None if default is None else (default,), name, count=1)
-    return value
+def _number(element: ET.Element | None, key: str, name: str) -> float:
+    """Return an attribute, 0 if it is missing."""
+    return _numbers(element, key, (0.0,), name, count=1)[0]
 
 
 def _numbers(
