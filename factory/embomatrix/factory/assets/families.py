@@ -5,9 +5,9 @@ from collections.abc import Callable, Sequence
 from enum import StrEnum
 from typing import Self
 
-from embomatrix.factory.assets import cabinets, fixtures, furniture, goods, structures, vessels
+from embomatrix.factory.assets import cabinets, fixtures, furniture, goods, shapes, structures, vessels
 from embomatrix.factory.assets.body import Body, Proportions, proportioned
-from embomatrix.world.geometry import Vec3
+from embomatrix.world.geometry import Aabb, ConvexPart, Vec3
 
 Generator = Callable[[Vec3], Body]
 
@@ -22,6 +22,10 @@ def _cabinet(style: cabinets.CabinetStyle) -> Generator:
 
 def _vessel(style: vessels.VesselStyle) -> Generator:
     return functools.partial(vessels.vessel, style=style)
+
+
+def _filled(shape: Callable[[Aabb], ConvexPart]) -> Generator:
+    return functools.partial(goods.filled, shape=shape)
 
 
 class Family(StrEnum):
@@ -102,11 +106,11 @@ class Family(StrEnum):
     TREE = "tree", fixtures.tree
     CAR = "car", fixtures.car
     CLOTH = "cloth", goods.cloth
-    BREAD = "bread", goods.bread
-    CAKE_SLICE = "cake_slice", goods.slice_of_cake
-    BAR = "bar", goods.bar
-    HEAP = "heap", goods.heap
-    TENT = "tent", goods.tent
+    BREAD = "bread", _filled(shapes.loaf)
+    CAKE_SLICE = "cake_slice", _filled(shapes.wedge)
+    BAR = "bar", _filled(shapes.log)
+    HEAP = "heap", _filled(shapes.dome)
+    TENT = "tent", _filled(shapes.ridge)
     HOOP = "hoop", goods.hoop
     FIGURE = "figure", _boxes(goods.FIGURE)
     DUMBBELL = "dumbbell", _boxes(goods.DUMBBELL)

@@ -12,13 +12,9 @@ from embomatrix.factory.assets.shapes import (
     dome,
     frustum,
     half_disc,
-    loaf,
-    log,
     lump,
     prism,
-    ridge,
     ring,
-    wedge,
 )
 from embomatrix.world.geometry import Aabb, ConvexPart, Vec3
 
@@ -33,25 +29,15 @@ def round_food(size_m: Vec3) -> Body:
     if size_m[2] < 0.35 * min(size_m[:2]):
         return disc(size_m)
     if max(size_m[:2]) > _LONG * min(size_m[:2]):
-        return _of(capsule, size_m)
+        return filled(size_m, capsule)
     return Body(parts=[lump(centred(size_m))])
 
 
 def half_food(size_m: Vec3) -> Body:
     """A half that lies on its cut face; half a disc if the whole is flat."""
     if size_m[2] < 0.25 * max(size_m[:2]):
-        return _of(half_disc, size_m)
+        return filled(size_m, half_disc)
     return Body(parts=[dome(centred(size_m))])
-
-
-def bread(size_m: Vec3) -> Body:
-    """Bread and pastry with an arched back."""
-    return _of(loaf, size_m)
-
-
-def slice_of_cake(size_m: Vec3) -> Body:
-    """A wedge: slices of cake, pie and melon."""
-    return _of(wedge, size_m)
 
 
 def cloth(size_m: Vec3) -> Body:
@@ -64,26 +50,11 @@ def cloth(size_m: Vec3) -> Body:
     return body.add_support("top", (share * x0, share * y0), (share * x1, share * y1), z1)
 
 
-def bar(size_m: Vec3) -> Body:
-    """A round bar lying on its side: logs, rolls, torches."""
-    return _of(log, size_m)
-
-
-def heap(size_m: Vec3) -> Body:
-    """Boulders, bushes, heaps: broad at the foot."""
-    return _of(dome, size_m)
-
-
-def tent(size_m: Vec3) -> Body:
-    """A ridge between two slopes."""
-    return _of(ridge, size_m)
-
-
 def hoop(size_m: Vec3) -> Body:
     """A ring that lies flat: wreaths, tyres, coils of hose."""
     (_, _, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     if min(size_m) < LEAST_ROUND_M or size_m[2] > 0.8 * min(size_m[:2]):
-        return _of(box_of, size_m)
+        return filled(size_m, box_of)
     return Body(parts=ring((0.0, 0.0), (x1, y1), (z0, z1), 0.22 * min(size_m[:2])))
 
 
@@ -101,7 +72,7 @@ DUMBBELL: Final = (
 """Two heads with a grip between them."""
 
 
-def _of(shape: Callable[[Aabb], ConvexPart], size_m: Vec3) -> Body:
+def filled(size_m: Vec3, shape: Callable[[Aabb], ConvexPart]) -> Body:
     """One convex part that fills the box; the box itself if it is thin."""
     outer = centred(size_m)
     return Body(parts=[shape(outer) if min(size_m) >= LEAST_ROUND_M else box_of(outer)])

@@ -55,13 +55,10 @@ def hull(points: FloatArray) -> ConvexPart:
     return ConvexPart(Shape.HULL, Pose(centre), rounded(*(high - low)), vertices)
 
 
-def prism(centre: Vec2, radii: Vec2, z: Vec2, *, sides: int = 12) -> ConvexPart:
-    """Return an upright elliptic cylinder as a polygon prism; ``radii`` are its half extents along x and y.
-
-    If ``sides`` is a multiple of four, its bounding box is exactly twice the radii.
-    """
-    rim = _polygon(sides) * radii + centre
-    return hull(np.vstack([np.column_stack((rim, np.full(sides, height))) for height in z]))
+def prism(centre: Vec2, radii: Vec2, z: Vec2) -> ConvexPart:
+    """Return an upright elliptic cylinder as a prism of twelve sides; ``radii`` are its half extents along x and y."""
+    rim = _polygon(12) * radii + centre
+    return hull(np.vstack([np.column_stack((rim, np.full(12, height))) for height in z]))
 
 
 def shouldered(radii: Vec2, neck_share: float, z: Vec3) -> ConvexPart:
@@ -111,12 +108,12 @@ def lump(region: Aabb) -> ConvexPart:
 
     A true ellipsoid would roll for ever in a rigid-body engine, which has no rolling friction.
     """
-    return _stretched(_unit_lump(), region)
+    return _stretched(_lathe(_LUMP), region)
 
 
 def dome(region: Aabb) -> ConvexPart:
-    """Return half an ellipsoid on its cut face: halves of fruit, buns, heaps."""
-    return _stretched(_unit_dome(), region)
+    """Return half an ellipsoid on its cut face: halves of fruit, buns, heaps, boulders, bushes."""
+    return _stretched(_lathe(_DOME), region)
 
 
 def cushion(region: Aabb) -> ConvexPart:
@@ -125,12 +122,15 @@ def cushion(region: Aabb) -> ConvexPart:
 
 
 def loaf(region: Aabb) -> ConvexPart:
-    """Return a bar along the longer side with an arched back: bread."""
+    """Return a bar along the longer side with an arched back: bread, pastry."""
     return _extruded(region, _LOAF, ((0.0, 1.0), (1.0, 1.0)))
 
 
 def log(region: Aabb) -> ConvexPart:
-    """Return a round bar along the longer side. One of its eight sides lies flat on the ground, so it does not roll."""
+    """Return a round bar along the longer side: logs, rolls, torches.
+
+    One of its eight sides lies flat on the ground, so it does not roll.
+    """
     return _extruded(region, _ROUND, ((0.0, 1.0), (1.0, 1.0)))
 
 
@@ -173,6 +173,8 @@ def half_disc(region: Aabb) -> ConvexPart:
 
 
 _LOAF: Final = ((0.0, 0.0), (1.0, 0.0), (1.0, 0.55), (0.78, 0.92), (0.5, 1.0), (0.22, 0.92), (0.0, 0.55))
+_LUMP: Final = ((-0.5, 0.26), (-0.33, 0.42), (-0.05, 0.5), (0.25, 0.43), (0.5, 0.16))
+_DOME: Final = ((-0.5, 0.5), (-0.1, 0.48), (0.3, 0.34), (0.5, 0.12))
 _ROUND: Final = tuple((0.5 + x / 2, 0.5 + y / 2) for x, y in _OCTAGON)
 
 
@@ -202,16 +204,6 @@ def _polygon(sides: int) -> FloatArray:
 
 
 @functools.cache
-def _unit_lump() -> FloatArray:
-    return _lathe(((-0.5, 0.26), (-0.33, 0.42), (-0.05, 0.5), (0.25, 0.43), (0.5, 0.16)))
-
-
-@functools.cache
-def _unit_dome() -> FloatArray:
-    return _lathe(((-0.5, 0.5), (-0.1, 0.48), (0.3, 0.34), (0.5, 0.12)))
-
-
-@functools.cache
 def _unit_cushion() -> FloatArray:
     inset = 0.34
     rims = [(-0.5, inset), (-0.15, 0.5), (0.15, 0.5), (0.5, inset)]
@@ -219,9 +211,10 @@ def _unit_cushion() -> FloatArray:
     return _hull_corners(np.array([(sx * half, sy * half, z) for z, half in rims for sx, sy in corners]))
 
 
-def _lathe(profile: Sequence[Vec2], sides: int = 12) -> FloatArray:
+@functools.cache
+def _lathe(profile: tuple[Vec2, ...]) -> FloatArray:
     """Return the corners of a solid of revolution in the unit box; ``profile`` lists (height, radius)."""
-    rims = [np.column_stack((_polygon(sides) * radius, np.full(sides, z))) for z, radius in profile]
+    rims = [np.column_stack((_polygon(12) * radius, np.full(12, z))) for z, radius in profile]
     return _hull_corners(np.vstack(rims))
 
 
