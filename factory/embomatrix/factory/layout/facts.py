@@ -6,11 +6,11 @@ from typing import Final
 
 from embomatrix.factory.furnish.small_objects import HOST_GROUPS
 from embomatrix.factory.layout.organization import HIGHEST_M, LOWEST_M
-from embomatrix.factory.layout.values import HostFacts, HostOffer, LayoutRelation, LayoutRoomFacts
+from embomatrix.factory.layout.values import HostFacts, HostOffer, LayoutRelation, LayoutRoomFacts, Size3
 from embomatrix.factory.scenes.editor import SceneEditor
 from embomatrix.sim.geometry.candidates import EDGE_M, surfaces_for
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.asset import Asset
+from embomatrix.world.asset import Asset, SupportSurface
 from embomatrix.world.state import Relation
 
 OFFERED: Final = (LayoutRelation.ONTOP, LayoutRelation.INSIDE, LayoutRelation.UNDER)
@@ -68,33 +68,28 @@ def _offers(asset: Asset, base_m: float, *, is_named: bool) -> tuple[HostOffer, 
     )
 
 
-def _spaces(asset: Asset, relation: LayoutRelation) -> tuple[tuple[float, float, float, float], ...]:
-    """Return extents along x and y, free height, and height in the asset's frame of each space for a relation."""
-    return tuple(
-        (
-            surface.size_m[0] - 2 * EDGE_M,
-            surface.size_m[1] - 2 * EDGE_M,
-            surface.clearance_m - EDGE_M if math.isfinite(surface.clearance_m) else 9.0,
-            surface.center_m[2],
-        )
-        for surface in surfaces_for(asset, Relation(relation.value))
-        if min(surface.size_m) >= MIN_SPACE_M
-    )
-
-
 def _offer(asset: Asset, relation: LayoutRelation, base_m: float, highest_m: float) -> HostOffer | None:
-    spaces = _spaces(asset, relation)
-    if relation is LayoutRelation.UNDER and _height_below_m(asset) < MIN_UNDER_M:
+    under = relation is LayoutRelation.UNDER
+    if under and _height_below_m(asset) < MIN_UNDER_M:
         return None
-    reachable = [
-        space for space in spaces if relation is LayoutRelation.UNDER or base_m + space[3] <= highest_m
+    surfaces = [
+        surface
+        for surface in surfaces_for(asset, Relation(relation.value))
+        if min(surface.size_m) >= MIN_SPACE_M and (under or base_m + surface.center_m[2] <= highest_m)
     ]
-    if not reachable:
+    if not surfaces:
         return None
     # A low shelf of tall furniture must not exclude the higher shelves.
-    heights = [base_m + space[3] for space in reachable]
+    heights = [base_m + surface.center_m[2] for surface in surfaces]
     height = min((h for h in heights if h >= LOWEST_M), default=min(heights))
-    return HostOffer(relation, tuple((x, y, high) for x, y, high, _ in reachable), round(height, 3))
+    return HostOffer(relation, tuple(_space(surface) for surface in surfaces), round(height, 3))
+
+
+def _space(surface: SupportSurface) -> Size3:
+    """Return the free extents along x and y and the free height on a surface."""
+    x, y = surface.size_m
+    high = surface.clearance_m - EDGE_M if math.isfinite(surface.clearance_m) else 9.0
+    return (x - 2 * EDGE_M, y - 2 * EDGE_M, high)
 
 
 def _height_below_m(asset: Asset) -> float:

@@ -6,7 +6,6 @@ If the model's answers stay unusable, the rules answer instead and a warning is 
 import logging
 from collections.abc import Callable, Collection
 from contextlib import AbstractAsyncContextManager
-from dataclasses import replace
 from typing import Final, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -92,14 +91,11 @@ class ModelLayoutAgents(OnOneLoop):
 
     def agents(self, modelled: Collection[AgentName]) -> LayoutAgents:
         """Return layout agents of which the named ones use the model and the others rules."""
-        chosen = LayoutAgents()
-        if AgentName.DISTRIBUTOR in modelled:
-            chosen = replace(chosen, distribute=self.distribute)
-        if AgentName.ORGANIZER in modelled:
-            chosen = replace(chosen, organize=self.organize)
-        if AgentName.PLANNER in modelled:
-            chosen = replace(chosen, choose_constraints=self.choose_constraints)
-        return chosen
+        return LayoutAgents(
+            self.distribute if AgentName.DISTRIBUTOR in modelled else distribute,
+            self.organize if AgentName.ORGANIZER in modelled else organize,
+            self.choose_constraints if AgentName.PLANNER in modelled else choose_constraints,
+        )
 
     def distribute(self, brief: DistributionBrief) -> Distribution:
         """Scene-level Distribution Agent. Raise EndpointError."""

@@ -5,8 +5,8 @@ Each pose is free, reachable and blocks no path.
 
 import itertools
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -34,15 +34,6 @@ MODELS: Final = 8
 """Maximum number of a category's models tried if no model is given."""
 LIFT_M: Final = 0.0005
 """Initial gap between an object and its support, so that no object starts in contact."""
-
-
-@dataclass(slots=True)
-class _PoseCounts:
-    """Number of candidate poses, of collision-free ones, and of reachable ones among these."""
-
-    seen: int = 0
-    free: int = 0
-    reached: int = 0
 
 
 class ObjectSampler:
@@ -154,17 +145,15 @@ class ObjectSampler:
 
     def first_free(self, asset: Asset, poses: Iterable[Pose], target: str) -> Pose:
         """Return the first valid pose. Raise PlacementError."""
-        counts = _PoseCounts()
+        objections: Counter[LayoutReason] = Counter()
         for pose in poses:
-            counts.seen += 1
             objection = self._editor.objection(asset, pose, target)
             if objection is None:
                 return pose
-            counts.free += objection is not LayoutReason.NO_FREE_SPOT
-            counts.reached += objection is LayoutReason.BLOCKS_PATH
-            if counts.reached == MAX_BLOCKING:
+            objections[objection] += 1
+            if objections[LayoutReason.BLOCKS_PATH] == MAX_BLOCKING:
                 break
-        raise _no_pose_error(counts, asset, target or "the floor")
+        raise _no_pose_error(objections, asset, target or "the floor")
 
     def _under_edges(self, asset: Asset, carrier: Asset) -> Iterator[Pose]:
         """Yield poses under a carrier's edges with a good third of the object in the open, such as shoes under a bed."""
@@ -232,15 +221,15 @@ def assets_of(category: str, model: str | None, rng: np.random.Generator) -> lis
     return [build_asset(catalog, category, models[i].model_id) for i in rng.permutation(len(models))[:MODELS]]
 
 
-def _no_pose_error(counts: _PoseCounts, asset: Asset, host: str) -> PlacementError:
-    if counts.reached:
-        reason = LayoutReason.BLOCKS_PATH
-    else:
-        reason = LayoutReason.OUT_OF_REACH if counts.free else LayoutReason.NO_FREE_SPOT
+def _no_pose_error(objections: Counter[LayoutReason], asset: Asset, host: str) -> PlacementError:
+    reached = objections[LayoutReason.BLOCKS_PATH]
+    free = objections.total() - objections[LayoutReason.NO_FREE_SPOT]
+    after_collision = (LayoutReason.BLOCKS_PATH, LayoutReason.OUT_OF_REACH)
+    reason = next((each for each in after_collision if objections[each]), LayoutReason.NO_FREE_SPOT)
     return PlacementError(
         reason,
-        f"no place for {asset.asset_id}, {_metres(asset)}, at {host}: of {counts.seen} poses {counts.free} were free, "
-        f"{counts.reached} of them reachable, none without blocking the robot's path: try another host",
+        f"no place for {asset.asset_id}, {_metres(asset)}, at {host}: of {objections.total()} poses {free} were free, "
+        f"{reached} of them reachable, none without blocking the robot's path: try another host",
     )
 
 
