@@ -3,9 +3,10 @@
 Most rules are checked by geometry. The engine tests penetration a second time and lets all movable objects settle.
 """
 
+import contextlib
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
@@ -73,30 +74,28 @@ def check_scene(scene: Scene) -> tuple[SceneProblem, ...]:
 
 def check_in_engine(scene: Scene) -> tuple[SceneProblem, ...]:
     """Return penetrations of more than 1 mm found by Bullet. Raises EngineError if the engine is missing."""
-    engine = BulletEngine(scene)
-    try:
-        found = []
-        for item in scene.objects:
-            other = engine.penetrates(item.name, ignore=frozenset({FLOOR}))
-            if other:
-                found.append(SceneProblem(ProblemKind.PENETRATION, (item.name, other), "found by the engine"))
-        return tuple(found)
-    finally:
-        engine.close()
+    with contextlib.closing(BulletEngine(scene)) as engine:
+        pairs = [
+            (each.name, engine.penetrates(each.name, ignore=frozenset({FLOOR}))) for each in scene.objects
+        ]
+    return tuple(
+        SceneProblem(ProblemKind.PENETRATION, (name, other), "found by the engine")
+        for name, other in pairs
+        if other
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class Settlement:
-    """Result of settling a scene: the number of movable objects, those that moved, and objects that sank into others."""
+    """Result of settling a scene: the number of movable objects, those that moved, and objects that sank into others.
+
+    ``stable_share`` is the share of the movable objects that stayed in place; 1 if nothing can move.
+    """
 
     movable: int
     unstable: tuple[str, ...]
+    stable_share: float
     problems: tuple[SceneProblem, ...]
-
-    @property
-    def stable_share(self) -> float:
-        """Share of the movable objects that stayed in place; 1 if nothing can move."""
-        return 1.0 - len(self.unstable) / self.movable if self.movable else 1.0
 
 
 def check_settled(scene: Scene) -> Settlement:
@@ -106,15 +105,16 @@ def check_settled(scene: Scene) -> Settlement:
         SceneProblem(ProblemKind.SUNKEN, pair, f"{depth * 1000:.1f} mm into one another after settling")
         for pair, depth in settled.overlaps.items()
     ]
-    found = Settlement(len(settled.objects), settled.unstable, ())
-    if found.stable_share < STABLE_SHARE:
-        moved = max(settled.objects[name].moved_m for name in found.unstable)
+    movable, unstable = len(settled.objects), settled.unstable
+    stable_share = 1.0 - len(unstable) / movable if movable else 1.0
+    if stable_share < STABLE_SHARE:
+        moved = max(settled.objects[name].moved_m for name in unstable)
         detail = (
-            f"{found.stable_share:.1%} of {found.movable} movable objects stay in place, one moves {moved:.2f} m: "
+            f"{stable_share:.1%} of {movable} movable objects stay in place, one moves {moved:.2f} m: "
             f"expected {STABLE_SHARE:.0%}"
         )
-        problems.append(SceneProblem(ProblemKind.UNSTABLE, found.unstable, detail))
-    return replace(found, problems=tuple(problems))
+        problems.append(SceneProblem(ProblemKind.UNSTABLE, unstable, detail))
+    return Settlement(movable, unstable, stable_share, tuple(problems))
 
 
 def _names(scene: Scene) -> Iterator[SceneProblem]:

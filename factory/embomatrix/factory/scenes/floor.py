@@ -40,12 +40,6 @@ class ReachableFloor:
         return self._label > 0
 
     @property
-    def reachable_share(self) -> float:
-        """Share of the cells where the robot fits that it can reach from its start; 0 if there are none."""
-        free = int(self._grid.free.sum())
-        return float((self._grid.labels == self._label).sum() / free) if free and self.has_start else 0.0
-
-    @property
     def free_share(self) -> float:
         """Share of the rooms' floor without objects up to the robot's height."""
         free = total = 0

@@ -53,12 +53,9 @@ class SceneReport:
     """Share of the plan's bounding box that is floor or wall."""
     free_floor: float = 0.0
     """Share of the floor without objects."""
-    reachable: float = 0.0
-    """Share of the cells where the robot fits that it can reach."""
     stable: float = 0.0
     """Share of the movable objects that stay in place when all settle."""
     unstable: tuple[str, ...] = ()
-    placed_by_room: tuple[tuple[str, int], ...] = ()
     left_out: tuple[str, ...] = ()
     problems: tuple[SceneProblem, ...] = ()
 
@@ -69,9 +66,8 @@ class SceneReport:
     def to_json(self) -> Json:
         """Return a JSON-serialisable dict with rounded numbers."""
         value = asdict(self)
-        value["placed_by_room"] = dict(self.placed_by_room)
         value["problems"] = [[p.kind.value, list(p.names), p.detail] for p in self.problems]
-        for key in ("build_s", "check_s", "compactness", "free_floor", "reachable", "stable"):
+        for key in ("build_s", "check_s", "compactness", "free_floor", "stable"):
             value[key] = round(value[key], 4)
         return value
 
@@ -111,7 +107,6 @@ def report_of(scene: Scene, *, build_s: float = 0.0) -> SceneReport:
         *settlement.problems,
         *unaccounted(scene),
     )
-    floor = ReachableFloor(scene)
     return SceneReport(
         scene_id=scene.scene_id,
         seed=scene.seed,
@@ -124,11 +119,9 @@ def report_of(scene: Scene, *, build_s: float = 0.0) -> SceneReport:
         build_s=build_s,
         check_s=time.process_time() - started,
         compactness=compactness(scene.rooms),
-        free_floor=floor.free_share,
-        reachable=floor.reachable_share,
+        free_floor=ReachableFloor(scene).free_share,
         stable=settlement.stable_share,
         unstable=settlement.unstable,
-        placed_by_room=tuple(sorted(Counter(item.room for item in scene.objects).items())),
         left_out=scene.left_out,
         problems=problems,
     )

@@ -26,18 +26,16 @@ def write_scene(path: Path, scene: Scene) -> None:
 def read_scene(path: Path) -> Scene:
     """Read and check the scene in a file of at most MAX_BYTES. Raises SceneFileError."""
     if not path.is_file():
-        raise SceneFileError(f"{path} is not a file: expected one that `embomatrix scene build` wrote")
+        raise _unusable(path, "is not a file")
     try:
         return scene_from_json(json.loads(read_whole(path, at_most=MAX_BYTES)))
     except OSError as error:
-        raise SceneFileError(
-            f"{path} can't be read ({error.strerror}): expected a file that `embomatrix scene build` wrote"
-        ) from error
+        raise _unusable(path, f"can't be read ({error.strerror})") from error
     except SceneInvalidError as error:
-        raise SceneFileError(
-            f"{path} is not a scene ({error}): expected a file that `embomatrix scene build` wrote"
-        ) from error
+        raise _unusable(path, f"is not a scene ({error})") from error
     except (ValueError, RecursionError) as error:
-        raise SceneFileError(
-            f"{path} is not JSON ({error}): expected a file that `embomatrix scene build` wrote"
-        ) from error
+        raise _unusable(path, f"is not JSON ({error})") from error
+
+
+def _unusable(path: Path, problem: str) -> SceneFileError:
+    return SceneFileError(f"{path} {problem}: expected a file that `embomatrix scene build` wrote")
