@@ -161,8 +161,9 @@ def _link(number: int, raw: RawModel, transform: _Transform, decompose: Decompos
     meshes = [mesh for mesh in link.meshes if not mesh.convex]
     if meshes:
         # Joined meshes share the hulls that a link may have.
-        joined = append_faces([mesh.vertices for mesh in meshes], [mesh.faces for mesh in meshes])
-        pieces += decompose(Mesh(*joined), max(1, MAX_HULLS - len(pieces)))
+        vertices, faces = append_faces([mesh.vertices for mesh in meshes], [mesh.faces for mesh in meshes])
+        joined = Mesh(np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64))
+        pieces += decompose(joined, max(1, MAX_HULLS - len(pieces)))
     parts = tuple(convex_part(transform.points(piece)) for piece in merged(pieces, MAX_HULLS))
     name = "base" if number == 0 else link.name
     return Link(name, parts, transform.joint(raw, number))

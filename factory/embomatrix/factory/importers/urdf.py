@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 import trimesh
-from trimesh.transformations import euler_matrix
+from scipy.spatial.transform import Rotation
 
 from embomatrix.factory.importers.meshes import read_groups
 from embomatrix.factory.importers.model import (
@@ -217,9 +217,10 @@ def _mesh_path(filename: str, name: str, folder: Path) -> Path:
 def _origin(element: ET.Element, name: str) -> FloatArray:
     """Return the (4, 4) transform of an ``origin`` child: translation, and roll, pitch, yaw about fixed axes."""
     origin = element.find("origin")
-    transform = euler_matrix(*_numbers(origin, "rpy", (0.0, 0.0, 0.0), name))
+    transform = np.eye(4)
+    transform[:3, :3] = Rotation.from_euler("xyz", _numbers(origin, "rpy", (0.0, 0.0, 0.0), name)).as_matrix()
     transform[:3, 3] = _numbers(origin, "xyz", (0.0, 0.0, 0.0), name)
-    return np.asarray(transform)
+    return transform
 
 
 def _name(element: ET.Element) -> str:
