@@ -47,7 +47,7 @@ class WorkerReported(Event):
 
 @dataclass(frozen=True, slots=True)
 class SuspicionChanged(Event):
-    """Heartbeats are missing, so that a ``suspect`` worker gets no new leases, or it was heard again."""
+    """A worker became ``suspect`` because heartbeats are missing, or was heard again. A suspect gets no new leases."""
 
     worker_id: str
     suspect: bool
@@ -63,7 +63,7 @@ class WorkerLost(Event):
 
 @dataclass(frozen=True, slots=True)
 class DrainChanged(Event):
-    """An operator drains the worker, which finishes its leases and gets nothing new, or ends its drain and quarantine."""
+    """An operator drained a worker, which then only finishes its leases, or ended its drain and quarantine."""
 
     worker_id: str
     drained: bool
@@ -191,7 +191,7 @@ class ScenesUnplaceable(Event):
 
 @dataclass(frozen=True, slots=True)
 class PauseChanged(Event):
-    """Dispatch is ``paused``, so that there are no new leases, or resumed."""
+    """Dispatch was paused or resumed. While it is ``paused``, no leases are granted."""
 
     paused: bool
 

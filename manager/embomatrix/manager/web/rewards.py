@@ -134,9 +134,7 @@ async def _executed(runs: Runs, batch: Batch) -> dict[str, Outcome]:
 
 async def _read(log: BatchLog) -> dict[str, Outcome]:
     outcomes: dict[str, Outcome] = {}
-    cursor = 0
-    while rows := await log.after(cursor):
-        cursor = rows[-1].cursor
+    async for rows in log.messages(0):
         for row in rows:
             result = rollout_result_from_proto(types_pb2.RolloutResult.FromString(row.payload))
             outcomes[result.rollout_id] = result.outcome
