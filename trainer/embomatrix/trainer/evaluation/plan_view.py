@@ -24,9 +24,17 @@ def css_class(verdict: AnswerVerdict, number: int) -> str:
 
 def plan_view(scene: Scene, task: Task, plan: Plan, verdict: AnswerVerdict) -> str:
     """Return inline SVG. The page's CSS colours the classes room, piece, used, route, ok, bad and not."""
-    view = PlanView(scene, _rooms(scene, task, plan), margin_m=0.25, fit=FIT_PX)
-    used = {name for call in plan for name in _names(task, call)} & scene.by_name.keys()
-    marks = _marks(scene, task, plan)
+    objects = [_objects(scene, task, call) for call in plan]
+    used = {name for names in objects for name in names}
+    rooms = {scene.robot.room, *(scene.by_name[name].room for name in used)}
+    rooms |= {call.room_name for call in plan if call.room_name is not None}
+    view = PlanView(scene, rooms, margin_m=0.25, fit=FIT_PX)
+    # The robot goes to a call's first object.
+    marks = [
+        (number, scene.box_of(names[0]).center_m[:2])
+        for number, names in enumerate(objects, start=1)
+        if names
+    ]
     start = (scene.robot.x_m, scene.robot.y_m)
     x, y = view.at(*start)
     parts = [
@@ -51,30 +59,11 @@ def plan_view(scene: Scene, task: Task, plan: Plan, verdict: AnswerVerdict) -> s
     return view.svg(parts, f"plan of {task.task_id} on the plan view")
 
 
-def _names(task: Task, call: SkillCall) -> list[str]:
-    """Objects of a call that are in the task's table. The robot goes to the first one."""
+def _objects(scene: Scene, task: Task, call: SkillCall) -> list[str]:
+    """Objects of a call that are in the task's table and in the scene."""
     rows = (call.object_index, call.source_index)
-    return [task.table[row] for row in rows if row is not None and 0 <= row < len(task.table)]
-
-
-def _marks(scene: Scene, task: Task, plan: Plan) -> list[tuple[int, Vec2]]:
-    """(step number from 1, position of its object). Steps without an object are left out."""
-    found = []
-    for number, call in enumerate(plan, start=1):
-        names = [name for name in _names(task, call) if name in scene.by_name]
-        if names:
-            x, y, _ = scene.box_of(names[0]).center_m
-            found.append((number, (x, y)))
-    return found
-
-
-def _rooms(scene: Scene, task: Task, plan: Plan) -> set[str]:
-    """Rooms that the plan uses, and the robot's initial room."""
-    names = {scene.robot.room}
-    for call in plan:
-        names |= {scene.by_name[name].room for name in _names(task, call) if name in scene.by_name}
-        names.add(call.room_name or "")
-    return names
+    names = [task.table[row] for row in rows if row is not None and 0 <= row < len(task.table)]
+    return [name for name in names if name in scene.by_name]
 
 
 def _furniture(scene: Scene, view: PlanView, used: set[str]) -> list[str]:
