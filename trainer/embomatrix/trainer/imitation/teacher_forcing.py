@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import ImitationSettings
@@ -208,18 +209,9 @@ def _plan_tokens(examples: Sequence[Example]) -> int:
 
 def _total_loss(policy: Policy, examples: Sequence[Example]) -> Tensor:
     """Negative log-likelihood of the plans, summed over their tokens."""
-    tokens, mask = padded_plans([plan for _, plan in examples], policy)
-    scored = policy.logprobs([prompt for prompt, _ in examples], tokens, mask, group=1, temperature=1.0)
-    return -scored.logprobs.sum()
-
-
-def padded_plans(plans: Sequence[Tokens], policy: Policy) -> tuple[Tensor, Tensor]:
-    """Return plans as token rows, and the mask of their tokens; both (plans, longest)."""
+    prompts, plans = zip(*examples, strict=True)
+    tokens = pad_sequence([torch.tensor(plan) for plan in plans], batch_first=True)
+    mask = pad_sequence([torch.ones(len(plan), dtype=torch.bool) for plan in plans], batch_first=True)
     device = next(iter(policy.parameters())).device
-    longest = max(len(plan) for plan in plans)
-    tokens = torch.zeros(len(plans), longest, dtype=torch.long)
-    mask = torch.zeros(len(plans), longest, dtype=torch.bool)
-    for row, plan in enumerate(plans):
-        tokens[row, : len(plan)] = torch.tensor(plan)
-        mask[row, : len(plan)] = True
-    return tokens.to(device), mask.to(device)
+    scored = policy.logprobs(prompts, tokens.to(device), mask.to(device), group=1, temperature=1.0)
+    return -scored.logprobs.sum()

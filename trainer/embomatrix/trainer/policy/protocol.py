@@ -9,6 +9,7 @@ from typing import Protocol
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils.rnn import pad_sequence
 
 from embomatrix.skills.prompt import Codec, Prompt
 
@@ -105,10 +106,8 @@ def draw(scores: Tensor, temperature: float, generator: torch.Generator) -> tupl
 
 def pad_left(prompts: Sequence[Tokens], fill: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Return prompts as token rows that end together, and their padding mask; both (prompts, longest)."""
-    longest = max(len(prompt) for prompt in prompts)
-    tokens = torch.full((len(prompts), longest), fill)
-    padding = torch.ones(len(prompts), longest, dtype=torch.bool)
-    for row, prompt in enumerate(prompts):
-        tokens[row, longest - len(prompt) :] = torch.tensor(prompt)
-        padding[row, longest - len(prompt) :] = False
+    rows = [torch.tensor(prompt) for prompt in prompts]
+    real = [torch.ones(len(prompt), dtype=torch.bool) for prompt in prompts]
+    tokens = pad_sequence(rows, batch_first=True, padding_value=fill, padding_side="left")
+    padding = ~pad_sequence(real, batch_first=True, padding_side="left")
     return tokens.to(device), padding.to(device)
