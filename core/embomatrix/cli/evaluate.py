@@ -96,22 +96,7 @@ class EvalSettings(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """Model, endpoint or baseline to evaluate; one of the first three is given."""
-
-    model: str
-    endpoint: str
-    baseline: BaselineName | None
-    model_name: str
-    key: str
-
-    @property
-    def label(self) -> str:
-        return self.model or self.model_name or str(self.baseline)
-
-
-@dataclass(frozen=True, slots=True)
-class OpenSubject:
-    """Subject that is ready to answer, with its codec, maximum table rows and maximum tokens."""
+    """Model, endpoint or baseline that is ready to answer, with its codec, maximum table rows and maximum tokens."""
 
     ask: Callable[[Sequence[Question], AnswerSheet, OnProgress], None]
     codec: Codec = Codec.JSON
@@ -190,11 +175,17 @@ def evaluate(
             return
         if bench == NATIVE and (split or settings.tasks):
             raise TrainerError(f"{NATIVE} is measured as a whole: leave out --split and --tasks")
-        subject = Subject(model, endpoint, baseline, model_name, key)
+        label = model or model_name or str(baseline)
         with _exam(open_executor, bench or DEFAULT_BENCH, split, settings.tasks, settings.profile) as exam:
-            folder = out or DEFAULT_OUT / _file_name(f"{Path(exam.name).name}-{subject.label}")
+            folder = out or DEFAULT_OUT / _file_name(f"{Path(exam.name).name}-{label}")
             rows = [read_row(path, exam.digest) for path in beside or []]
-            setup, given = _ask(exam, subject, settings, folder)
+            if baseline is not None:
+                subject = Subject(functools.partial(ask_script, _baseline(exam, baseline)))
+            elif model:
+                subject = _policy(exam, model, settings)
+            else:
+                subject = _endpoint(endpoint, model_name, key, settings, folder)
+            setup, given = _ask(exam, subject, label, settings, folder)
             _judge(exam, setup, given, folder, rows)
 
 
@@ -258,40 +249,31 @@ def _exam(
     yield WorldExam(bench, open_executor(bench))
 
 
-def _open_subject(exam: Exam, subject: Subject, settings: EvalSettings, folder: Path) -> OpenSubject:
-    """Load the model, or prepare the endpoint or baseline. Raises TrainerError."""
-    if subject.model:
-        from embomatrix.trainer.evaluation.models import load_model
+def _policy(exam: Exam, model: str, settings: EvalSettings) -> Subject:
+    """Load the model. Raises TrainerError."""
+    from embomatrix.trainer.evaluation.models import load_model
 
-        loaded = load_model(subject.model, settings.codec, threads=settings.threads, device=settings.device)
-        codec = loaded.policy.codec
-        if isinstance(exam, NativeExam) and codec is Codec.NAMES:
-            raise TrainerError(
-                f"{subject.model} is a word-level policy, which can't read {NATIVE}'s prompts: pass another model"
-            )
-        return OpenSubject(
-            functools.partial(ask_policy, loaded.policy),
-            codec,
-            loaded.rows,
-            settings.max_tokens or loaded.max_tokens,
+    loaded = load_model(model, settings.codec, threads=settings.threads, device=settings.device)
+    codec = loaded.policy.codec
+    if isinstance(exam, NativeExam) and codec is Codec.NAMES:
+        raise TrainerError(
+            f"{model} is a word-level policy, which can't read {NATIVE}'s prompts: pass another model"
         )
-    if subject.endpoint:
-        if not subject.model_name:
-            raise TrainerError("the endpoint's model has no name: pass --model-name as the endpoint calls it")
-        if settings.codec is Codec.NAMES:
-            raise TrainerError("the codec `names` is for word-level policies: pass --codec json or lines")
-        from embomatrix.llm.endpoint import Endpoint, EndpointLimits
+    ask = functools.partial(ask_policy, loaded.policy)
+    return Subject(ask, codec, loaded.rows, settings.max_tokens or loaded.max_tokens)
 
-        limits = EndpointLimits(attempts=settings.attempts, concurrent=settings.concurrent)
-        connect = functools.partial(
-            Endpoint, subject.endpoint, subject.model_name, api_key=subject.key, limits=limits
-        )
-        ask = functools.partial(ask_endpoint, connect, folder / "ledger.jsonl")
-        return OpenSubject(
-            ask, settings.codec or Codec.JSON, max_tokens=settings.max_tokens or ENDPOINT_TOKENS
-        )
-    baseline = _baseline(exam, subject.baseline or BaselineName.ORACLE)
-    return OpenSubject(functools.partial(ask_script, baseline))
+
+def _endpoint(url: str, model_name: str, key: str, settings: EvalSettings, folder: Path) -> Subject:
+    if not model_name:
+        raise TrainerError("the endpoint's model has no name: pass --model-name as the endpoint calls it")
+    if settings.codec is Codec.NAMES:
+        raise TrainerError("the codec `names` is for word-level policies: pass --codec json or lines")
+    from embomatrix.llm.endpoint import Endpoint, EndpointLimits
+
+    limits = EndpointLimits(attempts=settings.attempts, concurrent=settings.concurrent)
+    connect = functools.partial(Endpoint, url, model_name, api_key=key, limits=limits)
+    ask = functools.partial(ask_endpoint, connect, folder / "ledger.jsonl")
+    return Subject(ask, settings.codec or Codec.JSON, max_tokens=settings.max_tokens or ENDPOINT_TOKENS)
 
 
 def _baseline(exam: Exam, name: BaselineName) -> Callable[[str, np.random.Generator], str]:
@@ -309,22 +291,21 @@ def _baseline(exam: Exam, name: BaselineName) -> Callable[[str, np.random.Genera
 
 
 def _ask(
-    exam: Exam, subject: Subject, settings: EvalSettings, folder: Path
+    exam: Exam, subject: Subject, label: str, settings: EvalSettings, folder: Path
 ) -> tuple[EvaluationSetup, tuple[Answer, ...]]:
     """Collect the missing answers."""
-    opened = _open_subject(exam, subject, settings, folder)
-    questions = exam.questions(opened.codec, opened.rows)
+    questions = exam.questions(subject.codec, subject.rows)
     setup = EvaluationSetup(
         bench=exam.name,
         bench_digest=exam.digest,
         split=exam.split,
         tasks=len(exam.task_ids),
-        model=subject.label,
-        codec=opened.codec.value if isinstance(exam, WorldExam) else EAI_CODEC,
-        rows=opened.rows,
+        model=label,
+        codec=subject.codec.value if isinstance(exam, WorldExam) else EAI_CODEC,
+        rows=subject.rows,
         samples=settings.samples,
         temperature=settings.temperature,
-        max_tokens=opened.max_tokens,
+        max_tokens=subject.max_tokens,
         seed=settings.seed,
         questions=questions_digest(questions),
         by_rule=exam.by_rule,
@@ -335,7 +316,7 @@ def _ask(
         if len(sheet):
             console.print(f"{len(sheet)} answers are already stored")
         with _bar("answers") as on_progress:
-            opened.ask(questions, sheet, on_progress)
+            subject.ask(questions, sheet, on_progress)
         given = sheet.ordered(exam.task_ids)
     console.print(f"{len(given)} answers in {time.monotonic() - began_s:.1f} s: {folder / FILE}")
     return setup, given
