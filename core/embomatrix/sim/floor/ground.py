@@ -50,14 +50,12 @@ class Ground:
             parts = [self._parts_of(item.name, engine.pose(item.name)) for item in blocking]
             obstacles, arrays = Obstacles.joined([self._walls(), *parts]), None
         grid = FloorGrid(self._scene, obstacles.blocking, arrays)
-        self.at_start = FloorLayout(obstacles, grid)
+        self.at_start = FloorLayout(obstacles, grid, RecentCache(len(self._scene.objects) + NARROWED_KEPT))
         """Floor in the scene as loaded. Read-only."""
         self._layouts: RecentCache[Floor, FloorLayout] = RecentCache(GRIDS_KEPT)
         self._moved: dict[int, Pose | None] = {}
         """Unsorted entries of ``floor``."""
         self._open_panels = OpenPanels(engine)
-        self._with_one_open: dict[OpenJoints, FloorGrid] = {}
-        """Grids of the initial floor with the panels of one more object wide open."""
         self._round, self._read = -1, 0
         self._current: FloorLayout | None = None
         self._now: FloorGrid | None = None
@@ -111,10 +109,7 @@ class Ground:
         if self._now is None and not self.open_joints:
             self._now = self._layout.grid
         if self._now is None:
-            known = self._with_one_open.get(self.open_joints) if self._layout is self.at_start else None
-            self._now = known or self._layout.narrowed.get(
-                self.open_joints, lambda: self.shut.narrowed(self.open_panels.blocking)
-            )
+            self._now = self._narrowed(self._layout, self.open_joints)
         return self._now
 
     def warm_up(self) -> Iterator[None]:
@@ -123,9 +118,14 @@ class Ground:
         Most plans open one object, and mostly the same ones.
         """
         for joints in self._open_panels.each_open():
-            panels = self._open_panels.obstacles(joints)
-            self._with_one_open[joints] = self.at_start.grid.narrowed(panels.blocking)
+            self._narrowed(self.at_start, joints)
             yield
+
+    def _narrowed(self, layout: FloorLayout, joints: OpenJoints) -> FloorGrid:
+        """Grid of a layout with panels at these joint positions."""
+        return layout.narrowed.get(
+            joints, lambda: layout.grid.narrowed(self._open_panels.obstacles(joints).blocking)
+        )
 
     def with_shut(self, number: int) -> FloorGrid:
         """Grid if one object's panels were shut."""
