@@ -24,9 +24,8 @@ from embomatrix.skills.appliances import (
     washed_away,
     washing,
 )
-from embomatrix.world.asset import Asset
 from embomatrix.world.geometry import Aabb
-from embomatrix.world.state import Relation, State, SubstanceFact, SubstanceRelation
+from embomatrix.world.state import State, SubstanceFact, SubstanceRelation
 from embomatrix.world.substances import flows_from, in_words, word_of
 
 VESSEL_M: Final = 0.3
@@ -119,10 +118,9 @@ class Thermal:
             return self._relations.inside(item, name)
         if self._relations.ontop(item, name):
             return True
-        vessels = self._above(name)
         return any(
             self._relations.ontop(vessel, name) and self._bears(vessel, item)
-            for vessel in vessels
+            for vessel in self._above(name)
             if vessel != item
         )
 
@@ -144,12 +142,17 @@ class Thermal:
         return Aabb(box.low_m, (x, y, z + VESSEL_M))
 
     def _bears(self, vessel: str, item: str) -> bool:
-        return self._relations.holds(Relation.INSIDE, item, vessel) or self._relations.ontop(item, vessel)
+        return self._relations.inside(item, vessel) or self._relations.ontop(item, vessel)
 
     def _gained(self, item: str, source: ThermalSource) -> list[State]:
         """States that the source would add to the object."""
-        states = self._states.get(item, ())
-        return [state for state in _states_at(self._scene.asset_of(item), source) if state not in states]
+        states, asset = self._states.get(item, ()), self._scene.asset_of(item)
+        effects = {
+            State.HOT: heats(source) and asset.can("heatable"),
+            State.COOKED: cooks(source, asset),
+            State.FROZEN: freezes(source) and asset.can("freezable"),
+        }
+        return [state for state, occurs in effects.items() if occurs and state not in states]
 
     def _expose(self, item: str, source: ThermalSource) -> list[Change]:
         """Apply the source's temperature to the object."""
@@ -160,17 +163,6 @@ class Thermal:
             states.discard(State.HOT)
         states.update(gained)
         return [Change(item, state.value) for state in gained]
-
-
-def _states_at(asset: Asset, source: ThermalSource) -> list[State]:
-    found: list[State] = []
-    if heats(source) and asset.can("heatable"):
-        found.append(State.HOT)
-    if cooks(source, asset):
-        found.append(State.COOKED)
-    if freezes(source) and asset.can("freezable"):
-        found.append(State.FROZEN)
-    return found
 
 
 class Water:
