@@ -1,5 +1,6 @@
 """Equal bundle, plan and seed give equal traces: in any order, in fresh loads, and in other processes."""
 
+import contextlib
 import os
 import random
 import subprocess
@@ -11,7 +12,7 @@ from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator, StepRandom
-from embomatrix.sim.placing.pose_cache import analyse_scene
+from embomatrix.sim.placing.pose_cache import PlacementLibrary, analyse_scene
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
 
@@ -31,7 +32,8 @@ SEEDS = (0, 7)
 @pytest.fixture(scope="module")
 def bundle():
     scene = kitchen_scene()
-    return decode_bundle(encode_bundle(Bundle(scene, {}, analyse_scene(scene, seed=1))))
+    with contextlib.closing(BulletEngine(scene)) as engine, contextlib.closing(PlacementLibrary()) as library:
+        return decode_bundle(encode_bundle(Bundle(scene, {}, analyse_scene(engine, library, seed=1))))
 
 
 def digests(bundle, order) -> dict[tuple[int, int], str]:

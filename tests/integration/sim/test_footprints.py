@@ -50,9 +50,9 @@ def engine(pool):
 
 
 @pytest.fixture(scope="module")
-def cache(engine, pool):
-    library = PlacementLibrary(pool)
-    yield analyse_scene(engine.scene, seed=3, engine=engine, library=library)
+def cache(engine):
+    library = PlacementLibrary()
+    yield analyse_scene(engine, library, seed=3)
     library.close()
 
 

@@ -90,7 +90,7 @@ def test_every_named_object_has_standing_poses(cache) -> None:
 
 
 def test_equal_seeds_give_equal_caches(cache, pool) -> None:
-    library = PlacementLibrary(pool)
+    library = PlacementLibrary()
     engine = BulletEngine(kitchen_scene(), pool)
     build_pose_cache(kitchen_scene(), ("table_lamp_1",), ("sink_1",), seed=1, engine=engine, library=library)
     again = build_pose_cache(kitchen_scene(), MOVABLE, SUPPORTS, seed=1, engine=engine, library=library)
@@ -104,8 +104,8 @@ def test_equal_seeds_give_equal_caches(cache, pool) -> None:
     library.close()
 
 
-def test_library_identifies_assets_by_content(pool) -> None:
-    library = PlacementLibrary(pool)
+def test_library_identifies_assets_by_content() -> None:
+    library = PlacementLibrary()
     first = library.poses(make.apple(), make.kitchen_table(), Relation.ONTOP, 0)
     started = time.perf_counter()
     assert library.poses(make.apple(), make.kitchen_table(), Relation.ONTOP, 0) is first
@@ -155,7 +155,7 @@ def test_unknown_name_is_a_key_error() -> None:
 def test_poses_beside_a_neighbour_satisfy_nextto(pool, yaw: float) -> None:
     scene = kitchen_scene()
     engine = BulletEngine(scene, pool)
-    library = PlacementLibrary(pool)
+    library = PlacementLibrary()
     table, lamp = scene.by_name["breakfast_table_1"].pose_world_asset, make.table_lamp()
     x, y, z = table.position_m
     top_m = z + scene.asset_of("breakfast_table_1").size_m[2] / 2

@@ -199,7 +199,7 @@ def _analysis_figures(bundle: Bundle) -> Iterator[Figure]:
         contextlib.closing(BulletEngine(bundle.scene)) as engine,
         _cpu_timed(seconds),
     ):
-        poses = analyse_scene(bundle.scene, seed=0, engine=engine, library=library)
+        poses = analyse_scene(engine, library, seed=0)
     count = sum(len(found) for found in poses.placements.values())
     yield Figure("poses_per_s", count / seconds[0], "1/s", Better.HIGHER, count, POSES_GOAL)
     yield Figure("analysis_s", seconds[0], "s", Better.LOWER, 1, ANALYSIS_GOAL_S)

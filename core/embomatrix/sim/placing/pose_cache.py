@@ -1,6 +1,5 @@
 """Offline scene analysis: terminal poses, each verified by settling, and standing poses."""
 
-import contextlib
 import hashlib
 import itertools
 import math
@@ -8,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 from embomatrix.sim.bullet.client import ClientPool
-from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.mini_world import MiniWorld, StaticObject
 from embomatrix.sim.engine import TOLERANCE_M, PhysicsEngine
 from embomatrix.sim.floor.navigation import Navigator
@@ -22,6 +20,7 @@ from embomatrix.sim.geometry.candidates import (
     surfaces_for,
 )
 from embomatrix.sim.geometry.footprints import LEVEL_FLOOR, Footprint, box_of, footprint_of
+from embomatrix.sim.geometry.surfaces import links_with_surfaces
 from embomatrix.sim.state.relations import Relations
 from embomatrix.world.asset import Asset
 from embomatrix.world.geometry import IDENTITY, Aabb, Pose
@@ -61,10 +60,8 @@ class Contents:
 class PlacementLibrary:
     """Verified placements by the content of both assets: equal pairs of other scenes are not simulated again."""
 
-    def __init__(self, pool: ClientPool | None = None) -> None:
-        """``pool`` lends the client for settling; without one the library opens its own and closes it in the end."""
-        self._owns_pool = pool is None
-        self._pool = pool or ClientPool()
+    def __init__(self) -> None:
+        self._pool = ClientPool()
         self._mini = MiniWorld(self._pool)
         self._known: dict[tuple[str, str, Relation, int], tuple[Pose, ...]] = {}
         self._standing: dict[str, Pose | None] = {}
@@ -116,10 +113,9 @@ class PlacementLibrary:
         return self._standing[key]
 
     def close(self) -> None:
-        """Return the client. Known placements stay readable."""
+        """Close the physics client. Known placements stay readable."""
         self._mini.close()
-        if self._owns_pool:
-            self._pool.close()
+        self._pool.close()
 
     def _verified(
         self, held: Asset, support: Asset, relation: Relation, shift: tuple[float, float], most: int
@@ -152,27 +148,17 @@ class PlacementLibrary:
                 yield back @ settled.pose
 
 
-def analyse_scene(
-    scene: Scene,
-    *,
-    seed: int,
-    engine: PhysicsEngine | None = None,
-    library: PlacementLibrary | None = None,
-) -> PoseCache:
+def analyse_scene(engine: PhysicsEngine, library: PlacementLibrary, *, seed: int) -> PoseCache:
     """Analyse a scene: placements of every portable object by its footprint, and standing poses for all objects.
 
-    ``engine`` must hold this scene in its initial state. Raises EngineError for an invalid scene.
+    ``engine`` must hold the scene in its initial state.
     """
-    with contextlib.ExitStack() as owned:
-        if library is None:
-            library = owned.enter_context(contextlib.closing(PlacementLibrary()))
-        if engine is None:
-            engine = owned.enter_context(contextlib.closing(BulletEngine(scene)))
-        names = [item.name for item in scene.objects]
-        movable = [item.name for item in scene.objects if not item.fixed]
-        supports = [name for name in names if scene.asset_of(name).supports or scene.asset_of(name).interiors]
-        placements = footprint_placements(scene, movable, supports, library, seed)
-        return PoseCache(placements, standing_poses(engine, names))
+    scene = engine.scene
+    names = [item.name for item in scene.objects]
+    movable = [item.name for item in scene.objects if not item.fixed]
+    supports = [name for name in names if links_with_surfaces(scene.asset_of(name))]
+    placements = footprint_placements(scene, movable, supports, library, seed)
+    return PoseCache(placements, standing_poses(engine, names))
 
 
 def footprint_placements(
