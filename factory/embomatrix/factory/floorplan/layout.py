@@ -67,7 +67,7 @@ def plan_floor(rooms: Sequence[RoomSpec], rng: np.random.Generator, *, trials: i
 
 def _finish(rooms: Sequence[RoomSpec], packing: Packing, rng: np.random.Generator) -> tuple[float, FloorPlan]:
     """Add doorways, windows and walls to a packing; return its score, windows without a wall included, and the plan."""
-    low = np.min([r.low for r in packing.rects.values()], axis=0)
+    low = np.min([*packing.rects.values()], axis=0)
     rects = {name: rect.moved(-float(low[0]), -float(low[1])) for name, rect in packing.rects.items()}
     doors, unused = place_doorways(rooms, rects, packing.parents, rng)
     panes, walled_up = place_windows(rooms, rects, doors)

@@ -53,7 +53,7 @@ def pack(rooms: Sequence[RoomSpec], rng: np.random.Generator) -> Packing | None:
         host = tuple(rects)[slot[0]]
         rects[spec.name], parents[spec.name] = slot[1], host
         penalty += ranks[host]
-    boxes = np.array([r.as_tuple() for r in rects.values()])
+    boxes = np.array([*rects.values()])
     span = boxes[:, 2:].max(axis=0) - boxes[:, :2].min(axis=0)
     return Packing(rects, parents, float(np.mean(span) ** 2) + penalty)
 
@@ -99,7 +99,7 @@ def _best_slot(
 
     The cost in square metres is the extent of the house, less the worth of shared walls, plus the host's oddness.
     """
-    placed = np.array([r.as_tuple() for r in rects.values()])  # (m, 4)
+    placed = np.array([*rects.values()])  # (m, 4)
     door = max([MIN_DOOR_M, *(min(d.width_m, OPEN_PASSAGE_M) for d in spec.doors)]) + 0.05
     sizes = [(w + WALL_M, h + WALL_M) for w, h in (spec.floor_m, spec.floor_m[::-1])]
     found = [_beside(placed, w, h, door + WALL_M) for w, h in sizes]
@@ -124,8 +124,7 @@ def _best_slot(
             best = (float(total[pick]), int(picks[pick]))
     if best is None:
         return None
-    x0, y0, x1, y1 = (float(value) for value in boxes[best[1]])
-    return int(hosts[best[1]]), Rect(x0, y0, x1, y1)
+    return int(hosts[best[1]]), Rect(*boxes[best[1]].tolist())
 
 
 def _fit(boxes: FloatArray, placed: FloatArray) -> tuple[NDArray[np.bool_], FloatArray]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Generic, TypeVar
+from typing import Final, Generic, NamedTuple, TypeVar
 
 from embomatrix.world.geometry import ConvexPart, Pose, Shape, Vec2
 from embomatrix.world.scene import Doorway, Window
@@ -56,21 +56,13 @@ class WallCut(Generic[OpeningT]):
     interval: Interval
 
 
-@dataclass(frozen=True, slots=True)
-class Rect:
+class Rect(NamedTuple):
     """Floor of a room grown by half a wall on each side."""
 
     x0: float
     y0: float
     x1: float
     y1: float
-
-    def as_tuple(self) -> tuple[float, float, float, float]:
-        return (self.x0, self.y0, self.x1, self.y1)
-
-    @property
-    def low(self) -> Vec2:
-        return (self.x0, self.y0)
 
     @property
     def floor(self) -> tuple[Vec2, Vec2]:
