@@ -9,12 +9,11 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from embomatrix.factory.furnish.candidates import (
     AHEAD,
     WALL_GAP_M,
-    GroupCandidates,
+    GroupFrames,
     RoomSurroundings,
     candidates_of,
 )
@@ -64,10 +63,10 @@ class RoomSolver:
         return any(self._place(replace(group, clear_m=share * group.clear_m), wobble) for share in shares)
 
     def _place(self, group: FurnitureGroup, wobble: float) -> bool:
-        options = candidates_of(group, self.space, self._around)
+        options, cost = candidates_of(group, self.space, self._around)
         if not len(options):
             return False
-        cost = options.cost + wobble * self._rng.uniform(0.0, 0.5, len(options))
+        cost = cost + wobble * self._rng.uniform(0.0, 0.5, len(options))
         options = options.take(np.argsort(cost))
         failed: list[tuple[float, float, int]] = []
         for index in np.flatnonzero(self.free(group, options)):
@@ -97,17 +96,17 @@ class RoomSolver:
 
     def is_free_at(self, group: FurnitureGroup, x: float, y: float, turns: int) -> bool:
         """True if the group and the space before its fronts are free in this frame."""
-        spot = GroupCandidates(np.array([x]), np.array([y]), np.array([turns]), np.zeros(1))
+        spot = GroupFrames(np.array([x]), np.array([y]), np.array([turns]))
         return bool(self.free(group, spot)[0])
 
-    def free(self, group: FurnitureGroup, options: GroupCandidates) -> BoolArray:
+    def free(self, group: FurnitureGroup, options: GroupFrames) -> BoolArray:
         """Mark the candidates that are free, with free space before their fronts; shape (n,)."""
         free = self._inside(group, options)
         rows = np.flatnonzero(free)
         free[rows] = self._is_free(group, options.take(rows))
         return free
 
-    def _inside(self, group: FurnitureGroup, options: GroupCandidates) -> BoolArray:
+    def _inside(self, group: FurnitureGroup, options: GroupFrames) -> BoolArray:
         """Mark the candidates that lie within the room; shape (n,)."""
         (x0, y0), (x1, y1) = self.space.room.low_m, self.space.room.high_m
         gap = WALL_GAP_M - 1e-6 + group.clear_m
@@ -123,7 +122,7 @@ class RoomSolver:
 
         return free
 
-    def _is_free(self, group: FurnitureGroup, options: GroupCandidates) -> BoolArray:
+    def _is_free(self, group: FurnitureGroup, options: GroupFrames) -> BoolArray:
         free = np.ones(len(options), dtype=bool)
         for member in group.members:
             for boxes in _boxes(member, options):
@@ -223,15 +222,14 @@ def _grown(boxes: FloatArray, by_m: float) -> FloatArray:
     return boxes + np.array([-by_m, -by_m, 0.0, by_m, by_m, 0.0]) if by_m else boxes
 
 
-def _boxes(member: Member, options: GroupCandidates) -> Iterator[FloatArray]:
+def _boxes(member: Member, options: GroupFrames) -> Iterator[FloatArray]:
     """Yield the world boxes of each of the member's blocks for every candidate, shape (n, 6)."""
-    x, y, yaw = _frames(member, options)
     for x0, y0, z0, x1, y1, z1 in member.piece.blocks:
         low = 0.0 if _on_brackets(member.piece, member.on) else member.bottom + z0
-        yield _turned(x, y, yaw, (x0, y0, x1, y1), (low, member.bottom + z1))
+        yield _turned(member, options, (x0, y0, x1, y1), (low, member.bottom + z1))
 
 
-def _front(member: Member, options: GroupCandidates) -> FloatArray | None:
+def _front(member: Member, options: GroupFrames) -> FloatArray | None:
     """Return the free space that the member needs before it for every candidate, (n, 6); None if it needs none."""
     kind = access_of(member.piece)
     if kind not in (Access.FRONT, Access.HUNG):
@@ -240,31 +238,18 @@ def _front(member: Member, options: GroupCandidates) -> FloatArray | None:
     hung = kind is Access.HUNG
     span = (member.bottom, member.bottom + height) if hung else (LOW_M + 0.001, _ACCESS_TOP_M)
     reach = front_depth_m(member.piece.asset)
-    return _turned(*_frames(member, options), (depth / 2, -width / 2, depth / 2 + reach, width / 2), span)
+    return _turned(member, options, (depth / 2, -width / 2, depth / 2 + reach, width / 2), span)
 
 
-def _frames(member: Member, options: GroupCandidates) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
-    c, s = AHEAD[options.turns, 0], AHEAD[options.turns, 1]
-    x = options.x + c * member.x - s * member.y
-    y = options.y + s * member.x + c * member.y
-    return x, y, (options.turns + member.turns) % 4
-
-
-def _turned(
-    x: FloatArray,
-    y: FloatArray,
-    yaw: NDArray[np.int64],
-    flat: tuple[float, float, float, float],
-    span: tuple[float, float],
-) -> FloatArray:
-    """Return a rectangle (x0, y0, x1, y1) in the piece's frame as boxes in the world, (n, 6)."""
+def _turned(member: Member, options: GroupFrames, flat: Rect4, span: tuple[float, float]) -> FloatArray:
+    """Return a rectangle in the member's frame as boxes in the world for every candidate, (n, 6)."""
     x0, y0, x1, y1 = flat
-    corners = np.array([(x0, y0, x1, y1), (-y1, x0, -y0, x1), (-x1, -y1, -x0, -y0), (y0, -x1, y1, -x0)])[yaw]
-    full = np.ones(len(x))
-    low, high = full * span[0], full * span[1]
-    return np.stack(
-        [x + corners[:, 0], y + corners[:, 1], low, x + corners[:, 2], y + corners[:, 3], high], axis=1
-    )
+    frames = options.moved(member.x, member.y, member.turns)
+    turned = np.array([(x0, y0, x1, y1), (-y1, x0, -y0, x1), (-x1, -y1, -x0, -y0), (y0, -x1, y1, -x0)])
+    corners, full = turned[frames.turns], np.ones(len(options))
+    low = (frames.x + corners[:, 0], frames.y + corners[:, 1], full * span[0])
+    high = (frames.x + corners[:, 2], frames.y + corners[:, 3], full * span[1])
+    return np.stack([*low, *high], axis=1)
 
 
 _MARGINS_M: Final = ((0.75, 0.75), (0.75, 0.05), (0.05, 0.75), (0.05, 0.05))
@@ -278,12 +263,10 @@ _LATTICES: Final = 4
 def lay_rows(solver: RoomSolver, rows: Rows, wobble: float, rng: np.random.Generator) -> list[FurnitureGroup]:
     """Place the groups on the lattice with room for most of them. Return the groups without a place."""
     unit = _unit(rows.groups)
-    best: tuple[float, GroupCandidates] | None = None
+    best: tuple[float, GroupFrames] | None = None
     for turns in range(4):
         for lattice in _lattices(solver, unit, rows, turns):
-            nodes = GroupCandidates(
-                lattice[:, 0], lattice[:, 1], np.full(len(lattice), turns), np.zeros(len(lattice))
-            )
+            nodes = GroupFrames(lattice[:, 0], lattice[:, 1], np.full(len(lattice), turns))
             free = nodes.take(np.flatnonzero(_all_free(solver, rows, nodes)))
             score = (
                 min(len(free), len(rows.groups)) - _SPARE * len(nodes) + wobble * float(rng.uniform(0.0, 0.5))
@@ -295,9 +278,7 @@ def lay_rows(solver: RoomSolver, rows: Rows, wobble: float, rng: np.random.Gener
     return _fill(solver, rows.groups, best[1])
 
 
-def _fill(
-    solver: RoomSolver, groups: Sequence[FurnitureGroup], nodes: GroupCandidates
-) -> list[FurnitureGroup]:
+def _fill(solver: RoomSolver, groups: Sequence[FurnitureGroup], nodes: GroupFrames) -> list[FurnitureGroup]:
     left = list(groups)
     for index in range(len(nodes)):
         if not left:
@@ -308,7 +289,7 @@ def _fill(
     return left
 
 
-def _all_free(solver: RoomSolver, rows: Rows, nodes: GroupCandidates) -> BoolArray:
+def _all_free(solver: RoomSolver, rows: Rows, nodes: GroupFrames) -> BoolArray:
     """Mark the nodes where the largest group is free: every other group fits there too."""
     largest = max(rows.groups, key=lambda g: len(g.members))
     return solver.free(replace(largest, clear_m=rows.clear_m), nodes)
