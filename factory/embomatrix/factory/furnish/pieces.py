@@ -82,7 +82,6 @@ class Placed:
     yaw: float
     host: int = -1
     relation: Relation | None = None
-    interior: str = ""
 
     @property
     def pose(self) -> Pose:

@@ -163,22 +163,18 @@ def _too_high(piece: FurniturePiece) -> bool:
 def _best_arrangement(
     room: Room, plan: FloorPlan, pieces: Sequence[FurniturePiece], rng: np.random.Generator
 ) -> _Arrangement:
-    best: _Arrangement | None = None
+    tried: list[_Arrangement] = []
     first: set[int] = set()
     standing = sum(p.role not in (FurnitureRole.SURFACE, FurnitureRole.PLANTING) for p in pieces)
     attempts = ATTEMPTS if standing < CROWD else CROWDED_ATTEMPTS if standing < HALL else 2
     for attempt in range(attempts):
-        tried = _arrange(room, plan, pieces, rng, first, wobble=0.4 + 0.2 * attempt)
+        tried.append(_arrange(room, plan, pieces, rng, first, wobble=0.4 + 0.2 * attempt))
         # Pieces without a place are placed first in the next attempt.
-        lost = [p for p in tried.dropped if _matters(p)]
+        lost = [p for p in tried[-1].dropped if _matters(p)]
         first |= {p.number for p in lost}
-        if best is None or tried.loss < best.loss:
-            best = tried
-        if not lost or (attempt >= CROWDED_ATTEMPTS and best.loss <= GOOD_ENOUGH):
+        if not lost or (attempt >= CROWDED_ATTEMPTS and min(a.loss for a in tried) <= GOOD_ENOUGH):
             break
-    if best is None:
-        raise ValueError(f"room {room.name!r} was never arranged: expected at least one attempt")
-    return best
+    return min(tried, key=lambda arrangement: arrangement.loss)
 
 
 def _arrange(

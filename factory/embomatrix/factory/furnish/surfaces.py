@@ -26,6 +26,13 @@ _TALL_M: Final = 1.3
 """Cabinets higher than this hold objects on their boards, not on their top."""
 _HEAD_SHARE: Final = 0.3
 """Share of a bed's free length, at its head, on which pillows lie."""
+_NO_SURFACES: Final = (
+    FurnitureRole.RUG,
+    FurnitureRole.CEILING,
+    FurnitureRole.SURFACE,
+    FurnitureRole.STRUCTURE,
+)
+"""Roles of pieces that hold no small objects."""
 _SAME_KIND: Final = 2.0
 """Ranks by which a surface is preferred if it already holds an object of the same category."""
 
@@ -83,18 +90,12 @@ class SurfacePlacer:
         return False
 
     def _usable(self, placed: Placed, number: int) -> Iterable[Surface]:
-        flat = not placed.piece.upended and abs(math.sin(2 * placed.yaw)) < 1e-6
-        if (
-            placed.piece.role
-            in (FurnitureRole.RUG, FurnitureRole.CEILING, FurnitureRole.SURFACE, FurnitureRole.STRUCTURE)
-            or not flat
-        ):
+        piece = placed.piece
+        flat = not piece.upended and abs(math.sin(2 * placed.yaw)) < 1e-6
+        on_wall = piece.role is FurnitureRole.WALL
+        if not flat or piece.role in _NO_SURFACES or (on_wall and piece.category != "shelf"):
             return []
-        if placed.piece.role is FurnitureRole.WALL and placed.piece.category != "shelf":
-            return []
-        tall = (
-            placed.bottom + placed.piece.size_m[2] > _TALL_M and placed.piece.role is not FurnitureRole.WALL
-        )
+        tall = placed.bottom + piece.size_m[2] > _TALL_M and not on_wall
         return [
             s
             for s in surfaces_of(placed, number)
@@ -139,19 +140,11 @@ class SurfacePlacer:
         pick = int(free[0])
         relation = Relation.INSIDE if surface.interior else Relation.ONTOP
         yaw = host.yaw + float(turn[pick])
-        self._add(
-            Placed(
-                piece,
-                host.room,
-                float(x[pick]),
-                float(y[pick]),
-                bottom,
-                yaw,
-                surface.host,
-                relation,
-                surface.interior,
-            )
-        )
+        x_m, y_m = float(x[pick]), float(y[pick])
+        item = Placed(piece, host.room, x_m, y_m, bottom, yaw, surface.host, relation)
+        self.placed.append(item)
+        self._boxes.extend([item.box])
+        self._used[item.host] += 1
         self._holds.add((piece.category, surface.host, surface.name))
         return True
 
@@ -187,11 +180,6 @@ class SurfacePlacer:
             others[None, :, :3] >= high[:, None] + _SPACING_M
         )
         return np.asarray(np.any(~np.any(apart, axis=2), axis=1))
-
-    def _add(self, item: Placed) -> None:
-        self.placed.append(item)
-        self._boxes.extend([item.box])
-        self._used[item.host] += 1
 
 
 def _to_head(shares: FloatArray, yaw: float) -> None:

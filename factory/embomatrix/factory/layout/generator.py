@@ -339,7 +339,6 @@ class _RoomLayout:
         """
         pending_objects = self._pending
         outcome = settle(self._editor, [self.names[name] for name in fresh], self._alternatives)
-        self._record.settled += outcome.dropped
         wrong = {name: (LayoutReason.INACCESSIBLE, detail) for name, detail in outcome.unreached.items()}
         wrong |= {name: (LayoutReason.UNSTABLE, detail) for name, detail in outcome.unstable.items()}
         for scene_name, (reason, detail) in wrong.items():

@@ -116,8 +116,6 @@ class LayoutRecord:
     planes: list[tuple[PlaneBrief, tuple[PlaneArrangement, ...]]] = field(default_factory=list)
     planar_s: dict[str, float] = field(default_factory=dict)
     """CPU seconds of the planar solver, by room."""
-    settled: int = 0
-    """Number of objects whose stability needed a physics simulation."""
 
 
 @dataclass(frozen=True, slots=True)

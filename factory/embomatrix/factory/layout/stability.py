@@ -31,11 +31,9 @@ CANNOT_TAKE_OUT: Final = "the robot opens its container but can't take it out"
 class StabilityReport:
     """Result of a stability check.
 
-    ``dropped`` counts the objects tested in physics. ``unstable`` and ``unreached`` map object names to a sentence
-    that states the problem.
+    ``unstable`` and ``unreached`` map object names to a sentence that states the problem.
     """
 
-    dropped: int
     unstable: Mapping[str, str]
     unreached: Mapping[str, str]
 
@@ -50,7 +48,7 @@ def settle(
     engine is missing.
     """
     if not names:
-        return StabilityReport(0, {}, {})
+        return StabilityReport({}, {})
     loose = {name for name in names if not editor.known(name).fixed and not is_provably_stable(editor, name)}
     rested: dict[str, Pose] = {}
     unstable: dict[str, str] = {}
@@ -76,7 +74,7 @@ def settle(
     editor.move(rested)
     shut_in = [name for name in names if name not in unstable.keys() | unreached.keys()]
     unreached |= dict.fromkeys(_untakeable(editor, shut_in), CANNOT_TAKE_OUT)
-    return StabilityReport(len(loose), unstable, unreached)
+    return StabilityReport(unstable, unreached)
 
 
 def _resting_on_others(editor: SceneEditor, relations: Relations, names: Sequence[str]) -> dict[str, str]:

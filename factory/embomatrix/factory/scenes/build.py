@@ -85,18 +85,15 @@ def _best_plan(
     specs: Sequence[RoomSpec], pieces: dict[str, list[FurniturePiece]], rng: np.random.Generator
 ) -> tuple[FloorPlan, Furnishing]:
     """Furnish plans until one loses nothing important; houses with many pieces get a single plan."""
-    best: tuple[FloorPlan, Furnishing] | None = None
+    tried: list[tuple[FloorPlan, Furnishing]] = []
     small_house = sum(len(mine) for mine in pieces.values()) < SMALL_HOUSE
     for attempt in range(PLANS_FOR_ESSENTIALS if small_house else 1):
         plan = plan_floor(specs, rng)
-        result = furnish(plan, pieces, rng)
-        if best is None or result.loss < best[1].loss:
-            best = (plan, result)
-        if best[1].loss < (LOSS_TAKEN if attempt < PLANS - 1 else ESSENTIAL):
+        tried.append((plan, furnish(plan, pieces, rng)))
+        least_loss = min(result.loss for _, result in tried)
+        if least_loss < (LOSS_TAKEN if attempt < PLANS - 1 else ESSENTIAL):
             break
-    if best is None:
-        raise ValueError(f"PLANS_FOR_ESSENTIALS is {PLANS_FOR_ESSENTIALS}: expected at least one")
-    return best
+    return min(tried, key=lambda pair: pair[1].loss)
 
 
 def room_spec(catalog: Catalog, room: RoomInventory) -> RoomSpec:

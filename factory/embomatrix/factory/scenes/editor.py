@@ -139,8 +139,7 @@ class SceneEditor:
 
         ``host`` supports it in ``relation``; empty means the floor. Without a room, the object's position decides.
         """
-        self._counts[asset.category] += 1
-        name = f"{asset.category}_{self._counts[asset.category]}"
+        name = self._new_name(asset)
         box = box_at(asset, pose)
         self._objects[name] = SceneObject(
             name=name,
@@ -190,8 +189,7 @@ class SceneEditor:
         origin = self.known(whole)
         names: list[str] = []
         for _ in range(count):
-            self._counts[asset.category] += 1
-            names.append(f"{asset.category}_{self._counts[asset.category]}")
+            names.append(self._new_name(asset))
             self._objects[names[-1]] = SceneObject(
                 name=names[-1],
                 asset_id=asset.asset_id,
@@ -227,6 +225,10 @@ class SceneEditor:
         objects = tuple(self._objects.values())
         used = {item.asset_id: self._assets[item.asset_id] for item in objects}
         return replace(self.base, scene_id=scene_id, objects=objects, assets=used)
+
+    def _new_name(self, asset: Asset) -> str:
+        self._counts[asset.category] += 1
+        return f"{asset.category}_{self._counts[asset.category]}"
 
     def _as_scene(self) -> Scene:
         return replace(self.base, objects=tuple(self._objects.values()), assets=self._assets)
