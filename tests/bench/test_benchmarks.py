@@ -15,7 +15,7 @@ from embomatrix.bench.cli import app
 from embomatrix.bench.cluster.processes import bench_cluster
 from embomatrix.bench.engine.plan_writer import write_workload
 from embomatrix.bench.engine.workload import read_workload, workload_to_text
-from embomatrix.bench.report.figures import BenchError
+from embomatrix.bench.report.figures import BenchError, read_result
 from embomatrix.skills.syntax import Skill
 from embomatrix.world.dataset import Dataset, write_dataset
 
@@ -225,3 +225,14 @@ def test_unwritable_page_is_refused_before_the_measurement(dataset, tmp_path):
     assert result.exit_code == 2
     assert "has no marks" in result.stderr
     assert page.read_text() == "# My notes\n"
+
+
+@pytest.mark.slow
+def test_simulation_command_writes_its_figures(tmp_path):
+    path = tmp_path / "figures.json"
+    answer = CliRunner().invoke(app, ["simulation", "--most-workers=10", f"--json={path}"])
+    assert answer.exit_code == 0, answer.output
+    found = {figure.name: figure.value for figure in read_result(path).figures}
+    assert found["sim_broken_invariants"] == 0
+    assert found["sim_hit_rate, k=2"] >= 0.95
+    assert found["sim_slots_at_work, 150 µs a rollout, 80 slots"] >= 0.9

@@ -31,7 +31,7 @@ from embomatrix.world.dataset import Dataset
 
 PLANS = {"apple_to_counter": "move apple_1; pick_up apple_1; move countertop_1; place countertop_1 ontop"}
 SCENES = 2
-PER_SCENE = 4
+PER_SCENE = 60
 MEASURED = SCENES * (PER_SCENE - 1)
 LIMIT_S = 60.0
 SIZES = PeerSizes((PeerSystem.POOL,), chunk=2, warm=1, alone=1, waves=1, wave=2, limit_s=LIMIT_S)
@@ -52,7 +52,7 @@ def work(tmp_path_factory):
 def test_chunks_hold_rollouts_of_one_scene(work):
     chunks = chunks_of(work.rollouts, 3)
     assert [rollout for chunk in chunks for rollout in chunk] == list(work.rollouts)
-    assert [len(chunk) for chunk in chunks] == [3, 1] * SCENES
+    assert [len(chunk) for chunk in chunks] == [3] * (SCENES * PER_SCENE // 3)
     assert all(len({rollout.bundle_digest for rollout in chunk}) == 1 for chunk in chunks)
 
 

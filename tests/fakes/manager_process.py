@@ -14,7 +14,10 @@ def main():
     try:
         asyncio.run(serve(ManagerSettings.model_validate_json(sys.argv[1]), lambda endpoints: None))
     except* StateError as group:
-        sys.exit(f"manager ends: {group.exceptions[0]}")
+        error = group
+        while isinstance(error, BaseExceptionGroup):
+            error = error.exceptions[0]
+        sys.exit(f"manager ends: {error}")
 
 
 if __name__ == "__main__":

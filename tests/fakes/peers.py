@@ -11,6 +11,7 @@ EXAMPLES = ROOT / "docs" / "examples"
 ROOTS = [ROOT / name for name in ("core", "proto", "manager", "worker", "factory", "trainer")]
 OURS = (
     "numpy>=1.26",
+    "msgspec>=0.19",
     "grpcio>=1.71",
     "protobuf>=5.29,<8",
     "pydantic>=2.9",

@@ -109,4 +109,4 @@ async def test_worker_stops_leases_that_it_cannot_renew(tmp_path):
         print_figures("A6 leases that run out", counted, redispatched=stats.redispatched)
         assert counted.clean
         assert stats.stale_results == 0
-        assert re.search(r"2 leases given up: no heartbeat was answered", cluster.log("w1"))
+        assert re.search(r"leases given up count=2: no heartbeat was answered", cluster.log("w1"))

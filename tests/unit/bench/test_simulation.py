@@ -4,11 +4,8 @@ import functools
 from dataclasses import replace
 
 import pytest
-from typer.testing import CliRunner
 
-from embomatrix.bench.cli import app
 from embomatrix.bench.cluster.simulated import FULL, PACES_US, SimulationBench, in_flight, sweeps
-from embomatrix.bench.report.figures import read_result
 from embomatrix.manager.simulation.run import simulate
 from embomatrix.manager.simulation.scenario import ManagerPace
 
@@ -68,14 +65,3 @@ def test_no_saturated_cluster_is_larger_than_allowed(most):
     bench = SimulationBench(lambda _: None, lambda scenario: workers.append(scenario.workers) or answer)
     assert list(bench.saturation_figures(most))
     assert max(workers) == most
-
-
-@pytest.mark.slow
-def test_simulation_command_writes_its_figures(tmp_path):
-    path = tmp_path / "figures.json"
-    answer = CliRunner().invoke(app, ["simulation", "--most-workers=10", f"--json={path}"])
-    assert answer.exit_code == 0, answer.output
-    found = {figure.name: figure.value for figure in read_result(path).figures}
-    assert found["sim_broken_invariants"] == 0
-    assert found["sim_hit_rate, k=2"] >= 0.95
-    assert found["sim_slots_at_work, 150 µs a rollout, 80 slots"] >= 0.9

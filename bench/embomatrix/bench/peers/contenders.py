@@ -111,13 +111,17 @@ def process_pool(setup: ContenderSetup) -> Iterator[Contender]:
 
     It has no retry. After the death of a process it is broken, and all that it had is lost.
     """
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(setup.slots, mp_context=context) as pool:
+    pool = concurrent.futures.ProcessPoolExecutor(
+        setup.slots, mp_context=multiprocessing.get_context("spawn")
+    )
 
-        def submit(chunk: RolloutChunk) -> concurrent.futures.Future[Answer]:
-            return pool.submit(execute_chunk, *setup.arguments(chunk))
+    def submit(chunk: RolloutChunk) -> concurrent.futures.Future[Answer]:
+        return pool.submit(execute_chunk, *setup.arguments(chunk))
 
+    try:
         yield FuturesContender(submit)
+    finally:
+        pool.shutdown(wait=False)  # a broken pool of Python 3.11 may wait for its own processes without end
 
 
 @contextlib.contextmanager
