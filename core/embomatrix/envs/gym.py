@@ -150,9 +150,7 @@ def step_info(outcome: EpisodeStep) -> dict[str, Any]:
     return {
         "success": reward.success,
         "failure": outcome.step.failure.value if outcome.step.failure is not None else "",
-        "format": reward.format,
-        "relevance": reward.relevance,
-        "goal": reward.goal,
+        **reward.tiers,
     }
 
 

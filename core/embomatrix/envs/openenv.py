@@ -96,9 +96,7 @@ class HouseholdEnvironment(Environment[PlanAction, HouseholdObservation, Househo
                 update={
                     "step_count": self._state.step_count + 1,
                     "success": reward.success,
-                    "format": reward.format,
-                    "relevance": reward.relevance,
-                    "goal": reward.goal,
+                    **reward.tiers,
                 }
             )
             if done or not outcome.step.ok:

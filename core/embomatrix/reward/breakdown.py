@@ -24,3 +24,8 @@ class RewardBreakdown:
     @property
     def total(self) -> float:
         return self.format + self.relevance + self.goal
+
+    @property
+    def tiers(self) -> dict[str, float]:
+        """The summands of the total by name."""
+        return {"format": self.format, "relevance": self.relevance, "goal": self.goal}

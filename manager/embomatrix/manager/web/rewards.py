@@ -154,8 +154,6 @@ def _response(rewards: Sequence[RewardBreakdown]) -> Mapping[str, object]:
         "rewards": [reward.total for reward in rewards],
         "scores": [float(reward.success) for reward in rewards],
         "extra_logs": {
-            "format": [reward.format for reward in rewards],
-            "relevance": [reward.relevance for reward in rewards],
-            "goal": [reward.goal for reward in rewards],
+            name: [reward.tiers[name] for reward in rewards] for name in ("format", "relevance", "goal")
         },
     }

@@ -77,8 +77,7 @@ def reward_payload(rewards: Sequence[RewardBreakdown]) -> dict[str, Any]:
         "rewards": torch.tensor([reward.total for reward in rewards]),
         "scores": torch.tensor([float(reward.success) for reward in rewards]),
         "extra_logs": {
-            "format": torch.tensor([reward.format for reward in rewards]),
-            "relevance": torch.tensor([reward.relevance for reward in rewards]),
-            "goal": torch.tensor([reward.goal for reward in rewards]),
+            name: torch.tensor([reward.tiers[name] for reward in rewards])
+            for name in ("format", "relevance", "goal")
         },
     }

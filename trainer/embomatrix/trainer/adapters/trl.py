@@ -119,12 +119,8 @@ def tiers(outcomes: Sequence[PlanOutcome]) -> dict[str, float]:
     known = [outcome.reward for outcome in outcomes if outcome.reward is not None]
     means = {"lost": 1.0 - len(known) / len(outcomes)} if outcomes else {}
     if known:
-        means |= {
-            "format": float(np.mean([reward.format for reward in known])),
-            "relevance": float(np.mean([reward.relevance for reward in known])),
-            "goal": float(np.mean([reward.goal for reward in known])),
-            "success": float(np.mean([reward.success for reward in known])),
-        }
+        rows = [{**reward.tiers, "success": float(reward.success)} for reward in known]
+        means |= {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     return means
 
 

@@ -38,7 +38,7 @@ class HouseholdTask(vf.Task[HouseholdData, vf.State, vf.TaskConfig]):  # type: i
         """Return the three tiers, which add up to the reward. Success is a separate metric."""
         reward = await shared_scorer(self.data.dataset).reward_of(str(self.data.id), trace.last_reply)
         trace.record_metrics({"success": float(reward.success)})
-        return {"format": reward.format, "relevance": reward.relevance, "goal": reward.goal}
+        return reward.tiers
 
 
 class HouseholdTaskset(vf.Taskset[HouseholdTask, HouseholdConfig]):  # type: ignore[misc]

@@ -33,10 +33,4 @@ async def compute_score(
 
 def reward_payload(reward: RewardBreakdown) -> dict[str, float]:
     """verl's format: the score and the values that it logs, always with the same keys."""
-    return {
-        "score": reward.total,
-        "format": reward.format,
-        "relevance": reward.relevance,
-        "goal": reward.goal,
-        "success": float(reward.success),
-    }
+    return {"score": reward.total, **reward.tiers, "success": float(reward.success)}

@@ -109,9 +109,7 @@ def _plan_to_json(outcome: PlanOutcome) -> dict[str, Any]:
         reward = outcome.reward
         row |= {
             "reward": reward.total,
-            "format": reward.format,
-            "relevance": reward.relevance,
-            "goal": reward.goal,
+            **reward.tiers,
             "success": reward.success,
             "atoms": [[atom.text, atom.holds] for atom in reward.atoms],
         }
