@@ -12,50 +12,23 @@ _VIEWER: Final = frozenset({AccessRole.VIEWER, AccessRole.TRAINER})
 _ADMIN: Final[frozenset[AccessRole]] = frozenset()
 
 # Admins may call every method and are not listed.
-_TABLE: Final[Mapping[str, Mapping[str, frozenset[AccessRole]]]] = {
-    f"{_PACKAGE}.WorkerService": {
-        "Register": frozenset({AccessRole.JOIN, AccessRole.WORKER}),
-        "Session": _WORKER,
-        "Heartbeat": _WORKER,
-        "FetchBundle": _WORKER,
-        "Deregister": _WORKER,
-    },
-    f"{_PACKAGE}.RolloutService": {
-        "GetCapabilities": frozenset(AccessRole),
-        "OpenRun": _TRAINER,
-        "AnnounceLookahead": _TRAINER,
-        "Execute": _TRAINER,
-        "WaitExecution": _TRAINER,
-        "CancelBatch": _TRAINER,
-        "ReportTraining": _TRAINER,
-        "CloseRun": _TRAINER,
-    },
-    f"{_PACKAGE}.SceneService": {
-        "MissingBundles": _TRAINER,
-        "PutBundle": _TRAINER,
-        "GetBundle": _TRAINER,
-    },
-    f"{_PACKAGE}.AdminService": {
-        "ListWorkers": _VIEWER,
-        "ListRuns": _VIEWER,
-        "GetPlan": _VIEWER,
-        "GetRun": _VIEWER,
-        "ReadEvents": _VIEWER,
-        "ExplainRollout": _VIEWER,
-        "DrainWorker": _ADMIN,
-        "ResumeWorker": _ADMIN,
-        "RevokeWorker": _ADMIN,
-        "PauseDispatch": _ADMIN,
-        "ResumeDispatch": _ADMIN,
-        "IssueToken": _ADMIN,
-        "ListTokens": _ADMIN,
-        "RevokeToken": _ADMIN,
-    },
-    "grpc.reflection.v1alpha.ServerReflection": {"ServerReflectionInfo": _VIEWER},
-}
+_GRANTS: Final = (
+    ("WorkerService", frozenset({AccessRole.JOIN, AccessRole.WORKER}), ("Register",)),
+    ("WorkerService", _WORKER, ("Session", "Heartbeat", "FetchBundle", "Deregister")),
+    ("RolloutService", frozenset(AccessRole), ("GetCapabilities",)),
+    ("RolloutService", _TRAINER, ("OpenRun", "AnnounceLookahead", "Execute", "WaitExecution")),
+    ("RolloutService", _TRAINER, ("CancelBatch", "ReportTraining", "CloseRun")),
+    ("SceneService", _TRAINER, ("MissingBundles", "PutBundle", "GetBundle")),
+    ("AdminService", _VIEWER, ("ListWorkers", "ListRuns", "GetPlan", "GetRun")),
+    ("AdminService", _VIEWER, ("ReadEvents", "ExplainRollout")),
+    ("AdminService", _ADMIN, ("DrainWorker", "ResumeWorker", "RevokeWorker")),
+    ("AdminService", _ADMIN, ("PauseDispatch", "ResumeDispatch")),
+    ("AdminService", _ADMIN, ("IssueToken", "ListTokens", "RevokeToken")),
+)
+"""Roles that may call methods of a service."""
 ROLES: Final[Mapping[str, frozenset[AccessRole]]] = {
-    f"/{service}/{method}": roles for service, methods in _TABLE.items() for method, roles in methods.items()
-}
+    f"/{_PACKAGE}.{service}/{method}": roles for service, roles, methods in _GRANTS for method in methods
+} | {"/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo": _VIEWER}
 OPEN: Final = frozenset(
     {
         "/grpc.health.v1.Health/Check",
