@@ -24,8 +24,7 @@ from embomatrix.factory.social.agent_interfaces import SOCIAL_AGENTS, SocialAgen
 from embomatrix.factory.social.model_agents import SocialModelAgents
 
 ALL_AGENTS: Final[Mapping[str, AgentInterface]] = {
-    **{name.value: interface for name, interface in SOCIAL_AGENTS.items()},
-    **{name.value: interface for name, interface in LAYOUT_AGENTS.items()},
+    name.value: interface for name, interface in (*SOCIAL_AGENTS.items(), *LAYOUT_AGENTS.items())
 }
 """Interfaces of all agents by name, in the order in which the pipeline calls them."""
 

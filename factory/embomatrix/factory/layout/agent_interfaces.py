@@ -6,7 +6,7 @@ The four agents follow the paper. Three of them can be a language model; poses a
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Final
+from typing import Any, Final, Self, get_type_hints
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -18,12 +18,6 @@ from embomatrix.factory.layout.planar import arrange
 from embomatrix.factory.layout.sampling import ObjectSampler
 from embomatrix.factory.layout.values import (
     Branch,
-    ConstraintBrief,
-    Distribution,
-    DistributionBrief,
-    PlacementConstraints,
-    PlaneArrangement,
-    PlaneBrief,
     RoomBrief,
     SampleBrief,
     SampledPose,
@@ -55,6 +49,12 @@ class AgentInterface:
     brief: TypeAdapter[Any]
     answer: TypeAdapter[Any]
     rules: Callable[[Any], Any]
+
+    @classmethod
+    def of(cls, rules: Callable[[Any], Any], about: str) -> Self:
+        """Return the interface of rules whose signature names the types of brief and answer."""
+        brief, answer = get_type_hints(rules).values()
+        return cls(about, TypeAdapter(brief), TypeAdapter(answer), rules)
 
     def read(self, text: str) -> Any:
         """Parse a brief from JSON. Raise BriefError that names the field."""
@@ -90,36 +90,17 @@ def sample(brief: SampleBrief) -> SampledPose:
 
 
 LAYOUT_AGENTS: Final[Mapping[AgentName, AgentInterface]] = {
-    AgentName.DISTRIBUTOR: AgentInterface(
-        "Scene-level Distribution Agent: room of each object",
-        TypeAdapter(DistributionBrief),
-        TypeAdapter(Distribution),
-        distribute,
+    AgentName.DISTRIBUTOR: AgentInterface.of(
+        distribute, "Scene-level Distribution Agent: room of each object"
     ),
-    AgentName.ORGANIZER: AgentInterface(
-        "Room-level Organization Agent: branches of a layout tree",
-        TypeAdapter(RoomBrief),
-        TypeAdapter(tuple[Branch, ...]),
-        _branches,
+    AgentName.ORGANIZER: AgentInterface.of(
+        _branches, "Room-level Organization Agent: branches of a layout tree"
     ),
-    AgentName.PLANNER: AgentInterface(
-        "Planar-Level Placement Generator, choice of constraints",
-        TypeAdapter(ConstraintBrief),
-        TypeAdapter(PlacementConstraints),
-        choose_constraints,
+    AgentName.PLANNER: AgentInterface.of(
+        choose_constraints, "Planar-Level Placement Generator, choice of constraints"
     ),
-    AgentName.SOLVER: AgentInterface(
-        "Planar-Level Placement Generator, solver",
-        TypeAdapter(PlaneBrief),
-        TypeAdapter(tuple[PlaneArrangement, ...]),
-        arrange,
-    ),
-    AgentName.SAMPLER: AgentInterface(
-        "Object-level Sampling Agent: pose in a base scene",
-        TypeAdapter(SampleBrief),
-        TypeAdapter(SampledPose),
-        sample,
-    ),
+    AgentName.SOLVER: AgentInterface.of(arrange, "Planar-Level Placement Generator, solver"),
+    AgentName.SAMPLER: AgentInterface.of(sample, "Object-level Sampling Agent: pose in a base scene"),
 }
 MODEL_BACKED: Final = frozenset({AgentName.DISTRIBUTOR, AgentName.ORGANIZER, AgentName.PLANNER})
 """Agents that can be a language model."""

@@ -9,7 +9,6 @@ from enum import StrEnum
 from typing import Any, Final
 
 import numpy as np
-from pydantic import TypeAdapter
 
 from embomatrix.factory.layout.agent_interfaces import AgentInterface, BriefError
 from embomatrix.factory.pictures.sights import sights_of
@@ -118,28 +117,12 @@ def _variant(name: str, seed: int, rng: np.random.Generator) -> Variant:
 
 
 SOCIAL_AGENTS: Final[Mapping[SocialAgent, AgentInterface]] = {
-    SocialAgent.EXTRACTOR: AgentInterface(
-        "scene information extraction: rooms, objects and possible actions",
-        TypeAdapter(SceneBrief),
-        TypeAdapter(SceneFacts),
-        extract,
+    SocialAgent.EXTRACTOR: AgentInterface.of(
+        extract, "scene information extraction: rooms, objects and possible actions"
     ),
-    SocialAgent.PLAYER: AgentInterface(
-        "Role-Playing Agent: people of a scene and their schedule",
-        TypeAdapter(SceneBrief),
-        TypeAdapter(TalkBrief),
-        play,
+    SocialAgent.PLAYER: AgentInterface.of(play, "Role-Playing Agent: people of a scene and their schedule"),
+    SocialAgent.SIMULATOR: AgentInterface.of(
+        simulate, "Social Simulation Agent: conversation that leads to a request"
     ),
-    SocialAgent.SIMULATOR: AgentInterface(
-        "Social Simulation Agent: conversation that leads to a request",
-        TypeAdapter(TalkBrief),
-        TypeAdapter(SummaryBrief),
-        simulate,
-    ),
-    SocialAgent.SUMMARIZER: AgentInterface(
-        "Summarization Agent: instruction",
-        TypeAdapter(SummaryBrief),
-        TypeAdapter(RequestSummary),
-        summarise,
-    ),
+    SocialAgent.SUMMARIZER: AgentInterface.of(summarise, "Summarization Agent: instruction"),
 }
