@@ -54,12 +54,13 @@ def models_for(addition: Addition, rng: np.random.Generator, requirement: Requir
     if requirement.contents:
         # A stable sort: models with space for everything come first.
         carried = [model for _, model in light] if requirement.carried else []
-        able.sort(key=lambda model: (bool(carried) and model not in carried, _room(model, requirement)))
+        able.sort(
+            key=lambda model: (
+                bool(carried) and model not in carried,
+                room_for(_asset(model), requirement.contents),
+            )
+        )
     return able[:MODEL_TRIES]
-
-
-def _room(model: Model, requirement: Requirement) -> CavityFit:
-    return room_for(_asset(model), requirement.contents)
 
 
 def _asset(model: Model) -> Asset:
@@ -183,17 +184,16 @@ def _meets(model: Model, requirement: Requirement, places: Sequence[HostPlacemen
         return False
     if requirement.burden and room_for(asset, requirement.burden, Relation.ONTOP) is not CavityFit.FOR_ALL:
         return False
-    return all(_fits_host(asset, place) for place in places)
+    # The object has a pose on or in each of its hosts, by geometry alone.
+    return all(
+        next(candidates(asset, place.host, place.relation, MIDDLE, CANDIDATES), None) is not None
+        for place in places
+    )
 
 
 def _is_liftable(model: Model) -> bool:
     asset = _asset(model)
     return is_liftable(asset.size_m, asset.mass_kg)
-
-
-def _fits_host(asset: Asset, place: HostPlacement) -> bool:
-    """True if the object has a pose on or in its host, by geometry alone."""
-    return next(candidates(asset, place.host, place.relation, MIDDLE, CANDIDATES), None) is not None
 
 
 def _first(models: Sequence[Model]) -> Asset | None:

@@ -30,27 +30,22 @@ def with_robot_in(scene: Scene, room_name: str) -> Scene:
 def with_states(scene: Scene, literals: Iterable[InitLiteral]) -> Scene:
     """Return the scene with doors, states and substances as the literals say. Relations are ignored."""
     shares: dict[str, float] = {}
-    facts: dict[str, set[SubstanceFact]] = {}
-    denied: dict[str, set[SubstanceFact]] = {}
-    gained: dict[str, set[State]] = {}
-    lost: dict[str, set[State]] = {}
-    for literal in literals:
-        if literal.atom.predicate in set(SubstanceRelation):
-            name, substance = literal.atom.args
-            fact = SubstanceFact(SubstanceRelation(literal.atom.predicate), substance)
-            (facts if literal.positive else denied).setdefault(name, set()).add(fact)
-        if literal.atom.predicate not in set(State):
-            continue
-        name, state = literal.atom.args[0], State(literal.atom.predicate)
-        if state is State.OPEN:
+    states = {item.name: set(item.states) for item in scene.objects}
+    substances = {item.name: set(item.substances) for item in scene.objects}
+    # Negative literals come last: they win over positive ones.
+    for literal in sorted(literals, key=lambda literal: not literal.positive):
+        name, predicate = literal.atom.args[0], literal.atom.predicate
+        if predicate == State.OPEN:
             shares[name] = float(literal.positive)
-        else:
-            (gained if literal.positive else lost).setdefault(name, set()).add(state)
+        elif predicate in set(SubstanceRelation):
+            fact = SubstanceFact(SubstanceRelation(predicate), literal.atom.args[1])
+            (substances[name].add if literal.positive else substances[name].discard)(fact)
+        elif predicate in set(State):
+            (states[name].add if literal.positive else states[name].discard)(State(predicate))
 
     def changed(item: SceneObject) -> SceneObject:
-        states = (item.states | gained.get(item.name, set())) - lost.get(item.name, set())
-        substances = (item.substances | facts.get(item.name, set())) - denied.get(item.name, set())
-        return dataclasses.replace(item, states=states, substances=substances)
+        facts = frozenset(substances[item.name])
+        return dataclasses.replace(item, states=frozenset(states[item.name]), substances=facts)
 
     objects = {item.name: item for item in scene.objects}
     for name, share in shares.items():
