@@ -113,11 +113,9 @@ def check(
     orders = []
     with _user_errors():
         for name in _chosen(scenes, every):
-            if name.endswith(SUFFIX):
-                scene = read_scene(Path(name))
+            if scene := _read(name):
                 orders.append(SceneBuildJob(scene.scene_id, scene.seed, source=Path(name)))
             else:
-                Catalog.load().inventory(name)
                 orders += [SceneBuildJob(name, seed) for seed in dict.fromkeys(seeds or (0,))]
     _check_writable(report)
     _print_reports(_run(orders, jobs), report)
@@ -145,10 +143,9 @@ def show(scene: SceneSource, seed: Seed = 0) -> None:
 @app.command()
 def render(scene: SceneSource, seed: Seed = 0, out: Out = Path()) -> None:
     """Draw a plan, an oblique view, and the robot's view at its start, as PNG files."""
-    _check_sources([scene])
-    _make_folder(out)
-    with _user_errors():
+    with _user_errors(out):
         built = _built(scene, seed)
+        out.mkdir(parents=True, exist_ok=True)
         pictures = {
             "plan": draw_plan(built),
             "view": Image.fromarray(np.asarray(render_oblique(built))),
@@ -190,7 +187,9 @@ def views(scenes: SceneSources = None, seed: Seed = 0, out: Picture = Path("view
 
 def _built_all(names: Sequence[str], seed: int, out: Path) -> list[Scene]:
     """Build the scenes with a progress bar, after checking all names and the output file."""
-    _check_sources(names)
+    with _user_errors():
+        for name in names:
+            _read(name)
     _check_writable(out)
     with _user_errors(), progress() as bars:
         return [_built(name, seed) for name in bars.track(names, description="scenes")]
@@ -228,18 +227,16 @@ def _chosen(names: Sequence[str] | None, every: bool) -> tuple[str, ...]:
     return Catalog.load().scene_ids if every else tuple(dict.fromkeys(names or ()))
 
 
-def _check_sources(names: Sequence[str]) -> None:
-    """Reject unknown names and damaged files before anything is written."""
-    with _user_errors():
-        for name in names:
-            if name.endswith(SUFFIX):
-                read_scene(Path(name))
-            else:
-                Catalog.load().inventory(name)
+def _read(name: str) -> Scene | None:
+    """Return the scene of a file, or None for a scene of the catalog. Raise SceneFileError or CatalogError."""
+    if name.endswith(SUFFIX):
+        return read_scene(Path(name))
+    Catalog.load().inventory(name)
+    return None
 
 
 def _built(name: str, seed: int) -> Scene:
-    return read_scene(Path(name)) if name.endswith(SUFFIX) else build_base_scene(name, seed=seed)
+    return _read(name) or build_base_scene(name, seed=seed)
 
 
 def _check_writable(path: Path | None) -> None:

@@ -197,7 +197,7 @@ class _SplitOrders:
 
     @property
     def admitted(self) -> int:
-        return len(self._store.records_of(self._split))
+        return sum(1 for _ in self._before(self._end))
 
     def next_round(self) -> list[VariantOrder]:
         """Return the next variants to make, without those that the store already holds. Empty if the split is complete.
@@ -212,10 +212,11 @@ class _SplitOrders:
             numbers = range(self._number, min(self._number + min(ROUND_VARIANTS, wanted), self._end))
             known = self._known(self._number)
             self._number = numbers.stop
+            made = {result.number for result in self._store.results if result.split == self._split}
             orders = [
                 VariantOrder(self._split, number, base, self._rooms[base], missing, known)
                 for number in numbers
-                if not self._store.has(self._split, number)
+                if number not in made
                 for base in (self._usable[number % len(self._usable)],)
             ]
             if orders:

@@ -161,12 +161,6 @@ class BuildStore:
     def results(self) -> list[VariantResult]:
         return self._log.outcomes
 
-    def has(self, split: str, number: int) -> bool:
-        return any(result.split == split and result.number == number for result in self.results)
-
-    def records_of(self, split: str) -> list[TaskRecord]:
-        return [record for result in self.results if result.split == split for record in result.records]
-
     def add(self, variant: VariantYield) -> None:
         """Store a variant's result. Its other files are written before its line in the log."""
         result = variant.result
