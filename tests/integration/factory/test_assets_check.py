@@ -146,7 +146,7 @@ def test_sheet_shows_an_asset_closed_and_open() -> None:
 
 def test_check_prints_the_rules_and_names_an_unknown_category() -> None:
     pytest.importorskip("pybullet", reason="PyBullet has wheels up to Python 3.11 on x86-64")
-    result = CliRunner().invoke(app, ["check", "--category", "bowl", "--category", "fridge", "--glance"])
+    result = CliRunner().invoke(app, ["check", "--category", "bowl", "--category", "fridge"])
     assert result.exit_code == 0, result.output
     assert "2 models" in result.output
     unknown = CliRunner().invoke(app, ["check", "--category", "frigde"])

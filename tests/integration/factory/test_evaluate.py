@@ -29,6 +29,7 @@ from embomatrix.factory.social.casting import NAMES
 from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.catalog import Catalog
+from embomatrix.world.dataset import DatasetError
 
 BED = RoomBox("bed", (1.0, 0.8), (1.0, 0.8), 0.0, 0.0, 0.6, FLOOR)
 DESK = RoomBox("desk", (3.7, 3.0), (0.3, 0.7), 0.0, 0.0, 0.75, FLOOR)
@@ -300,7 +301,7 @@ def test_folder_that_is_no_build_is_reported_in_a_sentence(tmp_path):
     assert "has no ledger of drafts" in answer.output
     a_build(tmp_path, "social", [])
     (tmp_path / "build.jsonl").write_text("{}\n")
-    with pytest.raises(EvaluationError, match="does not hold the settings"):
+    with pytest.raises(DatasetError, match="does not hold the settings"):
         evaluate_admissions(tmp_path)
 
 

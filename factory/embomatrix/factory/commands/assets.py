@@ -8,7 +8,7 @@ from typing import Annotated, Final
 
 import typer
 
-from embomatrix.factory.assets.check import GLANCE_STEPS, STEPS, AssetRule, check_asset, check_standing
+from embomatrix.factory.assets.check import AssetRule, check_asset, check_standing
 from embomatrix.factory.assets.library import build_asset, family_of
 from embomatrix.factory.commands.terminal import say, show_table, user_errors
 from embomatrix.factory.importers.assemble import ImportedAsset, import_model, read_model
@@ -46,17 +46,13 @@ def check(
     every_model: Annotated[
         bool, typer.Option("--every-model", help="All models of a category instead of the first.")
     ] = False,
-    glance: Annotated[
-        bool,
-        typer.Option("--glance", help="End each drop test once the asset is slow, not after two seconds."),
-    ] = False,
 ) -> None:
     """Check size, cavities, doors and stability of all assets in use; exit status 1 if one breaks a rule."""
     catalog = Catalog.load()
     with user_errors():
         assets = _assets(catalog, category, every_model=every_model)
         findings = [finding for asset in assets for finding in check_asset(catalog, asset)]
-        findings += check_standing(catalog, assets, GLANCE_STEPS if glance else STEPS)
+        findings += check_standing(catalog, assets)
     for finding in findings:
         if not finding.excused:
             say(f"{finding.asset_id}: {finding.rule}: {finding.detail}")

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures
 from embomatrix.factory.pipeline.settings import WriterKind
-from embomatrix.factory.pipeline.store import ATTEMPTS_FILE, BUILD_FILE, TIMES_FILE
+from embomatrix.factory.pipeline.store import ATTEMPTS_FILE, TIMES_FILE, build_settings
 from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.pages.figures import Better, Figure
 
@@ -29,22 +29,25 @@ def admitted_share(folder: Path, label: str = "") -> tuple[Figure, ...]:
 
 
 def evaluate_admissions(folder: Path) -> EvaluationFigures:
-    """Return share and rate of a build's admitted drafts, and the reasons against the others. Raises EvaluationError."""
+    """Return share and rate of a build's admitted drafts, and the reasons against the others.
+
+    Raises EvaluationError or DatasetError.
+    """
     attempts = _attempts(folder)
     if not attempts:
         raise EvaluationError(
             f"{folder} has no ledger of drafts: expected {ATTEMPTS_FILE}, which `factory build`, `generate` and `corpus` write"
         )
-    settings = _settings(folder)
-    label = WriterKind.PLAIN.value if settings["writer"] == WriterKind.PLAIN else ""
+    settings = build_settings(folder)
+    label = WriterKind.PLAIN.value if settings.get("writer") == WriterKind.PLAIN else ""
     figures = (*admitted_share(folder, label), *_per_hour(folder, attempts, label))
     reasons = Counter(each["outcome"] for each in attempts if each["outcome"] != ADMITTED)
     counts = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common()) or "nothing"
     conditions = {
         "dataset": folder.name,
         "scenes": len({base_scene_of(each["scene"]) for each in attempts}),
-        "look ahead": "yes" if settings["look_ahead"] else "no",
-        "in physics": "yes" if settings["physical"] else "no",
+        "look ahead": "yes" if settings.get("look_ahead") else "no",
+        "in physics": "yes" if settings.get("physical") else "no",
     }
     return EvaluationFigures(
         "admission", conditions, figures, (f"Rejected drafts{f' of {label}' if label else ''}: {counts}.",)
@@ -88,19 +91,6 @@ def _attempts(folder: Path) -> list[dict[str, Any]]:
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise EvaluationError(
             f"{path} can't be read as a ledger ({error}): run the build again to rewrite it"
-        ) from error
-
-
-def _settings(folder: Path) -> dict[str, Any]:
-    path = folder / BUILD_FILE
-    try:
-        with path.open(encoding="utf-8") as file:
-            value = json.loads(file.readline())["settings"]
-        return {name: value[name] for name in ("writer", "look_ahead", "physical")}
-    except (OSError, ValueError, LookupError, TypeError) as error:
-        raise EvaluationError(
-            f"{path} does not hold the settings of a build ({error}): name a folder written by `factory build`, "
-            "`generate` or `corpus`"
         ) from error
 
 

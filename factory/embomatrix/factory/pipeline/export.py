@@ -9,7 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
-from embomatrix.factory.pipeline.store import BUILD_FILE, TRANSCRIPTS_FOLDER
+from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER, build_settings
 from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
 
@@ -142,10 +142,9 @@ _SOURCES: Final = (
 
 def _settings(folder: Path) -> str:
     """Describe the settings of the build, if its log exists."""
-    path = folder / BUILD_FILE
     try:
-        settings = json.loads(path.read_text(encoding="utf-8").splitlines()[0])["settings"]
-    except (OSError, ValueError, LookupError, TypeError):
+        settings = build_settings(folder)
+    except DatasetError:
         return "The folder holds no build settings: these tasks were imported."
     listed = ", ".join(f"{name} `{value}`" for name, value in settings.items() if name != "scenes")
     return f"`embomatrix factory`, settings: {listed}, {len(settings.get('scenes', ()))} scenes."

@@ -144,6 +144,19 @@ class VariantYield:
     cpu_s: float = field(default=0.0, compare=False)
 
 
+def build_settings(folder: Path) -> dict[str, Any]:
+    """Return the settings of a build. Raise DatasetError if the folder holds none."""
+    path = folder / BUILD_FILE
+    try:
+        with path.open(encoding="utf-8") as file:
+            return dict(json.loads(file.readline())["settings"])
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise DatasetError(
+            f"{path} does not hold the settings of a build ({error}): name a folder written by `factory build`, "
+            "`generate` or `corpus`"
+        ) from error
+
+
 class BuildStore:
     """Folder of a build. Its log holds the settings in the first line and one variant in each further line."""
 

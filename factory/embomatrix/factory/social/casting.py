@@ -1,7 +1,7 @@
 """Rule-based Role-Playing Agent: roles by kind of place, and a seeded cast with a schedule that covers every room."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -9,14 +9,6 @@ import numpy as np
 from embomatrix.factory.social.occasions import ELSEWHERE, Occasion, occasions_in
 from embomatrix.factory.social.values import Cast, DaySlot, Person
 from embomatrix.world.scene import Room, Scene
-
-
-@dataclass(frozen=True, slots=True)
-class HouseholdSetting:
-    """Setting of a cast that contains all of these ties to the first person."""
-
-    words: str
-    ties: frozenset[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +35,8 @@ class Milieu:
     roles: tuple[SocialRole, ...]
     lived_in: bool = False
     """True if people sleep and wash there."""
-    households: tuple[HouseholdSetting, ...] = ()
+    households: Mapping[str, frozenset[str]] = field(default_factory=dict)
+    """Settings of casts that contain all of these ties to the first person."""
 
 
 GENERATION: Final = 20
@@ -63,13 +56,13 @@ _HOME: Final = Milieu(
         SocialRole(("student", "musician", "paramedic"), (21, 34), "lodger", "landlord", ("bedroom", "bathroom")),
     ),
     lived_in=True,
-    households=(
-        HouseholdSetting("a home that three generations share", frozenset({"parent", "child"})),
-        HouseholdSetting("a family home", frozenset({"child"})),
-        HouseholdSetting("a home that somebody shares with a parent", frozenset({"parent"})),
-        HouseholdSetting("a house with a lodger", frozenset({"lodger"})),
-        HouseholdSetting("a home that two people share", frozenset({"partner"})),
-    ),
+    households={
+        "a home that three generations share": frozenset({"parent", "child"}),
+        "a family home": frozenset({"child"}),
+        "a home that somebody shares with a parent": frozenset({"parent"}),
+        "a house with a lodger": frozenset({"lodger"}),
+        "a home that two people share": frozenset({"partner"}),
+    },
 )  # fmt: skip
 _RESTAURANT: Final = Milieu(
     (
@@ -229,7 +222,8 @@ def draw_cast(scene: Scene, rng: np.random.Generator) -> Cast:
         update={"ties": {name: role.back for role, name in zip(roles[1:], names[1:], strict=True)}}
     )
     ties = {role.tie for role in roles[1:]}
-    settings = [each.words for each in milieu.households if each.ties <= ties][:1] or milieu.setting
+    households = [words for words, needed in milieu.households.items() if needed <= ties]
+    settings = households[:1] or milieu.setting
     setting = settings[int(rng.integers(len(settings)))]
     return Cast(setting=setting, people=tuple(people), day=_day(people, scene.rooms, milieu, rng))
 
