@@ -7,6 +7,7 @@ from tests.fakes.problems import PROBLEM, source
 from embomatrix.factory.admission import RefusalReason, RefusedError, TaskRefusal
 from embomatrix.factory.task_import.batch import Verified, verify
 from embomatrix.factory.task_import.binding import bind
+from embomatrix.factory.task_import.search import BindingOptions
 from embomatrix.factory.task_import.start_state import with_states
 from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
 from embomatrix.factory.task_import.task_fields import category_of, instruction_of
@@ -116,7 +117,7 @@ def test_binding_considers_abilities(home: Scene) -> None:
     on = "(toggled_on electric_refrigerator.n.01_1)"
     problem = parse_problem(PROBLEM.replace("(not (open ?electric_refrigerator.n.01_1))", on))
     with pytest.raises(RefusedError, match="electric_refrigerator"):
-        bind(problem, home, np.random.default_rng(0), furnishing=False)
+        bind(problem, home, np.random.default_rng(0), BindingOptions(furnishing=False))
 
 
 def test_missing_small_object_is_placed_on_furniture_of_the_room(home: Scene) -> None:
@@ -230,11 +231,11 @@ def test_carried_appliance_becomes_movable_and_others_stay_fixed(home: Scene) ->
 def test_wildcard_stands_for_all_further_objects_of_the_type_in_the_room(home: Scene) -> None:
     text = PROBLEM.replace("breakfast_table.n.01_1 -", "breakfast_table.n.01_1 breakfast_table.n.01_* -")
     text = text.replace("(open elec", "(inroom breakfast_table.n.01_* kitchen)\n        (open elec")
-    binding = bind(parse_problem(text), home, np.random.default_rng(0))
+    binding = bind(parse_problem(text), home, np.random.default_rng(0), BindingOptions())
     assert "breakfast_table.n.01_2" not in binding.problem.objects, "the flat has one table"
     fruit = text.replace("breakfast_table.n.01_*", "mug.n.04_*").replace(
         "breakfast_table.n.01_1 mug.n.04_* -", "mug.n.04_* - mug.n.04 breakfast_table.n.01_1 -"
     )
     fruit = fruit.replace("mug.n.04_* kitchen", "mug.n.04_* living_room")
-    binding = bind(parse_problem(fruit), home, np.random.default_rng(0))
+    binding = bind(parse_problem(fruit), home, np.random.default_rng(0), BindingOptions())
     assert binding.found["mug.n.04_1"] == "mug_1"

@@ -178,13 +178,14 @@ def test_furniture_with_unreachable_contents_is_excluded_and_kept_as_fallback(
         return method
 
     text = SourceText("shoes", SHOE, "embomatrix")
-    second = import_problem(text, flat, options=ImportOptions(unreachable_at(1), reachable=False))
+    second = import_problem(text, flat, options=ImportOptions(lay=unreachable_at(1), reachable=False))
     assert isinstance(second, ImportedTask)
     assert len(asked) == 2
     assert asked[0] != asked[1]
     asked.clear()
     assert isinstance(
-        import_problem(text, flat, options=ImportOptions(unreachable_at(99), reachable=False)), ImportedTask
+        import_problem(text, flat, options=ImportOptions(lay=unreachable_at(99), reachable=False)),
+        ImportedTask,
     )
     assert len(asked) > 1
 
@@ -203,7 +204,7 @@ def test_layout_with_unreachable_objects_is_redrawn_and_the_best_is_used(
         return replace(layout, unreachable=(wrong,) * (2 if len(drawn) == 1 else 1))
 
     imported = import_problem(
-        SourceText("shoes", SHOE_ON_FLOOR, "embomatrix"), flat, options=ImportOptions(worst_at_first)
+        SourceText("shoes", SHOE_ON_FLOOR, "embomatrix"), flat, options=ImportOptions(lay=worst_at_first)
     )
     assert isinstance(imported, ImportedTask)
     assert len(drawn) == len(set(drawn)) == 1 + MAX_REDRAWN

@@ -64,7 +64,7 @@ def lay(
             return layouts[-1]
 
         imported = import_problem(
-            source, build_base_scene(scene), seed=seed, options=ImportOptions(lay_and_keep)
+            source, build_base_scene(scene), seed=seed, options=ImportOptions(lay=lay_and_keep)
         )
         for layout in layouts:
             _show(layout)

@@ -147,7 +147,7 @@ async def evaluate_looks(
         base = build_base_scene(task.scene)
         for number, method in enumerate(methods):
             laid = RecordedMethod(METHODS[method])
-            imported = import_problem(task, base, seed=seed, options=ImportOptions(laid))
+            imported = import_problem(task, base, seed=seed, options=ImportOptions(lay=laid))
             if isinstance(imported, ImportedTask) and laid.names:
                 try:
                     impression = await impression_of(model, imported.scene, laid.names, seed)

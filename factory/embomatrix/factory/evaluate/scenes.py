@@ -121,7 +121,7 @@ def judge(
     """Lay a task out with a method, check the scene, and execute the oracle's plan in it."""
     timed = RecordedMethod(METHODS[method])
     began = time.process_time()
-    imported = import_problem(task, base, seed=seed, options=ImportOptions(timed))
+    imported = import_problem(task, base, seed=seed, options=ImportOptions(lay=timed))
     refused = LayoutOutcome(
         task=task.name,
         scene=task.scene,

@@ -37,7 +37,7 @@ def draw_side_by_side(task: SourceText, seed: int) -> Image.Image:
     base = build_base_scene(task.scene)
     panels = []
     for method, lay in METHODS.items():
-        imported = import_problem(task, base, seed=seed, options=ImportOptions(lay))
+        imported = import_problem(task, base, seed=seed, options=ImportOptions(lay=lay))
         if isinstance(imported, TaskRefusal):
             panels.append(_reason(method, imported))
         else:

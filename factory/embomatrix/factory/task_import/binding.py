@@ -15,7 +15,7 @@ from embomatrix.factory.admission import RefusalReason, RefusedError
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.expressible import AGENT, FLOORS, check_expressible
 from embomatrix.factory.task_import.reach import pieces_of
-from embomatrix.factory.task_import.search import abilities_needed, search
+from embomatrix.factory.task_import.search import BindingOptions, abilities_needed, search
 from embomatrix.world.bddl import BddlProblem
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.scene import Scene
@@ -64,19 +64,14 @@ def bind(
     problem: BddlProblem,
     scene: Scene,
     rng: np.random.Generator,
-    *,
-    furnishing: bool = True,
-    reachable: bool = True,
-    renumbering: bool = False,
+    options: BindingOptions,
     excluded: Container[str] = (),
 ) -> Binding:
     """Find the problem's objects in the scene. Raise RefusedError for the first object that can't be bound.
 
-    With ``furnishing``, missing furniture is added, as in the paper's factory. With ``reachable``, a goal that no
-    skill reaches is refused. With ``renumbering``, room numbers don't count. Scene objects in ``excluded`` are not
-    used.
+    Scene objects in ``excluded`` are not used.
     """
-    check_expressible(problem, reachable=reachable)
+    check_expressible(problem, reachable=options.reachable)
     inroom = {
         item.atom.args[0]: item.atom.args[1]
         for item in problem.init
@@ -92,16 +87,7 @@ def bind(
         and name not in placed
         and name not in problem.wildcards
     ]
-    rooms, found = search(
-        problem,
-        view,
-        inroom,
-        fixtures,
-        rng,
-        furnishing=furnishing,
-        renumbering=renumbering,
-        excluded=excluded,
-    )
+    rooms, found = search(problem, view, inroom, fixtures, rng, options, excluded)
     problem = _with_wildcards_expanded(problem, view, rooms, found)
     floors = {name: rooms[room] for name, room in inroom.items() if problem.objects.get(name) in FLOORS}
     unassigned = {name: rooms[inroom[name]] for name in fixtures if name not in found}

@@ -4,6 +4,7 @@ import itertools
 import math
 from collections import defaultdict
 from collections.abc import Container, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -39,30 +40,40 @@ MAX_CHOICES: Final = 200
 """Maximum number of room assignments tried."""
 
 
+@dataclass(frozen=True, slots=True)
+class BindingOptions:
+    """Options of a binding."""
+
+    furnishing: bool = True
+    """If true, missing furniture is added, as in the paper's factory."""
+    reachable: bool = True
+    """If true, goals that no skill reaches are refused. Otherwise goals must only be evaluable."""
+    renumbering: bool = False
+    """If true, ``kitchen_0`` may be another kitchen, since other datasets number rooms differently."""
+
+
 def search(
     problem: BddlProblem,
     view: SceneView,
     inroom: Mapping[str, str],
     fixtures: list[str],
     rng: np.random.Generator,
-    *,
-    furnishing: bool,
-    renumbering: bool = False,
-    excluded: Container[str] = (),
+    options: BindingOptions,
+    excluded: Container[str],
 ) -> tuple[dict[str, str], dict[str, str]]:
     """Return scene rooms for the problem's rooms, and scene objects for its fixtures.
 
     All objects with one room name are in one room. If furniture is missing, the rooms that lack least are used. With
-    ``renumbering``, ``kitchen_0`` may be any kitchen, preferably another one, and a missing room type is replaced by
+    renumbering, ``kitchen_0`` may be any kitchen, preferably another one, and a missing room type is replaced by
     a similar one. Scene objects in ``excluded`` are not used.
     """
     words = sorted(set(inroom.values()))
-    find = _renumbered if renumbering else _rooms_for
-    options = {word: find(view.scene, word, rng) for word in words}
+    find = _renumbered if options.renumbering else _rooms_for
+    candidates = {word: find(view.scene, word, rng) for word in words}
     needs, requirements = abilities_needed(problem), requirements_of(problem)
     best: tuple[int, dict[str, str], dict[str, str]] | None = None
     lacking = ""
-    for rooms in itertools.islice(_room_choices(words, options), MAX_CHOICES):
+    for rooms in itertools.islice(_room_choices(words, candidates), MAX_CHOICES):
         wanted = {name: rooms[inroom[name]] for name in fixtures}
         found, missing = _assign(*_domains(problem, view, wanted, needs, requirements, rng, excluded))
         if not missing:
@@ -71,7 +82,7 @@ def search(
         lacking = lacking or f"{first} of type {problem.objects[first]!r} in {rooms[inroom[first]]}"
         if best is None or len(missing) < best[0]:
             best = (len(missing), rooms, found)
-    if best is None or not furnishing:
+    if best is None or not options.furnishing:
         raise RefusedError(
             RefusalReason.NO_SCENE_OBJECT,
             f"{view.scene.base} has no free object for {lacking or 'the rooms'}",

@@ -24,6 +24,7 @@ from embomatrix.factory.task_import.expressible import AGENT, FLOORS
 from embomatrix.factory.task_import.models import models_for, with_sizes
 from embomatrix.factory.task_import.neighbours import neighbours_of
 from embomatrix.factory.task_import.reach import FUTURE, INSOURCE, REAL, pieces_of, profile_for
+from embomatrix.factory.task_import.search import BindingOptions
 from embomatrix.factory.task_import.size_requirements import requirement_on, requirements_of
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.factory.task_import.start_state import with_robot_in, with_states
@@ -78,15 +79,10 @@ class ImportedTask:
 
 
 @dataclass(frozen=True, slots=True)
-class ImportOptions:
-    """Options of an import: layout method, and whether missing furniture is added."""
+class ImportOptions(BindingOptions):
+    """Options of an import: those of the binding, and the layout method."""
 
     lay: Lay = lay
-    furnishing: bool = True
-    reachable: bool = True
-    """If true, goals that no skill reaches are refused. Otherwise goals must only be evaluable."""
-    renumbering: bool = False
-    """If true, ``kitchen_0`` may be another kitchen, since other datasets number rooms differently."""
     compact: bool = False
     """If true, objects that share a host are scaled to fit side by side."""
 
@@ -147,22 +143,13 @@ class _Binder:
         Furniture whose contents the robot can't reach is excluded too, while other furniture is left. After that, the
         layout is redrawn, and the layout with the fewest unreachable objects is used.
         """
-        options = self._options
         excluded, redrawn = set[str](), 0
         first: RefusedError | None = None
         fallback: tuple[Binding, SceneEditor, dict[str, str]] | None = None
         fewest = math.inf
         while True:
             try:
-                binding = bind(
-                    self._problem,
-                    self._base,
-                    self._rng,
-                    furnishing=options.furnishing,
-                    reachable=options.reachable,
-                    renumbering=options.renumbering,
-                    excluded=excluded,
-                )
+                binding = bind(self._problem, self._base, self._rng, self._options, excluded)
             except RefusedError as error:
                 if fallback is not None:
                     return fallback
