@@ -1,6 +1,5 @@
 """``embomatrix factory lay``: run all layout agents on one task."""
 
-import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -51,9 +50,8 @@ def lay(
     names = model_backed_agents(forms)
     if (bddl is None) is (not activity):
         fail("expected exactly one of --bddl FILE and --activity NAME")
-    with user_errors(more=MODEL_ERRORS), contextlib.ExitStack() as stack:
+    with user_errors(more=MODEL_ERRORS), layout_agents(names, llm, model, key, cassette) as agents:
         source = read_file(bddl) if bddl is not None else read_activity(activity)
-        agents = stack.enter_context(layout_agents(names, llm, model, key, cassette))
         layouts: list[Layout] = []
 
         def lay_and_keep(editor: SceneEditor, items: Sequence[RequestedObject], seed: int) -> Layout:

@@ -4,16 +4,16 @@ import textwrap
 from collections.abc import Sequence
 from typing import Final
 
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from embomatrix.factory.admission import TaskRefusal
-from embomatrix.factory.evaluate.scenes import METHODS
+from embomatrix.factory.evaluate.scenes import METHODS, LayoutMethod
 from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.factory.pictures.scene import draw_plan
 from embomatrix.factory.pictures.sights import alone
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.sources import SourceText
-from embomatrix.factory.task_import.task import ImportOptions, import_problem
+from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
 
 CAPTION_PX: Final = 26
 LEAST_PX: Final = 420
@@ -35,13 +35,10 @@ def named(tasks: Sequence[SourceText], name: str) -> SourceText:
 def draw_side_by_side(task: SourceText, seed: int) -> Image.Image:
     """Return an RGB image with a panel for each method: the plan of the goal's first room, or the reason against a layout."""
     base = build_base_scene(task.scene)
-    panels = []
-    for method, lay in METHODS.items():
-        imported = import_problem(task, base, seed=seed, options=ImportOptions(lay=lay))
-        if isinstance(imported, TaskRefusal):
-            panels.append(_reason(method, imported))
-        else:
-            panels.append(_captioned(method, draw_plan(alone(imported.scene, imported.rooms[0]))))
+    panels = [
+        _panel(method, import_problem(task, base, seed=seed, options=ImportOptions(lay=lay)))
+        for method, lay in METHODS.items()
+    ]
     whole = Image.new(
         "RGB", (sum(each.width for each in panels), max(each.height for each in panels)), "white"
     )
@@ -52,15 +49,14 @@ def draw_side_by_side(task: SourceText, seed: int) -> Image.Image:
     return whole
 
 
-def _captioned(words: str, picture: Image.Image) -> Image.Image:
-    panel = Image.new("RGB", (picture.width, picture.height + CAPTION_PX), "white")
-    panel.paste(picture, (0, CAPTION_PX))
-    ImageDraw.Draw(panel).text((8, 4), words, fill="black", font=ImageFont.load_default(16))
+def _panel(method: LayoutMethod, imported: ImportedTask | TaskRefusal) -> Image.Image:
+    """Return a picture below the name of its method."""
+    if isinstance(imported, TaskRefusal):
+        picture = Image.new("RGB", (LEAST_PX, LEAST_PX), "white")
+        words = textwrap.fill(f"{imported.reason}: {imported.sentence}", WIDTH)
+        ImageDraw.Draw(picture).text((8, CAPTION_PX), words, fill="#b03030", font=ImageFont.load_default(14))
+    else:
+        picture = draw_plan(alone(imported.scene, imported.rooms[0]))
+    panel = ImageOps.expand(picture, (0, CAPTION_PX, 0, 0), fill="white")
+    ImageDraw.Draw(panel).text((8, 4), method, fill="black", font=ImageFont.load_default(16))
     return panel
-
-
-def _reason(method: str, refusal: TaskRefusal) -> Image.Image:
-    panel = Image.new("RGB", (LEAST_PX, LEAST_PX), "white")
-    words = "\n".join(textwrap.wrap(f"{refusal.reason}: {refusal.sentence}", WIDTH))
-    ImageDraw.Draw(panel).text((8, CAPTION_PX), words, fill="#b03030", font=ImageFont.load_default(14))
-    return _captioned(method, panel)

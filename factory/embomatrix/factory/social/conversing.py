@@ -14,11 +14,11 @@ from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.fitting import themes_of
 from embomatrix.factory.social.phrases import (
     AGREEMENTS,
-    CONJUNCTIONS,
     NEEDS,
     QUESTIONS,
     TURNS,
     fill,
+    joined,
     shorten_repeated_rooms,
     spoken_category,
 )
@@ -101,7 +101,7 @@ class GrammarConversation:
             self._refuse(further)
         for conjunct in further:
             self._say(self._person_nearby(), Act.ADD, clause=conjunct.clause)
-        self._say(ROBOT, Act.CONFIRM, clauses=self._joined(conjuncts))
+        self._say(ROBOT, Act.CONFIRM, clauses=joined([each.clause for each in conjuncts], self._voice))
         return Conversation(
             slot=slot,
             turns=tuple(self._turns),
@@ -157,12 +157,6 @@ class GrammarConversation:
             person.name for person in cast.people if slot.room in person.rooms and person.name != slot.person
         ]
         return near[int(self._rng.integers(len(near)))] if near and self._rng.random() < 0.5 else slot.person
-
-    def _joined(self, conjuncts: Sequence[GoalConjunct]) -> str:
-        text = conjuncts[0].clause
-        for conjunct in conjuncts[1:]:
-            text += self._voice.choose(CONJUNCTIONS) + conjunct.clause
-        return text
 
     def _say(self, speaker: str, act: Act, **words: str) -> None:
         text = shorten_repeated_rooms(fill(self._voice.choose(TURNS[act]), **words), self._context.view)

@@ -1,12 +1,12 @@
 """Sentence templates of people and robot by speech act. The vocabulary is wider than that of the plain task writer."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.values import Act
-from embomatrix.factory.writer.words import room_words, spoken
+from embomatrix.factory.writer.words import Voice, room_words, spoken
 
 CLAUSES: Final[Mapping[str, tuple[str, ...]]] = {
     "ontop": (
@@ -311,6 +311,14 @@ def fill(template: str, **words: str) -> str:
     """Fill a template with words, capitalised where the placeholder is."""
     capitals = {name.capitalize(): capital(text) for name, text in words.items()}
     return template.format(**words, **capitals)
+
+
+def joined(clauses: Sequence[str], voice: Voice) -> str:
+    """Return several requests as one clause."""
+    text = clauses[0]
+    for clause in clauses[1:]:
+        text += voice.choose(CONJUNCTIONS) + clause
+    return text
 
 
 def capital(text: str) -> str:

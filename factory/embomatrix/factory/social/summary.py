@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.phrases import (
-    CONJUNCTIONS,
     INSTRUCTIONS,
     fill,
+    joined,
     room_called,
     shorten_repeated_rooms,
 )
@@ -20,9 +20,7 @@ def instruction_of(conversation: Conversation, cast: Cast, view: SceneView, voic
     slot = conversation.slot
     who = cast.of(slot.person)
     others = [person.name for person in cast.people if person.name != who.name]
-    what = conversation.last_wishes[0]
-    for clause in conversation.last_wishes[1:]:
-        what += voice.choose(CONJUNCTIONS) + clause
+    what = joined(conversation.last_wishes, voice)
     text = fill(
         voice.choose(INSTRUCTIONS),
         who=who.name,
