@@ -153,7 +153,7 @@ def build_dataset(
     store = BuildStore(folder, dataclasses.asdict(settings))
     began = time.process_time()
     bases = [build_base_scene(scene_id, seed=settings.seed) for scene_id in settings.scenes]
-    store.spent_on_scenes(len(bases), time.process_time() - began)
+    store.spend({"base_scenes": len(bases)}, time.process_time() - began)
     rooms = split_rooms(bases, settings.seed) if settings.train else _all_held_out(bases)
     died = DatasetError(
         "a process that makes scene variants died, possibly for lack of memory: finished variants are kept; run the "

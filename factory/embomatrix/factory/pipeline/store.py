@@ -177,7 +177,7 @@ class BuildStore:
     def add(self, variant: VariantYield) -> None:
         """Store a variant's result. Its other files are written before its line in the log."""
         result = variant.result
-        self._spent({"split": result.split, "variant": result.number, "cpu_s": round(variant.cpu_s, 3)})
+        self.spend({"split": result.split, "variant": result.number}, variant.cpu_s)
         if result.records:
             path = self._folder / BUNDLES_FOLDER / bundle_file(result.records[0].bundle_digest)
             write_whole(path, variant.bundle)
@@ -193,12 +193,9 @@ class BuildStore:
         self._log.add(result)
         _append(self._folder / ATTEMPTS_FILE, _attempt_lines(result))
 
-    def spent_on_scenes(self, scenes: int, cpu_s: float) -> None:
-        """Record the CPU time of the base scenes of one call. Raise OSError."""
-        self._spent({"base_scenes": scenes, "cpu_s": round(cpu_s, 3)})
-
-    def _spent(self, line: Mapping[str, str | int | float]) -> None:
-        _append(self._folder / TIMES_FILE, json.dumps(line) + "\n")
+    def spend(self, work: Mapping[str, str | int], cpu_s: float) -> None:
+        """Record the CPU time of a variant, or of the base scenes of one call. Raise OSError."""
+        _append(self._folder / TIMES_FILE, json.dumps({**work, "cpu_s": round(cpu_s, 3)}) + "\n")
 
 
 def _attempt_lines(result: VariantResult) -> str:
