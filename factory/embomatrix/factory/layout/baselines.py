@@ -5,13 +5,13 @@ Both ignore robot positions and earlier failures. They use the same objects and 
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
 
-from embomatrix.factory.layout.organization import hosts_first
-from embomatrix.factory.layout.request import Layout, LayoutRecord, RequestedObject, object_brief
+from embomatrix.factory.layout.organization import named_first
+from embomatrix.factory.layout.request import Layout, LayoutRecord, RequestedObject
 from embomatrix.factory.layout.sampling import LIFT_M, ObjectSampler
 from embomatrix.factory.layout.values import LayoutFailure
 from embomatrix.factory.scenes.editor import LayoutReason, PlacementError, SceneEditor
@@ -64,7 +64,7 @@ def _lay_each(
     """Place each object at the pose found for it, or leave it out with the reason."""
     names: dict[str, str] = {}
     failures: list[LayoutFailure] = []
-    for item in _hosts_first(items):
+    for item in named_first(items, lambda item: (item.host, *item.beside)):
         asset = item.asset(0)
         relation, host = _requested_place(editor, item, names, rng)
         try:
@@ -99,12 +99,6 @@ def _rounded_pose(
 
 def _rounded(value: float) -> float:
     return round(value / GRID_M) * GRID_M
-
-
-def _hosts_first(items: Sequence[RequestedObject]) -> Iterator[RequestedObject]:
-    by_name = {item.name: item for item in items}
-    for brief in hosts_first([object_brief(item, item.asset(0), {}) for item in items]):
-        yield by_name[brief.name]
 
 
 def _requested_place(

@@ -7,9 +7,9 @@ conventions, by the objects already there, and by earlier failures.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, Protocol, TypeVar
 
 import numpy as np
 
@@ -29,6 +29,14 @@ from embomatrix.factory.layout.values import (
 )
 from embomatrix.factory.scenes.editor import LayoutReason
 from embomatrix.world.scene import SceneObject
+
+
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+NamedT = TypeVar("NamedT", bound=_Named)
 
 
 class TreeError(ValueError):
@@ -164,7 +172,7 @@ def organize(brief: RoomBrief) -> LayoutTree:
     hung: dict[str, Branch] = {
         host.name: Branch(brief.room.name, LayoutRelation.ONTOP, host.name) for host in brief.hosts
     }
-    for brief_item in hosts_first(brief.objects):
+    for brief_item in named_first(brief.objects, lambda item: (item.host, *item.beside)):
         options = list(choices(brief, brief_item, hung))
         if not options:
             continue
@@ -175,18 +183,15 @@ def organize(brief: RoomBrief) -> LayoutTree:
     return LayoutTree.of(brief.room.name, hung.values())
 
 
-def hosts_first(objects: Sequence[ObjectBrief]) -> list[ObjectBrief]:
-    """Return the objects with hosts before the objects at them, otherwise in the given order."""
-    order: list[ObjectBrief] = []
-    waiting = list(objects)
+def named_first(items: Sequence[NamedT], needs: Callable[[NamedT], Iterable[str]]) -> list[NamedT]:
+    """Return the items after those whose names they need, otherwise in the given order."""
+    order: list[NamedT] = []
+    waiting = list(items)
     while waiting:
-        names = {brief_item.name for brief_item in waiting}
-        ready = next(
-            (brief_item for brief_item in waiting if not names & {brief_item.host, *brief_item.beside}),
-            waiting[0],
-        )
-        waiting.remove(ready)
-        order.append(ready)
+        left = {item.name for item in waiting}
+        free = (item for item in waiting if (left - {item.name}).isdisjoint(needs(item)))
+        order.append(next(free, waiting[0]))
+        waiting.remove(order[-1])
     return order
 
 

@@ -80,6 +80,11 @@ class PendingObject:
         """True if the object is accepted although the robot can't reach it."""
         return self.unreached >= MAX_UNREACHED
 
+    @property
+    def reason(self) -> LayoutReason | None:
+        """Reason of the last failure."""
+        return self.last_failure.reason if self.last_failure else None
+
     def failure(self, room: str) -> LayoutFailure:
         """Return the reason for the missing place in a room."""
         if self.last_failure is not None:
@@ -161,20 +166,17 @@ class PendingObjects:
         if host is None:
             return False
         if host.choice + 1 < len(host.item.models):
-            self._replace_host_model(host)
+            self._remove(host.item.name)
+            self._restart_others(host)
+            self.next_model(host.item.name)
             return True
-        if pending.last_failure is None or pending.last_failure.reason not in FAR or host.moved == MAX_MOVES:
+        if pending.last_failure is None or pending.reason not in FAR or host.moved == MAX_MOVES:
             return False
         host.moved += 1
         detail = f"the robot can't reach objects {pending.last_failure.relation.value} it there"
         self.withdraw(host.item.name, LayoutReason.INACCESSIBLE, detail)
         self._restart_others(host)
         return True
-
-    def _replace_host_model(self, host: PendingObject) -> None:
-        self._remove(host.item.name)
-        self._restart_others(host)
-        self.next_model(host.item.name)
 
     def _restart_others(self, host: PendingObject) -> None:
         """Reset all other waiting objects to their first model and clear their failures."""
@@ -185,7 +187,7 @@ class PendingObjects:
 
     def _shrink_sibling(self, pending: PendingObject) -> bool:
         """Replace the widest other object at a full host by its narrowest model. Return False if there is none."""
-        if pending.last_failure is None or pending.last_failure.reason not in FULL or not pending.item.host:
+        if pending.reason not in FULL or not pending.item.host:
             return False
         others = [
             other
@@ -259,11 +261,7 @@ class PendingObjects:
 
     def _allow_blocking(self, pending: PendingObject) -> bool:
         """Let a floor object block the path to objects that the task doesn't name. Return False if that is already allowed."""
-        if (
-            pending.last_failure is None
-            or pending.last_failure.reason is not LayoutReason.BLOCKS_PATH
-            or self._may_block
-        ):
+        if pending.reason is not LayoutReason.BLOCKS_PATH or self._may_block:
             return False
         self._may_block = True
         editor = self._editor

@@ -25,6 +25,7 @@ from embomatrix.factory.layout.constraints import (
     margins,
     satisfaction,
 )
+from embomatrix.factory.layout.organization import named_first
 from embomatrix.factory.layout.values import (
     ConstraintKind,
     PlaneArrangement,
@@ -75,31 +76,13 @@ class _Beam:
 def arrange(brief: PlaneBrief) -> tuple[PlaneArrangement, ...]:
     """Return joint arrangements of the brief's objects, the best first, at least one. Each lists the objects left out."""
     grown = [_Beam()]
-    for item in _in_order(brief.objects):
+    largest_first = sorted(brief.objects, key=lambda item: -item.size_m[0] * item.size_m[1])
+    for item in named_first(largest_first, lambda item: (each.other for each in item.constraints)):
         grown = sorted(
             (child for beam in grown[:BEAMS] for child in _extended(brief, item, beam)),
             key=lambda beam: -beam.score,
         )
     return tuple(PlaneArrangement(beam.spots, beam.score, dict(beam.left_out)) for beam in grown[:RESULTS])
-
-
-def _in_order(objects: Sequence[PlaneObject]) -> list[PlaneObject]:
-    """Return the largest objects first, but no object before those that its constraints name."""
-    waiting = sorted(objects, key=lambda item: -item.size_m[0] * item.size_m[1])
-    order: list[PlaneObject] = []
-    while waiting:
-        left = {item.name for item in waiting}
-        ready = next(
-            (
-                item
-                for item in waiting
-                if not any(constraint.other in left - {item.name} for constraint in item.constraints)
-            ),
-            waiting[0],
-        )
-        waiting.remove(ready)
-        order.append(ready)
-    return order
 
 
 def _extended(brief: PlaneBrief, item: PlaneObject, beam: _Beam) -> list[_Beam]:
