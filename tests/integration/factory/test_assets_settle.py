@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -16,6 +16,7 @@ from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import Pose
 
 bullet_bodies = pytest.importorskip("embomatrix.sim.bullet.bodies", reason="needs pybullet")
+bullet_client = pytest.importorskip("embomatrix.sim.bullet.client", reason="needs pybullet")
 pybullet = pytest.importorskip("pybullet", reason="PyBullet has wheels up to Python 3.11 on x86-64")
 
 if TYPE_CHECKING:
@@ -32,25 +33,25 @@ LEANING = Pose((0.0, 0.0, 0.0), (math.sin(0.3), 0.0, 0.0, math.cos(0.3)))
 
 
 @pytest.fixture(scope="module")
-def client() -> Iterator[int]:
-    number = pybullet.connect(pybullet.DIRECT)
-    yield number
-    pybullet.disconnect(physicsClientId=number)
+def client() -> Iterator[Any]:
+    connected = bullet_client.connect()
+    yield connected
+    connected.disconnect()
 
 
 @pytest.mark.parametrize("category", THINGS.split())
-def test_dropped_object_stays_upright_in_place(client: int, category: str) -> None:
+def test_dropped_object_stays_upright_in_place(client: Any, category: str) -> None:
     catalog = Catalog.load()
     asset = build_asset(catalog, category, catalog.models_of(category)[0].model_id)
     half = asset.size_m[2] / 2
-    pybullet.resetSimulation(physicsClientId=client)
-    pybullet.setGravity(0.0, 0.0, -9.81, physicsClientId=client)
+    client.resetSimulation()
+    client.setGravity(0.0, 0.0, -9.81)
     bodies = bullet_bodies.BodyFactory(client)
     bodies.floor(0.0, 0.0, 5.0)
     body = bodies.rigid(asset, Pose((0.0, 0.0, half + 5e-4)), [0.0] * len(asset.joints), asset.mass_kg)
     for _ in range(STEPS):
-        pybullet.stepSimulation(physicsClientId=client)
-    (x, y, z), (qx, qy, _, _) = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
+        client.stepSimulation()
+    (x, y, z), (qx, qy, _, _) = client.getBasePositionAndOrientation(body)
     assert math.hypot(x, y) < 0.005
     assert z == pytest.approx(half, abs=0.002)
     assert math.degrees(math.acos(1 - 2 * (qx * qx + qy * qy))) < 1.5

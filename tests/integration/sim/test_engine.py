@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tests.fakes import furniture as make
 from tests.fakes.scenes import kitchen_scene, placed, scene_of, upright
 
-from embomatrix.sim.bullet.client import ClientPool, connect, pybullet
+from embomatrix.sim.bullet.client import ClientPool, connect
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.mini_world import STAGES_KEPT
 from embomatrix.sim.engine import FLOOR, WALL, EngineError
@@ -336,11 +336,10 @@ def test_pool_hands_out_the_client_that_was_given_back() -> None:
 
 def test_renderer_is_gone_from_every_client() -> None:
     client = connect()
-    bullet = pybullet()
-    body = bullet.createMultiBody(0, physicsClientId=client)
-    with pytest.raises(bullet.error):
-        bullet.getVisualShapeData(body, physicsClientId=client)
-    bullet.disconnect(physicsClientId=client)
+    body = client.createMultiBody(0)
+    with pytest.raises(client.error):
+        client.getVisualShapeData(body)
+    client.disconnect()
 
 
 def test_loading_prints_nothing() -> None:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from embomatrix.sim.bullet.client import pybullet
+from embomatrix.sim.bullet.client import BulletClient
 from embomatrix.sim.geometry.bounds import joint_motion
 from embomatrix.world.asset import Asset, Joint, JointKind
 from embomatrix.world.geometry import IDENTITY, ConvexPart, Pose, Shape, Vec3
@@ -50,14 +50,13 @@ def _rows(vertices: Sequence[Sequence[float]]) -> list[list[float]]:
 class BodyFactory:
     """Makes bodies in one client. An asset's bodies share shapes, which live until the client is reset."""
 
-    def __init__(self, client: int, flags: int = 0, *, plain: bool = False) -> None:
+    def __init__(self, client: BulletClient, flags: int = 0, *, plain: bool = False) -> None:
         """``flags`` are Bullet's, for every body.
 
         With ``plain``, single-piece bodies are rigid bodies instead of multi-bodies: they step three times as fast, but Bullet
         does not restore their saved states exactly.
         """
-        self._bullet = pybullet()
-        self._client = client
+        self._bullet = client
         self._flags = flags
         self._plain = plain
         self._pieces: dict[int, tuple[Asset, tuple[CollisionPiece, ...]]] = {}
@@ -72,11 +71,7 @@ class BodyFactory:
         if len(pieces) > 1:
             return tuple(self._create([0.0] * len(pieces), pieces, pose) for pose in poses)
         ids = self._bullet.createMultiBody(
-            0.0,
-            pieces[0].shape,
-            NO_SHAPE,
-            batchPositions=[pose.position_m for pose in poses],
-            physicsClientId=self._client,
+            0.0, pieces[0].shape, NO_SHAPE, batchPositions=[pose.position_m for pose in poses]
         )
         return (ids,) if isinstance(ids, int) else tuple(ids)
 
@@ -92,11 +87,7 @@ class BodyFactory:
     def brake(self, body: int) -> None:
         """Give a body slight resistance to rolling and spinning."""
         self._bullet.changeDynamics(
-            body,
-            -1,
-            rollingFriction=ROLLING_FRICTION,
-            spinningFriction=ROLLING_FRICTION,
-            physicsClientId=self._client,
+            body, -1, rollingFriction=ROLLING_FRICTION, spinningFriction=ROLLING_FRICTION
         )
 
     def hinged(self, asset: Asset, pose: Pose) -> int:
@@ -119,9 +110,7 @@ class BodyFactory:
 
     def floor(self, x_m: float, y_m: float, half_m: float) -> int:
         """Immovable square slab with its top at height 0, centred at a point."""
-        slab = self._bullet.createCollisionShape(
-            self._bullet.GEOM_BOX, halfExtents=(half_m, half_m, 0.25), physicsClientId=self._client
-        )
+        slab = self._bullet.createCollisionShape(self._bullet.GEOM_BOX, halfExtents=(half_m, half_m, 0.25))
         return self._create(
             [0.0], (CollisionPiece(slab, (0.0, 0.0, 0.0), -1, None),), Pose((x_m, y_m, -0.25))
         )
@@ -154,22 +143,20 @@ class BodyFactory:
         return (head, *(CollisionPiece(shape, (0.0, 0.0, 0.0), first, None) for shape in shapes[1:]))
 
     def _compound(self, parts: Sequence[ConvexPart], frame: Pose) -> int:
-        bullet = self._bullet
         kinds = {
-            Shape.BOX: bullet.GEOM_BOX,
-            Shape.CYLINDER: bullet.GEOM_CYLINDER,
-            Shape.SPHERE: bullet.GEOM_SPHERE,
+            Shape.BOX: self._bullet.GEOM_BOX,
+            Shape.CYLINDER: self._bullet.GEOM_CYLINDER,
+            Shape.SPHERE: self._bullet.GEOM_SPHERE,
         }
         poses = [frame @ part.pose for part in parts]
         return int(
-            bullet.createCollisionShapeArray(
+            self._bullet.createCollisionShapeArray(
                 shapeTypes=[kinds[part.shape] for part in parts],
                 halfExtents=[tuple(extent / 2 for extent in part.size_m) for part in parts],
                 radii=[part.size_m[0] / 2 for part in parts],
                 lengths=[part.size_m[2] for part in parts],
                 collisionFramePositions=[pose.position_m for pose in poses],
                 collisionFrameOrientations=[pose.quat_xyzw for pose in poses],
-                physicsClientId=self._client,
             )
         )
 
@@ -184,7 +171,6 @@ class BodyFactory:
                 ),
                 collisionFramePosition=pose.position_m,
                 collisionFrameOrientation=pose.quat_xyzw,
-                physicsClientId=self._client,
             )
         )
 
@@ -205,7 +191,6 @@ class BodyFactory:
                 baseOrientation=pose.quat_xyzw,
                 flags=self._flags,
                 useMaximalCoordinates=self._plain and len(pieces) == 1,
-                physicsClientId=self._client,
                 **self._links(masses_kg[1:], pieces[1:], motions),
             )
         )

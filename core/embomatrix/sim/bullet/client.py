@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import inspect
 import os
 import sys
 from collections.abc import Iterator
@@ -47,6 +48,21 @@ def pybullet() -> Any:
     return module
 
 
+class BulletClient:
+    """Bullet's functions, bound to one physics client, and its constants."""
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+
+    def __getattr__(self, name: str) -> Any:
+        """Bind a function at its first use; later uses find it in the instance."""
+        found = getattr(pybullet(), name)
+        if inspect.isbuiltin(found):
+            found = functools.partial(found, physicsClientId=self._number)
+        setattr(self, name, found)
+        return found
+
+
 class ClientPool:
     """Pool of connected clients: the memory of a new one costs more time than loading a scene.
 
@@ -57,62 +73,62 @@ class ClientPool:
         """Connect ``spare`` clients at once."""
         self._spare = [connect() for _ in range(spare)]
 
-    def take(self) -> int:
+    def take(self) -> BulletClient:
         """Take an empty client. Raises EngineError if Bullet has none left."""
         return self._spare.pop() if self._spare else connect()
 
-    def give_back(self, client: int) -> None:
+    def give_back(self, client: BulletClient) -> None:
         """Empty a client and keep it for reuse."""
-        pybullet().resetSimulation(physicsClientId=client)
+        client.resetSimulation()
         self._spare.append(client)
 
     def close(self) -> None:
         """Disconnect the spare clients."""
         for client in self._spare:
-            pybullet().disconnect(physicsClientId=client)
+            client.disconnect()
         self._spare.clear()
 
 
-def connect() -> int:
-    """Open a client without a renderer and return its id. Raises EngineError if Bullet has none left."""
+def connect(*, renders: bool = False) -> BulletClient:
+    """Open a client, without a renderer unless it ``renders``. Raises EngineError if Bullet has none left."""
     bullet = pybullet()
-    client = int(bullet.connect(bullet.DIRECT))
-    if client < 0:
+    number = int(bullet.connect(bullet.DIRECT))
+    if number < 0:
         raise EngineError(
             "Bullet opened no physics client: a process may hold 1,023 of them; close engines that are not in use"
         )
-    bullet.unloadPlugin(TINY_RENDERER, physicsClientId=client)
+    client = BulletClient(number)
+    if renders:
+        return client
+    client.unloadPlugin(TINY_RENDERER)
     if _renders(client):
-        bullet.disconnect(physicsClientId=client)
+        client.disconnect()
         raise EngineError(
             f"plugin {TINY_RENDERER} of pybullet is not its renderer: expected version 3.2.7; install that one"
         )
     return client
 
 
-def _renders(client: int) -> bool:
+def _renders(client: BulletClient) -> bool:
     """Return True if the renderer still answers: without it Bullet raises on queries about visual shapes."""
-    bullet = pybullet()
-    shape = bullet.createCollisionShape(bullet.GEOM_SPHERE, radius=0.1, physicsClientId=client)
-    body = bullet.createMultiBody(0, shape, physicsClientId=client)
+    body = client.createMultiBody(0, client.createCollisionShape(client.GEOM_SPHERE, radius=0.1))
     try:
-        bullet.getVisualShapeData(body, physicsClientId=client)
-    except bullet.error:
+        client.getVisualShapeData(body)
+    except client.error:
         return False
     finally:
-        bullet.resetSimulation(physicsClientId=client)
+        client.resetSimulation()
     return True
 
 
 @contextlib.contextmanager
-def near_contacts(client: int) -> Iterator[None]:
+def near_contacts(client: BulletClient) -> Iterator[None]:
     """Reduce the contact distance to 5 mm: an object taken from a crowded table then wakes only close neighbours.
 
     Bullet has one such number for all clients of a process, so the default returns afterwards.
     """
-    bullet = pybullet()
-    bullet.setPhysicsEngineParameter(contactBreakingThreshold=NEAR_M, physicsClientId=client)
+    client.setPhysicsEngineParameter(contactBreakingThreshold=NEAR_M)
     try:
         yield
     finally:
-        bullet.setPhysicsEngineParameter(contactBreakingThreshold=_USUAL_M, physicsClientId=client)
+        client.setPhysicsEngineParameter(contactBreakingThreshold=_USUAL_M)

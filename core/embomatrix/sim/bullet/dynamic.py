@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Final
 
-from embomatrix.sim.bullet.client import connect, near_contacts, pybullet
+from embomatrix.sim.bullet.client import connect, near_contacts
 from embomatrix.sim.bullet.dynamic_bodies import BodyState, DynamicBodies, differ
 from embomatrix.sim.bullet.mini_world import GRAVITY_M_S2
 from embomatrix.sim.bullet.passage import Passage
@@ -32,9 +32,8 @@ class DynamicWorld:
 
     def __init__(self, scene: Scene) -> None:
         """Connect a client; ``build`` fills it."""
-        self._bullet = pybullet()
-        self._client = connect()
-        self.bodies = DynamicBodies(scene, self._client)
+        self._bullet = connect()
+        self.bodies = DynamicBodies(scene, self._bullet)
         self._known: dict[str, BodyState] = {}
         self._held = ""
         self._hooked = ("", -1)
@@ -45,14 +44,13 @@ class DynamicWorld:
         self, poses: Mapping[str, Pose], joints: Mapping[str, tuple[float, ...]], posture: Posture
     ) -> None:
         """Fill the client: objects asleep at these poses and joint positions; objects without a pose are outside the world."""
-        bullet, client = self._bullet, self._client
-        bullet.resetSimulation(physicsClientId=client)
-        bullet.setGravity(0, 0, GRAVITY_M_S2, physicsClientId=client)
-        bullet.setPhysicsEngineParameter(solverResidualThreshold=CONVERGED, physicsClientId=client)
+        self._bullet.resetSimulation()
+        self._bullet.setGravity(0, 0, GRAVITY_M_S2)
+        self._bullet.setPhysicsEngineParameter(solverResidualThreshold=CONVERGED)
         self._held, self.steps = "", 0
-        with near_contacts(client):
+        with near_contacts(self._bullet):
             self.bodies.fill(poses, joints)
-            self.robot = RobotBody(client, posture)
+            self.robot = RobotBody(self._bullet, posture)
         # Sleeping bodies fall for one step until their contacts are known.
         self.rest()
         self.step(1)
@@ -63,9 +61,9 @@ class DynamicWorld:
 
     def step(self, steps: int) -> None:
         """Step the simulation."""
-        with near_contacts(self._client):
+        with near_contacts(self._bullet):
             for _ in range(steps):
-                self._bullet.stepSimulation(physicsClientId=self._client)
+                self._bullet.stepSimulation()
         self.steps += steps
 
     def go(self, posture: Posture, steps: int) -> None:
@@ -76,21 +74,20 @@ class DynamicWorld:
     def glide(self, posture: Posture, steps: int) -> None:
         """Step in longer increments for free space: longest with an empty hand."""
         each = GLIDE if self._held else ROLL
-        bullet, client = self._bullet, self._client
-        bullet.setTimeStep(each * STEP_S, physicsClientId=client)
+        self._bullet.setTimeStep(each * STEP_S)
         # Bullet converts a motor's force to an impulse with the step length at the time of the command.
         self.robot.steer(posture)
-        with near_contacts(client):
+        with near_contacts(self._bullet):
             for _ in range(0, steps, each):
-                bullet.stepSimulation(physicsClientId=client)
-        bullet.setTimeStep(STEP_S, physicsClientId=client)
+                self._bullet.stepSimulation()
+        self._bullet.setTimeStep(STEP_S)
         self.steps += steps
 
     def passage(self) -> Passage | None:
         """Free-space motion from the robot's posture; None while anything else moves, since time must pass for that."""
         if self._stirs(self.bodies.moving):
             return None
-        return Passage(self._client, self.robot, self.bodies, self._held)
+        return Passage(self._bullet, self.robot, self.bodies, self._held)
 
     def disturbed(self) -> tuple[str, ...]:
         """Objects that moved, or whose joints did, since the last call, in scene order; without the held object."""
@@ -125,7 +122,7 @@ class DynamicWorld:
 
     def touched_by(self, held: str, ignore: frozenset[str]) -> str:
         """Body in contact with an object, apart from those in ``ignore``; "" for none."""
-        contacts = self._bullet.getContactPoints(bodyA=self.bodies.body(held), physicsClientId=self._client)
+        contacts = self._bullet.getContactPoints(bodyA=self.bodies.body(held))
         for contact in contacts:
             other = self.bodies.name(contact[2])
             if other and other not in ignore and contact[8] < 0.002:
@@ -137,7 +134,7 @@ class DynamicWorld:
         bodies = [self.robot.body] + ([self.bodies.body(self._held)] if self._held else [])
         pressed: dict[str, float] = {}
         for body in bodies:
-            for contact in self._bullet.getContactPoints(bodyA=body, physicsClientId=self._client):
+            for contact in self._bullet.getContactPoints(bodyA=body):
                 other = self.bodies.name(contact[2])
                 if other and other != self._held:
                     pressed[other] = pressed.get(other, 0.0) + contact[9]
@@ -150,11 +147,7 @@ class DynamicWorld:
                 contact[8]
                 for tip in sorted(self.robot.tips)
                 for contact in self._bullet.getClosestPoints(
-                    self.robot.body,
-                    self.bodies.body(name),
-                    0.05,
-                    linkIndexA=tip,
-                    physicsClientId=self._client,
+                    self.robot.body, self.bodies.body(name), 0.05, linkIndexA=tip
                 )
             ),
             default=math.inf,
@@ -184,9 +177,7 @@ class DynamicWorld:
         link = self.bodies.panel_link(name, joint)
         tool = self.robot.hand_pose()
         point = tool.apply((0.0, 0.0, TIP_M))
-        state = self._bullet.getLinkState(
-            self.bodies.body(name), link, computeForwardKinematics=1, physicsClientId=self._client
-        )
+        state = self._bullet.getLinkState(self.bodies.body(name), link, computeForwardKinematics=1)
         self.bodies.wake((name,))
         in_link = Pose(tuple(state[4]), tuple(state[5])).inverse().apply(point)
         self.robot.hook(self.bodies.body(name), link, (0.0, 0.0, TIP_M), in_link)
@@ -204,4 +195,4 @@ class DynamicWorld:
 
     def close(self) -> None:
         """Free the client and end the world's use."""
-        self._bullet.disconnect(physicsClientId=self._client)
+        self._bullet.disconnect()

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from typing import Final
 
 from embomatrix.sim.bullet.bodies import BodyFactory
-from embomatrix.sim.bullet.client import pybullet
+from embomatrix.sim.bullet.client import BulletClient
 from embomatrix.sim.engine import FLOOR, WALL
 from embomatrix.world.asset import JointKind
 from embomatrix.world.geometry import Pose, Vec3
@@ -32,11 +32,10 @@ AWAY_M: Final = -50.0
 class DynamicBodies:
     """Bodies of one scene in one client."""
 
-    def __init__(self, scene: Scene, client: int) -> None:
+    def __init__(self, scene: Scene, client: BulletClient) -> None:
         """``fill`` makes the bodies."""
         self._scene = scene
-        self._bullet = pybullet()
-        self._client = client
+        self._bullet = client
         self._factory = BodyFactory(client, self._bullet.URDF_ENABLE_SLEEPING)
         self._bodies: dict[str, int] = {}
         self._names: dict[int, str] = {}
@@ -66,7 +65,7 @@ class DynamicBodies:
 
     def links(self, name: str) -> range:
         """Link numbers of a body, its base first."""
-        return range(-1, int(self._bullet.getNumJoints(self._bodies[name], physicsClientId=self._client)))
+        return range(-1, int(self._bullet.getNumJoints(self._bodies[name])))
 
     def panel_link(self, name: str, joint: int) -> int:
         """Link that a joint of an object moves."""
@@ -78,9 +77,7 @@ class DynamicBodies:
 
     def pose(self, name: str) -> Pose:
         """Pose of the object's asset frame."""
-        position, quat = self._bullet.getBasePositionAndOrientation(
-            self._bodies[name], physicsClientId=self._client
-        )
+        position, quat = self._bullet.getBasePositionAndOrientation(self._bodies[name])
         return Pose(tuple(position), tuple(quat))
 
     def joints(self, name: str) -> tuple[float, ...]:
@@ -101,18 +98,13 @@ class DynamicBodies:
 
     def put(self, name: str, pose: Pose) -> None:
         """Bring in an object from outside the world, such as the piece of a sliced one."""
-        self._bullet.resetBasePositionAndOrientation(
-            self._bodies[name], pose.position_m, pose.quat_xyzw, physicsClientId=self._client
-        )
+        self._bullet.resetBasePositionAndOrientation(self._bodies[name], pose.position_m, pose.quat_xyzw)
         self.wake((name,))
 
     def take_out(self, name: str) -> None:
         """Take an object out of the world."""
         self._bullet.resetBasePositionAndOrientation(
-            self._bodies[name],
-            (self._bodies[name] * 3.0, 0.0, AWAY_M),
-            (0, 0, 0, 1),
-            physicsClientId=self._client,
+            self._bodies[name], (self._bodies[name] * 3.0, 0.0, AWAY_M), (0, 0, 0, 1)
         )
         self.sleep(name)
 
@@ -120,10 +112,7 @@ class DynamicBodies:
         """Wake objects whose support may be gone."""
         for name in names:
             self._bullet.changeDynamics(
-                self._bodies[name],
-                -1,
-                activationState=self._bullet.ACTIVATION_STATE_WAKE_UP,
-                physicsClientId=self._client,
+                self._bodies[name], -1, activationState=self._bullet.ACTIVATION_STATE_WAKE_UP
             )
 
     def state(self, name: str) -> BodyState:
@@ -135,19 +124,18 @@ class DynamicBodies:
 
     def is_in_motion(self, name: str) -> bool:
         """Return True if an object, or any of its panels, moves faster than a resting one."""
-        bullet, client, body = self._bullet, self._client, self._bodies[name]
+        bullet, body = self._bullet, self._bodies[name]
         if name in self._joints:
-            states = bullet.getJointStates(body, self._joints[name], physicsClientId=client)
+            states = bullet.getJointStates(body, self._joints[name])
             return any(abs(state[1]) > SLOW_M_S for state in states)
-        linear, angular = bullet.getBaseVelocity(body, physicsClientId=client)
+        linear, angular = bullet.getBaseVelocity(body)
         return math.hypot(*linear) > SLOW_M_S or math.hypot(*angular) > SLOW_RAD_S
 
     def still_sleep(self) -> None:
         """Put immovable bodies to sleep; otherwise Bullet compares them in every step with everything on them."""
-        bullet = self._bullet
-        asleep = bullet.ACTIVATION_STATE_ENABLE_SLEEPING | bullet.ACTIVATION_STATE_SLEEP
+        asleep = self._bullet.ACTIVATION_STATE_ENABLE_SLEEPING | self._bullet.ACTIVATION_STATE_SLEEP
         for body in self._still:
-            bullet.changeDynamics(body, -1, activationState=asleep, physicsClientId=self._client)
+            self._bullet.changeDynamics(body, -1, activationState=asleep)
 
     def spare_idle_contacts(self) -> None:
         """Disable contacts between panels and touching bodies if neither can push the other.
@@ -155,13 +143,12 @@ class DynamicBodies:
         A force along a hinge, or across runners, moves no panel. Bullet divides by the mobility along the force: such a
         contact stops the solver after one iteration, also for a robot that comes near, and its lift sinks.
         """
-        bullet, client = self._bullet, self._client
         for name in self._joints:
             body = self._bodies[name]
-            for contact in bullet.getContactPoints(bodyA=body, physicsClientId=client):
+            for contact in self._bullet.getContactPoints(bodyA=body):
                 _, _, other, link, other_link, *_ = contact
                 if not self._gives(body, link, contact[7]) and not self._gives(other, other_link, contact[7]):
-                    bullet.setCollisionFilterPair(body, other, link, other_link, 0, physicsClientId=client)
+                    self._bullet.setCollisionFilterPair(body, other, link, other_link, 0)
 
     def _gives(self, body: int, link: int, normal: Vec3) -> bool:
         """Return True if a force along a normal moves a link of a body. Bodies outside the scene, such as the robot, move."""
@@ -169,7 +156,7 @@ class DynamicBodies:
         if name not in self._joints:
             return not name or name in self.movable
         while link >= 0 and link not in self._joints[name]:
-            link = int(self._bullet.getJointInfo(body, link, physicsClientId=self._client)[16])
+            link = int(self._bullet.getJointInfo(body, link)[16])
         if link < 0:
             return False
         _, joint = self._scene.asset_of(name).joints[self._joints[name].index(link)]
@@ -178,13 +165,13 @@ class DynamicBodies:
 
     def sleep(self, name: str) -> None:
         """Put an object to sleep in place."""
-        bullet, client, body = self._bullet, self._client, self._bodies[name]
+        bullet, body = self._bullet, self._bodies[name]
         if name in self._joints:
             for index in self._joints[name]:
-                bullet.resetJointState(body, index, self._angle(name, index), physicsClientId=client)
+                bullet.resetJointState(body, index, self._angle(name, index))
         else:
-            bullet.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0), physicsClientId=client)
-        bullet.changeDynamics(body, -1, activationState=bullet.ACTIVATION_STATE_SLEEP, physicsClientId=client)
+            bullet.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))
+        bullet.changeDynamics(body, -1, activationState=bullet.ACTIVATION_STATE_SLEEP)
 
     def _add(self, name: str, pose: Pose, joints: tuple[float, ...]) -> None:
         item, asset = self._scene.by_name[name], self._scene.asset_of(name)
@@ -197,29 +184,24 @@ class DynamicBodies:
             self._swing(body, name, joints)
         else:
             (body,) = self._factory.jointed(asset, [pose])
-            self._bullet.resetBasePositionAndOrientation(
-                body, pose.position_m, pose.quat_xyzw, physicsClientId=self._client
-            )
+            self._bullet.resetBasePositionAndOrientation(body, pose.position_m, pose.quat_xyzw)
             self._still.append(body)
         self._bodies[name], self._names[body] = body, name
 
     def _swing(self, body: int, name: str, joints: tuple[float, ...]) -> None:
         """Set limits, friction and positions of the joints."""
-        bullet, client = self._bullet, self._client
         asset = self._scene.asset_of(name)
         for index, (_, joint), fraction in zip(self._joints[name], asset.joints, joints, strict=True):
             low, high = min(0.0, joint.upper), max(0.0, joint.upper)
-            bullet.changeDynamics(
-                body, index, jointLowerLimit=low, jointUpperLimit=high, physicsClientId=client
-            )
-            bullet.resetJointState(body, index, fraction * joint.upper, physicsClientId=client)
+            self._bullet.changeDynamics(body, index, jointLowerLimit=low, jointUpperLimit=high)
+            self._bullet.resetJointState(body, index, fraction * joint.upper)
             force = HINGE_NM if joint.kind is JointKind.REVOLUTE else RUNNER_N
-            bullet.setJointMotorControl2(
-                body, index, bullet.VELOCITY_CONTROL, targetVelocity=0, force=force, physicsClientId=client
+            self._bullet.setJointMotorControl2(
+                body, index, self._bullet.VELOCITY_CONTROL, targetVelocity=0, force=force
             )
 
     def _angle(self, name: str, index: int) -> float:
-        return float(self._bullet.getJointState(self._bodies[name], index, physicsClientId=self._client)[0])
+        return float(self._bullet.getJointState(self._bodies[name], index)[0])
 
 
 def differ(now: BodyState, before: BodyState) -> bool:

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.bullet.bodies import PART_LIMIT
-from embomatrix.sim.bullet.client import ClientPool, pybullet
+from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.mini_world import MiniWorld, StaticObject
 from embomatrix.sim.bullet.scene_bodies import SceneBodies
 from embomatrix.sim.engine import (
@@ -54,10 +54,9 @@ class BulletEngine:
         if prepared is None:
             check_scene(scene)
         self._scene = scene
-        self._bullet = pybullet()
         self._owns_pool = pool is None
         self._pool = pool or ClientPool()
-        self._client = self._pool.take()
+        self._bullet = self._pool.take()
         self._mini = MiniWorld(self._pool)
         self._index = {item.name: number for number, item in enumerate(scene.objects)}
         self._names = tuple(self._index)
@@ -82,7 +81,7 @@ class BulletEngine:
         """Entries of ``state_bytes`` for changed objects, valid until their next change."""
         self._all_chunks: bytes | None = b""
         """Concatenated entries, valid until the next change: half of the calls only move the robot."""
-        self._bodies = SceneBodies(self._client, scene)
+        self._bodies = SceneBodies(self._bullet, scene)
 
     @property
     def scene(self) -> Scene:
@@ -235,7 +234,7 @@ class BulletEngine:
     def close(self) -> None:
         self._mini.close()
         forget(self._scene.assets.values())
-        self._pool.give_back(self._client)
+        self._pool.give_back(self._bullet)
         if self._owns_pool:
             self._pool.close()
 
@@ -290,7 +289,7 @@ class BulletEngine:
 
     def _closest(self, body: int, other: int, limit_m: float) -> float:
         """Smallest signed distance between two bodies; infinity beyond ``limit_m`` (at least 0)."""
-        contacts = self._bullet.getClosestPoints(body, other, max(limit_m, 0.0), physicsClientId=self._client)
+        contacts = self._bullet.getClosestPoints(body, other, max(limit_m, 0.0))
         return min([contact[8] for contact in contacts]) if contacts else math.inf
 
 

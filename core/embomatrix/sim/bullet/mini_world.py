@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from embomatrix.sim.bullet.bodies import BodyFactory
-from embomatrix.sim.bullet.client import ClientPool, pybullet
+from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.engine import SETTLE_STEPS, Settled
 from embomatrix.sim.geometry.bounds import parts_of
 from embomatrix.world.asset import Asset
@@ -55,16 +55,15 @@ class MiniWorld:
     """
 
     def __init__(self, pool: ClientPool) -> None:
-        self._bullet = pybullet()
         self._pool = pool
-        self._client = pool.take()
-        self._factory = BodyFactory(self._client, plain=True)
+        self._bullet = pool.take()
+        self._factory = BodyFactory(self._bullet, plain=True)
         self._body = -1
         self._still: tuple[int, ...] = ()
         self._stages = 0
         self._set_rules()
         # Triggers Bullet's first-step allocations here, which processes forked later then share.
-        self._bullet.stepSimulation(physicsClientId=self._client)
+        self._bullet.stepSimulation()
 
     def stage(
         self,
@@ -99,20 +98,19 @@ class MiniWorld:
             self._renew()
         elif self._still:
             for body in (self._body, *self._still):
-                self._bullet.removeBody(body, physicsClientId=self._client)
+                self._bullet.removeBody(body)
 
     def _renew(self) -> None:
         """Free the leaked shapes of earlier stages."""
-        self._bullet.resetSimulation(physicsClientId=self._client)
+        self._bullet.resetSimulation()
         self._factory.forget_shapes()
         self._set_rules()
 
     def _set_rules(self) -> None:
         """Configure an empty client."""
-        bullet, client = self._bullet, self._client
-        bullet.setGravity(0, 0, GRAVITY_M_S2, physicsClientId=client)
+        self._bullet.setGravity(0, 0, GRAVITY_M_S2)
         # Contacts are solved in the order of body creation, independent of the broad phase's history.
-        bullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
+        self._bullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
 
     def lift(self) -> None:
         """Move the object out of the way, for queries about static bodies."""
@@ -123,9 +121,7 @@ class MiniWorld:
         self._put(pose)
         deepest = 0.0
         for other in self._still:
-            for contact in self._bullet.getClosestPoints(
-                self._body, other, 0.0, physicsClientId=self._client
-            ):
+            for contact in self._bullet.getClosestPoints(self._body, other, 0.0):
                 deepest = max(deepest, -contact[8])
         return deepest
 
@@ -138,7 +134,7 @@ class MiniWorld:
             for v in PROBED
         ]
         ends = [(x, y, z - LEVEL_M) for x, y, _ in starts]
-        hits = self._bullet.rayTestBatch(starts, ends, physicsClientId=self._client)
+        hits = self._bullet.rayTestBatch(starts, ends)
         return all(hit[0] in self._still and abs(hit[3][2] - z) <= LEVEL_M for hit in hits)
 
     def drop(self, pose: Pose, steps: int = SETTLE_STEPS, least: int = EARLIEST_STEPS) -> Settled:
@@ -146,33 +142,30 @@ class MiniWorld:
 
         It does not count as at rest before ``least`` steps.
         """
-        bullet, client = self._bullet, self._client
         self._put(pose)
         done = 0
         linear = angular = math.inf
         while done < steps:
             for _ in range(min(CHUNK_STEPS, steps - done)):
-                bullet.stepSimulation(physicsClientId=client)
+                self._bullet.stepSimulation()
             done += CHUNK_STEPS
             linear, angular = self._speeds()
             if done >= least and linear < SLOW_M_S and angular < SLOW_RAD_S:
                 break
-        position, quat = bullet.getBasePositionAndOrientation(self._body, physicsClientId=client)
+        position, quat = self._bullet.getBasePositionAndOrientation(self._body)
         return settled_from(pose, position, quat, linear, angular)
 
     def close(self) -> None:
         """Return the client and end the world's use."""
-        self._pool.give_back(self._client)
+        self._pool.give_back(self._bullet)
 
     def _put(self, pose: Pose) -> None:
         zero = (0.0, 0.0, 0.0)
-        self._bullet.resetBasePositionAndOrientation(
-            self._body, pose.position_m, pose.quat_xyzw, physicsClientId=self._client
-        )
-        self._bullet.resetBaseVelocity(self._body, zero, zero, physicsClientId=self._client)
+        self._bullet.resetBasePositionAndOrientation(self._body, pose.position_m, pose.quat_xyzw)
+        self._bullet.resetBaseVelocity(self._body, zero, zero)
 
     def _speeds(self) -> tuple[float, float]:
-        linear, angular = self._bullet.getBaseVelocity(self._body, physicsClientId=self._client)
+        linear, angular = self._bullet.getBaseVelocity(self._body)
         return math.hypot(*linear), math.hypot(*angular)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.bullet.client import pybullet
+from embomatrix.sim.bullet.client import BulletClient
 
 if TYPE_CHECKING:
     from embomatrix.sim.bullet.dynamic_bodies import DynamicBodies
@@ -25,9 +25,8 @@ DISTANCE: Final = 8
 class Passage:
     """Motion of a robot with its held object (``""`` for none) from their current state."""
 
-    def __init__(self, client: int, robot: RobotBody, bodies: DynamicBodies, held: str) -> None:
-        self._bullet = pybullet()
-        self._client = client
+    def __init__(self, client: BulletClient, robot: RobotBody, bodies: DynamicBodies, held: str) -> None:
+        self._bullet = client
         self._robot = robot
         self._bodies = bodies
         self._held = held
@@ -59,9 +58,9 @@ class Passage:
 
     def _carry(self, pose: Pose) -> None:
         """Put the held object at a pose, at rest."""
-        bullet, client, body = self._bullet, self._client, self._bodies.body(self._held)
-        bullet.resetBasePositionAndOrientation(body, pose.position_m, pose.quat_xyzw, physicsClientId=client)
-        bullet.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0), physicsClientId=client)
+        bullet, body = self._bullet, self._bodies.body(self._held)
+        bullet.resetBasePositionAndOrientation(body, pose.position_m, pose.quat_xyzw)
+        bullet.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))
 
     def _nothing_near_at(self, posture: Posture) -> bool:
         if not self._robot.can_stand(posture):
@@ -71,10 +70,10 @@ class Passage:
 
     def _nothing_near(self) -> bool:
         """Each detection refreshes the contacts that Bullet reports."""
-        self._bullet.performCollisionDetection(physicsClientId=self._client)
+        self._bullet.performCollisionDetection()
         moved = [self._robot.body, *([self._bodies.body(self._held)] if self._held else [])]
         return not any(
             contact[DISTANCE] < CLEAR_M
             for body in moved
-            for contact in self._bullet.getContactPoints(bodyA=body, physicsClientId=self._client)
+            for contact in self._bullet.getContactPoints(bodyA=body)
         )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from embomatrix.sim.bullet.client import pybullet
+from embomatrix.sim.bullet.client import BulletClient
 from embomatrix.sim.bullet.robot_model import (
     DRIVEN_JOINTS,
     FINGER_JOINTS,
@@ -62,26 +62,22 @@ def tucked(at: StandPose) -> Posture:
     return Posture(at.x_m, at.y_m, at.yaw, TUCKED_LIFT_M, TUCKED_ARM)
 
 
-def load_robot(client: int, *, visuals: bool = False) -> int:
+def load_robot(client: BulletClient, *, visuals: bool = False) -> int:
     """Load the robot into a client and return its body. Raises EngineMissingError if its description is not installed."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "robot.urdf"
         path.write_text(robot_urdf(visuals=visuals))
-        return int(pybullet().loadURDF(str(path), useFixedBase=True, physicsClientId=client))
+        return int(client.loadURDF(str(path), useFixedBase=True))
 
 
 class RobotBody:
     """Robot loaded into a client, until the client is reset."""
 
-    def __init__(self, client: int, posture: Posture) -> None:
+    def __init__(self, client: BulletClient, posture: Posture) -> None:
         """Load the robot with its joints at a posture."""
-        self._bullet = bullet = pybullet()
-        self._client = client
+        self._bullet = client
         self.body = load_robot(client)
-        infos = [
-            bullet.getJointInfo(self.body, joint, physicsClientId=client)
-            for joint in range(bullet.getNumJoints(self.body, physicsClientId=client))
-        ]
+        infos = [client.getJointInfo(self.body, joint) for joint in range(client.getNumJoints(self.body))]
         joints = {info[1].decode(): int(info[0]) for info in infos}
         links = {info[12].decode(): int(info[0]) for info in infos}
         self.hand = links[HAND]
@@ -91,7 +87,7 @@ class RobotBody:
         self._limits = [infos[joint][8:10] for joint in self._driven]
         self._forces = [BASE_N] * 2 + [BASE_NM] + [LIFT_N] * 2
         self._forces += [SHOULDER_EFFORT_NM] * 4 + [WRIST_EFFORT_NM] * 3 + [FINGER_N] * 2
-        self._inertial = Pose(tuple(bullet.getDynamicsInfo(self.body, self.hand, physicsClientId=client)[3]))
+        self._inertial = Pose(tuple(client.getDynamicsInfo(self.body, self.hand)[3]))
         self._hold = -1
         self.appear(posture)
 
@@ -104,11 +100,7 @@ class RobotBody:
         """Move to a posture at once, at rest. The motors keep their targets."""
         values = spread(posture)
         self._bullet.resetJointStatesMultiDof(
-            self.body,
-            self._driven,
-            [(value,) for value in values],
-            [(0.0,)] * len(values),
-            physicsClientId=self._client,
+            self.body, self._driven, [(value,) for value in values], [(0.0,)] * len(values)
         )
 
     def can_stand(self, posture: Posture) -> bool:
@@ -121,21 +113,19 @@ class RobotBody:
     @property
     def posture(self) -> Posture:
         """Current joint positions."""
-        states = self._bullet.getJointStates(self.body, self._driven, physicsClientId=self._client)
+        states = self._bullet.getJointStates(self.body, self._driven)
         values = [state[0] for state in states]
         return Posture.of((*values[:3], values[3] + values[4], *values[5:12]))
 
     def steer(self, posture: Posture) -> None:
         """Set the motors' targets, which they approach within their forces as time passes."""
-        bullet = self._bullet
-        bullet.setJointMotorControlArray(
+        self._bullet.setJointMotorControlArray(
             self.body,
             self._driven,
-            bullet.POSITION_CONTROL,
+            self._bullet.POSITION_CONTROL,
             targetPositions=spread(posture),
             forces=self._forces,
             positionGains=[GAIN] * len(self._driven),
-            physicsClientId=self._client,
         )
 
     def hold(self, body: int, link: int, pose_hand_body: Pose) -> None:
@@ -152,42 +142,31 @@ class RobotBody:
             (0, 0, 0),
             centre.quat_xyzw,
             (0, 0, 0, 1),
-            physicsClientId=self._client,
         )
-        self._bullet.changeConstraint(self._hold, maxForce=GRIP_N, physicsClientId=self._client)
+        self._bullet.changeConstraint(self._hold, maxForce=GRIP_N)
 
     def hook(self, body: int, link: int, in_hand: Sequence[float], in_link: Sequence[float]) -> None:
         """Attach one point of a body's link to a point of the hand; the link may turn about it."""
         point = self._inertial.inverse().apply((in_hand[0], in_hand[1], in_hand[2]))
         self._hold = self._bullet.createConstraint(
-            self.body,
-            self.hand,
-            body,
-            link,
-            self._bullet.JOINT_POINT2POINT,
-            (0, 0, 0),
-            point,
-            tuple(in_link),
-            physicsClientId=self._client,
+            self.body, self.hand, body, link, self._bullet.JOINT_POINT2POINT, (0, 0, 0), point, tuple(in_link)
         )
-        self._bullet.changeConstraint(self._hold, maxForce=GRIP_N, physicsClientId=self._client)
+        self._bullet.changeConstraint(self._hold, maxForce=GRIP_N)
 
     def let_go(self) -> None:
         """End the hold if there is one."""
         if self._hold >= 0:
-            self._bullet.removeConstraint(self._hold, physicsClientId=self._client)
+            self._bullet.removeConstraint(self._hold)
             self._hold = -1
 
     def hand_pose(self) -> Pose:
         """Frame of the hand in the world: z points out of it, y along the fingers' travel."""
-        state = self._bullet.getLinkState(
-            self.body, self.hand, computeForwardKinematics=1, physicsClientId=self._client
-        )
+        state = self._bullet.getLinkState(self.body, self.hand, computeForwardKinematics=1)
         return Pose(tuple(state[4]), tuple(state[5]))
 
     def collide(self, body: int, links: Sequence[int], *, on: bool) -> None:
         """Switch collisions between the robot and a body's links: the held object must not push against it."""
-        every = range(-1, self._bullet.getNumJoints(self.body, physicsClientId=self._client))
+        every = range(-1, self._bullet.getNumJoints(self.body))
         self._filter(body, links, every, on=on)
 
     def brush(self, body: int, link: int, *, on: bool) -> None:
@@ -197,9 +176,7 @@ class RobotBody:
     def _filter(self, body: int, links: Sequence[int], own: Iterable[int], *, on: bool) -> None:
         for link in own:
             for other in links:
-                self._bullet.setCollisionFilterPair(
-                    self.body, body, link, other, int(on), physicsClientId=self._client
-                )
+                self._bullet.setCollisionFilterPair(self.body, body, link, other, int(on))
 
 
 def spread(posture: Posture) -> list[float]:

@@ -7,7 +7,7 @@ depend on which bodies exist: they are never stepped, only compared in pairs.
 from collections.abc import Iterator, Sequence
 
 from embomatrix.sim.bullet.bodies import PART_LIMIT, BodyFactory
-from embomatrix.sim.bullet.client import pybullet
+from embomatrix.sim.bullet.client import BulletClient
 from embomatrix.world.asset import Asset
 from embomatrix.world.geometry import Pose
 from embomatrix.world.scene import Scene
@@ -16,9 +16,8 @@ from embomatrix.world.scene import Scene
 class SceneBodies:
     """Immovable bodies by the numbers of a scene's objects and walls. The client must be empty."""
 
-    def __init__(self, client: int, scene: Scene) -> None:
-        self._bullet = pybullet()
-        self._client = client
+    def __init__(self, client: BulletClient, scene: Scene) -> None:
+        self._bullet = client
         self._scene = scene
         self._factory = BodyFactory(client)
         self._objects: dict[int, int] = {}
@@ -55,13 +54,11 @@ class SceneBodies:
         return self._walls[chunk]
 
     def _put(self, body: int, pose: Pose) -> None:
-        self._bullet.resetBasePositionAndOrientation(
-            body, pose.position_m, pose.quat_xyzw, physicsClientId=self._client
-        )
+        self._bullet.resetBasePositionAndOrientation(body, pose.position_m, pose.quat_xyzw)
 
     def _turn(self, body: int, asset: Asset, fractions: Sequence[float]) -> None:
         if not fractions:
             return
         links = self._factory.joint_indices(asset)
         for link, (_, joint), fraction in zip(links, asset.joints, fractions, strict=True):
-            self._bullet.resetJointState(body, link, fraction * joint.upper, physicsClientId=self._client)
+            self._bullet.resetJointState(body, link, fraction * joint.upper)

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from embomatrix.sim.bullet.bodies import BodyFactory
-from embomatrix.sim.bullet.client import connect, pybullet
+from embomatrix.sim.bullet.client import BulletClient, connect
 from embomatrix.sim.bullet.mini_world import (
     CHUNK_STEPS,
     GRAVITY_M_S2,
@@ -49,18 +49,17 @@ def settle_scene(scene: Scene) -> SettledScene:
     try:
         return _Fall(scene, client).run()
     finally:
-        pybullet().disconnect(physicsClientId=client)
+        client.disconnect()
 
 
 class _Fall:
     """Scene in one client, with mass on movable objects."""
 
-    def __init__(self, scene: Scene, client: int) -> None:
-        self._bullet = pybullet()
-        self._client = client
+    def __init__(self, scene: Scene, client: BulletClient) -> None:
+        self._bullet = client
         factory = BodyFactory(client)
-        self._bullet.resetSimulation(physicsClientId=client)
-        self._bullet.setGravity(0, 0, GRAVITY_M_S2, physicsClientId=client)
+        self._bullet.resetSimulation()
+        self._bullet.setGravity(0, 0, GRAVITY_M_S2)
         low = np.min([room.low_m for room in scene.rooms], axis=0)
         high = np.max([room.high_m for room in scene.rooms], axis=0)
         x, y = (low + high) / 2
@@ -83,27 +82,27 @@ class _Fall:
         done = 0
         while done < LEAST_STEPS or (done < MOST_STEPS and self._moves()):
             for _ in range(CHUNK_STEPS):
-                self._bullet.stepSimulation(physicsClientId=self._client)
+                self._bullet.stepSimulation()
             done += CHUNK_STEPS
         objects = {self._names[body]: self._settled(body, start) for body, start in self._starts.items()}
         return SettledScene(objects, self._overlaps())
 
     def _moves(self) -> bool:
         for body in self._starts:
-            linear, angular = self._bullet.getBaseVelocity(body, physicsClientId=self._client)
+            linear, angular = self._bullet.getBaseVelocity(body)
             if not (math.hypot(*linear) < SLOW_M_S and math.hypot(*angular) < SLOW_RAD_S):
                 return True
         return False
 
     def _settled(self, body: int, start: Pose) -> Settled:
-        position, quat = self._bullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
-        linear, angular = self._bullet.getBaseVelocity(body, physicsClientId=self._client)
+        position, quat = self._bullet.getBasePositionAndOrientation(body)
+        linear, angular = self._bullet.getBaseVelocity(body)
         return settled_from(start, position, quat, math.hypot(*linear), math.hypot(*angular))
 
     def _overlaps(self) -> dict[tuple[str, str], float]:
         """Pairs in contact deeper than the tolerance; pairs of immovable bodies are left out."""
         deepest: dict[tuple[str, str], float] = {}
-        for contact in self._bullet.getContactPoints(physicsClientId=self._client):
+        for contact in self._bullet.getContactPoints():
             pair = (self._names[contact[1]], self._names[contact[2]])
             if -contact[8] > max(TOLERANCE_M, deepest.get(pair, 0.0)):
                 deepest[pair] = -contact[8]

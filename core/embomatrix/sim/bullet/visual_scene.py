@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from embomatrix.sim.bullet.client import pybullet
+from embomatrix.sim.bullet.client import BulletClient, connect
 from embomatrix.sim.bullet.robot import Posture, load_robot, spread
 from embomatrix.sim.bullet.robot_model import DRIVEN_JOINTS
-from embomatrix.sim.engine import EngineError
 from embomatrix.sim.geometry.bounds import joint_motion
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.asset import Asset
@@ -64,10 +63,7 @@ class VisualScene:
     def __init__(self, scene: Scene) -> None:
         """Connect an empty client. Raises EngineError if pybullet is missing."""
         self.scene = scene
-        self._bullet = pybullet()
-        self._client = int(self._bullet.connect(self._bullet.DIRECT))
-        if self._client < 0:
-            raise EngineError("Bullet opened no physics client: close engines that are not in use")
+        self._bullet = connect(renders=True)
         self._shapes: dict[tuple[object, ...], int] = {}
         self._solids: dict[str, list[tuple[int, ConvexPart]]] = {}
 
@@ -77,7 +73,7 @@ class VisualScene:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._bullet.disconnect(physicsClientId=self._client)
+        self._bullet.disconnect()
 
     def add_floors(self) -> None:
         """Add a slab for each room, in alternating colours."""
@@ -125,7 +121,7 @@ class VisualScene:
 
     def add_robot(self) -> RobotFigure:
         """Add the robot, out of sight at first."""
-        return RobotFigure(self._client)
+        return RobotFigure(self._bullet)
 
     def add_solid(
         self, shape: Shape, size_m: Vec3, pose: Pose, color: Rgba, vertices_m: tuple[Vec3, ...] = ()
@@ -135,12 +131,7 @@ class VisualScene:
         if key not in self._shapes:
             self._shapes[key] = self._visual(shape, size_m, color, vertices_m)
         body = self._bullet.createMultiBody(
-            0.0,
-            -1,
-            self._shapes[key],
-            basePosition=pose.position_m,
-            baseOrientation=pose.quat_xyzw,
-            physicsClientId=self._client,
+            0.0, -1, self._shapes[key], basePosition=pose.position_m, baseOrientation=pose.quat_xyzw
         )
         return int(body)
 
@@ -157,7 +148,6 @@ class VisualScene:
             lightDirection=(0.5, -0.8, 2.0),
             renderer=self._bullet.ER_TINY_RENDERER,
             flags=self._bullet.ER_NO_SEGMENTATION_MASK,
-            physicsClientId=self._client,
         )
         pixels = np.asarray(image[2], dtype=np.uint8).reshape(height_px, width_px, 4)
         return np.ascontiguousarray(pixels[..., :3])
@@ -174,17 +164,11 @@ class VisualScene:
         return self.add_solid(part.shape, part.size_m, frame @ part.pose, color, part.vertices_m)
 
     def _place(self, body: int, pose: Pose) -> None:
-        self._bullet.resetBasePositionAndOrientation(
-            body, pose.position_m, pose.quat_xyzw, physicsClientId=self._client
-        )
+        self._bullet.resetBasePositionAndOrientation(body, pose.position_m, pose.quat_xyzw)
 
     def _visual(self, shape: Shape, size_m: Vec3, color: Rgba, vertices_m: tuple[Vec3, ...]) -> int:
         bullet = self._bullet
-        look: dict[str, Any] = {
-            "rgbaColor": color,
-            "specularColor": (0, 0, 0),
-            "physicsClientId": self._client,
-        }
+        look = {"rgbaColor": color, "specularColor": (0, 0, 0)}
         match shape:
             case Shape.BOX:
                 half = tuple(max(extent, 0.002) / 2 for extent in size_m)
@@ -255,17 +239,16 @@ def _lighter(color: Rgba) -> Rgba:
 class RobotFigure:
     """Robot in a client with Bullet's renderer, for the client's lifetime."""
 
-    def __init__(self, client: int) -> None:
+    def __init__(self, client: BulletClient) -> None:
         """Load the robot, out of sight. Raises EngineMissingError if its description is not installed."""
-        self._bullet = bullet = pybullet()
-        self._client = client
+        self._bullet = client
         self._body = load_robot(client, visuals=True)
         joints: dict[str, int] = {}
-        for number in range(bullet.getNumJoints(self._body, physicsClientId=client)):
-            info = bullet.getJointInfo(self._body, number, physicsClientId=client)
+        for number in range(client.getNumJoints(self._body)):
+            info = client.getJointInfo(self._body, number)
             joints[info[1].decode()] = number
             if info[12].decode() in _OWN_LINKS:
-                bullet.changeVisualShape(self._body, number, rgbaColor=_CHASSIS, physicsClientId=client)
+                client.changeVisualShape(self._body, number, rgbaColor=_CHASSIS)
         self._driven = [joints[name] for name in DRIVEN_JOINTS]
         self.leave()
 
@@ -273,13 +256,11 @@ class RobotFigure:
         """Show the robot in a posture."""
         self._put(0.0)
         for joint, value in zip(self._driven, spread(posture), strict=True):
-            self._bullet.resetJointState(self._body, joint, value, physicsClientId=self._client)
+            self._bullet.resetJointState(self._body, joint, value)
 
     def leave(self) -> None:
         """Hide the robot: its own camera does not see it."""
         self._put(-100.0)
 
     def _put(self, height_m: float) -> None:
-        self._bullet.resetBasePositionAndOrientation(
-            self._body, (0.0, 0.0, height_m), (0.0, 0.0, 0.0, 1.0), physicsClientId=self._client
-        )
+        self._bullet.resetBasePositionAndOrientation(self._body, (0.0, 0.0, height_m), (0.0, 0.0, 0.0, 1.0))
