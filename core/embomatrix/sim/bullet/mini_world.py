@@ -8,7 +8,7 @@ from typing import Final
 from embomatrix.sim.bullet.bodies import BodyFactory
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.engine import SETTLE_STEPS, Settled
-from embomatrix.sim.geometry.bounds import parts_of
+from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.world.asset import Asset
 from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Quat, Shape, Vec3
 
@@ -86,7 +86,7 @@ class MiniWorld:
         parts = [slab, *walls]
         for item in stills:
             box = region if region is not None else EVERYWHERE
-            parts += parts_of(item.asset).within(item.pose, item.fractions, box)
+            parts += bounds_of(item.asset).parts_within(item.pose, item.fractions, box)
         self._still = self._factory.walls(parts)
         self._body = self._factory.rigid(asset, pose, fractions, asset.mass_kg)
         if any(part.shape in ROUND for link in asset.links for part in link.parts):

@@ -10,7 +10,7 @@ from embomatrix.sim.floor.grid import FloorGrid
 from embomatrix.sim.floor.obstacles import WALLS, Obstacles
 from embomatrix.sim.floor.open_panels import OpenJoints, OpenPanels
 from embomatrix.sim.floor.prepared import PreparedScene
-from embomatrix.sim.geometry.bounds import parts_of
+from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.world.geometry import IDENTITY, Pose
 
 ON_FLOOR_M: Final = 0.05
@@ -163,6 +163,6 @@ class Ground:
     def _parts_of(self, name: str, pose: Pose) -> Obstacles:
         """Boxes of the object's parts at a pose with its joints shut."""
         asset = self._scene.asset_of(name)
-        boxes = parts_of(asset).boxes(pose, (0.0,) * len(asset.joints))
+        boxes = bounds_of(asset).part_boxes(pose, (0.0,) * len(asset.joints))
         panels = [link.joint is not None for link in asset.links for _ in link.parts]
         return Obstacles.of(boxes, self.numbers[name], panels)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.floor.obstacles import WALLS, Obstacles
-from embomatrix.sim.geometry.bounds import parts_of
+from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.world.state import OPEN_FRACTION
 
 OpenJoints = tuple[tuple[int, tuple[float, ...]], ...]
@@ -58,7 +58,7 @@ class OpenPanels:
         for number, fractions in joints:
             item = self._objects[number]
             asset = self._engine.scene.asset_of(item.name)
-            boxes = parts_of(asset).boxes(self._engine.pose(item.name), fractions)
+            boxes = bounds_of(asset).part_boxes(self._engine.pose(item.name), fractions)
             out = [box for box, is_out in zip(boxes, self._are_out(number, fractions), strict=True) if is_out]
             found.append(Obstacles.of(out, number, [True] * len(out)))
         return Obstacles.joined(found)

@@ -61,12 +61,15 @@ def square_box(box: Aabb, frame: Pose) -> Aabb | None:
 
 
 class AssetBounds:
-    """Points whose hull encloses each link of an asset, shared by all objects of the asset."""
+    """Boxes of an asset, of its parts and of its panels, shared by all objects of the asset."""
 
     def __init__(self, asset: Asset) -> None:
-        self._links = [(link.parts, link.joint) for link in asset.links if link.parts]
+        self._links = [(link.joint, link.parts) for link in asset.links if link.parts]
+        self._of_base = len(asset.links[0].parts)
         self._extents = BoundedCache(EXTENTS_KEPT, self._find_extents)
-        self._points_at = BoundedCache(EXTENTS_KEPT, self._find_points)
+        self._part_extents = BoundedCache(EXTENTS_KEPT, self._find_part_extents)
+        self._panel_extents = BoundedCache(EXTENTS_KEPT, self._find_panel_extents)
+        self._hull_at = BoundedCache(EXTENTS_KEPT, self._find_hull)
 
     def box(self, pose: Pose, fractions: Sequence[float] = ()) -> Aabb:
         """Bounding box in the target of ``pose``, with the joints at these shares of their travel."""
@@ -76,69 +79,27 @@ class AssetBounds:
 
     def extents(self, rotations: FloatArray, fractions: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
         """Corners of the boxes relative to the origin at rotations of shape (n, 3, 3); each of shape (n, 3)."""
-        points, radii = self._points_at[fractions]
+        points, radii = self._hull_at[fractions]
         turned = rotations @ points  # (n, 3, m)
         if radii is None:
             return turned.min(axis=2), turned.max(axis=2)
         return (turned - radii).min(axis=2), (turned + radii).max(axis=2)
 
-    def _find_points(self, fractions: tuple[float, ...]) -> tuple[FloatArray, FloatArray | None]:
-        """Points of all links in the asset's frame, shape (3, m), and the radii of balls around them; None for no balls."""
-        moving = iter(fractions)
-        points: list[FloatArray] = []
-        for (cloud, _), joint in self._clouds:
-            fraction = next(moving, 0.0) if joint is not None else 0.0
-            points.append(joint_motion(joint, fraction).apply_all(cloud) if joint and fraction else cloud)
-        radii = np.concatenate([balls[:, 0] for (_, balls), _ in self._clouds])
-        return np.ascontiguousarray(np.concatenate(points).T), radii if radii.any() else None
-
-    @functools.cached_property
-    def _clouds(self) -> list[tuple[tuple[FloatArray, FloatArray], Joint | None]]:
-        return [(_cloud(parts), joint) for parts, joint in self._links]
-
-    def _find_extents(self, turned_as: Turned) -> Corners:
-        quat_xyzw, fractions = turned_as
-        points, radii = self._points_at[fractions]
-        turned = Pose(IDENTITY.position_m, quat_xyzw).rotation @ points  # (3, m)
-        lows, highs = (turned, turned) if radii is None else (turned - radii, turned + radii)
-        # ufunc.reduce directly: the array methods go through Python, which doubles the cost.
-        a, b, c = np.minimum.reduce(lows, 1).tolist()
-        d, e, f = np.maximum.reduce(highs, 1).tolist()
-        return (a, b, c), (d, e, f)
-
-
-class AssetParts:
-    """Boxes of an asset's parts one by one, shared by all objects of the asset."""
-
-    def __init__(self, asset: Asset) -> None:
-        self._links = [(link.joint, link.parts) for link in asset.links if link.parts]
-        self._of_base = len(asset.links[0].parts)
-        self._extents = BoundedCache(EXTENTS_KEPT, self._find_extents)
-        self._panels = BoundedCache(EXTENTS_KEPT, self._find_panels)
-
-    def boxes(self, pose: Pose, fractions: Sequence[float]) -> list[Aabb]:
+    def part_boxes(self, pose: Pose, fractions: Sequence[float]) -> list[Aabb]:
         """World box of every part, in the order of the links; equal to ``ConvexPart.aabb``."""
-        x, y, z = pose.position_m
-        return [
-            Aabb((x + a, y + b, z + c), (x + d, y + e, z + f))
-            for (a, b, c), (d, e, f) in self._extents[pose.quat_xyzw, tuple(fractions)]
-        ]
+        return _moved(self._part_extents[pose.quat_xyzw, tuple(fractions)], pose)
 
     def base_boxes(self, pose: Pose) -> list[Aabb]:
         """World box of every part of the base."""
-        return self.boxes(pose, ())[: self._of_base]
+        return self.part_boxes(pose, ())[: self._of_base]
 
-    def panels(self, pose: Pose, fractions: Sequence[float]) -> list[Aabb]:
+    def panel_boxes(self, pose: Pose, fractions: Sequence[float]) -> list[Aabb]:
         """World box of every moving link."""
-        x, y, z = pose.position_m
-        return [
-            Aabb((x + a, y + b, z + c), (x + d, y + e, z + f))
-            for (a, b, c), (d, e, f) in self._panels[pose.quat_xyzw, tuple(fractions)]
-        ]
+        return _moved(self._panel_extents[pose.quat_xyzw, tuple(fractions)], pose)
 
-    def within(self, pose: Pose, fractions: Sequence[float], box: Aabb) -> list[ConvexPart]:
+    def parts_within(self, pose: Pose, fractions: Sequence[float], box: Aabb) -> list[ConvexPart]:
         """Parts whose boxes overlap a world box, each at its world pose."""
-        boxes = iter(self.boxes(pose, fractions))
+        boxes = iter(self.part_boxes(pose, fractions))
         return [
             ConvexPart(part.shape, frame @ part.pose, part.size_m, part.vertices_m)
             for frame, parts in self._frames(pose, fractions)
@@ -146,25 +107,19 @@ class AssetParts:
             if part_box.overlaps(box)
         ]
 
-    def _find_panels(self, turned_as: Turned) -> list[Corners]:
-        extents = iter(self._extents[turned_as])
-        found: list[Corners] = []
-        for joint, parts in self._links:
-            boxes = [Aabb(low, high) for low, high in itertools.islice(extents, len(parts))]
-            if joint is not None:
-                box = Aabb.around(boxes)
-                found.append((box.low_m, box.high_m))
-        return found
-
-    @functools.cached_property
-    def _points(self) -> tuple[FloatArray, IntArray]:
-        """Points whose hull encloses each part, shape (n, 3), and the index of each part's first point."""
-        corners = [part.pose.apply_all(part.corners()) for _, parts in self._links for part in parts]
-        return np.concatenate(corners), np.cumsum([0, *map(len, corners)])[:-1]
-
-    def _find_extents(self, turned_as: Turned) -> list[Corners]:
+    def _find_extents(self, turned_as: Turned) -> Corners:
         quat_xyzw, fractions = turned_as
-        points, starts = self._points
+        points, radii = self._hull_at[fractions]
+        turned = Pose(IDENTITY.position_m, quat_xyzw).rotation @ points  # (3, m)
+        lows, highs = (turned, turned) if radii is None else (turned - radii, turned + radii)
+        # ufunc.reduce directly: the array methods go through Python, which doubles the cost.
+        a, b, c = np.minimum.reduce(lows, 1).tolist()
+        d, e, f = np.maximum.reduce(highs, 1).tolist()
+        return (a, b, c), (d, e, f)
+
+    def _find_part_extents(self, turned_as: Turned) -> list[Corners]:
+        quat_xyzw, fractions = turned_as
+        points, starts = self._corners
         chunks, first = [], 0
         for frame, parts in self._frames(Pose(IDENTITY.position_m, quat_xyzw), fractions):
             count = sum(len(part.vertices_m) or CORNERS for part in parts)
@@ -174,6 +129,36 @@ class AssetParts:
         lows = np.minimum.reduceat(world, starts).tolist()
         highs = np.maximum.reduceat(world, starts).tolist()
         return [((a, b, c), (d, e, f)) for (a, b, c), (d, e, f) in zip(lows, highs, strict=True)]
+
+    def _find_panel_extents(self, turned_as: Turned) -> list[Corners]:
+        extents = iter(self._part_extents[turned_as])
+        found: list[Corners] = []
+        for joint, parts in self._links:
+            boxes = [Aabb(low, high) for low, high in itertools.islice(extents, len(parts))]
+            if joint is not None:
+                box = Aabb.around(boxes)
+                found.append((box.low_m, box.high_m))
+        return found
+
+    def _find_hull(self, fractions: tuple[float, ...]) -> tuple[FloatArray, FloatArray | None]:
+        """Points of all parts in the asset's frame, shape (3, m), and the radii of balls around them; None for no balls.
+
+        The hull of points and balls encloses the asset.
+        """
+        moving = zip(self._frames(IDENTITY, fractions), self._clouds, strict=True)
+        points = np.concatenate([frame.apply_all(cloud) for (frame, _), (cloud, _) in moving])
+        radii = np.concatenate([balls for _, balls in self._clouds])
+        return np.ascontiguousarray(points.T), radii if radii.any() else None
+
+    @functools.cached_property
+    def _clouds(self) -> list[tuple[FloatArray, FloatArray]]:
+        return [_cloud(parts) for _, parts in self._links]
+
+    @functools.cached_property
+    def _corners(self) -> tuple[FloatArray, IntArray]:
+        """Points whose hull encloses each part, shape (n, 3), and the index of each part's first point."""
+        corners = [part.pose.apply_all(part.corners()) for _, parts in self._links for part in parts]
+        return np.concatenate(corners), np.cumsum([0, *map(len, corners)])[:-1]
 
     def _frames(
         self, pose: Pose, fractions: Sequence[float]
@@ -188,12 +173,12 @@ class AssetParts:
 
 def bounds_of(asset: Asset) -> AssetBounds:
     """Bounds of an asset, made at the first call."""
-    return _known(asset)[0]
-
-
-def parts_of(asset: Asset) -> AssetParts:
-    """Parts of an asset, made at the first call."""
-    return _known(asset)[1]
+    known = _KNOWN.get(id(asset))
+    if known is None:
+        if len(_KNOWN) >= ASSETS_KEPT:
+            _KNOWN.clear()
+        known = _KNOWN[id(asset)] = (asset, AssetBounds(asset))
+    return known[1]
 
 
 def forget(assets: Iterable[Asset]) -> None:
@@ -202,24 +187,20 @@ def forget(assets: Iterable[Asset]) -> None:
         _KNOWN.pop(id(asset), None)
 
 
-_KNOWN: Final[dict[int, tuple[Asset, AssetBounds, AssetParts]]] = {}
-"""Caches by the asset's id. Holding the asset keeps its id from being reused."""
+_KNOWN: Final[dict[int, tuple[Asset, AssetBounds]]] = {}
+"""Bounds by the asset's id. Holding the asset keeps its id from being reused."""
 
 
-def _known(asset: Asset) -> tuple[AssetBounds, AssetParts]:
-    known = _KNOWN.get(id(asset))
-    if known is None:
-        if len(_KNOWN) >= ASSETS_KEPT:
-            _KNOWN.clear()
-        known = _KNOWN[id(asset)] = (asset, AssetBounds(asset), AssetParts(asset))
-    return known[1], known[2]
+def _moved(extents: Sequence[Corners], pose: Pose) -> list[Aabb]:
+    x, y, z = pose.position_m
+    return [Aabb((x + a, y + b, z + c), (x + d, y + e, z + f)) for (a, b, c), (d, e, f) in extents]
 
 
 def _cloud(parts: Sequence[ConvexPart]) -> tuple[FloatArray, FloatArray]:
-    """Points, shape (n, 3), and the radius of the ball around each, shape (n, 1), in the asset's frame."""
+    """Points, shape (n, 3), and the radius of the ball around each, shape (n,), in the asset's frame."""
     points = [part.pose.apply_all(_points(part)) for part in parts]
     radii = [
-        np.full((len(chunk), 1), part.size_m[0] / 2 if part.shape is Shape.SPHERE else 0.0)
+        np.full(len(chunk), part.size_m[0] / 2 if part.shape is Shape.SPHERE else 0.0)
         for part, chunk in zip(parts, points, strict=True)
     ]
     return np.concatenate(points), np.concatenate(radii)

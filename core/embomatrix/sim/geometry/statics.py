@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from embomatrix.sim.geometry.bounds import bounds_of, parts_of
+from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.world.asset import Asset, JointKind
 from embomatrix.world.geometry import IDENTITY, Aabb, ConvexPart, Pose, Shape, Vec2, Vec3
 
@@ -94,7 +94,7 @@ def _parts_near(
     support: Asset, fractions: Sequence[float], near: Aabb
 ) -> Iterator[tuple[ConvexPart | None, Aabb]]:
     """Boxes of a support's parts that overlap a box, in the support's frame, each with its part; None for a rotated part."""
-    boxes = iter(parts_of(support).boxes(IDENTITY, fractions))
+    boxes = iter(bounds_of(support).part_boxes(IDENTITY, fractions))
     moving = iter(fractions)
     for link in support.links:
         joint = link.joint

@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from embomatrix.sim.geometry.bounds import joint_motion, parts_of
+from embomatrix.sim.geometry.bounds import bounds_of, joint_motion
 from embomatrix.world.asset import Asset, Interior
 from embomatrix.world.geometry import IDENTITY, Aabb, Pose
 from embomatrix.world.state import OPEN_FRACTION, Relation
@@ -143,6 +143,6 @@ def heights_over(box: Aabb, asset: Asset, pose: Pose) -> list[float]:
     cx, cy, _ = box.center_m
     return [
         part_box.low_m[2]
-        for part_box in parts_of(asset).base_boxes(pose)
+        for part_box in bounds_of(asset).base_boxes(pose)
         if part_box.low_m[0] <= cx <= part_box.high_m[0] and part_box.low_m[1] <= cy <= part_box.high_m[1]
     ]

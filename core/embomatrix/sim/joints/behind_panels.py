@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from embomatrix.sim.geometry.batch_poses import PoseBoxes
-from embomatrix.sim.geometry.bounds import joint_motion, parts_of
+from embomatrix.sim.geometry.bounds import bounds_of, joint_motion
 from embomatrix.world.asset import Asset, JointKind
 from embomatrix.world.geometry import IDENTITY, Aabb, FloatArray, Pose
 from embomatrix.world.poses import StandPose
@@ -32,7 +32,7 @@ def behind_panels(
     doors = list(_open_doors(asset, pose, fractions))
     if not doors:
         return np.zeros(len(middles), dtype=np.bool_)
-    behind = _blocked(middles, stand, pose, parts_of(asset).base_boxes(IDENTITY), 0.0)
+    behind = _blocked(middles, stand, pose, bounds_of(asset).base_boxes(IDENTITY), 0.0)
     for frame, box in doors:
         behind |= _blocked(middles, stand, frame, [box], ARM_M)
     return behind
@@ -40,7 +40,7 @@ def behind_panels(
 
 def _open_doors(asset: Asset, pose: Pose, fractions: Sequence[float]) -> Iterator[tuple[Pose, Aabb]]:
     """Frames of the open doors, each with the door's box in its frame."""
-    boxes = iter(parts_of(asset).panels(IDENTITY, (0.0,) * len(fractions)))
+    boxes = iter(bounds_of(asset).panel_boxes(IDENTITY, (0.0,) * len(fractions)))
     moving = [link for link in asset.links if link.joint is not None]
     for link, fraction in zip(moving, fractions, strict=True):
         joint = link.joint

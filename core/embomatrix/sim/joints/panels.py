@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from embomatrix.sim.engine import FLOOR, WALL, PhysicsEngine
-from embomatrix.sim.geometry.bounds import bounds_of, parts_of
+from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.surfaces import link_frame
 from embomatrix.sim.state.relations import Relations
 from embomatrix.world.geometry import Aabb, Pose
@@ -125,7 +125,7 @@ class DoorPanels:
     def _near_panels(self, fractions: Sequence[float]) -> frozenset[str]:
         """Objects, walls and floor near any panel at these joint positions."""
         engine, near = self._engine, set[str]()
-        for panel in parts_of(self._asset).panels(self._base, fractions):
+        for panel in bounds_of(self._asset).panel_boxes(self._base, fractions):
             box = panel.grown(PANEL_SLACK_M)
             near.update(engine.near(box))
             if panel.low_m[2] < 0.0:

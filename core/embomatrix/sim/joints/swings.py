@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from embomatrix.sim.engine import PhysicsEngine
-from embomatrix.sim.geometry.bounds import bounds_of, parts_of
+from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.surfaces import links_with_surfaces
 from embomatrix.sim.joints.panels import PANEL_SLACK_M, DoorPanels
 from embomatrix.sim.state.relations import Relations
@@ -78,7 +78,7 @@ class Swings:
         boxes: list[Aabb] = []
         for fractions in stops:
             boxes.append(bounds_of(asset).box(pose, fractions))
-            boxes += parts_of(asset).panels(pose, fractions)
+            boxes += bounds_of(asset).panel_boxes(pose, fractions)
             for item, carried in panels.carried_poses(fractions):
                 boxes.append(bounds_of(scene.asset_of(item)).box(carried, engine.joints(item)))
         if links_with_surfaces(asset) - {""}:

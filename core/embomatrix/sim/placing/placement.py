@@ -8,7 +8,7 @@ import numpy as np
 
 from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.floor.navigation import Navigator
-from embomatrix.sim.geometry.bounds import bounds_of, parts_of
+from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.candidates import candidates
 from embomatrix.sim.geometry.surfaces import is_upright
 from embomatrix.sim.placing.options import PlacementOptions
@@ -55,7 +55,7 @@ class Placer:
                 self.options.footprints[asset_id]
                 self.options.bases[asset_id]
                 yield
-            parts_of(asset).boxes(IDENTITY, (0.0,) * len(asset.joints))
+            bounds_of(asset).part_boxes(IDENTITY, (0.0,) * len(asset.joints))
             yield
 
     def find(
