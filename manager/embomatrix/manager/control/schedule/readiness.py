@@ -55,7 +55,8 @@ class ReadinessForecast:
         self._now_s = now_s
 
     def warmth(self, scene: str) -> Warmth:
-        if self._residencies.warm_since_s(scene) is not None:
+        holders = (self._residencies.by_id[name] for name in self._residencies.assigned_on(scene))
+        if any(scene in residency.warm_since_s for residency in holders):
             return Warmth.WARM
         if scene in self._unplaceable:
             return Warmth.UNPLACEABLE
