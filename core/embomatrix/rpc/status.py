@@ -130,26 +130,20 @@ async def translate(context: grpc.aio.ServicerContext) -> AsyncIterator[None]:
     """Turn errors of a servicer's body into gRPC status codes. Unexpected errors are logged and become ``INTERNAL``."""
     try:
         yield
-    except ClusterError as error:
-        await _abort(context, _status_of(error), str(error), _metadata(error))
-    except ConvertError as error:
-        await _abort(context, grpc.StatusCode.INVALID_ARGUMENT, f"malformed message: {error}")
     except grpc.aio.AbortError:
         raise
-    except Exception:
-        logger.exception("unexpected error while serving a call")
-        await _abort(
-            context, grpc.StatusCode.INTERNAL, "the manager failed on this call: its log has the details"
-        )
+    except Exception as error:  # noqa: BLE001  # logged unless it is known
+        known = _known(error)
+        await context.abort(_status_of(known), str(known), trailing_metadata=_metadata(known))
 
 
-async def _abort(
-    context: grpc.aio.ServicerContext,
-    code: grpc.StatusCode,
-    sentence: str,
-    metadata: tuple[tuple[str, str], ...] = ((ERROR_KEY, _PLAIN),),
-) -> None:
-    await context.abort(code, sentence, trailing_metadata=metadata)
+def _known(error: Exception) -> ClusterError:
+    if isinstance(error, ClusterError):
+        return error
+    if isinstance(error, ConvertError):
+        return InvalidRequestError(f"malformed message: {error}")
+    logger.exception("unexpected error while serving a call")
+    return InternalError("the manager failed on this call: its log has the details")
 
 
 def _metadata(error: ClusterError) -> tuple[tuple[str, str], ...]:
@@ -158,10 +152,8 @@ def _metadata(error: ClusterError) -> tuple[tuple[str, str], ...]:
 
 
 def _status_of(error: ClusterError) -> grpc.StatusCode:
-    for kind in type(error).__mro__:
-        if kind in STATUS:
-            return STATUS[kind]
-    return grpc.StatusCode.INTERNAL
+    statuses = (STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
+    return next(statuses, grpc.StatusCode.INTERNAL)
 
 
 def cluster_error(error: grpc.aio.AioRpcError, address: str) -> ClusterError:
