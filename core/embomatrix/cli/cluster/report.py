@@ -88,11 +88,11 @@ def _length_s(summary: RunSummary) -> float:
 
 
 def _tiles(summary: RunSummary) -> str:
-    stats, phases = summary.run.stats, summary.phases
+    stats = summary.run.stats
     completed = sum(summary.series.completed)
     active_s = summary.series.step_s * sum(count > 0 for count in summary.series.completed)
-    execute_s = phases[RolloutPhase.EXECUTE].sum_s
-    cpu_s = summary.manager_cpu_s + execute_s
+    execute = summary.phases[RolloutPhase.EXECUTE]
+    cpu_s = summary.manager_cpu_s + execute.sum_s
     asked = stats.prewarm_hits + stats.prewarm_misses
     tiles = (
         (
@@ -101,11 +101,7 @@ def _tiles(summary: RunSummary) -> str:
             f"{stats.infra_failures:,} failed, {stats.redispatched:,} rollouts re-dispatched",
         ),
         ("Throughput", f"{completed / active_s:,.0f}/s" if active_s else NONE, "while there was work"),
-        (
-            "Execute p50",
-            seconds_text(phases[RolloutPhase.EXECUTE].p50_s),
-            f"p99 {seconds_text(phases[RolloutPhase.EXECUTE].p99_s)}",
-        ),
+        ("Execute p50", seconds_text(execute.p50_s), f"p99 {seconds_text(execute.p99_s)}"),
         ("Prewarm hits", _share(stats.prewarm_hits, asked), f"{stats.prewarm_hits:,} of {asked:,} scenes"),
         (
             "Prewarm waste",

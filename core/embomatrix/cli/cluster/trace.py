@@ -65,21 +65,19 @@ def _meta(kind: str, process: int, thread: int, name: str) -> TraceEvent:
     return {"ph": "M", "name": kind, "pid": process, "tid": thread, "args": {"name": name}}
 
 
+def _slice(
+    track: Mapping[str, int], name: str, begin_us: float, length_us: float, arguments: TraceEvent
+) -> TraceEvent:
+    return {"ph": "X", "name": name, "ts": begin_us, "dur": length_us, "args": arguments, **track}
+
+
 def _submissions(run: Sequence[RunEvent], clock: _Clock) -> Iterator[TraceEvent]:
     submitted = [event for event in run if event.kind is EventKind.SUBMITTED]
     for event, after in itertools.zip_longest(submitted, submitted[1:]):
         begin = clock.us(event.at_s)
         length = min(SUBMISSION_US, clock.us(after.at_s) - begin) if after is not None else SUBMISSION_US
         arguments = {"batch": event.batch_id, "rollouts": event.size}
-        yield {
-            "ph": "X",
-            "name": f"submit {event.size}",
-            "ts": begin,
-            "dur": length,
-            "args": arguments,
-            "pid": MANAGER,
-            "tid": 1,
-        }
+        yield _slice({"pid": MANAGER, "tid": 1}, f"submit {event.size}", begin, length, arguments)
 
 
 def _track(process: int, slot: int, spans: Sequence[Span], clock: _Clock) -> Iterator[TraceEvent]:
@@ -89,14 +87,7 @@ def _track(process: int, slot: int, spans: Sequence[Span], clock: _Clock) -> Ite
     def part(name: str, begin_s: float, end_s: float, arguments: TraceEvent) -> Iterator[TraceEvent]:
         begin, end = clock.us(begin_s), clock.us(end_s)
         if end > begin:
-            yield {
-                "ph": "X",
-                "name": name,
-                "ts": begin,
-                "dur": round(end - begin, 3),
-                "args": arguments,
-                **track,
-            }
+            yield _slice(track, name, begin, round(end - begin, 3), arguments)
 
     free_s: float | None = None
     arrived_s = 0.0
