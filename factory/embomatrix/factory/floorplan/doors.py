@@ -1,5 +1,6 @@
 """Doorways of a floor plan: one from each room to the room it is entered from, and more if the inventory lists them."""
 
+import itertools
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Final
@@ -41,13 +42,10 @@ def place_doorways(
     )
     cuts = [_join(child, parent, rects, left, types, rng) for child, parent in pairs]
     joined = {frozenset(pair) for pair in parents.items()}
-    names = [r.name for r in rooms]
-    for i, a in enumerate(names):
-        for b in names[i + 1 :]:
-            shared = {d.model for d in left[a]} & {d.model for d in left[b]}
-            edge = shared_edge(rects[a], rects[b])
-            if frozenset((a, b)) in joined or not shared or edge is None or edge.length < MIN_DOOR_M + 0.2:
-                continue
+    for a, b in itertools.combinations([r.name for r in rooms], 2):
+        shared = {d.model for d in left[a]} & {d.model for d in left[b]}
+        edge = shared_edge(rects[a], rects[b])
+        if shared and frozenset((a, b)) not in joined and edge and edge.length >= MIN_DOOR_M + 0.2:
             cuts.append(_join(a, b, rects, left, types, rng))
     unused = Counter((room, door.model) for room, doors in left.items() for door in doors)
     notes = [

@@ -26,7 +26,7 @@ from embomatrix.factory.importers.urdf import read_urdf
 from embomatrix.world.asset import Asset, Credit, Joint, JointKind, Link
 from embomatrix.world.catalog import Catalog, Model
 from embomatrix.world.codec import asset_from_json, asset_to_json
-from embomatrix.world.geometry import Aabb, ConvexPart, FloatArray, Shape, Vec3
+from embomatrix.world.geometry import IDENTITY, Aabb, ConvexPart, FloatArray, Shape, Vec3
 
 THIN_M: Final = 0.002
 """Least thickness of a part, in metres: the engine can't handle flat sheets."""
@@ -205,7 +205,7 @@ def _directions() -> FloatArray:
 
 def _exactly(links: Sequence[Link], entry: Model) -> tuple[Link, ...]:
     """Scale the links to the catalog's box exactly: cutting and thickening change it a little."""
-    boxes = [_box_of(part) for link in links for part in link.parts]
+    boxes = [part.aabb(IDENTITY) for link in links for part in link.parts]
     whole = Aabb.around(boxes)
     scale = np.asarray(entry.size_m) / np.asarray(whole.size_m)
     middle = np.asarray(whole.center_m)
@@ -225,12 +225,6 @@ def _points(part: ConvexPart) -> FloatArray:
     return np.asarray(np.asarray(part.pose.position_m) + np.array([-half, half]))
 
 
-def _box_of(part: ConvexPart) -> Aabb:
-    points = _points(part)
-    (a, b, c), (d, e, f) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
-    return Aabb((a, b, c), (d, e, f))
-
-
 def _places(links: Sequence[Link], size_m: Vec3) -> Body:
     """Find the places for objects: the largest open surface of the base, and its cavities."""
     solid = solid_cells([_planes(part) for part in links[0].parts], size_m)
@@ -248,7 +242,7 @@ def _places(links: Sequence[Link], size_m: Vec3) -> Body:
 
 def _closes(link: Link, inside: Aabb) -> bool:
     """True if a moving link covers at least CLOSING_SHARE of the front or the top of a cavity."""
-    box = Aabb.around(_box_of(part) for part in link.parts)
+    box = Aabb.around(part.aabb(IDENTITY) for part in link.parts)
     shared = [
         max(0.0, min(b, d) - max(a, c))
         for a, b, c, d in zip(box.low_m, box.high_m, inside.low_m, inside.high_m, strict=True)

@@ -73,7 +73,7 @@ def cavities(solid: Grid, size_m: Vec3) -> tuple[Cavity, ...]:
             break
         low, high = box
         if (
-            _is_roomy(low, high)
+            min(high - low) >= LEAST_SHARE * CELLS
             and _has_floor(solid, low, high)
             and not any(_is_remnant(low, high, *other) for other in taken)
         ):
@@ -98,10 +98,6 @@ def _largest_box(free: Grid) -> tuple[Cells, Cells] | None:
             for end in (0, 1):
                 grown |= _grow(free, low, high, axis, end)
     return low, high
-
-
-def _is_roomy(low: Cells, high: Cells) -> bool:
-    return bool(min(high - low) >= LEAST_SHARE * CELLS)
 
 
 def _is_remnant(low: Cells, high: Cells, other_low: Cells, other_high: Cells) -> bool:

@@ -28,15 +28,12 @@ def draw_legend(colors: Sequence[tuple[str, str]], lines: Iterable[str], height_
     legend = Image.new("RGB", (columns * _COLUMN_PX, height_px), "white")
     draw = ImageDraw.Draw(legend)
     font = ImageFont.load_default(_SIZE)
-    swatches = [("", color, words) for color, words in colors]
-    for number, (row, color, words) in enumerate([*swatches, *((row, "", "") for row in rows)]):
+    for number, (color, words) in enumerate([*colors, *(("", row) for row in rows)]):
         x = _MARGIN_PX // 2 + _COLUMN_PX * (number // in_column)
         y = _MARGIN_PX + _LINE_PX * (number % in_column)
         if color:
             draw.rectangle((x, y + 2, x + 16, y + 13), fill=color, outline="#555555")
-            draw.text((x + 24, y), words, "black", font)
-        else:
-            draw.text((x, y), row, "black", font)
+        draw.text((x + 24 if color else x, y), words, "black", font)
     return legend
 
 
