@@ -159,19 +159,13 @@ def _mixed(scene: Scene, before: FilmFrame, after: FilmFrame, share: float) -> F
     """Interpolated frame: joints and positions are mixed, headings are those of ``after``."""
     poses: dict[str, Pose] = {}
     for name in {*before.poses, *after.poses} - after.hidden:
-        start, end = (_pose_in(scene, frame, name) for frame in (before, after))
+        placed = scene.by_name[name].pose_world_asset
+        start, end = (frame.poses.get(name, placed) for frame in (before, after))
         x, y, z = (a + (b - a) * share for a, b in zip(start.position_m, end.position_m, strict=True))
         poses[name] = Pose((x, y, z), end.quat_xyzw)
     joints: dict[str, tuple[float, ...]] = {}
     for name in {*before.joints, *after.joints}:
-        pairs = zip(_joints_in(scene, before, name), _joints_in(scene, after, name), strict=True)
+        first = scene.by_name[name].joints
+        pairs = zip(before.joints.get(name, first), after.joints.get(name, first), strict=True)
         joints[name] = tuple(a + (b - a) * share for a, b in pairs)
     return FilmFrame(after.robot, after.step, poses, joints, after.hidden)
-
-
-def _pose_in(scene: Scene, frame: FilmFrame, name: str) -> Pose:
-    return frame.poses.get(name, scene.by_name[name].pose_world_asset)
-
-
-def _joints_in(scene: Scene, frame: FilmFrame, name: str) -> tuple[float, ...]:
-    return frame.joints.get(name, tuple(scene.by_name[name].joints))

@@ -59,13 +59,9 @@ class OpenPanels:
             item = self._objects[number]
             asset = self._engine.scene.asset_of(item.name)
             boxes = bounds_of(asset).part_boxes(self._engine.pose(item.name), fractions)
-            out = [box for box, is_out in zip(boxes, self._are_out(number, fractions), strict=True) if is_out]
+            moving = iter(fractions)
+            shares = [next(moving) if link.joint is not None else 0.0 for link in asset.links]
+            of_parts = [share for link, share in zip(asset.links, shares, strict=True) for _ in link.parts]
+            out = [box for box, share in zip(boxes, of_parts, strict=True) if share > OPEN_FRACTION]
             found.append(Obstacles.of(out, number, [True] * len(out)))
         return Obstacles.joined(found)
-
-    def _are_out(self, number: int, fractions: tuple[float, ...]) -> Iterator[bool]:
-        """Tell for each part of an object, in the order of its links, if it belongs to an open panel."""
-        moving = iter(fractions)
-        for link in self._engine.scene.asset_of(self._objects[number].name).links:
-            is_out = link.joint is not None and next(moving, 0.0) > OPEN_FRACTION
-            yield from (is_out for _ in link.parts)

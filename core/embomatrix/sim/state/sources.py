@@ -4,7 +4,7 @@ The effects follow from the state alone, whichever call caused it, and are immed
 frozen until a source undoes it: a rollout is shorter than cooling. Cooked objects stay cooked. Nothing dries or empties.
 """
 
-from collections.abc import Iterator, Mapping, MutableMapping, Set
+from collections.abc import Mapping, MutableMapping, Set
 from dataclasses import dataclass
 from typing import Final
 
@@ -99,8 +99,9 @@ class Thermal:
             if not self.works(name, source):
                 continue
             if first or source.requires_on or changed.affects(name, self._area(name)):
-                for item in self._acted_on(name, source):
-                    changes += self._expose(item, source)
+                for item in self._above(name):
+                    if self._gained(item, source) and self.is_at(item, name, source):
+                        changes += self._expose(item, source)
         return changes
 
     def works(self, name: str, source: ThermalSource) -> bool:
@@ -123,12 +124,6 @@ class Thermal:
             for vessel in self._above(name)
             if vessel != item
         )
-
-    def _acted_on(self, name: str, source: ThermalSource) -> Iterator[str]:
-        """Objects at the source that it would change."""
-        for item in self._above(name):
-            if self._gained(item, source) and self.is_at(item, name, source):
-                yield item
 
     def _above(self, name: str) -> tuple[str, ...]:
         """Movable objects in or near the source's box, or above it up to the height of vessels."""

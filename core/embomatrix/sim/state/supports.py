@@ -32,15 +32,6 @@ class AssetCavities:
     by_link: tuple[tuple[str, tuple[Interior, ...]], ...]
     too_wide_m: float
 
-    @staticmethod
-    def of(asset: Asset) -> AssetCavities:
-        """Cavities of an asset that has at least one."""
-        links = dict.fromkeys(item.link for item in asset.interiors)
-        by_link = [(link, tuple(item for item in asset.interiors if item.link == link)) for link in links]
-        return AssetCavities(
-            tuple(by_link), max(math.hypot(*item.size_m[:2]) for item in asset.interiors) + SLACK_M
-        )
-
 
 @dataclass(frozen=True, slots=True)
 class Host:
@@ -144,7 +135,12 @@ class SupportTracker:
         return _middle_m(self._scene.asset_of(name)) <= math.hypot(width, depth) + SLACK_M
 
     def _find_cavities(self, asset_id: str) -> AssetCavities:
-        return AssetCavities.of(self._scene.assets[asset_id])
+        """Cavities of an asset that has at least one."""
+        interiors = self._scene.assets[asset_id].interiors
+        links = dict.fromkeys(item.link for item in interiors)
+        by_link = ((link, tuple(item for item in interiors if item.link == link)) for link in links)
+        widest_m = max(math.hypot(*item.size_m[:2]) for item in interiors)
+        return AssetCavities(tuple(by_link), widest_m + SLACK_M)
 
     def _find(self, name: str) -> SupportState:
         engine, scene = self._engine, self._scene
