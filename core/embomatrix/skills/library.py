@@ -84,6 +84,10 @@ class SkillDefinition:
 
 
 _AT_HAND: Final = (Precondition.IN_REACH, Precondition.APPROACHABLE, Precondition.ACCESSIBLE)
+_HAND_FREE_FOR: Final = (Precondition.OBJECT_LISTED, Precondition.HAND_FREE)
+_DOOR: Final = (*_HAND_FREE_FOR, Precondition.OPENABLE, *_AT_HAND)
+_SWITCH: Final = (*_HAND_FREE_FOR, Precondition.TOGGLEABLE, *_AT_HAND)
+_BOTH_LISTED: Final = (Precondition.OBJECT_LISTED, Precondition.SOURCE_LISTED)
 _SOURCE_AT_HAND: Final = (
     Precondition.SOURCE_IN_REACH,
     Precondition.SOURCE_APPROACHABLE,
@@ -98,15 +102,11 @@ LIBRARY: Final[Mapping[Skill, SkillDefinition]] = {
         (Precondition.OBJECT_LISTED, Precondition.NOT_CARRIED),
         (FailureReason.NO_STANDING_POSE, FailureReason.NO_PATH),
     ),
-    Skill.TURN: SkillDefinition(
-        "the heading grows by the angle",
-        (),
-    ),
+    Skill.TURN: SkillDefinition("the heading grows by the angle", ()),
     Skill.PICK_UP: SkillDefinition(
         "the hand holds the object, and its relations end",
         (
-            Precondition.OBJECT_LISTED,
-            Precondition.HAND_FREE,
+            *_HAND_FREE_FOR,
             Precondition.PORTABLE,
             Precondition.LIGHT_ENOUGH,
             Precondition.SMALL_ENOUGH,
@@ -134,55 +134,28 @@ LIBRARY: Final[Mapping[Skill, SkillDefinition]] = {
     ),
     Skill.OPEN: SkillDefinition(
         "the object is open",
-        (
-            Precondition.OBJECT_LISTED,
-            Precondition.HAND_FREE,
-            Precondition.OPENABLE,
-            *_AT_HAND,
-            Precondition.IS_CLOSED,
-            Precondition.NOT_RUNNING,
-        ),
+        (*_DOOR, Precondition.IS_CLOSED, Precondition.NOT_RUNNING),
         (FailureReason.DOOR_BLOCKED, FailureReason.ARM_BLOCKED),
     ),
     Skill.CLOSE: SkillDefinition(
         "the object is closed",
-        (
-            Precondition.OBJECT_LISTED,
-            Precondition.HAND_FREE,
-            Precondition.OPENABLE,
-            *_AT_HAND,
-            Precondition.IS_OPEN,
-        ),
+        (*_DOOR, Precondition.IS_OPEN),
         (FailureReason.DOOR_BLOCKED, FailureReason.ARM_BLOCKED),
     ),
     Skill.TOGGLE_ON: SkillDefinition(
         "the object is on",
-        (
-            Precondition.OBJECT_LISTED,
-            Precondition.HAND_FREE,
-            Precondition.TOGGLEABLE,
-            *_AT_HAND,
-            Precondition.IS_OFF,
-            Precondition.CLOSED_TO_START,
-        ),
+        (*_SWITCH, Precondition.IS_OFF, Precondition.CLOSED_TO_START),
         (FailureReason.ARM_BLOCKED,),
     ),
     Skill.TOGGLE_OFF: SkillDefinition(
         "the object is off",
-        (
-            Precondition.OBJECT_LISTED,
-            Precondition.HAND_FREE,
-            Precondition.TOGGLEABLE,
-            *_AT_HAND,
-            Precondition.IS_ON,
-        ),
+        (*_SWITCH, Precondition.IS_ON),
         (FailureReason.ARM_BLOCKED,),
     ),
     Skill.HEAT: SkillDefinition(
         "the object is hot, and no longer frozen",
         (
-            Precondition.OBJECT_LISTED,
-            Precondition.SOURCE_LISTED,
+            *_BOTH_LISTED,
             Precondition.SOURCE_HEATS,
             Precondition.HEATABLE,
             *_SOURCE_AT_HAND,
@@ -192,8 +165,7 @@ LIBRARY: Final[Mapping[Skill, SkillDefinition]] = {
     Skill.COOK: SkillDefinition(
         "the food is cooked and hot",
         (
-            Precondition.OBJECT_LISTED,
-            Precondition.SOURCE_LISTED,
+            *_BOTH_LISTED,
             Precondition.SOURCE_HEATS,
             Precondition.COOKABLE,
             *_SOURCE_AT_HAND,
@@ -203,8 +175,7 @@ LIBRARY: Final[Mapping[Skill, SkillDefinition]] = {
     Skill.FREEZE: SkillDefinition(
         "the object is frozen, and no longer hot",
         (
-            Precondition.OBJECT_LISTED,
-            Precondition.SOURCE_LISTED,
+            *_BOTH_LISTED,
             Precondition.SOURCE_COOLS,
             Precondition.FREEZABLE,
             *_SOURCE_AT_HAND,
@@ -219,8 +190,7 @@ LIBRARY: Final[Mapping[Skill, SkillDefinition]] = {
     Skill.SLICE: SkillDefinition(
         "the object is sliced; if it has pieces, they replace it",
         (
-            Precondition.OBJECT_LISTED,
-            Precondition.SOURCE_LISTED,
+            *_BOTH_LISTED,
             Precondition.SOURCE_CUTS,
             Precondition.SLICEABLE,
             Precondition.SOURCE_HELD,
@@ -234,8 +204,7 @@ LIBRARY: Final[Mapping[Skill, SkillDefinition]] = {
     Skill.CLEAN: SkillDefinition(
         "the substances that the tool removes are off the object",
         (
-            Precondition.OBJECT_LISTED,
-            Precondition.SOURCE_LISTED,
+            *_BOTH_LISTED,
             Precondition.SOURCE_CLEANS,
             Precondition.SOURCE_HELD,
             Precondition.NOT_CARRIED,
@@ -249,8 +218,7 @@ LIBRARY: Final[Mapping[Skill, SkillDefinition]] = {
     Skill.SOAK: SkillDefinition(
         "a cloth is soaked with the liquid of the source; a vessel is filled with it",
         (
-            Precondition.OBJECT_LISTED,
-            Precondition.SOURCE_LISTED,
+            *_BOTH_LISTED,
             Precondition.SOURCE_WETS,
             Precondition.SOAKABLE,
             Precondition.SOURCE_IN_REACH,
