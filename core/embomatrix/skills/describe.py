@@ -1,6 +1,6 @@
 """Observations in words: the effect of a step, and the final state of objects."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -98,11 +98,16 @@ def final_lines(described: Sequence[ObjectDescription]) -> tuple[str, ...]:
 
 def call_in_words(call: SkillCall, table: Sequence[str]) -> str:
     """Format a call with object names in place of indices. Indices outside the table stay numbers."""
+    return words_of(call, lambda index: table[index] if 0 <= index < len(table) else str(index))
+
+
+def words_of(call: SkillCall, name_of: Callable[[int], str]) -> str:
+    """Format a call as its skill and its arguments, objects by the names that ``name_of`` gives to their indices."""
     words = [call.skill.value]
     for arg in SIGNATURES[call.skill]:
         value = getattr(call, arg.value)
-        if arg in (Arg.OBJECT, Arg.SOURCE) and isinstance(value, int) and 0 <= value < len(table):
-            words.append(table[value])
+        if arg in (Arg.OBJECT, Arg.SOURCE) and value is not None:
+            words.append(name_of(value))
         else:
             words.append(f"{value:g}" if isinstance(value, float) else str(value))
     return " ".join(words)

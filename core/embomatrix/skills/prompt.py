@@ -13,21 +13,19 @@ A prompt covers the rows of the task's object table and never contains the goal 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.skills.syntax import PROFILES, SIGNATURES, Arg, PlaceRelation, Plan, Skill, SkillCall
+from embomatrix.skills.describe import words_of
+from embomatrix.skills.syntax import PROFILES, SIGNATURES, Arg, PlaceRelation, Plan, Skill
 from embomatrix.world.state import OPEN_FRACTION, Relation, State
 from embomatrix.world.substances import MEANINGS, facts_of, in_words
 from embomatrix.world.task import Profile, Task
 
 if TYPE_CHECKING:
     from embomatrix.world.scene import Scene, SceneObject
-
-
-_RowName = Callable[[int | None], str]
 
 
 class Codec(StrEnum):
@@ -297,24 +295,7 @@ _SYSTEM: Final[Mapping[tuple[Codec, Profile], str]] = {
 def plan_in_names(plan: Plan, situation: Situation) -> str:
     """Write a plan in the ``names`` codec, one call a line. Rows that the situation lacks are named ``row_<index>``."""
     label = labels(situation)
-
-    def row_name(index: int | None) -> str:
-        return label.get(-1 if index is None else index, f"row_{index}")
-
-    return "\n".join(" ".join([call.skill.value, *_arguments(call, row_name)]) for call in plan)
-
-
-def _arguments(call: SkillCall, row_name: _RowName) -> list[str]:
-    words: list[str] = []
-    for argument in SIGNATURES[call.skill]:
-        if argument is Arg.OBJECT:
-            words.append(row_name(call.object_index))
-        elif argument is Arg.SOURCE:
-            words.append(row_name(call.source_index))
-        else:
-            value = getattr(call, argument.value)
-            words.append(f"{value:g}" if isinstance(value, float) else str(value))
-    return words
+    return "\n".join(words_of(call, lambda index: label.get(index, f"row_{index}")) for call in plan)
 
 
 _SKILLS: Final = frozenset(Skill)

@@ -15,7 +15,7 @@ from embomatrix.sim.blockers import path_refusal, room_refusal
 from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.live_world import LiveWorld
-from embomatrix.sim.physical.doors import close_all, open_all
+from embomatrix.sim.physical.doors import move_panels
 from embomatrix.sim.physical.pick import pick_up
 from embomatrix.sim.physical.place import place
 from embomatrix.sim.physical.press import press
@@ -144,8 +144,8 @@ MOTIONS: Final[Mapping[Skill, Motion]] = {
     Skill.PICK_UP: lambda stage, call, rng: pick_up(stage, target_of(stage.world, call)),
     Skill.PLACE: place,
     Skill.MOVE_FORWARD: _move_forward,
-    Skill.OPEN: lambda stage, call, rng: open_all(stage, target_of(stage.world, call)),
-    Skill.CLOSE: lambda stage, call, rng: close_all(stage, target_of(stage.world, call)),
+    Skill.OPEN: lambda stage, call, rng: move_panels(stage, target_of(stage.world, call), 1.0),
+    Skill.CLOSE: lambda stage, call, rng: move_panels(stage, target_of(stage.world, call), 0.0),
     Skill.TOGGLE_ON: _toggle,
     Skill.TOGGLE_OFF: _toggle,
     Skill.HEAT: _wait,

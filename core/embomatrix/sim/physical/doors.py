@@ -135,17 +135,11 @@ def panels_of(stage: PhysicalStage, name: str) -> list[DoorPanel]:
     ]
 
 
-def open_all(stage: PhysicalStage, name: str) -> SkillRefusal | None:
-    """Open every panel, the low ones first. Fails, and leaves its changes, if one does not get half open."""
-    return _move_all(stage, name, 1.0)
+def move_panels(stage: PhysicalStage, name: str, goal: float) -> SkillRefusal | None:
+    """Open every panel, the low ones first (``goal`` 1), or shut every panel, the high ones first (``goal`` 0).
 
-
-def close_all(stage: PhysicalStage, name: str) -> SkillRefusal | None:
-    """Shut every panel, the high ones first."""
-    return _move_all(stage, name, 0.0)
-
-
-def _move_all(stage: PhysicalStage, name: str, goal: float) -> SkillRefusal | None:
+    Fails, and leaves its changes, if a panel does not get half open, or shut.
+    """
     if not stage.dynamic.bodies.has_panels(name):
         return refuse(FailureReason.ARM_BLOCKED, target=name, other=name)
     home = stage.commanded

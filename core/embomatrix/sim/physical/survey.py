@@ -7,7 +7,7 @@ for arm paths once, in the initial scene, with the search of physical mode. Noth
 import contextlib
 import hashlib
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -20,8 +20,7 @@ from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical.doors import (
     STRETCHES,
     DoorPanel,
-    close_all,
-    open_all,
+    move_panels,
     panel_paths,
     panels_in_order,
 )
@@ -34,7 +33,6 @@ from embomatrix.sim.physical.stage import AROUND_M, PhysicalStage
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.sim.placing.pose_cache import Contents
 from embomatrix.skills.limits import ROBOT
-from embomatrix.skills.view import SkillRefusal
 from embomatrix.world.asset import Asset
 from embomatrix.world.geometry import IDENTITY, FloatArray
 from embomatrix.world.poses import Handling, PoseCache, StandPose
@@ -44,11 +42,8 @@ Look = tuple[int | None, str]
 
 STANDS: Final = 2
 """Standing poses to examine. More add little, because the robot steps aside to work."""
-TRIALS: Final[Mapping[Handling, Callable[[PhysicalStage, str], SkillRefusal | None]]] = {
-    Handling.OPEN: open_all,
-    Handling.CLOSE: close_all,
-}
-"""Door handlings, which the survey tries in simulated time if no path is found."""
+DOOR_GOALS: Final[Mapping[Handling, float]] = {Handling.OPEN: 1.0, Handling.CLOSE: 0.0}
+"""Share of the travel that each door handling aims at. The survey tries these in simulated time if no path is found."""
 SEEN_M: Final = ROBOT.reach_m + AROUND_M
 """Objects farther than this from a door have no influence on its reachability."""
 
@@ -137,9 +132,9 @@ class _Surveyor:
         """Return the first suitable standing pose; else None and the blocker."""
         self._make_ready(name, handling)
         # Motions of doors try other standing poses themselves.
-        looks = 1 if handling in TRIALS else STANDS
+        looks = 1 if handling in DOOR_GOALS else STANDS
         stands = self._world.navigator.stands(name, self._world.navigator.start)[:looks]
-        if handling not in TRIALS:
+        if handling not in DOOR_GOALS:
             number, other = self._look_from(stands, name, handling)
         else:
             key = self._surroundings(name, handling, stands)
@@ -158,7 +153,7 @@ class _Surveyor:
             if not other:
                 return number, ""
         # Panels make room for each other as they move, so doors that seem blocked are tried in simulated time.
-        if stands and handling in TRIALS and self._does(stands[0], name, handling):
+        if stands and handling in DOOR_GOALS and self._does(stands[0], name, handling):
             return 0, ""
         return None, other
 
@@ -167,7 +162,7 @@ class _Surveyor:
         self._make_ready(name, handling)
         self._world.robot = stand
         self._stage.begin()
-        refusal = TRIALS[handling](self._stage, name)
+        refusal = move_panels(self._stage, name, DOOR_GOALS[handling])
         self._world.hand.forget()
         self._stage.grip = None
         return refusal is None
@@ -207,10 +202,8 @@ class _Surveyor:
                 return self._paths_blocker(reach, reach.paths(tool_paths, bases))
             case Handling.PRESS:
                 return self._paths_blocker(*press_paths(self._stage, name))
-            case Handling.OPEN:
-                return self._panels_blocker(name, 1.0)
-            case Handling.CLOSE:
-                return self._panels_blocker(name, 0.0)
+            case Handling.OPEN | Handling.CLOSE:
+                return self._panels_blocker(name, DOOR_GOALS[handling])
 
     def _paths_blocker(self, reach: ArmReach, paths: Iterator[ArmPath]) -> str:
         """Return the blocker of all paths; "" if the arm reaches the start of one of them."""
