@@ -23,7 +23,6 @@ from embomatrix.world.goal import (
     Forall,
     Formula,
     ForN,
-    ForNPairs,
     ForPairs,
     Imply,
     Not,
@@ -304,10 +303,8 @@ class _Reader:
                 return Exists(variable, type_name, body)
             case "forn":
                 return ForN(count, variable, type_name, body)
-            case "forpairs":
-                return ForPairs(*binders[0], *binders[1], body)
             case _:
-                return ForNPairs(count, *binders[0], *binders[1], body)
+                return ForPairs(*binders[0], *binders[1], body, count if counted else None)
 
     def _binder(self, node: _Node) -> tuple[str, str]:
         words = [item.word.lower() for item in node.items]

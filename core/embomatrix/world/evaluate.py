@@ -16,7 +16,6 @@ from embomatrix.world.goal import (
     Forall,
     Formula,
     ForN,
-    ForNPairs,
     ForPairs,
     Imply,
     Not,
@@ -50,7 +49,7 @@ def _holds(formula: Formula, facts: Facts, types: Types, scope: Mapping[str, str
             return not _holds(premise, facts, types, scope) or _holds(conclusion, facts, types, scope)
         case Forall() | Exists() | ForN():
             return _holds_quantified(formula, facts, types, scope)
-        case ForPairs() | ForNPairs():
+        case ForPairs():
             return _holds_pairs(formula, facts, types, scope)
 
 
@@ -68,7 +67,7 @@ def _holds_quantified(
             return sum(cases) == count
 
 
-def _holds_pairs(formula: ForPairs | ForNPairs, facts: Facts, types: Types, scope: Mapping[str, str]) -> bool:
+def _holds_pairs(formula: ForPairs, facts: Facts, types: Types, scope: Mapping[str, str]) -> bool:
     """Evaluate a pair quantifier; rows are the objects of the first type.
 
     A pair of an object with itself has no cell, as in ``bddl``. The columns of a table over one type are the places left in a
@@ -85,7 +84,7 @@ def _holds_pairs(formula: ForPairs | ForNPairs, facts: Facts, types: Types, scop
         for a in rows
     ]  # (rows, columns)
     width = min((len(row) for row in table), default=0)
-    needed = formula.count if isinstance(formula, ForNPairs) else min(len(table), width)
+    needed = min(len(table), width) if formula.count is None else formula.count
     true_rows = sum(any(row) for row in table)
     true_columns = sum(any(row[index] for row in table) for index in range(width))
     return true_rows >= needed and true_columns >= needed
@@ -177,7 +176,7 @@ def types_of(formula: Formula) -> frozenset[str]:
     for part in subformulas(formula):
         if isinstance(part, Forall | Exists | ForN):
             found.add(part.type)
-        elif isinstance(part, ForPairs | ForNPairs):
+        elif isinstance(part, ForPairs):
             found |= {part.type_a, part.type_b}
     return frozenset(found)
 
@@ -216,7 +215,6 @@ def render(formula: Formula) -> str:
             return f"(exists ({variable} - {type_name}) {render(body)})"
         case ForN(count, variable, type_name, body):
             return f"(forn ({count}) ({variable} - {type_name}) {render(body)})"
-        case ForPairs(a, type_a, b, type_b, body):
-            return f"(forpairs ({a} - {type_a}) ({b} - {type_b}) {render(body)})"
-        case ForNPairs(count, a, type_a, b, type_b, body):
-            return f"(fornpairs ({count}) ({a} - {type_a}) ({b} - {type_b}) {render(body)})"
+        case ForPairs(a, type_a, b, type_b, body, count):
+            word = "forpairs" if count is None else f"fornpairs ({count})"
+            return f"({word} ({a} - {type_a}) ({b} - {type_b}) {render(body)})"

@@ -67,26 +67,18 @@ class ForN:
 
 @dataclass(frozen=True, slots=True)
 class ForPairs:
-    """Quantifier over pairs: at least min(|A|, |B|) rows and as many columns of the truth table over A x B hold a true cell."""
+    """Quantifier over pairs: at least ``count`` rows and as many columns of the truth table over A x B hold a true cell.
+
+    Without a count, it is the smaller number of objects: BDDL writes ``forpairs``, and ``fornpairs`` with a count.
+    """
 
     variable_a: str
     type_a: str
     variable_b: str
     type_b: str
     body: Formula
+    count: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class ForNPairs:
-    """Variant of ``ForPairs`` with ``count`` in place of the smaller number of objects."""
-
-    count: int
-    variable_a: str
-    type_a: str
-    variable_b: str
-    type_b: str
-    body: Formula
-
-
-Compound = Not | And | Or | Imply | Forall | Exists | ForN | ForPairs | ForNPairs
+Compound = Not | And | Or | Imply | Forall | Exists | ForN | ForPairs
 Formula = Atom | Compound

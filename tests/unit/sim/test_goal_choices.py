@@ -13,7 +13,6 @@ from embomatrix.world.goal import (
     Exists,
     Forall,
     ForN,
-    ForNPairs,
     ForPairs,
     Imply,
     Not,
@@ -95,7 +94,7 @@ def test_pairs_use_every_tray_once():
 
 
 def test_n_pairs_use_the_requested_number():
-    assert len(first(ForNPairs(1, "?c", "cup", "?t", "tray", on("?c", "?t")))) == 1
+    assert len(first(ForPairs("?c", "cup", "?t", "tray", on("?c", "?t"), 1))) == 1
 
 
 def test_contradictory_goal_has_no_choice():

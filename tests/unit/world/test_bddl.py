@@ -19,7 +19,6 @@ from embomatrix.world.goal import (
     Forall,
     Formula,
     ForN,
-    ForNPairs,
     ForPairs,
     Imply,
     Not,
@@ -229,7 +228,7 @@ def formulas() -> st.SearchStrategy[Formula]:
             st.builds(Exists, st.just("?w"), types, inner),
             st.builds(ForN, st.integers(0, 9), st.just("?v"), types, inner),
             st.builds(ForPairs, st.just("?v"), types, st.just("?w"), types, inner),
-            st.builds(ForNPairs, st.integers(0, 9), st.just("?v"), types, st.just("?w"), types, inner),
+            st.builds(ForPairs, st.just("?v"), types, st.just("?w"), types, inner, st.integers(0, 9)),
         )
 
     return st.recursive(atoms, grow, max_leaves=8).map(lambda body: Forall("?v", "a", body))

@@ -20,7 +20,6 @@ from embomatrix.world.goal import (
     Forall,
     Formula,
     ForN,
-    ForNPairs,
     ForPairs,
     Imply,
     Not,
@@ -67,11 +66,10 @@ def lists_of(formula: Formula) -> list[Any]:
             return [word, [variable.lstrip("?"), "-", kind], lists_of(body)]
         case ForN(count, variable, kind, body):
             return ["forn", [str(count)], [variable.lstrip("?"), "-", kind], lists_of(body)]
-        case ForPairs(a, kind_a, b, kind_b, body):
-            return ["forpairs", [a.lstrip("?"), "-", kind_a], [b.lstrip("?"), "-", kind_b], lists_of(body)]
-        case ForNPairs(count, a, kind_a, b, kind_b, body):
+        case ForPairs(a, kind_a, b, kind_b, body, count):
             binders = [[a.lstrip("?"), "-", kind_a], [b.lstrip("?"), "-", kind_b]]
-            return ["fornpairs", [str(count)], *binders, lists_of(body)]
+            head = ["forpairs"] if count is None else ["fornpairs", [str(count)]]
+            return [*head, *binders, lists_of(body)]
 
 
 def unmarked(nested: Any) -> Any:
@@ -215,7 +213,7 @@ def formulas(draw: st.DrawFn, scope: tuple[str, ...] = (), depth: int = 3) -> Fo
             return ForPairs(variables[0], draw(kinds), variables[1], draw(kinds), inner(*variables))
         case _:
             count = draw(st.integers(0, 2))
-            return ForNPairs(count, variables[0], draw(kinds), variables[1], draw(kinds), inner(*variables))
+            return ForPairs(variables[0], draw(kinds), variables[1], draw(kinds), inner(*variables), count)
 
 
 @settings(max_examples=300, deadline=None)

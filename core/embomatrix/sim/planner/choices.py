@@ -14,7 +14,6 @@ from embomatrix.world.goal import (
     Forall,
     Formula,
     ForN,
-    ForNPairs,
     ForPairs,
     Imply,
     Not,
@@ -109,7 +108,7 @@ class _Alternatives:
                 )
             case ForN(count, variable, type_name, body):
                 return self._exactly(count, self._ground(body, variable, type_name), positive=positive)
-            case ForPairs() | ForNPairs():
+            case ForPairs():
                 return self._paired(formula) if positive else self._unpaired(formula)
 
     def _ground(self, body: Formula, variable: str, type_name: str) -> list[Formula]:
@@ -137,16 +136,12 @@ class _Alternatives:
                 found += self._joined(wanted, positive=True, every=True)
         return self._best(found)
 
-    def _sides(self, formula: ForPairs | ForNPairs) -> tuple[tuple[str, ...], tuple[str, ...], int]:
+    def _sides(self, formula: ForPairs) -> tuple[tuple[str, ...], tuple[str, ...], int]:
         """Return the objects on both sides of a pair quantifier, and the number of pairs that it needs."""
         rows, columns = (self.types.get(name, ()) for name in (formula.type_a, formula.type_b))
-        return (
-            rows,
-            columns,
-            formula.count if isinstance(formula, ForNPairs) else min(len(rows), len(columns)),
-        )
+        return rows, columns, min(len(rows), len(columns)) if formula.count is None else formula.count
 
-    def _paired(self, formula: ForPairs | ForNPairs) -> list[Choice]:
+    def _paired(self, formula: ForPairs) -> list[Choice]:
         """Return choices of one-to-one pairs."""
         rows, columns, needed = self._sides(formula)
         found: list[Choice] = []
@@ -158,7 +153,7 @@ class _Alternatives:
                     found += self._joined(cells, positive=True, every=True)
         return self._best(found)
 
-    def _unpaired(self, formula: ForPairs | ForNPairs) -> list[Choice]:
+    def _unpaired(self, formula: ForPairs) -> list[Choice]:
         """Return choices that leave too few rows, or too few columns, with a true cell."""
         rows, columns, needed = self._sides(formula)
         found: list[Choice] = []
@@ -192,7 +187,7 @@ class _Alternatives:
         return (impossible, self._cost(choice), _chained(choice), -preferred)
 
 
-def _cell(formula: ForPairs | ForNPairs, a: str, b: str) -> Formula:
+def _cell(formula: ForPairs, a: str, b: str) -> Formula:
     return substitute(formula.body, {formula.variable_a: a, formula.variable_b: b})
 
 

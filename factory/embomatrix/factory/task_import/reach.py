@@ -19,7 +19,6 @@ from embomatrix.world.goal import (
     Forall,
     Formula,
     ForN,
-    ForNPairs,
     ForPairs,
     Imply,
     Not,
@@ -100,7 +99,7 @@ def literals(
             yield from literals(conclusion, positive, scope)
         case Forall(variable, kind, body) | Exists(variable, kind, body) | ForN(_, variable, kind, body):
             yield from literals(body, positive, {**scope, variable: kind})
-        case ForPairs(a, kind_a, b, kind_b, body) | ForNPairs(_, a, kind_a, b, kind_b, body):
+        case ForPairs(a, kind_a, b, kind_b, body):
             yield from literals(body, positive, {**scope, a: kind_a, b: kind_b})
 
 
@@ -144,7 +143,7 @@ class Reachability:
                 return self._several(self._ground(variable, type_name, body), positive, every=not positive)
             case ForN(count, variable, type_name, body):
                 return not positive or self._exactly(count, self._ground(variable, type_name, body))
-            case ForPairs() | ForNPairs():
+            case ForPairs():
                 return not positive or self._paired(formula)
 
     def _several(self, parts: tuple[Formula, ...], positive: bool, *, every: bool) -> bool:
@@ -155,10 +154,10 @@ class Reachability:
         never = sum(not self.possible(part) for part in parts)
         return always <= count <= len(parts) - never
 
-    def _paired(self, formula: ForPairs | ForNPairs) -> bool:
+    def _paired(self, formula: ForPairs) -> bool:
         rows = self._problem.types[formula.type_a]
         columns = self._problem.types[formula.type_b]
-        needed = formula.count if isinstance(formula, ForNPairs) else min(len(rows), len(columns))
+        needed = min(len(rows), len(columns)) if formula.count is None else formula.count
         table = [
             [
                 self.possible(substitute(formula.body, {formula.variable_a: row, formula.variable_b: column}))

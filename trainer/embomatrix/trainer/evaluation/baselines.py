@@ -24,7 +24,6 @@ from embomatrix.world.goal import (
     Forall,
     Formula,
     ForN,
-    ForNPairs,
     ForPairs,
     Imply,
     Not,
@@ -129,7 +128,7 @@ class _Script:
                 yield from self._ground(body, variable, self._types[kind][:1])
             case ForN(count, variable, kind, body):
                 yield from self._ground(body, variable, self._types[kind][:count])
-            case ForPairs(a, kind_a, b, kind_b, body) | ForNPairs(_, a, kind_a, b, kind_b, body):
+            case ForPairs(a, kind_a, b, kind_b, body):
                 for one, other in zip(self._types[kind_a], self._types[kind_b], strict=False):
                     yield from self._literals(substitute(body, {a: one, b: other}))
             case _:
