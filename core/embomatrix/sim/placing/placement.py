@@ -93,7 +93,9 @@ class Placer:
         if not is_upright(self._engine.pose(target)):
             return fails
         reached = self._reached_in_set(held, target, relation)
-        search = self._search(held, target, relation, robot, excluded_stands)
+        search = PlacementSearch(
+            self._engine, self._relations, self.options, held, target, relation, robot, excluded_stands
+        )
         poses = search.poses(rng, reached)
         found = self._first(most, held, poses if reached is not None else self._takeable_first(search, poses))
         if found:
@@ -111,20 +113,8 @@ class Placer:
         options = next(self.options.verified(held, target, relation), None)
         if options is None or held == target or not is_upright(self._engine.pose(target)):
             return ()
-        search = self._search(held, target, relation, robot)
+        search = PlacementSearch(self._engine, self._relations, self.options, held, target, relation, robot)
         return self._first(most, held, search.accepted(options, range(len(options))))
-
-    def _search(
-        self,
-        held: str,
-        target: str,
-        relation: Relation,
-        robot: StandPose,
-        excluded_stands: tuple[StandPose, ...] = (),
-    ) -> PlacementSearch:
-        return PlacementSearch(
-            self._engine, self._relations, self.options, held, target, relation, robot, excluded_stands
-        )
 
     def _first(self, most: int, held: str, found: Iterator[T]) -> tuple[T, ...]:
         """First results of a search, which moves the held object. The object is parked again afterwards."""
