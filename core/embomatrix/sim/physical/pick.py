@@ -41,7 +41,7 @@ def pick_up(stage: PhysicalStage, target: str) -> SkillRefusal | None:
     """Pick up an object in reach."""
     home = stage.commanded
     for _ in range(ATTEMPTS):
-        refusal = _take(stage, target)
+        refusal = take_by(stage, target, *pick_paths(stage, target))
         if refusal is None or not _was_pushed(stage, target):
             break
         stage.settle()
@@ -58,11 +58,6 @@ def _was_pushed(stage: PhysicalStage, name: str) -> bool:
     """True if an object was moved, so that the planned paths miss it."""
     now, then = stage.dynamic.bodies.pose(name), stage.world.engine.pose(name)
     return stage.grip is None and math.dist(now.position_m, then.position_m) > PUSHED_M
-
-
-def _take(stage: PhysicalStage, target: str) -> SkillRefusal | None:
-    tool_paths, roofed, bases = pick_paths(stage, target)
-    return take_by(stage, target, tool_paths, roofed, bases)
 
 
 def pick_paths(stage: PhysicalStage, target: str) -> tuple[list[ToolPath], int, list[FloatArray]]:

@@ -12,7 +12,7 @@ from embomatrix.sim.actions import other_stands
 from embomatrix.sim.physical.fold import fold
 from embomatrix.sim.physical.grasp import grasp_tool_paths
 from embomatrix.sim.physical.pick import bases_at, entry, take_by
-from embomatrix.sim.physical.put import PutRequest, drop, put
+from embomatrix.sim.physical.put import PutRequest, put
 from embomatrix.sim.physical.reach import ToolPath
 from embomatrix.sim.physical.stage import Grip, PhysicalStage
 from embomatrix.sim.physical.travel import travel
@@ -77,7 +77,7 @@ def place(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> Sk
         if regrasp(stage, found, is_valid, home):
             refusal = put(stage, found, is_valid, target)
         if refusal is not None and stage.grip is not None:
-            refusal = drop(stage, found, is_valid, target)
+            refusal = put(stage, found, is_valid, target, dropped=True)
     fold(stage, home, target)
     if stage.grip is not None:
         return refusal

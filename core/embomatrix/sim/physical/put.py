@@ -157,36 +157,23 @@ def _at(option: PutPose) -> tuple[Pose, float, float | None]:
 
 
 def put(
-    stage: PhysicalStage, poses: Sequence[Pose], is_valid: Callable[[], bool], target: str
+    stage: PhysicalStage,
+    poses: Sequence[Pose],
+    is_valid: Callable[[], bool],
+    target: str,
+    *,
+    dropped: bool = False,
 ) -> SkillRefusal | None:
     """Bring the held object to the first reachable pose, let go, and draw the hand back.
 
-    ``is_valid`` checks the object's present pose in the planning scene. A refusal names the target if no other
-    blocker is known. The object may then still be in the hand.
+    With ``dropped``, let go at the least height above one of the poses. ``is_valid`` checks the object's present pose in the
+    planning scene. A refusal names the target if no other blocker is known. The object may then still be in the hand.
     """
-    assert stage.grip is not None
-    request = PutRequest(stage, stage.grip, poses, is_valid)
-    return _bring(stage, request, request.paths(), target)
-
-
-def drop(
-    stage: PhysicalStage, poses: Sequence[Pose], is_valid: Callable[[], bool], target: str
-) -> SkillRefusal | None:
-    """Drop the held object from the least height above one of the poses. Arguments and result are those of ``put``."""
-    assert stage.grip is not None
-    request = PutRequest(stage, stage.grip, poses, is_valid)
-    return _bring(stage, request, request.drops(), target)
-
-
-def _bring(
-    stage: PhysicalStage,
-    request: PutRequest,
-    paths: Iterator[ArmPath],
-    target: str,
-) -> SkillRefusal | None:
     grip = stage.grip
     assert grip is not None
+    request = PutRequest(stage, grip, poses, is_valid)
     refusal = None
+    paths = request.drops() if dropped else request.paths()
     for path, refusal in arrivals(stage, paths, request.reach, loaded=True):
         if refusal is None:
             return _set_down(stage, path)
