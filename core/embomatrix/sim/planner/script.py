@@ -136,9 +136,7 @@ class PlanScript:
 
     def use_on(self, skill: Skill, name: str, source: str, at: str) -> None:
         """Use a source or a tool on an object, from beside ``at``."""
-        step = self._calls.use_on(skill, name, source, at)
-        if not step.ok:
-            raise StuckError(_sentence(step))
+        _check(self._calls.use_on(skill, name, source, at))
 
     def unload(self, name: str) -> None:
         """Put away the objects that rest on an object."""
@@ -213,8 +211,7 @@ class PlanScript:
         while step.failure is FailureReason.TOO_HEAVY and len(cargo := self._world.cargo(name)) > 1:
             self._unload(cargo[1], name, depth)
             step = self._calls.use(Skill.PICK_UP, name)
-        if not step.ok:
-            raise StuckError(_sentence(step))
+        _check(step)
 
     def _unload(self, burden: str, name: str, depth: int) -> None:
         if depth == DEPTH:
@@ -237,9 +234,13 @@ class PlanScript:
         self._use(skill, name)
 
     def _use(self, skill: Skill, name: str) -> None:
-        step = self._calls.use(skill, name)
-        if not step.ok:
-            raise StuckError(_sentence(step))
+        _check(self._calls.use(skill, name))
+
+
+def _check(step: Step) -> None:
+    """Raise StuckError for a step that failed."""
+    if not step.ok:
+        raise StuckError(_sentence(step))
 
 
 def _sentence(step: Step) -> str:
