@@ -131,7 +131,7 @@ def converters(
     writers: dict[str, Callable[[Any], Any]] = {}
     for name in names:
         field: Any = message_type.DESCRIPTOR.fields_by_name[name]
-        repeated = field.label == FieldDescriptor.LABEL_REPEATED
+        repeated = field.default_value == []  # protobuf 7 has no `label`, protobuf 5 no `is_repeated`
         if enums and name in enums:
             writers[name], readers[name] = _enum(enums[name])
         elif parts and name in parts:
