@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from tests.fakes import furniture as make
+from tests.fakes.formulas import exists, forall, forn, forpairs
 from tests.fakes.plans import task_over, words_of
 from tests.fakes.pose_caches import build_pose_cache
 from tests.fakes.scenes import NORTH, SOUTH, WEST, placed, scene_of, upright
@@ -25,7 +26,7 @@ from embomatrix.skills.check import check
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.evaluate import evaluate, render
-from embomatrix.world.goal import And, Atom, Exists, Forall, ForN, ForPairs, Imply, Not, Or
+from embomatrix.world.goal import And, Atom, Imply, Not, Or
 from embomatrix.world.state import Relation, State
 
 if TYPE_CHECKING:
@@ -268,13 +269,13 @@ def _quantified(task: Task, atoms: Sequence[Atom], rng: np.random.Generator) -> 
     first, *rest = atom.args
     body = Atom(atom.predicate, ("?a", *rest))
     forms: list[Formula] = [
-        Forall("?a", kinds[first], body),
-        Exists("?a", kinds[first], body),
-        ForN(1, "?a", kinds[first], body),
-        Forall("?a", kinds[first], Not(body)),
+        forall("?a", kinds[first], body),
+        exists("?a", kinds[first], body),
+        forn(1, "?a", kinds[first], body),
+        forall("?a", kinds[first], Not(body)),
     ]
     if rest and rest[0] in kinds:
-        forms.append(ForPairs("?a", kinds[first], "?b", kinds[rest[0]], Atom(atom.predicate, ("?a", "?b"))))
+        forms.append(forpairs("?a", kinds[first], "?b", kinds[rest[0]], Atom(atom.predicate, ("?a", "?b"))))
     return forms[int(rng.integers(len(forms)))]
 
 

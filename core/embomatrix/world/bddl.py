@@ -16,18 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Final, NoReturn
 
 from embomatrix.world.evaluate import atoms_of, render
-from embomatrix.world.goal import (
-    And,
-    Atom,
-    Exists,
-    Forall,
-    Formula,
-    ForN,
-    ForPairs,
-    Imply,
-    Not,
-    Or,
-)
+from embomatrix.world.goal import And, Atom, Formula, Imply, Not, Or, Quantified, Quantifier
 from embomatrix.world.state import SubstanceRelation
 from embomatrix.world.substances import is_substance
 
@@ -283,28 +272,19 @@ class _Reader:
             case "imply":
                 self._expect(node, 2)
                 return Imply(self.formula(rest[0], scope), self.formula(rest[1], scope))
-            case "forall" | "exists" | "forn" | "forpairs" | "fornpairs":
-                return self._quantified(node, scope)
+            case word if word in set(Quantifier):
+                return self._quantified(node, Quantifier(word), scope)
             case _:
                 return self._atom(node, scope)
 
-    def _quantified(self, node: _Node, scope: Mapping[str, str]) -> Formula:
-        counted = node.head in {"forn", "fornpairs"}
-        self._expect(node, (2 if node.head in {"forall", "exists", "forn"} else 3) + counted)
+    def _quantified(self, node: _Node, quantifier: Quantifier, scope: Mapping[str, str]) -> Quantified:
+        counted = quantifier in {Quantifier.FORN, Quantifier.FORNPAIRS}
+        paired = quantifier in {Quantifier.FORPAIRS, Quantifier.FORNPAIRS}
+        self._expect(node, 2 + counted + paired)
         rest = node.items[1:]
-        count = _count(rest[0]) if counted else 0
-        binders = [self._binder(item) for item in rest[int(counted) : -1]]
-        body = self.formula(rest[-1], {**scope, **dict(binders)})
-        variable, type_name = binders[0]
-        match node.head:
-            case "forall":
-                return Forall(variable, type_name, body)
-            case "exists":
-                return Exists(variable, type_name, body)
-            case "forn":
-                return ForN(count, variable, type_name, body)
-            case _:
-                return ForPairs(*binders[0], *binders[1], body, count if counted else None)
+        count = _count(rest[0]) if counted else None
+        binders = tuple(self._binder(item) for item in rest[int(counted) : -1])
+        return Quantified(quantifier, binders, self.formula(rest[-1], {**scope, **dict(binders)}), count)
 
     def _binder(self, node: _Node) -> tuple[str, str]:
         words = [item.word.lower() for item in node.items]

@@ -7,20 +7,7 @@ tests compare with its evaluator.
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 
-from embomatrix.world.goal import (
-    And,
-    Atom,
-    Compound,
-    Exists,
-    Facts,
-    Forall,
-    Formula,
-    ForN,
-    ForPairs,
-    Imply,
-    Not,
-    Or,
-)
+from embomatrix.world.goal import And, Atom, Compound, Facts, Formula, Imply, Not, Or, Quantified, Quantifier
 from embomatrix.world.substances import is_substance
 
 Types = Mapping[str, tuple[str, ...]]
@@ -47,37 +34,32 @@ def _holds(formula: Formula, facts: Facts, types: Types, scope: Mapping[str, str
             return any(_holds(part, facts, types, scope) for part in parts)
         case Imply(premise, conclusion):
             return not _holds(premise, facts, types, scope) or _holds(conclusion, facts, types, scope)
-        case Forall() | Exists() | ForN():
-            return _holds_quantified(formula, facts, types, scope)
-        case ForPairs():
-            return _holds_pairs(formula, facts, types, scope)
+        case Quantified():
+            hold = _holds_each if len(formula.binders) == 1 else _holds_pairs
+            return hold(formula, facts, types, scope)
 
 
-def _holds_quantified(
-    formula: Forall | Exists | ForN, facts: Facts, types: Types, scope: Mapping[str, str]
-) -> bool:
-    members = _members(formula.type, types)
-    cases = (_holds(formula.body, facts, types, {**scope, formula.variable: name}) for name in members)
-    match formula:
-        case Forall():
-            return all(cases)
-        case Exists():
-            return any(cases)
-        case ForN(count):
-            return sum(cases) == count
+def _holds_each(formula: Quantified, facts: Facts, types: Types, scope: Mapping[str, str]) -> bool:
+    [(variable, type_name)] = formula.binders
+    members = _members(type_name, types)
+    cases = (_holds(formula.body, facts, types, {**scope, variable: name}) for name in members)
+    if formula.quantifier is Quantifier.FORALL:
+        return all(cases)
+    return any(cases) if formula.quantifier is Quantifier.EXISTS else sum(cases) == formula.count
 
 
-def _holds_pairs(formula: ForPairs, facts: Facts, types: Types, scope: Mapping[str, str]) -> bool:
+def _holds_pairs(formula: Quantified, facts: Facts, types: Types, scope: Mapping[str, str]) -> bool:
     """Evaluate a pair quantifier; rows are the objects of the first type.
 
     A pair of an object with itself has no cell, as in ``bddl``. The columns of a table over one type are the places left in a
     row: one fewer than rows.
     """
-    rows = _members(formula.type_a, types)
-    columns = _members(formula.type_b, types)
+    (variable_a, type_a), (variable_b, type_b) = formula.binders
+    rows = _members(type_a, types)
+    columns = _members(type_b, types)
     table = [
         [
-            _holds(formula.body, facts, types, {**scope, formula.variable_a: a, formula.variable_b: b})
+            _holds(formula.body, facts, types, {**scope, variable_a: a, variable_b: b})
             for b in columns
             if b != a
         ]
@@ -111,21 +93,49 @@ def scored_atoms(formula: Formula, types: Types) -> tuple[Formula, ...]:
     match formula:
         case And(parts):
             return tuple(atom for part in parts for atom in scored_atoms(part, types))
-        case Forall(variable, type_name, body):
-            return tuple(
-                atom
-                for name in _members(type_name, types)
-                for atom in scored_atoms(substitute(body, {variable: name}), types)
-            )
+        case Quantified(Quantifier.FORALL):
+            return scored_atoms(And(instances(formula, types)), types)
         case _:
             return (formula,)
+
+
+def expand(formula: Formula, types: Types) -> Atom | Not | And | Or | Quantified:
+    """Rewrite an outermost implication, ``forall`` or ``exists`` with ``not``, ``and`` and ``or``."""
+    match formula:
+        case Imply(premise, conclusion):
+            return Or((Not(premise), conclusion))
+        case Quantified(Quantifier.FORALL):
+            return And(instances(formula, types))
+        case Quantified(Quantifier.EXISTS):
+            return Or(instances(formula, types))
+        case _:
+            return formula
+
+
+def instance(formula: Quantified, *names: str) -> Formula:
+    """Body of a quantifier with these objects as its variables."""
+    return substitute(
+        formula.body, {variable: name for (variable, _), name in zip(formula.binders, names, strict=True)}
+    )
+
+
+def instances(formula: Quantified, types: Types) -> tuple[Formula, ...]:
+    """Bodies of a quantifier with one variable, one for each object of its type."""
+    [(_, type_name)] = formula.binders
+    return tuple(instance(formula, name) for name in _members(type_name, types))
+
+
+def pair_sides(formula: Quantified, types: Types) -> tuple[tuple[str, ...], tuple[str, ...], int]:
+    """Objects on both sides of a pair quantifier, and the number of pairs that it needs."""
+    rows, columns = (_members(type_name, types) for _, type_name in formula.binders)
+    return rows, columns, min(len(rows), len(columns)) if formula.count is None else formula.count
 
 
 def substitute(formula: Formula, names: Mapping[str, str]) -> Formula:
     """Replace free arguments, variables and objects alike. Quantifiers shadow their variables."""
     if isinstance(formula, Atom):
         return Atom(formula.predicate, tuple(names.get(arg, arg) for arg in formula.args))
-    bound = {getattr(formula, field, "") for field in ("variable", "variable_a", "variable_b")}
+    bound = dict(formula.binders) if isinstance(formula, Quantified) else {}
     free = {arg: name for arg, name in names.items() if arg not in bound}
     return _map_children(formula, lambda child: substitute(child, free))
 
@@ -172,13 +182,8 @@ def atoms_of(formula: Formula) -> tuple[Atom, ...]:
 
 def types_of(formula: Formula) -> frozenset[str]:
     """Types that the formula quantifies over."""
-    found: set[str] = set()
-    for part in subformulas(formula):
-        if isinstance(part, Forall | Exists | ForN):
-            found.add(part.type)
-        elif isinstance(part, ForPairs):
-            found |= {part.type_a, part.type_b}
-    return frozenset(found)
+    quantified = [part for part in subformulas(formula) if isinstance(part, Quantified)]
+    return frozenset(type_name for part in quantified for _, type_name in part.binders)
 
 
 def objects_of(formula: Formula, types: Types) -> frozenset[str]:
@@ -209,12 +214,7 @@ def render(formula: Formula) -> str:
             return f"(or {' '.join(map(render, parts))})" if parts else "(or)"
         case Imply(premise, conclusion):
             return f"(imply {render(premise)} {render(conclusion)})"
-        case Forall(variable, type_name, body):
-            return f"(forall ({variable} - {type_name}) {render(body)})"
-        case Exists(variable, type_name, body):
-            return f"(exists ({variable} - {type_name}) {render(body)})"
-        case ForN(count, variable, type_name, body):
-            return f"(forn ({count}) ({variable} - {type_name}) {render(body)})"
-        case ForPairs(a, type_a, b, type_b, body, count):
-            word = "forpairs" if count is None else f"fornpairs ({count})"
-            return f"({word} ({a} - {type_a}) ({b} - {type_b}) {render(body)})"
+        case Quantified(quantifier, binders, body, count):
+            head = [quantifier] if count is None else [quantifier, f"({count})"]
+            bound = [f"({variable} - {type_name})" for variable, type_name in binders]
+            return f"({' '.join((*head, *bound, render(body)))})"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Protocol
 
 
@@ -41,44 +42,31 @@ class Imply:
     conclusion: Formula
 
 
-@dataclass(frozen=True, slots=True)
-class Forall:
-    variable: str
-    type: str
-    body: Formula
+class Quantifier(StrEnum):
+    """Quantifiers in the words of BDDL; the last two range over pairs of objects."""
+
+    FORALL = "forall"
+    EXISTS = "exists"
+    FORN = "forn"
+    """Exactly ``count`` objects satisfy the body."""
+    FORPAIRS = "forpairs"
+    """``fornpairs`` with the smaller number of objects as the count."""
+    FORNPAIRS = "fornpairs"
+    """At least ``count`` rows and as many columns of the truth table over A x B hold a true cell."""
 
 
 @dataclass(frozen=True, slots=True)
-class Exists:
-    variable: str
-    type: str
-    body: Formula
+class Quantified:
+    """Quantifier and its body. ``binders`` are its variables with their types: one, or two for pairs.
 
-
-@dataclass(frozen=True, slots=True)
-class ForN:
-    """Exactly ``count`` objects of the type satisfy the body."""
-
-    count: int
-    variable: str
-    type: str
-    body: Formula
-
-
-@dataclass(frozen=True, slots=True)
-class ForPairs:
-    """Quantifier over pairs: at least ``count`` rows and as many columns of the truth table over A x B hold a true cell.
-
-    Without a count, it is the smaller number of objects: BDDL writes ``forpairs``, and ``fornpairs`` with a count.
+    ``count`` is a number for ``forn`` and ``fornpairs``, else None.
     """
 
-    variable_a: str
-    type_a: str
-    variable_b: str
-    type_b: str
+    quantifier: Quantifier
+    binders: tuple[tuple[str, str], ...]
     body: Formula
     count: int | None = None
 
 
-Compound = Not | And | Or | Imply | Forall | Exists | ForN | ForPairs
+Compound = Not | And | Or | Imply | Quantified
 Formula = Atom | Compound

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 from tests.fakes import furniture as make
+from tests.fakes.formulas import exists, forall, forn, forpairs
 from tests.fakes.plans import awkward_scene, task_over, with_objects, words_of
 from tests.fakes.pose_caches import build_pose_cache
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks, placed, upright
@@ -13,7 +14,7 @@ from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.syntax import MAX_STEPS, Skill
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.evaluate import evaluate
-from embomatrix.world.goal import And, Atom, Exists, Forall, ForN, ForPairs, Imply, Not, Or
+from embomatrix.world.goal import And, Atom, Imply, Not, Or
 from embomatrix.world.state import Relation
 
 FETCH_CHICKEN = "move microwave_1; open microwave_1; move fridge_1; open fridge_1; pick_up chicken_leg_1; "
@@ -150,10 +151,10 @@ def test_microwave_is_switched_off_before_the_food_is_taken_out(flat):
 @pytest.mark.parametrize(
     "goal",
     [
-        Forall("?a", "apple.n.01", atom("inside", "?a", "fridge_1")),
-        Exists("?a", "apple.n.01", atom("inside", "?a", "bowl_1")),
-        ForN(1, "?a", "apple.n.01", atom("inside", "?a", "cabinet_1")),
-        ForPairs("?a", "apple.n.01", "?b", "bowl.n.01", atom("inside", "?a", "?b")),
+        forall("?a", "apple.n.01", atom("inside", "?a", "fridge_1")),
+        exists("?a", "apple.n.01", atom("inside", "?a", "bowl_1")),
+        forn(1, "?a", "apple.n.01", atom("inside", "?a", "cabinet_1")),
+        forpairs("?a", "apple.n.01", "?b", "bowl.n.01", atom("inside", "?a", "?b")),
         Or((atom("sliced", "apple_1"), atom("open", "cabinet_1"))),
         Imply(atom("inside", "chicken_leg_1", "fridge_1"), atom("open", "fridge_1")),
         atom("inroom", "apple_1", "living_room_0"),
@@ -184,7 +185,7 @@ def test_source_named_in_the_instruction_is_preferred(flat):
 
 
 def test_object_in_the_named_room_is_preferred(flat):
-    task = task_over(flat.world.scene, Exists("?a", "apple.n.01", atom("inside", "?a", "bowl_1")))
+    task = task_over(flat.world.scene, exists("?a", "apple.n.01", atom("inside", "?a", "bowl_1")))
     instructed = replace(task, instruction="Put the apple in the living room into the bowl.")
     assert words_of(find_plan(flat, task), task).startswith("move apple_1")
     assert words_of(find_plan(flat, instructed), task).startswith("move apple_2")
@@ -282,7 +283,7 @@ def test_stacked_objects_are_removed_first():
             "move apple_2; pick_up apple_2; move sink_1; place sink_1 ontop",
         ),
         (
-            Not(ForPairs("?a", "bowl.n.01", "?b", "breakfast_table.n.01", atom("ontop", "?a", "?b"))),
+            Not(forpairs("?a", "bowl.n.01", "?b", "breakfast_table.n.01", atom("ontop", "?a", "?b"))),
             "move bowl_1; pick_up bowl_1; move countertop_1; place countertop_1 ontop",
         ),
     ],

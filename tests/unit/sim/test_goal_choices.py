@@ -4,20 +4,11 @@ from dataclasses import dataclass
 
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.fakes.formulas import exists, forall, forn, forpairs
 
 from embomatrix.sim.planner.choices import choices
 from embomatrix.world.evaluate import evaluate
-from embomatrix.world.goal import (
-    And,
-    Atom,
-    Exists,
-    Forall,
-    ForN,
-    ForPairs,
-    Imply,
-    Not,
-    Or,
-)
+from embomatrix.world.goal import And, Atom, Imply, Not, Or
 
 TYPES = {"cup": ("cup_1", "cup_2", "cup_3"), "tray": ("tray_1", "tray_2")}
 
@@ -69,17 +60,17 @@ def test_implication_is_satisfied_by_a_false_premise():
 
 
 def test_forall_requires_every_member_and_its_negation_one():
-    assert first(Forall("?c", "cup", hot("?c"))) == {"hot cup_1", "hot cup_2", "hot cup_3"}
-    assert first(Not(Forall("?c", "cup", hot("?c"))), hot("cup_1"), hot("cup_2")) == {"not hot cup_3"}
+    assert first(forall("?c", "cup", hot("?c"))) == {"hot cup_1", "hot cup_2", "hot cup_3"}
+    assert first(Not(forall("?c", "cup", hot("?c"))), hot("cup_1"), hot("cup_2")) == {"not hot cup_3"}
 
 
 def test_exists_prefers_the_member_with_fewest_changes():
-    goal = Exists("?c", "cup", And((hot("?c"), on("?c", "tray_1"))))
+    goal = exists("?c", "cup", And((hot("?c"), on("?c", "tray_1"))))
     assert first(goal, hot("cup_3")) == {"hot cup_3", "ontop cup_3 tray_1"}
 
 
 def test_exactly_n_excludes_the_other_members():
-    goal = ForN(1, "?c", "cup", on("?c", "tray_1"))
+    goal = forn(1, "?c", "cup", on("?c", "tray_1"))
     assert first(goal, on("cup_2", "tray_1")) == {
         "ontop cup_2 tray_1",
         "not ontop cup_1 tray_1",
@@ -88,13 +79,13 @@ def test_exactly_n_excludes_the_other_members():
 
 
 def test_pairs_use_every_tray_once():
-    chosen = first(ForPairs("?c", "cup", "?t", "tray", on("?c", "?t")), on("cup_2", "tray_1"))
+    chosen = first(forpairs("?c", "cup", "?t", "tray", on("?c", "?t")), on("cup_2", "tray_1"))
     assert len(chosen) == 2
     assert "ontop cup_2 tray_1" in chosen
 
 
 def test_n_pairs_use_the_requested_number():
-    assert len(first(ForPairs("?c", "cup", "?t", "tray", on("?c", "?t"), 1))) == 1
+    assert len(first(forpairs("?c", "cup", "?t", "tray", on("?c", "?t"), 1))) == 1
 
 
 def test_contradictory_goal_has_no_choice():
@@ -106,10 +97,10 @@ ATOMS = st.builds(hot, st.sampled_from(TYPES["cup"])) | st.builds(
 )
 QUANTIFIED = st.sampled_from(
     [
-        Forall("?c", "cup", hot("?c")),
-        Exists("?c", "cup", on("?c", "tray_1")),
-        ForN(2, "?c", "cup", hot("?c")),
-        ForPairs("?c", "cup", "?t", "tray", on("?c", "?t")),
+        forall("?c", "cup", hot("?c")),
+        exists("?c", "cup", on("?c", "tray_1")),
+        forn(2, "?c", "cup", hot("?c")),
+        forpairs("?c", "cup", "?t", "tray", on("?c", "?t")),
     ]
 )
 GOALS = st.recursive(

@@ -9,21 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.fakes.bddl_text import render_problem
+from tests.fakes.formulas import exists, forall, forn, forpairs
 
 from embomatrix.world.bddl import BddlError, BddlProblem, parse_formula, parse_problem
 from embomatrix.world.evaluate import render
-from embomatrix.world.goal import (
-    And,
-    Atom,
-    Exists,
-    Forall,
-    Formula,
-    ForN,
-    ForPairs,
-    Imply,
-    Not,
-    Or,
-)
+from embomatrix.world.goal import And, Atom, Formula, Imply, Not, Or
 
 SAMPLE = Path(__file__).parents[4] / "shared" / "data" / "embomatrix_tasks_sample.jsonl"
 
@@ -66,7 +56,7 @@ def test_problem_is_read_into_values() -> None:
     assert problem.init[3].atom == Atom("inroom", ("basket.n.01_1", "living_room"))
     assert problem.goal == And(
         (
-            Forall("?apple.n.01", "apple.n.01", Atom("inside", ("?apple.n.01", "basket.n.01_1"))),
+            forall("?apple.n.01", "apple.n.01", Atom("inside", ("?apple.n.01", "basket.n.01_1"))),
             Not(Atom("ontop", ("apple.n.01_1", "floor.n.01_1"))),
         )
     )
@@ -224,14 +214,14 @@ def formulas() -> st.SearchStrategy[Formula]:
             st.builds(And, several),
             st.builds(Or, several),
             st.builds(Imply, inner, inner),
-            st.builds(Forall, st.just("?v"), types, inner),
-            st.builds(Exists, st.just("?w"), types, inner),
-            st.builds(ForN, st.integers(0, 9), st.just("?v"), types, inner),
-            st.builds(ForPairs, st.just("?v"), types, st.just("?w"), types, inner),
-            st.builds(ForPairs, st.just("?v"), types, st.just("?w"), types, inner, st.integers(0, 9)),
+            st.builds(forall, st.just("?v"), types, inner),
+            st.builds(exists, st.just("?w"), types, inner),
+            st.builds(forn, st.integers(0, 9), st.just("?v"), types, inner),
+            st.builds(forpairs, st.just("?v"), types, st.just("?w"), types, inner),
+            st.builds(forpairs, st.just("?v"), types, st.just("?w"), types, inner, st.integers(0, 9)),
         )
 
-    return st.recursive(atoms, grow, max_leaves=8).map(lambda body: Forall("?v", "a", body))
+    return st.recursive(atoms, grow, max_leaves=8).map(lambda body: forall("?v", "a", body))
 
 
 @given(formulas())

@@ -10,21 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.fakes.bddl_text import render_problem
+from tests.fakes.formulas import exists, forall, forn, forpairs
 
 from embomatrix.world.bddl import WILDCARD, BddlProblem, InitLiteral, parse_problem
 from embomatrix.world.evaluate import evaluate
-from embomatrix.world.goal import (
-    And,
-    Atom,
-    Exists,
-    Forall,
-    Formula,
-    ForN,
-    ForPairs,
-    Imply,
-    Not,
-    Or,
-)
+from embomatrix.world.goal import And, Atom, Formula, Imply, Not, Or, Quantified
 
 bddl = pytest.importorskip("bddl", reason="the bddl package is not installed")
 FOLDER = Path(bddl.__file__).parent / "activity_definitions"
@@ -61,15 +51,10 @@ def lists_of(formula: Formula) -> list[Any]:
             return ["and" if isinstance(formula, And) else "or", *map(lists_of, parts)]
         case Imply(premise, conclusion):
             return ["imply", lists_of(premise), lists_of(conclusion)]
-        case Forall(variable, kind, body) | Exists(variable, kind, body):
-            word = "forall" if isinstance(formula, Forall) else "exists"
-            return [word, [variable.lstrip("?"), "-", kind], lists_of(body)]
-        case ForN(count, variable, kind, body):
-            return ["forn", [str(count)], [variable.lstrip("?"), "-", kind], lists_of(body)]
-        case ForPairs(a, kind_a, b, kind_b, body, count):
-            binders = [[a.lstrip("?"), "-", kind_a], [b.lstrip("?"), "-", kind_b]]
-            head = ["forpairs"] if count is None else ["fornpairs", [str(count)]]
-            return [*head, *binders, lists_of(body)]
+        case Quantified(quantifier, binders, body, count):
+            head = [quantifier.value] if count is None else [quantifier.value, [str(count)]]
+            bound = [[variable.lstrip("?"), "-", kind] for variable, kind in binders]
+            return [*head, *bound, lists_of(body)]
 
 
 def unmarked(nested: Any) -> Any:
@@ -204,16 +189,16 @@ def formulas(draw: st.DrawFn, scope: tuple[str, ...] = (), depth: int = 3) -> Fo
         case 5:
             return Imply(inner(), inner())
         case 6:
-            return Forall(variables[0], draw(kinds), inner(variables[0]))
+            return forall(variables[0], draw(kinds), inner(variables[0]))
         case 7:
-            return Exists(variables[0], draw(kinds), inner(variables[0]))
+            return exists(variables[0], draw(kinds), inner(variables[0]))
         case 8:
-            return ForN(draw(st.integers(0, 3)), variables[0], draw(kinds), inner(variables[0]))
+            return forn(draw(st.integers(0, 3)), variables[0], draw(kinds), inner(variables[0]))
         case 9:
-            return ForPairs(variables[0], draw(kinds), variables[1], draw(kinds), inner(*variables))
+            return forpairs(variables[0], draw(kinds), variables[1], draw(kinds), inner(*variables))
         case _:
             count = draw(st.integers(0, 2))
-            return ForPairs(variables[0], draw(kinds), variables[1], draw(kinds), inner(*variables), count)
+            return forpairs(variables[0], draw(kinds), variables[1], draw(kinds), inner(*variables), count)
 
 
 @settings(max_examples=300, deadline=None)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.fakes.formulas import forall
 
 from embomatrix.world.bddl import parse_formula
 from embomatrix.world.evaluate import (
@@ -17,7 +18,7 @@ from embomatrix.world.evaluate import (
     substitute,
     types_of,
 )
-from embomatrix.world.goal import Atom, Forall, Formula
+from embomatrix.world.goal import Atom, Formula
 
 OBJECTS = {"apple_1": "apple", "apple_2": "apple", "box_1": "box", "box_2": "box", "lamp_1": "lamp"}
 TYPES = {"apple": ("apple_1", "apple_2"), "box": ("box_1", "box_2"), "lamp": ("lamp_1",)}
@@ -103,7 +104,7 @@ def test_scored_atoms_are_conjuncts_after_grounding_and_other_operators_count_on
 
 def test_unknown_type_and_free_variable_are_named() -> None:
     with pytest.raises(GoalError, match="'pear'"):
-        evaluate(Forall("?x", "pear", Atom("hot", ("?x",))), facts(), TYPES)
+        evaluate(forall("?x", "pear", Atom("hot", ("?x",))), facts(), TYPES)
     with pytest.raises(GoalError, match=r"'\?x' is not bound"):
         evaluate(Atom("hot", ("?x",)), facts(), TYPES)
 

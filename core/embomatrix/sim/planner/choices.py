@@ -5,20 +5,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from embomatrix.world.evaluate import substitute
-from embomatrix.world.goal import (
-    And,
-    Atom,
-    Exists,
-    Facts,
-    Forall,
-    Formula,
-    ForN,
-    ForPairs,
-    Imply,
-    Not,
-    Or,
-)
+from embomatrix.world.evaluate import expand, instance, instances, pair_sides
+from embomatrix.world.goal import And, Atom, Facts, Formula, Not, Or, Quantified, Quantifier
 from embomatrix.world.state import Relation
 
 Types = Mapping[str, tuple[str, ...]]
@@ -87,32 +75,19 @@ class _Alternatives:
     judged: dict[GroundLiteral, tuple[bool, bool]] = field(default_factory=dict)
 
     def of(self, formula: Formula, *, positive: bool) -> list[Choice]:
-        match formula:
-            case Atom():
-                return [(GroundLiteral(formula, positive),)]
+        match expand(formula, self.types):
+            case Atom() as atom:
+                return [(GroundLiteral(atom, positive),)]
             case Not(body):
                 return self.of(body, positive=not positive)
             case And(parts):
                 return self._joined(parts, positive=positive, every=positive)
             case Or(parts):
                 return self._joined(parts, positive=positive, every=not positive)
-            case Imply(premise, conclusion):
-                return self.of(Or((Not(premise), conclusion)), positive=positive)
-            case Forall(variable, type_name, body):
-                return self._joined(
-                    self._ground(body, variable, type_name), positive=positive, every=positive
-                )
-            case Exists(variable, type_name, body):
-                return self._joined(
-                    self._ground(body, variable, type_name), positive=positive, every=not positive
-                )
-            case ForN(count, variable, type_name, body):
-                return self._exactly(count, self._ground(body, variable, type_name), positive=positive)
-            case ForPairs():
-                return self._paired(formula) if positive else self._unpaired(formula)
-
-    def _ground(self, body: Formula, variable: str, type_name: str) -> list[Formula]:
-        return [substitute(body, {variable: name}) for name in self.types.get(type_name, ())]
+            case Quantified(Quantifier.FORN, count=int(count)) as counted:
+                return self._exactly(count, instances(counted, self.types), positive=positive)
+            case Quantified() as pairs:
+                return self._paired(pairs) if positive else self._unpaired(pairs)
 
     def _joined(self, parts: Iterable[Formula], *, positive: bool, every: bool) -> list[Choice]:
         """Return choices for all of the parts if ``every``, else for any one of them."""
@@ -136,31 +111,26 @@ class _Alternatives:
                 found += self._joined(wanted, positive=True, every=True)
         return self._best(found)
 
-    def _sides(self, formula: ForPairs) -> tuple[tuple[str, ...], tuple[str, ...], int]:
-        """Return the objects on both sides of a pair quantifier, and the number of pairs that it needs."""
-        rows, columns = (self.types.get(name, ()) for name in (formula.type_a, formula.type_b))
-        return rows, columns, min(len(rows), len(columns)) if formula.count is None else formula.count
-
-    def _paired(self, formula: ForPairs) -> list[Choice]:
+    def _paired(self, formula: Quantified) -> list[Choice]:
         """Return choices of one-to-one pairs."""
-        rows, columns, needed = self._sides(formula)
+        rows, columns, needed = pair_sides(formula, self.types)
         found: list[Choice] = []
         for picked in itertools.islice(itertools.combinations(rows, needed), WIDTH):
             for partners in itertools.islice(itertools.permutations(columns, needed), 4 * WIDTH):
                 pairs = list(zip(picked, partners, strict=True))
                 if all(a != b for a, b in pairs):
-                    cells = [_cell(formula, a, b) for a, b in pairs]
+                    cells = [instance(formula, a, b) for a, b in pairs]
                     found += self._joined(cells, positive=True, every=True)
         return self._best(found)
 
-    def _unpaired(self, formula: ForPairs) -> list[Choice]:
+    def _unpaired(self, formula: Quantified) -> list[Choice]:
         """Return choices that leave too few rows, or too few columns, with a true cell."""
-        rows, columns, needed = self._sides(formula)
+        rows, columns, needed = pair_sides(formula, self.types)
         found: list[Choice] = []
         for cleared, others, transposed in ((rows, columns, False), (columns, rows, True)):
             for picked in itertools.islice(itertools.combinations(cleared, len(cleared) - needed + 1), WIDTH):
                 pairs = [(b, a) if transposed else (a, b) for a in picked for b in others if a != b]
-                cells = [_cell(formula, a, b) for a, b in pairs]
+                cells = [instance(formula, a, b) for a, b in pairs]
                 found += self._joined(cells, positive=False, every=True)
         return self._best(found)
 
@@ -185,10 +155,6 @@ class _Alternatives:
         impossible = any(self._judge(item)[1] for item in choice)
         preferred = sum(self.preference(name) for item in choice for name in item.atom.args if item.positive)
         return (impossible, self._cost(choice), _chained(choice), -preferred)
-
-
-def _cell(formula: ForPairs, a: str, b: str) -> Formula:
-    return substitute(formula.body, {formula.variable_a: a, formula.variable_b: b})
 
 
 def _chained(choice: Choice) -> int:

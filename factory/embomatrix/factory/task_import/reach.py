@@ -11,19 +11,17 @@ from typing import Final
 
 from embomatrix.world.bddl import BddlProblem
 from embomatrix.world.catalog import Catalog
-from embomatrix.world.evaluate import atoms_of, render, substitute
-from embomatrix.world.goal import (
-    And,
-    Atom,
-    Exists,
-    Forall,
-    Formula,
-    ForN,
-    ForPairs,
-    Imply,
-    Not,
-    Or,
+from embomatrix.world.evaluate import (
+    atoms_of,
+    expand,
+    instance,
+    instances,
+    pair_sides,
+    render,
+    scored_atoms,
+    substitute,
 )
+from embomatrix.world.goal import And, Atom, Formula, Imply, Not, Or, Quantified, Quantifier
 from embomatrix.world.state import Relation, State, SubstanceFact, SubstanceRelation
 from embomatrix.world.substances import (
     MEANINGS,
@@ -97,10 +95,8 @@ def literals(
         case Imply(premise, conclusion):
             yield from literals(premise, not positive, scope)
             yield from literals(conclusion, positive, scope)
-        case Forall(variable, kind, body) | Exists(variable, kind, body) | ForN(_, variable, kind, body):
-            yield from literals(body, positive, {**scope, variable: kind})
-        case ForPairs(a, kind_a, b, kind_b, body):
-            yield from literals(body, positive, {**scope, a: kind_a, b: kind_b})
+        case Quantified(_, binders, body):
+            yield from literals(body, positive, {**scope, **dict(binders)})
 
 
 class Reachability:
@@ -108,6 +104,7 @@ class Reachability:
 
     def __init__(self, problem: BddlProblem, profile: Profile = Profile.HOUSEHOLD) -> None:
         self._problem = problem
+        self._types = problem.types
         self._profile = profile
         self._true = {_canonical(item.atom, problem) for item in problem.init if item.positive}
         self._pieces = pieces_of(problem)
@@ -115,36 +112,24 @@ class Reachability:
 
     def unreachable_part(self, formula: Formula) -> Formula | None:
         """Return a conjunct of the goal that can't become true; None if the goal is reachable."""
-        match formula:
-            case And(parts):
-                return next((found for part in parts if (found := self.unreachable_part(part))), None)
-            case Forall(variable, type_name, body):
-                grounded = self._ground(variable, type_name, body)
-                return next((found for part in grounded if (found := self.unreachable_part(part))), None)
-            case _:
-                return None if self.possible(formula) else formula
+        conjuncts = scored_atoms(formula, self._types)
+        return next((part for part in conjuncts if not self.possible(part)), None)
 
     def possible(self, formula: Formula, positive: bool = True) -> bool:
         """True if the formula, or its negation, can become true. Its parts are judged independently."""
-        match formula:
-            case Atom():
-                return self._reachable(formula)[0 if positive else 1]
+        match expand(formula, self._types):
+            case Atom() as atom:
+                return self._reachable(atom)[0 if positive else 1]
             case Not(body):
                 return self.possible(body, not positive)
             case And(parts):
                 return self._several(parts, positive, every=positive)
             case Or(parts):
                 return self._several(parts, positive, every=not positive)
-            case Imply(premise, conclusion):
-                return self.possible(Or((Not(premise), conclusion)), positive)
-            case Forall(variable, type_name, body):
-                return self._several(self._ground(variable, type_name, body), positive, every=positive)
-            case Exists(variable, type_name, body):
-                return self._several(self._ground(variable, type_name, body), positive, every=not positive)
-            case ForN(count, variable, type_name, body):
-                return not positive or self._exactly(count, self._ground(variable, type_name, body))
-            case ForPairs():
-                return not positive or self._paired(formula)
+            case Quantified(Quantifier.FORN, count=int(count)) as counted:
+                return not positive or self._exactly(count, instances(counted, self._types))
+            case Quantified() as pairs:
+                return not positive or self._paired(pairs)
 
     def _several(self, parts: tuple[Formula, ...], positive: bool, *, every: bool) -> bool:
         return (all if every else any)(self.possible(part, positive) for part in parts)
@@ -154,22 +139,13 @@ class Reachability:
         never = sum(not self.possible(part) for part in parts)
         return always <= count <= len(parts) - never
 
-    def _paired(self, formula: ForPairs) -> bool:
-        rows = self._problem.types[formula.type_a]
-        columns = self._problem.types[formula.type_b]
-        needed = min(len(rows), len(columns)) if formula.count is None else formula.count
+    def _paired(self, formula: Quantified) -> bool:
+        rows, columns, needed = pair_sides(formula, self._types)
         table = [
-            [
-                self.possible(substitute(formula.body, {formula.variable_a: row, formula.variable_b: column}))
-                for column in columns
-                if column != row
-            ]
+            [self.possible(instance(formula, row, column)) for column in columns if column != row]
             for row in rows
         ]
         return sum(map(any, table)) >= min(needed, len(table))
-
-    def _ground(self, variable: str, type_name: str, body: Formula) -> tuple[Formula, ...]:
-        return tuple(substitute(body, {variable: name}) for name in self._problem.types[type_name])
 
     def _reachable(self, atom: Atom) -> tuple[bool, bool]:
         """Return whether the atom can be true at the end, and whether it can be false."""

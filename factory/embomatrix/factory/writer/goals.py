@@ -12,7 +12,7 @@ from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.writer.variant import Variant
 from embomatrix.factory.writer.words import PHRASES, Voice, room_words, spoken
 from embomatrix.world.asset import JointKind
-from embomatrix.world.goal import And, Atom, Exists, Formula, Not
+from embomatrix.world.goal import And, Atom, Formula, Not, Quantified, Quantifier
 from embomatrix.world.state import Relation
 from embomatrix.world.substances import flows_from
 
@@ -179,7 +179,8 @@ def _any_alike(
         return atom(target), {}, (target,), context.refer(target)
     synset = view.asset(target).synset
     variable = f"?{synset}"
-    return Exists(variable, synset, atom(variable)), {synset: alike}, alike, context.refer(target)
+    goal = Quantified(Quantifier.EXISTS, ((variable, synset),), atom(variable))
+    return goal, {synset: alike}, alike, context.refer(target)
 
 
 def switch_goal(context: GoalContext) -> GoalConjunct | None:

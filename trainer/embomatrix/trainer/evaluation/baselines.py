@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
@@ -16,19 +17,8 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.skills.prompt import PromptRow
 from embomatrix.skills.syntax import MAX_STEPS, PlaceRelation, Plan, Skill, SkillCall
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.world.evaluate import substitute
-from embomatrix.world.goal import (
-    And,
-    Atom,
-    Exists,
-    Forall,
-    Formula,
-    ForN,
-    ForPairs,
-    Imply,
-    Not,
-    Or,
-)
+from embomatrix.world.evaluate import instance
+from embomatrix.world.goal import And, Atom, Formula, Imply, Not, Or, Quantified, Quantifier
 from embomatrix.world.state import Relation, State
 
 if TYPE_CHECKING:
@@ -122,21 +112,13 @@ class _Script:
                 yield from self._literals(parts[0])
             case Imply(_, conclusion):
                 yield from self._literals(conclusion)
-            case Forall(variable, kind, body):
-                yield from self._ground(body, variable, self._types[kind])
-            case Exists(variable, kind, body):
-                yield from self._ground(body, variable, self._types[kind][:1])
-            case ForN(count, variable, kind, body):
-                yield from self._ground(body, variable, self._types[kind][:count])
-            case ForPairs(a, kind_a, b, kind_b, body):
-                for one, other in zip(self._types[kind_a], self._types[kind_b], strict=False):
-                    yield from self._literals(substitute(body, {a: one, b: other}))
+            case Quantified(quantifier, binders, _, count):
+                rows = zip(*(self._types[kind] for _, kind in binders), strict=False)
+                limit = {Quantifier.EXISTS: 1, Quantifier.FORN: count}.get(quantifier)
+                for names in itertools.islice(rows, limit):
+                    yield from self._literals(instance(formula, *names))
             case _:
                 yield formula
-
-    def _ground(self, body: Formula, variable: str, names: Sequence[str]) -> Iterator[Formula]:
-        for name in names:
-            yield from self._literals(substitute(body, {variable: name}))
 
     def _achieve(self, predicate: str, args: tuple[str, ...]) -> Iterator[SkillCall]:
         rows = [self._rows[name] for name in args if name in self._rows]
