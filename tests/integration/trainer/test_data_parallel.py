@@ -41,7 +41,9 @@ def learnt(folder, **changes):
 
 
 @pytest.mark.parametrize(
-    "changes", [{}, {"grpo__reserve": 4, "grpo__overlap": "ahead"}], ids=["plain", "all"]
+    "changes",
+    [{}, {"grpo__chunk": 1}, {"grpo__chunk": 1, "grpo__reserve": 4, "grpo__overlap": "ahead"}],
+    ids=["plain", "several microbatches each", "all"],
 )
 def test_two_processes_are_bit_identical_to_one(tmp_path, remotes, changes):
     one = learnt(tmp_path / "one", **changes)

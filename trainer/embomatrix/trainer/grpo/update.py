@@ -1,7 +1,7 @@
 """One optimiser step of GRPO that hides simulation behind sampling and back-propagation.
 
 Microbatches (chunks of tasks) are sampled one after the other, and each one's plans go to the cluster at once. With
-``Overlap.STREAM`` each is back-propagated as soon as its rewards and all microbatches before it are there, followed by one
+``Overlap.STREAM`` a process back-propagates its microbatches in turn, each as soon as its rewards are there, followed by one
 optimiser step. The gradient is on-policy and covers the whole batch. Its order of summation is fixed, so it does not
 depend on which worker was faster.
 ``Overlap.AHEAD`` also samples the next step's plans before this step's rewards are needed, from weights that are one step
@@ -135,22 +135,36 @@ class Updater:
             for chunk in chunks
             if (remote := self._workers.remote(chunk.index)) is not None
         }
-        for chunk in chunks:
+        learnt: dict[int, _LearntChunk] = {}
+        # Remote chunks come last: this process does not wait for another one before its own work is done.
+        for chunk in sorted(chunks, key=lambda chunk: chunk.index in remote_chunks):
             with self._stopwatch.track(Activity.WAITING):
                 chunk.outcomes()
             with self._stopwatch.track(Activity.UPDATE):
-                remote_chunk = remote_chunks.get(chunk.index)
-                learnt = self._learn_locally(chunk, state) if remote_chunk is None else remote_chunk.result()
-                state.count(learnt)
-                if learnt.gradient is not None:
-                    self._add_gradient(learnt.gradient)
+                if chunk.index in remote_chunks:
+                    learnt[chunk.index] = remote_chunks[chunk.index].result()
+                else:
+                    learnt[chunk.index] = self._learn_locally(chunk, state, separately=bool(remote_chunks))
+        with self._stopwatch.track(Activity.UPDATE):
+            for chunk in chunks:
+                state.count(learnt[chunk.index])
+                if (gradient := learnt[chunk.index].gradient) is not None:
+                    self._add_gradient(gradient)
 
-    def _learn_locally(self, chunk: SampledChunk, state: _StepState) -> _LearntChunk:
-        """Add the chunk's gradient to the parameters' gradients, which hold the step's sum."""
+    def _learn_locally(self, chunk: SampledChunk, state: _StepState, *, separately: bool) -> _LearntChunk:
+        """Add the chunk's gradient to the step's sum in the parameters; ``separately``: return the gradient instead."""
         microbatch, logs = self._microbatch(chunk, chunk.outcomes(), state)
         if microbatch is None:
             return _LearntChunk(logs)
-        return _LearntChunk(logs, self._workers.local.learn(microbatch), len(microbatch.tokens))
+        if not separately:
+            return _LearntChunk(logs, self._workers.local.learn(microbatch), len(microbatch.tokens))
+        total = [parameter.grad for parameter in self._policy.parameters()]
+        self.optimiser.zero_grad()
+        metrics = self._workers.local.learn(microbatch)
+        gradient = [parameter.grad for parameter in self._policy.parameters()]
+        for parameter, part in zip(self._policy.parameters(), total, strict=True):
+            parameter.grad = part
+        return _LearntChunk(logs, metrics, len(microbatch.tokens), gradient)
 
     def _learn_remotely(self, chunk: SampledChunk, state: _StepState, remote: RemoteLearner) -> _LearntChunk:
         microbatch, logs = self._microbatch(chunk, chunk.outcomes(), state)
@@ -160,7 +174,7 @@ class Updater:
         return _LearntChunk(logs, metrics, len(microbatch.tokens), gradient)
 
     def _add_gradient(self, gradient: Sequence[torch.Tensor | None]) -> None:
-        """Add a gradient by parameter from another process to the step's sum."""
+        """Add a gradient by parameter to the step's sum."""
         for parameter, part in zip(self._policy.parameters(), gradient, strict=True):
             if parameter.grad is None:
                 parameter.grad = part
@@ -266,7 +280,7 @@ class Updater:
 
 @dataclass(frozen=True, slots=True)
 class _LearntChunk:
-    """Back-propagated chunk. ``metrics`` is None without a learning signal, ``gradient`` is given by other processes only."""
+    """Back-propagated chunk. ``metrics`` is None without a signal, ``gradient`` if it is already in the step's sum."""
 
     logs: list[GroupLog]
     metrics: LossMetrics | None = None
