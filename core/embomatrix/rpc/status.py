@@ -1,16 +1,20 @@
 """Cluster errors and their gRPC status codes, in one table for services and clients."""
 
 import contextlib
+import functools
+import inspect
 import logging
 import re
-from collections.abc import AsyncIterator, Iterator, Mapping
-from typing import Final
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from typing import Any, Final, TypeVar
 
 import grpc
 
 from embomatrix.rpc.wire.codec import ConvertError
 
 logger = logging.getLogger(__name__)
+
+ServicerT = TypeVar("ServicerT")
 
 ERROR_KEY: Final = "embomatrix-error"
 """Trailing metadata key of every status that our services set. It distinguishes an overloaded manager from a dead one."""
@@ -135,6 +139,29 @@ async def translate(context: grpc.aio.ServicerContext) -> AsyncIterator[None]:
     except Exception as error:  # noqa: BLE001  # logged unless it is known
         known = _known(error)
         await context.abort(_status_of(known), str(known), trailing_metadata=_metadata(known))
+
+
+def translated(servicer: type[ServicerT]) -> type[ServicerT]:
+    """Class decorator of a gRPC servicer: errors of its public methods become status codes."""
+    for name, method in list(vars(servicer).items()):
+        if name[0].isupper():
+            setattr(servicer, name, _translated(method))
+    return servicer
+
+
+def _translated(method: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(method)
+    async def stream(self: object, request: object, context: grpc.aio.ServicerContext) -> AsyncIterator[Any]:
+        async with translate(context), contextlib.aclosing(method(self, request, context)) as messages:
+            async for message in messages:
+                yield message
+
+    @functools.wraps(method)
+    async def call(self: object, request: object, context: grpc.aio.ServicerContext) -> Any:
+        async with translate(context):
+            return await method(self, request, context)
+
+    return stream if inspect.isasyncgenfunction(method) else call
 
 
 def _known(error: Exception) -> ClusterError:

@@ -15,7 +15,7 @@ from embomatrix.manager.runtime.runs import BATCH_ROLLOUTS, Runs
 from embomatrix.proto.v1 import rollout_service_pb2 as pb
 from embomatrix.proto.v1 import rollout_service_pb2_grpc
 from embomatrix.rpc.logs import bind
-from embomatrix.rpc.status import NotFoundError, TrimmedError, translate
+from embomatrix.rpc.status import NotFoundError, TrimmedError, translated
 from embomatrix.rpc.versions import SPOKEN, VersionRange, agree, software_version
 from embomatrix.rpc.wire.codec import each
 from embomatrix.rpc.wire.rollout import batch_with, rollout_from_proto
@@ -38,6 +38,7 @@ SLICE: Final = 128
 ResultsT = TypeVar("ResultsT", pb.ExecuteResponse, pb.WaitExecutionResponse)
 
 
+@translated
 class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
     """``authority`` is the PEM certificate of the signing authority; empty without TLS."""
 
@@ -60,62 +61,55 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
         )
 
     async def OpenRun(self, request: pb.OpenRunRequest, context: Context) -> pb.OpenRunResponse:
-        async with translate(context):
-            spoken = request.protocol_version
-            agree(SPOKEN, VersionRange(spoken, spoken), us="this manager", them="the trainer")
-            run_id = await self._runs.open_run(request.name, request.run_id, run_terms_from_proto(request))
+        spoken = request.protocol_version
+        agree(SPOKEN, VersionRange(spoken, spoken), us="this manager", them="the trainer")
+        run_id = await self._runs.open_run(request.name, request.run_id, run_terms_from_proto(request))
         return pb.OpenRunResponse(run_id=run_id)
 
     async def AnnounceLookahead(
         self, request: pb.AnnounceLookaheadRequest, context: Context
     ) -> pb.AnnounceLookaheadResponse:
-        async with translate(context):
-            bind("run", request.run_id)
-            entries = each("entries", lookahead_entry_from_proto, request.entries)
-            answers = self._runs.announce(request.run_id, request.version, entries)
-        return pb.AnnounceLookaheadResponse(answers=[lookahead_answer_to_proto(one) for one in answers])
+        bind("run", request.run_id)
+        entries = each("entries", lookahead_entry_from_proto, request.entries)
+        answers = self._runs.announce(request.run_id, request.version, entries)
+        return pb.AnnounceLookaheadResponse(answers=map(lookahead_answer_to_proto, answers))
 
     async def Execute(
         self, request: pb.ExecuteRequest, context: Context
     ) -> AsyncIterator[pb.ExecuteResponse]:
-        async with translate(context):
-            bind("run", request.run_id)
-            bind("batch", request.batch_id)
-            log = await self._runs.submit(await _batch(request))
-            async for message in self._results(context, log, 0, pb.ExecuteResponse):
-                yield message
+        bind("run", request.run_id)
+        bind("batch", request.batch_id)
+        log = await self._runs.submit(await _batch(request))
+        async for message in self._results(context, log, 0, pb.ExecuteResponse):
+            yield message
 
     async def WaitExecution(
         self, request: pb.WaitExecutionRequest, context: Context
     ) -> AsyncIterator[pb.WaitExecutionResponse]:
-        async with translate(context):
-            bind("run", request.run_id)
-            bind("batch", request.batch_id)
-            log = self._runs.log_of(request.run_id, request.batch_id)
-            async for message in self._results(context, log, request.after_cursor, pb.WaitExecutionResponse):
-                yield message
+        bind("run", request.run_id)
+        bind("batch", request.batch_id)
+        log = self._runs.log_of(request.run_id, request.batch_id)
+        async for message in self._results(context, log, request.after_cursor, pb.WaitExecutionResponse):
+            yield message
 
     async def CancelBatch(self, request: pb.CancelBatchRequest, context: Context) -> pb.CancelBatchResponse:
-        async with translate(context):
-            bind("run", request.run_id)
-            bind("batch", request.batch_id)
-            self._runs.cancel(request.run_id, request.batch_id)
+        bind("run", request.run_id)
+        bind("batch", request.batch_id)
+        self._runs.cancel(request.run_id, request.batch_id)
         return pb.CancelBatchResponse()
 
     async def ReportTraining(
         self, request: pb.ReportTrainingRequest, context: Context
     ) -> pb.ReportTrainingResponse:
-        async with translate(context):
-            bind("run", request.run_id)
-            report = training_report_from_proto(request)
-            name = self._runs.touch(request.run_id).name
-            self._training.note(request.run_id, name, report, at_s=time.time())
+        bind("run", request.run_id)
+        report = training_report_from_proto(request)
+        name = self._runs.touch(request.run_id).name
+        self._training.note(request.run_id, name, report, at_s=time.time())
         return pb.ReportTrainingResponse()
 
     async def CloseRun(self, request: pb.CloseRunRequest, context: Context) -> pb.CloseRunResponse:
-        async with translate(context):
-            bind("run", request.run_id)
-            stats = await self._runs.close_run(request.run_id)
+        bind("run", request.run_id)
+        stats = await self._runs.close_run(request.run_id)
         return pb.CloseRunResponse(stats=run_stats_to_proto(stats))
 
     async def _results(

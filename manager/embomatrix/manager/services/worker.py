@@ -21,7 +21,7 @@ from embomatrix.rpc.status import (
     InvalidRequestError,
     NotAllowedError,
     SupersededError,
-    translate,
+    translated,
 )
 from embomatrix.rpc.versions import SPOKEN, VersionRange, agree
 from embomatrix.rpc.wire.codec import each, inside
@@ -50,6 +50,7 @@ every worker."""
 _WORKER_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._:@-]{0,127}")
 
 
+@translated
 class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
     """Workers must stop leases that they could not renew within ``lease_ttl_s``."""
 
@@ -59,21 +60,20 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
         self._lease_ttl_s = lease_ttl_s
 
     async def Register(self, request: pb.RegisterRequest, context: Context) -> pb.RegisterResponse:
-        async with translate(context):
-            _check_name(request.worker_id)
-            bind("worker", request.worker_id)
-            # Versions are checked first: a refused version must not use up a join token.
-            protocol = _agreed(request)
-            resources = inside("resources", resources_from_proto, request.resources)
-            token_id, credential = await self._gate.admit(
-                context, request.join_token, request.worker_id, request.boot_id
-            )
-            session, interval_s = await self._runtime.register(
-                request.worker_id,
-                request.boot_id,
-                resources,
-                credential_id=token_id,
-            )
+        _check_name(request.worker_id)
+        bind("worker", request.worker_id)
+        # Versions are checked first: a refused version must not use up a join token.
+        protocol = _agreed(request)
+        resources = inside("resources", resources_from_proto, request.resources)
+        token_id, credential = await self._gate.admit(
+            context, request.join_token, request.worker_id, request.boot_id
+        )
+        session, interval_s = await self._runtime.register(
+            request.worker_id,
+            request.boot_id,
+            resources,
+            credential_id=token_id,
+        )
         return pb.RegisterResponse(
             session_id=session.session_id,
             session_epoch=session.epoch,
@@ -86,50 +86,46 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
     async def Session(  # type: ignore[override]  # gRPC also takes a coroutine that writes by the context
         self, request_iterator: AsyncIterator[pb.SessionRequest], context: Context
     ) -> None:
-        async with translate(context):
-            first = await _first_state(request_iterator)
-            session = self._runtime.registry.find(first.session_id, first.session_epoch)
-            self._check_session(context, session)
-            bind("worker", session.worker_id)
-            bind("session", session.session_id[:SESSION_SHOWN])
-            with self._runtime.attached(session) as link:
-                await self._take(link, first, resync=True)
-                await _until_one_ends(self._listen(link, request_iterator), _speak(link, context))
+        first = await _first_state(request_iterator)
+        session = self._runtime.registry.find(first.session_id, first.session_epoch)
+        self._check_session(context, session)
+        bind("worker", session.worker_id)
+        bind("session", session.session_id[:SESSION_SHOWN])
+        with self._runtime.attached(session) as link:
+            await self._take(link, first, resync=True)
+            await _until_one_ends(self._listen(link, request_iterator), _speak(link, context))
 
     async def Heartbeat(self, request: pb.HeartbeatRequest, context: Context) -> pb.HeartbeatResponse:
-        async with translate(context):
-            self._check_session(context, self._runtime.registry.find_by_id(request.session_id))
-            interval_s = self._runtime.process_heartbeat(
-                request.session_id,
-                request.session_epoch,
-                Heartbeat(
-                    each("running", lease_ref_from_proto, request.running),
-                    request.load,
-                    request.memory_used_mb,
-                    each("progress", lease_progress_from_proto, request.progress),
-                ),
-            )
+        self._check_session(context, self._runtime.registry.find_by_id(request.session_id))
+        interval_s = self._runtime.process_heartbeat(
+            request.session_id,
+            request.session_epoch,
+            Heartbeat(
+                each("running", lease_ref_from_proto, request.running),
+                request.load,
+                request.memory_used_mb,
+                each("progress", lease_progress_from_proto, request.progress),
+            ),
+        )
         return pb.HeartbeatResponse(next_interval_s=interval_s)
 
     async def FetchBundle(
         self, request: pb.FetchBundleRequest, context: Context
     ) -> AsyncIterator[pb.FetchBundleResponse]:
-        async with translate(context):
-            session = self._runtime.registry.find_by_id(request.session_id)
-            self._check_session(context, session)
-            if request.bundle_digest not in session.allowed_bundles:
-                raise NotAllowedError(
-                    f"worker {session.worker_id} was not asked to hold bundle {request.bundle_digest[:80]!r}"
-                )
-            async for chunk in self._runtime.bundles.get(request.bundle_digest):
-                yield pb.FetchBundleResponse(chunk=chunk)
+        session = self._runtime.registry.find_by_id(request.session_id)
+        self._check_session(context, session)
+        if request.bundle_digest not in session.allowed_bundles:
+            raise NotAllowedError(
+                f"worker {session.worker_id} was not asked to hold bundle {request.bundle_digest[:80]!r}"
+            )
+        async for chunk in self._runtime.bundles.get(request.bundle_digest):
+            yield pb.FetchBundleResponse(chunk=chunk)
 
     async def Deregister(self, request: pb.DeregisterRequest, context: Context) -> pb.DeregisterResponse:
-        async with translate(context):
-            session = self._runtime.registry.find(request.session_id, request.session_epoch)
-            self._check_session(context, session)
-            left = SupersededError(f"worker {session.worker_id} has left: its session is over")
-            self._runtime.end_session(session, "it left", left, WorkerStanding.LEFT)
+        session = self._runtime.registry.find(request.session_id, request.session_epoch)
+        self._check_session(context, session)
+        left = SupersededError(f"worker {session.worker_id} has left: its session is over")
+        self._runtime.end_session(session, "it left", left, WorkerStanding.LEFT)
         return pb.DeregisterResponse()
 
     def _check_session(self, context: Context, session: WorkerSession) -> None:
