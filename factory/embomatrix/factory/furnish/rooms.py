@@ -17,7 +17,7 @@ from embomatrix.factory.furnish.space import RoomSpace
 from embomatrix.factory.furnish.surfaces import SurfacePlacer
 from embomatrix.factory.furnish.tables import STOOLS
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.scene import Doorway, Room
+from embomatrix.world.scene import Room
 
 ATTEMPTS: Final = 24
 CROWDED_ATTEMPTS: Final = 6
@@ -87,15 +87,8 @@ def furnish(plan: FloorPlan, pieces: dict[str, list[FurniturePiece]], rng: np.ra
         start = len(placed)
         loss += best.loss
         placed += [replace(p, host=p.host + start) if p.host >= 0 else p for p in best.placed]
-        left_out += [
-            *notes,
-            *(
-                sentence
-                for reason in dict.fromkeys(reason for _, reason in best.unfit)
-                for sentence in _sentences([p for p, why in best.unfit if why == reason], room.name, reason)
-            ),
-            *_unplaced(best.dropped, room),
-        ]
+        unplaced = _with_reasons(best.dropped, room)
+        left_out += [*notes, *_sentences(best.unfit, room.name), *_sentences(unplaced, room.name)]
         done = {p.piece.number for p in best.placed} | {p.number for p in best.dropped}
         small += [(room.name, p) for p in wanted if p.role is FurnitureRole.SURFACE and p.number not in done]
     left_out += _set_small_things(plan, placed, small, rng)
@@ -109,7 +102,7 @@ def _moved(
     rooms = {room.name: room for room in plan.rooms}
     moved: dict[str, list[FurniturePiece]] = {name: [] for name in rooms}
     for name, mine in pieces.items():
-        beside = [_other(d, name) for d in plan.doorways if name in d.rooms and d.rooms[1]]
+        beside = _neighbours(plan, name)
         large = [p for p in mine if p.category == "bar" and not _has_room(p, rooms[name])]
         home = next((other for other in beside if large and _has_room(large[0], rooms[other])), name)
         for piece in mine:
@@ -240,43 +233,41 @@ def _set_small_things(
 ) -> list[str]:
     """Put small objects on and in the furniture of their room, else of a neighbouring room."""
     placer = SurfacePlacer(placed, rng)
-    beside = {
-        r.name: [_other(d, r.name) for d in plan.doorways if r.name in d.rooms and d.rooms[1]]
-        for r in plan.rooms
-    }
-    dropped: dict[str, list[FurniturePiece]] = {}
+    beside = {room.name: _neighbours(plan, room.name) for room in plan.rooms}
+    dropped: dict[str, list[tuple[FurniturePiece, str]]] = {}
     for room, piece in sorted(small, key=lambda item: -item[1].size_m[0] * item[1].size_m[1]):
         if not placer.place(piece, (room, *beside[room])):
-            dropped.setdefault(room, []).append(piece)
+            dropped.setdefault(room, []).append((piece, "no surface has room for it"))
+    return [sentence for room, refused in dropped.items() for sentence in _sentences(refused, room)]
+
+
+def _neighbours(plan: FloorPlan, room: str) -> list[str]:
+    """Return the rooms that share a doorway with this one."""
+    inner = (doorway.rooms for doorway in plan.doorways if room in doorway.rooms and doorway.rooms[1])
+    return [b if a == room else a for a, b in inner]
+
+
+def _with_reasons(pieces: Sequence[FurniturePiece], room: Room) -> list[tuple[FurniturePiece, str]]:
+    """Return pieces without a place on floor or walls, with the reason: larger than the room first, then plants."""
+    too_large = f"larger than the room of {room.size_m[0]:.1f} x {room.size_m[1]:.1f} m"
+    reasons = (too_large, "the edges of the garden are full", _IN_THE_WAY)
+
+    def rank(piece: FurniturePiece) -> int:
+        short, long = sorted(piece.size_m[:2])
+        if long > max(room.size_m) or short > min(room.size_m):
+            return 0
+        return 1 if piece.role is FurnitureRole.PLANTING else 2
+
+    return [(piece, reasons[rank(piece)]) for piece in sorted(pieces, key=rank)]
+
+
+def _sentences(refused: Sequence[tuple[FurniturePiece, str]], room: str) -> list[str]:
+    """Return a sentence for each reason and model, those of one reason together."""
+    counts = Counter((reason, piece.asset.asset_id) for piece, reason in refused)
+    reasons = dict.fromkeys(reason for _, reason in refused)
     return [
-        s for room, pieces in dropped.items() for s in _sentences(pieces, room, "no surface has room for it")
+        f"{count} {asset_id} in {room}: {reason}"
+        for reason in reasons
+        for (why, asset_id), count in counts.items()
+        if why == reason
     ]
-
-
-def _other(doorway: Doorway, room: str) -> str:
-    return doorway.rooms[1] if doorway.rooms[0] == room else doorway.rooms[0]
-
-
-def _unplaced(pieces: Sequence[FurniturePiece], room: Room) -> list[str]:
-    """Return sentences on pieces without a place on floor or walls: larger than the room, or blocking it."""
-    large = [
-        p for p in pieces if max(p.size_m[:2]) > max(room.size_m) or min(p.size_m[:2]) > min(room.size_m)
-    ]
-    numbers = {p.number for p in large}
-    rest = [p for p in pieces if p.number not in numbers]
-    return [
-        *_sentences(
-            large, room.name, f"larger than the room of {room.size_m[0]:.1f} x {room.size_m[1]:.1f} m"
-        ),
-        *_sentences(
-            [p for p in rest if p.role is FurnitureRole.PLANTING],
-            room.name,
-            "the edges of the garden are full",
-        ),
-        *_sentences([p for p in rest if p.role is not FurnitureRole.PLANTING], room.name, _IN_THE_WAY),
-    ]
-
-
-def _sentences(pieces: Sequence[FurniturePiece], room: str, reason: str) -> list[str]:
-    counts = Counter(p.asset.asset_id for p in pieces)
-    return [f"{count} {asset_id} in {room}: {reason}" for asset_id, count in counts.items()]

@@ -67,7 +67,8 @@ class SceneEditor:
         self._boxes: dict[str, Aabb] = {}
         self._solids = Solids.of_scene(scene)
         self._kept: set[str] = set()
-        self._floor = ReachableFloor(scene)
+        self.floor = ReachableFloor(scene)
+        """Floor that the robot can reach in the current scene."""
         self._unreached = {problem.names for problem in reach_problems(scene)}
         self.unserved = frozenset(name for names in self._unreached for name in names)
         """Objects of the base scene that the robot can't reach initially."""
@@ -79,11 +80,6 @@ class SceneEditor:
     def objects(self) -> Mapping[str, SceneObject]:
         """Current objects by name, in scene order."""
         return self._objects
-
-    @property
-    def floor(self) -> ReachableFloor:
-        """Floor that the robot can reach in the current scene."""
-        return self._floor
 
     def known(self, name: str) -> SceneObject:
         """Return an object. Raise PlacementError for an unknown name."""
@@ -154,7 +150,7 @@ class SceneEditor:
         self._assets[asset.asset_id] = asset
         self._solids.add(name, placed_parts(asset, pose))
         if box.low_m[2] < _ON_FLOOR_M:
-            self._floor = ReachableFloor(self._as_scene())
+            self.floor = ReachableFloor(self._as_scene())
         return name
 
     def fasten(self, name: str) -> None:
@@ -238,13 +234,13 @@ class SceneEditor:
             self._boxes.pop(name, None)
         scene = self._as_scene()
         self._solids = Solids.of_scene(scene)
-        self._floor = ReachableFloor(scene)
+        self.floor = ReachableFloor(scene)
 
     def _in_reach(self, box: Aabb, target: str) -> bool:
         if not ROBOT.reach_low_m <= box.center_m[2] <= ROBOT.reach_high_m:
             return False
         front = self.known(target).pose_world_asset if target and self.asset_of(target).joints else None
-        return len(self._floor.spots(box, front_of=front)) > 0
+        return len(self.floor.spots(box, front_of=front)) > 0
 
     def _keeps_paths_clear(self, asset: Asset, pose: Pose, box: Aabb, room: str) -> bool:
         """True if doorways stay clear and everything reachable before stays reachable with this object on the floor."""

@@ -177,6 +177,7 @@ _HALL: Final = Milieu(
         SocialRole(("visitor",), (18, 75), "visitor", "organiser", ("lobby", "corridor", "bar")),
     ),
 )
+# By the first word of a base scene's name. Scenes named after towns are homes.
 _BY_STEM: Final[Mapping[str, Milieu]] = {
     "restaurant": _RESTAURANT,
     "grocery": _GROCERY,
@@ -198,18 +199,13 @@ HOBBIES: Final = (
 )  # fmt: skip
 
 
-def milieu_of(base: str) -> Milieu:
-    """Return the kind of place of a base scene, from the first word of its name. Scenes named after towns are homes."""
-    return _BY_STEM.get(base.split("_")[0], _HOME)
-
-
 MIN_SLOTS: Final = 5
 """Number of activities of a cast member in their own rooms. Further activities cover the remaining rooms."""
 
 
 def draw_cast(scene: Scene, rng: np.random.Generator) -> Cast:
     """Return two to five people whose roles suit the place. Every room has an owner or a visitor on this day."""
-    milieu = milieu_of(scene.base)
+    milieu = _BY_STEM.get(scene.base.split("_")[0], _HOME)
     count = int(rng.integers(2, min(5, len(milieu.roles)) + 1))
     others = rng.permutation(len(milieu.roles) - 1)[: count - 1]
     roles = [milieu.roles[0], *(milieu.roles[1 + int(at)] for at in sorted(others))]

@@ -5,7 +5,7 @@ from typing import Final
 
 from embomatrix.factory.furnish.small_objects import COOKWARE, FOR_DRINKS, MEMBERS, ItemKind
 from embomatrix.factory.scenes.view import SceneView
-from embomatrix.factory.social.occasions import Occasion, Theme, occasion_of
+from embomatrix.factory.social.occasions import Theme, occasion_of
 from embomatrix.factory.social.values import Cast, DaySlot
 from embomatrix.factory.writer.goals import GoalConjunct
 
@@ -252,21 +252,15 @@ def best_slot(
         here = sum(slot.room in each for each in rooms) / len(conjuncts)
         owned = sum(bool({*each} & {*cast.of(slot.person).rooms}) for each in rooms) / len(conjuncts)
         if here or owned:
-            found.append(
-                (
-                    2 * here
-                    + owned
-                    - 0.5 * request_counts.get(slot.person, 0)
-                    - request_counts.get(slot.activity, 0),
-                    slot,
-                )
-            )
-    return max(found, key=lambda item: item[0]) if found else None
+            repeated = 0.5 * request_counts.get(slot.person, 0)
+            score = 2 * here + owned - repeated - request_counts.get(slot.activity, 0)
+            found.append((score, slot))
+    return max(found, key=lambda item: item[0], default=None)
 
 
 def reasons_for(activity: str) -> tuple[str, ...]:
     """Return reasons for needing help during an activity; empty for an unknown activity."""
-    occasion: Occasion | None = occasion_of(activity)
+    occasion = occasion_of(activity)
     return occasion.why if occasion is not None else ()
 
 

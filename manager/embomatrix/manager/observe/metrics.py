@@ -1,7 +1,7 @@
 """Load of the manager (CPU accounting, clock lag, store latency), and counters of delivered results."""
 
 import time
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -9,8 +9,6 @@ from embomatrix.manager.histogram import Histogram, quantile
 from embomatrix.rpc.wire.values import Cancelled, Completed, InfraFailure, RolloutResult
 
 WINDOW_S: Final = 60.0
-OPERATIONS: Final = 64
-"""Kinds of store operations at most."""
 
 
 class _Sample(NamedTuple):
@@ -27,14 +25,13 @@ class ManagerLoad:
     def __init__(self) -> None:
         self.lag = Histogram()
         """Lag of each tick in seconds. More than a few hundredths mean that the event loop is saturated."""
-        self.store: dict[str, Histogram] = {}
+        self.store: defaultdict[str, Histogram] = defaultdict(Histogram)
         """Durations of store operations in seconds, by name."""
         self._samples: deque[_Sample] = deque()
 
     def operated(self, operation: str, seconds: float) -> None:
         """Count an operation of the store."""
-        if operation in self.store or len(self.store) < OPERATIONS:
-            self.store.setdefault(operation, Histogram()).observe(seconds)
+        self.store[operation].observe(seconds)
 
     def sample(self, now_s: float, manager_s: float, slots_s: float) -> None:
         """Note the CPU time so far. A slot runs on one core, so its busy time counts as CPU time."""
