@@ -67,10 +67,10 @@ compose-check: $(VENV)/.dev
 	$(BIN)/python -m pytest -m docker $(ARGS)
 
 pictures: $(VENV)/.dev
-	for scene in Rs_int Wainscott_0_int restaurant_diner; do $(BIN)/embomatrix scene render $$scene --out docs/pictures || exit 1; done
-	$(BIN)/embomatrix scene views Rs_int Wainscott_0_int restaurant_diner --out docs/pictures/scenes.png
-	$(BIN)/embomatrix scene sheet --all --out docs/pictures/base_scenes.png
-	$(BIN)/embomatrix scene relations --out docs/pictures
+	$(BIN)/embomatrix scene draw Rs_int Wainscott_0_int restaurant_diner --out docs/pictures
+	$(BIN)/embomatrix scene draw Rs_int Wainscott_0_int restaurant_diner --as views --out docs/pictures
+	$(BIN)/embomatrix scene draw --all --as sheet --out docs/pictures
+	$(BIN)/embomatrix scene draw --as relations --out docs/pictures
 
 clean:
 	rm -rf build runs

@@ -81,7 +81,7 @@ def test_unknown_scene_gets_one_sentence_with_close_names() -> None:
 
 
 def test_render_writes_plan_view_and_robot_view(tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["render", "hotel_suite_small", "--out", str(tmp_path)])
+    result = CliRunner().invoke(app, ["draw", "hotel_suite_small", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "hotel_suite_small_eyes.png",
@@ -97,7 +97,7 @@ def test_check_accepts_a_base_scene() -> None:
 
 
 def test_relations_are_drawn_by_a_command(tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["relations", "--out", str(tmp_path)])
+    result = CliRunner().invoke(app, ["draw", "--as", "relations", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
     assert [path.name for path in tmp_path.iterdir()] == ["relations.png"]
 

@@ -36,7 +36,7 @@ def test_scene_in_a_file_is_shown_and_drawn(flat: Scene, path: Path) -> None:
     shown = CliRunner().invoke(app, ["show", str(path)])
     assert shown.exit_code == 0, shown.output
     assert all(room.name in shown.output for room in flat.rooms)
-    drawn = CliRunner().invoke(app, ["sheet", str(path), "--out", str(path.parent / "sheet.png")])
+    drawn = CliRunner().invoke(app, ["draw", str(path), "--as", "sheet", "--out", str(path.parent)])
     assert drawn.exit_code == 0, drawn.output
     assert (path.parent / "sheet.png").read_bytes().startswith(b"\x89PNG")
 
@@ -78,7 +78,7 @@ def test_file_without_a_scene_is_rejected_in_a_sentence(tmp_path: Path, data: by
 def test_path_is_never_used_as_a_scene_name(flat: Scene, tmp_path: Path, name: str) -> None:
     path = tmp_path / "bad.json"
     path.write_text(json.dumps({**scene_to_json(flat), "scene_id": name}))
-    result = CliRunner().invoke(app, ["render", str(path), "--out", str(tmp_path / "pictures")])
+    result = CliRunner().invoke(app, ["draw", str(path), "--out", str(tmp_path / "pictures")])
     assert result.exit_code == 2
     assert "scene.scene_id" in result.output
     assert not (tmp_path / "pictures").exists()
@@ -88,7 +88,7 @@ def test_oversized_file_is_rejected_before_reading(tmp_path: Path) -> None:
     path = tmp_path / "big.json"
     with path.open("wb") as file:
         file.truncate(1 << 30)
-    for command in ("check", "render"):
+    for command in ("check", "draw"):
         result = CliRunner().invoke(app, [command, str(path)])
         assert result.exit_code == 2, result.output
         assert "over 67,108,864 bytes" in result.output

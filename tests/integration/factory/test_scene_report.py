@@ -169,7 +169,7 @@ def test_check_writes_a_report_and_names_missing_objects(tmp_path: Path) -> None
         (["check"], "no scene is named"),
         (["check", SMALL, "--all"], "give names or --all"),
         (["build", "--all", "Rs_itn"], "give names or --all"),
-        (["sheet", "Rs_itn"], "Rs_int"),
+        (["draw", "Rs_itn"], "Rs_int"),
     ],
 )
 def test_names_and_all_exclude_one_another(arguments: list[str], words: str) -> None:

@@ -3,7 +3,8 @@
 import io
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -36,6 +37,17 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+
+
+class Drawing(StrEnum):
+    """Kinds of pictures that ``scene draw`` makes."""
+
+    SCENE = "scene"
+    SHEET = "sheet"
+    VIEWS = "views"
+    RELATIONS = "relations"
+
+
 SceneIds = Annotated[list[str] | None, typer.Argument(help="Names of scenes; none with --all.")]
 SceneSource = Annotated[
     str,
@@ -51,7 +63,14 @@ Seeds = Annotated[
     list[int] | None, typer.Option("--seed", min=0, help="Seed of the arrangement; repeatable. Default: 0.")
 ]
 Out = Annotated[Path, typer.Option(help="Output folder.")]
-Picture = Annotated[Path, typer.Option(help="PNG file to write.")]
+Kind = Annotated[
+    Drawing,
+    typer.Option(
+        "--as",
+        help="Plan, oblique view and robot's view of each scene; a sheet of all their plans; their oblique views side "
+        "by side; or examples and counterexamples of every relation, without scenes.",
+    ),
+]
 Jobs = Annotated[int, typer.Option(min=1, help="Number of processes.")]
 Report = Annotated[
     Path | None, typer.Option(help="JSON file for all figures, problems and objects left out.")
@@ -89,7 +108,8 @@ def build(
         if assets is not None:
             read_assets(assets)
     _check_writable(report)
-    _make_folder(out)
+    with _user_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
     several = len(set(seeds or ())) > 1
     orders = [
         SceneBuildJob(name, seed, out / (f"{name}-{seed}.json" if several else f"{name}.json"), assets)
@@ -141,58 +161,42 @@ def show(scene: SceneSource, seed: Seed = 0) -> None:
 
 
 @app.command()
-def render(scene: SceneSource, seed: Seed = 0, out: Out = Path()) -> None:
-    """Draw a plan, an oblique view, and the robot's view at its start, as PNG files."""
-    with _user_errors(out):
-        built = _built(scene, seed)
-        out.mkdir(parents=True, exist_ok=True)
-        pictures = {
-            "plan": draw_plan(built),
-            "view": Image.fromarray(np.asarray(render_oblique(built))),
-            "eyes": draw_eyes(built),
-        }
-    for kind, picture in pictures.items():
-        _write_png(out / f"{built.scene_id}_{kind}.png", picture)
-
-
-@app.command()
-def relations(out: Out = Path()) -> None:
-    """Draw examples and counterexamples of every relation as a PNG file."""
-    _make_folder(out)
-    with _user_errors():
-        picture = draw_relations()
-    _write_png(out / "relations.png", picture.quantize(64))
-
-
-@app.command()
-def sheet(
+def draw(
     scenes: SceneSources = None,
     every: All = False,
+    kind: Kind = Drawing.SCENE,
     seed: Seed = 0,
-    out: Picture = Path("scenes.png"),
+    out: Out = Path(),
 ) -> None:
-    """Draw the plans of many scenes on one sheet as a PNG file."""
-    built = _built_all(_chosen(scenes, every), seed, out)
-    _write_png(out, draw_sheet(built).quantize(64))
-
-
-@app.command()
-def views(scenes: SceneSources = None, seed: Seed = 0, out: Picture = Path("views.png")) -> None:
-    """Draw oblique views of some scenes side by side as a PNG file."""
-    built = _built_all(_chosen(scenes, every=False), seed, out)
-    with _user_errors():
-        picture = draw_views(built)
-    _write_png(out, picture.quantize(128))
-
-
-def _built_all(names: Sequence[str], seed: int, out: Path) -> list[Scene]:
-    """Build the scenes with a progress bar, after checking all names and the output file."""
-    with _user_errors():
+    """Draw scenes or examples of the relations as PNG files in a folder."""
+    names = () if kind is Drawing.RELATIONS else _chosen(scenes, every)
+    with _user_errors(out), progress() as bars:
         for name in names:
             _read(name)
-    _check_writable(out)
-    with _user_errors(), progress() as bars:
-        return [_built(name, seed) for name in bars.track(names, description="scenes")]
+        out.mkdir(parents=True, exist_ok=True)
+        built = [_built(name, seed) for name in bars.track(names, description="scenes")]
+        for title, picture in _pictures(kind, built):
+            buffer = io.BytesIO()
+            picture.save(buffer, format="PNG", optimize=True)
+            file = out / f"{title}.png"
+            write_whole(file, buffer.getvalue())
+            say(file)
+
+
+def _pictures(kind: Drawing, scenes: Sequence[Scene]) -> Iterator[tuple[str, Image.Image]]:
+    """Yield pictures of a kind with their titles. Raise EngineError without pybullet."""
+    match kind:
+        case Drawing.SCENE:
+            for scene in scenes:
+                yield f"{scene.scene_id}_plan", draw_plan(scene)
+                yield f"{scene.scene_id}_view", Image.fromarray(np.asarray(render_oblique(scene)))
+                yield f"{scene.scene_id}_eyes", draw_eyes(scene)
+        case Drawing.SHEET:
+            yield "sheet", draw_sheet(scenes).quantize(64)
+        case Drawing.VIEWS:
+            yield "views", draw_views(scenes).quantize(128)
+        case Drawing.RELATIONS:
+            yield "relations", draw_relations().quantize(64)
 
 
 def _run(orders: Sequence[SceneBuildJob], jobs: int) -> list[SceneReport]:
@@ -244,16 +248,3 @@ def _check_writable(path: Path | None) -> None:
     if path is not None:
         with _user_errors(path):
             check_writable(path)
-
-
-def _make_folder(path: Path) -> None:
-    with _user_errors(path):
-        path.mkdir(parents=True, exist_ok=True)
-
-
-def _write_png(path: Path, image: Image.Image) -> None:
-    buffer = io.BytesIO()
-    image.save(buffer, format="PNG", optimize=True)
-    with _user_errors(path):
-        write_whole(path, buffer.getvalue())
-    say(path)
