@@ -424,7 +424,7 @@ COMMANDS = (
     ),
     CommandCase(
         "evaluation without ledger",
-        "factory evaluate admissions KITCHEN",
+        "factory evaluate admission --dataset KITCHEN",
         "KITCHEN",
         "expected attempts.jsonl",
     ),

@@ -296,7 +296,7 @@ def test_plain_writer_figures_have_no_goals_and_untimed_builds_no_rate(tmp_path)
 
 
 def test_folder_that_is_no_build_is_reported_in_a_sentence(tmp_path):
-    answer = CliRunner().invoke(app, ["evaluate", "admissions", str(tmp_path)])
+    answer = CliRunner().invoke(app, ["evaluate", "admission", "--dataset", str(tmp_path)])
     assert answer.exit_code == 2
     assert "has no ledger of drafts" in answer.output
     a_build(tmp_path, "social", [])
@@ -317,3 +317,30 @@ def test_command_reports_user_errors_in_a_sentence(tmp_path):
     found = CliRunner().invoke(app, ["evaluate", "aesthetics", "--rooms", str(tmp_path)])
     assert found.exit_code == 2
     assert "not a table of hand-made rooms" in found.output.replace("\n", " ")
+
+
+def test_figures_of_a_build_and_of_a_file_reach_the_page(tmp_path):
+    a_build(tmp_path, "plain", [])
+    figures = tmp_path / "figures"
+    measure = ["evaluate", "admission", "--dataset", str(tmp_path), "--out", str(figures)]
+    assert CliRunner().invoke(app, measure).exit_code == 0
+    page = tmp_path / "page.md"
+    read = CliRunner().invoke(app, ["evaluate", str(figures / "admission.json"), "--page", str(page)])
+    assert read.exit_code == 0, read.output
+    assert "admitted_share plain" in read.output
+    assert "| admitted_share plain |" in page.read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["admision"], "unknown part 'admision'"),
+        (["admission"], "give --dataset FOLDER"),
+        (["scenes"], "give --sample FILE"),
+        (["tasks", "--llm", "http://127.0.0.1:1"], "give --model"),
+    ],
+)
+def test_missing_input_of_a_part_is_named(arguments, words):
+    found = CliRunner().invoke(app, ["evaluate", *arguments])
+    assert found.exit_code == 2
+    assert words in " ".join(found.output.split())

@@ -10,9 +10,9 @@ from rich.table import Column
 from embomatrix.factory.commands.agents import agent
 from embomatrix.factory.commands.assets import app as assets_app
 from embomatrix.factory.commands.build import make_dataset
-from embomatrix.factory.commands.corpus import app as corpus_app
-from embomatrix.factory.commands.evaluate import app as evaluate_app
-from embomatrix.factory.commands.inspection import app as inspect_app
+from embomatrix.factory.commands.corpus import corpus
+from embomatrix.factory.commands.evaluate import evaluate
+from embomatrix.factory.commands.inspection import inspect, pictures
 from embomatrix.factory.commands.language_model import (
     MODEL_ERRORS,
     Forms,
@@ -26,9 +26,9 @@ from embomatrix.factory.commands.language_model import (
 )
 from embomatrix.factory.commands.layout import lay
 from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Scenes, Seed, in_physics
-from embomatrix.factory.commands.task_import import app as import_app
+from embomatrix.factory.commands.task_import import import_
 from embomatrix.factory.commands.terminal import fail, say, show_table, user_errors
-from embomatrix.factory.commands.verification import app as verify_app
+from embomatrix.factory.commands.verification import verify
 from embomatrix.factory.pipeline.build import VariantCheck
 from embomatrix.factory.pipeline.cluster import cluster_check
 from embomatrix.factory.pipeline.export import dataset_card, encode_rows, export_rows
@@ -46,13 +46,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(assets_app, name="assets")
-app.add_typer(evaluate_app, name="evaluate")
-app.command()(agent)
-app.command()(lay)
-app.add_typer(import_app)
-app.add_typer(inspect_app)
-app.add_typer(corpus_app)
-app.add_typer(verify_app)
+app.command("import")(import_)
+for command in (agent, lay, inspect, pictures, corpus, verify, evaluate):
+    app.command()(command)
 
 Out = Annotated[Path, typer.Option(help="Folder for the dataset.")]
 SocialLlm = Annotated[

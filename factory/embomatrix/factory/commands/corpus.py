@@ -10,10 +10,7 @@ from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Seed,
 from embomatrix.factory.commands.terminal import say, user_errors
 from embomatrix.factory.pipeline.corpus import HELDOUT_SCENES, CorpusSettings, check_frozen, freeze
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
-
-@app.command()
 def corpus(
     out: Annotated[Path, typer.Option(help="Folder for the corpus.")] = Path("build/corpus"),
     train: Annotated[int, typer.Option(min=0, help="Number of training tasks.")] = 2_000,

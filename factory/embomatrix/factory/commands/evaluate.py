@@ -2,15 +2,18 @@
 
 import asyncio
 import json
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 import numpy as np
 import typer
 
-from embomatrix.factory.commands.language_model import MODEL_ERRORS, Key, Tape, chat_model
+from embomatrix.factory.commands.language_model import MODEL_ERRORS, Key, Llm, Model, Tape, chat_model
+from embomatrix.factory.commands.options import Seed
 from embomatrix.factory.commands.terminal import counter, report_evaluation, say, user_errors
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
 from embomatrix.factory.evaluate.aesthetics import evaluate_aesthetics
@@ -19,180 +22,123 @@ from embomatrix.factory.evaluate.page import with_factory
 from embomatrix.factory.evaluate.scenes import LayoutMethod, evaluate_scenes, fixed_tasks, outcome_log
 from embomatrix.factory.evaluate.side_by_side import draw_side_by_side, named
 from embomatrix.factory.evaluate.tasks import DraftFeatures, asked_of, evaluate_tasks, panel, people_of
-from embomatrix.factory.metrics.figures import (
-    EvaluationError,
-    EvaluationFigures,
-    read_evaluation,
-)
+from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures, read_evaluation
 from embomatrix.factory.pipeline.corpus import training_scenes
 from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER
+from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.llm.values import ChatModel
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.whole_file import write_whole
 
-app = typer.Typer(
-    help="Measure tasks and scenes; write the figures as JSON and to the benchmark page.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
-PAGE = Path("docs/benchmarks.md")
-JsonFile = Annotated[Path | None, typer.Option("--json", help="File for the figures.")]
-Seed = Annotated[int, typer.Option(min=0, help="Random seed.")]
-Methods = Annotated[
-    list[LayoutMethod] | None,
-    typer.Option("--method", help="Layout method; repeatable. Default: all."),
-]
-Only = Annotated[int, typer.Option(min=1, help="Use only every n-th of the 140 tasks.")]
-T = TypeVar("T")
+METHODS = list(LayoutMethod)
+JUDGED = ("variety", "characters", "overall")
+Judge = AbstractAsyncContextManager[ChatModel]
 
 
-@app.command()
-def tasks(
+def evaluate(
+    parts: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Parts to measure: tasks, scenes, looks, admission, aesthetics. A .json file of figures is read instead."
+        ),
+    ] = None,
     dataset: Annotated[
         Path | None,
-        typer.Option(help="Measure the tasks of this dataset. Default: draft tasks with both writers."),
-    ] = None,
-    scenes: Annotated[
-        list[str] | None,
-        typer.Option(help="Base scene; repeatable. Default: the 45 training scenes."),
+        typer.Option(
+            help="Dataset for the parts tasks and admission. Default for tasks: draft tasks with both writers."
+        ),
     ] = None,
     each: Annotated[int, typer.Option(min=2, help="Tasks per scene (10 in the paper).")] = 10,
+    sample: Annotated[
+        Path | None,
+        typer.Option(
+            help="JSON lines file with the paper's sample of tasks, for scenes, looks and --picture."
+        ),
+    ] = None,
+    only: Annotated[int, typer.Option(min=1, help="Use only every n-th of the 140 tasks.")] = 1,
+    outcomes: Annotated[
+        Path | None,
+        typer.Option(help="JSON lines file for the outcomes of scenes; an interrupted run resumes from it."),
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of processes for scenes.")] = 1,
+    rooms: Annotated[
+        Path | None, typer.Option(help="Gzipped JSON file with hand-made rooms, for aesthetics.")
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="File for the aesthetic weights fitted to all rooms.")
+    ] = None,
     seed: Seed = 0,
-    json_file: JsonFile = None,
-    llm: Annotated[str, typer.Option(help="URL of an endpoint; its model also scores the tasks.")] = "",
-    model: Annotated[str, typer.Option(help="Name of the model at the endpoint.")] = "",
+    llm: Llm = "",
+    model: Model = "",
     key: Key = "",
     cassette: Tape = None,
+    picture: Annotated[
+        str, typer.Option(help="Fixed task to draw as TASK.png, laid out by three methods side by side.")
+    ] = "",
+    out: Annotated[Path | None, typer.Option(help="Folder for the figures, PART.json.")] = None,
+    page: Annotated[
+        Path | None, typer.Option(help="Page with the factory's section to update, docs/benchmarks.md.")
+    ] = None,
 ) -> None:
-    """Measure the diversity of instructions and goals, with and without social simulation."""
+    """Measure parts of the factory: diversity of tasks, layouts of fixed tasks, admission of drafts, aesthetics.
+
+    A language model judges looks, and also tasks if one is given.
+    """
+    judge = partial(chat_model, llm, model, key, cassette)
+    measures: Mapping[str, Callable[[], EvaluationFigures]] = {
+        "tasks": lambda: _tasks(dataset, each, seed, judge() if llm or cassette else None),
+        "scenes": lambda: _scenes(_fixed(sample)[::only], only, seed, jobs, outcomes),
+        "looks": lambda: asyncio.run(_looks(judge(), _fixed(sample)[::only], seed)),
+        "admission": lambda: evaluate_admissions(_given(dataset, "--dataset FOLDER")),
+        "aesthetics": lambda: _aesthetics(_given(rooms, "--rooms FILE"), seed, calibration),
+    }
     with user_errors(more=MODEL_ERRORS):
         if llm and not model:
             raise EvaluationError("--llm needs the name of a model there: give --model")
-        if dataset is not None:
-            groups, evaluation = _of_dataset(dataset, each)
-        else:
-            chosen = tuple(dict.fromkeys(scenes or training_scenes()))
-            with counter("scenes", len(chosen)) as count:
-                groups, evaluation = evaluate_tasks(chosen, each, seed, count)
-        if llm or cassette is not None:
-            verdicts = asyncio.run(
-                _asked(lambda judge: _judged(judge, groups, seed), llm, model, key, cassette)
-            )
-            evaluation = replace(evaluation, figures=(*evaluation.figures, *verdicts))
-        report_evaluation(evaluation, json_file)
+        for part in parts or ():
+            if part not in measures and not part.endswith(".json"):
+                raise EvaluationError(
+                    f"unknown part {part!r}: expected a .json file or {', '.join(measures)}"
+                )
+        if picture:
+            draw_side_by_side(named(_fixed(sample), picture), seed).save(f"{picture}.png")
+            say(f"picture: {picture}.png")
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+        evaluations = []
+        for part in parts or ():
+            measured = part in measures
+            evaluations.append(measures[part]() if measured else read_evaluation(Path(part)))
+            report_evaluation(evaluations[-1], out / f"{part}.json" if out and measured else None)
+    if page is not None:
+        with user_errors(page):
+            before = page.read_text(encoding="utf-8") if page.exists() else ""
+            write_whole(page, with_factory(before, evaluations).encode("utf-8"))
+        say(f"page: {page}")
 
 
-@app.command()
-def scenes(
-    sample: Annotated[
-        Path,
-        typer.Option(help="JSON lines file with the paper's sample of tasks, half of the fixed tasks."),
-    ],
-    methods: Methods = None,
-    only: Only = 1,
-    seed: Seed = 0,
-    jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
-    json_file: JsonFile = None,
-    outcomes: Annotated[
-        Path | None,
-        typer.Option(
-            help="JSON lines file for the outcome of each task; an interrupted run resumes from it."
-        ),
-    ] = None,
-) -> None:
-    """Measure generation rate, verification pass rate and time of 140 fixed tasks, by layout tree and two baselines."""
-    kept = "; outcomes so far are saved: run the same command to resume" if outcomes is not None else ""
-    with user_errors(outcomes, kept):
-        chosen = fixed_tasks(sample)[::only]
-        used_methods = methods or list(LayoutMethod)
-        log = outcome_log(outcomes, seed)
-        with counter("trials", len(chosen) * len(used_methods)) as count:
-            evaluation, _ = evaluate_scenes(chosen, used_methods, seed, jobs, count, log)
-        if only > 1:
-            taken = {"taken": f"one in {only} of the fixed tasks", **evaluation.conditions}
-            evaluation = replace(evaluation, conditions=taken)
-        report_evaluation(evaluation, json_file)
+def _given(path: Path | None, option: str) -> Path:
+    if path is None:
+        raise EvaluationError(f"an input of this part is missing: give {option}")
+    return path
 
 
-@app.command()
-def picture(
-    task: Annotated[str, typer.Argument(help="Name of one of the 140 fixed tasks.")],
-    sample: Annotated[Path, typer.Option(help="JSON lines file with the paper's sample of tasks.")],
-    seed: Seed = 0,
-    out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("side_by_side.png"),
-) -> None:
-    """Draw the layouts of one fixed task by the three methods, side by side."""
-    with user_errors(out):
-        drawn = draw_side_by_side(named(fixed_tasks(sample), task), seed)
-        drawn.save(out)
-    say(f"picture: {out}")
+def _fixed(sample: Path | None) -> list[SourceText]:
+    return fixed_tasks(_given(sample, "--sample FILE"))
 
 
-@app.command()
-def looks(
-    sample: Annotated[Path, typer.Option(help="JSON lines file with the paper's sample of tasks.")],
-    methods: Methods = None,
-    only: Only = 1,
-    seed: Seed = 0,
-    json_file: JsonFile = None,
-    llm: Annotated[str, typer.Option(help="URL of an endpoint with a vision-language model.")] = "",
-    model: Annotated[str, typer.Option(help="Name of the model at the endpoint.")] = "",
-    key: Key = "",
-    cassette: Tape = None,
-) -> None:
-    """Score layouts with the paper's judge: a vision-language model sees the plan of each room and its layout tree."""
-    with user_errors(more=MODEL_ERRORS):
-        chosen, used_methods = fixed_tasks(sample)[::only], methods or list(LayoutMethod)
-
-        async def looked(judge: ChatModel) -> EvaluationFigures:
-            with counter("trials", len(chosen) * len(used_methods)) as count:
-                return await evaluate_looks(judge, chosen, used_methods, seed, count)
-
-        evaluation = asyncio.run(_asked(looked, llm, model, key, cassette))
-    report_evaluation(evaluation, json_file)
-
-
-@app.command()
-def admissions(
-    folder: Annotated[Path, typer.Argument(help="Folder written by `build`, `generate` or `corpus`.")],
-    json_file: JsonFile = None,
-) -> None:
-    """Count the admitted drafts of a build, in total and per hour on two cores, and the reasons against the others."""
-    with user_errors():
-        evaluation = evaluate_admissions(folder)
-    report_evaluation(evaluation, json_file)
-
-
-@app.command()
-def aesthetics(
-    rooms: Annotated[Path, typer.Option(help="Gzipped JSON file with hand-made rooms.")],
-    seed: Seed = 0,
-    json_file: JsonFile = None,
-    calibration: Annotated[
-        Path | None, typer.Option(help="File for the weights fitted to all rooms.")
-    ] = None,
-) -> None:
-    """Measure how well the geometric score separates held-out hand-made rooms from corrupted ones."""
-    with user_errors():
-        evaluation, fitted = evaluate_aesthetics(rooms, seed)
-        if calibration is not None:
-            write_whole(calibration, (json.dumps(asdict(fitted), indent=1) + "\n").encode("ascii"))
-        report_evaluation(evaluation, json_file)
-
-
-@app.command()
-def page(
-    files: Annotated[list[Path], typer.Argument(help="Files written by `evaluate PART --json`.")],
-    out: Annotated[Path, typer.Option(help="Page with the factory's section to replace.")] = PAGE,
-) -> None:
-    """Write the factory's section of the benchmark page."""
-    with user_errors(out):
-        evaluations = [read_evaluation(file) for file in files]
-        before = out.read_text(encoding="utf-8") if out.exists() else ""
-        write_whole(out, with_factory(before, evaluations).encode("utf-8"))
-    say(f"page: {out}")
+def _tasks(dataset: Path | None, each: int, seed: int, judge: Judge | None) -> EvaluationFigures:
+    """Measure the diversity of instructions and goals, with and without social simulation."""
+    if dataset is not None:
+        groups, evaluation = _of_dataset(dataset, each)
+    else:
+        chosen = training_scenes()
+        with counter("scenes", len(chosen)) as count:
+            groups, evaluation = evaluate_tasks(chosen, each, seed, count)
+    if judge is None:
+        return evaluation
+    return replace(evaluation, figures=(*evaluation.figures, *asyncio.run(_judged(judge, groups, seed))))
 
 
 def _of_dataset(folder: Path, each: int) -> tuple[Mapping[str, Sequence[DraftFeatures]], EvaluationFigures]:
@@ -204,28 +150,42 @@ def _of_dataset(folder: Path, each: int) -> tuple[Mapping[str, Sequence[DraftFea
     return groups, EvaluationFigures("tasks", conditions, figures)
 
 
-async def _asked(
-    question: Callable[[ChatModel], Awaitable[T]], url: str, model: str, key: str, cassette: Path | None
-) -> T:
-    """Run a question against an endpoint, a recording, or both."""
-    async with chat_model(url, model, key, cassette) as judge:
-        return await question(judge)
-
-
-async def _judged(
-    judge: ChatModel, groups: Mapping[str, Sequence[DraftFeatures]], seed: int
-) -> tuple[Figure, ...]:
+async def _judged(judge: Judge, groups: Mapping[str, Sequence[DraftFeatures]], seed: int) -> list[Figure]:
     """Return the mean scores of a language model over the scenes."""
-    verdicts = [
-        await judged(judge, [asked.instruction for asked in group], seed) for group in groups.values()
+    async with judge as model:
+        verdicts = [
+            await judged(model, [asked.instruction for asked in group], seed) for group in groups.values()
+        ]
+    means = np.mean([[getattr(verdict, name) for name in JUDGED] for verdict in verdicts], axis=0)
+    return [
+        Figure(f"judge {name}", float(mean), "of 10", Better.NEITHER, len(verdicts))
+        for name, mean in zip(JUDGED, means, strict=True)
     ]
-    return tuple(
-        Figure(
-            f"judge {name}",
-            float(np.mean([getattr(each, name) for each in verdicts])),
-            "of 10",
-            Better.NEITHER,
-            len(verdicts),
-        )
-        for name in ("variety", "characters", "overall")
-    )
+
+
+def _scenes(
+    tasks: Sequence[SourceText], only: int, seed: int, jobs: int, outcomes: Path | None
+) -> EvaluationFigures:
+    """Measure generation rate, verification pass rate and time, by layout tree and two baselines."""
+    kept = "; outcomes so far are saved: run the same command to resume" if outcomes is not None else ""
+    with user_errors(outcomes, kept):
+        log = outcome_log(outcomes, seed)
+        with counter("trials", len(tasks) * len(METHODS)) as count:
+            evaluation, _ = evaluate_scenes(tasks, METHODS, seed, jobs, count, log)
+    taken = {"taken": f"one in {only} of the fixed tasks"} if only > 1 else {}
+    return replace(evaluation, conditions={**taken, **evaluation.conditions})
+
+
+async def _looks(judge: Judge, tasks: Sequence[SourceText], seed: int) -> EvaluationFigures:
+    """Score layouts with the paper's judge: a vision-language model sees each room's plan and its layout tree."""
+    async with judge as model:
+        with counter("trials", len(tasks) * len(METHODS)) as count:
+            return await evaluate_looks(model, tasks, METHODS, seed, count)
+
+
+def _aesthetics(rooms: Path, seed: int, calibration: Path | None) -> EvaluationFigures:
+    """Measure how well the geometric score separates held-out hand-made rooms from corrupted ones."""
+    evaluation, fitted = evaluate_aesthetics(rooms, seed)
+    if calibration is not None:
+        write_whole(calibration, (json.dumps(asdict(fitted), indent=1) + "\n").encode("ascii"))
+    return evaluation

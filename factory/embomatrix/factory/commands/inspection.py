@@ -13,12 +13,10 @@ from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER, TREES_FOLDER
 from embomatrix.world.dataset import Dataset, bundle_file
 from embomatrix.world.whole_file import check_writable, write_whole
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 PICTURES_FOLDER = "pictures"
 CARD_PX = (720, 540)
 
 
-@app.command()
 def inspect(
     task: Annotated[str, typer.Argument(help="Id of the task, as `factory list` shows it.")],
     dataset: Annotated[Path, typer.Option(help="Folder of the dataset.")] = Path("build/dataset"),
@@ -48,7 +46,6 @@ def inspect(
     say(f"page: {file}")
 
 
-@app.command()
 def pictures(
     dataset: Annotated[Path, typer.Argument(help="Folder of the dataset.")],
 ) -> None:

@@ -41,7 +41,6 @@ from embomatrix.world.substances import is_substance
 from embomatrix.world.task import Profile
 from embomatrix.world.whole_file import check_writable, write_whole
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 EVERY_ACTIVITY = "all"
 
 
@@ -68,7 +67,6 @@ ReachedBy = Annotated[
 Solids = Annotated[bool, typer.Option("--solids", help="Skip problems that name a liquid or a powder.")]
 
 
-@app.command("import")
 def import_(
     bddl: Annotated[Path | None, typer.Option(help="A BDDL problem file.")] = None,
     activity: Annotated[str, typer.Option(help="An activity of the bddl package, or 'all'.")] = "",

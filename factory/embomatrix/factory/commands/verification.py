@@ -11,17 +11,14 @@ from embomatrix.factory.evaluate.verification import evaluation_of, objections, 
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.whole_file import check_writable
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-
 Physical = Annotated[
     bool,
     typer.Option("--physical", help="Also execute the oracle's plans with a robot in stepped physics."),
 ]
 Sample = Annotated[int | None, typer.Option(min=1, help="Number of tasks to sample. Default: all.")]
-Figures = Annotated[Path | None, typer.Option("--json", help="File for the figures, for `evaluate page`.")]
+Figures = Annotated[Path | None, typer.Option("--json", help="File for the figures, for `evaluate --page`.")]
 
 
-@app.command()
 def verify(
     folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")] = Path("build/dataset"),
     physical: Physical = False,

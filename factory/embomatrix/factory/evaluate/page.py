@@ -26,9 +26,9 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
     ),
     "admission": (
         "Admission",
-        "`embomatrix factory evaluate admissions DATASET` reads the ledger of a build. *admitted_per_hour* is computed from "
-        "CPU time for two dedicated cores. The time covers writing, layout, look-ahead and verification of all drafts, and "
-        "the base scenes. *plain* is the writer without social simulation.",
+        "`embomatrix factory evaluate admission --dataset DATASET` reads the ledger of a build. *admitted_per_hour* is "
+        "computed from CPU time for two dedicated cores. The time covers writing, layout, look-ahead and verification of all "
+        "drafts, and the base scenes. *plain* is the writer without social simulation.",
     ),
     "imports": (
         "Imports",
@@ -97,7 +97,7 @@ def _there(text: str) -> dict[str, str]:
 
 def _render(sections: Mapping[str, str]) -> str:
     """Return the section as Markdown, in the order of `PARTS`."""
-    lines = ["## Factory", "", "Written by `embomatrix factory evaluate page FILE...`."]
+    lines = ["## Factory", "", "Written by `embomatrix factory evaluate PART... --page FILE`."]
     for part, (heading, _) in PARTS.items():
         if part in sections:
             lines += [f"{_HEADING}{heading}", "", sections[part]]

@@ -62,6 +62,6 @@ def read_evaluation(path: Path) -> EvaluationFigures:
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise EvaluationError(
-            f"{path} contains no figures of an evaluation ({error}): expected a file written by 'embomatrix factory "
-            "evaluate' with --json"
+            f"{path} contains no figures of an evaluation ({error}): expected a file that `embomatrix factory "
+            "evaluate`, `import` or `verify` wrote"
         ) from error
