@@ -149,6 +149,7 @@ def test_check_prints_the_rules_and_names_an_unknown_category() -> None:
     result = CliRunner().invoke(app, ["check", "--category", "bowl", "--category", "fridge"])
     assert result.exit_code == 0, result.output
     assert "2 models" in result.output
+    assert "2 categories" in result.output
     unknown = CliRunner().invoke(app, ["check", "--category", "frigde"])
     assert unknown.exit_code == 2
     assert "did you mean fridge" in unknown.output

@@ -47,7 +47,10 @@ def check(
         bool, typer.Option("--every-model", help="All models of a category instead of the first.")
     ] = False,
 ) -> None:
-    """Check size, cavities, doors and stability of all assets in use; exit status 1 if one breaks a rule."""
+    """Check size, cavities, doors and stability of all assets in use, and count their families.
+
+    Exit status 1 if an asset breaks a rule.
+    """
     catalog = Catalog.load()
     with user_errors():
         assets = _assets(catalog, category, every_model=every_model)
@@ -62,16 +65,10 @@ def check(
     reasons = Counter(f"{finding.rule}: {finding.detail}" for finding in findings if finding.excused)
     for reason, number in sorted(reasons.items()):
         say(f"excused {number} x {reason}")
+    families = Counter(family_of(catalog, name) for name in {asset.category for asset in assets})
+    show_table(("family", "categories"), families.most_common(), f"{families.total()} categories")
     if any(not finding.excused for finding in findings):
         raise typer.Exit(1)
-
-
-@app.command()
-def families() -> None:
-    """Count the categories in use by family."""
-    catalog = Catalog.load()
-    counts = Counter(family_of(catalog, name) for name in catalog.used_categories)
-    show_table(("family", "categories"), counts.most_common(), f"{len(catalog.used_categories)} categories")
 
 
 @app.command()
