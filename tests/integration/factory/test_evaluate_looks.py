@@ -14,10 +14,8 @@ from embomatrix.factory.commands.app import app
 from embomatrix.factory.evaluate.judges import Impression, evaluate_looks, impression_of
 from embomatrix.factory.evaluate.page import with_factory
 from embomatrix.factory.evaluate.scenes import LIST, LayoutMethod
-from embomatrix.factory.evaluate.side_by_side import LEAST_PX, draw_side_by_side, named
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.request import RequestedObject
-from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.factory.pictures.sights import alone
 from embomatrix.factory.scenes.editor import SceneEditor
 from embomatrix.factory.task_import.sources import SourceText
@@ -92,19 +90,6 @@ async def test_every_method_has_its_mean_and_unusable_answers_are_counted() -> N
     assert found.notes == ("1 scenes got no usable answer.",)
     assert done == [1, 2]
     assert "| judge tree | 8.5 of 10 |" in with_factory("", [found])
-
-
-def test_picture_has_a_panel_for_each_method_or_the_reason_of_its_failure() -> None:
-    huge = APPLE.replace("breakfast_table", "unicorn")
-    one, none = (
-        draw_side_by_side(SourceText("apple", text, "embomatrix", scene="Rs_int"), 0)
-        for text in (APPLE, huge)
-    )
-    assert none.width == LEAST_PX * len(LayoutMethod)
-    assert one.width > none.width
-    assert len(none.getcolors(1 << 16)) > 1
-    with pytest.raises(EvaluationError, match="is not a fixed task"):
-        named([SourceText("apple", APPLE, "embomatrix", scene="Rs_int")], "pear")
 
 
 def _fixed() -> list[tuple[str, str]]:

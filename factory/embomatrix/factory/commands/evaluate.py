@@ -20,7 +20,6 @@ from embomatrix.factory.evaluate.aesthetics import evaluate_aesthetics
 from embomatrix.factory.evaluate.judges import evaluate_looks, judged
 from embomatrix.factory.evaluate.page import with_factory
 from embomatrix.factory.evaluate.scenes import LayoutMethod, evaluate_scenes, fixed_tasks, outcome_log
-from embomatrix.factory.evaluate.side_by_side import draw_side_by_side, named
 from embomatrix.factory.evaluate.tasks import DraftFeatures, asked_of, evaluate_tasks, panel, people_of
 from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures, read_evaluation
 from embomatrix.factory.pipeline.corpus import training_scenes
@@ -38,11 +37,11 @@ Judge = AbstractAsyncContextManager[ChatModel]
 
 def evaluate(
     parts: Annotated[
-        list[str] | None,
+        list[str],
         typer.Argument(
             help="Parts to measure: tasks, scenes, looks, admission, aesthetics. A .json file of figures is read instead."
         ),
-    ] = None,
+    ],
     dataset: Annotated[
         Path | None,
         typer.Option(
@@ -52,9 +51,7 @@ def evaluate(
     each: Annotated[int, typer.Option(min=2, help="Tasks per scene (10 in the paper).")] = 10,
     sample: Annotated[
         Path | None,
-        typer.Option(
-            help="JSON lines file with the paper's sample of tasks, for scenes, looks and --picture."
-        ),
+        typer.Option(help="JSON lines file with the paper's sample of tasks, for scenes and looks."),
     ] = None,
     only: Annotated[int, typer.Option(min=1, help="Use only every n-th of the 140 tasks.")] = 1,
     outcomes: Annotated[
@@ -73,9 +70,6 @@ def evaluate(
     model: Model = "",
     key: Key = "",
     cassette: Tape = None,
-    picture: Annotated[
-        str, typer.Option(help="Fixed task to draw as TASK.png, laid out by three methods side by side.")
-    ] = "",
     out: Annotated[Path | None, typer.Option(help="Folder for the figures, PART.json.")] = None,
     page: Annotated[
         Path | None, typer.Option(help="Page with the factory's section to update, docs/benchmarks.md.")
@@ -96,18 +90,15 @@ def evaluate(
     with user_errors(more=MODEL_ERRORS):
         if llm and not model:
             raise EvaluationError("--llm needs the name of a model there: give --model")
-        for part in parts or ():
+        for part in parts:
             if part not in measures and not part.endswith(".json"):
                 raise EvaluationError(
                     f"unknown part {part!r}: expected a .json file or {', '.join(measures)}"
                 )
-        if picture:
-            draw_side_by_side(named(_fixed(sample), picture), seed).save(f"{picture}.png")
-            say(f"picture: {picture}.png")
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
         evaluations = []
-        for part in parts or ():
+        for part in parts:
             measured = part in measures
             evaluations.append(measures[part]() if measured else read_evaluation(Path(part)))
             report_evaluation(evaluations[-1], out / f"{part}.json" if out and measured else None)
