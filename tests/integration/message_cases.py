@@ -185,7 +185,7 @@ COMMANDS = (
         "unknown layout method",
         "factory lay --scene=Rs_int --bddl=FILES/problem.bddl --method=magic",
         "magic",
-        "expected one of tree",
+        "is not one of 'tree'",
     ),
     # Options
     CommandCase(
@@ -366,7 +366,7 @@ COMMANDS = (
         "missing scene file",
         "scene show FILES/nothing.json",
         "FILES/nothing.json",
-        "expected one that `embomatrix scene build` wrote",
+        "expected a file that `embomatrix scene build` wrote",
     ),
     CommandCase(
         "unknown model format",
@@ -420,7 +420,7 @@ COMMANDS = (
         "folder of another file",
         "scene build Rs_int --out=FILES/file/out",
         "FILES/file/out",
-        "name another folder with --out",
+        "name another path",
     ),
     CommandCase(
         "evaluation without ledger",

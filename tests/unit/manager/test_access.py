@@ -176,7 +176,7 @@ class TokenMachine(RuleBasedStateMachine):
         self.book = CredentialBook()
         self.now_s = 1000.0
         self.model: dict[str, Known] = {}
-        """By token, in order of issue: tokens are random, and drawing from a sorted list would not be repeatable."""
+        """Issued tokens in order of issue: tokens are random, and drawing from a sorted list would not be repeatable."""
 
     def valid(self, token):
         known = self.model[token]
