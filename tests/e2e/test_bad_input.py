@@ -302,4 +302,4 @@ def test_interrupted_build_leaves_no_dataset_and_resumes(tmp_path):
     other = run(
         "factory", "build", f"--out={out}", "--scene=Rs_int", "--train=9", "--heldout=0", "--no-look-ahead"
     )
-    assert_ended(other, 2, "holds a build with other settings (train 8, now 9): give the same settings again")
+    assert_ended(other, 2, "holds a run with other settings (train 8, now 9): give the same settings again")

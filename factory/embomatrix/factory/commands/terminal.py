@@ -1,6 +1,7 @@
 """Terminal output of the factory's commands: lines, tables, progress bars and user errors."""
 
 import contextlib
+import errno
 import functools
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -32,6 +33,7 @@ from embomatrix.world.dataset import DatasetError
 
 fail = functools.partial(failure.fail, "")
 """Print a sentence on standard error and exit the command."""
+_NO_SPACE: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 USER_ERRORS: Final = (
     BddlError,
     CatalogError,
@@ -95,9 +97,11 @@ def user_errors(
     except OSError as error:
         if out is None and error.filename is None:
             raise
-        if out is None:
+        if out is None and error.errno not in _NO_SPACE:
             fail(f"{error.filename} can't be used ({error.strerror}): name another file or folder")
-        fail(f"{out} can't be written ({error.strerror}): free disk space, or name another path{kept}")
+        fail(
+            f"{out or error.filename} can't be written ({error.strerror}): free disk space, or name another path{kept}"
+        )
     except KeyboardInterrupt:
         fail(f"interrupted{kept}", status=130)
 
