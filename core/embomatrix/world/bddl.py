@@ -93,6 +93,11 @@ class BddlProblem:
             item.atom.args[0]: item.atom.args[1] for item in self.init if item.atom.args[0].endswith(WILDCARD)
         }
 
+    def initial_pairs(self, *relations: str) -> list[tuple[str, str]]:
+        """Arguments of the true atoms of ``:init`` with one of these predicates of two arguments."""
+        true = [item.atom for item in self.init if item.positive]
+        return [(atom.args[0], atom.args[1]) for atom in true if atom.predicate in relations]
+
     def spelt_out(self, members: Mapping[str, tuple[str, ...]]) -> BddlProblem:
         """Replace each wildcard by objects of these names, which may be none."""
         objects: dict[str, str] = {}

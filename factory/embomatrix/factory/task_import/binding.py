@@ -72,11 +72,7 @@ def bind(
     Scene objects in ``excluded`` are not used.
     """
     check_expressible(problem, reachable=options.reachable)
-    inroom = {
-        item.atom.args[0]: item.atom.args[1]
-        for item in problem.init
-        if item.positive and item.atom.predicate == Relation.INROOM
-    }
+    inroom = dict(problem.initial_pairs(Relation.INROOM))
     placed = _placements(problem)
     view = SceneView(scene)
     fixtures = [
@@ -120,9 +116,8 @@ def _placements(problem: BddlProblem) -> dict[str, tuple[Relation, str]]:
     """Return the relation and host that ``:init`` gives to each object."""
     placed: dict[str, tuple[Relation, str]] = {}
     for relation in PLACING:
-        for item in problem.init:
-            if item.positive and item.atom.predicate == relation:
-                placed.setdefault(item.atom.args[0], (relation, item.atom.args[1]))
+        for name, host in problem.initial_pairs(relation):
+            placed.setdefault(name, (relation, host))
     return placed
 
 
@@ -159,9 +154,7 @@ def _in_order(
 
 def _neighbours(problem: BddlProblem, name: str, ready: Container[str]) -> tuple[str, ...]:
     """Return existing neighbours that the start puts next to the object, in either order."""
-    pairs = (
-        item.atom.args for item in problem.init if item.positive and item.atom.predicate == Relation.NEXTTO
-    )
+    pairs = problem.initial_pairs(Relation.NEXTTO)
     others = (b if a == name else a for a, b in pairs if name in (a, b))
     return tuple(dict.fromkeys(other for other in others if other in ready))
 

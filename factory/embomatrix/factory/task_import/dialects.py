@@ -185,18 +185,8 @@ def _rooms_as_rooms(problem: BddlProblem, notes: list[str]) -> BddlProblem:
 
 
 def _placed(problem: BddlProblem, notes: list[str]) -> BddlProblem:
-    known = {
-        item.atom.args[0]: item.atom.args[1]
-        for item in problem.init
-        if item.positive and item.atom.predicate == Relation.INROOM
-    }
-    rests = {
-        item.atom.args[0]: item.atom.args[1]
-        for item in problem.init
-        if item.positive
-        and len(item.atom.args) == 2
-        and item.atom.predicate in set(Relation) - {Relation.INROOM}
-    }
+    known = dict(problem.initial_pairs(Relation.INROOM))
+    rests = dict(problem.initial_pairs(*set(Relation) - {Relation.INROOM}))
     if not known:
         return problem
     added: list[InitLiteral] = []

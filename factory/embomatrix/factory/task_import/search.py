@@ -137,11 +137,7 @@ def _domains(
 ) -> tuple[dict[str, list[str]], list[str]]:
     """Return candidate scene objects for each name, the best first, and the names of furniture without any."""
     catalog = Catalog.load()
-    hosts = {
-        item.atom.args[1]
-        for item in problem.init
-        if item.positive and item.atom.predicate in {Relation.ONTOP, Relation.INSIDE}
-    }
+    hosts = {host for _, host in problem.initial_pairs(Relation.ONTOP, Relation.INSIDE)}
     domains: dict[str, list[str]] = {}
     missing: list[str] = []
     for name, room in wanted.items():

@@ -77,9 +77,7 @@ def requirements_of(problem: BddlProblem) -> Mapping[str, Requirement]:
     found = {}
     for name in (*problem.objects, *problem.types):
         contents, burden = (
-            tuple(started[relation, name])
-            if len(started[relation, name]) > len(ended[relation, name])
-            else tuple(ended[relation, name])
+            max(tuple(ended[relation, name]), tuple(started[relation, name]), key=len)
             for relation in (Relation.INSIDE, Relation.ONTOP)
         )
         found[name] = Requirement(name in bears, contents, name in carried, tuple(places[name]), burden)
@@ -151,9 +149,7 @@ def smallest_m(type_name: str) -> Vec3 | None:
 def _holds_at_start(problem: BddlProblem, atom: Atom) -> bool:
     """True if the atom holds at the start for everything that its names stand for."""
     first, second = (problem.types.get(name.lstrip("?"), (name.lstrip("?"),)) for name in atom.args)
-    at_start = {
-        item.atom.args for item in problem.init if item.positive and item.atom.predicate == atom.predicate
-    }
+    at_start = set(problem.initial_pairs(atom.predicate))
     return all(any((one, other) in at_start for other in second) for one in first)
 
 
