@@ -139,7 +139,7 @@ def test_figures_agree_with_hand_computed_values():
     assert (report.plan_s, report.full_scene_plans, report.full_scene_plan_s) == (1.5, 1, 2.0)
     assert report.speedup_min == pytest.approx(500.0)
     by_skill = {item.skill: item for item in report.skills}
-    assert (by_skill[Skill.CLOSE].unequal, by_skill[Skill.PLACE].other_reason) == (1, 1)
+    assert (by_skill[Skill.CLOSE].unequal, by_skill[Skill.PLACE].unequal) == (1, 0)
 
 
 def test_empty_suite_has_default_figures():

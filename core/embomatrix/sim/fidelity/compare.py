@@ -18,10 +18,7 @@ import msgspec
 
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.parse import plan_from_json, plan_to_json
-from embomatrix.skills.syntax import (
-    Plan,
-    Skill,
-)
+from embomatrix.skills.syntax import Plan, Skill
 from embomatrix.world.evaluate import objects_of
 from embomatrix.world.state import Relation, State
 from embomatrix.world.task import Profile, Task

@@ -31,8 +31,8 @@ FULL_SCENE: Final = (250, 350)
 class SkillReport:
     """Figures of one skill over all trials. ``calls`` and ``succeeded`` refer to cached mode.
 
-    Both modes reached ``compared`` calls; ``unequal`` of them had different outcomes, and ``other_reason`` failed in both for
-    different reasons. Times are mean processor seconds of calls that succeeded in both modes.
+    Both modes reached ``compared`` calls; ``unequal`` of them had different outcomes. Times are mean
+    processor seconds of calls that succeeded in both modes.
     """
 
     skill: Skill
@@ -40,7 +40,6 @@ class SkillReport:
     succeeded: int
     compared: int
     unequal: int
-    other_reason: int
     cached_s: float
     physical_s: float
 
@@ -91,15 +90,15 @@ def report_on(comparisons: Sequence[Comparison]) -> FidelityReport:
     return FidelityReport(
         plans=len(comparisons),
         scenes=len({item.trial.base for item in comparisons}),
-        succeeded=_share((item.cached.ok for item in comparisons), len(comparisons)),
+        succeeded=_ratio(sum(item.cached.ok for item in comparisons), len(comparisons)),
         atoms=atoms,
         atoms_equal=_ratio(sum(len(item.equal_atoms) for item in comparisons), atoms),
-        plans_equal=_share((item.first_difference is None for item in comparisons), len(comparisons)),
+        plans_equal=_ratio(sum(item.first_difference is None for item in comparisons), len(comparisons)),
         steps=len(pairs),
         steps_equal=_ratio(equal_steps, len(pairs)),
         steps_of_either=steps_of_either,
         steps_equal_of_either=_ratio(equal_steps, steps_of_either),
-        reasons_equal=_share((one.failure is other.failure for one, other in pairs), len(pairs)),
+        reasons_equal=_ratio(sum(one.failure is other.failure for one, other in pairs), len(pairs)),
         plan_s=_mean([item.physical.cpu_s for item in comparisons]),
         full_scene_plans=len(full),
         full_scene_plan_s=_mean([item.physical.cpu_s for item in full]),
@@ -122,16 +121,9 @@ def _skill_report(skill: Skill, comparisons: Sequence[Comparison]) -> SkillRepor
         succeeded=sum(step.ok for step in mine),
         compared=len(pairs),
         unequal=sum(one.ok is not other.ok for one, other in pairs),
-        other_reason=sum(
-            not one.ok and not other.ok and one.failure is not other.failure for one, other in pairs
-        ),
         cached_s=_mean([one.cpu_s for one, _ in both]),
         physical_s=_mean([other.cpu_s for _, other in both]),
     )
-
-
-def _share(items: Iterable[bool], total: int) -> float:
-    return _ratio(sum(items), total)
 
 
 def _ratio(part: int, whole: int) -> float:
