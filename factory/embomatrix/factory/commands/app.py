@@ -1,6 +1,7 @@
 """``embomatrix factory``: build, generate, list and export datasets of verified tasks."""
 
 import contextlib
+from dataclasses import astuple
 from pathlib import Path
 from typing import Annotated
 
@@ -167,16 +168,7 @@ def _print_account(ledger: Ledger) -> None:
     show_table(
         ("agent", "calls", "failed", "retries", "tokens in", "tokens out", "seconds", "cost"),
         (
-            (
-                purpose,
-                account.calls,
-                account.failed,
-                account.retries,
-                account.prompt_tokens,
-                account.completion_tokens,
-                f"{account.seconds:.1f}",
-                f"{account.cost:.4f}",
-            )
+            (purpose, *(round(figure, 4) for figure in astuple(account)))
             for purpose, account in (*ledger.accounts.items(), ("all", ledger.total()))
         ),
     )
