@@ -32,6 +32,7 @@ from embomatrix.bench.report.figures import (
 )
 from embomatrix.bench.report.output import console, errors, hand_in, refusals, write
 from embomatrix.bench.report.page import check_page, render_page
+from embomatrix.host.commands import command_group
 from embomatrix.pages.figures import Figure
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.simulation import load_simulator
@@ -39,12 +40,7 @@ from embomatrix.world.dataset import Dataset
 
 OnStep = Callable[[str], None]
 
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    help="Measure the engine, the cluster, the trainer and operations on this machine.",
-)
+app = command_group(help="Measure the engine, the cluster, the trainer and operations on this machine.")
 
 
 class ClusterPart(StrEnum):

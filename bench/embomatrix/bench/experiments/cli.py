@@ -32,6 +32,7 @@ from embomatrix.bench.experiments.section import add_section, learning_section
 from embomatrix.bench.report.figures import BenchResult, commit_here, describe_machine
 from embomatrix.bench.report.output import hand_in, write
 from embomatrix.cli.local_cluster import no_problem, run_command
+from embomatrix.host.commands import command_group
 from embomatrix.host.failure import fail
 from embomatrix.host.limits import usable_cores
 from embomatrix.pages.figures import Figure
@@ -40,11 +41,8 @@ from embomatrix.trainer.config.settings import checked_settings
 from embomatrix.trainer.logging.outcome import read_outcome
 from embomatrix.trainer.run.starting import default_threads
 
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    help="Run the paper's experiments over several seeds: figures, and a section for docs/experiments/training.md.",
+app = command_group(
+    help="Run the paper's experiments over several seeds: figures, and a section for docs/experiments/training.md."
 )
 console = Console(highlight=False, markup=False, soft_wrap=True)
 

@@ -22,6 +22,7 @@ from embomatrix.cli.cluster.tables import (
 )
 from embomatrix.cli.cluster.trace import chrome_trace
 from embomatrix.cli.connection import AsJson, manager_command
+from embomatrix.host.commands import command_group
 from embomatrix.host.failure import fail
 from embomatrix.rpc.admin_client import AdminClient
 
@@ -29,11 +30,8 @@ T = TypeVar("T")
 FOLLOW_S: Final = 0.5
 """Pause between two requests of `events --follow`."""
 
-app = typer.Typer(
-    help="Inspect and control a cluster: workers, runs, look-ahead, reports, traces, and the history of a rollout.",
-    add_completion=False,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
+app = command_group(
+    help="Inspect and control a cluster: workers, runs, look-ahead, reports, traces, and the history of a rollout."
 )
 
 Worker = Annotated[str, typer.Argument(help="Id of a worker, as `embomatrix cluster workers` shows it.")]

@@ -34,18 +34,14 @@ from embomatrix.factory.pipeline.build import VariantCheck
 from embomatrix.factory.pipeline.cluster import cluster_check
 from embomatrix.factory.pipeline.export import dataset_card, encode_rows, export_rows
 from embomatrix.factory.pipeline.settings import SCENE_EXTRACTOR, BuildSettings, WriterKind, scene_ids
+from embomatrix.host.commands import command_group
 from embomatrix.llm.batch import FailureLimit
 from embomatrix.llm.ledger import Ledger, Price
 from embomatrix.rpc.options import Ca, Token
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.whole_file import write_whole
 
-app = typer.Typer(
-    help="Build and inspect datasets of verified tasks.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
+app = command_group(help="Build and inspect datasets of verified tasks.")
 app.add_typer(assets_app, name="assets")
 app.command("import")(import_)
 for command in (agent, lay, inspect, pictures, corpus, verify, evaluate):

@@ -16,16 +16,12 @@ from embomatrix.factory.importers.convex import Coacd, by_components
 from embomatrix.factory.importers.model import AxisConvention, ModelFileError
 from embomatrix.factory.importers.shelf import save_asset
 from embomatrix.factory.pictures.assets import draw_sheet
+from embomatrix.host.commands import command_group
 from embomatrix.world.asset import Asset, Credit
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.records import SceneInvalidError
 
-app = typer.Typer(
-    help="Test, draw and import the models that scenes are built from.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
+app = command_group(help="Test, draw and import the models that scenes are built from.")
 WORTH_TELLING: Final = 1.25
 """Ratio of the largest to the smallest scale from which a distorted model is reported."""
 

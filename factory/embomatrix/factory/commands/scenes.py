@@ -25,18 +25,14 @@ from embomatrix.factory.scenes.batch import SceneBuildJob, run_batch
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.report import TABLE_COLUMNS, SceneReport, problem_lines, report_table
 from embomatrix.factory.scenes.scene_file import SUFFIX, SceneFileError, read_scene
+from embomatrix.host.commands import command_group
 from embomatrix.host.limits import usable_cores
 from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.scene import Scene
 from embomatrix.world.whole_file import check_writable, write_whole
 
-app = typer.Typer(
-    help="Build, check and draw base scenes.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
+app = command_group(help="Build, check and draw base scenes.")
 
 
 class Drawing(StrEnum):

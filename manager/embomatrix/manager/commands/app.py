@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 from pydantic import ValidationError
 
+from embomatrix.host.commands import command_group
 from embomatrix.host.failure import fail
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.rpc.logs import LogFormat, hide, log_to_stderr, without_secrets
@@ -19,16 +20,9 @@ if TYPE_CHECKING:
     from embomatrix.rpc.admin_client import AdminClient
     from embomatrix.rpc.wire.tokens import AccessRole, TokenInfo
 
-app = typer.Typer(
-    help="Serve a manager, create its certificates, and manage its tokens.",
-    add_completion=False,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-)
+app = command_group(help="Serve a manager, create its certificates, and manage its tokens.")
 
-token_app = typer.Typer(
-    help="Issue, list and revoke tokens.", no_args_is_help=True, pretty_exceptions_enable=False
-)
+token_app = command_group(help="Issue, list and revoke tokens.")
 app.add_typer(token_app, name="token")
 T = TypeVar("T")
 _refuse = functools.partial(fail, "manager")

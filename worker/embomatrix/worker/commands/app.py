@@ -6,10 +6,10 @@ import tempfile
 import time
 from pathlib import Path
 
-import typer
 from rich.console import Console
 from rich.table import Table
 
+from embomatrix.host.commands import command_group
 from embomatrix.worker.commands.install import install
 from embomatrix.worker.commands.options import check_engine, fail, parse
 from embomatrix.worker.commands.ray import ray_workers
@@ -18,12 +18,7 @@ from embomatrix.worker.commands.status import status
 from embomatrix.worker.host.resources import measure
 from embomatrix.worker.slots.processes import ProcessGoneError, start_root
 
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    help="Run a worker that lends this machine's cores to a manager.",
-)
+app = command_group(help="Run a worker that lends this machine's cores to a manager.")
 console = Console()
 
 app.command()(run)
