@@ -1,15 +1,21 @@
 """Atomic writes and bounded reads of files."""
 
 import errno
+import functools
 import os
 from pathlib import Path
 
 
-def write_whole(path: Path, data: bytes) -> None:
-    """Write beside the target and rename: readers see the old file or the new one. Raises OSError."""
+def write_whole(path: Path, data: bytes, *, mode: int = 0o666) -> None:
+    """Write beside the target and rename: readers see the old file or the new one. Raises OSError.
+
+    The file has the permissions ``mode``, less the umask, from its first byte.
+    """
     part = path.with_name(f"{path.name}.part")
     try:
-        part.write_bytes(data)
+        part.unlink(missing_ok=True)
+        with open(part, "xb", opener=functools.partial(os.open, mode=mode)) as file:
+            file.write(data)
         part.replace(path)
     except BaseException:
         part.unlink(missing_ok=True)

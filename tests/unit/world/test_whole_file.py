@@ -12,6 +12,12 @@ def test_file_is_written_and_nothing_else_remains(tmp_path: Path) -> None:
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a.json", b"new")]
 
 
+def test_file_with_a_mode_ignores_a_left_over_part(tmp_path: Path) -> None:
+    (tmp_path / "key.part").write_bytes(b"readable by all")
+    write_whole(tmp_path / "key", b"secret", mode=0o600)
+    assert [(path.name, path.stat().st_mode & 0o777) for path in tmp_path.iterdir()] == [("key", 0o600)]
+
+
 def test_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
     target = tmp_path / "taken"
     (target / "inner").mkdir(parents=True)

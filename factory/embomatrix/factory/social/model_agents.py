@@ -138,11 +138,9 @@ class SocialModelAgents:
         said = "\n".join(f"{turn.speaker}: {turn.text}" for turn in conversation.turns)
         user = SUMMARY_USER.format(scene=facts.described(), conversation=said)
         request = self._request(SUMMARY, SUMMARY_SYSTEM, user, seed)
-
-        def check(request: TaskRequest) -> None:
-            check_request(request, view, known)
-
-        return await ask(self._model, request, TaskRequest, check=check)
+        return await ask(
+            self._model, request, TaskRequest, check=lambda wanted: check_request(wanted, view, known)
+        )
 
     def _request(self, purpose: str, system: str, user: str, seed: int) -> ChatRequest:
         messages = (Message(Speaker.SYSTEM, system), Message(Speaker.USER, user))

@@ -9,9 +9,9 @@ import hashlib
 import hmac
 import json
 import secrets
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 from embomatrix.manager.store.protocol import ShelfRow
 from embomatrix.rpc.status import (
@@ -57,8 +57,8 @@ class Credential:
     """Reason of the revocation; empty while valid."""
 
     @classmethod
-    def from_row(cls, row: ShelfRow) -> Credential:
-        fields = json.loads(row.payload)
+    def of(cls, fields: Mapping[str, Any]) -> Credential:
+        """Return the credential of stored fields."""
         return cls(**{**fields, "role": AccessRole(fields["role"])})
 
     def row(self) -> ShelfRow:

@@ -1,7 +1,6 @@
 """Folder ``access`` of a data folder: authority, certificate and first tokens, made by ``manager init``."""
 
 import json
-import os
 import socket
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -19,12 +18,13 @@ from embomatrix.manager.access.certificates import (
 )
 from embomatrix.manager.access.credentials import LONGEST_JOIN_S, Credential, CredentialBook
 from embomatrix.manager.settings import LOOPBACK_NAMES
-from embomatrix.manager.store.protocol import ShelfRow
 from embomatrix.rpc.trust import fingerprint_of
 from embomatrix.rpc.wire.tokens import AccessRole
+from embomatrix.world.whole_file import write_whole
 
 FIRST_ROLES: Final = (AccessRole.ADMIN, AccessRole.TRAINER, AccessRole.VIEWER, AccessRole.JOIN)
 _PUBLIC: Final = 0o644
+_SECRET: Final = 0o600
 
 
 class AccessError(Exception):
@@ -58,10 +58,7 @@ class AccessFolder:
     def first_credentials(self) -> tuple[Credential, ...]:
         """Return the first credentials. Raises AccessError."""
         try:
-            rows = json.loads(self.hashes.read_bytes())
-            return tuple(
-                Credential.from_row(ShelfRow(row["token_id"], json.dumps(row).encode())) for row in rows
-            )
+            return tuple(map(Credential.of, json.loads(self.hashes.read_bytes())))
         except (FileNotFoundError, NotADirectoryError):
             return ()
         except OSError as error:
@@ -108,9 +105,9 @@ def hand_out_to(data_dir: Path, role: AccessRole, target: Path) -> None:
     folder = AccessFolder(data_dir)
     try:
         target.mkdir(parents=True, exist_ok=True)
-        _write(target / "ca.pem", folder.ca.read_bytes(), _PUBLIC)
+        write_whole(target / "ca.pem", folder.ca.read_bytes(), mode=_PUBLIC)
         if not (target / "token").exists():
-            _write(target / "token", folder.token(role).read_bytes())
+            write_whole(target / "token", folder.token(role).read_bytes(), mode=_SECRET)
     except FileNotFoundError as error:
         raise AccessError(
             f"{error.filename} no longer exists: issue a token with `embomatrix manager token issue --role {role}`"
@@ -119,23 +116,14 @@ def hand_out_to(data_dir: Path, role: AccessRole, target: Path) -> None:
         raise AccessError(f"{error.filename or target} can't be written ({error.strerror})") from error
 
 
-def _write(path: Path, content: bytes, mode: int = 0o600) -> None:
-    """Write atomically, by default readable by the owner only."""
-    part = path.with_name(f"{path.name}.part")
-    part.unlink(missing_ok=True)
-    with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
-        file.write(content)
-    part.replace(path)
-
-
 def _authority(folder: AccessFolder, now: datetime, done: PreparedAccess) -> KeyPair:
     if folder.ca.exists():
         done.found.append(f"the authority {folder.ca}")
         return KeyPair(folder.ca.read_bytes(), folder.ca_key.read_bytes() if folder.ca_key.exists() else b"")
     authority = make_authority(f"EmboMatrix authority of {socket.gethostname()}", now)
     # The key is written first: a certificate without a key means an authority that is kept elsewhere.
-    _write(folder.ca_key, authority.key)
-    _write(folder.ca, authority.certificate, _PUBLIC)
+    write_whole(folder.ca_key, authority.key, mode=_SECRET)
+    write_whole(folder.ca, authority.certificate, mode=_PUBLIC)
     done.made.append(f"the authority {folder.ca}: clients pass it as --ca")
     return authority
 
@@ -159,8 +147,8 @@ def _certify(
         pair = make_server_certificate(authority, names, now)
     except ValueError as error:
         raise AccessError(f"--san: {error}") from error
-    _write(folder.server_key, pair.key)
-    _write(folder.server, pair.certificate, _PUBLIC)
+    write_whole(folder.server_key, pair.key, mode=_SECRET)
+    write_whole(folder.server, pair.certificate, mode=_PUBLIC)
     done.made.append(f"the certificate {folder.server}, for {', '.join(names)}")
 
 
@@ -185,11 +173,11 @@ def _first_tokens(
             role, valid_s=valid_s, label="made by manager init", now_s=now.timestamp()
         )
         pinned = f".{fingerprint_of(folder.ca.read_text())}" if role is AccessRole.JOIN else ""
-        _write(path, f"{token}{pinned}\n".encode())
+        write_whole(path, f"{token}{pinned}\n".encode(), mode=_SECRET)
         credentials.append(credential)
         done.made.append(
             f"a token of the role {role}: {path}" + (", valid for one worker and one day" if valid_s else "")
         )
     if len(credentials) > len(known):
         rows = [asdict(credential) for credential in credentials]
-        _write(folder.hashes, json.dumps(rows, indent=1).encode())
+        write_whole(folder.hashes, json.dumps(rows, indent=1).encode(), mode=_SECRET)

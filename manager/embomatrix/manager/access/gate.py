@@ -2,6 +2,7 @@
 
 import asyncio
 import hmac
+import json
 import logging
 import time
 from collections.abc import Iterable
@@ -67,7 +68,7 @@ class Gate:
         Raises AccessError for a shared token that was issued for a role, since it would become an admin's.
         """
         now_s = time.time()
-        known = [Credential.from_row(row) for row in await self._store.rows(Shelf.CREDENTIALS)]
+        known = [Credential.of(json.loads(row.payload)) for row in await self._store.rows(Shelf.CREDENTIALS)]
         self._book.keep(*(credential for credential in known if is_remembered(credential, now_s=now_s)))
         fresh = [credential for credential in first if credential.token_id not in self._book]
         if fresh:

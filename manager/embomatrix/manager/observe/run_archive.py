@@ -6,7 +6,6 @@ import asyncio
 import gzip
 import itertools
 import logging
-import os
 import re
 import time
 import zlib
@@ -36,6 +35,7 @@ from embomatrix.rpc.wire.run_log import (
     run_summary_to_proto,
 )
 from embomatrix.rpc.wire.values import Batch, RunInfo, RunStats
+from embomatrix.world.whole_file import write_whole
 
 logger = logging.getLogger(__name__)
 
@@ -185,11 +185,9 @@ class RunArchive:
         """Write a closed run. It replaces an earlier run of the same id."""
         message = pb.KeptRun(summary=run_summary_to_proto(summary), events=map(run_event_to_proto, events))
         path = self._path(summary.run.run_id)
-        fresh = path.with_suffix(".new")
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            fresh.write_bytes(gzip.compress(message.SerializeToString(), compresslevel=3))
-            os.replace(fresh, path)
+            write_whole(path, gzip.compress(message.SerializeToString(), compresslevel=3))
             for old in self._files()[self._kept :]:
                 old.unlink(missing_ok=True)
         except OSError as error:

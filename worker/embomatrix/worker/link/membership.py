@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.rpc.trust import Invitation, fetch_ca, read_ca, read_token
+from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
     from embomatrix.worker.host.settings import WorkerSettings
@@ -50,19 +50,15 @@ class MembershipFile:
             ) from error
 
     def keep(self, membership: Membership) -> None:
-        """Write the file beside and rename it; only its owner can read it from the first byte."""
+        """Write the file; only its owner can read it from the first byte."""
         self._path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        part = self._path.with_suffix(".part")
-        part.unlink(missing_ok=True)
         kept = {
             "manager": membership.manager,
             "name": membership.name,
             "credential": membership.token,
             "ca": membership.ca.decode("ascii"),
         }
-        with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as file:
-            json.dump(kept, file)
-        part.replace(self._path)
+        write_whole(self._path, json.dumps(kept).encode("ascii"), mode=0o600)
 
 
 async def membership_of(settings: WorkerSettings) -> Membership:
