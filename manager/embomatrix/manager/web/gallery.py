@@ -87,7 +87,9 @@ class Gallery:
 
     async def detail(self, task_id: str) -> TaskDetail:
         """Return one task. Raises NotFoundError, or UnavailableError for a damaged dataset."""
-        record = await self._record(task_id)
+        record = (await self._loaded()).get(task_id)
+        if record is None:
+            raise NotFoundError(f"the dataset has no task {task_id[:100]!r}: the page of tasks lists them")
         async with self._reading:
             return await asyncio.to_thread(self._read_detail, record)
 
@@ -110,12 +112,6 @@ class Gallery:
     async def _check_bundle(self, digest: str) -> None:
         if not any(record.bundle_digest == digest for record in (await self._loaded()).values()):
             raise NotFoundError(f"no task of the dataset is in a bundle {digest[:80]!r}")
-
-    async def _record(self, task_id: str) -> TaskRecord:
-        record = (await self._loaded()).get(task_id)
-        if record is None:
-            raise NotFoundError(f"the dataset has no task {task_id[:100]!r}: the page of tasks lists them")
-        return record
 
     async def _loaded(self) -> dict[str, TaskRecord]:
         """Return the records by id. They are read again after the file changes."""
