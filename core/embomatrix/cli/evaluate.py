@@ -51,7 +51,7 @@ from embomatrix.trainer.evaluation.answers import (
 )
 from embomatrix.trainer.evaluation.baselines import PLANNERS, BaselineName
 from embomatrix.trainer.evaluation.benchmark import Benchmark, find_benchmark
-from embomatrix.trainer.evaluation.exam import Exam, Question, WorldExam
+from embomatrix.trainer.evaluation.exam import Question, WorldExam
 from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.table import ScoreRow, read_row, report_of, text_report
 from embomatrix.world.task import MAX_TABLE, Profile
@@ -61,6 +61,7 @@ DEFAULT_BENCH: Final = "build/dataset"
 DEFAULT_OUT: Final = Path("runs/eval")
 ENDPOINT_TOKENS: Final = 1024
 """Enough for a plan of 64 steps in JSON and some reasoning before it."""
+Exam = WorldExam | NativeExam
 console = Console(highlight=False, markup=False, soft_wrap=True)
 
 
@@ -253,14 +254,13 @@ def _policy(exam: Exam, model: str, settings: EvalSettings) -> Subject:
     """Load the model. Raises TrainerError."""
     from embomatrix.trainer.evaluation.models import load_model
 
-    loaded = load_model(model, settings.codec, threads=settings.threads, device=settings.device)
-    codec = loaded.policy.codec
-    if isinstance(exam, NativeExam) and codec is Codec.NAMES:
+    policy, trained = load_model(model, settings.codec, threads=settings.threads, device=settings.device)
+    if isinstance(exam, NativeExam) and policy.codec is Codec.NAMES:
         raise TrainerError(
             f"{model} is a word-level policy, which can't read {NATIVE}'s prompts: pass another model"
         )
-    ask = functools.partial(ask_policy, loaded.policy)
-    return Subject(ask, codec, loaded.rows, settings.max_tokens or loaded.max_tokens)
+    ask = functools.partial(ask_policy, policy)
+    return Subject(ask, policy.codec, trained.prompt.rows, settings.max_tokens or trained.grpo.max_new)
 
 
 def _endpoint(url: str, model_name: str, key: str, settings: EvalSettings, folder: Path) -> Subject:
@@ -284,7 +284,7 @@ def _baseline(exam: Exam, name: BaselineName) -> Callable[[str, np.random.Genera
                 f"the baseline `{name}` is for our own tasks: on {NATIVE} pass --baseline human"
             )
         return lambda task_id, rng: exam.human(task_id)
-    if name is BaselineName.HUMAN or not isinstance(exam, WorldExam):
+    if name is BaselineName.HUMAN:
         raise TrainerError(f"the human plans are of {NATIVE}: pass --bench {NATIVE}, or --baseline oracle")
     plan, tasks = PLANNERS[name], exam.bench.tasks
     return lambda task_id, rng: json.dumps(plan_to_json(plan(tasks[task_id], rng)))

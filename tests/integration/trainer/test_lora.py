@@ -170,7 +170,7 @@ def test_resumed_run_with_adapters_is_bit_identical(model_folder, tmp_path):
     frozen = adapters(whole.module)
     for name, layer in adapters(new_policy(settings_of(model_folder), TASKS).module).items():
         assert torch.equal(layer.base_layer.weight, frozen[name].base_layer.weight)
-    loaded = load_model(str(summary.checkpoint), Codec.LINES, threads=1, device="cpu").policy
+    loaded, _ = load_model(str(summary.checkpoint), Codec.LINES, threads=1, device="cpu")
     assert not adapters(loaded.module)
     assert torch.allclose(scored(loaded).logprobs, scored(whole).logprobs, atol=1e-4)
 

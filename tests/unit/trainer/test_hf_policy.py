@@ -283,7 +283,7 @@ def test_trained_policy_keeps_its_codec_and_other_models_use_json(policy, tokeni
     tokenizer.save_pretrained(tmp_path / "other")
 
     def codec(name, requested):
-        return load_model(str(tmp_path / name), requested, threads=1, device="cpu").policy.codec
+        return load_model(str(tmp_path / name), requested, threads=1, device="cpu")[0].codec
 
     assert codec("taught", None) is Codec.LINES
     assert codec("taught", Codec.JSON) is Codec.JSON

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from embomatrix.skills.prompt import Codec, Prompt, limited, prompt_for
 from embomatrix.trainer.cluster.executor import Executor
@@ -35,37 +35,11 @@ class ExamResult:
     others: Mapping[str, Estimate] = field(default_factory=dict)
 
 
-class Exam(Protocol):
-    """Tasks in order. ``digest`` identifies them. ``by_rule`` counts the tasks that can't be expressed and count as failed."""
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def digest(self) -> str: ...
-
-    @property
-    def split(self) -> str: ...
-
-    @property
-    def task_ids(self) -> Sequence[str]: ...
-
-    @property
-    def by_rule(self) -> int: ...
-
-    def questions(self, codec: Codec, rows: int) -> Sequence[Question]:
-        """Return one question per task, with at most ``rows`` rows of its object table. Raises TrainerError."""
-        ...
-
-    def judge(
-        self, setup: EvaluationSetup, answers: Sequence[Answer], report: Callable[[int, int], None]
-    ) -> ExamResult:
-        """Judge answers. ``report`` gets the number of judged plans and the total. Raises TrainerError and ClusterError."""
-        ...
-
-
 class WorldExam:
-    """Benchmark of our own tasks, executed in our simulator."""
+    """Benchmark of our own tasks, executed in our simulator.
+
+    ``digest`` identifies the tasks. ``by_rule`` counts those that can't be expressed and count as failed.
+    """
 
     def __init__(self, bench: Benchmark, executor: Executor) -> None:
         self.bench = bench
@@ -75,6 +49,7 @@ class WorldExam:
         self.by_rule = len(bench.failed_by_rule)
 
     def questions(self, codec: Codec, rows: int) -> tuple[Question, ...]:
+        """Return one question per task, with at most ``rows`` rows of its object table. Raises TrainerError."""
         return tuple(
             Question(task_id, prompt_for(limited(task.situation, rows), codec))
             for task_id, task in self.bench.tasks.items()
@@ -83,6 +58,7 @@ class WorldExam:
     def judge(
         self, setup: EvaluationSetup, answers: Sequence[Answer], report: Callable[[int, int], None]
     ) -> ExamResult:
+        """Judge answers. ``report`` gets the number of judged plans and the total. Raises TrainerError and ClusterError."""
         judged = judge_answers(self.bench, setup, self._executor, answers, report)
         categories = {record.task.task_id: record.task.category for record in self.bench.records}
         board = Scoreboard.of(categories, judged.verdicts, self.by_rule)

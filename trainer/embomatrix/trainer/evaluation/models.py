@@ -1,13 +1,17 @@
 """Models to evaluate: a checkpoint of a run, a saved policy, or any Hugging Face model."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, LoraSettings, read_settings
+from embomatrix.trainer.config.settings import (
+    LANGUAGE_MODEL_DEFAULTS,
+    LoraSettings,
+    TrainSettings,
+    read_settings,
+)
 from embomatrix.trainer.lifecycle.checkpoint import read_state
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.loading import configure_torch, saved_policy
@@ -15,33 +19,28 @@ from embomatrix.trainer.policy.protocol import Policy
 from embomatrix.trainer.policy.tiny import TinyPolicy
 
 
-@dataclass(frozen=True, slots=True)
-class LoadedModel:
-    """Policy with its maximum table rows and maximum tokens per plan."""
+def load_model(
+    named: str, codec: Codec | None, *, threads: int | None, device: str
+) -> tuple[Policy, TrainSettings]:
+    """Load a policy with its settings. Raises TrainerError.
 
-    policy: Policy
-    rows: int
-    max_tokens: int
-
-
-def load_model(named: str, codec: Codec | None, *, threads: int | None, device: str) -> LoadedModel:
-    """Load a model. A trained policy keeps its codec; any other model uses ``codec``, by default JSON. Raises TrainerError."""
+    A trained policy keeps its codec; any other model uses ``codec``, by default JSON.
+    """
     folder = Path(named)
     if folder.is_dir() and (folder / "policy").is_dir():
         _, settings = read_state(folder)
         # A checkpoint holds the merged model, so the base model of its adapters is not needed.
         settings = settings.model_copy(update={"device": device, "lora": LoraSettings()})
         configure_torch(threads or settings.threads, device)
-        policy: Policy = saved_policy(folder / "policy", settings)
-        return LoadedModel(policy, settings.prompt.rows, settings.grpo.max_new)
+        return saved_policy(folder / "policy", settings), settings
     configure_torch(threads or torch.get_num_threads(), device)
     if folder.is_dir() and TinyPolicy.is_saved_in(folder):
         settings = read_settings(None, {"device": device})
-        return LoadedModel(saved_policy(folder, settings), settings.prompt.rows, settings.grpo.max_new)
+        return saved_policy(folder, settings), settings
     if folder.is_dir() and not HfPolicy.is_saved_in(folder):
         raise TrainerError(
             f"{folder} is not a model: expected runs/NAME/checkpoints/step-000050, or a folder with config.json"
         )
     written = codec or HfPolicy.codec_in(folder) or Codec.JSON
     settings = read_settings(None, {"device": device, "codec": written}, LANGUAGE_MODEL_DEFAULTS)
-    return LoadedModel(HfPolicy.load(named, settings), settings.prompt.rows, settings.grpo.max_new)
+    return HfPolicy.load(named, settings), settings
