@@ -13,24 +13,9 @@ from typing import Any, Final
 
 from embomatrix.trainer.eai.inside.stand_ins import BINARY, UNARY, make_object, state_class
 
-PREDICATES: Final = {
-    "inside": "Inside",
-    "onfloor": "OnFloor",
-    "ontop": "OnTop",
-    "under": "Under",
-    "nextto": "NextTo",
-    "touching": "Touching",
-    "cooked": "Cooked",
-    "dusty": "Dusty",
-    "frozen": "Frozen",
-    "open": "Open",
-    "sliced": "Sliced",
-    "soaked": "Soaked",
-    "stained": "Stained",
-    "toggled_on": "ToggledOn",
-    "burnt": "Burnt",
-}
-RELATIONS: Final = frozenset(name for name, state in PREDICATES.items() if state in BINARY)
+PREDICATES: Final = {state.lower(): state for state in (*BINARY, *UNARY)} | {"toggled_on": "ToggledOn"}
+"""iGibson's states by the names of BDDL's predicates."""
+RELATIONS: Final = frozenset(state.lower() for state in BINARY)
 STARTS_OPEN: Final = frozenset({"carton.n.02"})
 """The published human plans put objects into cartons without opening them. All other openable objects start closed."""
 OFF_FLOOR: Final = ("top_cabinet", "sink", "window", "door", "microwave", "room_floor")
