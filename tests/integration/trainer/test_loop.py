@@ -107,7 +107,7 @@ def test_run_writes_report_metrics_samples_and_the_newest_checkpoints(tmp_path):
     assert success_rows(summary)[0][0] == "all tasks"
     outcome = read_outcome(tmp_path)
     assert (outcome.steps, outcome.rollouts, len(outcome.before), len(outcome.after)) == (6, 96, 4, 4)
-    assert 0 <= outcome.wait_share <= outcome.overhead < 1
+    assert 0 <= outcome.shares.waiting <= outcome.shares.overhead < 1
     assert outcome.peak_mb > 50, "torch alone takes more"
 
 

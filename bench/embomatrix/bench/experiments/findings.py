@@ -44,11 +44,11 @@ class ArmFindings:
 
     @property
     def wait_share(self) -> float:
-        return _mean([run.outcome.wait_share for run in self.runs])
+        return _mean([run.outcome.shares.waiting for run in self.runs])
 
     @property
     def overhead(self) -> float:
-        return _mean([run.outcome.overhead for run in self.runs])
+        return _mean([run.outcome.shares.overhead for run in self.runs])
 
 
 def read_runs(design: Design, folder_of: Callable[[int, str], Path]) -> dict[str, list[Run]]:

@@ -134,7 +134,7 @@ def _time_row(run: Run) -> tuple[str, ...]:
         str(run.seed),
         f"{total / max(1, outcome.steps):.2f}",
         *(f"{share:.1%}" for share in shares),
-        f"{outcome.overhead:.1%}",
+        f"{outcome.shares.overhead:.1%}",
         f"{outcome.peak_mb:,.0f} MB" if outcome.peak_mb else NOTHING,
     )
 

@@ -45,22 +45,15 @@ class RunOutcome:
     peak_mb: float = 0.0
 
     @property
-    def wait_share(self) -> float:
-        """Share of the GRPO steps in which the trainer waited for simulation; NaN without steps."""
-        return TimeShares(self.grpo_s, self.spent_s).waiting
-
-    @property
-    def overhead(self) -> float:
-        """Share of the GRPO steps outside of sampling and updates; NaN without steps."""
-        return TimeShares(self.grpo_s, self.spent_s).overhead
+    def shares(self) -> TimeShares:
+        """Time shares of the GRPO steps; NaN without steps."""
+        return TimeShares(self.grpo_s, self.spent_s)
 
 
-def write_outcome(folder: Path, outcome: RunOutcome) -> Path:
+def write_outcome(folder: Path, outcome: RunOutcome) -> None:
     """Write the outcome into a run's folder. Raises OSError."""
-    path = folder / OUTCOME
     value = {"schema": SCHEMA, **asdict(outcome)}
-    write_whole(path, (json.dumps(value, indent=1) + "\n").encode("utf-8"))
-    return path
+    write_whole(folder / OUTCOME, (json.dumps(value, indent=1) + "\n").encode("utf-8"))
 
 
 def read_outcome(folder: Path) -> RunOutcome:

@@ -78,7 +78,7 @@ def prewarm_share(stats: RunStats) -> float:
     return stats.prewarm_hits / asked if asked else 0.0
 
 
-def write_report(summary: TrainingSummary, metrics: Sequence[Mapping[str, Any]], machine: str) -> Path:
+def write_report(summary: TrainingSummary, metrics: Sequence[Mapping[str, Any]], machine: str) -> None:
     outcome = summary.outcome
     times = [(name, f"{spent:.1f}", f"{share:.0%}") for name, spent, share in time_rows(outcome)]
     parts = [
@@ -100,7 +100,6 @@ def write_report(summary: TrainingSummary, metrics: Sequence[Mapping[str, Any]],
     style = "body { max-width: 720px; margin: 2rem auto; padding: 0 1rem; } svg { display: block; fill: currentColor; }"
     page = f"{page_head('Training report')}<style>{style}</style></head><body>{''.join(parts)}</body></html>"
     summary.report.write_text(page, encoding="utf-8")
-    return summary.report
 
 
 def _curve(series: Sequence[float | None], title: str, colour: str) -> str:
