@@ -77,12 +77,8 @@ class Glance:
     runs: tuple[RunInfo, ...]
 
     @property
-    def workers(self) -> tuple[WorkerInfo, ...]:
-        return self.fleet.workers
-
-    @property
     def completed(self) -> int:
-        return sum(worker.completed for worker in self.workers)
+        return sum(worker.completed for worker in self.fleet.workers)
 
 
 def earliest(glances: Sequence[Glance], span_s: float) -> Glance:
@@ -98,10 +94,10 @@ def rate(before: Glance, now: Glance) -> float:
 
 def screen(before: Glance, now: Glance, *, lines: int) -> RenderableType:
     """Draw runs and workers within ``lines`` lines; workers that do not work come first, then the busiest."""
-    present, busy = _at_work(now.workers)
+    present, busy = _at_work(now.fleet.workers)
     head = Text(f"{rate(before, now):,.0f} rollouts/s", style="bold")
     head.append(
-        f"   {busy}   {len(present)} of {counted(len(now.workers), 'worker')} at work"
+        f"   {busy}   {len(present)} of {counted(len(now.fleet.workers), 'worker')} at work"
         f"   {counted(len(now.runs), 'run')}",
         style="default",
     )
@@ -109,7 +105,7 @@ def screen(before: Glance, now: Glance, *, lines: int) -> RenderableType:
         head.append(f"\n{now.fleet.health}", style="default")
     runs = now.runs[-max(1, lines // 3) :]
     room = max(1, lines - OTHER_LINES - len(runs))
-    order = sorted(now.workers, key=lambda w: (w.state == "ready", -w.running, w.worker_id))
+    order = sorted(now.fleet.workers, key=lambda w: (w.state == "ready", -w.running, w.worker_id))
     more = len(order) - room
     parts: list[RenderableType] = [head, Text("")]
     parts += [run_table(runs) if runs else Text("no open runs", style="dim"), Text("")]

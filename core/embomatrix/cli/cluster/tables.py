@@ -74,10 +74,8 @@ def worker_table(workers: Sequence[WorkerInfo]) -> Table:
 
 
 def run_table(runs: Sequence[RunInfo]) -> Table:
-    table = _table("run", "name", "state", **dict.fromkeys(("done", "open", "failed", "again", "late"), 1))
-    table.add_column("prewarm hits", justify="right", no_wrap=True)
-    table.add_column("wasted", justify="right", no_wrap=True)
-    table.add_column("waits for", overflow="fold", max_width=SENTENCE)
+    figures = ("done", "open", "failed", "again", "late", "prewarm hits", "wasted")
+    table = _table("run", "name", "state", **dict.fromkeys(figures, 1), **{"waits for": 0})
     for run in runs:
         stats = run.stats
         asked = stats.prewarm_hits + stats.prewarm_misses
