@@ -80,9 +80,10 @@ class Contender(Protocol):
 
     def victim(self, pids: Sequence[int]) -> int:
         """Process id of an executing process, to be killed. ``pids`` have answered already."""
+        return pids[-1]
 
 
-class FuturesContender:
+class FuturesContender(Contender):
     """Library with futures: ``submit(chunk)`` returns one."""
 
     def __init__(self, submit: Callable[[RolloutChunk], concurrent.futures.Future[Answer]]) -> None:
@@ -100,9 +101,6 @@ class FuturesContender:
                 failure = future.exception()
                 size = len(futures[future])
                 take(Lost(size, type(failure).__name__) if failure else _done(future.result()))
-
-    def victim(self, pids: Sequence[int]) -> int:
-        return pids[-1]
 
 
 @contextlib.contextmanager
@@ -169,7 +167,7 @@ def celery_on_redis(setup: ContenderSetup) -> Iterator[Contender]:
             yield CeleryContender(setup, app)
 
 
-class CeleryContender:
+class CeleryContender(Contender):
     """Submits chunks as tasks of a Celery application."""
 
     def __init__(self, setup: ContenderSetup, app: Any) -> None:
@@ -191,9 +189,6 @@ class CeleryContender:
                 failed = answer["status"] != "SUCCESS"
                 take(Lost(len(chunk), type(result).__name__) if failed else _done(result))
 
-    def victim(self, pids: Sequence[int]) -> int:
-        return pids[-1]
-
 
 @contextlib.contextmanager
 def own_cluster(setup: ContenderSetup, workload: Workload) -> Iterator[Contender]:
@@ -213,7 +208,7 @@ def own_cluster(setup: ContenderSetup, workload: Workload) -> Iterator[Contender
             runner.run(stack.aclose())
 
 
-class ClusterContender:
+class ClusterContender(Contender):
     """Submits all chunks as one batch, which the dispatcher distributes."""
 
     def __init__(self, cluster: BenchCluster, runner: asyncio.Runner, load: LoadGenerator) -> None:
