@@ -18,6 +18,7 @@ from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.logs import LogFormat, log_to_stderr
 from embomatrix.rpc.options import Ca, Manager, Token
+from embomatrix.rpc.trust import read_ca, read_token
 from embomatrix.trainer.config.errors import TrainerError
 
 if TYPE_CHECKING:
@@ -90,7 +91,7 @@ def train(
     with _report_errors("train", out):
         if log_format is LogFormat.JSON:
             log_to_stderr("info", log_format)
-        connect = _connector(manager, token, ca)
+        connect = functools.partial(ClusterClient, manager, read_token(token), ca=read_ca(ca))
         changes = {
             "seed": seed,
             "device": device,
@@ -181,14 +182,6 @@ def _coefficients(options: Sequence[str]) -> dict[str, str]:
                 f"--reward {name + equals + value!r}: expected NAME=VALUE, for example goal=10"
             )
     return {f"reward.{name}": value for name, _, value in pairs}
-
-
-def _connector(manager: str, token: str, ca: Path | None) -> Connect:
-    """Return a function that connects to the manager. Credentials are read once. Raises ClusterError."""
-    from embomatrix.rpc.client import ClusterClient
-    from embomatrix.rpc.trust import read_ca, read_token
-
-    return functools.partial(ClusterClient, manager, read_token(token), ca=read_ca(ca))
 
 
 def _run(start: RunStart, connect: Connect, out: Path) -> TrainingSummary:

@@ -10,6 +10,7 @@ Wrap your ``DataLoader`` or sampler, and announce the window to the cluster:
 Batches keep the loader's order, and each is drawn exactly once, ``steps`` earlier than needed.
 """
 
+import itertools
 from collections import deque
 from collections.abc import Iterable, Iterator
 from typing import Generic, TypeVar
@@ -50,8 +51,4 @@ class Lookahead(Generic[T]):
         return tuple(self._window)
 
     def _fill(self, source: Iterator[T]) -> None:
-        while len(self._window) <= self._steps:
-            try:
-                self._window.append(next(source))
-            except StopIteration:
-                return
+        self._window.extend(itertools.islice(source, self._steps + 1 - len(self._window)))
