@@ -119,19 +119,18 @@ class DoorPanel:
 def panels_of(stage: PhysicalStage, name: str) -> list[DoorPanel]:
     """Return the moving panels of an object, in the order of its joints."""
     asset, pose = stage.world.asset(name), stage.world.engine.pose(name)
-    moving = [link for link in asset.links if link.joint is not None]
+    moving = [(link, link.joint) for link in asset.links if link.joint is not None]
     return [
         DoorPanel(
             name,
             number,
             link,
-            link.joint,
+            joint,
             asset,
             pose,
             Aabb.around(part.aabb(IDENTITY) for part in link.parts),
         )
-        for number, link in enumerate(moving)
-        if link.joint is not None
+        for number, (link, joint) in enumerate(moving)
     ]
 
 

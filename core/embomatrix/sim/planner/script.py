@@ -47,11 +47,6 @@ class PlanScript:
         """Calls so far, as `PlanCalls.plan` gives them."""
         return self._calls.plan
 
-    @property
-    def rows(self) -> tuple[str, ...]:
-        """Object table of the task."""
-        return self._task.table
-
     def transfer(self, name: str, target: str, relation: PlaceRelation, *, near: str = "") -> None:
         """Carry an object to its place, from beside ``near`` if possible. Containers are opened while the hand is empty.
 
@@ -78,7 +73,7 @@ class PlanScript:
         for other in self._task.table:
             is_inside = other != name and self._world.relations.inside(other, target)
             if is_inside and self._calls.use(Skill.PLACE, other, PlaceRelation.ONTOP).ok:
-                if self.holds(Relation.INSIDE, name, target):
+                if self._world.relations.holds(Relation.INSIDE, name, target):
                     return True
                 self._take(name, DEPTH)
         return False
@@ -119,10 +114,6 @@ class PlanScript:
             raise StuckError(f"there is no free surface in the object table to put {name} on")
         self._take(name, depth)
         self._set_down(name, avoid)
-
-    def holds(self, relation: Relation, a: str, b: str) -> bool:
-        """True if the relation holds now."""
-        return self._world.relations.holds(relation, a, b)
 
     def take(self, name: str) -> None:
         """Pick an object up unless it is in the hand."""

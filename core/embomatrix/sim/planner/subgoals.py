@@ -131,13 +131,13 @@ class Subgoals:
             script.switch_on(source)
 
     def _place(self, item: PlacementGoal, script: PlanScript, world: LiveWorld) -> None:
-        if script.holds(item.relation, item.name, item.target):
+        if world.relations.holds(item.relation, item.name, item.target):
             return
         if item.relation is Relation.INROOM:
             elsewhere = frozenset(name for name in world.scene.by_name if world.room_of(name) != item.target)
             script.put_away(item.name, elsewhere)
             return
-        found = carry_sequences(item, world, script.rows)
+        found = carry_sequences(item, world, world.table)
         if not found:
             raise StuckError(f"{item.name} fits nowhere so that it is {item.relation.value} {item.target}")
         for carry in found[self.variant % len(found)]:
@@ -150,7 +150,7 @@ class Subgoals:
         """
         kept = ""
         for item in self.leave:
-            if not script.holds(item.relation, item.name, item.target):
+            if not world.relations.holds(item.relation, item.name, item.target):
                 continue
             in_room = item.relation is Relation.INROOM
             # The first object is carried away from the second, unless it is fixed.
