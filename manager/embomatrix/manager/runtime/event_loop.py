@@ -210,20 +210,14 @@ class ManagerRuntime:
             return self._unrenewed() or "the state store is away"
         return self._delivery.problem
 
-    async def pause_dispatch(self) -> None:
-        """Stop giving leases, also under later managers. Live leases continue.
+    async def set_paused(self, paused: bool) -> None:
+        """Stop giving leases, also under later managers, or give them again. Live leases continue.
 
-        Raises UnavailableError if the pause can't be stored for later managers.
+        Raises UnavailableError if the change can't be stored for later managers.
         """
-        self.paused = True
+        self.paused = paused
         self._update_dispatch()
-        await self._journal.note_pause(True)
-
-    async def resume_dispatch(self) -> None:
-        """Give leases again, unless the store is away. Raises UnavailableError like ``pause_dispatch``."""
-        self.paused = False
-        self._update_dispatch()
-        await self._journal.note_pause(False)
+        await self._journal.note_pause(paused)
 
     def _update_dispatch(self) -> None:
         event = PauseChanged(self.paused or self._suspended)

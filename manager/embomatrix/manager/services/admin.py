@@ -66,13 +66,13 @@ class AdminServicer(admin_service_pb2_grpc.AdminServiceServicer):
     async def PauseDispatch(
         self, request: pb.PauseDispatchRequest, context: Context
     ) -> pb.PauseDispatchResponse:
-        await self._runtime.pause_dispatch()
+        await self._runtime.set_paused(True)
         return pb.PauseDispatchResponse()
 
     async def ResumeDispatch(
         self, request: pb.ResumeDispatchRequest, context: Context
     ) -> pb.ResumeDispatchResponse:
-        await self._runtime.resume_dispatch()
+        await self._runtime.set_paused(False)
         return pb.ResumeDispatchResponse()
 
     async def IssueToken(self, request: pb.IssueTokenRequest, context: Context) -> pb.IssueTokenResponse:

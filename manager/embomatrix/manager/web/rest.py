@@ -129,14 +129,14 @@ def command_routes(runtime: ManagerRuntime, snapshots: Snapshots, revocation: Re
     async def pause() -> Changed:
         """Stop giving leases. Live leases continue."""
         with _changing(snapshots):
-            await runtime.pause_dispatch()
+            await runtime.set_paused(True)
         return Changed("dispatch", "paused")
 
     @router.post("/dispatch/resume", response_model=Changed)
     async def go_on() -> Changed:
         """Give leases again."""
         with _changing(snapshots):
-            await runtime.resume_dispatch()
+            await runtime.set_paused(False)
         return Changed("dispatch", "running")
 
     return router
