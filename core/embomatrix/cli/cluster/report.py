@@ -1,11 +1,11 @@
 """The report of a run: one HTML file with everything in it. It loads nothing and runs no script."""
 
 import dataclasses
-import html
 import string
 import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from html import escape
 from importlib.resources import files
 from typing import Final
 
@@ -33,8 +33,8 @@ def report_page(summary: RunSummary, events: Sequence[RunEvent]) -> str:
     run = summary.run
     return string.Template(template).substitute(
         head=page_head(f"{run.name or run.run_id} · EmboMatrix run"),
-        title=_text(run.name or run.run_id),
-        about=_text(_about(summary)),
+        title=escape(run.name or run.run_id),
+        about=escape(_about(summary)),
         tiles=_tiles(summary),
         throughput=throughput_chart(summary.series),
         busy=_busy(summary, events),
@@ -43,7 +43,7 @@ def report_page(summary: RunSummary, events: Sequence[RunEvent]) -> str:
         prewarm_rows=_prewarm_rows(summary),
         worker_rows=_worker_rows(summary),
         failures=_failures(summary),
-        kept=_text(_kept(summary, events)),
+        kept=escape(_kept(summary, events)),
     )
 
 
@@ -115,7 +115,7 @@ def _tiles(summary: RunSummary) -> str:
         ),
     )
     return "".join(
-        f'<section class="tile"><h2>{_text(name)}</h2><b>{_text(value)}</b><span>{_text(note)}</span></section>'
+        f'<section class="tile"><h2>{escape(name)}</h2><b>{escape(value)}</b><span>{escape(note)}</span></section>'
         for name, value, note in tiles
     )
 
@@ -140,8 +140,8 @@ def _phase_rows(summary: RunSummary) -> str:
         found = summary.phases[phase]
         quantiles = (found.p50_s, found.p95_s, found.p99_s)
         share = found.sum_s / whole_s if whole_s else 0.0
-        cells = [_text(seconds_text(value)) for value in quantiles]
-        name = f"{phase.value}<small>{_text(PHASES[phase])}</small>"
+        cells = [escape(seconds_text(value)) for value in quantiles]
+        name = f"{phase.value}<small>{escape(PHASES[phase])}</small>"
         rows.append(_row([name, *cells, _bar(share)], figures=3))
     return "".join(rows)
 
@@ -157,7 +157,7 @@ def _prewarm_rows(summary: RunSummary) -> str:
         ("lead: warm before it was needed", _quantiles(summary.prewarm_lead)),
         ("loading a scene, on all workers", _quantiles(summary.scene_load)),
     ]
-    return "".join(_row([_text(name), _text(value)], figures=1) for name, value in rows)
+    return "".join(_row([escape(name), escape(value)], figures=1) for name, value in rows)
 
 
 def _quantiles(found: PhaseSummary) -> str:
@@ -173,7 +173,7 @@ def _worker_rows(summary: RunSummary) -> str:
         mean = seconds_text(worker.execute_s / worker.completed) if worker.completed else NONE
         figures = (f"{worker.completed:,}", f"{worker.failed:,}", mean, seconds_text(worker.load_s))
         share = worker.execute_s / total_s if total_s else 0.0
-        rows.append(_row([_text(worker.worker_id), *map(_text, figures), _bar(share)], figures=4))
+        rows.append(_row([escape(worker.worker_id), *map(escape, figures), _bar(share)], figures=4))
     return "".join(rows) or '<tr><td colspan="6" class="none">No worker has finished anything.</td></tr>'
 
 
@@ -186,7 +186,7 @@ def _failures(summary: RunSummary) -> str:
     names = ("time", "what", "reason", "attempt", "rollout", "worker", "scene")
     head = "".join(f"<th>{name}</th>" for name in names)
     table = f"<table><tr>{head}</tr>{rows}</table>"
-    return f'<p class="note">The latest {len(summary.failures)}: {_text(counts)}.</p><div class="scroll">{table}</div>'
+    return f'<p class="note">The latest {len(summary.failures)}: {escape(counts)}.</p><div class="scroll">{table}</div>'
 
 
 def _failure_row(event: RunEvent) -> str:
@@ -195,8 +195,8 @@ def _failure_row(event: RunEvent) -> str:
     at = time.strftime("%H:%M:%S", time.gmtime(event.at_s))
     scene = event.bundle_digest.removeprefix("sha256:")[:8] or NONE
     words = (at, what, event.code, str(event.attempt), event.rollout_id, event.worker_id or NONE, scene)
-    cells = "".join(f"<td>{_text(word)}</td>" for word in words)
-    message = f'<tr class="words"><td colspan="{len(words)}">{_text(event.message)}</td></tr>'
+    cells = "".join(f"<td>{escape(word)}</td>" for word in words)
+    message = f'<tr class="words"><td colspan="{len(words)}">{escape(event.message)}</td></tr>'
     return f'<tr class="failure">{cells}</tr>{message}'
 
 
@@ -223,7 +223,3 @@ def _kept(summary: RunSummary, events: Sequence[RunEvent]) -> str:
         f"The latest {len(events):,} events are kept, {summary.events_dropped:,} earlier ones were dropped: busy slots are "
         f"known for the end of the run only; all other figures cover the whole run."
     )
-
-
-def _text(words: str) -> str:
-    return html.escape(words)
