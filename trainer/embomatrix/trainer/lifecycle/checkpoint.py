@@ -92,12 +92,9 @@ class CheckpointStore:
 
     def latest(self) -> Path | None:
         """Return the folder of the newest complete checkpoint."""
-        found = self._all()
-        return found[-1] if found else None
+        return max(self._all(), default=None)
 
     def _all(self) -> list[Path]:
-        if not self._folder.is_dir():
-            return []
         return sorted(
             path
             for prefix in _PREFIXES
