@@ -52,7 +52,7 @@ class Quantifier(StrEnum):
     FORPAIRS = "forpairs"
     """``fornpairs`` with the smaller number of objects as the count."""
     FORNPAIRS = "fornpairs"
-    """At least ``count`` rows and as many columns of the truth table over A x B hold a true cell."""
+    """The truth table over A x B has a true cell in at least ``count`` rows and as many columns."""
 
 
 @dataclass(frozen=True, slots=True)
