@@ -16,12 +16,7 @@ from embomatrix.bench.engine.plan_writer import save_workload, write_workload
 from embomatrix.bench.engine.workload import PINNED, SIZES, Workload, load_workload
 from embomatrix.bench.fidelity.page import figures_of
 from embomatrix.bench.fidelity.pool import Modes
-from embomatrix.bench.fidelity.suite import (
-    DISAGREEMENTS_FILE,
-    RESULTS_FILE,
-    FidelitySettings,
-    run_fidelity,
-)
+from embomatrix.bench.fidelity.suite import DISAGREEMENTS_FILE, RESULTS_FILE, FidelitySettings, run_fidelity
 from embomatrix.bench.peers.contest import PeerSizes, bench_peers
 from embomatrix.bench.report.figures import (
     BenchResult,

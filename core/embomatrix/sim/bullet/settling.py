@@ -9,13 +9,7 @@ import numpy as np
 
 from embomatrix.sim.bullet.bodies import BodyFactory
 from embomatrix.sim.bullet.client import BulletClient, connect
-from embomatrix.sim.bullet.mini_world import (
-    CHUNK_STEPS,
-    GRAVITY_M_S2,
-    SLOW_M_S,
-    SLOW_RAD_S,
-    settled_from,
-)
+from embomatrix.sim.bullet.mini_world import CHUNK_STEPS, GRAVITY_M_S2, SLOW_M_S, SLOW_RAD_S, settled_from
 from embomatrix.sim.engine import FLOOR, TOLERANCE_M, WALL, Settled
 from embomatrix.sim.validation import check_scene
 from embomatrix.world.geometry import Pose

@@ -17,13 +17,7 @@ from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.joints.panels import DoorPanels, swing_panels
 from embomatrix.sim.joints.swings import SWING
 from embomatrix.sim.live_world import LiveWorld
-from embomatrix.sim.physical.doors import (
-    STRETCHES,
-    DoorPanel,
-    move_panels,
-    panel_paths,
-    panels_in_order,
-)
+from embomatrix.sim.physical.doors import STRETCHES, DoorPanel, move_panels, panel_paths, panels_in_order
 from embomatrix.sim.physical.fold import PATHS_TRIED, approach
 from embomatrix.sim.physical.pick import pick_paths
 from embomatrix.sim.physical.placement_reachability import PlacementQuery, PlacementReachability

@@ -16,12 +16,7 @@ from embomatrix.factory.layout.distribution import distribute
 from embomatrix.factory.layout.organization import organize
 from embomatrix.factory.layout.planar import arrange
 from embomatrix.factory.layout.sampling import ObjectSampler
-from embomatrix.factory.layout.values import (
-    Branch,
-    RoomBrief,
-    SampleBrief,
-    SampledPose,
-)
+from embomatrix.factory.layout.values import Branch, RoomBrief, SampleBrief, SampledPose
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.editor import PlacementError, SceneEditor
 from embomatrix.world.state import Relation

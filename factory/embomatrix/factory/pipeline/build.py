@@ -15,12 +15,7 @@ from typing import Final
 from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pipeline.settings import BuildSettings
 from embomatrix.factory.pipeline.store import BuildStore, Rejection, VariantYield
-from embomatrix.factory.pipeline.variants import (
-    TASKS_PER_VARIANT,
-    VariantMaker,
-    VariantOrder,
-    uniqueness_key,
-)
+from embomatrix.factory.pipeline.variants import TASKS_PER_VARIANT, VariantMaker, VariantOrder, uniqueness_key
 from embomatrix.factory.scenes.build import base_scene_of, build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.writer.tasks import TaskWriter

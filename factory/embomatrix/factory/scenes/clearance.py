@@ -7,13 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from embomatrix.factory.furnish.space import (
-    DOOR_CLEAR_M,
-    DOOR_HEIGHT_M,
-    LOW_M,
-    WINDOW_CLEAR_M,
-    WINDOW_FROM_M,
-)
+from embomatrix.factory.furnish.space import DOOR_CLEAR_M, DOOR_HEIGHT_M, LOW_M, WINDOW_CLEAR_M, WINDOW_FROM_M
 from embomatrix.world.geometry import Aabb, FloatArray
 from embomatrix.world.scene import Doorway, Room, Scene, Window
 

@@ -3,13 +3,7 @@
 from collections.abc import Sequence
 
 from embomatrix.factory.scenes.view import SceneView
-from embomatrix.factory.social.phrases import (
-    INSTRUCTIONS,
-    fill,
-    joined,
-    room_called,
-    shorten_repeated_rooms,
-)
+from embomatrix.factory.social.phrases import INSTRUCTIONS, fill, joined, room_called, shorten_repeated_rooms
 from embomatrix.factory.social.values import ROBOT, Cast, Conversation
 from embomatrix.factory.writer.goals import GoalConjunct
 from embomatrix.factory.writer.words import Voice

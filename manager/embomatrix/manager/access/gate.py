@@ -11,12 +11,7 @@ from typing import Final
 
 import grpc
 
-from embomatrix.manager.access.credentials import (
-    NO_TOKEN,
-    Credential,
-    CredentialBook,
-    is_remembered,
-)
+from embomatrix.manager.access.credentials import NO_TOKEN, Credential, CredentialBook, is_remembered
 from embomatrix.manager.access.folder import AccessError
 from embomatrix.manager.access.roles import OPEN, may_call, who_may
 from embomatrix.manager.store.protocol import Shelf, StateError, StateStore

@@ -20,14 +20,7 @@ from embomatrix.manager.observe.run_figures import RunFigures
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.wire.leases import LeaseResult
 from embomatrix.rpc.wire.run_log import EventKind, EventPage, RolloutPhase, RunEvent
-from embomatrix.rpc.wire.values import (
-    Batch,
-    Completed,
-    InfraFailure,
-    Resident,
-    ResidentState,
-    Resources,
-)
+from embomatrix.rpc.wire.values import Batch, Completed, InfraFailure, Resident, ResidentState, Resources
 
 logger = logging.getLogger(__name__)
 

@@ -9,13 +9,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 
-from embomatrix.manager.control.events import (
-    DrainChanged,
-    Event,
-    SuspicionChanged,
-    WorkerJoined,
-    WorkerLost,
-)
+from embomatrix.manager.control.events import DrainChanged, Event, SuspicionChanged, WorkerJoined, WorkerLost
 from embomatrix.rpc.status import NotFoundError, SupersededError, UnknownSessionError
 from embomatrix.rpc.wire.values import Resources
 

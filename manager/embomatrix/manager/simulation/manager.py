@@ -6,24 +6,13 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from embomatrix.manager.control.commands import (
-    Command,
-    DeliverResult,
-    FinishBatch,
-    QuarantineWorker,
-)
+from embomatrix.manager.control.commands import Command, DeliverResult, FinishBatch, QuarantineWorker
 from embomatrix.manager.control.events import BatchSubmitted, LookaheadAnnounced, RunOpened
 from embomatrix.manager.runtime.intake import TICK_S, Heartbeat, Intake
 from embomatrix.manager.runtime.worker_link import OutgoingMessage
 from embomatrix.manager.simulation.machines import SimulatedWorld
 from embomatrix.rpc.wire.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
-from embomatrix.rpc.wire.values import (
-    Batch,
-    LookaheadEntry,
-    Resources,
-    RolloutResult,
-    RunTerms,
-)
+from embomatrix.rpc.wire.values import Batch, LookaheadEntry, Resources, RolloutResult, RunTerms
 
 if TYPE_CHECKING:
     from embomatrix.manager.runtime.registry import WorkerSession

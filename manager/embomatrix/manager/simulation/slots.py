@@ -11,14 +11,7 @@ from typing import Final
 from embomatrix.manager.simulation.machines import SimulatedMachine, SimulatedWorld
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.rpc.wire.leases import Lease, LeaseProgress, LeaseRef, LeaseResult
-from embomatrix.rpc.wire.values import (
-    Completed,
-    InfraCode,
-    InfraFailure,
-    Resident,
-    ResidentState,
-    Timings,
-)
+from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, Resident, ResidentState, Timings
 
 RETRY_LOAD_S: Final = 10.0
 """Pause before a failed load is tried again, as in the real worker."""

@@ -23,12 +23,7 @@ from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers
 from embomatrix.trainer.grpo.learner import Learner
 from embomatrix.trainer.grpo.records import GroupLog, StepRecord
 from embomatrix.trainer.grpo.update import StepPlan, Updater
-from embomatrix.trainer.lifecycle.checkpoint import (
-    CHECKPOINTS,
-    CheckpointStore,
-    atomic_folder,
-    restore,
-)
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, atomic_folder, restore
 from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
 from embomatrix.trainer.lifecycle.stopwatch import Activity, Stopwatch
 from embomatrix.trainer.logging.dashboard import DashboardReporter

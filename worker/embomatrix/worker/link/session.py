@@ -14,13 +14,7 @@ import grpc
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.rpc.channel import open_channel
-from embomatrix.rpc.status import (
-    ClusterError,
-    DeadlineError,
-    NotFoundError,
-    UnavailableError,
-    cluster_errors,
-)
+from embomatrix.rpc.status import ClusterError, DeadlineError, NotFoundError, UnavailableError, cluster_errors
 from embomatrix.rpc.versions import PROTOCOL_VERSION
 from embomatrix.rpc.wire.codec import each
 from embomatrix.rpc.wire.leases import LeaseClaim, LeaseResult, WorkerState
