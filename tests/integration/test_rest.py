@@ -1,6 +1,7 @@
 """REST API and dashboard files of a real manager."""
 
 import asyncio
+import json
 import re
 from importlib.resources import files
 
@@ -10,7 +11,7 @@ from tests.contract.test_state_store import no_file_grows
 from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import BEDROOM, KITCHEN, batch, manager, open_run, outcomes
 
-from embomatrix.manager.web.rest import PREFIX
+from embomatrix.manager.web.rest import PREFIX, VIEWERS
 from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.status import NotFoundError
 from embomatrix.rpc.wire.training import RewardTiers, SampledPlan, TrainingReport
@@ -162,20 +163,62 @@ async def test_commands_are_refused_to_viewers_and_foreign_origins(tmp_path):
     assert (body, own.status_code) == ([401, 401, 403], 200)
 
 
-async def test_event_pages_resume_after_a_sequence_number(tmp_path):
+async def test_event_stream_resumes_after_a_sequence_number(tmp_path):
+    async def read(http, count, after=0):
+        async with http.stream(
+            "GET", f"{PREFIX}/events/stream", params={"run": "r1", "after": after}
+        ) as answer:
+            assert answer.headers["content-type"].startswith("text/event-stream")
+            found = []
+            async for line in answer.aiter_lines():
+                if line.startswith("data: "):
+                    found.append(json.loads(line.removeprefix("data: ")))
+                if len(found) == count:
+                    return found
+        return found
+
     async with (
         manager(tmp_path) as at,
         open_run(at.address) as client,
         FakeWorker(at.address, slots=2),
         http_at(at) as http,
     ):
+        reading = asyncio.create_task(read(http, 6))
         await outcomes(client, batch(8))
-        every = (await http.get(f"{PREFIX}/events", params={"run": "r1"})).json()["events"]
-        numbers = [event["sequence"] for event in every]
-        rest = await http.get(f"{PREFIX}/events", params={"run": "r1", "after": numbers[5]})
-        assert rest.json()["events"] == every[6:]
-        assert (await http.get(f"{PREFIX}/events", params={"run": "nobody"})).status_code == 404
+        first = await reading
+        rest = await read(http, 4, after=first[-1]["sequence"])
+        assert (await http.get(f"{PREFIX}/events/stream", params={"run": "nobody"})).status_code == 404
+    numbers = [event["sequence"] for event in (*first, *rest)]
     assert numbers == sorted(set(numbers))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+async def test_unread_event_streams_delay_nobody(tmp_path):
+    async with (
+        manager(tmp_path) as at,
+        open_run(at.address) as client,
+        FakeWorker(at.address, slots=2),
+        http_at(at, **{"accept-encoding": "identity"}) as http,
+    ):
+        port = httpx.URL(at.status_url).port
+        mute = [await asyncio.open_connection("127.0.0.1", port, limit=64) for _ in range(VIEWERS)]
+        for _, writer in mute:
+            writer.write(f"GET {PREFIX}/events/stream?run=r1 HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n".encode())
+        for reader, _ in mute:
+            assert b"200" in await reader.readline()
+        refused = await http.get(f"{PREFIX}/events/stream?run=r1")
+        assert (refused.status_code, "streams are open" in refused.text) == (503, True)
+        assert len(await outcomes(client, batch(200))) == 200
+        assert (await http.get(f"{PREFIX}/snapshot")).json()["overview"]["outcomes"] == {"completed": 200}
+        for _, writer in mute:
+            writer.transport.abort()
+        for _ in range(300):
+            async with http.stream("GET", f"{PREFIX}/events/stream?run=r1") as again:
+                if again.status_code == 200:
+                    break
+            await asyncio.sleep(0.1)
+        assert again.status_code == 200
 
 
 def named_in(text):

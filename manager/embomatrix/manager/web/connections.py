@@ -14,7 +14,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.server import ServerState
 
 CONNECTIONS: Final = 2048
-"""Connections at most. A page opens six."""
+"""Connections at most. A page opens six, an event stream holds one."""
 SILENT_S: Final = 10.0
 """Seconds from the start of a connection to its first whole request."""
 FILES: Final = 65_536

@@ -3,15 +3,16 @@
 ``http_rules`` has checked the caller's role before a request arrives here.
 """
 
+import asyncio
 import contextlib
 import dataclasses
 import functools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import AsyncIterator, Iterator, Mapping
 from typing import Annotated, Any, Final
 
-from fastapi import APIRouter, Body, FastAPI, Query, Request, Response
-from fastapi.responses import JSONResponse
+from fastapi import APIRouter, Body, FastAPI, HTTPException, Query, Request, Response
+from fastapi.responses import JSONResponse, StreamingResponse
 
 from embomatrix.manager.observe.training_reports import TrainingDetail, TrainingView
 from embomatrix.manager.runtime.event_loop import ManagerRuntime
@@ -41,6 +42,8 @@ from embomatrix.rpc.status import (
 from embomatrix.rpc.wire.run_log import RunEvent
 
 PREFIX: Final = "/api/v1"
+VIEWERS: Final = 256
+"""Concurrent event streams at most. A stream that is not read buffers one page at most."""
 STATUSES: Final[Mapping[type[ClusterError], int]] = {
     InvalidRequestError: 422,
     NotFoundError: 404,
@@ -48,6 +51,9 @@ STATUSES: Final[Mapping[type[ClusterError], int]] = {
     PreconditionError: 409,
     UnavailableError: 503,
 }
+LOOK_S: Final = 0.5
+SILENCE_S: Final = 15.0
+"""An idle stream sends a comment this often, so that proxies keep the connection open."""
 LONGEST_S: Final = 3600.0
 
 Offset = Annotated[int, Query(ge=0, description="Rows to skip.")]
@@ -97,6 +103,7 @@ def read_routes(runtime: ManagerRuntime, snapshots: Snapshots) -> APIRouter:
     _figures(router, snapshots)
     _logs(router, runtime)
     _training(router, runtime, snapshots)
+    _stream(router, runtime)
     return router
 
 
@@ -187,6 +194,49 @@ def _training(router: APIRouter, runtime: ManagerRuntime, snapshots: Snapshots) 
     async def detail(run_id: str) -> Response:
         """Learning curves of a run, and recent plans of its policy."""
         return json_response(runtime.training.detail(run_id))
+
+
+def _stream(router: APIRouter, runtime: ManagerRuntime) -> None:
+    viewers = 0
+
+    @router.get("/events/stream", response_class=StreamingResponse)
+    async def stream(run: Run = "", after: After = 0) -> Response:
+        """New events as server-sent events: `id` is the sequence number, `data` the event as JSON."""
+        nonlocal viewers
+        await runtime.history.events(run, after, 1)
+        if viewers >= VIEWERS:
+            raise HTTPException(503, f"{VIEWERS} streams are open: close one, or ask for pages of /events")
+
+        async def sent() -> AsyncIterator[str]:
+            nonlocal viewers
+            viewers += 1
+            try:
+                async for text in _growing(runtime, run, after):
+                    yield text
+            finally:
+                viewers -= 1
+
+        return StreamingResponse(
+            sent(), media_type="text/event-stream", headers={"cache-control": "no-store"}
+        )
+
+
+async def _growing(runtime: ManagerRuntime, run: str, after: int) -> AsyncIterator[str]:
+    """Yield events as they arrive, until the run's log is gone."""
+    silent_s = 0.0
+    while True:
+        try:
+            page = await runtime.history.events(run, after, 0)
+        except NotFoundError:
+            return
+        for event in page.events:
+            after = event.sequence
+            yield f"id: {after}\ndata: {json.dumps(_event(event))}\n\n"
+        silent_s = 0.0 if page.events else silent_s + LOOK_S
+        if silent_s >= SILENCE_S:
+            silent_s = 0.0
+            yield ": nothing new\n\n"
+        await asyncio.sleep(LOOK_S)
 
 
 def _event(event: RunEvent) -> dict[str, Any]:
