@@ -109,6 +109,7 @@ _TEXTS = {
     "rate.toml": '[grpo]\nlearning_rate = "fast"\n',
     "samples.toml": "samples = 0\n",
     "attic.toml": "cache_mbb = 3\n",
+    "still.toml": "heartbeat_s = 0\n",
     "preferences.toml": "[preferences]\nhous = '18:00-08:00'\n",
     "scene.json": '{"rooms": [',
     "empty_scene.json": "{}",
@@ -636,6 +637,18 @@ COMMANDS = (
     CommandCase("label without value", "worker run --label=attic", "'attic'", "expected KEY=VALUE"),
     CommandCase(
         "worker name with a space", "worker run --name='my pc'", "'my pc'", "expected up to 64 letters"
+    ),
+    CommandCase(
+        "unknown manager setting",
+        "manager serve --config=FILES/attic.toml",
+        "cache_mbb",
+        "correct its name or remove it",
+    ),
+    CommandCase(
+        "manager setting out of range",
+        "manager serve --config=FILES/still.toml",
+        "heartbeat_s 0",
+        "should be greater than 0",
     ),
     CommandCase(
         "unknown worker setting", "worker run --config=FILES/attic.toml", "cache_mbb", "expected one of ca"

@@ -190,7 +190,12 @@ def evaluate(
             _judge(exam, setup, given, folder, rows)
 
 
-add_settings(evaluate, EvalSettings, panel="Settings (also in the file of --settings)")
+add_settings(
+    evaluate,
+    EvalSettings,
+    skip=("concurrent", "attempts", "device"),
+    panel="Settings (also in the file of --settings)",
+)
 
 
 def read_eval_settings(path: Path | None, options: dict[str, Any]) -> EvalSettings:

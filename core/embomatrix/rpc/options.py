@@ -2,9 +2,10 @@
 
 import enum
 import inspect
+import tomllib
 from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, NoReturn, Protocol
 
 import typer
 from pydantic import BaseModel
@@ -42,6 +43,16 @@ def given_options(context: CommandLine) -> dict[str, Any]:
         for name, source in sources.items()
         if source is not None and not source.name.startswith("DEFAULT")
     }
+
+
+def read_config(path: Path, refuse: Callable[[str], NoReturn]) -> dict[str, Any]:
+    """Read the TOML file of ``--config``. Its values are validated with the options."""
+    try:
+        return tomllib.loads(path.expanduser().read_text(encoding="utf-8"))
+    except OSError as error:
+        refuse(f"--config {path}: the file can't be read ({error.strerror or error}): name a TOML file")
+    except ValueError as error:
+        refuse(f"--config {path}: {error}: expected a TOML file")
 
 
 def add_settings(

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from tests.fakes.worker import completed
 from typer.testing import CliRunner
 
+from embomatrix.manager.commands import app as commands
 from embomatrix.manager.commands.app import app
 from embomatrix.manager.control.dispatch.state import DispatchLimits
 from embomatrix.manager.control.reputation import AuditRules
@@ -208,6 +209,16 @@ def test_unknown_settings_are_refused_and_the_token_is_never_shown():
     with pytest.raises(ValidationError, match="Extra inputs"):
         ManagerSettings(prot=1)
     assert "secret" not in repr(ManagerSettings(token="secret"))
+
+
+def test_options_override_the_settings_file(tmp_path, monkeypatch):
+    served = []
+    monkeypatch.setattr(commands, "_serve", served.append)
+    file = tmp_path / "manager.toml"
+    file.write_text("heartbeat_s = 2.5\nport = 1\n")
+    answer = CliRunner().invoke(app, ["serve", f"--config={file}", "--port=2"])
+    assert answer.exit_code == 0, answer.output
+    assert (served[0].heartbeat_s, served[0].port) == (2.5, 2)
 
 
 def test_limits_have_the_values_of_the_settings_of_the_same_names():

@@ -59,7 +59,7 @@ def task_page(
         moments=_script_json([_moment_json(moment, view) for moment in show.moments]),
         steps=_steps(show),
         verdict=escape(f"The plan {verdict} and earns {show.reward:.2f}."),
-        final=_items(show.final),
+        final=_list([escape(words) for words in show.final]),
         transcript=_section("Transcript", transcript_html(transcript)) if transcript else "",
         tree=_section("Layout tree", _tree(tree)) if tree else "",
         objects=_object_rows(record, scene, about),
@@ -84,10 +84,6 @@ def transcript_html(text: str) -> str:
 
 def _inline(text: str) -> str:
     return _STRONG.sub(r"<strong>\1</strong>", escape(text))
-
-
-def _items(words: tuple[str, ...]) -> str:
-    return _list([escape(each) for each in words])
 
 
 def _list(items: list[str]) -> str:

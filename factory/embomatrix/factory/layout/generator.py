@@ -193,12 +193,13 @@ class _RoomLayout:
 
     def _place_tree(self, tree: LayoutTree) -> None:
         """Place the objects of a tree, hosts first. Objects on the same host are placed together."""
+        waiting = self._pending.waiting
         groups: dict[tuple[str, LayoutRelation], list[str]] = {}
         for branch in tree.branches():
-            if branch.child in self._pending.waiting:
+            if branch.child in waiting:
                 groups.setdefault((branch.parent, branch.relation), []).append(branch.child)
         for (parent, relation), children in groups.items():
-            if parent in self._pending.waiting:
+            if parent in waiting:
                 continue  # the host itself has no place
             host = self.names.get(parent, parent)
             if relation is LayoutRelation.ONTOP:
@@ -207,7 +208,8 @@ class _RoomLayout:
                 for child in children:
                     self._hang(child)
             elif relation is LayoutRelation.INSIDE and self._is_packed(host, children):
-                for child in sorted(children, key=self._volume_m3, reverse=True):
+                volumes_m3 = {name: math.prod(waiting[name].asset.size_m) for name in children}
+                for child in sorted(children, key=volumes_m3.__getitem__, reverse=True):
                     self._sample(child, Relation.INSIDE, host, packed=True)
             else:
                 for child in children:
@@ -220,9 +222,6 @@ class _RoomLayout:
         """
         item = self._editor.objects.get(host)
         return item is not None and not item.fixed and len(children) >= MIN_PACKED
-
-    def _volume_m3(self, name: str) -> float:
-        return math.prod(self._pending.waiting[name].asset.size_m)
 
     def _place_on(self, host: str, children: list[str]) -> None:
         """Arrange objects on the surfaces of a host, the best surface first. The sampler places the rest."""

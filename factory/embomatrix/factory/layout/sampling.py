@@ -120,7 +120,8 @@ class ObjectSampler:
             yield from self._beside(asset, target)
             return
         carrier = editor.asset_of(host)
-        local = list(candidates(asset, carrier, relation, self._shift(), TRIES))
+        shift = (float(self._rng.random()), float(self._rng.random()))
+        local = list(candidates(asset, carrier, relation, shift, TRIES))
         if relation is Relation.UNDER:
             local += self._under_edges(asset, carrier)
         found = [target.pose_world_asset @ pose for pose in local]
@@ -204,9 +205,6 @@ class ObjectSampler:
 
     def _yaw(self) -> float:
         return float(self._rng.integers(4)) * math.pi / 2
-
-    def _shift(self) -> tuple[float, float]:
-        return (float(self._rng.random()), float(self._rng.random()))
 
 
 def assets_of(category: str, model: str | None, rng: np.random.Generator) -> list[Asset]:

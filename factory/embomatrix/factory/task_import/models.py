@@ -117,7 +117,7 @@ def with_sizes(
         places = [
             HostPlacement(relation, host, _share_of_all(host, requirements[name]) if compact else math.inf)
             for relation, name in requirement.places
-            if (host := found.get(name) or _first(chosen.get(name, ()))) is not None
+            if (host := found.get(name) or next(map(_asset, chosen.get(name, ())), None)) is not None
         ]
         models = _ordered(chosen[addition.name], requirement, places)
         if (
@@ -194,7 +194,3 @@ def _meets(model: Model, requirement: Requirement, places: Sequence[HostPlacemen
 def _is_liftable(model: Model) -> bool:
     asset = _asset(model)
     return is_liftable(asset.size_m, asset.mass_kg)
-
-
-def _first(models: Sequence[Model]) -> Asset | None:
-    return _asset(models[0]) if models else None

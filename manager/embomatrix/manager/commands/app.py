@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path  # typer evaluates the annotation
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 import typer
 from pydantic import ValidationError
@@ -14,7 +14,7 @@ from embomatrix.host.commands import command_group
 from embomatrix.host.failure import fail
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.rpc.logs import LogFormat, hide, log_to_stderr, without_secrets
-from embomatrix.rpc.options import Ca, LogLines, Manager, Token, add_settings
+from embomatrix.rpc.options import Ca, LogLines, Manager, Token, add_settings, given_options, read_config
 
 if TYPE_CHECKING:
     from embomatrix.rpc.admin_client import AdminClient
@@ -25,6 +25,11 @@ app = command_group(help="Serve a manager, create its certificates, and manage i
 token_app = command_group(help="Issue, list and revoke tokens.")
 app.add_typer(token_app, name="token")
 T = TypeVar("T")
+OPTIONS: Final = {
+    *("host", "port", "advertise", "http_host", "http_port", "data_dir", "dataset", "state", "audit"),
+    *("tls_cert", "tls_key", "tls_ca", "insecure_bind"),
+}
+"""Settings with an option of `manager serve`. Only the file of --config sets the others."""
 _refuse = functools.partial(fail, "manager")
 """Print one sentence and exit with status 2."""
 
@@ -45,16 +50,23 @@ def serve(
         typer.Option(help="debug, info, warning or error; debug also checks invariants."),
     ] = "info",
     log_format: LogLines = LogFormat.HUMAN,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            help="TOML file of these and further settings (docs/protocol.md); options take precedence."
+        ),
+    ] = None,
     **_: object,
 ) -> None:
     """Serve until interrupted."""
     _log_to_stderr(log_level, log_format)
-    settings = _settings({**context.params, "token": _token(token)})
+    options = {**given_options(context), "token": _token(token)}
+    settings = _settings(options, read_config(config, _refuse) if config is not None else {})
     hide(settings.token)
     _serve(settings)
 
 
-add_settings(serve, ManagerSettings)
+add_settings(serve, ManagerSettings, skip=ManagerSettings.model_fields.keys() - OPTIONS)
 
 
 @app.command()
@@ -113,12 +125,12 @@ def _token(text: str) -> str:
         _refuse(str(error))
 
 
-def _settings(options: Mapping[str, object]) -> ManagerSettings:
-    """Return the settings of the same names as the given options, or exit with a sentence about a wrong one."""
+def _settings(options: Mapping[str, object], file: Mapping[str, object] | None = None) -> ManagerSettings:
+    """Merge the settings file with the options of the same names, or exit with a sentence about a wrong one."""
     known = ManagerSettings.model_fields
     given = {name: value for name, value in options.items() if name in known and value is not None}
     try:
-        return ManagerSettings.model_validate(given)
+        return ManagerSettings.model_validate({**(file or {}), **given})
     except ValidationError as error:
         first = error.errors()[0]
         expected = first["msg"].removeprefix("Value error, ")
@@ -128,7 +140,10 @@ def _settings(options: Mapping[str, object]) -> ManagerSettings:
         if name == "token":
             # The value is not shown: it may be almost the secret.
             _refuse("--token: expected visible ASCII characters without spaces")
-        _refuse(f"--{name.replace('_', '-')} {first['input']!r}: {expected[:1].lower()}{expected[1:]}")
+        if first["type"] == "extra_forbidden":
+            _refuse(f"--config: unknown setting {name!r}: correct its name or remove it")
+        shown = f"--{name.replace('_', '-')}" if name in OPTIONS else f"--config: {name}"
+        _refuse(f"{shown} {first['input']!r}: {expected[:1].lower()}{expected[1:]}")
 
 
 def _serve(settings: ManagerSettings) -> None:

@@ -6,7 +6,6 @@ import logging
 import os
 import signal
 import sys
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -17,7 +16,16 @@ import typer
 
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.logs import LogFormat, bind, hide, log_to_stderr
-from embomatrix.rpc.options import Ca, CommandLine, LogLines, Manager, Token, add_settings, given_options
+from embomatrix.rpc.options import (
+    Ca,
+    CommandLine,
+    LogLines,
+    Manager,
+    Token,
+    add_settings,
+    given_options,
+    read_config,
+)
 from embomatrix.rpc.status import ClusterError
 from embomatrix.worker.commands.options import StateDir, check_engine, fail, parse
 from embomatrix.worker.host.machine import HostMachine
@@ -34,6 +42,8 @@ logger = logging.getLogger(__name__)
 PREFERENCES: Final = frozenset(Preferences.model_fields)
 NOT_SETTINGS: Final = frozenset({"config", "labels", "verbose", "log_format"})
 """Options that are no settings of the daemon, or have another name there."""
+FILE_ONLY: Final = ("preferences", "slot_memory_mb", "drain_s", "grace_s", "calm_s", "check_s")
+"""Settings without an option: only the file of --config sets them."""
 
 
 def run(
@@ -55,7 +65,7 @@ def run(
     ] = None,
     config: Annotated[
         Path | None,
-        typer.Option(help="TOML file of these options; options on the command line take precedence."),
+        typer.Option(help="TOML file of these and further settings; options take precedence."),
     ] = None,
     verbose: Annotated[bool, typer.Option("--verbose", help="Log every rollout.")] = False,
     log_format: LogLines = LogFormat.HUMAN,
@@ -77,7 +87,7 @@ def run(
         fail(f"{where} can't be used ({error.strerror or error}): name another folder with --cache-dir")
 
 
-add_settings(run, WorkerSettings, Preferences, skip=("preferences",))
+add_settings(run, WorkerSettings, Preferences, skip=FILE_ONLY)
 
 
 def settings_of(words: Sequence[str]) -> WorkerSettings:
@@ -90,8 +100,10 @@ def settings_of(words: Sequence[str]) -> WorkerSettings:
 
 def values_of(context: CommandLine, config: Path | None, labels: list[str]) -> dict[str, Any]:
     """Merge the file with options and environment variables, which take precedence."""
-    values = read_config(config) if config is not None else {}
+    values = read_config(config, fail) if config is not None else {}
     preferences = values.setdefault("preferences", {})
+    if not isinstance(preferences, dict):
+        fail(f"--config {config}: expected preferences to be a table, [preferences]")
     for name, value in given_options(context).items():
         if name in NOT_SETTINGS:
             continue
@@ -100,19 +112,6 @@ def values_of(context: CommandLine, config: Path | None, labels: list[str]) -> d
         (preferences if name in PREFERENCES else values)[name] = value
     if labels:
         values["labels"] = {**values.get("labels", {}), **dict(map(split_label, labels))}
-    return values
-
-
-def read_config(path: Path) -> dict[str, Any]:
-    """Read a TOML file of options. Its values are validated with the others."""
-    try:
-        values = tomllib.loads(path.expanduser().read_text(encoding="utf-8"))
-    except OSError as error:
-        fail(f"--config {path}: the file can't be read ({error.strerror or error}): name a TOML file")
-    except ValueError as error:
-        fail(f"--config {path}: {error}: expected a TOML file")
-    if not isinstance(values.get("preferences", {}), dict):
-        fail(f"--config {path}: expected preferences to be a table, [preferences]")
     return values
 
 
