@@ -10,6 +10,7 @@ import logging
 import multiprocessing
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
@@ -119,7 +120,10 @@ def process_pool(setup: ContenderSetup) -> Iterator[Contender]:
     try:
         yield FuturesContender(submit)
     finally:
-        pool.shutdown(wait=False)  # a broken pool of Python 3.11 may wait for its own processes without end
+        # A broken pool of Python 3.11 may wait for its own processes without end.
+        closing = threading.Thread(target=pool.shutdown, daemon=True)
+        closing.start()
+        closing.join(10.0)
 
 
 @contextlib.contextmanager
