@@ -162,10 +162,7 @@ class _VariantWork:
                     left[draft.task.category] -= 1
             tasks = {draft.task.task_id: draft.task for draft, _ in self._admitted}
             data = encode_bundle(prepare(Bundle(scene, tasks, poses), simulator.world))
-        transcripts = {
-            draft.task.task_id: draft.transcript for draft, _ in self._admitted if draft.transcript
-        }
-        return VariantYield(self._result(bundle_digest(data)), data, transcripts, self._trees())
+        return VariantYield(self._result(bundle_digest(data)), data, self._transcripts(), self._trees())
 
     def _write(
         self, missing: Mapping[TaskCategory, int], view: SceneView, rng: np.random.Generator
@@ -206,6 +203,10 @@ class _VariantWork:
 
     def _task_id(self, number: int) -> str:
         return f"{self._variant.scene.scene_id}-{number:02d}"
+
+    def _transcripts(self) -> dict[str, str]:
+        """Return the transcripts of the admitted tasks by task id."""
+        return {draft.task.task_id: draft.transcript for draft, _ in self._admitted if draft.transcript}
 
     def _trees(self) -> dict[str, Mapping[str, Any]]:
         """Return the layout trees of the admitted tasks' rooms, by task id."""
