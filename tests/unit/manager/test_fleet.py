@@ -86,6 +86,17 @@ def test_next_start_is_predicted_from_the_slot_that_started_last():
     assert pool.stealable_lease(thief, before_s=3.0, now_s=3.5).ref.lease_id == "twice.2"
 
 
+def test_lease_is_not_stolen_while_the_slot_that_started_first_ends():
+    pool = pool_of(1)
+    thief, victim = pool.workers["w0000"], pool.join("twice", Resources(2, 2, 1024))
+    victim.note_completed(0.3)
+    load(pool, "twice", 1, given_s=1.0)
+    load(pool, "twice", 2, given_s=1.29)  # the other slot has just begun
+    victim.reported = True
+    assert pool.stealable_lease(thief, before_s=1.3, now_s=1.3) is None
+    assert pool.stealable_lease(thief, before_s=1.3, now_s=1.8).ref.lease_id == "twice.2"
+
+
 def test_idle_workers_are_rotated():
     pool = pool_of(2 * SEEKERS + 1)
     load(pool, "w0000", 2)

@@ -131,13 +131,11 @@ class WorkerRecord:
         self.credits = self.slots * (1 + behind)
 
     def begins_soon(self, now_s: float) -> bool:
-        """True if its last lease, queued behind a slot, is predicted to start now: see ``BEGINS_S``."""
+        """True if one of the slots is predicted to start the last lease, queued behind it, now: see ``BEGINS_S``."""
+        wait_s = self.pace_s * math.ceil(len(self.held) / self.slots - 1)
         running = islice(self.held.values(), self.slots)
-        began_s = max(
-            (lease.started_s for lease in running if lease.started_s is not None), default=-math.inf
-        )
-        in_s = began_s + self.pace_s * math.ceil(len(self.held) / self.slots - 1) - now_s
-        return self.completed > 0 and -LATE_S < in_s < BEGINS_S
+        starts_s = (lease.started_s + wait_s for lease in running if lease.started_s is not None)
+        return self.completed > 0 and any(-LATE_S < start_s - now_s < BEGINS_S for start_s in starts_s)
 
     def avoids(self, record: RolloutRecord, now_s: float) -> bool:
         """True while the rollout's last failure on this worker is too recent."""
