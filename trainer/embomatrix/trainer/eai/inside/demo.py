@@ -237,17 +237,15 @@ def backend() -> Any:
     def unary(self: Any) -> bool:
         return _truths[-1](self.STATE_NAME, self.input)
 
-    def unasked(self: Any, *args: Any) -> bool:
-        """Stand in for two methods that bddl declares abstract and that judging a demonstration never calls.
+    def refuse(self: Any, *args: Any) -> bool:
+        """Raise RuntimeError: the graph of a demonstration has no scene in which an atom could be tested or sampled.
 
-        ``_evaluate`` is only called by the ``evaluate`` that the functions above replace, ``_sample`` only to make
-        scenes. Raises NotImplementedError.
+        bddl requires ``_evaluate`` and ``_sample`` of every atom. The first is only called by the ``evaluate`` that the
+        functions above replace, the second only to make scenes.
         """
-        raise NotImplementedError(
-            f"{self.STATE_NAME} is judged from the graph of a demonstration, not sampled"
-        )
+        raise RuntimeError(f"{self.STATE_NAME} is judged from the graph of a demonstration, not sampled")
 
-    class Backend(BDDLBackend):  # type: ignore[misc]  # bddl is untyped
+    class Backend(BDDLBackend):
         def get_predicate_class(self, predicate_name: str) -> type:
             base, evaluate = (
                 (BinaryAtomicFormula, binary) if predicate_name in RELATIONS else (UnaryAtomicFormula, unary)
@@ -255,8 +253,8 @@ def backend() -> Any:
             body = {
                 "STATE_NAME": predicate_name,
                 "evaluate": evaluate,
-                "_evaluate": unasked,
-                "_sample": unasked,
+                "_evaluate": refuse,
+                "_sample": refuse,
             }
             return type(predicate_name, (base,), body)
 
