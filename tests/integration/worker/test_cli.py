@@ -4,8 +4,8 @@ import subprocess
 import sys
 
 
-def _worker(*arguments, prelude=""):
-    program = f"import sys\n{prelude}\nsys.argv = ['embomatrix', 'worker', *{arguments!r}]\n"
+def _worker(*arguments, prelude="", command=("worker",)):
+    program = f"import sys\n{prelude}\nsys.argv = ['embomatrix', *{command!r}, *{arguments!r}]\n"
     program += "from embomatrix.cli.main import main\nmain()\n"
     return subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
@@ -50,7 +50,7 @@ def test_wrong_address_is_reported_with_an_example():
 
 
 def test_doctor_reports_resources_and_starts_the_simulator():
-    result = _worker("doctor")
+    result = _worker(command=("doctor",))
     assert result.returncode == 0
     assert "pybullet 3.2.7" in result.stdout
     assert "starts in" in result.stdout

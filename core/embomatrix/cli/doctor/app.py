@@ -1,8 +1,9 @@
 """`embomatrix doctor`: checks of this machine and of the connection to a manager."""
 
 import asyncio
+import importlib.util
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Final
 
 import typer
@@ -12,7 +13,7 @@ from rich.text import Text
 
 from embomatrix.cli.cluster.tables import show_json
 from embomatrix.cli.connection import AsJson
-from embomatrix.cli.doctor.machine import Finding, Level, machine, verdict
+from embomatrix.cli.doctor.machine import NEEDED, Finding, Level, machine, verdict
 from embomatrix.cli.doctor.manager import Visit, manager, ports_held
 from embomatrix.host.failure import MENDABLE, fail
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
@@ -33,7 +34,7 @@ def doctor(
     ] = 8070,
     as_json: AsJson = False,
 ) -> None:
-    """Check Python, packages, ports, memory, disk and the connection to a manager. Exits with 2 if something is wrong."""
+    """Check this machine, its fitness as a worker, and the connection to a manager. Exits with 2 if something is wrong."""
     try:
         addresses = Managers(manager or DEFAULT_ADDRESS).addresses
         secret, trusted = read_token(token), read_ca(ca)
@@ -44,13 +45,21 @@ def doctor(
     held = frozenset().union(
         *(ports_held(visit, found) for visit, found in zip(visits, findings_by_visit, strict=True))
     )
-    findings = [*machine(held), *itertools.chain.from_iterable(findings_by_visit)]
+    findings = [*machine(held), *_as_worker(), *itertools.chain.from_iterable(findings_by_visit)]
     if as_json:
         show_json(findings)
     else:
         _show(findings)
     if any(finding.level is Level.WRONG for finding in findings):
         raise SystemExit(MENDABLE)
+
+
+def _as_worker() -> Iterator[Finding]:
+    """Yield findings about this machine as a worker, if the worker's packages are installed."""
+    if all(importlib.util.find_spec(name) for name in NEEDED["worker"]):
+        from embomatrix.cli.doctor.worker import worker
+
+        yield from worker()
 
 
 async def _visit(visits: Sequence[Visit]) -> list[list[Finding]]:
