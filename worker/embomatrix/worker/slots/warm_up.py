@@ -13,7 +13,7 @@ from embomatrix.world.bundle import Bundle
 from embomatrix.world.evaluate import render
 from embomatrix.world.geometry import ConvexPart, Pose, Shape
 from embomatrix.world.goal import Atom
-from embomatrix.world.poses import PlacementKey, PoseCache, StandPose
+from embomatrix.world.poses import PoseCache, StandPose
 from embomatrix.world.scene import Doorway, RobotStart, Room, Scene, SceneObject
 from embomatrix.world.state import Relation
 from embomatrix.world.task import Task, TaskCategory
@@ -44,8 +44,8 @@ def warm_up_bundle() -> Bundle:
         assets={asset.asset_id: asset for asset in (table, ball)},
         robot=RobotStart(1.0, 3.0, 0.0, "room_0"),
     )
-    on_table = PlacementKey("ball-a", "table-a", Relation.ONTOP)
-    poses = PoseCache({on_table: (Pose((0.1, 0.2, 0.39)),)}, {"table_1": (StandPose(1.0, 2.0, 0.0),)})
+    # Without a verified pose, `place` searches and settles: a slot that never did has 0.2 MB more private memory.
+    poses = PoseCache({}, {"table_1": (StandPose(1.0, 2.0, 0.0),)})
     return Bundle(scene, {WARM_UP: _task(scene)}, poses)
 
 
