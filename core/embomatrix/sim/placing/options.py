@@ -103,10 +103,8 @@ class PlacementOptions:
         rows = rows_of(self._cache.placements, verified)  # (n, 7)
         if not len(rows):
             return None
-        bounds, support = (
-            bounds_of(self._scene.assets[key.asset_id]),
-            self._scene.assets[key.support_asset_id],
-        )
+        bounds = bounds_of(self._scene.assets[key.asset_id])
+        support = self._scene.assets[key.support_asset_id]
         places = PoseSet.of(bounds, rows, [""] * len(rows), pose_held_asset)
         if not links_with_surfaces(support) <= {""}:
             boxes = places.world_boxes((), {"": IDENTITY}).each()

@@ -1,15 +1,13 @@
 """Alternative ways to make a goal true: conjunctions of ground literals, those that change least first."""
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from embomatrix.world.evaluate import expand, instance, instances, pair_sides
+from embomatrix.world.evaluate import Types, expand, instance, instances, pair_sides
 from embomatrix.world.goal import And, Atom, Facts, Formula, Not, Or, Quantified, Quantifier
 from embomatrix.world.state import Relation
-
-Types = Mapping[str, tuple[str, ...]]
 
 WIDTH: Final = 12
 """Alternatives kept for each part of a goal."""
