@@ -18,7 +18,7 @@ from embomatrix.factory.scenes.joints import with_joints
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.asset import FLOOR_CATEGORY, Asset, Link, SupportSurface
-from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
+from embomatrix.world.geometry import IDENTITY, Aabb, ConvexPart, Pose, Shape
 from embomatrix.world.scene import Room, Scene, SceneObject
 from embomatrix.world.state import Relation, State
 
@@ -273,6 +273,6 @@ def floor_asset(room: Room) -> Asset:
         synset="floor.n.01",
         size_m=size,
         mass_kg=100.0,
-        links=(Link("base", (ConvexPart(Shape.BOX, Pose((0.0, 0.0, 0.0)), size),)),),
+        links=(Link("base", (ConvexPart(Shape.BOX, IDENTITY, size),)),),
         supports=(SupportSurface("floor", (0.0, 0.0, _PLATE_M / 2 + _SUNK_M), room.size_m, 2.0),),
     )

@@ -11,7 +11,7 @@ from embomatrix.skills.syntax import Plan
 from embomatrix.world.asset import Asset, Link, SupportSurface
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.evaluate import render
-from embomatrix.world.geometry import ConvexPart, Pose, Shape
+from embomatrix.world.geometry import IDENTITY, ConvexPart, Pose, Shape
 from embomatrix.world.goal import Atom
 from embomatrix.world.poses import PoseCache, StandPose
 from embomatrix.world.scene import Doorway, RobotStart, Room, Scene, SceneObject
@@ -66,5 +66,5 @@ def _table() -> Asset:
 
 
 def _ball() -> Asset:
-    part = ConvexPart(Shape.SPHERE, Pose((0.0, 0.0, 0.0)), (0.08, 0.08, 0.08))
+    part = ConvexPart(Shape.SPHERE, IDENTITY, (0.08, 0.08, 0.08))
     return Asset("ball-a", "ball", "ball.n.01", (0.08, 0.08, 0.08), 0.1, (Link("base", (part,)),))
