@@ -261,10 +261,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"{path}  {path.stat().st_size} bytes")  # noqa: T201 - this is the command line
 
 
-if __name__ == "__main__":
-    main()
-
-
 ON: Final = "on"
 """Stands for a substance in the needs of a remover that works when it is switched on."""
 DEFAULTS: Final = {
@@ -338,3 +334,7 @@ def _options(conditions: list[list[Json]] | None) -> list[str] | None:
     if conditions is None:
         return None
     return [value if state == "saturated" else ON for state, value in conditions]
+
+
+if __name__ == "__main__":
+    main()

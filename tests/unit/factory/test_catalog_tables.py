@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gzip
 import json
+import subprocess
+import sys
 from importlib import resources
 from typing import TYPE_CHECKING
 
@@ -16,7 +18,6 @@ from embomatrix.factory.catalog_tables import (
     SUBSTANCES_FILE,
     CatalogSourceError,
     encode,
-    main,
     source_folder,
 )
 
@@ -33,7 +34,8 @@ def rebuilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
     except CatalogSourceError as error:
         pytest.skip(str(error))
     out = tmp_path_factory.mktemp("tables")
-    main(["--out", str(out)])
+    command = [sys.executable, "-m", "embomatrix.factory.catalog_tables", "--out", str(out)]
+    subprocess.run(command, check=True)
     return out
 
 
