@@ -139,20 +139,10 @@ def build_scenes(folder: Path) -> Json:
     typical = _typical_floors(scenes, boxes)
     return {
         "source": f"bddl {BDDL_VERSION}",
-        "scenes": {scene_id: _scene(rooms, boxes, typical) for scene_id, rooms in scenes.items()},
-    }
-
-
-def _scene(rooms: Json, boxes: Json, typical: Mapping[str, list[float]]) -> Json:
-    panels = {
-        asset_id: boxes[asset_id.rsplit("-", 1)[1]]
-        for models in rooms.values()
-        for asset_id in models
-        if _category(asset_id) == "walls"
-    }
-    return {
-        "walls": [[round(extent, 3) for extent in panels[name]] for name in sorted(panels)],
-        "rooms": {name: _room(name, models, boxes, typical) for name, models in rooms.items()},
+        "scenes": {
+            scene_id: {"rooms": {name: _room(name, models, boxes, typical) for name, models in rooms.items()}}
+            for scene_id, rooms in scenes.items()
+        },
     }
 
 
