@@ -1,8 +1,10 @@
 """Caches with a limit on their entries."""
 
+import inspect
+import weakref
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -11,18 +13,20 @@ V = TypeVar("V")
 class BoundedCache(dict[K, V]):
     """Cache that makes missing values with a function of the key, and is emptied when a new key does not fit.
 
-    Reading it costs no more than reading a dictionary.
+    Reading it costs no more than reading a dictionary. A method's object is held weakly, because it owns the cache: a closed
+    scene is then freed at once, without a garbage collection.
     """
 
     def __init__(self, most: int, make: Callable[[K], V]) -> None:
         super().__init__()
         self._most = most
-        self._make = make
+        self._make: Callable[[], Any] = weakref.WeakMethod(make) if inspect.ismethod(make) else lambda: make
 
     def __missing__(self, key: K) -> V:
         if len(self) >= self._most:
             self.clear()
-        self[key] = value = self._make(key)
+        value: V = self._make()(key)
+        self[key] = value
         return value
 
 

@@ -3,14 +3,18 @@
 import dataclasses
 import gc
 import sys
+import weakref
 
 from tests.fakes import furniture as make
-from tests.fakes.scenes import placed, scene_of, upright
+from tests.fakes.scenes import kitchen_scene, placed, scene_of, upright
 
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.asset import Link
+from embomatrix.world.bundle import Bundle
 from embomatrix.world.geometry import ConvexPart, Pose, Shape
+from embomatrix.world.poses import PoseCache
 from embomatrix.world.scene import Scene
 
 LOADS = 100
@@ -46,3 +50,21 @@ def test_loading_and_closing_scenes_of_hulls_leaks_no_objects() -> None:
     # A vertex that pybullet kept would be four blocks: 16 corners would leave 64 of them at each load.
     assert blocks_after(LOADS, pool) - before < 8 * LOADS
     pool.close()
+
+
+def test_closed_scene_is_freed_without_a_garbage_collection() -> None:
+    gc.collect()
+    gc.disable()
+    try:
+        simulator = load_simulator(Bundle(kitchen_scene(), {}, PoseCache({}, {})))
+        for _ in simulator.warm_up():
+            pass
+        world = simulator.world
+        owners = [
+            weakref.ref(item) for item in (world.engine, world.relations, world.navigator, world.placer)
+        ]
+        simulator.close()
+        del simulator, world
+        assert [owner() for owner in owners] == [None] * len(owners)
+    finally:
+        gc.enable()
