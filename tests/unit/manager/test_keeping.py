@@ -221,6 +221,23 @@ def test_options_override_the_settings_file(tmp_path, monkeypatch):
     assert (served[0].heartbeat_s, served[0].port) == (2.5, 2)
 
 
+def test_token_of_the_settings_file_guards_the_manager(tmp_path, monkeypatch):
+    monkeypatch.delenv("EMBOMATRIX_TOKEN", raising=False)
+    served = []
+    monkeypatch.setattr(commands, "_serve", served.append)
+    (tmp_path / "token").write_text("kept-apart\n")
+    file = tmp_path / "manager.toml"
+    for token, options in (("plain", []), (f"@{tmp_path}/token", []), ("plain", ["--token=other"])):
+        file.write_text(f'token = "{token}"\n')
+        answer = CliRunner().invoke(app, ["serve", f"--config={file}", *options])
+        assert answer.exit_code == 0, answer.output
+    assert [settings.token for settings in served] == ["plain", "kept-apart", "other"]
+    file.write_text("token = 5\n")
+    answer = CliRunner().invoke(app, ["serve", f"--config={file}"])
+    assert answer.exit_code == 2
+    assert "--token: expected visible ASCII characters" in answer.output
+
+
 def test_limits_have_the_values_of_the_settings_of_the_same_names():
     audit = AuditRules()
     assert limits_of(DispatchLimits, ManagerSettings(), audit=audit) == DispatchLimits()

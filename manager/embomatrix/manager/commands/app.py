@@ -15,10 +15,12 @@ from embomatrix.host.failure import fail
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.rpc.logs import LogFormat, hide, log_to_stderr, without_secrets
 from embomatrix.rpc.options import Ca, LogLines, Manager, Token, add_settings, given_options, read_config
+from embomatrix.rpc.status import ClusterError, InvalidRequestError
+from embomatrix.rpc.trust import Invitation, fingerprint_of, read_ca, read_token
+from embomatrix.rpc.wire.tokens import AccessRole, TokenInfo
 
 if TYPE_CHECKING:
     from embomatrix.rpc.admin_client import AdminClient
-    from embomatrix.rpc.wire.tokens import AccessRole, TokenInfo
 
 app = command_group(help="Serve a manager, create its certificates, and manage its tokens.")
 
@@ -60,8 +62,8 @@ def serve(
 ) -> None:
     """Serve until interrupted."""
     _log_to_stderr(log_level, log_format)
-    options = {**given_options(context), "token": _token(token)}
-    settings = _settings(options, read_config(config, _refuse) if config is not None else {})
+    file = read_config(config, _refuse) if config is not None else {}
+    settings = _settings(given_options(context), file)
     hide(settings.token)
     _serve(settings)
 
@@ -107,8 +109,6 @@ def init(
 
 def _recipient(text: str) -> tuple[AccessRole, Path]:
     """Parse ``ROLE:FOLDER``."""
-    from embomatrix.rpc.wire.tokens import AccessRole
-
     name, _, target = text.partition(":")
     if name not in (AccessRole.WORKER, AccessRole.TRAINER, AccessRole.VIEWER, AccessRole.ADMIN) or not target:
         _refuse(f"--hand-out {text!r}: expected worker:FOLDER, trainer:FOLDER, viewer:FOLDER or admin:FOLDER")
@@ -116,9 +116,6 @@ def _recipient(text: str) -> tuple[AccessRole, Path]:
 
 
 def _token(text: str) -> str:
-    from embomatrix.rpc.status import InvalidRequestError
-    from embomatrix.rpc.trust import read_token
-
     try:
         return read_token(text)
     except InvalidRequestError as error:
@@ -129,8 +126,11 @@ def _settings(options: Mapping[str, object], file: Mapping[str, object] | None =
     """Merge the settings file with the options of the same names, or exit with a sentence about a wrong one."""
     known = ManagerSettings.model_fields
     given = {name: value for name, value in options.items() if name in known and value is not None}
+    values = {**(file or {}), **given}
+    if isinstance(token := values.get("token"), str):
+        values["token"] = _token(token)
     try:
-        return ManagerSettings.model_validate({**(file or {}), **given})
+        return ManagerSettings.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
         expected = first["msg"].removeprefix("Value error, ")
@@ -199,9 +199,6 @@ def issue(
     ca: Ca = None,
 ) -> None:
     """Issue a token. It is shown once: the manager keeps only a hash."""
-    from embomatrix.rpc.trust import Invitation, fingerprint_of, read_ca
-    from embomatrix.rpc.wire.tokens import AccessRole
-
     if role not in list(AccessRole):
         _refuse(f"--role {role!r}: expected one of {', '.join(AccessRole)}")
     wanted = AccessRole(role)
@@ -250,8 +247,6 @@ def _ask(manager: str, token: str, ca: Path | None, question: Callable[[AdminCli
     import asyncio
 
     from embomatrix.rpc.admin_client import AdminClient
-    from embomatrix.rpc.status import ClusterError
-    from embomatrix.rpc.trust import read_ca, read_token
 
     async def ask() -> T:
         async with AdminClient(manager, read_token(token), ca=read_ca(ca)) as client:
