@@ -40,7 +40,7 @@ def reward_settings_to_proto(reward: RewardSettings) -> types_pb2.RewardSettings
 def reward_settings_from_proto(message: types_pb2.RewardSettings) -> RewardSettings:
     """Return the coefficients. Raise ConvertError for values that make no reward."""
     try:
-        return RewardSettings(**{name: getattr(message, name) for name in dataclasses.asdict(PAPER)})
+        return RewardSettings(**{name: getattr(message, name) for name in RewardSettings.__slots__})
     except RewardSettingsError as error:
         raise ConvertError(error.field, error.problem) from error
 
