@@ -8,7 +8,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from embomatrix.rpc.status import InvalidRequestError
-from embomatrix.world.task import Profile  # pydantic evaluates the annotations
+from embomatrix.world.task import Profile
 
 LARGEST_SEED = 2**31 - 1
 

@@ -12,11 +12,11 @@ from typing import Final
 from embomatrix.manager.control.schedule.lookahead import LookaheadWindow
 from embomatrix.manager.observe.metrics import FAILURES_KEPT, FailureNote
 from embomatrix.manager.observe.run_figures import summary_of
-from embomatrix.manager.observe.training_reports import TrainingView  # OpenAPI reads annotations
+from embomatrix.manager.observe.training_reports import TrainingView
 from embomatrix.manager.runtime.event_loop import UNAUDITED, ManagerRuntime
 from embomatrix.manager.runtime.registry import WorkerSession, WorkerStanding
 from embomatrix.rpc.status import NotFoundError
-from embomatrix.rpc.wire.run_log import PhaseSummary  # OpenAPI reads annotations
+from embomatrix.rpc.wire.run_log import PhaseSummary
 from embomatrix.rpc.wire.values import PlanCell, Resident, ResidentState, RunInfo, Warmth, WorkerInfo
 
 NO_WINDOW: Final = LookaheadWindow(0, ())
