@@ -41,7 +41,7 @@ class ManagerSettings(BaseModel):
     token: str = Field("", repr=False, pattern=TOKEN_PATTERN)
     """Shared secret with the role of an admin, in addition to issued tokens. Empty: none."""
     tls_cert: Path | None = None
-    """Certificate chain of the manager (PEM). None: that of ``manager init``, if present."""
+    """Certificate chain of the manager (PEM). Default: that of ``manager init``, if present."""
     tls_key: Path | None = None
     """Private key of the certificate."""
     tls_ca: Path | None = None
@@ -82,7 +82,7 @@ class ManagerSettings(BaseModel):
     leader_ttl_s: float = Field(6.0, gt=0)
     """A standby may take over after the leader has not renewed its lease for this many seconds."""
     audit: bool | None = None
-    """Execute a share of the results again on other workers and compare. None: only if workers on other machines may
+    """Execute a share of the results again on other workers and compare. Default: only if workers on other machines may
     join. Runs with verified results are always audited."""
     audit_probation: int = Field(50, ge=0)
     """Number of first executions of a new worker that are all audited."""
