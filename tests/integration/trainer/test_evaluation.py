@@ -180,6 +180,16 @@ def test_page_escapes_texts_of_models_and_tasks(bench):
     assert "<svg" in page
 
 
+def test_each_figure_of_an_exam_has_its_own_line_on_the_page(bench):
+    value, _ = report(bench, asked(bench, BaselineName.ORACLE))
+    half = {"value": 0.5, "low": 0.4, "high": 0.6}
+    page = evaluation_page({**value, "others": {"exact": half, "executed": half}}, ())
+    assert (
+        "<section class='lines'>exact, %: 50.0 [40.0, 60.0]\nexecuted, %: 50.0 [40.0, 60.0]</section>" in page
+    )
+    assert ".lines { white-space: pre-line; }" in page
+
+
 @pytest.mark.parametrize(
     ("damage", "words"),
     [

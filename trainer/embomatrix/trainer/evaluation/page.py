@@ -36,7 +36,7 @@ def evaluation_page(
         title=html.escape(title),
         about=html.escape(about(report)),
         scores="".join(map(_section, score_tables(report, beside))),
-        notes="".join(f"<section>{html.escape(note)}</section>" for note in notes(report)),
+        notes="".join(f"<section class='lines'>{html.escape(note)}</section>" for note in notes(report)),
         causes="".join(map(_section, cause_tables(report))),
         pictures="".join(_picture(picture) for picture in pictures),
         count=report["tasks"],
