@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from embomatrix.pages.figures import Figure
+from embomatrix.pages.figures import Better, Figure
 
 ROOTS: Final = ("core", "manager", "worker", "trainer", "factory", "bench")
 BANNED: Final = re.compile(
@@ -98,8 +98,6 @@ def banned_openings(sources: Mapping[str, str]) -> list[str]:
 
 def house_figures(sources: Mapping[str, str], unit_test_s: float | None) -> tuple[Figure, ...]:
     """All figures; the time of the unit tests only if it was measured."""
-    from embomatrix.pages.figures import Better, Figure
-
     code = {path: text for path, text in sources.items() if not path.startswith("tests/")}
     packages = below(code, ROOTS)
     folders = Counter(str(Path(path).parent) for path in code)
