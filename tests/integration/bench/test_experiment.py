@@ -8,6 +8,7 @@ from datetime import date
 import pytest
 from typer.testing import CliRunner
 
+from embomatrix.bench.experiments import cli
 from embomatrix.bench.experiments.benchmarks import PolicyStage, bench_table, benchmark_section
 from embomatrix.bench.experiments.cli import app
 from embomatrix.bench.experiments.conduct import IMITATED, Conductor, Venue
@@ -264,3 +265,18 @@ def test_benchmark_has_a_line_for_each_stage(tmp_path, bench, figure):
     assert [(each.name, each.value) for each in figures] == [(f"{figure}_before", 0.25), (figure, 0.5)]
     text = benchmark_section(tmp_path, lines, "abc", TODAY)
     assert "| GRPO | 50.0 [10.0, 80.0] |" in text
+
+
+def test_load_of_a_table_is_read_before_its_evaluations(tmp_path, monkeypatch):
+    write_outcome(tmp_path, outcome((0.0, 0.5), (0.5, 1.0)))
+    for folder in ("reference", "checkpoints/step-000020"):
+        (tmp_path / folder).mkdir(parents=True)
+    load = [0.25]
+    monkeypatch.setattr(cli, "describe_machine", lambda: MACHINE | {"load_before": load[0]})
+    monkeypatch.setattr(cli, "bench_table", lambda *_: ((), ()))
+    monkeypatch.setattr(cli, "run_command", lambda *_: load.insert(0, 8.0))
+    status, text = invoke("table", f"--run={tmp_path}", "--bench=eai")
+    assert status == 0, text
+    assert load[0] == 8.0
+    assert "load before 0.25" in text
+    assert "The machine was busy" not in text

@@ -190,6 +190,7 @@ def table(
     """Success before and after GRPO on benchmarks, as in the paper's table."""
     with _refusals():
         stages = _stages(run)
+        machine, commit = describe_machine(), commit_here()
         lines: list[str] = []
         figures: list[Figure] = []
         where = f"--manager={manager}" if manager else f"--jobs={jobs or usable_cores()}"
@@ -207,8 +208,8 @@ def table(
             table_lines, success = bench_table(run, name, stages)
             lines += table_lines
             figures += success
-        hand_in(BenchResult("experiment table", commit_here(), describe_machine(), tuple(figures)), json_file)
-        _publish(benchmark_section(run, lines, commit_here(), date.today()), run / "benchmarks.md", page)
+        hand_in(BenchResult("experiment table", commit, machine, tuple(figures)), json_file)
+        _publish(benchmark_section(run, lines, commit, date.today()), run / "benchmarks.md", page)
 
 
 def _stages(run: Path) -> tuple[PolicyStage, ...]:
