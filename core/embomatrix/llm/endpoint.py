@@ -78,16 +78,16 @@ class Endpoint:
         async with self._gate:
             began_s = time.monotonic()
             for attempt in range(self._limits.attempts):
-                failure = await self._attempt(body)
-                if not isinstance(failure, _Failure):
-                    return _reply(failure, self.model, time.monotonic() - began_s, attempt)
+                found = await self._attempt(body)
+                if not isinstance(found, _Failure):
+                    return _reply(found, self.model, time.monotonic() - began_s, attempt)
                 wait_s = backoff.next_s()
-                if failure.retry_after_s is not None:
-                    wait_s = min(failure.retry_after_s, MAX_RETRY_AFTER_S)
+                if found.retry_after_s is not None:
+                    wait_s = min(found.retry_after_s, MAX_RETRY_AFTER_S)
                 elapsed_s = time.monotonic() - began_s
                 last = attempt + 1 == self._limits.attempts or elapsed_s + wait_s > self._limits.deadline_s
-                if not failure.transient or last:
-                    raise EndpointError(self._sentence(request, failure, attempt + 1))
+                if not found.transient or last:
+                    raise EndpointError(self._sentence(request, found, attempt + 1))
                 await asyncio.sleep(wait_s)
         raise AssertionError("the last attempt returns or raises")
 
@@ -144,10 +144,9 @@ def _judged(response: httpx.Response, data: bytes) -> dict[str, Any] | _Failure:
     if response.status_code != httpx.codes.OK:
         return _Failure(f"it answered {response.status_code} ({_quoted(data)})", transient=False)
     try:
-        value = json.loads(data)
+        value: dict[str, Any] = json.loads(data)
         if isinstance(value["choices"][0]["message"], dict):
-            completion: dict[str, Any] = value
-            return completion
+            return value
     except (ValueError, KeyError, IndexError, TypeError):
         pass
     # A proxy that is starting up may send anything with status 200.
