@@ -171,7 +171,7 @@ def run_apart(measure: Callable[..., Any], arguments: tuple[Any, ...], limit_s: 
 
 
 def measure_peer(peer: PeerSystem, workload: Workload, sizes: PeerSizes) -> PeerMeasurement:
-    """Raises what the library raises."""
+    """Measure the peer. Raises what the library raises."""
     with _folder(workload) as folder:
         setup = ContenderSetup(folder, sizes.slots, tuple(workload.bundles))
         with LIBRARIES[peer][0](setup) as contender:

@@ -155,7 +155,7 @@ class PlanScorer:
         return [outcomes[index] for index in range(len(texts))]
 
     async def score_one(self, task_id: str, text: str) -> PlanOutcome:
-        """Score one text, grouped with others of its task within ``GROUPING_S``. Use one event loop only."""
+        """Score one text, grouped with others of its task within ``GROUPING_S``. Use one event loop at a time."""
         group = self._pending.get(task_id)
         if group is None:
             group = self._pending[task_id] = _PendingGroup(
