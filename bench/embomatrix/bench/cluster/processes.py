@@ -26,7 +26,7 @@ REDIS_START_S: Final = 20.0
 POLL_S: Final = 0.05
 LOG_LINES: Final = 5
 COMMAND_S: Final = 3600.0
-"""Limit for one command. A few training steps take minutes, and many times as long on a shared machine."""
+"""Usual limit for one command. A few training steps take minutes, and many times as long on a shared machine."""
 SERVES: Final = re.compile(r"manager serves at (\S+:\d+), status page (\S+),")
 
 
@@ -147,16 +147,15 @@ def running_program(folder: Path, name: str, *command: str) -> Iterator[Process]
             child.wait()
 
 
-def output_of(*command: str, environment: Mapping[str, str] | None = None, folder: Path | None = None) -> str:
+def output_of(*command: str, environment: Mapping[str, str] | None = None, limit_s: float = COMMAND_S) -> str:
     """Return the standard output of a program. Raise BenchError with its last line if it fails."""
     try:
         done = subprocess.run(
             command,
             capture_output=True,
             text=True,
-            timeout=COMMAND_S,
+            timeout=limit_s,
             check=False,
-            cwd=folder,
             env=without_membership(environment or os.environ),
         )
     except (OSError, subprocess.TimeoutExpired) as error:

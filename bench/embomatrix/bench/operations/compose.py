@@ -44,8 +44,10 @@ class Compose:
     def run(self, *arguments: str) -> str:
         """Run a subcommand and return its output. Raise BenchError if it fails."""
         ports = {"MANAGER_PORT": str(self.port), "PAGE_PORT": str(self.page_port)}
-        command = (*self.command, "-p", PROJECT, "-f", str(self.folder / "docker-compose.yml"), *arguments)
-        return output_of(*command, environment={**os.environ, **ports}, folder=self.folder)
+        # Not as options: an error quotes the first words of the command, which would hide the subcommand.
+        project = {"COMPOSE_PROJECT_NAME": PROJECT, "COMPOSE_FILE": str(self.folder / "docker-compose.yml")}
+        environment = {**os.environ, **ports, **project}
+        return output_of(*self.command, *arguments, environment=environment, limit_s=COMMAND_S)
 
 
 def compose_at(folder: Path) -> Compose | None:

@@ -22,13 +22,13 @@ def measure_joining(on_step: Callable[[str], None]) -> tuple[Figure, ...]:
         folder = Path(name)
         data, access = f"--data-dir={folder / 'manager'}", folder / "manager" / "access"
         on_step("certificates and a manager")
-        output_of(*embomatrix_command("manager", "init", data, "--san=localhost"))
+        output_of(*embomatrix_command("manager", "init", data, "--san=localhost"), limit_s=LIMIT_S)
         deadline_s = time.monotonic() + LIMIT_S
         with running_manager(folder, "--state=memory:", data) as manager:
             port = manager.wait_for(SERVES, deadline_s)[1].rpartition(":")[2]
             issue = embomatrix_command("manager", "token", "issue", "--role=join")
             admin = (f"--token=@{access / 'tokens' / 'admin'}", f"--ca={access / 'ca.pem'}")
-            invitation = output_of(*issue, f"--manager=localhost:{port}", *admin).strip()
+            invitation = output_of(*issue, f"--manager=localhost:{port}", *admin, limit_s=LIMIT_S).strip()
             on_step("a worker joins")
             started_s = time.monotonic()
             join = ("worker", "run", "--join", invitation, "--nice=0", f"--state-dir={folder / 'state'}")
