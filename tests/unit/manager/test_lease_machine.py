@@ -111,6 +111,7 @@ class LeaseMachine(RuleBasedStateMachine):
     def apply(self, event, *, lost=False):
         self.now_s += 0.01
         for command in self.cluster.handle(event, now_s=self.now_s):
+            assert command.cause is not None, command
             match command:
                 case DeliverResult(result=result):
                     assert result.rollout_id in self.submitted

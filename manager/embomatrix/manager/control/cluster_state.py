@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from embomatrix.manager.control.commands import Command, QuarantineWorker
+from embomatrix.manager.control.commands import ManagerCommand, QuarantineWorker
 from embomatrix.manager.control.dispatch.dispatcher import Dispatcher
 from embomatrix.manager.control.dispatch.state import DispatchLimits
 from embomatrix.manager.control.events import Event, RunClosed, ScenesUnplaceable
@@ -49,7 +49,7 @@ class ClusterState:
         self._closed = RunStats()
         self._unplaceable: dict[str, str] = {}
 
-    def handle(self, *events: Event, now_s: float) -> list[Command]:
+    def handle(self, *events: Event, now_s: float) -> list[ManagerCommand]:
         """Apply events of one moment; return the commands in order."""
         commands = self.dispatcher.handle(*events, now_s=now_s)
         urgency = max((self.scheduler.note(event, now_s=now_s) for event in events), default=Urgency.NONE)
@@ -66,7 +66,7 @@ class ClusterState:
             self.check_invariants()
         return commands
 
-    def close_run(self, run_id: str, *, now_s: float) -> tuple[RunStats, list[Command]]:
+    def close_run(self, run_id: str, *, now_s: float) -> tuple[RunStats, list[ManagerCommand]]:
         """End a run; return its final counters, and the commands that cancel its open batches."""
         commands = self.handle(RunClosed(run_id), now_s=now_s)
         self.scheduler.prewarm.close(run_id)
@@ -113,7 +113,7 @@ class ClusterState:
         cost_s = UNIT_COST_S * self.scheduler.cost
         return cost_s / NOW_SHARE if self._urgency is Urgency.NOW else max(LATER_S, cost_s / LATER_SHARE)
 
-    def _place(self, now_s: float) -> list[Command]:
+    def _place(self, now_s: float) -> list[ManagerCommand]:
         self._placed_s, self._urgency = now_s, Urgency.NONE
         self._waiting = self.dispatcher.waiting_scenes
         self.scheduler.note(self.dispatcher.demand(), now_s=now_s)

@@ -1,14 +1,23 @@
 """Commands of the manager's state machines; the runtime carries them out."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from embomatrix.manager.control.events import Event
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.wire.leases import LeaseOrigin, LeaseRef
 from embomatrix.rpc.wire.values import Rollout, RolloutResult
 
 
 @dataclass(frozen=True, slots=True)
-class SetDesired:
+class ManagerCommand:
+    """Order of a state machine to the runtime."""
+
+    cause: Event | None = field(default=None, kw_only=True, compare=False, repr=False)
+    """Event that led to the command."""
+
+
+@dataclass(frozen=True, slots=True)
+class SetDesired(ManagerCommand):
     """The worker should hold these scenes, most urgent first; it may evict all others."""
 
     worker_id: str
@@ -16,7 +25,7 @@ class SetDesired:
 
 
 @dataclass(frozen=True, slots=True)
-class GiveLease:
+class GiveLease(ManagerCommand):
     """The worker executes the rollout within ``deadline_s`` seconds of execution."""
 
     worker_id: str
@@ -33,7 +42,7 @@ class GiveLease:
 
 
 @dataclass(frozen=True, slots=True)
-class CancelLease:
+class CancelLease(ManagerCommand):
     """The lease is void: the worker stops or forgets it."""
 
     worker_id: str
@@ -41,7 +50,7 @@ class CancelLease:
 
 
 @dataclass(frozen=True, slots=True)
-class AcknowledgeLease:
+class AcknowledgeLease(ManagerCommand):
     """The worker may forget the result: it was taken, or it is stale."""
 
     worker_id: str
@@ -49,7 +58,7 @@ class AcknowledgeLease:
 
 
 @dataclass(frozen=True, slots=True)
-class DeliverResult:
+class DeliverResult(ManagerCommand):
     """The one outcome of a rollout."""
 
     run_id: str
@@ -58,7 +67,7 @@ class DeliverResult:
 
 
 @dataclass(frozen=True, slots=True)
-class FinishBatch:
+class FinishBatch(ManagerCommand):
     """Every rollout of the batch has its outcome."""
 
     run_id: str
@@ -66,15 +75,10 @@ class FinishBatch:
 
 
 @dataclass(frozen=True, slots=True)
-class QuarantineWorker:
+class QuarantineWorker(ManagerCommand):
     """The worker's results are wrong and it gets no more work. Reported to operators, not to the worker."""
 
     worker_id: str
     reason: str
     audited: int
     """Number of its executions compared so far, including the wrong one."""
-
-
-Command = (
-    SetDesired | GiveLease | CancelLease | AcknowledgeLease | DeliverResult | FinishBatch | QuarantineWorker
-)

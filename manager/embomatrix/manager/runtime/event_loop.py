@@ -14,10 +14,10 @@ from embomatrix.manager.control.cluster_state import ClusterState
 from embomatrix.manager.control.commands import (
     AcknowledgeLease,
     CancelLease,
-    Command,
     DeliverResult,
     FinishBatch,
     GiveLease,
+    ManagerCommand,
     QuarantineWorker,
     SetDesired,
 )
@@ -223,9 +223,10 @@ class ManagerRuntime:
         event = PauseChanged(self.paused or self._suspended)
         self._carry_out(self.cluster.handle(event, now_s=time.monotonic()))
 
-    def _carry_out(self, commands: Sequence[Command], *, more: bool = False) -> None:
+    def _carry_out(self, commands: Sequence[ManagerCommand], *, more: bool = False) -> None:
         now_s = time.monotonic()
         for command in commands:
+            logger.debug("%s because of %s", command, type(command.cause).__name__)
             match command:
                 case SetDesired() | CancelLease():
                     self._send(command)

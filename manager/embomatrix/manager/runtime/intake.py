@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.control.commands import Command
+from embomatrix.manager.control.commands import ManagerCommand
 from embomatrix.manager.control.events import (
     Event,
     LeaseFinished,
@@ -54,7 +54,7 @@ class Intake:
         resources: Resources,
         *,
         now_s: float,
-    ) -> tuple[WorkerSession, list[Command]]:
+    ) -> tuple[WorkerSession, list[ManagerCommand]]:
         """Open a session for a worker."""
         session, events = self.registry.register(worker_id, boot_id, resources, now_s=now_s)
         return session, self.cluster.handle(*events, now_s=now_s)
@@ -67,7 +67,7 @@ class Intake:
         *,
         resync: bool,
         now_s: float,
-    ) -> list[Command]:
+    ) -> list[ManagerCommand]:
         """Process a worker's message; ``resync`` marks the first message of a stream."""
         session = self.registry.find(session.session_id, session.epoch)
         finished = (*(state.finished if state is not None else ()), *results)
@@ -85,7 +85,7 @@ class Intake:
 
     def heartbeat(
         self, session_id: str, epoch: int, beat: Heartbeat, *, now_s: float
-    ) -> tuple[float, list[Command]]:
+    ) -> tuple[float, list[ManagerCommand]]:
         """Renew the leases that the worker names. Return the seconds until the next heartbeat, and commands."""
         session = self.registry.find(session_id, epoch)
         session.load, session.memory_used_mb = beat.load, beat.memory_mb
@@ -94,7 +94,7 @@ class Intake:
         commands = self.cluster.handle(*events, renewed, now_s=now_s)
         return self.registry.interval_s, commands
 
-    def tick(self, *, now_s: float) -> tuple[list[WorkerLost], list[Command]]:
+    def tick(self, *, now_s: float) -> tuple[list[WorkerLost], list[ManagerCommand]]:
         """Process the passage of time. Return lost workers and commands."""
         events = self.registry.tick(now_s=now_s)
         lost = [event for event in events if isinstance(event, WorkerLost)]

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final
 
 from embomatrix.manager.control.cluster_state import ClusterState
-from embomatrix.manager.control.commands import Command
+from embomatrix.manager.control.commands import ManagerCommand
 from embomatrix.manager.control.dispatch.batches import group_sizes
 from embomatrix.manager.control.events import (
     BatchCancelled,
@@ -82,7 +82,7 @@ class Runs:
         store: StateStore,
         bundles: BundleStore,
         logs: ResultLogs,
-        carry_out: Callable[[Sequence[Command]], None],
+        carry_out: Callable[[Sequence[ManagerCommand]], None],
         history: RunHistory,
     ) -> None:
         self._cluster = cluster

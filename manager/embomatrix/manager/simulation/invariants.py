@@ -7,10 +7,10 @@ from typing import Final
 from embomatrix.manager.control.commands import (
     AcknowledgeLease,
     CancelLease,
-    Command,
     DeliverResult,
     FinishBatch,
     GiveLease,
+    ManagerCommand,
 )
 from embomatrix.manager.simulation.network import EventQueue
 from embomatrix.rpc.wire.leases import LeaseRef, WorkerState
@@ -90,7 +90,7 @@ class InvariantChecker:
         """Note an execution whose result left the worker."""
         self._executed.add((rollout_id, worker_id))
 
-    def watch(self, commands: Iterable[Command], *, lost: Iterable[str] = ()) -> None:
+    def watch(self, commands: Iterable[ManagerCommand], *, lost: Iterable[str] = ()) -> None:
         """Check commands. The leases of workers that the manager has just ``lost`` are void."""
         # A lease of the first lost worker may be granted to the second before its loss is handled.
         self._gone = frozenset(lost)

@@ -6,7 +6,15 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from embomatrix.manager.control.commands import Command, DeliverResult, FinishBatch, QuarantineWorker
+from embomatrix.manager.control.commands import (
+    AcknowledgeLease,
+    CancelLease,
+    DeliverResult,
+    GiveLease,
+    ManagerCommand,
+    QuarantineWorker,
+    SetDesired,
+)
 from embomatrix.manager.control.events import BatchSubmitted, LookaheadAnnounced, RunOpened
 from embomatrix.manager.runtime.intake import TICK_S, Heartbeat, Intake
 from embomatrix.manager.runtime.worker_link import OutgoingMessage
@@ -145,7 +153,7 @@ class SimulatedManager:
         if stream is not None:
             stream.ended()
 
-    def _carry_out(self, commands: Sequence[Command], *, lost: Iterable[str] = ()) -> None:
+    def _carry_out(self, commands: Sequence[ManagerCommand], *, lost: Iterable[str] = ()) -> None:
         self._checker.watch(commands, lost=lost)
         messages: dict[str, OutgoingMessage] = {}
         results: dict[str, list[RolloutResult]] = {}
@@ -153,11 +161,9 @@ class SimulatedManager:
             match command:
                 case DeliverResult(run_id, _, result):
                     results.setdefault(run_id, []).append(result)
-                case FinishBatch():
-                    pass
                 case QuarantineWorker():
                     self._report.caught[command.worker_id] = command.audited
-                case _:
+                case SetDesired() | GiveLease() | CancelLease() | AcknowledgeLease():
                     messages.setdefault(command.worker_id, OutgoingMessage()).add(command)
         for worker_id, message in messages.items():
             # Without a stream the message is lost; the worker's next full state shows that.

@@ -18,7 +18,7 @@ A pure state machine: ``handle`` is the only way to change it, the clock is an a
 
 from collections.abc import Mapping
 
-from embomatrix.manager.control.commands import Command
+from embomatrix.manager.control.commands import ManagerCommand
 from embomatrix.manager.control.dispatch.audits import drop_run
 from embomatrix.manager.control.dispatch.deadlines import note_unplaceable, renew_leases, tick
 from embomatrix.manager.control.dispatch.lease_ends import settle_result
@@ -73,7 +73,7 @@ class Dispatcher:
         self.live_leases: Mapping[str, LeaseRecord] = self.state.leases.live
         self.workers: Mapping[str, WorkerRecord] = self.state.pool.workers
 
-    def handle(self, *events: Event, now_s: float) -> list[Command]:
+    def handle(self, *events: Event, now_s: float) -> list[ManagerCommand]:
         """Apply events of one moment; return the commands in order. Freed slots are filled after all events."""
         state = self.state
         state.now_s = now_s

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from embomatrix.manager.control.commands import Command
+from embomatrix.manager.control.commands import ManagerCommand
 from embomatrix.manager.control.dispatch.batches import OpenBatches
 from embomatrix.manager.control.dispatch.fair_share import RunAccounts
 from embomatrix.manager.control.dispatch.leases import LeaseTable
@@ -173,16 +173,16 @@ class DispatchState:
 
         self.freed: dict[str, Event | None] = {}
         """Workers that lost a lease during this event, with the cause. Their slots are filled last."""
-        self._commands: list[Command] = []
+        self._commands: list[ManagerCommand] = []
         self._history: deque[tuple[float, RolloutStepKind, RolloutKey, str, str, type]] = deque(
             maxlen=HISTORY_KEPT
         )
 
-    def emit(self, command: Command) -> None:
+    def emit(self, command: ManagerCommand) -> None:
         """Add a command to those of the event."""
         self._commands.append(command)
 
-    def take_commands(self) -> list[Command]:
+    def take_commands(self) -> list[ManagerCommand]:
         """Return the commands since the last call, in order."""
         commands, self._commands = self._commands, []
         return commands

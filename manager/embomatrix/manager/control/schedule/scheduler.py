@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
-from embomatrix.manager.control.commands import Command, SetDesired
+from embomatrix.manager.control.commands import ManagerCommand, SetDesired
 from embomatrix.manager.control.events import (
     BatchRestored,
     BatchSubmitted,
@@ -116,7 +116,7 @@ class Scheduler:
                 return Urgency.NONE
         return Urgency.LATER
 
-    def place(self, *, now_s: float) -> list[Command]:
+    def place(self, *, now_s: float) -> list[ManagerCommand]:
         """Place every needed scene; return the desired sets that changed."""
         self._now_s = now_s
         needs = needs_of(self._peaks, [window.entries for window in self.windows.values()])
@@ -297,4 +297,4 @@ class Scheduler:
         residency.desired = scenes
         self._residencies.changed(residency)
         self._residencies.fresh.discard(name)
-        return SetDesired(name, scenes)
+        return SetDesired(name, scenes, cause=self._demand)
