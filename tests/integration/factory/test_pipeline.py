@@ -156,9 +156,9 @@ def test_different_settings_are_listed(tmp_path: Path) -> None:
         BuildStore(tmp_path, {"seed": 2, "train": 8})
 
 
-@pytest.mark.parametrize("content", ["", "{}", "[1]\n", "not json"])
-def test_build_file_without_settings_is_damaged(tmp_path: Path, content: str) -> None:
-    (tmp_path / "build.jsonl").write_text(content)
+@pytest.mark.parametrize("content", [b"", b"{}", b"[1]\n", b"not json", b"\xff"])
+def test_build_file_without_settings_is_damaged(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "build.jsonl").write_bytes(content)
     with pytest.raises(DatasetError, match="is damaged: expected the settings of the run in its first line"):
         BuildStore(tmp_path, {"seed": 2})
 

@@ -43,9 +43,9 @@ class ResumableLog(Generic[T]):
             return
         if not self.path.exists():
             write_whole(self.path, (json.dumps(settings) + "\n").encode("ascii"))
-        lines = self.path.read_text(encoding="utf-8").splitlines()
         wanted = json.loads(json.dumps(settings))
         try:
+            lines = self.path.read_text(encoding="utf-8").splitlines()
             found = json.loads(lines[0])
         except (ValueError, IndexError):
             found = None
