@@ -172,6 +172,10 @@ def test_start_states_are_set_and_cleared(home: Scene) -> None:
     )
 
 
+def test_start_state_of_a_substance_changes_no_object(home: Scene) -> None:
+    assert with_states(home, [InitLiteral(Atom("cooked", ("rice.n.01",)))]) == home
+
+
 @pytest.mark.parametrize(
     ("name", "expected"),
     [

@@ -163,6 +163,13 @@ def test_build_file_without_settings_is_damaged(tmp_path: Path, content: bytes) 
         BuildStore(tmp_path, {"seed": 2})
 
 
+@pytest.mark.parametrize("settings", ["null", "3", '"x"'])
+def test_other_shape_of_a_nested_setting_is_a_difference(tmp_path: Path, settings: str) -> None:
+    (tmp_path / "build.jsonl").write_text(f'{{"settings": {settings}}}\n', encoding="utf-8")
+    with pytest.raises(DatasetError, match="holds a run with other settings"):
+        BuildStore(tmp_path, {"seed": 2})
+
+
 def test_every_task_has_a_layout_tree_on_its_page(folder: Path, dataset: Dataset, tmp_path: Path) -> None:
     for record in dataset.records:
         tree = json.loads((folder / "trees" / f"{record.task.task_id}.json").read_text(encoding="utf-8"))

@@ -28,7 +28,7 @@ from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.llm.values import ChatModel
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.dataset import Dataset
-from embomatrix.world.whole_file import write_whole
+from embomatrix.world.whole_file import check_writable, write_whole
 
 METHODS = list(LayoutMethod)
 JUDGED = ("variety", "characters", "overall")
@@ -87,6 +87,9 @@ def evaluate(
         "admission": lambda: evaluate_admissions(_given(dataset, "--dataset FOLDER")),
         "aesthetics": lambda: _aesthetics(_given(rooms, "--rooms FILE"), seed, calibration),
     }
+    if page is not None:
+        with user_errors(page):
+            check_writable(page)
     with user_errors(more=MODEL_ERRORS):
         if llm and not model:
             raise EvaluationError("--llm needs the name of a model there: give --model")

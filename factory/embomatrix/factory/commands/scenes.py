@@ -166,11 +166,12 @@ def draw(
 ) -> None:
     """Draw scenes or examples of the relations as PNG files in a folder."""
     names = () if kind is Drawing.RELATIONS else _chosen(scenes, every)
-    with _user_errors(out), progress() as bars:
+    with _user_errors(out):
         for name in names:
             _read(name)
         out.mkdir(parents=True, exist_ok=True)
-        built = [_built(name, seed) for name in bars.track(names, description="scenes")]
+        with progress() as bars:
+            built = [_built(name, seed) for name in bars.track(names, description="scenes")]
         for title, picture in _pictures(kind, built):
             buffer = io.BytesIO()
             picture.save(buffer, format="PNG", optimize=True)

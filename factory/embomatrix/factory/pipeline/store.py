@@ -91,7 +91,7 @@ def _differences(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
     """Return the settings that differ, such as ``seed 1, now 2``."""
     return ", ".join(
         _differences(found[name], value)
-        if isinstance(value, dict)
+        if isinstance(value, dict) and isinstance(found.get(name), dict)
         else f"{name} {found.get(name)}, now {value}"
         for name, value in wanted.items()
         if found.get(name) != value

@@ -1,6 +1,7 @@
 """Start state of a scene: position of the robot, open doors, symbolic states and substances."""
 
 import dataclasses
+from collections import defaultdict
 from collections.abc import Iterable
 
 import numpy as np
@@ -30,8 +31,9 @@ def with_robot_in(scene: Scene, room_name: str) -> Scene:
 def with_states(scene: Scene, literals: Iterable[InitLiteral]) -> Scene:
     """Return the scene with doors, states and substances as the literals say. Relations are ignored."""
     shares: dict[str, float] = {}
-    states = {item.name: set(item.states) for item in scene.objects}
-    substances = {item.name: set(item.substances) for item in scene.objects}
+    # A literal about something that is no object of the scene, such as a substance, changes nothing.
+    states = defaultdict(set, {item.name: set(item.states) for item in scene.objects})
+    substances = defaultdict(set, {item.name: set(item.substances) for item in scene.objects})
     # Negative literals come last: they win over positive ones.
     for literal in sorted(literals, key=lambda literal: not literal.positive):
         name, predicate = literal.atom.args[0], literal.atom.predicate
