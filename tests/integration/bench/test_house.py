@@ -115,3 +115,10 @@ def test_code_figures_use_the_common_benchmark_format(checkout, tmp_path):
         "public_name_clashes": 1,
         "banned_openings": 2,
     }
+
+
+def test_arguments_of_make_house_do_not_reach_the_unit_tests(tmp_path, monkeypatch):
+    (tmp_path / "Makefile").write_text('test-unit:\n\ttest -z "$(ARGS)"\n')
+    # Variables of make's command line reach a make below it in this way.
+    monkeypatch.setenv("MAKEFLAGS", "-- ARGS=--json\\ figures.json")
+    assert house.time_unit_tests(tmp_path) > 0
