@@ -225,8 +225,10 @@ class ManagerRuntime:
 
     def _carry_out(self, commands: Sequence[ManagerCommand], *, more: bool = False) -> None:
         now_s = time.monotonic()
+        if logger.isEnabledFor(logging.DEBUG):
+            for command in commands:
+                logger.debug("%.200s because of %s", command, type(command.cause).__name__)
         for command in commands:
-            logger.debug("%s because of %s", command, type(command.cause).__name__)
             match command:
                 case SetDesired() | CancelLease():
                     self._send(command)

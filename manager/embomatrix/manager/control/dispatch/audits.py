@@ -154,8 +154,7 @@ def _convict(state: DispatchState, worker_id: str, case: AuditCase) -> None:
     state.auditor.convict(worker_id, known or reason)
     if known:
         return  # a second wrong result that was under way
-    audited = state.auditor.of(worker_id).audited
-    state.emit(QuarantineWorker(worker_id, reason, audited, cause=state.cause))
+    state.emit(QuarantineWorker(worker_id, reason, state.auditor.of(worker_id).audited))
     again = [other for other in state.cases.values() if other.opinions[0].worker_id == worker_id]
     for other in again:
         held = other.held
@@ -171,7 +170,7 @@ def _convict(state: DispatchState, worker_id: str, case: AuditCase) -> None:
         state.pool.update_standing(worker)
         leases = list(worker.held.values())
         for lease in leases:
-            state.emit(CancelLease(worker_id, lease.ref, cause=state.cause))
+            state.emit(CancelLease(worker_id, lease.ref))
             return_lease(state, lease, "its worker is in quarantine")
         for scene in dict.fromkeys(lease.record.scene for lease in leases):
             offer_scene(state, scene)

@@ -15,7 +15,7 @@ from embomatrix.rpc.wire.values import Completed, GroupPolicy, InfraCode, InfraF
 
 def settle_result(state: DispatchState, event: LeaseFinished) -> None:
     """Acknowledge a reported result, and use it if its lease is live. Any other result is stale and dropped."""
-    state.emit(AcknowledgeLease(event.worker_id, event.ref, cause=event))
+    state.emit(AcknowledgeLease(event.worker_id, event.ref))
     lease = state.leases.find(event.worker_id, event.ref)
     if lease is None:
         run_id = state.leases.run_of_ended(event.ref)
@@ -61,7 +61,7 @@ def take_away(state: DispatchState, lease: LeaseRecord, failure: InfraFailure, *
     """Revoke a lease whose worker failed it; another worker gets the rollout."""
     if lease not in lease.record.leases:
         return  # it ended with its group a moment ago
-    state.emit(CancelLease(lease.worker_id, lease.ref, cause=state.cause))
+    state.emit(CancelLease(lease.worker_id, lease.ref))
     give_back(state, lease, failure, counted=started)
     offer_scene(state, lease.record.scene)
 

@@ -84,7 +84,6 @@ def grant(
             hedge,
             record.check,
             record.reward,
-            cause=state.cause,
         )
     )
 
@@ -93,7 +92,7 @@ def revoke(state: DispatchState, lease: LeaseRecord, why: str) -> None:
     """End a lease that its worker may still hold."""
     state.log(RolloutStepKind.REVOKED, lease.record.key, lease.worker_id, why)
     state.end_lease(lease)
-    state.emit(CancelLease(lease.worker_id, lease.ref, cause=state.cause))
+    state.emit(CancelLease(lease.worker_id, lease.ref))
 
 
 def hedge_late(state: DispatchState) -> None:

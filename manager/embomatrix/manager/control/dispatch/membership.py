@@ -117,7 +117,7 @@ def _reconcile(state: DispatchState, worker: WorkerRecord, event: WorkerReported
     for ref in event.held:
         known = state.leases.find(worker.worker_id, ref) is not None
         if not known and not _adopt(state, worker, ref, origins.get(ref)):
-            state.emit(CancelLease(worker.worker_id, ref, cause=event))
+            state.emit(CancelLease(worker.worker_id, ref))
 
 
 def _adopt(state: DispatchState, worker: WorkerRecord, ref: LeaseRef, origin: LeaseOrigin | None) -> bool:

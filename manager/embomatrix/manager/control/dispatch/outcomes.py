@@ -122,7 +122,7 @@ def _conclude(state: DispatchState, record: RolloutRecord, outcome: Outcome) -> 
     result = RolloutResult(
         record.key.rollout_id, record.rollout.group_id, cursor, max(record.attempts, 1), outcome
     )
-    state.emit(DeliverResult(batch.run_id, batch.batch_id, result, cause=state.cause))
+    state.emit(DeliverResult(batch.run_id, batch.batch_id, result))
     if not batch.whole.left:
         _close(state, batch)
 
@@ -141,4 +141,4 @@ def _fail_group(state: DispatchState, batch: BatchRecord, group: GroupRecord, wh
 
 def _close(state: DispatchState, batch: BatchRecord) -> None:
     state.batches.close(batch)
-    state.emit(FinishBatch(batch.run_id, batch.batch_id, cause=state.cause))
+    state.emit(FinishBatch(batch.run_id, batch.batch_id))

@@ -179,7 +179,8 @@ class DispatchState:
         )
 
     def emit(self, command: ManagerCommand) -> None:
-        """Add a command to those of the event."""
+        """Add a new command to those of the event, which is its cause."""
+        object.__setattr__(command, "cause", self.cause)
         self._commands.append(command)
 
     def take_commands(self) -> list[ManagerCommand]:
