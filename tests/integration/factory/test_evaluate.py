@@ -331,6 +331,15 @@ def test_figures_of_a_build_and_of_a_file_reach_the_page(tmp_path):
     assert "| admitted_share plain |" in page.read_text()
 
 
+def test_page_that_cannot_be_written_is_reported_before_anything_is_measured(tmp_path):
+    a_build(tmp_path, "plain", [])
+    measure = ["evaluate", "admission", "--dataset", str(tmp_path), "--page", str(tmp_path)]
+    answer = CliRunner().invoke(app, measure)
+    assert answer.exit_code == 2
+    assert "can't be written (Is a directory)" in answer.output.replace("\n", " ")
+    assert "admitted_share" not in answer.output
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

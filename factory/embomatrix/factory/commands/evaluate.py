@@ -14,7 +14,7 @@ import typer
 
 from embomatrix.factory.commands.language_model import MODEL_ERRORS, Key, Llm, Model, Tape, chat_model
 from embomatrix.factory.commands.options import Seed
-from embomatrix.factory.commands.terminal import counter, report_evaluation, say, user_errors
+from embomatrix.factory.commands.terminal import check_output, counter, report_evaluation, say, user_errors
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
 from embomatrix.factory.evaluate.aesthetics import evaluate_aesthetics
 from embomatrix.factory.evaluate.judges import evaluate_looks, judged
@@ -28,7 +28,7 @@ from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.llm.values import ChatModel
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.dataset import Dataset
-from embomatrix.world.whole_file import check_writable, write_whole
+from embomatrix.world.whole_file import write_whole
 
 METHODS = list(LayoutMethod)
 JUDGED = ("variety", "characters", "overall")
@@ -87,9 +87,7 @@ def evaluate(
         "admission": lambda: evaluate_admissions(_given(dataset, "--dataset FOLDER")),
         "aesthetics": lambda: _aesthetics(_given(rooms, "--rooms FILE"), seed, calibration),
     }
-    if page is not None:
-        with user_errors(page):
-            check_writable(page)
+    check_output(page)
     with user_errors(more=MODEL_ERRORS):
         if llm and not model:
             raise EvaluationError("--llm needs the name of a model there: give --model")

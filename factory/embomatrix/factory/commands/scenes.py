@@ -14,7 +14,7 @@ import typer
 from PIL import Image
 from rich.console import Console
 
-from embomatrix.factory.commands.terminal import fail, progress, say, show_table, user_errors
+from embomatrix.factory.commands.terminal import check_output, fail, progress, say, show_table, user_errors
 from embomatrix.factory.floorplan.spec import FloorPlanError
 from embomatrix.factory.importers.model import ModelFileError
 from embomatrix.factory.importers.shelf import read_assets
@@ -30,7 +30,7 @@ from embomatrix.host.limits import usable_cores
 from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.scene import Scene
-from embomatrix.world.whole_file import check_writable, write_whole
+from embomatrix.world.whole_file import write_whole
 
 app = command_group(help="Build, check and draw base scenes.")
 
@@ -103,7 +103,7 @@ def build(
             Catalog.load().inventory(name)
         if assets is not None:
             read_assets(assets)
-    _check_writable(report)
+    check_output(report)
     with _user_errors(out):
         out.mkdir(parents=True, exist_ok=True)
     several = len(set(seeds or ())) > 1
@@ -133,7 +133,7 @@ def check(
                 orders.append(SceneBuildJob(scene.scene_id, scene.seed, source=Path(name)))
             else:
                 orders += [SceneBuildJob(name, seed) for seed in dict.fromkeys(seeds or (0,))]
-    _check_writable(report)
+    check_output(report)
     _print_reports(_run(orders, jobs), report)
 
 
@@ -238,10 +238,3 @@ def _read(name: str) -> Scene | None:
 
 def _built(name: str, seed: int) -> Scene:
     return _read(name) or build_base_scene(name, seed=seed)
-
-
-def _check_writable(path: Path | None) -> None:
-    """Reject an output file that can't be written before minutes of work begin."""
-    if path is not None:
-        with _user_errors(path):
-            check_writable(path)

@@ -30,6 +30,7 @@ from embomatrix.sim.engine import EngineError
 from embomatrix.world.bddl import BddlError
 from embomatrix.world.catalog import CatalogError
 from embomatrix.world.dataset import DatasetError
+from embomatrix.world.whole_file import check_writable
 
 fail = functools.partial(failure.fail, "")
 """Print a sentence on standard error and exit the command."""
@@ -104,6 +105,13 @@ def user_errors(
         )
     except KeyboardInterrupt:
         fail(f"interrupted{kept}", status=130)
+
+
+def check_output(path: Path | None) -> None:
+    """Reject an output file that can't be written before minutes of work begin."""
+    if path is not None:
+        with user_errors(path):
+            check_writable(path)
 
 
 def report_evaluation(evaluation: EvaluationFigures, json_file: Path | None) -> None:
