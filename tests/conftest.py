@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+from embomatrix.rpc import logs
+
 ROOT = str(Path(__file__).resolve().parents[1])
 if ROOT not in sys.path:
     sys.path.insert(0, ROOT)
@@ -22,11 +24,25 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 
 @pytest.fixture(autouse=True)
-def _remove_log_handlers():
-    """Remove the log handlers that a command installed, so that later tests don't read its lines."""
-    yield
+def _reset_logging():
+    """Remove the log handlers, hidden words and bound ids that a test left, so that later tests don't depend on them."""
+    yield from _as_before()
     root = logging.getLogger()
     for handler in root.handlers[:]:
         if not type(handler).__module__.startswith("_pytest"):
             root.removeHandler(handler)
     logging.getLogger("embomatrix").setLevel(logging.NOTSET)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _reset_logging_of_module():
+    """Remove the hidden words and bound ids of fixtures that several tests share."""
+    yield from _as_before()
+
+
+def _as_before():
+    hidden, bound = set(logs._hidden), logs._bound.get()
+    yield
+    logs._hidden.clear()
+    logs._hidden.update(hidden)
+    logs._bound.set(bound)
