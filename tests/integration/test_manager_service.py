@@ -348,6 +348,16 @@ async def test_rollouts_without_bundle_or_run_are_refused(tmp_path):
             await outcomes(client, batch(1))
 
 
+async def test_stopped_manager_leaves_no_socket_in_the_event_loop(tmp_path):
+    async with await asyncio.start_server(lambda reader, writer: writer.close(), "127.0.0.1") as server:
+        async with manager(tmp_path) as at, httpx.AsyncClient(base_url=at.status_url) as http:
+            assert (await http.get("/")).status_code == 200
+        # New sockets get the numbers of closed ones: they can't connect by a number that the event loop still watches.
+        address = server.sockets[0].getsockname()
+        opened = [await asyncio.open_connection(*address) for _ in range(32)]
+    assert len(opened) == 32
+
+
 async def test_second_worker_with_the_same_id_ends_the_first_session(tmp_path):
     async with manager(tmp_path) as at, FakeWorker(at.address) as first:
         call = first._stub.Session(first._requests())

@@ -171,8 +171,7 @@ def _gallery(dataset: Path | None) -> Gallery | None:
 def _candidate(settings: ManagerSettings) -> Candidate:
     # Only one process can be bound to this address, so a leader lease of the same holder belongs to an earlier
     # process of this manager.
-    holder = f"{socket.gethostname()}/{settings.address}"
-    return Candidate(holder, settings.address, settings.leader_ttl_s)
+    return Candidate(f"{socket.gethostname()}/{settings.address}", settings.address, settings.leader_ttl_s)
 
 
 async def _win(
@@ -263,7 +262,11 @@ class _HttpServer:
         self._app = app
 
     async def serve(self) -> None:
-        await self._server.serve(sockets=[self._socket])
+        try:
+            await self._server.serve(sockets=[self._socket])
+        finally:
+            # A cancelled uvicorn leaves its listener in the event loop, where a later socket may get the same number.
+            asyncio.get_running_loop().remove_reader(self._socket)
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         await self._app(scope, receive, send)
