@@ -69,6 +69,16 @@ def test_unreadable_source_is_rejected_in_one_sentence(tmp_path: Path) -> None:
         list(read_jsonl(tmp_path / "bad.jsonl"))
 
 
+@pytest.mark.parametrize("option", ["--report", "--json"])
+def test_output_that_cannot_be_written_is_named_before_any_import(tmp_path: Path, option: str) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    command = ["import", "--activity", "all", "--out", str(tmp_path / "out"), option, str(folder)]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 2
+    assert f"{folder} can't be written (Is a directory)" in re.sub(r"\s+", " ", result.output)
+
+
 @pytest.mark.skipif(
     not SAMPLE.exists(), reason="the sample of the paper's tasks is not beside the repository"
 )

@@ -10,7 +10,7 @@ import typer
 
 from embomatrix.factory.admission import TaskRefusal
 from embomatrix.factory.commands.options import Jobs, LookAhead, Scenes, Seed, processes
-from embomatrix.factory.commands.terminal import counter, fail, say, show_table, user_errors
+from embomatrix.factory.commands.terminal import check_output, counter, fail, say, show_table, user_errors
 from embomatrix.factory.metrics.figures import EvaluationFigures, write_evaluation
 from embomatrix.factory.pipeline.settings import scene_ids
 from embomatrix.factory.pipeline.store import ResumableLog
@@ -39,7 +39,7 @@ from embomatrix.world.bddl import BddlError
 from embomatrix.world.dataset import TASKS_FILE, DatasetError, write_dataset
 from embomatrix.world.substances import is_substance
 from embomatrix.world.task import Profile
-from embomatrix.world.whole_file import check_writable, write_whole
+from embomatrix.world.whole_file import write_whole
 
 EVERY_ACTIVITY = "all"
 
@@ -92,9 +92,9 @@ def import_(
     kept = (
         "; finished outcomes are kept; run the same command again to resume" if outcomes is not None else ""
     )
+    for file in (report, json_file):
+        check_output(file)
     with user_errors(out or outcomes, kept):
-        for file in filter(None, (report, json_file)):
-            check_writable(file)
         if out is not None:
             _check_free(out, depth, outcomes)
         sources = _selected(_sources(bddl, activity, jsonl, eai), reached_by, solids=solids)
