@@ -34,7 +34,7 @@ DONE = Completed(RewardBreakdown(0.5, 0.0, 0.0, (), False), (), (), "", "", Timi
 
 
 def main(rollouts: int, workers: int) -> None:
-    cluster, now_s, given, delivered = ClusterState(boot_id="bench"), 0.0, [], 0
+    cluster, now_s, given, delivered = ClusterState(lease_key=b"key"), 0.0, [], 0
     slowest_s = 0.0
 
     def apply(event):

@@ -30,7 +30,7 @@ class Table:
     """Dispatcher with its clock. Keeps its commands by kind."""
 
     def __init__(self, limits=LIMITS):
-        self.dispatcher = Dispatcher(limits, boot_id="boot")
+        self.dispatcher = Dispatcher(limits, lease_key=b"key")
         self.now_s = 0.0
         self.results = {}
 

@@ -51,7 +51,7 @@ class Bench:
 
     def __init__(self, workers=("w1", "w2", "w3"), terms=VERIFIED, rules=None, versions=SAME):
         limits = DispatchLimits(audit=rules or AuditRules())
-        self.cluster = ClusterState(limits, boot_id="boot", audit_key=b"secret")
+        self.cluster = ClusterState(limits, lease_key=b"key", audit_key=b"secret")
         self.now_s = 0.0
         self.live = {}
         self.results = {}

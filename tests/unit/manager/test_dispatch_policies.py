@@ -44,7 +44,7 @@ class Bench:
     """Dispatcher with its clock and the leases that its workers hold."""
 
     def __init__(self, limits=LIMITS):
-        self.dispatcher = Dispatcher(limits, boot_id="boot")
+        self.dispatcher = Dispatcher(limits, lease_key=b"key")
         self.now_s = 0.0
         self.results = {}
         self.held = {}
@@ -276,12 +276,23 @@ def test_stalled_lease_moves_to_another_worker(bench):
     assert bench.dispatcher.counters("r1").redispatched == 1
 
 
-def test_worker_that_reports_no_progress_never_stalls(bench):
+def test_lease_that_is_renewed_without_any_progress_is_revoked(bench):
     known(bench)
     ref = bench.held["b1.0.19"]["w1"]
-    for _ in range(20):
+    for _ in range(4):
         bench.apply(LeasesRenewed("w1", (ref,)), after_s=5.0)
-    assert bench.held["b1.0.19"] == {"w1": ref}
+    assert ref not in bench.held["b1.0.19"].values()
+
+
+def test_lease_without_progress_is_revoked_in_a_run_without_history(bench):
+    bench.worker("w1")
+    bench.worker("w2")
+    bench.submit(1)
+    (ref,) = bench.held["b1.0.0"].values()
+    bench.apply(LeasesRenewed("w1", (ref,)), after_s=29.0)
+    assert list(bench.held["b1.0.0"]) == ["w1"]
+    bench.apply(LeasesRenewed("w1", (ref,)), after_s=2.0)
+    assert list(bench.held["b1.0.0"]) == ["w2"]
 
 
 def test_third_stall_fails_a_rollout(bench):

@@ -25,7 +25,7 @@ class Manager:
     """Intake with one worker of one slot, which has the scene and its full number of leases."""
 
     def __init__(self, rollouts):
-        self.intake = Intake(ClusterState(boot_id="boot"), Registry(LivenessLimits()))
+        self.intake = Intake(ClusterState(lease_key=b"key"), Registry(LivenessLimits()))
         self.session, _ = self.intake.register("w1", "boot-1", Resources(1, 1, 1000), now_s=0.0)
         self.report(WorkerState(WARM), now_s=0.0, resync=True)
         batch = Batch(

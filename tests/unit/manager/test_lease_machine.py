@@ -93,7 +93,7 @@ class LeaseMachine(RuleBasedStateMachine):
 
     @initialize()
     def begin(self):
-        self.cluster = ClusterState(LIMITS, boot_id="boot", debug=True)
+        self.cluster = ClusterState(LIMITS, lease_key=b"key", debug=True)
         self.now_s = 0.0
         self.submitted = {}
         self.delivered = {}

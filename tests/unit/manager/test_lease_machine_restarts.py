@@ -25,9 +25,7 @@ class RestartedMachine(LeaseMachine):
         self.managers += 1
         self.hedges = 0
         first_epoch = self.managers << 32
-        self.cluster = ClusterState(
-            LIMITS, boot_id=f"boot{self.managers}", first_epoch=first_epoch, debug=True
-        )
+        self.cluster = ClusterState(LIMITS, lease_key=b"key", first_epoch=first_epoch, debug=True)
         for batch in self.batches.values():
             known = [one.rollout_id for one in batch.rollouts if one.rollout_id in self.delivered]
             self.apply(BatchRestored(batch, {name: self.delivered[name].cursor for name in known}))

@@ -22,7 +22,7 @@ OWN = re.compile(r"# (?:HELP|TYPE) (embo_\w+)")
 @pytest.fixture
 async def page(tmp_path):
     bundles = BundleStore(tmp_path / "bundles", total_bytes=1)
-    cluster, registry = ClusterState(boot_id="boot"), Registry(LivenessLimits())
+    cluster, registry = ClusterState(lease_key=b"key"), Registry(LivenessLimits())
     runtime = ManagerRuntime(cluster, registry, open_store("memory:"), bundles, RunArchive(tmp_path / "runs"))
     await runtime.start()
     return metrics_page(runtime)

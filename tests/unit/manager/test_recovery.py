@@ -13,6 +13,7 @@ from embomatrix.manager.control.commands import (
     GiveLease,
 )
 from embomatrix.manager.control.dispatch.dispatcher import Dispatcher
+from embomatrix.manager.control.dispatch.leases import lease_id_of
 from embomatrix.manager.control.dispatch.state import DispatchLimits
 from embomatrix.manager.control.events import (
     BatchCancelled,
@@ -36,6 +37,7 @@ from embomatrix.rpc.wire.values import (
 
 GRACE_S = 5.0
 FIRST_EPOCH = 1 << 32
+KEY = b"secret of the cluster"
 WARM = (Resident("kitchen", ResidentState.WARM),)
 
 
@@ -43,8 +45,10 @@ def batch(count, batch_id="b1"):
     return Batch("r1", batch_id, 1, tuple(Rollout(f"x{i}", "g", "kitchen", "t", (), 0) for i in range(count)))
 
 
-def claim(rollout_id, epoch=1, attempt=1, batch_id="b1"):
-    return LeaseClaim(LeaseRef(f"old-{epoch}", epoch), LeaseOrigin("r1", batch_id, rollout_id, attempt))
+def claim(rollout_id, epoch=1, attempt=1, batch_id="b1", worker_id="w1", key=KEY):
+    """Return the claim of a lease that a former manager gave to this worker, if the key is the cluster's."""
+    origin = LeaseOrigin("r1", batch_id, rollout_id, attempt)
+    return LeaseClaim(LeaseRef(lease_id_of(key, origin, worker_id, epoch), epoch), origin)
 
 
 class Successor:
@@ -52,7 +56,7 @@ class Successor:
 
     def __init__(self, count=2, delivered=(), failures=0):
         limits = DispatchLimits(restart_grace_s=GRACE_S)
-        self.dispatcher = Dispatcher(limits, boot_id="new", first_epoch=FIRST_EPOCH)
+        self.dispatcher = Dispatcher(limits, lease_key=KEY, first_epoch=FIRST_EPOCH)
         self.now_s = 100.0
         cursors = {name: number + 1 for number, name in enumerate(delivered)}
         self.first = self.apply(BatchRestored(batch(count), cursors, failures))
@@ -145,7 +149,7 @@ def test_scenes_of_awaited_rollouts_are_in_demand():
 def test_later_of_two_claimed_leases_counts():
     for order in (("w1", "w2"), ("w2", "w1")):
         successor = Successor(1)
-        claims = {"w1": claim("x0", epoch=5), "w2": claim("x0", epoch=9)}
+        claims = {"w1": claim("x0", epoch=5), "w2": claim("x0", epoch=9, worker_id="w2")}
         commands = [command for name in order for command in successor.worker(name, claims[name])]
         assert kinds(commands, CancelLease) == [CancelLease("w1", claims["w1"].ref)]
         late = successor.apply(LeaseFinished("w1", claims["w1"].ref, completed()))
@@ -162,11 +166,73 @@ def test_claim_after_the_rollout_was_redispatched_is_rejected():
     assert kinds(successor.worker("w1", claim("x0")), CancelLease) == [CancelLease("w1", claim("x0").ref)]
 
 
-def test_late_claim_of_a_queued_rollout_is_adopted():
+def test_claim_after_the_grace_time_is_refused():
     successor = Successor(1)
     successor.wait_out_the_grace()
-    assert successor.worker("w1", claim("x0")) == []
-    assert successor.dispatcher.queued == 0
+    commands = successor.worker("w1", claim("x0"))
+    assert kinds(commands, CancelLease) == [CancelLease("w1", claim("x0").ref)]
+    assert given_to(commands) == [("w1", "x0")]
+
+
+def test_claim_is_refused_once_all_expected_workers_are_back():
+    successor = Successor(2)
+    successor.apply(WorkersExpected(frozenset({"w1"})))
+    successor.worker("w1", slots=2)
+    successor.apply(Tick(), after_s=0.1)
+    late = claim("x0", worker_id="w2")
+    assert kinds(successor.worker("w2", late), CancelLease) == [CancelLease("w2", late.ref)]
+
+
+def test_claim_without_a_restart_is_refused():
+    dispatcher = Dispatcher(DispatchLimits(), lease_key=KEY, first_epoch=FIRST_EPOCH)
+    dispatcher.handle(BatchSubmitted(batch(1)), now_s=1.0)
+    dispatcher.handle(WorkerJoined("w1", Resources(1, 1, 1024)), now_s=1.0)
+    forged = claim("x0")
+    reported = WorkerReported("w1", WARM, (forged.ref,), resync=True, claims=(forged,))
+    commands = dispatcher.handle(reported, now_s=1.0)
+    assert kinds(commands, CancelLease) == [CancelLease("w1", forged.ref)]
+    assert given_to(commands) == [("w1", "x0")]
+
+
+@pytest.mark.parametrize(
+    "forged",
+    [
+        claim("x0", key=b"guessed"),
+        claim("x0", worker_id="w2"),  # given to another worker
+        LeaseClaim(claim("x0").ref, claim("x1").origin),  # given for another rollout
+        LeaseClaim(claim("x0").ref, LeaseOrigin("r1", "b1", "x0", attempt=4294967295)),
+        LeaseClaim(LeaseRef(claim("x0").ref.lease_id, 2), claim("x0").origin),
+        LeaseClaim(LeaseRef("boot-1", 1), claim("x0").origin),
+    ],
+    ids=["key", "worker", "rollout", "attempt", "epoch", "id"],
+)
+def test_forged_claim_is_cancelled_and_its_result_dropped(forged):
+    successor = Successor(2)
+    commands = successor.worker("w1", forged)
+    commands += successor.apply(LeaseFinished("w1", forged.ref, completed("w1")))
+    assert kinds(commands, CancelLease) == [CancelLease("w1", forged.ref)]
+    assert kinds(commands, DeliverResult) == []
+    assert given_to(successor.wait_out_the_grace()) == [("w1", "x0"), ("w1", "x1")]
+
+
+def test_claims_of_one_epoch_are_ordered_and_expire_together():
+    successor = Successor(2)
+    successor.worker("w1", claim("x0", epoch=7), claim("x1", epoch=7), slots=2)
+    assert len(successor.dispatcher.live_leases) == 2
+    commands = successor.apply(Tick(), after_s=31.0)
+    assert {command.ref for command in kinds(commands, CancelLease)} == {
+        claim("x0", epoch=7).ref,
+        claim("x1", epoch=7).ref,
+    }
+
+
+def test_claim_repeated_by_its_worker_is_adopted_once():
+    successor = Successor(1)
+    successor.worker("w1", claim("x0"), claim("x0"))
+    assert len(successor.dispatcher.live_leases) == 1
+    successor.apply(WorkerLost("w1", "killed"))
+    assert kinds(successor.worker("w1", claim("x0")), CancelLease) == [CancelLease("w1", claim("x0").ref)]
+    successor.dispatcher.state.check_invariants()
 
 
 @pytest.mark.parametrize(
@@ -237,7 +303,7 @@ def test_every_rollout_gets_one_outcome_whatever_workers_claim(held, back):
     successor = Successor(6)
     claims = {name: [] for name in back}
     for epoch, (name, number) in enumerate(held, 1):
-        claims[name].append(claim(f"x{number}", epoch=epoch))
+        claims[name].append(claim(f"x{number}", epoch=epoch, worker_id=name))
     delivered, running = [], []
 
     def settle(commands):

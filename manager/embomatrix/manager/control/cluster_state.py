@@ -24,8 +24,8 @@ NOW_SHARE: Final = 0.1
 class ClusterState:
     """All decisions of the manager. Events in, commands out, the clock an argument, no I/O.
 
-    ``boot_id`` is new for every process of the manager, whose lease epochs begin at ``first_epoch``. ``audit_key`` is
-    secret. With ``debug``, the invariants are checked after every event.
+    ``lease_key`` and ``audit_key`` are secret, and all managers of a cluster have the same ``lease_key``. Lease epochs
+    begin at ``first_epoch``. With ``debug``, the invariants are checked after every event.
     """
 
     def __init__(
@@ -33,13 +33,13 @@ class ClusterState:
         dispatch: DispatchLimits | None = None,
         schedule: ScheduleLimits | None = None,
         *,
-        boot_id: str,
+        lease_key: bytes,
         first_epoch: int = 1,
         audit_key: bytes = b"",
         debug: bool = False,
     ) -> None:
         self.dispatcher = Dispatcher(
-            dispatch or DispatchLimits(), boot_id=boot_id, first_epoch=first_epoch, audit_key=audit_key
+            dispatch or DispatchLimits(), lease_key=lease_key, first_epoch=first_epoch, audit_key=audit_key
         )
         self.scheduler = Scheduler(schedule or ScheduleLimits(), self.dispatcher.workers)
         self._debug = debug

@@ -62,6 +62,14 @@ class WorkerLost(Event):
 
 
 @dataclass(frozen=True, slots=True)
+class WorkerFaulted(Event):
+    """A worker sent a message that no sound worker sends. It is quarantined."""
+
+    worker_id: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class DrainChanged(Event):
     """An operator drained a worker, which then only finishes its leases, or ended its drain and quarantine."""
 

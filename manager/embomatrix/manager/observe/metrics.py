@@ -1,5 +1,6 @@
-"""Load of the manager (CPU accounting, clock lag, store latency), and counters of delivered results."""
+"""Load of the manager (CPU accounting, clock lag, store latency), counters of delivered results, and of errors."""
 
+import logging
 import time
 from collections import Counter, defaultdict, deque
 from dataclasses import dataclass
@@ -46,6 +47,23 @@ class ManagerLoad:
         first, last = self._samples[0], self._samples[-1]
         manager_s, slots_s = last.manager_s - first.manager_s, last.slots_s - first.slots_s
         return manager_s / (manager_s + slots_s) if slots_s > 0 else 0.0
+
+
+class ErrorCount(logging.Handler):
+    """Number of errors that the manager logged while the context is held. Each INTERNAL answer is one."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.total = 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.total += 1
+
+    def __enter__(self) -> None:
+        logging.getLogger("embomatrix").addHandler(self)
+
+    def __exit__(self, *_: object) -> None:
+        logging.getLogger("embomatrix").removeHandler(self)
 
 
 THROUGHPUT_S: Final = 120

@@ -21,9 +21,9 @@ from embomatrix.manager.control.commands import (
     QuarantineWorker,
     SetDesired,
 )
-from embomatrix.manager.control.events import PauseChanged
+from embomatrix.manager.control.events import Event, PauseChanged, WorkerFaulted
 from embomatrix.manager.observe.event_log import RunEventLog
-from embomatrix.manager.observe.metrics import ManagerLoad, Meter
+from embomatrix.manager.observe.metrics import ErrorCount, ManagerLoad, Meter
 from embomatrix.manager.observe.run_archive import RunArchive, RunHistory
 from embomatrix.manager.observe.training_reports import TrainingBook
 from embomatrix.manager.runtime.bundles import BundleStore
@@ -35,7 +35,7 @@ from embomatrix.manager.runtime.state_journal import StateJournal
 from embomatrix.manager.runtime.worker_link import WorkerCommand, WorkerLink
 from embomatrix.manager.store.opening import timed_store
 from embomatrix.manager.store.protocol import StateStore
-from embomatrix.rpc.status import ClusterError, SupersededError, UnavailableError
+from embomatrix.rpc.status import ClusterError, InternalError, SupersededError, UnavailableError
 from embomatrix.rpc.wire.leases import LeaseResult, WorkerState
 from embomatrix.rpc.wire.values import Resources
 
@@ -82,6 +82,7 @@ class ManagerRuntime:
         self.meter = Meter()
         self.training = TrainingBook()
         self.load = ManagerLoad()
+        self.errors = ErrorCount()
         store = timed_store(store, self.load.operated)
         self.started_s = time.monotonic()
         self.event_log = RunEventLog(epoch_s=time.time() - self.started_s)
@@ -107,6 +108,10 @@ class ManagerRuntime:
 
     async def serve(self) -> None:
         """Drive the clock and write results until cancelled. Raises FencedError after another manager took over."""
+        with self.errors:
+            await self._serve()
+
+    async def _serve(self) -> None:
         async with asyncio.TaskGroup() as group:
             group.create_task(self._keep_time())
             group.create_task(self._clean_up())
@@ -160,11 +165,12 @@ class ManagerRuntime:
         """
         now_s, worker_id = time.monotonic(), link.session.worker_id
         ended = (*state.finished, *results) if state is not None else results
-        self.event_log.reported(worker_id, ended, self.cluster.dispatcher.live_leases, now_s=now_s)
-        commands = self._intake.report(link.session, state, results, resync=resync, now_s=now_s)
-        if state is not None:
-            self.event_log.residents(worker_id, state.residents, now_s=now_s)
-        self._carry_out(commands, more=True)
+        with self._fault_barrier(link.session):
+            self.event_log.reported(worker_id, ended, self.cluster.dispatcher.live_leases, now_s=now_s)
+            commands = self._intake.report(link.session, state, results, resync=resync, now_s=now_s)
+            if state is not None:
+                self.event_log.residents(worker_id, state.residents, now_s=now_s)
+            self._carry_out(commands, more=True)
 
     def deliver(self) -> None:
         """Write the results of a worker's message in one transaction, after its last slice."""
@@ -172,8 +178,9 @@ class ManagerRuntime:
 
     def process_heartbeat(self, session_id: str, epoch: int, beat: Heartbeat) -> float:
         """Renew the leases that the worker names. Return the seconds until the next heartbeat."""
-        interval_s, commands = self._intake.heartbeat(session_id, epoch, beat, now_s=time.monotonic())
-        self._carry_out(commands)
+        with self._fault_barrier(self.registry.find(session_id, epoch)):
+            interval_s, commands = self._intake.heartbeat(session_id, epoch, beat, now_s=time.monotonic())
+            self._carry_out(commands)
         return interval_s
 
     def end_session(
@@ -189,6 +196,36 @@ class ManagerRuntime:
             logger.info("session ended worker=%s: %s", session.worker_id, reason)
             self._carry_out(self.cluster.handle(*events, now_s=time.monotonic()))
             self._close_link(session.worker_id, error)
+
+    @contextlib.contextmanager
+    def _fault_barrier(self, session: WorkerSession) -> Iterator[None]:
+        """Keep the manager alive if a worker's message breaks a state machine: quarantine the worker and disconnect it.
+
+        Its leases are re-dispatched, so a half-processed message leaves no rollout without a place. Raises
+        InternalError instead of the original error.
+        """
+        try:
+            yield
+        except ClusterError:
+            raise
+        except Exception as error:
+            worker_id = session.worker_id
+            logger.exception("message of worker %s broke the state machine", worker_id)
+            reason = f"its message broke the manager's state machine ({type(error).__name__})"
+            self._survive(WorkerFaulted(worker_id, reason))
+            fault = InternalError(f"worker {worker_id} is quarantined: {reason}, see the manager's log")
+            self._survive(*self.registry.end(session, reason))
+            self._close_link(worker_id, fault)
+            raise fault from error
+
+    def _survive(self, *events: Event) -> None:
+        """Apply events; log an error instead of raising it."""
+        try:
+            self._carry_out(self.cluster.handle(*events, now_s=time.monotonic()))
+        except Exception:
+            logger.exception(
+                "state machine failed on %s", ", ".join(type(event).__name__ for event in events)
+            )
 
     def drain_worker(self, worker_id: str) -> None:
         """Give the worker no new leases, and have it leave after its last one."""
@@ -294,12 +331,19 @@ class ManagerRuntime:
                 self.registry.excuse_silence(late_s, now_s=time.monotonic())
             self._watch_leadership()
             self._warn_unaudited()
-            lost, commands = self._intake.tick(now_s=time.monotonic())
-            for event in lost:
-                logger.warning("worker lost worker=%s: %s", event.worker_id, event.reason)
-                self.event_log.lost(event.worker_id, event.reason, now_s=time.monotonic())
-                self._close_link(event.worker_id)
-            self._carry_out(commands)
+            try:
+                self._tick()
+            except Exception:
+                # A tick repeats everything that a failed one left undone.
+                logger.exception("clock tick failed")
+
+    def _tick(self) -> None:
+        lost, commands = self._intake.tick(now_s=time.monotonic())
+        for event in lost:
+            logger.warning("worker lost worker=%s: %s", event.worker_id, event.reason)
+            self.event_log.lost(event.worker_id, event.reason, now_s=time.monotonic())
+            self._close_link(event.worker_id)
+        self._carry_out(commands)
 
     async def _clean_up(self) -> None:
         while True:

@@ -79,6 +79,8 @@ class Leadership:
 
 MARK: Final = "folder-id"
 _KEY: Final = "data_folder"
+_LEASE_KEY: Final = "lease_key"
+LEASE_KEY_BYTES: Final = 32
 
 
 async def warn_of_another_folder(store: StateStore, folder: Path) -> None:
@@ -99,6 +101,15 @@ async def warn_of_another_folder(store: StateStore, folder: Path) -> None:
 async def note_folder(store: StateStore, folder: Path) -> None:
     """Note this manager's data folder in the state. Raises StateError or OSError."""
     await store.put_rows(Shelf.SWITCHES, [ShelfRow(_KEY, _mark_of(folder))])
+
+
+async def lease_key(store: StateStore) -> bytes:
+    """Return the cluster's secret for lease ids. The first leader creates it. Raises StateError."""
+    known = {row.key: row.payload for row in await store.rows(Shelf.SWITCHES)}.get(_LEASE_KEY)
+    if known is None:
+        known = secrets.token_bytes(LEASE_KEY_BYTES)
+        await store.put_rows(Shelf.SWITCHES, [ShelfRow(_LEASE_KEY, known)])
+    return known
 
 
 def _mark_of(folder: Path) -> bytes:

@@ -28,7 +28,12 @@ from embomatrix.manager.control.schedule.scheduler import ScheduleLimits
 from embomatrix.manager.observe.run_archive import RunArchive
 from embomatrix.manager.runtime.bundles import BundleStore
 from embomatrix.manager.runtime.event_loop import ManagerRuntime
-from embomatrix.manager.runtime.leadership import Leadership, note_folder, warn_of_another_folder
+from embomatrix.manager.runtime.leadership import (
+    Leadership,
+    lease_key,
+    note_folder,
+    warn_of_another_folder,
+)
 from embomatrix.manager.runtime.registry import LivenessLimits, Registry
 from embomatrix.manager.runtime.revocation import Revocation
 from embomatrix.manager.services.listen import bound_socket
@@ -215,7 +220,7 @@ async def _start_runtime(
     cluster = ClusterState(
         limits_of(DispatchLimits, settings, audit=audit),
         limits_of(ScheduleLimits, settings),
-        boot_id=secrets.token_hex(4),
+        lease_key=await lease_key(store),
         first_epoch=first_epoch,
         audit_key=secrets.token_bytes(32),
         debug=logging.getLogger("embomatrix").isEnabledFor(logging.DEBUG),

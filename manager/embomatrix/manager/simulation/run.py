@@ -33,7 +33,7 @@ class ClusterSimulation:
         self._setting = setting_of(scenario)
         self._report = Report(scenario, self._setting.slots)
         self._world = SimulatedWorld(self._setting, self.queue, self._checker, self._report)
-        self._cluster = ClusterState(scenario.dispatch, scenario.schedule, boot_id="simulated")
+        self._cluster = ClusterState(scenario.dispatch, scenario.schedule, lease_key=b"simulated")
         numbers = iter(range(1 << 62))
         registry = Registry(scenario.liveness, new_id=lambda: f"session-{next(numbers)}")
         self.manager = SimulatedManager(self._world, Intake(self._cluster, registry))

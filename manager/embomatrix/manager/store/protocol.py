@@ -98,7 +98,7 @@ class Shelf(StrEnum):
     REPUTATIONS = "reputes"
     """Audit reputations by worker id."""
     SWITCHES = "switches"
-    """Switches of the operator."""
+    """Switches of the operator, the id of the data folder, and the secret key of lease ids."""
     WINDOWS = "windows"
     """Last announced look-ahead windows by run id; deleted with the run."""
 

@@ -103,6 +103,7 @@ class _Cluster(Collector):
         dropped = sum(run.ring.dropped for run in runtime.event_log.runs.values())
         dropped += runtime.event_log.dropped + runtime.event_log.fleet.dropped
         yield _counter("embo_events_dropped", "Events discarded from full logs.", dropped)
+        yield _counter("embo_errors", "Errors that the manager logged.", runtime.errors.total)
 
     def _slot_states(self) -> dict[str, int]:
         states = Counter[str]()

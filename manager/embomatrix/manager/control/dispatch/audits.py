@@ -147,9 +147,13 @@ def _rule(state: DispatchState, case: AuditCase) -> None:
 
 
 def _convict(state: DispatchState, worker_id: str, case: AuditCase) -> None:
-    """Quarantine a worker, and re-dispatch its rollouts without a confirmed result."""
     others = " and ".join(o.worker_id for o in case.opinions if o.worker_id != worker_id)
     reason = f"its result of rollout {case.key.rollout_id} of run {case.key.run_id} contradicts {others}"
+    quarantine(state, worker_id, reason)
+
+
+def quarantine(state: DispatchState, worker_id: str, reason: str) -> None:
+    """Quarantine a worker, and re-dispatch its rollouts without a confirmed result."""
     known = state.auditor.of(worker_id).quarantine
     state.auditor.convict(worker_id, known or reason)
     if known:

@@ -18,14 +18,18 @@ STALL_TIMES: Final = 5.0
 
 
 def renew_leases(state: DispatchState, event: LeasesRenewed) -> None:
-    """Renew the leases of a heartbeat, and revoke those that make no progress: a worker that is alive may be stuck."""
-    state.leases.renew(event.worker_id, event.held, state.now_s)
-    for lease in state.leases.note_progress(event.worker_id, event.progress, state.now_s):
-        still_s = state.now_s - lease.moved_s
+    """Renew the leases of a heartbeat, and revoke those that make no progress: a worker that is alive may be stuck.
+
+    A lease that should run by the manager's reckoning and reports no progress counts as one without a step.
+    """
+    state.leases.note_progress(event.worker_id, event.progress, state.now_s)
+    for lease in state.leases.renew(event.worker_id, event.held, state.now_s):
+        if lease.started_s is None:
+            continue
+        still_s = state.now_s - max(lease.started_s, lease.moved_s)
         if still_s >= _stall_after_s(state, lease):
-            text = f"{event.worker_id} did no step for {still_s:.0f} s, after {lease.steps}"
-            failure = InfraFailure(InfraCode.STALLED, text, event.worker_id)
-            take_away(state, lease, failure, started=lease.started_s is not None)
+            text = f"{event.worker_id} did no step for {still_s:.0f} s, after {max(lease.steps, 0)}"
+            take_away(state, lease, InfraFailure(InfraCode.STALLED, text, event.worker_id), started=True)
 
 
 def tick(state: DispatchState) -> None:
@@ -57,7 +61,7 @@ def note_unplaceable(state: DispatchState, reasons: Mapping[str, str]) -> None:
 def _stall_after_s(state: DispatchState, lease: LeaseRecord) -> float:
     usual_s = state.runs.of(lease.record.key.run_id).times.quantile_s(0.99)
     if usual_s is None:
-        return state.limits.execute_deadline_s  # the run's step times are not known yet
+        return state.limits.first_stall_s
     return max(state.limits.stall_after_s, STALL_TIMES * usual_s)
 
 

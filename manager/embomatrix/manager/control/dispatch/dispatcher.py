@@ -19,7 +19,7 @@ A pure state machine: ``handle`` is the only way to change it, the clock is an a
 from collections.abc import Mapping
 
 from embomatrix.manager.control.commands import ManagerCommand
-from embomatrix.manager.control.dispatch.audits import drop_run
+from embomatrix.manager.control.dispatch.audits import drop_run, quarantine
 from embomatrix.manager.control.dispatch.deadlines import note_unplaceable, renew_leases, tick
 from embomatrix.manager.control.dispatch.lease_ends import settle_result
 from embomatrix.manager.control.dispatch.leasing import fill_freed, fill_workers
@@ -50,6 +50,7 @@ from embomatrix.manager.control.events import (
     ScenesUnplaceable,
     SuspicionChanged,
     Tick,
+    WorkerFaulted,
     WorkerJoined,
     WorkerLost,
     WorkerReported,
@@ -59,16 +60,16 @@ from embomatrix.manager.control.workers import WorkerRecord
 
 
 class Dispatcher:
-    """Batches in, leases and results out. ``boot_id`` keeps lease ids of different manager processes apart.
+    """Batches in, leases and results out.
 
-    ``first_epoch`` is above the epoch of every lease that a former manager granted. ``audit_key`` is secret: it determines
-    which results will be audited.
+    ``lease_key`` is the cluster's secret for lease ids. ``first_epoch`` is above the epoch of every lease that a former
+    manager granted. ``audit_key`` is secret: it determines which results will be audited.
     """
 
     def __init__(
-        self, limits: DispatchLimits, *, boot_id: str, first_epoch: int = 1, audit_key: bytes = b""
+        self, limits: DispatchLimits, *, lease_key: bytes, first_epoch: int = 1, audit_key: bytes = b""
     ) -> None:
-        self.state = DispatchState(limits, boot_id=boot_id, first_epoch=first_epoch, audit_key=audit_key)
+        self.state = DispatchState(limits, lease_key=lease_key, first_epoch=first_epoch, audit_key=audit_key)
         self.auditor = self.state.auditor
         self.live_leases: Mapping[str, LeaseRecord] = self.state.leases.live
         self.workers: Mapping[str, WorkerRecord] = self.state.pool.workers
@@ -117,6 +118,8 @@ class Dispatcher:
                 worker_reported(state, event)
             case WorkerLost():
                 worker_lost(state, event)
+            case WorkerFaulted(worker_id, reason):
+                quarantine(state, worker_id, reason)
             case SuspicionChanged() | DrainChanged():
                 standing_changed(state, event)
             case ScenesUnplaceable(reasons):

@@ -5,10 +5,10 @@ from itertools import islice
 from typing import Final
 
 from embomatrix.manager.control.commands import CancelLease, GiveLease
+from embomatrix.manager.control.dispatch.leases import origin_of
 from embomatrix.manager.control.dispatch.records import LeaseRecord, RolloutRecord
 from embomatrix.manager.control.dispatch.state import DispatchState
 from embomatrix.manager.control.workers import WorkerRecord
-from embomatrix.rpc.wire.leases import LeaseOrigin
 from embomatrix.rpc.wire.run_log import RolloutStepKind
 
 LOOKED_AT: Final = 256
@@ -72,7 +72,6 @@ def grant(
 ) -> None:
     """Lease a rollout that is in no queue to a worker that takes it."""
     lease = state.leases.grant(record, worker, state.now_s)
-    origin = LeaseOrigin(*record.key, attempt=record.attempts + 1)
     state.log(RolloutStepKind.HEDGED if hedge else RolloutStepKind.LEASED, record.key, worker.worker_id, why)
     state.emit(
         GiveLease(
@@ -80,7 +79,7 @@ def grant(
             lease.ref,
             record.rollout,
             state.limits.execute_deadline_s,
-            origin,
+            origin_of(record),
             hedge,
             record.check,
             record.reward,

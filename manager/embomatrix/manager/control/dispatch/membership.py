@@ -96,6 +96,7 @@ def release_awaited(state: DispatchState) -> None:
     all_back = state.expected_workers is not None and not state.expected_workers
     if not state.awaited or not (all_back or state.now_s >= state.awaited_until_s):
         return
+    state.awaited_until_s = state.now_s
     left = [record for record in state.awaited.values() if record.phase is not DispatchPhase.DONE]
     state.awaited.clear()
     state.awaited_scenes.clear()
@@ -123,9 +124,12 @@ def _reconcile(state: DispatchState, worker: WorkerRecord, event: WorkerReported
 def _adopt(state: DispatchState, worker: WorkerRecord, ref: LeaseRef, origin: LeaseOrigin | None) -> bool:
     """Adopt a former manager's lease; True on success.
 
-    The lease is void if the rollout has its outcome, or a lease with a higher epoch.
+    A claim counts only within the grace time after a restart. The lease is void if the rollout has its outcome, or a
+    lease with a higher epoch.
     """
-    if origin is None or not state.leases.is_former(ref):
+    if origin is None or state.now_s >= state.awaited_until_s:
+        return False
+    if not state.leases.is_genuine(ref, origin, worker.worker_id):
         return False
     batch = state.batches.get((origin.run_id, origin.batch_id))
     record = batch.open.get(origin.rollout_id) if batch is not None else None

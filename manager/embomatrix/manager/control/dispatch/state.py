@@ -54,6 +54,8 @@ class DispatchLimits:
     """Executions of a run after which its slot-time quantiles count."""
     stall_after_s: float = 10.0
     """A running lease is revoked after this long without a step, and five times the 99th percentile of its run."""
+    first_stall_s: float = 30.0
+    """A running lease of a run whose slot times are not known is revoked after this long without a step."""
     restart_grace_s: float = 5.0
     """A manager that took over waits this long for workers to claim their leases before it re-dispatches them."""
     audit: AuditRules = field(default_factory=AuditRules)
@@ -131,7 +133,7 @@ class DispatchState:
     """
 
     def __init__(
-        self, limits: DispatchLimits, *, boot_id: str, first_epoch: int = 1, audit_key: bytes = b""
+        self, limits: DispatchLimits, *, lease_key: bytes, first_epoch: int = 1, audit_key: bytes = b""
     ) -> None:
         self.limits = limits
         self.now_s = 0.0
@@ -145,7 +147,7 @@ class DispatchState:
         self.leases = LeaseTable(
             self.pool,
             self.runs,
-            boot_id=boot_id,
+            key=lease_key,
             ttl_s=limits.lease_ttl_s,
             limit_s=limits.lease_limit_s,
             first_epoch=first_epoch,
