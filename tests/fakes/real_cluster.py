@@ -202,7 +202,7 @@ class Tally:
         return self == Tally(self.submitted, self.submitted, 0, 0, 0)
 
 
-def tally(batch, results, reward=30.7):
+def tally(batch, results, reward=30.5):
     """Count the outcomes. ``reward`` is the true reward or a function of the rollout id; other values are fabricated."""
     counts = collections.Counter(result.rollout_id for result in results)
     expected = reward if callable(reward) else lambda _: reward

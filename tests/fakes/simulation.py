@@ -12,6 +12,7 @@ import zlib
 
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
 from embomatrix.rpc.wire.values import Completed, Timings
+from embomatrix.skills.trace import Step
 from embomatrix.worker.slots.slot_program import BundleCorruptError, run_program
 
 PROGRAM = (sys.executable, __file__)
@@ -86,11 +87,11 @@ class FakeScene:
                 os.kill(os.getppid(), signal.SIGSTOP)
                 time.sleep(1.0)
         made_up = lies()
+        holds = [number < (0 if made_up else satisfied(rollout)) for number in range(3)]
+        atoms = tuple(AtomResult(f"done {number}", truth) for number, truth in enumerate(holds))
         return Completed(
-            reward=RewardBreakdown(
-                reward.format, 0.2, made_up or goal(rollout), (AtomResult("done", True),), True
-            ),
-            steps=(),
+            reward=RewardBreakdown(reward.format, 0.0, reward.goal * sum(holds) / 3, atoms, all(holds)),
+            steps=tuple(Step(call, None, "done") for call in rollout.plan),
             final=(f"executed {self._executed} in {os.getpid()} of {os.getppid()}",),
             trace_digest=f"{'no ' if made_up else ''}trace of {rollout.rollout_id}",
             worker_id="",
@@ -99,9 +100,9 @@ class FakeScene:
         )
 
 
-def goal(rollout):
-    """Return the goal reward: 30, or for graded tasks the value in the rollout id."""
-    return graded(rollout.rollout_id) if rollout.task_id == "graded" else 30.0
+def satisfied(rollout):
+    """Return the number of the three atoms that hold."""
+    return zlib.crc32(rollout.rollout_id.encode()) % 4 if rollout.task_id == "graded" else 3
 
 
 def lies():
@@ -114,7 +115,7 @@ def graded(rollout_id):
 
 
 def graded_total(rollout_id):
-    return 0.7 + graded(rollout_id)
+    return 0.5 + graded(rollout_id)
 
 
 def note(rollout_id):

@@ -2,14 +2,13 @@
 
 import asyncio
 import contextlib
-import dataclasses
 from dataclasses import dataclass, field
 
 import grpc
 
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
-from embomatrix.reward.breakdown import RewardBreakdown
+from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
 from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.versions import PROTOCOL_VERSION
@@ -31,12 +30,19 @@ from embomatrix.rpc.wire.values import (
     Resources,
     Timings,
 )
+from embomatrix.skills.trace import Step
 
 
-def completed(worker_id="w1", reward=PAPER):
-    """Return the outcome of a plan that reached half of its goal."""
-    scored = RewardBreakdown(reward.format, reward.relevance_per_object, reward.goal / 2, (), success=False)
-    return Completed(scored, (), (), "sha256:trace", worker_id, Timings(execute_s=0.001), warm=True)
+def completed(worker_id="w1", reward=PAPER, plan=(), holds=(True, False)):
+    """Return the outcome of a plan whose calls all succeed; ``holds`` gives the truth of the goal's atoms."""
+    steps = tuple(Step(call, None, "done") for call in plan)
+    touched = {call.object_index for call in plan} | {call.source_index for call in plan}
+    relevance = min(reward.relevance_limit, reward.relevance_per_object * len(touched - {None}))
+    atoms = tuple(AtomResult(f"atom {number}", truth) for number, truth in enumerate(holds))
+    scored = RewardBreakdown(
+        reward.format, relevance, reward.goal * sum(holds) / len(holds), atoms, success=all(holds)
+    )
+    return Completed(scored, steps, (), "sha256:trace", worker_id, Timings(execute_s=0.001), warm=True)
 
 
 @dataclass
@@ -122,7 +128,12 @@ class FakeWorker:
         """Send the results of all held leases in one message and return their number."""
         held, self.leases = self.leases, {}
         if held:
-            self._send(results=[LeaseResult(lease.ref, completed(self.worker_id)) for lease in held.values()])
+            self._send(
+                results=[
+                    LeaseResult(lease.ref, completed(self.worker_id, plan=lease.rollout.plan))
+                    for lease in held.values()
+                ]
+            )
         return len(held)
 
     def pause(self, reason):
@@ -215,8 +226,9 @@ class FakeWorker:
             crashed = InfraFailure(InfraCode.SLOT_CRASHED, "signal 11", self.worker_id)
             self.report(lease.ref, crashed, slot)
         else:
-            reward = dataclasses.replace(lease.reward, goal=0.0) if self.lies else lease.reward
-            self.report(lease.ref, completed(self.worker_id, reward), slot)
+            holds = (False, False) if self.lies else (True, False)
+            outcome = completed(self.worker_id, lease.reward, lease.rollout.plan, holds)
+            self.report(lease.ref, outcome, slot)
 
     async def _beat(self, interval_s):
         while True:

@@ -36,7 +36,7 @@ async def test_each_run_is_scored_with_its_own_coefficients(tmp_path):
         await open_run(client, RunTerms(), "r2")
         own, usual = batch(4), batch(4, batch_id="b2", run_id="r2")
         scored = await asyncio.gather(outcomes(client, own), outcomes(client, usual))
-        assert [totals(results) for results in scored] == [{5.0}, {0.5 + 0.2 + 15.0}]
+        assert [totals(results) for results in scored] == [{5.0}, {0.5 + 15.0}]
         infos = {info.run_id: info.reward for info in await _runs(at.address)}
         assert infos == {"r1": OWN, "r2": PAPER}
         await client.close_run("r1")

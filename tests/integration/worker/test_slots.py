@@ -105,7 +105,7 @@ async def test_lease_is_executed_and_scored_in_another_process(tmp_path):
         harness.submit("l1")
         outcome = (await harness.outcomes(1))["l1"]
     assert isinstance(outcome, Completed)
-    assert outcome.reward.total == 30.7
+    assert outcome.reward.total == 30.5
     assert outcome.trace_digest == "trace of l1"
     assert str(os.getpid()) not in outcome.final[0]
     assert not outcome.warm

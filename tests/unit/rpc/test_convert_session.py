@@ -36,7 +36,7 @@ from embomatrix.rpc.wire.values import (
 from embomatrix.skills.syntax import Skill, SkillCall
 
 NAMES = st.text("abcdefgh-0123", min_size=1, max_size=12)
-SECONDS = st.floats(0.001, 1e6)
+SECONDS = st.floats(0.001, 10_000)
 REFS = st.builds(LeaseRef, NAMES, st.integers(0, 2**64 - 1))
 ORIGINS = st.builds(LeaseOrigin, NAMES, NAMES, NAMES, st.integers(1, 9))
 RESIDENTS = st.builds(Resident, NAMES, st.sampled_from(ResidentState), SECONDS, SECONDS, NAMES)

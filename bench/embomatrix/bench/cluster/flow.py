@@ -134,10 +134,7 @@ async def _flow(
     store: psutil.Process | None,
 ) -> Flow:
     """Push batches through the manager, two at a time, so that about one of them is in flight at any moment."""
-    steps = len(workload.rollouts[0].plan)
-    with running_process(
-        folder, "null-worker", NULL_WORKER, cluster.address, str(sizes.slots), str(steps)
-    ) as worker:
+    with running_process(folder, "null-worker", NULL_WORKER, cluster.address, str(sizes.slots)) as worker:
         on_step("warming up")
         await load.warm_up(workload.rollouts)
         await load.submit(_repeated(workload, sizes.in_flight // 4))

@@ -1,6 +1,6 @@
 """Null worker: it executes nothing, holds every desired scene warm and answers each lease with a prepared result.
 
-``python -m embomatrix.bench.cluster.null_worker ADDRESS SLOTS STEPS`` runs one and prints two numbers for each message with
+``python -m embomatrix.bench.cluster.null_worker ADDRESS SLOTS`` runs one and prints two numbers for each message with
 leases: its time on the monotonic clock, and the seconds since the last message with results.
 """
 
@@ -18,14 +18,15 @@ from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.wire.leases import LeaseRef, LeaseResult, WorkerState
 from embomatrix.rpc.wire.outcome import completed_from_proto, completed_to_proto
+from embomatrix.rpc.wire.rollout import unread_rollout
 from embomatrix.rpc.wire.session import (
     lease_ref_from_proto,
     lease_ref_to_proto,
     lease_result_to_proto,
     worker_state_to_proto,
 )
-from embomatrix.rpc.wire.values import Completed, Resident, ResidentState, Resources, Timings
-from embomatrix.skills.syntax import Skill, SkillCall
+from embomatrix.rpc.wire.values import Completed, Resident, ResidentState, Resources, Rollout, Timings
+from embomatrix.skills.syntax import Plan
 from embomatrix.skills.trace import Step
 from embomatrix.worker.link.membership import Membership
 from embomatrix.worker.link.session import HEARTBEAT_S, Registration, register
@@ -45,13 +46,14 @@ async def register_null_worker(address: str, name: str, slots: int) -> Registrat
 
 
 class NullWorker:
-    """One session of a null worker. Without a ``result`` it keeps its leases and stays present."""
+    """One session of a null worker. Unless it ``answers``, it keeps its leases and stays present."""
 
-    def __init__(self, registration: Registration, result: Completed | None = None) -> None:
+    def __init__(self, registration: Registration, *, answers: bool = False) -> None:
         self._registration = registration
-        self._result = result
+        self._answers = answers
+        self._prepared: dict[Plan, Completed] = {}
         self._outgoing: asyncio.Queue[pb.SessionRequest] = asyncio.Queue()
-        self._held: list[LeaseRef] = []
+        self._held: dict[LeaseRef, Rollout] = {}
         self._leased = asyncio.Event()
         self._sent_s: float | None = None
         """Time at which results were sent that no leases have followed."""
@@ -62,8 +64,8 @@ class NullWorker:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._listen(stub))
             tasks.create_task(self._beat(stub))
-            if self._result is not None:
-                tasks.create_task(self._answer(self._result))
+            if self._answers:
+                tasks.create_task(self._answer())
 
     async def _listen(self, stub: worker_service_pb2_grpc.WorkerServiceAsyncStub) -> None:
         async for response in stub.Session(self._requests()):
@@ -74,20 +76,32 @@ class NullWorker:
                 if self._sent_s is not None:
                     sys.stdout.write(f"{now_s} {now_s - self._sent_s}\n")
                     self._sent_s = None
-                self._held += [lease_ref_from_proto(lease.ref) for lease in response.leases]
+                self._held |= {
+                    lease_ref_from_proto(lease.ref): unread_rollout(lease.rollout)
+                    for lease in response.leases
+                }
                 self._leased.set()
 
-    async def _answer(self, result: Completed) -> None:
+    async def _answer(self) -> None:
         """Send many results in a message, as a worker does that has enough leases ahead."""
         while True:
             await self._leased.wait()
             await asyncio.sleep(PAUSE_S)
             self._leased.clear()
             message = self._request()
-            message.results.extend(lease_result_to_proto(LeaseResult(ref, result)) for ref in self._held)
+            message.results.extend(
+                lease_result_to_proto(LeaseResult(ref, self._result_of(rollout.plan)))
+                for ref, rollout in self._held.items()
+            )
             self._held.clear()
             self._sent_s = time.monotonic()
             self._outgoing.put_nowait(message)
+
+    def _result_of(self, plan: Plan) -> Completed:
+        result = self._prepared.get(plan)
+        if result is None:
+            result = self._prepared[plan] = prepared_result(plan)
+        return result
 
     async def _beat(self, stub: worker_service_pb2_grpc.WorkerServiceAsyncStub) -> None:
         known = self._registration
@@ -114,22 +128,21 @@ class NullWorker:
         return pb.SessionRequest(session_id=known.session_id, session_epoch=known.epoch, state=state)
 
 
-def prepared_result(steps: int) -> Completed:
-    """A result of usual size, as a slot's process hands it to its daemon."""
-    reward = RewardBreakdown(0.5, 0.4, 30.0, (AtomResult("(ontop thing_1 countertop_1)", True),), True)
-    call = SkillCall(Skill.MOVE, 0)
-    trace = tuple(Step(call, None, f"step {number} of the plan is done") for number in range(steps))
+def prepared_result(plan: Plan) -> Completed:
+    """Return a result of usual size, as a slot's process hands it to its daemon."""
+    reward = RewardBreakdown(0.5, 0.0, 30.0, (AtomResult("(ontop thing_1 countertop_1)", True),), True)
+    trace = tuple(Step(call, None, f"step {number} of the plan is done") for number, call in enumerate(plan))
     timings = Timings(execute_s=EXECUTE_S)
     completed = Completed(reward, trace, FINAL, "sha256:" + "0" * 64, "null", timings, warm=True)
     return completed_from_proto(completed_to_proto(completed))
 
 
-async def main(address: str, slots: str, steps: str) -> None:
+async def main(address: str, slots: str) -> None:
     """Serve as one worker until killed."""
     registration = await register_null_worker(address, "null", int(slots))
     async with open_channel(address) as channel:
         stub = worker_service_pb2_grpc.WorkerServiceStub(channel)
-        await NullWorker(registration, prepared_result(int(steps))).run(stub, ())
+        await NullWorker(registration, answers=True).run(stub, ())
 
 
 if __name__ == "__main__":

@@ -82,6 +82,13 @@ def finite(field: str, number: float) -> float:
     return number
 
 
+def within(field: str, number: float, most: float) -> float:
+    """Return the number, or raise ConvertError unless it is between 0 and ``most``."""
+    if not 0.0 <= number <= most:
+        raise ConvertError(field, f"found {number}: expected 0 to {most:g}")
+    return number
+
+
 def enum_numbers(members: type[EnumT], wire: _EnumTypeWrapper[NumberT], prefix: str) -> dict[EnumT, NumberT]:
     """Return the wire number of each enum member. ``prefix`` precedes the member's name in the .proto file."""
     return {member: wire.Value(f"{prefix}_{member.name}") for member in members}

@@ -1,19 +1,19 @@
 """Conversion of rollout outcomes to and from protobuf."""
 
 import functools
-import math
 
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
+from embomatrix.rpc.wire.bounds import DAY_S, check
 from embomatrix.rpc.wire.codec import (
     ConvertError,
     converters,
     each_known,
     enum_numbers,
-    finite,
     inside,
     maker,
     required,
+    within,
 )
 from embomatrix.rpc.wire.rollout import KNOWN, skill_call_from_proto, skill_call_to_proto
 from embomatrix.rpc.wire.values import (
@@ -40,12 +40,6 @@ infra_failure_to_proto, infra_failure_from_proto = converters(
 )
 
 
-def _check_reward(message: types_pb2.Reward) -> None:
-    finite("format", message.format)
-    finite("relevance", message.relevance)
-    finite("goal", message.goal)
-
-
 def step_to_proto(step: Step) -> types_pb2.StepResult:
     failure = "" if step.failure is None else step.failure.value
     return types_pb2.StepResult(
@@ -56,6 +50,7 @@ def step_to_proto(step: Step) -> types_pb2.StepResult:
 @functools.lru_cache(KNOWN)
 def _step_of(data: bytes) -> Step:
     message = types_pb2.StepResult.FromString(data)
+    check(message)
     call = inside("call", skill_call_from_proto, message.call)
     return Step(call, _failure_reason(message.failure), message.message, message.blocker)
 
@@ -82,9 +77,9 @@ timings_to_proto = maker(types_pb2.Timings, _write_timings)
 
 def timings_from_proto(message: types_pb2.Timings) -> Timings:
     durations_s = (message.queued_s, message.load_s, message.execute_s, message.lease_s, message.deliver_s)
-    if not math.isfinite(sum(durations_s)):
+    if not (min(durations_s) >= 0.0 and sum(durations_s) <= DAY_S):
         for name, seconds in zip(Timings.__slots__, durations_s, strict=True):
-            finite(name, seconds)
+            within(name, seconds, DAY_S)
     return Timings(*durations_s)
 
 
@@ -123,13 +118,14 @@ def completed_from_proto(message: types_pb2.Completed) -> Completed:
 
 
 def checked_completed(message: types_pb2.Completed) -> Completed:
-    """Return the result after the same checks, without its values. The first access to a value parses it."""
-    inside("reward", _check_reward, _reward_in(message))
+    """Return the result after the same checks, with reward and steps. The first access to another value parses it."""
+    reward = inside("reward", reward_from_proto, _reward_in(message))
     wire = message.SerializeToString()
-    _steps_in(wire)
     return Completed.unread(
         wire,
         _read_completed,
+        reward=reward,
+        steps=_steps_in(wire),
         timings=inside("timings", timings_from_proto, message.timings),
         warm=message.warm,
         worker_id=message.worker_id,

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Final, Literal
 
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
+from embomatrix.rpc.wire.bounds import check
 from embomatrix.rpc.wire.codec import ConvertError, each, each_known, enum_numbers, finite, maker, required
 from embomatrix.rpc.wire.values import Batch, Rollout
 from embomatrix.skills.syntax import (
@@ -53,6 +54,7 @@ def skill_call_from_proto(message: types_pb2.SkillCall) -> SkillCall:
 @functools.lru_cache(KNOWN)
 def _call_of(data: bytes) -> SkillCall:
     message = types_pb2.SkillCall.FromString(data)
+    check(message)
     skill = _SKILLS.get(message.skill)
     if skill is None:
         raise ConvertError(
@@ -121,6 +123,7 @@ def rollout_from_proto(message: types_pb2.Rollout) -> Rollout:
         raise ConvertError(
             "plan", f"makes a rollout of {len(wire)} bytes: at most {MAX_ROLLOUT_BYTES} are accepted"
         )
+    check(message)
     rollout = Rollout(
         rollout_id=required("rollout_id", message.rollout_id),
         group_id=required("group_id", message.group_id),

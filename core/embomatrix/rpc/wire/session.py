@@ -4,7 +4,17 @@ from typing import Final
 
 from embomatrix.proto.v1 import admin_service_pb2, types_pb2, worker_service_pb2
 from embomatrix.reward.settings import PAPER
-from embomatrix.rpc.wire.codec import ConvertError, converters, enum_numbers, finite, inside, maker, required
+from embomatrix.rpc.wire.bounds import DAY_S, check_result
+from embomatrix.rpc.wire.codec import (
+    ConvertError,
+    converters,
+    enum_numbers,
+    finite,
+    inside,
+    maker,
+    required,
+    within,
+)
 from embomatrix.rpc.wire.leases import (
     Lease,
     LeaseClaim,
@@ -160,6 +170,7 @@ lease_result_to_proto = maker(worker_service_pb2.LeaseResult, write_lease_result
 
 
 def lease_result_from_proto(message: worker_service_pb2.LeaseResult) -> LeaseResult:
+    check_result(message)
     ref = inside("lease", lease_ref_from_proto, message.lease)
     outcome: Completed | InfraFailure
     match message.WhichOneof("outcome"):
@@ -169,7 +180,7 @@ def lease_result_from_proto(message: worker_service_pb2.LeaseResult) -> LeaseRes
             outcome = inside("infra_failure", infra_failure_from_proto, message.infra_failure)
         case None:
             raise ConvertError("outcome", "found no value: expected completed or infra_failure")
-    return LeaseResult(ref, outcome, slot=message.slot, held_s=finite("held_s", message.held_s))
+    return LeaseResult(ref, outcome, slot=message.slot, held_s=within("held_s", message.held_s, DAY_S))
 
 
 _LEASE_REF = (lease_ref_to_proto, lease_ref_from_proto)

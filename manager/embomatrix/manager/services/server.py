@@ -13,6 +13,7 @@ from embomatrix.manager.runtime.event_loop import ManagerRuntime
 from embomatrix.manager.runtime.revocation import Revocation
 from embomatrix.manager.services.admin import AdminServicer
 from embomatrix.manager.services.listen import bind_server
+from embomatrix.manager.services.messages import BoundsInterceptor
 from embomatrix.manager.services.rollout import RolloutServicer
 from embomatrix.manager.services.scene import SceneServicer
 from embomatrix.manager.services.standby import refusing
@@ -43,7 +44,9 @@ async def build_server(
 
     Raises PortInUseError.
     """
-    server = grpc.aio.server(options=SERVER_OPTIONS, interceptors=[RoleInterceptor(gate)])
+    server = grpc.aio.server(
+        options=SERVER_OPTIONS, interceptors=[RoleInterceptor(gate), BoundsInterceptor()]
+    )
     worker_service_pb2_grpc.add_WorkerServiceServicer_to_server(
         WorkerServicer(runtime, gate, lease_ttl_s=settings.lease_ttl_s), server
     )

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from embomatrix.manager.simulation.machines import SimulatedMachine, SimulatedWorld
-from embomatrix.reward.breakdown import RewardBreakdown
+from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
 from embomatrix.rpc.wire.leases import Lease, LeaseProgress, LeaseRef, LeaseResult
 from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, Resident, ResidentState, Timings
 
@@ -18,8 +18,10 @@ RETRY_LOAD_S: Final = 10.0
 RESPAWN_S: Final = 0.02
 """Time until a killed or crashed slot has a new process."""
 STEP_S: Final = 0.1
-REWARD: Final = RewardBreakdown(0.5, 0.2, 15.0, (), False)
-INVENTED: Final = RewardBreakdown(0.5, 0.2, 30.0, (), True)
+_HALF: Final = (AtomResult("one", True), AtomResult("other", False))
+_WHOLE: Final = (AtomResult("one", True), AtomResult("other", True))
+REWARD: Final = RewardBreakdown(0.5, 0.0, 15.0, _HALF, False)
+INVENTED: Final = RewardBreakdown(0.5, 0.0, 30.0, _WHOLE, True)
 
 
 @dataclass(slots=True, eq=False)

@@ -1,0 +1,63 @@
+"""Check of a result against its plan and the reward coefficients of its run.
+
+It needs no simulator: a result that fails it contradicts itself, whatever the scene. Audits check the rest.
+"""
+
+from embomatrix.reward.breakdown import RewardBreakdown
+from embomatrix.reward.settings import RewardSettings
+from embomatrix.rpc.wire.values import Completed, Rollout
+from embomatrix.skills.trace import Step
+
+
+def contradiction(completed: Completed, rollout: Rollout, settings: RewardSettings) -> str:
+    """Return the reason why no execution of the plan can have this result; empty if one can."""
+    return _wrong_steps(completed.steps, rollout) or _wrong_reward(
+        completed.reward, completed.steps, settings
+    )
+
+
+def _wrong_steps(steps: tuple[Step, ...], rollout: Rollout) -> str:
+    plan = rollout.plan
+    if len(steps) > len(plan):
+        return f"it has {len(steps)} steps for a plan of {len(plan)} calls"
+    if tuple([step.call for step in steps]) != plan[: len(steps)]:
+        return "its steps are other calls than the plan's"
+    failures = [step.failure for step in steps]
+    if any(failures[:-1]):
+        return "it goes on after a failed step"
+    if len(steps) < len(plan) and not (failures and failures[-1]):
+        return f"it ends after {len(steps)} of {len(plan)} calls without a failure"
+    return ""
+
+
+def _wrong_reward(reward: RewardBreakdown, steps: tuple[Step, ...], settings: RewardSettings) -> str:
+    """Recompute the tiers as `embomatrix.reward.hierarchy.score` does, to the bit."""
+    satisfied = sum(atom.holds for atom in reward.atoms)
+    goal = settings.goal * satisfied / len(reward.atoms) if reward.atoms else 0.0
+    if reward.format != settings.format:
+        return f"its format reward is {reward.format:g} instead of {settings.format:g}"
+    if reward.goal != goal:
+        return f"its goal reward is {reward.goal:g}, and its atoms earn {goal:g}"
+    if reward.success and not satisfied:
+        return "it succeeds without an atom that holds"
+    return "" if _is_relevance(reward.relevance, steps, settings) else _irrelevant(reward.relevance)
+
+
+def _irrelevant(relevance: float) -> str:
+    return f"no number of touched objects earns its relevance reward of {relevance:g}"
+
+
+def _is_relevance(relevance: float, steps: tuple[Step, ...], settings: RewardSettings) -> bool:
+    """True if some of the objects that successful calls can have touched earn this relevance reward.
+
+    A call touches its target and its source. Calls without an index act on the held object.
+    """
+    if relevance == 0.0:
+        return True
+    done = [step.call for step in steps if step.failure is None]
+    named = {call.object_index for call in done} | {call.source_index for call in done}
+    most = len(named - {None})
+    return any(
+        relevance == min(settings.relevance_limit, settings.relevance_per_object * count)
+        for count in range(1, most + 1)
+    )

@@ -1,0 +1,76 @@
+"""Results that contradict their plan or the coefficients of their run."""
+
+import dataclasses
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.fakes.worker import completed
+
+from embomatrix.manager.control.plausibility import contradiction
+from embomatrix.reward.breakdown import AtomResult
+from embomatrix.reward.settings import PAPER, RewardSettings
+from embomatrix.rpc.wire.values import Rollout
+from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.syntax import Skill, SkillCall
+from embomatrix.skills.trace import Step
+
+PLAN = (SkillCall(Skill.MOVE, object_index=3), SkillCall(Skill.OPEN, object_index=4))
+ROLLOUT = Rollout("x1", "g", "kitchen", "t", PLAN, 1)
+HONEST = completed(plan=PLAN)
+
+
+def reward(**changes):
+    return dataclasses.replace(HONEST, reward=dataclasses.replace(HONEST.reward, **changes))
+
+
+def steps(*steps):
+    return dataclasses.replace(HONEST, steps=steps, reward=dataclasses.replace(HONEST.reward, relevance=0.0))
+
+
+def test_honest_result_is_accepted():
+    assert contradiction(HONEST, ROLLOUT, PAPER) == ""
+    failed = Step(PLAN[0], FailureReason.OUT_OF_REACH, "too far")
+    assert contradiction(steps(failed), ROLLOUT, PAPER) == ""
+
+
+@pytest.mark.parametrize(
+    ("result", "reason"),
+    [
+        (reward(goal=1.7e308), "its atoms earn 15"),
+        (reward(goal=-1e9), "its atoms earn 15"),
+        (reward(goal=30.0), "its atoms earn 15"),
+        (reward(format=1e9), "format reward"),
+        (reward(relevance=0.6), "no number of touched objects"),
+        (reward(relevance=float("nan")), "no number of touched objects"),
+        (reward(goal=0.0, atoms=(), success=True), "without an atom"),
+        (reward(goal=0.0, atoms=(AtomResult("a", False),), success=True), "without an atom"),
+        (steps(*(Step(PLAN[0], None, "done"),) * 500), "500 steps for a plan of 2 calls"),
+        (steps(Step(PLAN[1], None, "done"), Step(PLAN[0], None, "done")), "other calls"),
+        (steps(Step(PLAN[0], None, "done")), "ends after 1 of 2"),
+        (steps(), "ends after 0 of 2"),
+        (
+            steps(Step(PLAN[0], FailureReason.OUT_OF_REACH, "too far"), Step(PLAN[1], None, "done")),
+            "goes on after a failed step",
+        ),
+    ],
+)
+def test_impossible_result_is_named(result, reason):
+    assert reason in contradiction(result, ROLLOUT, PAPER)
+
+
+@given(
+    st.builds(
+        RewardSettings,
+        format=st.floats(0, 9),
+        relevance_per_object=st.floats(0, 2),
+        relevance_limit=st.floats(0, 5),
+        goal=st.floats(0, 1e6),
+    ),
+    st.lists(st.booleans(), min_size=1, max_size=7),
+    st.lists(st.integers(0, 9), max_size=9),
+)
+def test_every_reward_that_can_be_computed_is_accepted(settings, holds, objects):
+    plan = tuple(SkillCall(Skill.MOVE, object_index=index) for index in objects)
+    result = completed(reward=settings, plan=plan, holds=tuple(holds))
+    assert contradiction(result, dataclasses.replace(ROLLOUT, plan=plan), settings) == ""
