@@ -25,6 +25,7 @@ MASK: Final = "***"
 _NAMED: Final = re.compile(r"(?:(\w+)=)?(%%|%[-+#0 ]*\d*(?:\.\d+)?[sdrfgixe])")
 _BEARER: Final = re.compile(r"(Bearer\s+)\S+", re.IGNORECASE)
 _PASSWORD: Final = re.compile(r"(://[^/@:\s]*:)[^/@\s]*@")
+_CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
 _bound: contextvars.ContextVar[Mapping[str, str]] = contextvars.ContextVar(
     "_bound", default=MappingProxyType({})
 )
@@ -69,6 +70,14 @@ def without_secrets(text: str) -> str:
     return _PASSWORD.sub(rf"\1{MASK}@", _BEARER.sub(rf"\1{MASK}", text))
 
 
+def one_line(text: str) -> str:
+    """Return the text with control characters and direction marks escaped.
+
+    A name from another machine can then neither forge a log line nor drive a terminal.
+    """
+    return _CONTROL.sub(lambda found: repr(found[0])[1:-1], text)
+
+
 class HumanFormatter(logging.Formatter):
     """Text line: time, level, and message, then bound ids that the message lacks."""
 
@@ -78,7 +87,7 @@ class HumanFormatter(logging.Formatter):
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  # the standard library's name
         named = set(_fields(record))
         more = "".join(f" {name}={value}" for name, value in _bound.get().items() if name not in named)
-        return super().formatMessage(record) + more
+        return one_line(super().formatMessage(record) + more)
 
     def format(self, record: logging.LogRecord) -> str:
         return without_secrets(super().format(record))

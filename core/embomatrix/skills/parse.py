@@ -52,7 +52,10 @@ PLAN_KEYS: Final = ("action_sequence", "plan")
 MAX_INDEX: Final = 2**63 - 1
 """Largest index that the wire format carries."""
 _MAX_STARTS: Final = 256
-"""Most brackets at which the parser looks for JSON: bounds the work on adversarial text."""
+"""Most brackets at which the parser looks for JSON."""
+_READ_TIMES: Final = 8
+"""Most characters that failed attempts may read, as a multiple of the text: nested brackets that never close are
+read again from each bracket."""
 _JSON_START: Final = re.compile(r"\[\s*\{|\{\s*\"")
 _LIST_MARK: Final = re.compile(r"^\s*(?:\d+[.)]|[-*])\s+")
 _WORD: Final = re.compile(r"[A-Za-z_]+")
@@ -70,7 +73,7 @@ def parse_plan(text: str, profile: Profile = Profile.PAPER) -> Plan:
             f"the text has {size} bytes: expected at most {MAX_PLAN_BYTES}; shorten the plan",
         )
     answer = _without_reasoning(text)
-    value = _last_json_plan(answer)
+    value = last_json_plan(answer, json.JSONDecoder())
     if value is not None:
         return plan_from_json(value, profile)
     return _parse_lines(answer, profile)
@@ -134,23 +137,30 @@ def _steps_in(value: object) -> Sequence[object] | None:
     return None
 
 
-def _last_json_plan(text: str) -> object | None:
-    """Return the last outermost JSON value that holds a plan."""
-    decoder = json.JSONDecoder()
+def last_json_plan(text: str, decoder: json.JSONDecoder) -> object | None:
+    """Return the last outermost JSON value that holds a plan. Reads about ``_READ_TIMES`` times the text at most."""
     found: object | None = None
-    position = 0
+    position, left = 0, _READ_TIMES * len(text)
     for _ in range(_MAX_STARTS):
         match = _JSON_START.search(text, position)
-        if match is None:
+        if match is None or left < 0:
             break
         try:
             value, position = decoder.raw_decode(text, match.start())
-        except (ValueError, RecursionError):
+        except (ValueError, RecursionError) as error:
+            left -= _end_of_failure(error, text) - match.start()
             position = match.start() + 1
             continue
         if _steps_in(value) is not None:
             found = value
     return found
+
+
+def _end_of_failure(error: Exception, text: str) -> int:
+    """Return the index up to which the decoder has read; the text's end where the error does not tell."""
+    if isinstance(error, json.JSONDecodeError) and not error.msg.startswith("Unterminated"):
+        return error.pos
+    return len(text)
 
 
 def _call_from_json(value: object, number: int, profile: Profile) -> SkillCall:

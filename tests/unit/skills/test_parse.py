@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from embomatrix.skills.parse import (
     PlanError,
     PlanReason,
+    last_json_plan,
     parse_plan,
     plan_from_json,
     plan_to_json,
@@ -265,3 +266,32 @@ def refuse_or_read(text: str) -> None:
     except PlanError:
         return
     assert 0 < len(plan) <= MAX_STEPS
+
+
+class CountingDecoder(json.JSONDecoder):
+    """JSON decoder that counts the characters that it was given to read."""
+
+    def __init__(self):
+        super().__init__()
+        self.read = 0
+
+    def raw_decode(self, s, idx=0):
+        try:
+            value, end = super().raw_decode(s, idx)
+        except json.JSONDecodeError as error:
+            unterminated = error.msg.startswith("Unterminated")
+            self.read += (len(s) if unterminated else error.pos) - idx
+            raise
+        except RecursionError:
+            self.read += len(s) - idx
+            raise
+        self.read += end - idx
+        return value, end
+
+
+@pytest.mark.parametrize("piece", ['[{"a":', '{"a":[', '{"a', '[{"action":"move","x":[', '[ { "b" : '])
+def test_work_on_brackets_that_never_close_grows_linearly(piece):
+    for size in (4_000, 8_000, 16_000):
+        decoder, text = CountingDecoder(), piece * (size // len(piece))
+        assert last_json_plan(text, decoder) is None
+        assert decoder.read <= 9 * size

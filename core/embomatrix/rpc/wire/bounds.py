@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -239,6 +240,8 @@ MESSAGE_BYTES: Final[Mapping[str, int]] = {
     "ReportTrainingRequest": 4 * 1024 * 1024,
 }
 """Bytes of a whole message."""
+OWN: Final = "embomatrix."
+"""Package of the messages that have bounds; health checks and reflection have sizes only."""
 OTHER_BYTES: Final = 2 * 1024 * 1024
 """Bytes of every other message."""
 CONVERTED_LATER: Final = frozenset(
@@ -251,6 +254,8 @@ CONVERTED_LATER: Final = frozenset(
     }
 )
 """Repeated messages that are checked in slices, or once for equal bytes, while they are converted."""
+_CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
+"""Control characters and direction marks, which names may not have."""
 _BOOLEAN: Final = FieldDescriptor.CPPTYPE_BOOL
 
 
@@ -268,7 +273,8 @@ def parsed(message_type: type[MessageT], data: bytes) -> MessageT:
         raise ConvertError(
             name, "found bytes that are no message of this kind: check the protocol version"
         ) from None
-    check(message)
+    if message_type.DESCRIPTOR.file.package.startswith(OWN):
+        check(message)
     return message
 
 
@@ -352,6 +358,8 @@ def _text_rule(field: str, bound: Bound) -> Any:
     def rule(value: str | bytes) -> None:
         if len(value) > bound.length:
             raise ConvertError(field, f"found {len(value):,} characters: expected at most {bound.length:,}")
+        if bound.length == NAME and isinstance(value, str) and _CONTROL.search(value):
+            raise ConvertError(field, f"found {value[:80]!r}: expected a name without control characters")
 
     return rule
 

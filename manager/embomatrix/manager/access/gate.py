@@ -5,7 +5,7 @@ import hmac
 import json
 import logging
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -86,12 +86,12 @@ class Gate:
         found = self._book.find(token, now_s=time.time())
         return Caller(found.role, found.token_id, found.worker_id if found.role is AccessRole.WORKER else "")
 
-    def refusal(self, method: str, header: str | None) -> ClusterError | None:
-        """Return the reason to refuse the method with this ``authorization`` header; None if it is allowed."""
-        if method in OPEN and not header:
+    def refusal(self, method: str, headers: Sequence[str]) -> ClusterError | None:
+        """Return the reason to refuse the method with these ``authorization`` headers; None if it is allowed."""
+        if method in OPEN and not headers:
             return None
         try:
-            caller = self.caller(token_of(header))
+            caller = self.caller(the_token(headers))
         except NotSignedInError as error:
             return error
         if method in OPEN or may_call(caller.role, method):
@@ -102,7 +102,7 @@ class Gate:
 
     def caller_of(self, context: grpc.aio.ServicerContext) -> Caller:
         """Return the caller of a gRPC call. Raises NotSignedInError."""
-        return self.caller(token_of(_header(context)))
+        return self.caller(_token_in(context))
 
     async def admit(
         self, context: grpc.aio.ServicerContext, join_token: str, worker_id: str, boot_id: str
@@ -111,7 +111,7 @@ class Gate:
 
         Return the id of its token from now on, and the token of its new credential; empty if it keeps its own.
         """
-        token = token_of(_header(context)) or join_token
+        token = _token_in(context) or join_token
         caller = self.caller(token)
         if not may_call(caller.role, _REGISTER):
             raise NotAllowedError(
@@ -195,5 +195,15 @@ class Gate:
 _REGISTER: Final = "/embomatrix.proto.v1.WorkerService/Register"
 
 
-def _header(context: grpc.aio.ServicerContext) -> str | None:
-    return next((value for key, value in context.invocation_metadata() or () if key == TOKEN_KEY), None)
+def the_token(headers: Sequence[str]) -> str:
+    """Return the token of the ``authorization`` headers of one call; empty without any.
+
+    Raises NotSignedInError for several headers, since proxies and servers disagree about the one that counts.
+    """
+    if len(headers) > 1:
+        raise NotSignedInError(f"found {len(headers)} authorization headers: send one")
+    return token_of(headers[0]) if headers else ""
+
+
+def _token_in(context: grpc.aio.ServicerContext) -> str:
+    return the_token([value for key, value in context.invocation_metadata() or () if key == TOKEN_KEY])

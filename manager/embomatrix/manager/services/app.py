@@ -133,7 +133,9 @@ async def running(
         gate = Gate(store, guarded=protection.guarded, shared_token=settings.token)
         await gate.open(protection.first)
         server, port = await build_server(runtime, gate, protection.tls, settings)
-        rules = HttpRules(gate, hosts=allowed_hosts(settings.http_host, protection.tls))
+        rules = HttpRules(
+            gate, allowed_hosts(settings.http_host, protection.tls), secure=protection.tls is not None
+        )
         http.show(build_api(runtime, rules, Revocation(runtime, gate), _gallery(settings.dataset)))
         stack.callback(group.create_task(leadership.keep()).cancel)
         stack.callback(group.create_task(runtime.serve()).cancel)

@@ -15,8 +15,6 @@ from google.protobuf.message import Message
 from embomatrix.rpc.status import translate
 from embomatrix.rpc.wire.bounds import parsed
 
-OWN: str = "/embomatrix."
-
 
 class BoundsInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc is untyped
     """Refuses messages that are malformed or out of bounds with ``INVALID_ARGUMENT``."""
@@ -30,7 +28,7 @@ class BoundsInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # gr
         if handler is None or handler.request_deserializer is None:
             return handler
         method = handler_call_details.method
-        return _bounded(handler, _request_type(method)) if method.startswith(OWN) else handler
+        return _bounded(handler, _request_type(method))
 
 
 def _request_type(method: str) -> type[Message]:

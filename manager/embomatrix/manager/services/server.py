@@ -84,7 +84,7 @@ class RoleInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc
         handler = await continuation(handler_call_details)
         if handler is None:
             return handler
-        metadata = dict(handler_call_details.invocation_metadata or ())
         method = handler_call_details.method
-        refusal = self._gate.refusal(method, metadata.get(TOKEN_KEY))
+        headers = [value for key, value in handler_call_details.invocation_metadata or () if key == TOKEN_KEY]
+        refusal = self._gate.refusal(method, headers)
         return handler if refusal is None else refusing(method, refusal)

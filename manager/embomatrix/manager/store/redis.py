@@ -247,6 +247,11 @@ class RedisStore:
             return await answer
         except ResponseError as error:
             if _FENCED in str(error):
+                if not await self._redis.exists(self._key("epoch")):
+                    raise FencedError(
+                        f"the state in {self._shown} is gone: Redis lost its data (restarted without a file, or flushed?). "
+                        "Turn on its append-only file and restart this manager; open runs are lost"
+                    ) from error
                 raise FencedError(
                     f"another manager took over the state in {self._shown}: stop this one"
                 ) from error

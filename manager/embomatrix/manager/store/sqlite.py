@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import os
 import sqlite3
 import time
 from collections.abc import Callable, Collection, Sequence
@@ -78,7 +79,12 @@ class SqliteStore:
         self._lock = asyncio.Lock()
         try:
             if not isinstance(path, str):
-                path.parent.mkdir(parents=True, exist_ok=True)
+                path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+                # New journal files get the mode of the state file, which holds the key of lease ids.
+                os.close(os.open(path, os.O_CREAT | os.O_RDWR, 0o600))
+                for file in (path, path.with_name(f"{path.name}-wal"), path.with_name(f"{path.name}-shm")):
+                    with contextlib.suppress(FileNotFoundError):
+                        file.chmod(0o600)
             self._db = sqlite3.connect(
                 path, timeout=0.0, check_same_thread=False, isolation_level=None, uri=isinstance(path, str)
             )

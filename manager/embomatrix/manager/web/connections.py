@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import resource
 import socket
+from collections import Counter
 from collections.abc import Callable
 from typing import Any, Final, cast
 
@@ -15,6 +16,8 @@ from uvicorn.server import ServerState
 
 CONNECTIONS: Final = 2048
 """Connections at most. A page opens six, an event stream holds one."""
+PER_ADDRESS: Final = 512
+"""Connections of one address at most, so that one machine can't shut out the others."""
 SILENT_S: Final = 10.0
 """Seconds from the start of a connection to its first whole request."""
 FILES: Final = 65_536
@@ -25,6 +28,7 @@ class BoundedConnections(H11Protocol):
     """HTTP connection that is closed at once above ``CONNECTIONS``, and after ``SILENT_S`` without a request."""
 
     limit = CONNECTIONS
+    per_address = PER_ADDRESS
     silent_s = SILENT_S
     listener: BoundedListener | None = None
     """Listener that accepted the connections."""
@@ -38,13 +42,18 @@ class BoundedConnections(H11Protocol):
     ) -> None:
         super().__init__(config, server_state, app_state, _loop)
         self._timer: asyncio.TimerHandle | None = None
+        self._address: str | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         # uvicorn narrows the parameter's type; a server passes a stream transport only.
         super().connection_made(cast("asyncio.Transport", transport))
         if self.listener is not None:
             self.listener.handshake_done(transport.get_extra_info("peername"))
-        if len(self.connections) > self.limit:
+        self._address = self.client[0] if self.client else ""
+        if self.listener is not None:
+            self.listener.by_address[self._address] += 1
+        crowded = self.listener is not None and self.listener.by_address[self._address] > self.per_address
+        if len(self.connections) > self.limit or crowded:
             self.transport.abort()
         else:
             self._timer = self.loop.call_later(self.silent_s, self._close_silent)
@@ -52,6 +61,11 @@ class BoundedConnections(H11Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         if self._timer is not None:
             self._timer.cancel()
+        if self.listener is not None and self._address is not None:
+            self.listener.by_address[self._address] -= 1
+            if not self.listener.by_address[self._address]:
+                del self.listener.by_address[self._address]
+            self._address = None
         super().connection_lost(exc)
 
     def _close_silent(self) -> None:
@@ -92,6 +106,8 @@ class BoundedListener(socket.socket):
     def __init__(self, *given: Any, **options: Any) -> None:
         super().__init__(*given, **options)
         self._waiting: dict[object, asyncio.TimerHandle] = {}
+        self.by_address: Counter[str] = Counter()
+        """Open HTTP connections by the client's address."""
 
     def accept(self) -> tuple[socket.socket, Any]:
         for _ in range(REJECTED_AT_ONCE):

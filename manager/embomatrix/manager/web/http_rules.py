@@ -10,9 +10,9 @@ from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse, Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from embomatrix.manager.access.gate import the_token
 from embomatrix.manager.settings import LOOPBACK_NAMES, is_loopback
 from embomatrix.manager.web.rewards import REWARDS
-from embomatrix.rpc.channel import token_of
 from embomatrix.rpc.status import NotSignedInError
 from embomatrix.rpc.wire.tokens import AccessRole
 
@@ -35,6 +35,8 @@ class HttpRules:
 
     gate: Gate
     hosts: frozenset[str]
+    secure: bool = False
+    """Served over TLS: pages of plain HTTP are foreign."""
 
     def refusal(self, method: str, path: str, headers: Headers) -> Response | None:
         """Return the answer to a refused request; None if the request is allowed."""
@@ -45,14 +47,14 @@ class HttpRules:
                 f"this server is not called {host[:100]!r}: add the name with `manager init --san`", 400
             )
         changes = method not in READING
-        if changes and _is_foreign(headers, host):
+        if changes and self._is_foreign(headers, host):
             return PlainTextResponse(
                 "a page of another origin requested a change: open the manager's own dashboard", 403
             )
         if (path in OPEN_PATHS or path.startswith(STATIC)) and not changes:
             return None
         try:
-            role = self.gate.caller(token_of(headers.get("authorization"))).role
+            role = self.gate.caller(the_token(headers.getlist("authorization"))).role
         except NotSignedInError as error:
             sentence = f"{error}; HTTP requests send it as `Authorization: Bearer TOKEN`"
             return PlainTextResponse(sentence, 401, {"www-authenticate": "Bearer"})
@@ -60,6 +62,14 @@ class HttpRules:
         if role not in RANKS[RANKS.index(needed) :]:
             return PlainTextResponse(f"a token of the role {role} may not do this: it needs {needed}", 403)
         return None
+
+    def _is_foreign(self, headers: Headers, host: str) -> bool:
+        """Return True if a page of another origin sent the request. Programs send neither header."""
+        origin = headers.get("origin")
+        if origin is not None:
+            found = urlsplit(origin)
+            return found.netloc.lower() != host.lower() or (self.secure and found.scheme != "https")
+        return headers.get("sec-fetch-site", "none") not in ("same-origin", "none")
 
 
 class Guard:
@@ -88,14 +98,6 @@ def _needed_role(path: str, *, changes: bool) -> AccessRole:
     if path == REWARDS:
         return AccessRole.TRAINER
     return AccessRole.ADMIN if changes else AccessRole.VIEWER
-
-
-def _is_foreign(headers: Headers, host: str) -> bool:
-    """Return True if a page of another origin sent the request. Programs other than browsers send neither header."""
-    origin = headers.get("origin")
-    if origin is not None:
-        return urlsplit(origin).netloc.lower() != host.lower()
-    return headers.get("sec-fetch-site", "none") not in ("same-origin", "none")
 
 
 def _name_of(host: str) -> str:

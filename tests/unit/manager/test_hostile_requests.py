@@ -1,0 +1,73 @@
+"""Requests that a proxy, a browser or a log reader would understand differently from the manager."""
+
+import logging
+import stat
+
+import pytest
+from starlette.datastructures import Headers
+
+from embomatrix.manager.access.gate import Gate, the_token
+from embomatrix.manager.store.sqlite import SqliteStore
+from embomatrix.manager.web.http_rules import HttpRules
+from embomatrix.proto.v1 import rollout_service_pb2
+from embomatrix.rpc.logs import HumanFormatter, one_line
+from embomatrix.rpc.status import NotSignedInError
+from embomatrix.rpc.wire.bounds import check
+from embomatrix.rpc.wire.codec import ConvertError
+
+
+def test_call_with_two_tokens_is_refused_whatever_their_order():
+    assert the_token([]) == ""
+    assert the_token(["Bearer one"]) == "one"
+    for headers in (["Bearer one", "Bearer two"], ["Bearer two", "Bearer one"], ["Bearer one", "Bearer one"]):
+        with pytest.raises(NotSignedInError, match="found 2 authorization headers: send one"):
+            the_token(headers)
+
+
+def rules(*, secure):
+    return HttpRules(Gate(None, guarded=False), frozenset(), secure=secure)
+
+
+def posted(origin, **headers):
+    return Headers({"host": "manager.example", "origin": origin, **headers})
+
+
+def test_plain_page_may_not_change_a_manager_behind_tls():
+    plain, own = posted("http://manager.example"), posted("https://manager.example")
+    assert rules(secure=True).refusal("POST", "/api/v1/rewards", plain).status_code == 403
+    assert rules(secure=True).refusal("POST", "/api/v1/rewards", own) is None
+    assert rules(secure=False).refusal("POST", "/api/v1/rewards", plain) is None
+
+
+def test_two_authorization_headers_over_http_are_refused():
+    raw = [(b"host", b"manager.example"), (b"authorization", b"Bearer a"), (b"authorization", b"Bearer b")]
+    refusal = rules(secure=False).refusal("GET", "/api/v1/runs", Headers(raw=raw))
+    assert refusal.status_code == 401
+
+
+async def test_state_file_is_readable_by_its_owner_only(tmp_path):
+    path = tmp_path / "data" / "state.sqlite"
+    path.parent.mkdir()
+    path.touch(0o644)
+    store = SqliteStore(path)
+    await store.workers()
+    for file in path.parent.iterdir():
+        assert stat.S_IMODE(file.stat().st_mode) == 0o600, file.name
+    await store.close()
+
+
+@pytest.mark.parametrize("name", ["a\nlevel=info", "a\x1b[2J", "a\u202eb", "a\x9b31m"])
+def test_name_with_control_characters_is_refused(name):
+    with pytest.raises(ConvertError, match=r"name: found .* without control characters"):
+        check(rollout_service_pb2.OpenRunRequest(name=name))
+
+
+def test_log_line_stays_one_line_and_drives_no_terminal():
+    record = logging.LogRecord(
+        "a", logging.INFO, "", 0, "run opened name=%s", ("x\n2026 ERROR forged\x1b[31m",), None
+    )
+    line = HumanFormatter().format(record)
+    assert "\n" not in line
+    assert "\x1b" not in line
+    assert r"x\n2026 ERROR forged\x1b[31m" in line
+    assert one_line("café ✓") == "café ✓"
