@@ -10,7 +10,7 @@ ARGS ?=
 
 DEFAULT_TESTS := not slow and not docker and not hf and not eai and not peers
 
-.PHONY: run test test-unit test-slow test-random house lint types contracts proto proto-check check site diagrams compose-check pictures clean
+.PHONY: run test test-unit test-slow test-random test-random-hour house lint types contracts proto proto-check check site diagrams compose-check pictures clean
 
 run: $(VENV)/.runtime
 	$(BIN)/embomatrix demo $(ARGS)
@@ -30,6 +30,14 @@ test-slow: $(VENV)/.dev
 # Property tests with new inputs in every run. `ARGS="-k lease"` narrows the search.
 test-random: $(VENV)/.dev
 	HYPOTHESIS_PROFILE=random $(BIN)/python -m pytest -n logical --maxprocesses=8 --dist=loadfile -m "hypothesis and not docker" $(ARGS)
+
+# The same again and again for an hour at the lowest priority; ends at the first failure. `SECONDS_LEFT=600` is shorter.
+SECONDS_LEFT ?= 3600
+test-random-hour: $(VENV)/.dev
+	end=$$(($$(date +%s) + $(SECONDS_LEFT))); while [ $$(date +%s) -lt $$end ]; do \
+	  HYPOTHESIS_PROFILE=random nice -n 19 $(BIN)/python -m pytest tests/unit tests/integration -n 1 -p no:cacheprovider -q \
+	    -m "hypothesis and not docker and not slow" $(ARGS) || exit 1; \
+	done
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

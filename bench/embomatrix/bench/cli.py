@@ -2,12 +2,14 @@
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from embomatrix.bench.adversary.siege import QUICK_SIEGE, SiegeSizes, bench_adversary
 from embomatrix.bench.cluster.ablation import AblationSizes, bench_ablation
 from embomatrix.bench.cluster.flow import FlowSizes, bench_flow
 from embomatrix.bench.cluster.prewarm import PrewarmSizes, bench_prewarm
@@ -134,6 +136,21 @@ def operations(
     with refusals():
         workload = load_workload(dataset)
         hand_in(_measured("operations", lambda on_step: _operations(workload, on_step)), json_file)
+
+
+@app.command()
+def adversary(
+    dataset: DataSet = PINNED,
+    json_file: Json = None,
+    seed: Annotated[int, typer.Option(min=0, help="Equal seeds draw equal messages.")] = 0,
+    quick: Annotated[
+        bool, typer.Option("--quick", help=f"Send {QUICK_SIEGE.messages:,} messages: a check, not a result.")
+    ] = False,
+) -> None:
+    """Attack a manager with hostile workers, trainers and clients, and measure the harm."""
+    with refusals():
+        found, sizes = load_workload(dataset), replace(QUICK_SIEGE if quick else SiegeSizes(), seed=seed)
+        hand_in(_measured("adversary", lambda on_step: bench_adversary(found, sizes, on_step)), json_file)
 
 
 @app.command()

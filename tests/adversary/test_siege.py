@@ -1,0 +1,58 @@
+"""A manager under hostile messages of every kind stays alive, and honest runs complete with the right rewards."""
+
+import random
+
+import pytest
+
+from embomatrix.bench.adversary.attackers import Fight
+from embomatrix.bench.adversary.kinds import KINDS, REQUESTS, Actor
+from embomatrix.bench.adversary.messages import MessageMaker
+from embomatrix.bench.adversary.siege import Harm, battlefield, besiege
+from embomatrix.bench.engine.workload import PINNED, load_workload
+
+HOUR_S = 3600.0
+MEMORY_MB = 200.0
+
+
+@pytest.fixture(scope="module")
+def workload():
+    return load_workload(PINNED)
+
+
+def _check(harm: Harm, fight: Fight, place):
+    assert harm.manager_deaths == 0, place.manager.log.read_text()[-2000:]
+    assert harm.submitted > 0
+    assert (harm.lost, harm.fabricated) == (0, 0)
+    assert harm.unreadable == []
+    assert harm.rss_growth_mb <= MEMORY_MB
+    assert harm.internal <= harm.alarms, fight.internal
+    assert {KINDS[name].actor for name in fight.sent} == set(Actor)
+
+
+@pytest.mark.timeout(120)
+async def test_honest_run_completes_beside_attackers_of_every_role(workload, tmp_path):
+    async with battlefield(tmp_path, workload) as place:
+        harm, fight = await besiege(place, 4_000, seed=1, limit_s=30.0)
+        _check(harm, fight, place)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(2 * HOUR_S)
+async def test_manager_withstands_an_hour_of_attacks(workload, tmp_path):
+    async with battlefield(tmp_path, workload) as place:
+        harm, fight = await besiege(place, 10_000_000, seed=random.randrange(2**32), limit_s=HOUR_S)
+        _check(harm, fight, place)
+
+
+def test_every_call_of_the_protocol_is_attacked_with_and_without_a_token():
+    attacked = {(kind.method, kind.actor is Actor.STRANGER) for kind in KINDS.values()}
+    assert attacked >= {(method, without) for method in REQUESTS for without in (True, False)}
+    assert len(KINDS) >= 60
+
+
+@pytest.mark.parametrize("request_type", REQUESTS.values(), ids=REQUESTS)
+def test_equal_seeds_draw_equal_messages(request_type):
+    first, second = (MessageMaker(random.Random(7), ["a"]) for _ in range(2))
+    for _ in range(5):
+        drawn = [maker.any(request_type).SerializeToString(deterministic=True) for maker in (first, second)]
+        assert drawn[0] == drawn[1]
