@@ -207,7 +207,7 @@ def test_training_reports_interrupts_and_write_errors(kitchen, tmp_path):
 
 def test_interrupted_demo_ends_its_processes(kitchen, tmp_path):
     out = tmp_path / "out"
-    arguments = ("demo", f"--dataset={kitchen}", f"--out={out}", "--imitate-seconds=0.5", "--minutes=30")
+    arguments = ("demo", f"--dataset={kitchen}", f"--out={out}", "--imitate-steps=5", "--steps=100000")
     with background(tmp_path / "log", *arguments) as demo:
         demo.wait_for((out / "metrics.jsonl").exists)
         address = re.search(r"manager at (\S+),", demo.text)[1]

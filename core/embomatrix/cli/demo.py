@@ -17,6 +17,10 @@ from embomatrix.host.failure import fail
 DEFAULT_OUT: Final = Path("runs/demo")
 TASKS: Final = 960
 """Training tasks. With half as many, the policy memorises the plans before it learns to read prompts."""
+HELDOUT: Final = 120
+IMITATION_STEPS: Final = 340
+GRPO_STEPS: Final = 420
+"""Budgets in steps: the same seed gives the same curve on a fast machine and on a slow one."""
 console = Console()
 
 
@@ -30,8 +34,10 @@ def demo(
     ),
     workers: Annotated[int, typer.Option(min=1, max=64, help="Workers on this machine.")] = 2,
     slots: Annotated[int, typer.Option(min=1, max=64, help="Slots per worker.")] = 1,
-    minutes: Annotated[float, typer.Option(min=0.1, help="Minutes of GRPO.")] = 5.5,
-    imitate_seconds: Annotated[float, typer.Option(min=0.0, help="Seconds of imitation before GRPO.")] = 80.0,
+    steps: Annotated[int, typer.Option(min=0, help="Steps of GRPO.")] = GRPO_STEPS,
+    imitate_steps: Annotated[
+        int, typer.Option(min=0, help="Steps of imitation before GRPO.")
+    ] = IMITATION_STEPS,
     model: Annotated[str, typer.Option(help="`tiny`, or a Hugging Face model by name or folder.")] = "tiny",
     seed: Annotated[int, typer.Option(help="Random seed of tasks, policy and sampling.")] = 0,
     threads: Annotated[int, typer.Option(min=0, help="torch threads per process. 0: half of the cores.")] = 0,
@@ -49,8 +55,8 @@ def demo(
         _announce(cluster, slots)
         options = [
             f"--model={model}",
-            f"--minutes={minutes}",
-            f"--imitate-seconds={imitate_seconds}",
+            f"--steps={steps}",
+            f"--imitate-steps={imitate_steps}",
             f"--seed={seed}",
         ]
         if threads:
@@ -72,7 +78,16 @@ def _ensure_tasks(dataset: Path, seed: int) -> None:
     console.rule("tasks")
     # Skip the reachability check for physical mode, which a demo does not need.
     where = [f"--out={dataset}", f"--seed={seed}"]
-    run_command("demo", no_problem, "factory", "build", *where, f"--train={TASKS}", "--no-look-ahead")
+    run_command(
+        "demo",
+        no_problem,
+        "factory",
+        "build",
+        *where,
+        f"--train={TASKS}",
+        f"--heldout={HELDOUT}",
+        "--no-look-ahead",
+    )
 
 
 def _announce(cluster: LocalCluster, slots: int) -> None:

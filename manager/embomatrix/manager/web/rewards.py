@@ -10,60 +10,43 @@ import secrets
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from fastapi import APIRouter, HTTPException, Request
+from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from embomatrix.manager.runtime.results import BatchLog
 from embomatrix.manager.runtime.runs import Runs
+from embomatrix.manager.web.bodies import BodyBudget
+from embomatrix.manager.web.parsing import Answer, AnswerParser
 from embomatrix.manager.web.rest import PREFIX
+from embomatrix.manager.web.reward_request import RewardRequest
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import unparsable
-from embomatrix.rpc.reward_label import RewardLabel, answer_in
-from embomatrix.rpc.status import InvalidRequestError, UnavailableError
+from embomatrix.rpc.status import UnavailableError
 from embomatrix.rpc.wire.outcome import rollout_result_from_proto
 from embomatrix.rpc.wire.values import Batch, Completed, GroupPolicy, Outcome, Rollout, RunTerms
-from embomatrix.skills.parse import PlanError, parse_plan
 
 REWARDS: Final = f"{PREFIX}/rewards"
 RUN_ID: Final = "http-rewards"
 TERMS: Final = RunTerms(GroupPolicy.PARTIAL)
-LARGEST_BYTES: Final = 64 * 1024 * 1024
-MOST_ANSWERS: Final = 4096
 LONGEST_S: Final = 170.0
 """OpenRLHF's client repeats a request after 180 s."""
-
-
-class RewardRequest(BaseModel):
-    """Request of OpenRLHF. ``query`` is the prompt followed by the answer; unknown fields are ignored."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-    query: list[str] = Field(min_length=1, max_length=MOST_ANSWERS)
-    prompts: list[str]
-    """Prompts without answers. They keep the example plan in a prompt from being parsed as the answer."""
-    labels: list[str]
-    """``RewardLabel`` of each answer, as text."""
-
-    @model_validator(mode="after")
-    def _as_many(self) -> RewardRequest:
-        if not len(self.query) == len(self.prompts) == len(self.labels):
-            raise ValueError(
-                f"found {len(self.query)} queries, {len(self.prompts)} prompts and {len(self.labels)} labels: "
-                "send the same number of each"
-            )
-        return self
 
 
 def reward_routes(runs: Runs) -> APIRouter:
     """Return the routes of trainers."""
     router = APIRouter(prefix=PREFIX, tags=["train"])
+    bodies, parser = BodyBudget(), AnswerParser()
 
     @router.post("/rewards", openapi_extra={"requestBody": _BODY})
     async def rewards(request: Request) -> JSONResponse:
         """Reward, success (as score) and tiers of each answer; 503 after an infrastructure failure."""
-        requested = _request(await _body(request))
-        return JSONResponse(_response(await _rewards(runs, requested)))
+        body = await bodies.receive(request)
+        try:
+            answers = await parser.parse(body)
+        finally:
+            bodies.release(request, len(body))
+        return JSONResponse(_response(await _rewards(runs, answers)))
 
     return router
 
@@ -71,37 +54,13 @@ def reward_routes(runs: Runs) -> APIRouter:
 _BODY: Final = {"content": {"application/json": {"schema": RewardRequest.model_json_schema()}}}
 
 
-async def _body(request: Request) -> bytes:
-    """Return the body. Raise HTTP 413 above ``LARGEST_BYTES``, since uvicorn has no limit."""
-    body = bytearray()
-    async for chunk in request.stream():
-        body += chunk
-        if len(body) > LARGEST_BYTES:
-            raise HTTPException(413, f"more than {LARGEST_BYTES >> 20} MiB: send fewer answers at once")
-    return bytes(body)
-
-
-def _request(body: bytes) -> RewardRequest:
-    try:
-        return RewardRequest.model_validate_json(body)
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False, include_context=False)[0]
-        field = ".".join(map(str, first["loc"])) or "request"
-        message = first["msg"].removeprefix("Value error, ")
-        raise InvalidRequestError(
-            f"{field}: {message}; expected a JSON object with query, prompts and labels"
-        ) from error
-
-
-async def _rewards(runs: Runs, requested: RewardRequest) -> list[RewardBreakdown]:
+async def _rewards(runs: Runs, answers: Sequence[Answer]) -> list[RewardBreakdown]:
     """Return the rewards in the order of the answers. Unparsable answers are scored here and never executed."""
     batch_id = secrets.token_hex(8)
     found: dict[int, RewardBreakdown] = {}
     rollouts: dict[int, Rollout] = {}
-    for index, label in enumerate(map(RewardLabel.parse, requested.labels)):
-        try:
-            plan = parse_plan(answer_in(requested.query[index], requested.prompts[index]), label.profile)
-        except PlanError:
+    for index, (label, plan) in enumerate(answers):
+        if plan is None:
             found[index] = unparsable()
             continue
         group = f"{RUN_ID}/{batch_id}/{label.task_id}"
@@ -113,7 +72,7 @@ async def _rewards(runs: Runs, requested: RewardRequest) -> list[RewardBreakdown
         outcomes = await _executed(runs, batch)
         for index, rollout in rollouts.items():
             found[index] = _reward(outcomes.get(rollout.rollout_id))
-    return [found[index] for index in range(len(requested.query))]
+    return [found[index] for index in range(len(answers))]
 
 
 async def _executed(runs: Runs, batch: Batch) -> dict[str, Outcome]:

@@ -75,6 +75,9 @@ def train(
     minutes: Annotated[float | None, typer.Option(min=0, help="Minutes of GRPO. Default: 5.")] = None,
     steps: Annotated[int | None, typer.Option(min=0, help="Steps of GRPO instead of minutes.")] = None,
     imitate_seconds: _IMITATE = None,
+    imitate_steps: Annotated[
+        int | None, typer.Option(min=0, help="Steps of imitation instead of seconds.")
+    ] = None,
     resume: _RESUME = False,
     seed: _SEED = None,
     settings_file: _SETTINGS = None,
@@ -100,6 +103,7 @@ def train(
             "grpo.minutes": minutes,
             "grpo.steps": steps,
             "imitation.seconds": imitate_seconds,
+            "imitation.steps": imitate_steps,
             "track": track,
             **_coefficients(reward or ()),
         }
