@@ -8,6 +8,7 @@ import resource
 import sqlite3
 
 import pytest
+from redis.asyncio import Redis
 from tests.fakes.redis_server import RedisServer
 
 from embomatrix.cli.local_cluster import free_port
@@ -382,4 +383,17 @@ async def test_redis_that_evicts_is_refused_with_the_remedy(tmp_path):
         store = RedisStore(server.url)
         with pytest.raises(StateError, match="set `maxmemory-policy noeviction`"):
             await store.claim(FIRST)
+        await store.close()
+
+
+async def test_a_redis_server_that_lost_its_data_is_not_called_another_manager(tmp_path):
+    with RedisServer(tmp_path / "lost", free_port()) as server:
+        store = RedisStore(server.url)
+        await store.claim(FIRST)
+        eraser = Redis.from_url(server.url)
+        await eraser.flushall()
+        await eraser.aclose()
+        with pytest.raises(FencedError, match="Redis lost its data") as caught:
+            await store.open_run(RunRow("r1", "run"))
+        assert "another manager" not in str(caught.value)
         await store.close()

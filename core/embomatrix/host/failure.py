@@ -12,6 +12,8 @@ from typing import Final, NoReturn
 
 from rich.console import Console
 
+from embomatrix.host.printable import printable
+
 logger = logging.getLogger(__name__)
 
 MENDABLE: Final = 2
@@ -59,7 +61,9 @@ def shown(command: str) -> Iterator[None]:
 def fail(command: str, sentence: str, status: int = MENDABLE) -> NoReturn:
     """Print the problem on standard error and exit with the status."""
     name = f"embomatrix {command}".strip()
-    Console(stderr=True, soft_wrap=True).print(f"{name}: {sentence}", highlight=False, markup=False)
+    Console(stderr=True, soft_wrap=True).print(
+        printable(f"{name}: {sentence}", lines=True), highlight=False, markup=False
+    )
     raise SystemExit(status)
 
 

@@ -5,6 +5,7 @@ adds an id to all later lines of a task.
 """
 
 import contextvars
+import dataclasses
 import functools
 import json
 import logging
@@ -16,16 +17,24 @@ from enum import StrEnum
 from types import MappingProxyType
 from typing import Any, Final, Literal
 
+from embomatrix.host.printable import printable
+
 Id = Literal["run", "batch", "rollout", "lease", "worker", "session", "scene"]
 """Names of ids in log lines."""
 
 SHORTEST_SECRET: Final = 4
 """Shorter words are not masked, since they occur inside other words."""
+LINES: Final = 20
+"""Warnings and errors of one kind within ``WINDOW_S`` at most."""
+WINDOW_S: Final = 10.0
+KINDS: Final = 1024
+"""Kinds of lines that are counted. The oldest is forgotten first."""
+KIND_CHARACTERS: Final = 60
+"""Beginning of a message that distinguishes kinds: some libraries fill values in before they log."""
 MASK: Final = "***"
 _NAMED: Final = re.compile(r"(?:(\w+)=)?(%%|%[-+#0 ]*\d*(?:\.\d+)?[sdrfgixe])")
 _BEARER: Final = re.compile(r"(Bearer\s+)\S+", re.IGNORECASE)
 _PASSWORD: Final = re.compile(r"(://[^/@:\s]*:)[^/@\s]*@")
-_CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
 _bound: contextvars.ContextVar[Mapping[str, str]] = contextvars.ContextVar(
     "_bound", default=MappingProxyType({})
 )
@@ -46,6 +55,7 @@ def log_to_stderr(level: str, log_format: LogFormat) -> None:
         raise ValueError("expected debug, info, warning or error")
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter() if log_format is LogFormat.JSON else HumanFormatter())
+    handler.addFilter(LineLimit())
     # Libraries log warnings and errors only; our own loggers use the requested level.
     logging.basicConfig(level=max(logging.WARNING, known[level.upper()]), handlers=[handler], force=True)
     logging.getLogger("embomatrix").setLevel(level.upper())
@@ -70,14 +80,6 @@ def without_secrets(text: str) -> str:
     return _PASSWORD.sub(rf"\1{MASK}@", _BEARER.sub(rf"\1{MASK}", text))
 
 
-def one_line(text: str) -> str:
-    """Return the text with control characters and direction marks escaped.
-
-    A name from another machine can then neither forge a log line nor drive a terminal.
-    """
-    return _CONTROL.sub(lambda found: repr(found[0])[1:-1], text)
-
-
 class HumanFormatter(logging.Formatter):
     """Text line: time, level, and message, then bound ids that the message lacks."""
 
@@ -87,10 +89,53 @@ class HumanFormatter(logging.Formatter):
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  # the standard library's name
         named = set(_fields(record))
         more = "".join(f" {name}={value}" for name, value in _bound.get().items() if name not in named)
-        return one_line(super().formatMessage(record) + more)
+        return printable(super().formatMessage(record) + more)
 
     def format(self, record: logging.LogRecord) -> str:
-        return without_secrets(super().format(record))
+        # The message is one line; only a traceback after it has more.
+        return printable(without_secrets(super().format(record)), lines=True)
+
+
+class LineLimit(logging.Filter):
+    """Filter that passes at most ``LINES`` lines of one kind per ``WINDOW_S``.
+
+    A kind is a logger with its message before the values are filled in. The next line that passes names the number of
+    suppressed lines. ``INFO`` and lower levels pass, since they report work that the manager has accepted.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._windows: dict[tuple[str, str], _Window] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        if record.levelno < logging.WARNING:
+            return True
+        kind = (record.name, str(record.msg)[:KIND_CHARACTERS])
+        window = self._windows.get(kind)
+        if window is None:
+            if len(self._windows) >= KINDS:
+                del self._windows[next(iter(self._windows))]
+            window = self._windows[kind] = _Window(record.created)
+        if record.created - window.begin_s >= WINDOW_S:
+            window.begin_s, window.passed = record.created, 0
+        if window.passed >= LINES:
+            window.suppressed += 1
+            return False
+        window.passed += 1
+        if window.suppressed:
+            message = record.getMessage()
+            record.msg, record.args = "%s (%d similar lines suppressed)", (message, window.suppressed)
+            window.suppressed = 0
+        return True
+
+
+@dataclasses.dataclass(slots=True)
+class _Window:
+    """Lines of one kind since ``begin_s``, in wall-clock seconds."""
+
+    begin_s: float
+    passed: int = 0
+    suppressed: int = 0
 
 
 class JsonFormatter(logging.Formatter):
@@ -108,6 +153,10 @@ class JsonFormatter(logging.Formatter):
             line["exception"] = self.formatException(record.exc_info)
         for name, value in {**_bound.get(), **_fields(record)}.items():
             line.setdefault(name, value)
+        line = {
+            name: printable(value, lines=True) if isinstance(value, str) else value
+            for name, value in line.items()
+        }
         return without_secrets(json.dumps(line, ensure_ascii=False, default=str))
 
 

@@ -10,6 +10,7 @@ from typing import Any, Final, TypeVar
 
 import grpc
 
+from embomatrix.host.printable import printable
 from embomatrix.rpc.wire.codec import ConvertError
 
 logger = logging.getLogger(__name__)
@@ -186,7 +187,7 @@ def _status_of(error: ClusterError) -> grpc.StatusCode:
 def cluster_error(error: grpc.aio.AioRpcError, address: str) -> ClusterError:
     """Return the ClusterError of a failed call to ``address`` (HOST:PORT)."""
     code = error.code()
-    details = error.details() or ""
+    details = printable(error.details() or "")
     trailers = {key: str(value) for key, value in error.trailing_metadata() or ()}
     if LEADER_KEY in trailers:
         return StandbyError(details, trailers[LEADER_KEY])

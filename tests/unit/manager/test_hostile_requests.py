@@ -6,11 +6,12 @@ import stat
 import pytest
 from starlette.datastructures import Headers
 
+from embomatrix.host.printable import printable
 from embomatrix.manager.access.gate import Gate, the_token
 from embomatrix.manager.store.sqlite import SqliteStore
 from embomatrix.manager.web.http_rules import HttpRules
 from embomatrix.proto.v1 import rollout_service_pb2
-from embomatrix.rpc.logs import HumanFormatter, one_line
+from embomatrix.rpc.logs import HumanFormatter
 from embomatrix.rpc.status import NotSignedInError
 from embomatrix.rpc.wire.bounds import check
 from embomatrix.rpc.wire.codec import ConvertError
@@ -70,4 +71,4 @@ def test_log_line_stays_one_line_and_drives_no_terminal():
     assert "\n" not in line
     assert "\x1b" not in line
     assert r"x\n2026 ERROR forged\x1b[31m" in line
-    assert one_line("café ✓") == "café ✓"
+    assert printable("café ✓") == "café ✓"

@@ -15,6 +15,7 @@ from rich.text import Text
 
 from embomatrix.cli.cluster.tables import run_table, show_json, worker_table
 from embomatrix.cli.connection import AsJson, manager_command
+from embomatrix.host.printable import printable
 from embomatrix.rpc.admin_client import AdminClient
 from embomatrix.rpc.status import UnavailableError
 from embomatrix.rpc.wire.values import FleetStatus, PlanCell, RunInfo, Warmth, WorkerInfo
@@ -43,7 +44,7 @@ async def status(client: AdminClient, as_json: AsJson = False) -> None:
         return
     console = Console(highlight=False)
     for sentence in described:
-        console.print(sentence, markup=False)
+        console.print(printable(sentence), markup=False)
 
 
 @manager_command("top", timeout_s=TIMEOUT_S, until_interrupted=True)
@@ -102,7 +103,7 @@ def screen(before: Glance, now: Glance, *, lines: int) -> RenderableType:
         style="default",
     )
     if now.fleet.health:
-        head.append(f"\n{now.fleet.health}", style="default")
+        head.append(f"\n{printable(now.fleet.health)}", style="default")
     runs = now.runs[-max(1, lines // 3) :]
     room = max(1, lines - OTHER_LINES - len(runs))
     order = sorted(now.fleet.workers, key=lambda w: (w.state == "ready", -w.running, w.worker_id))

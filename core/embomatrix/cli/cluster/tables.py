@@ -11,6 +11,7 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
+from embomatrix.host.printable import printable
 from embomatrix.rpc.wire.run_log import EventKind, RolloutStep, RunEvent
 from embomatrix.rpc.wire.values import PlanCell, ResidentState, RunInfo, Warmth, WorkerInfo
 
@@ -58,9 +59,9 @@ def worker_table(workers: Sequence[WorkerInfo]) -> Table:
     )
     for worker in workers:
         warm = sum(resident.state is ResidentState.WARM for resident in worker.residents)
-        state = Text(worker.state, style=STATE_STYLES.get(worker.state, "yellow"))
+        state = Text(printable(worker.state), style=STATE_STYLES.get(worker.state, "yellow"))
         table.add_row(
-            Text(worker.worker_id),
+            Text(printable(worker.worker_id)),
             state,
             str(worker.resources.slots),
             str(worker.running),
@@ -68,7 +69,7 @@ def worker_table(workers: Sequence[WorkerInfo]) -> Table:
             str(warm),
             str(worker.resources.memory_mb),
             f"{worker.last_seen_s:.1f}",
-            Text(worker.reason),
+            Text(printable(worker.reason)),
         )
     return table
 
@@ -81,13 +82,13 @@ def run_table(runs: Sequence[RunInfo]) -> Table:
         asked = stats.prewarm_hits + stats.prewarm_misses
         counts = (stats.delivered, run.pending, stats.infra_failures, stats.redispatched, stats.stale_results)
         table.add_row(
-            Text(run.run_id),
-            Text(run.name),
+            Text(printable(run.run_id)),
+            Text(printable(run.name)),
             f"closed {_ago(run.closed_s)}" if run.closed_s else "open",
             *map(str, counts),
             f"{stats.prewarm_hits}/{asked}" if asked else "-",
             str(stats.prewarm_wasted),
-            Text(run.waits_for),
+            Text(printable(run.waits_for)),
         )
     return table
 
@@ -102,9 +103,11 @@ def plan_table(cells: Sequence[PlanCell]) -> Table:
         more = len(cell.worker_ids) - NAMED
         names = (*cell.worker_ids[:NAMED], *([f"{more}_more"] if more > 0 else []))
         label = f"{scene}·{cell.count}·{cell.warmth.value}" + (f"@{','.join(names)}" if names else "")
-        rows.setdefault((cell.run_id, cell.step), []).append(Text(label, style=WARMTH_STYLES[cell.warmth]))
+        rows.setdefault((cell.run_id, cell.step), []).append(
+            Text(printable(label), style=WARMTH_STYLES[cell.warmth])
+        )
     for (run_id, step), labels in sorted(rows.items()):
-        table.add_row(Text(run_id), str(step), Text("  ").join(labels))
+        table.add_row(Text(printable(run_id)), str(step), Text("  ").join(labels))
     return table
 
 
@@ -123,20 +126,20 @@ def event_line(event: RunEvent) -> Text:
     )
     line = Text(f"{at} ", style="dim", no_wrap=True)
     line.append(f"{event.kind.value:<14}", style="red" if event.kind in _BAD else "default")
-    line.append("".join(f" {name}={value}" for name, value in named if value), style="default")
+    line.append(printable("".join(f" {name}={value}" for name, value in named if value)), style="default")
     if event.timings is not None:
         line.append(f" execute={event.timings.execute_s * 1e3:.1f}ms", style="default")
-    return line.append(f" {event.message}" if event.message else "", style="default")
+    return line.append(printable(f" {event.message}") if event.message else "", style="default")
 
 
 def step_line(step: RolloutStep, begin_s: float) -> Text:
     """Format a step of a rollout's history as one line, with seconds since the first step."""
     at = time.strftime("%H:%M:%S", time.localtime(step.at_s))
     line = Text(f"{at} +{step.at_s - begin_s:.3f} s ", style="dim", no_wrap=True)
-    line.append(f"{step.kind:<10}", style="default")
-    line.append(f" {step.worker_id}:" if step.worker_id else "", style="default")
-    line.append(f" {step.reason}" if step.reason else "", style="default")
-    return line.append(f"  ({step.cause})", style="dim")
+    line.append(printable(f"{step.kind:<10}"), style="default")
+    line.append(printable(f" {step.worker_id}:") if step.worker_id else "", style="default")
+    line.append(printable(f" {step.reason}") if step.reason else "", style="default")
+    return line.append(printable(f"  ({step.cause})"), style="dim")
 
 
 def _table(*names: str, **figures: int) -> Table:

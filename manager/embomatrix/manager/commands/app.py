@@ -219,10 +219,14 @@ def list_(manager: Manager = "127.0.0.1:50070", token: Token = "", ca: Ca = None
     """List the valid tokens by id."""
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
+
+    from embomatrix.host.printable import printable
 
     table = Table("id", "role", "label", "valid for", "worker")
     for info in _ask(manager, token, ca, lambda client: client.list_tokens()):
-        table.add_row(info.token_id, info.role, info.label, _left(info), info.worker_id)
+        values = (info.token_id, info.role, info.label, _left(info), info.worker_id)
+        table.add_row(*(Text(printable(value)) for value in values))
     Console().print(table)
 
 

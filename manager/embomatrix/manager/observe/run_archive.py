@@ -186,7 +186,8 @@ class RunArchive:
         message = pb.KeptRun(summary=run_summary_to_proto(summary), events=map(run_event_to_proto, events))
         path = self._path(summary.run.run_id)
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
+            self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            self._folder.chmod(0o700)
             write_whole(path, gzip.compress(message.SerializeToString(), compresslevel=3))
             for old in self._files()[self._kept :]:
                 old.unlink(missing_ok=True)

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final
 
+from embomatrix.host.printable import printable
 from embomatrix.manager.control.cluster_state import ClusterState
 from embomatrix.manager.control.commands import ManagerCommand
 from embomatrix.manager.control.dispatch.batches import group_sizes
@@ -148,7 +149,7 @@ class Runs:
         if run_id not in self._runs:
             if len(self._runs) >= RUNS:
                 raise OverloadedError(f"{len(self._runs)} runs are open: close some with CloseRun")
-            run = RunRow(run_id, name[:200], terms_payload(terms))
+            run = RunRow(run_id, printable(name[:200]), terms_payload(terms))
             with _store_errors():
                 await self._store.open_run(run)
             if run_id not in self._runs:
