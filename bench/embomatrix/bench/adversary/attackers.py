@@ -20,7 +20,7 @@ from embomatrix.bench.adversary.messages import MessageMaker
 from embomatrix.bench.adversary.worker_kinds import SESSION, first_state, lie, sound_registration
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.proto.v1 import worker_service_pb2 as pb
-from embomatrix.rpc.channel import open_channel
+from embomatrix.rpc.channel import TOKEN_KEY, bearer, open_channel
 from embomatrix.rpc.status import ERROR_KEY
 from embomatrix.rpc.versions import PROTOCOL_VERSION
 
@@ -90,20 +90,39 @@ class Arsenal:
         return self._first.popleft() if self._first else self._rng.choices(self._kinds, self._weights)[0]
 
 
-async def _call(channel: grpc.aio.Channel, kind: Kind, payloads: Sequence[bytes], fight: Fight) -> None:
+def _metadata(token: str) -> tuple[tuple[str, str], ...]:
+    return ((TOKEN_KEY, bearer(token)),) if token else ()
+
+
+def _opened(
+    channel: grpc.aio.Channel, method: str, token: str, limit_s: float | None = None
+) -> grpc.aio.StreamStreamCall[bytes, bytes]:
+    """Return a call of any shape. On the wire a single request is a stream of one."""
+    open_call = channel.stream_stream(f"/{SERVICES}{method}")
+    return open_call(timeout=limit_s, metadata=_metadata(token))
+
+
+async def _call(
+    channel: grpc.aio.Channel, token: str, kind: Kind, payloads: Sequence[bytes], fight: Fight
+) -> None:
     """Send the payloads as one call of any shape and read its answers for a while."""
     fight.sent[kind.name] += len(payloads)
-    call = channel.stream_stream(f"/{SERVICES}{kind.method}")(list(payloads), timeout=ANSWER_S)
+    call = _opened(channel, kind.method, token, ANSWER_S)
     try:
-        async for _answer in call:
+        for payload in payloads:
+            await call.write(payload)
+        await call.done_writing()
+        while await call.read() is not grpc.aio.EOF:
             pass
         fight.answers["OK"] += 1
     except grpc.aio.AioRpcError as error:
         fight.answered(kind, error)
         if error.code() is grpc.StatusCode.UNAVAILABLE:
             await asyncio.sleep(UNREACHABLE_S)
-    except grpc.aio.UsageError:
-        await asyncio.sleep(UNREACHABLE_S)
+    except asyncio.InvalidStateError:  # the manager answered before it had read everything
+        fight.answers[(await call.code()).name] += 1
+    finally:
+        call.cancel()
 
 
 async def _strike_in_parallel(
@@ -112,7 +131,8 @@ async def _strike_in_parallel(
     async def strikes() -> None:
         while not fight.over:
             kind = arsenal.draw()
-            await _call(channel, kind, [_bytes(payload) for payload in kind.make(known, maker)], fight)
+            payloads = [_bytes(payload) for payload in kind.make(known, maker)]
+            await _call(channel, known.token, kind, payloads, fight)
 
     async with asyncio.TaskGroup() as group:
         for _ in range(CALLS_AT_ONCE):
@@ -133,12 +153,12 @@ async def trainer(target: Target, fight: Fight, seed: int) -> None:
     rng = random.Random(seed)
     known = Knowledge(run_id=f"hostile-{seed}", rollouts=target.rollouts, token=target.trainer_token)
     maker = MessageMaker(rng, [known.run_id, *{rollout.bundle_digest for rollout in target.rollouts}])
-    async with open_channel(target.address, target.trainer_token) as channel:
+    async with open_channel(target.address) as channel:
         opening = rollout_service_pb2.OpenRunRequest(
             name="hostile", run_id=known.run_id, protocol_version=PROTOCOL_VERSION
         )
         kind = KINDS["any OpenRun"]
-        await _call(channel, kind, [opening.SerializeToString()], fight)
+        await _call(channel, known.token, kind, [opening.SerializeToString()], fight)
         await _strike_in_parallel(channel, Arsenal(rng, Actor.TRAINER), known, maker, fight)
 
 
@@ -188,19 +208,21 @@ async def hostile_worker(
         join_token = await target.join()
         with contextlib.suppress(grpc.aio.AioRpcError):
             async with open_channel(target.address) as channel:
-                request = sound_registration(known, join_token)
-                answer = await _register(channel, request)
-            async with open_channel(target.address, answer.credential) as channel:
+                answer = await _register(channel, "", sound_registration(known, join_token))
+                known.token = answer.credential
                 while not fight.over:
                     known.session_id, known.epoch = answer.session_id, answer.session_epoch
                     known.leases.clear()
                     await _fight_in_session(channel, known, arsenal, rng, fight)
-                    answer = await _register(channel, sound_registration(known))
+                    answer = await _register(channel, known.token, sound_registration(known))
 
 
-async def _register(channel: grpc.aio.Channel, request: pb.RegisterRequest) -> pb.RegisterResponse:
+async def _register(
+    channel: grpc.aio.Channel, token: str, request: pb.RegisterRequest
+) -> pb.RegisterResponse:
     call = channel.unary_unary(f"/{SERVICES}WorkerService/Register")
-    return pb.RegisterResponse.FromString(await call(request.SerializeToString(), timeout=REGISTER_S))
+    sent = call(request.SerializeToString(), timeout=REGISTER_S, metadata=_metadata(token))
+    return pb.RegisterResponse.FromString(await sent)
 
 
 async def _fight_in_session(
@@ -208,7 +230,7 @@ async def _fight_in_session(
 ) -> None:
     """Send strikes in one session until the manager ends it, or enough were sent."""
     maker = MessageMaker(rng, [known.session_id, known.worker_id, known.run_id])
-    stream = channel.stream_stream(f"/{SERVICES}{SESSION}")()
+    stream = _opened(channel, SESSION, known.token)
     kind = KINDS["any Session"]
     listening = asyncio.create_task(_collect_leases(stream, known, maker))
     try:
@@ -219,7 +241,7 @@ async def _fight_in_session(
             kind = arsenal.draw()
             payloads = [_bytes(payload) for payload in kind.make(known, maker)]
             if kind.method != SESSION:
-                await _call(channel, kind, payloads, fight)
+                await _call(channel, known.token, kind, payloads, fight)
                 continue
             for payload in payloads:
                 fight.sent[kind.name] += 1
@@ -240,7 +262,7 @@ async def _fight_in_session(
 async def _collect_leases(
     stream: grpc.aio.StreamStreamCall[bytes, bytes], known: Knowledge, maker: MessageMaker
 ) -> None:
-    async for data in stream:
+    while (data := await stream.read()) is not grpc.aio.EOF:
         for lease in pb.SessionResponse.FromString(data).leases:
             known.leases.append(lease)
             known.foreign.append(lease.ref)
@@ -252,13 +274,13 @@ async def fast_liar(target: Target, name: str = "liar") -> None:
     """Answer every lease at once with a well-formed made-up result, until cancelled or expelled."""
     known = Knowledge(worker_id=name, rollouts=target.rollouts)
     async with open_channel(target.address) as channel:
-        answer = await _register(channel, sound_registration(known, await target.join()))
+        answer = await _register(channel, "", sound_registration(known, await target.join()))
     known.session_id, known.epoch = answer.session_id, answer.session_epoch
-    async with open_channel(target.address, answer.credential) as channel:
-        stream = channel.stream_stream(f"/{SERVICES}{SESSION}")()
+    async with open_channel(target.address) as channel:
+        stream = _opened(channel, SESSION, answer.credential)
         with contextlib.suppress(grpc.aio.AioRpcError, asyncio.InvalidStateError):
             await stream.write(first_state(known).SerializeToString())
-            async for data in stream:
+            while (data := await stream.read()) is not grpc.aio.EOF:
                 leases = pb.SessionResponse.FromString(data).leases
                 if leases:
                     lies = pb.SessionRequest(

@@ -14,9 +14,11 @@ import time
 import urllib.request
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
+from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import psutil
 
@@ -43,6 +45,8 @@ from embomatrix.world.whole_file import write_whole
 if TYPE_CHECKING:
     from embomatrix.bench.engine.workload import Workload
 
+ResultT = TypeVar("ResultT")
+
 HONEST: Final = "embomatrix.bench.adversary.honest"
 ADMIN: Final = "adversary-benchmark-admin"
 """Secret of the benchmark's own manager, which serves on loopback until the benchmark ends."""
@@ -50,6 +54,8 @@ SLOTS: Final = 4
 START_S: Final = 60.0
 SAMPLE_S: Final = 0.05
 BATCH: Final = 40
+LAST_WORDS: Final = 2_000
+"""Characters of the manager's log that are kept."""
 PROBATION: Final = 50
 """Default of the manager's ``audit_probation``: the unaudited results that a new worker may deliver at most."""
 LAG_BUCKET: Final = re.compile(r'embo_manager_lag_seconds_bucket\{le="([^"]+)"\} (\S+)')
@@ -90,6 +96,9 @@ class Harm:
     """Errors that the manager counted in ``embo_errors_total``."""
     unreadable: list[str] = field(default_factory=list)
     """Lists of the manager that were no valid JSON, or were not served, after the attack."""
+
+    last_words: str = ""
+    """End of the manager's log."""
 
     @property
     def lost(self) -> int:
@@ -320,23 +329,46 @@ def bench_adversary(
     workload: Workload, sizes: SiegeSizes, on_step: Callable[[str], None]
 ) -> tuple[Figure, ...]:
     """Measure the harm of all attacks. Raise BenchError if the processes don't start."""
-    return asyncio.run(_measured(workload, sizes, on_step))
+    on_step(f"{sizes.messages:,} hostile messages")
+    harm, fight = run_siege(workload, sizes)
+    on_step("a fast liar")
+    return _figures(harm, fight, {each: run_temptation(workload, sizes, each) for each in (True, False)})
 
 
-async def _measured(
-    workload: Workload, sizes: SiegeSizes, on_step: Callable[[str], None]
-) -> tuple[Figure, ...]:
-    with _folder() as folder:
-        async with battlefield(folder, workload) as place:
-            on_step(f"{sizes.messages:,} hostile messages")
-            harm, fight = await besiege(place, sizes.messages, sizes.seed, sizes.limit_s)
-    lies: dict[bool, Harm] = {}
-    for verified in (True, False):
+def run_siege(workload: Workload, sizes: SiegeSizes) -> tuple[Harm, Fight]:
+    """Return the harm of a siege, and the messages of the attackers."""
+    return _alone(_siege, workload, sizes)
+
+
+def run_temptation(workload: Workload, sizes: SiegeSizes, verified: bool) -> Harm:
+    """Return the harm of a fast liar beside two honest workers."""
+    return _alone(_temptation, workload, sizes, verified)
+
+
+def _alone(work: Callable[..., ResultT], *arguments: Any) -> ResultT:
+    """Run the function in a fresh process. One with gRPC's threads must not fork the processes of a cluster."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(work, *arguments).result()
+
+
+def _siege(workload: Workload, sizes: SiegeSizes) -> tuple[Harm, Fight]:
+    async def measure() -> tuple[Harm, Fight]:
+        with _folder() as folder:
+            async with battlefield(folder, workload) as place:
+                harm, fight = await besiege(place, sizes.messages, sizes.seed, sizes.limit_s)
+                harm.last_words = place.manager.log.read_text(errors="replace")[-LAST_WORDS:]
+                return harm, fight
+
+    return asyncio.run(measure())
+
+
+def _temptation(workload: Workload, sizes: SiegeSizes, verified: bool) -> Harm:
+    async def measure() -> Harm:
         with _folder() as folder:
             async with battlefield(folder, workload, "--audit") as place:
-                on_step(f"a fast liar in a run {'with' if verified else 'without'} verified results")
-                lies[verified] = await tempt(place, sizes.lies, verified=verified)
-    return _figures(harm, fight, lies)
+                return await tempt(place, sizes.lies, verified=verified)
+
+    return asyncio.run(measure())
 
 
 @contextlib.contextmanager
