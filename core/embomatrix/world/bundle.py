@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final
 
+import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
@@ -32,7 +33,7 @@ from embomatrix.world.poses import PoseCache
 from embomatrix.world.records import PosesJson, Record, SceneInvalidError, SceneJson, TaskJson, decode
 from embomatrix.world.scene import Scene
 from embomatrix.world.tables import Tables, TableWriter
-from embomatrix.world.task import Task
+from embomatrix.world.task import Profile, Task
 
 Arrays = Mapping[str, NDArray[np.generic]]
 
@@ -94,6 +95,34 @@ def read_bundle(path: Path, *, digest: str = "") -> Bundle:
     with path.open("rb") as file:
         data = file.read(DEFAULT_LIMITS.compressed_bytes + 1)
     return decode_bundle(data, digest=digest)
+
+
+class _TaskHead(msgspec.Struct):
+    task_id: str
+    profile: Profile = Profile.PAPER
+
+
+class _TasksOfBundle(msgspec.Struct):
+    tasks: list[_TaskHead]
+
+
+def read_profiles(path: Path, *, limits: BundleLimits = DEFAULT_LIMITS) -> dict[str, Profile]:
+    """Return the profile of each task of a bundle file by task id. Scene and arrays are skipped, not built.
+
+    Raises BundleError or OSError.
+    """
+    with path.open("rb") as file:
+        content = decompress(file.read(limits.compressed_bytes + 1), limits)
+    if len(content) < _HEAD.size or content[:4] != MAGIC:
+        raise BundleError(f"it begins with {content[:4]!r}: expected {MAGIC!r}")
+    text_bytes = _HEAD.unpack_from(content)[2]
+    try:
+        found = msgspec.json.decode(
+            memoryview(content)[_HEAD.size : _HEAD.size + text_bytes], type=_TasksOfBundle
+        )
+    except (ValueError, RecursionError) as error:
+        raise BundleError(f"its tasks can't be read: {error}") from error
+    return {task.task_id: task.profile for task in found.tasks}
 
 
 def decode_bundle(data: bytes, *, digest: str = "", limits: BundleLimits = DEFAULT_LIMITS) -> Bundle:

@@ -9,9 +9,9 @@ from embomatrix.reward.hierarchy import score
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.describe import call_in_words
-from embomatrix.skills.parse import plan_from_json
+from embomatrix.skills.parse import PlanError, plan_from_json
 from embomatrix.world.bundle import Bundle
-from embomatrix.world.dataset import TaskRecord
+from embomatrix.world.dataset import DatasetError, TaskRecord
 from embomatrix.world.evaluate import evaluate, render, scored_atoms
 
 
@@ -44,9 +44,17 @@ class OraclePlayback:
 
 
 def play_oracle(record: TaskRecord, bundle: Bundle) -> OraclePlayback:
-    """Execute the record's oracle plan in its bundle. Raise EngineError if the scene can't be loaded."""
+    """Execute the record's oracle plan in its bundle.
+
+    Raise EngineError if the scene can't be loaded, DatasetError if the plan can't be read.
+    """
     task = record.task
-    plan = plan_from_json(list(record.oracle), task.profile)
+    try:
+        plan = plan_from_json(list(record.oracle), task.profile)
+    except PlanError as error:
+        raise DatasetError(
+            f"the oracle plan of task {task.task_id!r} can't be read: {error}; build the dataset again"
+        ) from error
     with contextlib.closing(load_simulator(bundle)) as simulator:
         simulator.reset(task, SEED)
         moments = [_moment(simulator, record, "", "")]

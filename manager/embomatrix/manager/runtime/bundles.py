@@ -8,20 +8,24 @@ import os
 import re
 import tempfile
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import IO, Final
 
 from embomatrix.rpc.channel import CHUNK_BYTES
 from embomatrix.rpc.status import InvalidRequestError, NotFoundError, OverloadedError
+from embomatrix.world.bundle import read_profiles
 from embomatrix.world.inflation import BundleError, Inflation
+from embomatrix.world.task import Profile
 
 logger = logging.getLogger(__name__)
 
 PREFIX: Final = "sha256:"
 INCOMING: Final = "incoming-"
 """Prefix of the names of incomplete files."""
+PROFILES_KEPT: Final = 1024
+"""Bundles whose tasks stay in memory. The oldest is forgotten first."""
 _DIGEST: Final = re.compile(r"sha256:[0-9a-f]{64}")
 
 
@@ -45,6 +49,7 @@ class BundleStore:
         self._keep_s = keep_s
         self._clock = clock
         self._needed: Callable[[], AbstractSet[str]] = frozenset
+        self._profiles: dict[str, Mapping[str, Profile]] = {}
         folder.mkdir(parents=True, exist_ok=True)
         for left_over in folder.glob(f"{INCOMING}*"):
             if clock() - left_over.stat().st_mtime > keep_s:
@@ -66,6 +71,23 @@ class BundleStore:
     def missing(self, digests: list[str]) -> list[str]:
         """Return the digests of bundles that are absent, in the same order."""
         return [digest for digest in dict.fromkeys(digests) if not self.has(digest)]
+
+    async def profiles(self, digests: Iterable[str]) -> Mapping[str, Mapping[str, Profile]]:
+        """Return the tasks of the bundles that are present and readable: the profile of each by task id."""
+        found = {}
+        for digest in dict.fromkeys(digests):
+            tasks = self._profiles.get(digest)
+            if tasks is None:
+                try:
+                    tasks = await asyncio.to_thread(read_profiles, self._path(digest))
+                except (OSError, BundleError):
+                    # Absent bundles are reported by ``missing``, unreadable ones by the workers that load them.
+                    continue
+                while len(self._profiles) >= PROFILES_KEPT:
+                    del self._profiles[next(iter(self._profiles))]
+                self._profiles[digest] = tasks
+            found[digest] = tasks
+        return found
 
     async def missing_or_damaged(self, digests: list[str]) -> list[str]:
         """Return the digests of bundles that are absent or damaged. Damaged files are deleted."""

@@ -59,6 +59,8 @@ from embomatrix.rpc.wire.values import (
     RunStats,
     RunTerms,
 )
+from embomatrix.skills.syntax import PROFILES
+from embomatrix.world.task import Profile
 
 logger = logging.getLogger(__name__)
 
@@ -180,6 +182,8 @@ class Runs:
     async def submit(self, batch: Batch) -> BatchLog:
         """Queue the batch, or attach to an earlier submission. Return its result log."""
         self.touch(batch.run_id)
+        profiles = await self._bundles.profiles(rollout.bundle_digest for rollout in batch.rollouts)
+        self.touch(batch.run_id)
         row = batch_row(batch)
         taken = ConflictError(
             f"batch {batch.batch_id!r} was submitted before with other rollouts: use a new id"
@@ -190,6 +194,7 @@ class Runs:
                 raise taken
             return self.log_of(batch.run_id, batch.batch_id)
         self._check_batch(batch)
+        check_plans(batch, profiles)
         log = BatchLog(batch.run_id, batch.batch_id, row.digest, groups=group_sizes(batch))
         self._logs.add(log)
         try:
@@ -272,6 +277,33 @@ class Runs:
 
     def _feed(self, event: Event) -> None:
         self._carry_out(self._cluster.handle(event, now_s=time.monotonic()))
+
+
+def check_plans(batch: Batch, profiles: Mapping[str, Mapping[str, Profile]]) -> None:
+    """Raise InvalidRequestError for an unknown task, an empty plan, or a skill outside the task's profile.
+
+    ``profiles`` holds the tasks of the readable bundles by digest and id. Rollouts of other bundles are not checked.
+    """
+    for rollout in batch.rollouts:
+        tasks = profiles.get(rollout.bundle_digest)
+        if tasks is None:
+            continue
+        name = f"rollout {rollout.rollout_id!r} of batch {batch.batch_id!r}"
+        profile = tasks.get(rollout.task_id)
+        if profile is None:
+            raise InvalidRequestError(
+                f"{name}: bundle {rollout.bundle_digest} has no task {rollout.task_id[:80]!r}: "
+                f"expected one of its {len(tasks)} tasks"
+            )
+        if not rollout.plan:
+            raise InvalidRequestError(f"{name} has an empty plan: expected at least one skill call")
+        allowed = PROFILES[profile]
+        for call in rollout.plan:
+            if call.skill not in allowed:
+                raise InvalidRequestError(
+                    f"{name}: the profile {profile} of task {rollout.task_id!r} has no skill {call.skill}: "
+                    f"expected one of {', '.join(allowed)}"
+                )
 
 
 @contextlib.contextmanager
