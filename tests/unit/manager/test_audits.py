@@ -245,7 +245,7 @@ def test_audits_end_with_their_rollout_or_run(event):
 
 
 def test_background_audits_deliver_at_once_and_use_idle_slots():
-    bench = Bench(terms=PLAIN, rules=AuditRules(background=True))
+    bench = Bench(terms=PLAIN, rules=AuditRules(background=True, probation=0, share=1.0))
     bench.submit(3)
     leases = list(bench.live.values())
     bench.finish(leases[0])
@@ -266,7 +266,9 @@ def test_background_audits_deliver_at_once_and_use_idle_slots():
 
 
 def test_background_audit_waits_for_queued_rollouts():
-    bench = Bench(workers=("w1", "w2"), terms=PLAIN, rules=AuditRules(background=True))
+    bench = Bench(
+        workers=("w1", "w2"), terms=PLAIN, rules=AuditRules(background=True, probation=0, share=1.0)
+    )
     bench.submit(40)
     while len(bench.results) < 40:
         bench.apply(Tick())
@@ -352,3 +354,42 @@ def test_workers_falsifying_a_tenth_of_results_are_caught_on_probation():
     assert len(report.caught) >= LIARS - 1
     # Two liars may meet, and the third worker may lie as well: an unconfirmed result is lost.
     assert report.infra_failures <= 0.01 * report.submitted
+
+
+def test_fast_liar_delivers_nothing_to_a_run_that_did_not_ask_for_verified_results():
+    bench = Bench(terms=PLAIN, rules=AuditRules(background=True))
+    bench.submit(600)
+    for _ in range(2000):
+        if not bench.live:
+            break
+        # The liar answers first, whenever it has a lease.
+        lease = next(
+            (one for one in bench.live.values() if one.worker_id == "w1"), next(iter(bench.live.values()))
+        )
+        bench.finish(lease, lie("w1") if lease.worker_id == "w1" else None)
+    assert bench.caught == ["w1"]
+    assert len(bench.results) == 600
+    assert not [r for r in bench.results.values() if r.outcome.trace_digest.startswith("invented")]
+
+
+def test_worker_on_probation_has_few_leases_and_unconfirmed_results():
+    bench = Bench(("w1", "w2"), terms=PLAIN, rules=AuditRules(background=True, unconfirmed=8))
+    bench.submit(100)
+    for _ in range(60):
+        lease = next((one for one in bench.live.values() if one.worker_id == "w1" and not one.audit), None)
+        if lease is None:
+            break
+        bench.finish(lease)
+    worker = bench.cluster.dispatcher.workers["w1"]
+    assert worker.unconfirmed + len(worker.held) <= 8
+    bench.answer(limit=5000)
+    assert len(bench.results) == 100
+
+
+def test_newcomers_confirm_each_other_and_are_then_trusted():
+    bench = Bench(("w1", "w2"), terms=PLAIN, rules=AuditRules(background=True, probation=10, share=0.0))
+    bench.submit(200)
+    bench.answer(limit=5000)
+    assert len(bench.results) == 200
+    assert bench.stats().audited <= 2 * (10 + 32)
+    assert not any(w.most_unconfirmed for w in bench.cluster.dispatcher.workers.values())

@@ -32,7 +32,10 @@ class AuditRules:
     share: float = 0.05
     """Share of its later results that is compared."""
     background: bool = False
-    """Audit other runs as well, after delivery and on idle slots."""
+    """Audit other runs as well: results of workers on probation before delivery, a share of the others after it, on idle
+    slots."""
+    unconfirmed: int = 32
+    """Most leases and unconfirmed results that a worker on probation may have at a time."""
     backlog: int = 4096
     """Most background audits that may wait; further results are not audited."""
     timeout_s: float = 10.0
@@ -145,8 +148,11 @@ class Auditor:
         reputation = self.of(worker_id)
         if reputation.disputed:
             return True  # its honesty is in doubt, whatever its record
-        known = reputation.agreed if verified else reputation.taken
-        return known < self.rules.probation or self._drawn(lease_id)
+        return self.on_probation(worker_id) or self._drawn(lease_id)
+
+    def on_probation(self, worker_id: str) -> bool:
+        """True until enough executions of the worker were confirmed by others."""
+        return self.of(worker_id).agreed < self.rules.probation
 
     def took(self, worker_id: str) -> None:
         """Count a result of the worker that is audited."""

@@ -74,6 +74,10 @@ class WorkerRecord:
     """Moving average of log slowdowns against other workers."""
     penalty_s: float = 0.0
     """Placement penalty of a slow worker: it takes only rollouts that have waited this long."""
+    unconfirmed: int = 0
+    """Its results in open audit cases."""
+    most_unconfirmed: int | None = None
+    """Most leases and unconfirmed results together while it is on probation; None for no limit."""
     completed: int = 0
     pace_s: float = 0.0
     """Moving average of execution times."""
@@ -146,6 +150,10 @@ class WorkerRecord:
         if record.failed_on == self.worker_id and now_s < record.avoid_until_s:
             return False
         if now_s - record.submitted_s < self.penalty_s:
+            return False
+        # Checks are exempt from the limit: newcomers that have reached it confirm each other.
+        most = None if record.check else self.most_unconfirmed
+        if most is not None and len(self.held) + self.unconfirmed >= most:
             return False
         queue = record.queue
         if queue.render and self.rendering >= self.render_slots:

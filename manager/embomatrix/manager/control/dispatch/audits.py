@@ -1,8 +1,8 @@
 """Audits: an audited result is compared with a second execution on another worker, and with a third on a mismatch.
 
 A check is a separate rollout record outside all batches. Its worker cannot distinguish it from any other rollout. In a
-run that requests verified results, the check is queued and the result is held back. In other runs, the check gets an
-idle slot.
+run that requests verified results, and for workers on probation, the check is queued and the result is held back.
+Otherwise the check gets an idle slot after the delivery.
 """
 
 from itertools import islice
@@ -45,6 +45,8 @@ def hold_for_audit(state: DispatchState, lease: LeaseRecord, completed: Complete
     verified = state.runs.of(record.key.run_id).terms.verified
     if not auditor.wants(worker_id, lease.ref.lease_id, verified=verified):
         return False
+    # A newcomer could answer faster than it is audited, and leave.
+    verified |= auditor.on_probation(worker_id)
     if record.key in state.cases or (not verified and len(state.cases) >= auditor.rules.backlog):
         return False
     check = _make_check(state, record, frozenset({worker_id}))
@@ -58,6 +60,7 @@ def hold_for_audit(state: DispatchState, lease: LeaseRecord, completed: Complete
         record.key, record if verified else None, check, [opinion], [completed] if verified else []
     )
     state.cases[case.key] = case
+    state.pool.workers[worker_id].unconfirmed += 1
     record.held = verified
     if verified:
         state.log(RolloutStepKind.HELD, record.key, worker_id, "another worker checks the result")
@@ -76,7 +79,16 @@ def drop_run(state: DispatchState, run_id: str) -> None:
 def restore_quarantine(state: DispatchState, worker: WorkerRecord) -> None:
     """Apply what is known of the worker from earlier sessions."""
     worker.quarantined = bool(state.auditor.of(worker.worker_id).quarantine)
+    note_probation(state, worker.worker_id)
     state.pool.update_standing(worker)
+
+
+def note_probation(state: DispatchState, worker_id: str) -> None:
+    """Limit the leases of a worker on probation, or end the limit."""
+    worker, rules = state.pool.workers.get(worker_id), state.auditor.rules
+    if worker is not None:
+        limited = rules.background and state.auditor.on_probation(worker_id)
+        worker.most_unconfirmed = rules.unconfirmed if limited else None
 
 
 def tick_audits(state: DispatchState) -> None:
@@ -131,6 +143,7 @@ def _rule(state: DispatchState, case: AuditCase) -> None:
         _count(state, case, mismatch=len(case.opinions) > 2)
         for at in verdict.right:
             state.auditor.agreed(case.opinions[at].worker_id)
+            note_probation(state, case.opinions[at].worker_id)
         _close_and_deliver(state, case, case.results[verdict.right[0]] if case.results else None)
         for at in verdict.wrong:
             _convict(state, case.opinions[at].worker_id, case)
@@ -159,6 +172,11 @@ def quarantine(state: DispatchState, worker_id: str, reason: str) -> None:
     if known:
         return  # a second wrong result that was under way
     state.emit(QuarantineWorker(worker_id, reason, state.auditor.of(worker_id).audited))
+    worker = state.pool.workers.get(worker_id)
+    if worker is not None:
+        # First, so that it gets none of the rollouts that are queued again.
+        worker.quarantined = True
+        state.pool.update_standing(worker)
     again = [other for other in state.cases.values() if other.opinions[0].worker_id == worker_id]
     for other in again:
         held = other.held
@@ -168,10 +186,7 @@ def quarantine(state: DispatchState, worker_id: str, reason: str) -> None:
             state.runs.of(other.key.run_id).counters.redispatched += 1
             state.log(RolloutStepKind.QUEUED, held.key, reason=f"again, because {worker_id} is in quarantine")
             queue_rollouts(state, [held])
-    worker = state.pool.workers.get(worker_id)
     if worker is not None:
-        worker.quarantined = True
-        state.pool.update_standing(worker)
         leases = list(worker.held.values())
         for lease in leases:
             state.emit(CancelLease(worker_id, lease.ref))

@@ -91,7 +91,10 @@ def requeue(state: DispatchState, record: RolloutRecord) -> None:
 
 def close_case(state: DispatchState, case: AuditCase) -> None:
     """End an audit case and its check, wherever the check is."""
-    state.cases.pop(case.key, None)
+    if state.cases.pop(case.key, None) is not None:
+        first = state.pool.workers.get(case.opinions[0].worker_id)
+        if first is not None and first.unconfirmed:
+            first.unconfirmed -= 1
     for worker_id in case.disputed:
         state.auditor.of(worker_id).disputed -= 1
     case.disputed = ()
