@@ -31,6 +31,8 @@ class FakeSimulation:
                 raise ValueError("a table without legs")
             case "crash":
                 os.kill(os.getpid(), signal.SIGSEGV)
+            case "huge":
+                return FakeScene(ballast=bytearray(8 * 1024 * 1024 * 1024))
             case "large":
                 return FakeScene(ballast=bytearray(os.urandom(1) * (40 * 1024 * 1024)))
         return FakeScene()

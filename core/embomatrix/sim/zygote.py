@@ -5,6 +5,7 @@ memory. A requester passes the child's end of a socket pair, talks to the child 
 stream.
 """
 
+import contextlib
 import ctypes
 import gc
 import json
@@ -160,6 +161,19 @@ def limit_memory(more_mb: int) -> None:
     mapped_pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = mapped_pages * resource.getpagesize() + more_mb * MIB
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+
+
+@contextlib.contextmanager
+def memory_limited(more_mb: int) -> Iterator[None]:
+    """Limit further memory mappings of this process to ``more_mb`` MiB while the context is held."""
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    mapped_pages = int(Path("/proc/self/statm").read_text().split()[0])
+    limit = mapped_pages * resource.getpagesize() + more_mb * MIB
+    resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 def give_back_memory() -> None:

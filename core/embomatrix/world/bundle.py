@@ -26,6 +26,7 @@ from embomatrix.world.inflation import (
     BundleError,
     BundleLimits,
     bundle_digest,
+    check_values,
     decompress,
     too_large,
 )
@@ -116,10 +117,10 @@ def read_profiles(path: Path, *, limits: BundleLimits = DEFAULT_LIMITS) -> dict[
     if len(content) < _HEAD.size or content[:4] != MAGIC:
         raise BundleError(f"it begins with {content[:4]!r}: expected {MAGIC!r}")
     text_bytes = _HEAD.unpack_from(content)[2]
+    text = memoryview(content)[_HEAD.size : _HEAD.size + text_bytes]
+    check_values(text, limits)
     try:
-        found = msgspec.json.decode(
-            memoryview(content)[_HEAD.size : _HEAD.size + text_bytes], type=_TasksOfBundle
-        )
+        found = msgspec.json.decode(text, type=_TasksOfBundle)
     except (ValueError, RecursionError) as error:
         raise BundleError(f"its tasks can't be read: {error}") from error
     return {task.task_id: task.profile for task in found.tasks}
@@ -133,8 +134,8 @@ def decode_bundle(data: bytes, *, digest: str = "", limits: BundleLimits = DEFAU
     if digest and found != digest:
         raise BundleError(f"the bundle's digest is {found}: expected {digest}; fetch it again")
     try:
-        bundle = _from_content(decompress(data, limits))
-    except SceneInvalidError as error:
+        bundle = _from_content(decompress(data, limits), limits)
+    except (SceneInvalidError, BundleError) as error:
         raise BundleError(f"bundle {found}: {error}") from error
     except (ValueError, RecursionError) as error:
         raise BundleError(f"bundle {found} can't be read: {error}") from error
@@ -142,7 +143,7 @@ def decode_bundle(data: bytes, *, digest: str = "", limits: BundleLimits = DEFAU
     return bundle
 
 
-def _from_content(content: bytes) -> Bundle:
+def _from_content(content: bytes, limits: BundleLimits) -> Bundle:
     """Decode decompressed content. Raises ValueError for other data and SceneInvalidError for a broken rule."""
     if len(content) < _HEAD.size or content[:4] != MAGIC:
         raise ValueError(
@@ -158,6 +159,7 @@ def _from_content(content: bytes) -> Bundle:
         raise ValueError(
             f"its JSON should have {text_bytes} bytes, but the bundle has {len(content)}: fetch it again"
         )
+    check_values(memoryview(content)[_HEAD.size : end], limits)
     record = decode(content[_HEAD.size : end], BundleJson, "bundle")
     arrays = _arrays(record.arrays, memoryview(content)[end:])
     prepared = {

@@ -25,6 +25,8 @@ class BundleLimits:
     compressed_bytes: int = 8 * 1024 * 1024
     ratio: float = 100.0
     """Decompressed bytes per compressed byte; scenes need about ten."""
+    values: int = 400_000
+    """Values of its JSON text. The largest shipped bundle has 29,000; each becomes an object of some hundred bytes."""
 
 
 DEFAULT_LIMITS: Final = BundleLimits()
@@ -80,6 +82,19 @@ def too_large(limits: BundleLimits) -> BundleError:
     return BundleError(
         f"the bundle has over {limits.compressed_bytes:,} bytes: expected at most {limits.compressed_bytes:,}"
     )
+
+
+def check_values(text: bytes | memoryview, limits: BundleLimits) -> None:
+    """Raise BundleError if the JSON text may hold too many values, before any of them becomes an object.
+
+    Each value but the first follows a comma or an opening bracket. Those inside texts are counted too.
+    """
+    content = bytes(text)
+    count = 1 + sum(map(content.count, (b",", b"[", b"{")))
+    if count > limits.values:
+        raise BundleError(
+            f"its JSON has up to {count:,} values: expected at most {limits.values:,}; split the scene or its tasks"
+        )
 
 
 def decompress(data: bytes, limits: BundleLimits) -> bytes:

@@ -274,6 +274,7 @@ async def test_killed_root_is_restarted(tmp_path):
         ("corrupt", InfraCode.BUNDLE_CORRUPT, "not what its digest says"),
         ("impossible", InfraCode.SCENE_LOAD_FAILED, "a table without legs"),
         ("crash", InfraCode.SCENE_LOAD_FAILED, "killed by SIGSEGV"),
+        ("huge", InfraCode.SCENE_LOAD_FAILED, "the scene takes more than"),
         ("unfetchable", InfraCode.BUNDLE_CORRUPT, "damaged twice"),
     ],
 )

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+SMALLEST_LIMIT_MB: Final = 512
+"""A scene may map this much memory while it loads, or what the worker offers to all scenes if that is more."""
 COLLECT_S: Final = 0.05
 """Time for the system to tear down a killed process before its parent collects it."""
 LOAD_S: Final = 60.0
@@ -285,6 +287,7 @@ class Residents:
             "path": str(path),
             "digest": scene.digest,
             "slot_memory_mb": self._limits.slot_memory_mb,
+            "scene_memory_mb": max(int(self._limits.memory_mb), SMALLEST_LIMIT_MB),
         }
         try:
             answer = await child.peer.ask(PipeMessage(request))

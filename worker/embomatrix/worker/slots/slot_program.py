@@ -34,6 +34,7 @@ from embomatrix.sim.zygote import (
     PipeMessage,
     give_back_memory,
     limit_memory,
+    memory_limited,
     private_mb,
     receive,
     resident_mb,
@@ -127,8 +128,16 @@ def _hold_scene(simulation: SimulationBackend, connection: socket.socket, board:
     # A scene is a hundred thousand objects without garbage: collections would take half of the loading time.
     gc.disable()
     core_s = time.thread_time()
+    most_mb = int(request.header["scene_memory_mb"])
     try:
-        scene = simulation.load(Path(request.header["path"]), request.header["digest"])
+        with memory_limited(most_mb):
+            scene = simulation.load(Path(request.header["path"]), request.header["digest"])
+    except MemoryError:
+        text = (
+            f"the scene takes more than {most_mb} MB: give the worker more memory, or make the scene smaller"
+        )
+        send(connection, PipeMessage({"code": InfraCode.SCENE_LOAD_FAILED.value, "error": text}))
+        return
     except BundleCorruptError as error:
         send(connection, PipeMessage(_failure(InfraCode.BUNDLE_CORRUPT, error)))
         return
