@@ -5,11 +5,12 @@ import stat
 
 import pytest
 from starlette.datastructures import Headers
+from starlette.responses import PlainTextResponse
 
 from embomatrix.host.printable import printable
 from embomatrix.manager.access.gate import Gate, the_token
 from embomatrix.manager.store.sqlite import SqliteStore
-from embomatrix.manager.web.http_rules import HttpRules
+from embomatrix.manager.web.http_rules import COMMAND_BYTES, Guard, HttpRules
 from embomatrix.proto.v1 import rollout_service_pb2
 from embomatrix.rpc.logs import HumanFormatter
 from embomatrix.rpc.status import NotSignedInError
@@ -72,3 +73,29 @@ def test_log_line_stays_one_line_and_drives_no_terminal():
     assert "\x1b" not in line
     assert r"x\n2026 ERROR forged\x1b[31m" in line
     assert printable("café ✓") == "café ✓"
+
+
+async def answered(body, *, path="/api/v1/workers/w1/drain"):
+    """Return the status of a command with this body, and the body that the application read."""
+    read, sent, waiting = [], [], [body[:100], body[100:]]
+
+    async def application(scope, receive, send):
+        read.append((await receive())["body"])
+        await PlainTextResponse("done")(scope, receive, send)
+
+    async def receive():
+        return {"type": "http.request", "body": waiting.pop(0), "more_body": bool(waiting)}
+
+    async def send(message):
+        sent.append(message)
+
+    guard = Guard(application, rules(secure=False))
+    scope = {"type": "http", "method": "POST", "path": path, "headers": []}
+    await guard(scope, receive, send)
+    return sent[0]["status"], read
+
+
+async def test_body_of_a_command_is_bounded_and_passed_on_unchanged():
+    body = bytes(range(256)) * 200
+    assert await answered(body) == (200, [body])
+    assert await answered(b"x" * (COMMAND_BYTES + 1)) == (413, [])

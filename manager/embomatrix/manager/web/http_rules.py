@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse, Response
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from embomatrix.manager.access.gate import the_token
 from embomatrix.manager.settings import LOOPBACK_NAMES, is_loopback
@@ -24,6 +25,10 @@ STATIC: Final = "/static/"
 """Prefix of the page's files, which hold nothing about the cluster and need no token."""
 OPEN_PATHS: Final = frozenset({"/", "/healthz"})
 """Page and health check, which need no token."""
+COMMAND_BYTES: Final = 64 * 1024
+"""Bytes of the body of a command; rewards have budgets of their own."""
+COMMAND_S: Final = 10.0
+"""Seconds from the head of a command to the end of its body."""
 READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 RANKS: Final = (AccessRole.VIEWER, AccessRole.TRAINER, AccessRole.ADMIN)
 """Roles that may send requests. Each may do everything that the roles before it may."""
@@ -84,7 +89,39 @@ class Guard:
             await send({"type": "websocket.close", "code": 1008})
             return
         refusal = self._rules.refusal(scope["method"], scope["path"], Headers(scope=scope))
+        if refusal is None and scope["method"] not in READING and scope["path"] != REWARDS:
+            body = await _small_body(receive)
+            refusal = body if isinstance(body, Response) else None
+            receive = receive if isinstance(body, Response) else _again(body, receive)
         await (refusal or self._app)(scope, receive, send)
+
+
+async def _small_body(receive: Receive) -> bytes | Response:
+    """Return the body of a command, or the answer to one that is too large or does not end."""
+    body = bytearray()
+    try:
+        async with asyncio.timeout(COMMAND_S):
+            while True:
+                message = await receive()
+                body += message.get("body", b"")
+                if len(body) > COMMAND_BYTES:
+                    return PlainTextResponse(
+                        f"the body has more than {COMMAND_BYTES:,} bytes: shorten it", 413
+                    )
+                if not message.get("more_body", False):
+                    return bytes(body)
+    except TimeoutError:
+        return PlainTextResponse(f"the body did not end within {COMMAND_S:g} s: send it without pauses", 408)
+
+
+def _again(body: bytes, receive: Receive) -> Receive:
+    """Return a ``receive`` that yields the body once more, and then what follows it."""
+    waiting: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
+
+    async def replay() -> Message:
+        return waiting.pop() if waiting else await receive()
+
+    return replay
 
 
 def allowed_hosts(bound: str, tls: Tls | None) -> frozenset[str]:
