@@ -7,18 +7,17 @@ arrays with the numbers: see ``tables``.
 
 import json
 import math
-import struct
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from embomatrix.world.bundle_head import FORMAT, HEAD, MAGIC
 from embomatrix.world.codec import scene_of, scene_to_json
 from embomatrix.world.codec_task import poses_of, poses_to_json, task_of, task_to_json
 from embomatrix.world.inflation import (
@@ -34,14 +33,10 @@ from embomatrix.world.poses import PoseCache
 from embomatrix.world.records import PosesJson, Record, SceneInvalidError, SceneJson, TaskJson, decode
 from embomatrix.world.scene import Scene
 from embomatrix.world.tables import Tables, TableWriter
-from embomatrix.world.task import Profile, Task
+from embomatrix.world.task import Task
 
 Arrays = Mapping[str, NDArray[np.generic]]
 
-FORMAT: Final = 3
-MAGIC: Final = b"EMBX"
-_HEAD: Final = struct.Struct("<4sII")
-"""Magic, format, number of bytes of JSON."""
 _ALIGNMENT: Final = 8
 _DTYPES: Final[Mapping[str, np.dtype[Any]]] = {name: np.dtype(name) for name in ("<f8", "<i4", "|u1")}
 _PREPARED: Final = "prepared."
@@ -83,8 +78,8 @@ def encode_bundle(bundle: Bundle) -> bytes:
     arrays = {name: _plain(name, array) for name, array in (tables.arrays() | prepared).items()}
     value["arrays"] = {name: [array.dtype.str, *array.shape] for name, array in arrays.items()}
     text = json.dumps(value, separators=(",", ":"), allow_nan=False, ensure_ascii=True).encode("ascii")
-    text += b" " * (-(_HEAD.size + len(text)) % _ALIGNMENT)
-    parts = [_HEAD.pack(MAGIC, FORMAT, len(text)), text]
+    text += b" " * (-(HEAD.size + len(text)) % _ALIGNMENT)
+    parts = [HEAD.pack(MAGIC, FORMAT, len(text)), text]
     for array in arrays.values():
         data = array.tobytes()
         parts += [data, bytes(-len(data) % _ALIGNMENT)]
@@ -96,34 +91,6 @@ def read_bundle(path: Path, *, digest: str = "") -> Bundle:
     with path.open("rb") as file:
         data = file.read(DEFAULT_LIMITS.compressed_bytes + 1)
     return decode_bundle(data, digest=digest)
-
-
-class _TaskHead(msgspec.Struct):
-    task_id: str
-    profile: Profile = Profile.PAPER
-
-
-class _TasksOfBundle(msgspec.Struct):
-    tasks: list[_TaskHead]
-
-
-def read_profiles(path: Path, *, limits: BundleLimits = DEFAULT_LIMITS) -> dict[str, Profile]:
-    """Return the profile of each task of a bundle file by task id. Scene and arrays are skipped, not built.
-
-    Raises BundleError or OSError.
-    """
-    with path.open("rb") as file:
-        content = decompress(file.read(limits.compressed_bytes + 1), limits)
-    if len(content) < _HEAD.size or content[:4] != MAGIC:
-        raise BundleError(f"it begins with {content[:4]!r}: expected {MAGIC!r}")
-    text_bytes = _HEAD.unpack_from(content)[2]
-    text = memoryview(content)[_HEAD.size : _HEAD.size + text_bytes]
-    check_values(text, limits)
-    try:
-        found = msgspec.json.decode(text, type=_TasksOfBundle)
-    except (ValueError, RecursionError) as error:
-        raise BundleError(f"its tasks can't be read: {error}") from error
-    return {task.task_id: task.profile for task in found.tasks}
 
 
 def decode_bundle(data: bytes, *, digest: str = "", limits: BundleLimits = DEFAULT_LIMITS) -> Bundle:
@@ -145,22 +112,22 @@ def decode_bundle(data: bytes, *, digest: str = "", limits: BundleLimits = DEFAU
 
 def _from_content(content: bytes, limits: BundleLimits) -> Bundle:
     """Decode decompressed content. Raises ValueError for other data and SceneInvalidError for a broken rule."""
-    if len(content) < _HEAD.size or content[:4] != MAGIC:
+    if len(content) < HEAD.size or content[:4] != MAGIC:
         raise ValueError(
             f"it begins with {content[:4]!r}: expected {MAGIC!r}; build the dataset again with this version"
         )
-    _, version, text_bytes = _HEAD.unpack_from(content)
+    _, version, text_bytes = HEAD.unpack_from(content)
     if version != FORMAT:
         raise ValueError(
             f"it has format {version}: expected {FORMAT}; build the dataset again with this version"
         )
-    end = _HEAD.size + text_bytes
+    end = HEAD.size + text_bytes
     if end > len(content) or end % _ALIGNMENT:
         raise ValueError(
             f"its JSON should have {text_bytes} bytes, but the bundle has {len(content)}: fetch it again"
         )
-    check_values(memoryview(content)[_HEAD.size : end], limits)
-    record = decode(content[_HEAD.size : end], BundleJson, "bundle")
+    check_values(memoryview(content)[HEAD.size : end], limits)
+    record = decode(content[HEAD.size : end], BundleJson, "bundle")
     arrays = _arrays(record.arrays, memoryview(content)[end:])
     prepared = {
         name.removeprefix(_PREPARED): arrays.pop(name) for name in list(arrays) if name.startswith(_PREPARED)

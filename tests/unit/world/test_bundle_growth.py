@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from embomatrix.world.bundle import FORMAT, MAGIC, decode_bundle
+from embomatrix.world.bundle import decode_bundle
+from embomatrix.world.bundle_head import FORMAT, MAGIC
 from embomatrix.world.inflation import BundleError, BundleLimits, check_values
 
 MOST_MB = 200

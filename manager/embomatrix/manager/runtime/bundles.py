@@ -15,7 +15,7 @@ from typing import IO, Final
 
 from embomatrix.rpc.channel import CHUNK_BYTES
 from embomatrix.rpc.status import InvalidRequestError, NotFoundError, OverloadedError
-from embomatrix.world.bundle import read_profiles
+from embomatrix.world.bundle_head import read_profiles
 from embomatrix.world.inflation import BundleError, Inflation
 from embomatrix.world.task import Profile
 
