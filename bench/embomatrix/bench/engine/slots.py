@@ -69,7 +69,12 @@ async def _measure(scenes: Sequence[tuple[SceneWork, bytes]], folder: Path, samp
 async def _load(root: Root, scene: SceneWork, path: Path, sample: SlotSample) -> Child:
     child = await root.fork()
     memory_mb = SlotLimits(1, 0).slot_memory_mb
-    request = {"path": str(path), "digest": scene.bundle_digest, "slot_memory_mb": memory_mb}
+    request = {
+        "path": str(path),
+        "digest": scene.bundle_digest,
+        "slot_memory_mb": memory_mb,
+        "scene_memory_mb": memory_mb,
+    }
     answer = await _ask(child, PipeMessage(request))
     sample.load_s.append(float(answer.header["cpu_s"]))
     return child
